@@ -1,0 +1,67 @@
+# make demo   install what the demo needs into .venv and run it
+# make test   install what the tests need, then check and test everything
+# make check  format, lint, types, direction of imports, generated code
+# make bench  measurements, as ratios
+# make schema regenerate the code of schemas/fan.proto
+# make twin   train the demo's twin anew
+# make lock   pin the dependencies anew
+# make clean  remove what was built (and nothing that was recorded)
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate pyproject.toml
+TORCH := torch==2.13.0
+SOURCES := schemas pipeline stages twin tests bench
+
+.PHONY: demo test check bench schema twin lock clean
+.DEFAULT_GOAL := demo
+
+demo: $(VENV)/.runtime
+	$(BIN)/fantwin demo
+
+test: $(VENV)/.development check
+	$(BIN)/python -m pytest
+
+check: $(VENV)/.development
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+bench: $(VENV)/.development
+	for script in bench/*.py; do $(BIN)/python $$script || exit 1; done
+
+schema: $(VENV)/.development
+	$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. schemas/fan.proto
+
+twin: $(VENV)/.development
+	sh demo/train_twin.sh $(BIN)/fantwin
+
+lock: $(VENV)/.development
+	$(COMPILE) --extra view --output-file requirements.lock
+	$(COMPILE) --extra view --extra dev --constraint requirements.lock --output-file requirements-dev.lock
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	find $(SOURCES) -name __pycache__ -type d -exec rm -rf {} +
+
+$(VENV)/bin/python:
+	@echo "making $(VENV) with $$($(PYTHON) --version)"
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "fantwin needs Python 3.11 or newer; name one: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	@$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.runtime: requirements.lock pyproject.toml | $(VENV)/bin/python
+	@echo "installing fantwin and what it runs on into $(VENV), about 250 MB (once)"
+	@$(PIP) install --require-hashes -r requirements.lock
+	@$(PIP) install --no-deps --editable .
+	@touch $@
+
+$(VENV)/.development: requirements-dev.lock pyproject.toml | $(VENV)/.runtime
+	@echo "installing what tests and training need into $(VENV), PyTorch among it (once)"
+	@$(PIP) install --require-hashes -r requirements-dev.lock
+	@$(PIP) install $(TORCH)
+	@$(PIP) install --editable '.[view,train,dev]'
+	@touch $@

@@ -1,0 +1,1 @@
+"""How stages run: bus, runner, health, configuration, launcher, recordings, command line."""

@@ -1,0 +1,159 @@
+"""The bus: the only module that knows Zenoh.
+
+Processes are peers that need no router. The first to start on a host listens on the configured endpoint, the
+others connect there and learn of each other. When that process dies, the rest stay connected to one another, and
+the next to start takes the endpoint over. (Trying again and again to listen would take it over at once, but a
+session that still tries cannot be closed in less than ten seconds: measured with Zenoh 1.10.)
+
+Data is published with congestion control BLOCK, and each publisher keeps its last messages and answers
+questions for them, so that a consumer that was not yet connected, or was restarted, asks for what it missed.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from pipeline.config import BusConfig
+from pipeline.errors import UserError
+from schemas.topics import Topic
+
+_RETRY = '{"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}'
+
+
+class BusError(UserError):
+    """The bus cannot be used: one line that says what, where and what to do."""
+
+
+class Outlet:
+    """One output of a stage: publishes bytes on a key and keeps the last ones for whoever missed them."""
+
+    def __init__(self, session: zenoh.Session, key: str, topic: Topic, encoding: str, producer: str) -> None:
+        self.key = key
+        self.published = 0
+        self._kept: deque[tuple[int, bytes]] = deque(maxlen=topic.history)
+        self._lock = threading.Lock()
+        self._publisher = session.declare_publisher(
+            key,
+            encoding=f"application/protobuf;{encoding}",
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            express=True,
+        )
+        self._recovery_key = recovery_key(key, producer)
+        self._queryable = session.declare_queryable(self._recovery_key, self._answer, complete=True)
+
+    def put(self, payload: bytes) -> None:
+        """Publish the message whose sequence number is `published`."""
+        with self._lock:
+            self._kept.append((self.published, payload))
+        self.published += 1
+        self._publisher.put(payload)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        first = int(query.parameters.get("first") or 0)
+        last = int(query.parameters.get("last") or 2**63)
+        with self._lock:
+            wanted = [(sequence, payload) for sequence, payload in self._kept if first <= sequence <= last]
+        with query:
+            for _, payload in wanted:
+                query.reply(self._recovery_key, payload)
+
+
+def recovery_key(key: str, producer: str) -> str:
+    """Where a producer answers for what it published on `key`."""
+    return f"{key}/recover/{producer}"
+
+
+class Bus:
+    """One session on the bus."""
+
+    def __init__(self, config: BusConfig) -> None:
+        self._config = config
+        try:
+            self._session = zenoh.open(_zenoh_config(config))
+        except zenoh.ZError as error:
+            raise BusError(f"bus.endpoint = {config.endpoint!r} cannot be used: {error}") from error
+        self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def outlet(self, key: str, topic: Topic, encoding: str, producer: str) -> Outlet:
+        """Declare an output; `encoding` is the full protobuf name of its messages."""
+        return Outlet(self._session, key, topic, encoding, producer)
+
+    def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> None:
+        """Call `on_message(key, payload)` from the bus's own thread; while it blocks, publishers wait."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            on_message(str(sample.key_expr), sample.payload.to_bytes())
+
+        self._declared.append(self._session.declare_subscriber(key_expression, receive))
+
+    def declare_alive(self, key: str) -> None:
+        """Show a liveliness token until this session ends, however it ends."""
+        self._declared.append(self._session.liveliness().declare_token(key))
+
+    def watch_alive(self, key_expression: str, on_change: Callable[[str, bool], None]) -> None:
+        """Call `on_change(key, alive)` for every token there is, comes or goes."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        self._declared.append(self._session.liveliness().declare_subscriber(key_expression, receive, history=True))
+
+    def recover(
+        self, key: str, producer: str, first: int, last: int, while_waiting: Callable[[], None]
+    ) -> Iterator[bytes]:
+        """Ask `producer` (or all, `*`) for its messages `first..last` on `key`; yields what it still has.
+
+        `while_waiting` is called again and again so that the caller can keep its inbox from filling: replies come
+        through the same threads that fill it.
+        """
+        replies = self._session.get(
+            f"{recovery_key(key, producer)}?first={first};last={last}",
+            timeout=self._config.recovery_timeout_s,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+        while True:
+            try:
+                reply = replies.try_recv()
+            except zenoh.ZError:  # the last reply has come
+                return
+            if reply is None:
+                while_waiting()
+            elif reply.ok is not None:
+                yield reply.ok.payload.to_bytes()
+
+    def close(self) -> None:
+        """Leave the bus; what was published before has left this process."""
+        self._session.close()
+
+
+def _zenoh_config(config: BusConfig) -> zenoh.Config:
+    conf = zenoh.Config()
+    conf.insert_json5("mode", json.dumps(config.mode))
+    conf.insert_json5("connect/endpoints", json.dumps([config.endpoint]))
+    conf.insert_json5("connect/timeout_ms", "-1")
+    conf.insert_json5("connect/exit_on_failure", "false")
+    conf.insert_json5("connect/retry", _RETRY)
+    conf.insert_json5("scouting/multicast/enabled", "false")
+    if config.mode == "peer":
+        host = config.endpoint.rsplit(":", 1)[0]
+        conf.insert_json5("listen/endpoints", json.dumps([config.endpoint, f"{host}:0"]))
+        conf.insert_json5("listen/timeout_ms", "0")
+        conf.insert_json5("listen/exit_on_failure", "false")
+        conf.insert_json5("scouting/gossip/enabled", "true")
+    return conf

@@ -1,0 +1,134 @@
+"""`fantwin status`: what every stage does, live."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from datetime import datetime
+from typing import Annotated
+
+import typer
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from pipeline.bus import Bus
+from pipeline.commands.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from pipeline.config import Config, load_config
+from pipeline.errors import UserError
+from pipeline.signals import stop_on_signals
+from pipeline.watcher import StageView, Watcher
+from schemas.messages import Alarm, StageStatus
+
+_LISTEN_S = 2.5  # two healths of every stage, so that there are rates
+
+
+def status(
+    config: ConfigOption = DEFAULT_CONFIG,
+    once: Annotated[bool, typer.Option("--once", help="Print once and exit instead of staying live.")] = False,
+    overrides: SetOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Show stages, rates, latency, losses and alarms of a running site.
+
+    Exit code 1 when no stage answers, 3 when one says it has lost something.
+
+    Example: fantwin status -c fantwin.toml --once
+    """
+    settings = load_config(config, overrides or ())
+    stop = threading.Event()
+    stop_on_signals(stop)
+    with Bus(settings.bus) as bus:
+        watcher = Watcher(bus, settings.site)
+        if once or json_output:
+            stop.wait(_LISTEN_S)
+            watcher.ask_for_past_alarms()
+            _require_someone(watcher, settings)
+            if json_output:
+                typer.echo(json.dumps(as_json(watcher)))
+            else:
+                Console().print(stage_table(watcher))
+        else:
+            watcher.ask_for_past_alarms()
+            with Live(console=Console(), refresh_per_second=4) as live:
+                while not stop.wait(0.25):
+                    live.update(stage_table(watcher))
+        if any(watcher.losses().values()):
+            raise typer.Exit(3)
+
+
+def _require_someone(watcher: Watcher, config: Config) -> None:
+    if not watcher.stages():
+        raise UserError(
+            f"no stage of site {config.site!r} answers at {config.bus.endpoint}; "
+            f"is `fantwin up -c {config.path}` running?"
+        )
+
+
+def stage_table(watcher: Watcher) -> Group:
+    """What a person is shown: a row for each stage, and the alarms below."""
+    table = Table("stage", "instance", "state", title="fantwin", title_justify="left")
+    for column in ("in /s", "out /s", "p50 ms", "p99 ms", "lost"):
+        table.add_column(column, justify="right")
+    table.add_column("problem", overflow="fold")
+    for view in watcher.stages():
+        health = view.health
+        lost = Text(str(health.lost), style="red" if health.lost else "")
+        latency = (
+            (f"{health.latency_p50_ms:.1f}", f"{health.latency_p99_ms:.1f}") if health.latency_p99_ms else ("", "")
+        )
+        rates = (f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}")
+        table.add_row(health.stage, health.instance, _state(view), *rates, *latency, lost, health.problem)
+    lines = [_alarm_line(alarm) for alarm in watcher.alarms()] or [Text("no alarms", style="green")]
+    return Group(table, *lines)
+
+
+def _state(view: StageView) -> Text:
+    if not view.alive:
+        stopped = view.health.status == StageStatus.STOPPED
+        return Text("stopped" if stopped else "gone", style="yellow" if stopped else "red")
+    if time.time_ns() - view.health.t_ns > 5e9:
+        return Text("silent", style="red")
+    styles = {StageStatus.STARTING: "yellow", StageStatus.OK: "green", StageStatus.DEGRADED: "red"}
+    return Text(view.health.status.name.lower(), style=styles.get(view.health.status, "yellow"))
+
+
+def _alarm_line(alarm: Alarm) -> Text:
+    at = datetime.fromtimestamp(alarm.t_ns / 1e9).strftime("%H:%M:%S.%f")[:-3]
+    word, style = ("ALARM  ", "bold red") if alarm.active else ("cleared", "green")
+    return Text.assemble((f"{at}  {word}", style), f"  {alarm.header.tray}  {alarm.message}")
+
+
+def as_json(watcher: Watcher) -> dict[str, object]:
+    """What a machine is shown."""
+    return {
+        "stages": [
+            {
+                "stage": view.health.stage,
+                "instance": view.health.instance,
+                "alive": view.alive,
+                "status": view.health.status.name.lower(),
+                "problem": view.health.problem,
+                "process_id": view.health.process_id,
+                "rate_in_hz": round(view.rate_in_hz, 1),
+                "rate_out_hz": round(view.rate_out_hz, 1),
+                "latency_ms": {"p50": view.health.latency_p50_ms, "p99": view.health.latency_p99_ms},
+                "lost": view.health.lost,
+                "counters": {counter.name: counter.value for counter in view.health.counters},
+            }
+            for view in watcher.stages()
+        ],
+        "alarms": [
+            {
+                "tray": alarm.header.tray,
+                "fan": alarm.fan,
+                "active": alarm.active,
+                "t_ns": alarm.t_ns,
+                "onset_t_ns": alarm.onset_t_ns,
+                "message": alarm.message,
+            }
+            for alarm in watcher.alarms()
+        ],
+    }

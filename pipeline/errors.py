@@ -1,0 +1,5 @@
+"""Errors that are the user's to mend."""
+
+
+class UserError(Exception):
+    """One line that says what is wrong, where, and what to do; the command line prints it and exits 1."""

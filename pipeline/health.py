@@ -1,0 +1,62 @@
+"""A stage's account of itself: built by the runner, published once a second and once more at the end."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from schemas.messages import Counter, Health, Input, Message, Output, StageStatus, newest_t_ns
+
+LOSS_PREFIX = "lost_"
+_LATENCIES_KEPT = 2000
+
+
+class HealthBook:
+    """Collects what a stage counts and makes `Health` messages of it."""
+
+    def __init__(self, stage: str, instance: str, started_t_ns: int) -> None:
+        self._stage = stage
+        self._instance = instance
+        self._started_t_ns = started_t_ns
+        self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES_KEPT)
+
+    def note_output(self, message: Message, now_ns: int) -> None:
+        """Remember how old the newest sample of an output was when it was sent."""
+        t_ns = newest_t_ns(message)
+        if t_ns:
+            self._latencies_ms.append((now_ns - t_ns) / 1e6)
+
+    def make(
+        self,
+        *,
+        status: StageStatus,
+        problems: Iterable[str],
+        inputs: tuple[Input, ...],
+        outputs: Iterable[Output],
+        counters: Mapping[str, int],
+        now_ns: int,
+    ) -> Health:
+        """The health message of this moment. Losses are missing messages and counters that begin with `lost_`."""
+        problem = "; ".join(filter(None, problems))
+        if problem and status == StageStatus.OK:
+            status = StageStatus.DEGRADED
+        p50, p99 = np.percentile(self._latencies_ms, (50, 99)) if self._latencies_ms else (0.0, 0.0)
+        return Health(
+            stage=self._stage,
+            instance=self._instance,
+            status=status,
+            t_ns=now_ns,
+            uptime_s=(now_ns - self._started_t_ns) / 1e9,
+            problem=problem,
+            inputs=inputs,
+            outputs=tuple(outputs),
+            counters=tuple(Counter(name=name, value=value) for name, value in sorted(counters.items())),
+            latency_p50_ms=float(p50),
+            latency_p99_ms=float(p99),
+            lost=sum(line.missing for line in inputs)
+            + sum(value for name, value in counters.items() if name.startswith(LOSS_PREFIX)),
+            process_id=os.getpid(),
+        )

@@ -1,0 +1,154 @@
+"""`fantwin up`: starts all stages as processes, restarts what dies, stops all in the order of the data."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pipeline.bus import Bus
+from pipeline.config import Config
+from pipeline.errors import UserError
+from pipeline.processes import EXIT_CANNOT_START, Child, StageProcess, process_list
+from pipeline.table_of_stages import load_stage
+from pipeline.watcher import Watcher
+from schemas.topics import alive_key
+
+_LOOK_S = 0.05
+_READY_TIMEOUT_S = 30.0
+_STABLE_S = 10.0  # a stage that ran this long starts again at the shortest delay
+
+
+@dataclass
+class _Slot:
+    """One row of the process list and what has become of it."""
+
+    row: StageProcess
+    child: Child | None = None
+    start_at_s: float = 0.0
+    delay_s: float = 0.0
+    was_ready: bool = False
+
+
+@dataclass
+class Outcome:
+    """How a run ended."""
+
+    restarts: dict[str, int] = field(default_factory=dict)
+    killed: list[str] = field(default_factory=list)
+    lost: dict[str, int] = field(default_factory=dict)
+    run_folder: str = ""
+
+    @property
+    def exit_code(self) -> int:
+        """0: all in order; 3: something was lost; 1: a stage did not stop in time and was killed."""
+        if self.killed:
+            return 1
+        return 3 if any(self.lost.values()) else 0
+
+
+class Launcher:
+    """Runs the stages of one configuration until told to stop."""
+
+    def __init__(self, config: Config, overrides: Sequence[str], say: Callable[[str], None]) -> None:
+        """`say` is given one line at a time on what happens."""
+        self._config = config
+        self._path: Path = config.path
+        self._overrides = tuple(overrides)
+        self._say = say
+        self._slots = [_Slot(row, delay_s=config.launcher.restart_delay_s) for row in process_list(config)]
+        self._alive: set[str] = set()
+        self._changed = threading.Event()
+        self.outcome = Outcome(run_folder=str(config.run_folder))
+
+    def run(self, stop: threading.Event) -> Outcome:
+        """Start all, look after them until `stop` is set, stop all.
+
+        Raises:
+            UserError: a stage cannot run as configured; the others have been stopped.
+        """
+        with Bus(self._config.bus) as bus:
+            bus.watch_alive(alive_key(self._config.site, "*", "*"), self._note_alive)
+            watcher = Watcher(bus, self._config.site)
+            try:
+                self._start_all(stop)
+                while not stop.wait(_LOOK_S):
+                    self._look()
+            finally:
+                self._stop_all()
+                self.outcome.lost = watcher.losses()
+        return self.outcome
+
+    def _note_alive(self, key: str, alive: bool) -> None:
+        (self._alive.add if alive else self._alive.discard)(key)
+        self._changed.set()
+
+    def _start_all(self, stop: threading.Event) -> None:
+        """Whoever listens first: sources start when all others are ready, so that no first sample is missed."""
+        sources = [slot for slot in self._slots if not _listens_only(slot.row)]
+        listeners = [slot for slot in self._slots if _listens_only(slot.row)]
+        for group in (listeners, sources):
+            for slot in reversed(group):
+                self._start(slot)
+            self._wait_until_ready(group, stop)
+
+    def _wait_until_ready(self, slots: list[_Slot], stop: threading.Event) -> None:
+        deadline = time.monotonic() + _READY_TIMEOUT_S
+        while not stop.is_set() and any(not slot.was_ready for slot in slots):
+            self._changed.wait(_LOOK_S)
+            self._changed.clear()
+            self._look()
+            if time.monotonic() > deadline:
+                late = ", ".join(slot.row.label for slot in slots if not slot.was_ready)
+                self._say(f"{late}: not ready after {_READY_TIMEOUT_S:.0f} s, going on; see `fantwin doctor`")
+                return
+
+    def _start(self, slot: _Slot) -> None:
+        slot.child = Child(slot.row, self._path, self._overrides, lambda row, line: self._say(f"{row.label} | {line}"))
+        self._say(f"{slot.row.label}: started, process {slot.child.process_id}")
+
+    def _look(self) -> None:
+        """See what has died and what is due to start again."""
+        now = time.monotonic()
+        for slot in self._slots:
+            if slot.child is None:
+                if slot.start_at_s and now >= slot.start_at_s:
+                    self._start(slot)
+                continue
+            status = slot.child.exit_status()
+            if status is None:
+                slot.was_ready |= alive_key(self._config.site, slot.row.stage, slot.row.instance) in self._alive
+                continue
+            if status == EXIT_CANNOT_START and not slot.was_ready:
+                slot.child.stop(0.1)
+                raise UserError(slot.child.last_line or f"{slot.row.label} cannot start as configured")
+            self._plan_restart(slot, status, now)
+
+    def _plan_restart(self, slot: _Slot, status: int, now: float) -> None:
+        assert slot.child is not None
+        limits = self._config.launcher
+        if now - slot.child.started_s > _STABLE_S:
+            slot.delay_s = limits.restart_delay_s
+        how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
+        self._say(f"{slot.row.label}: {how}, starting it again in {slot.delay_s:.1f} s")
+        self.outcome.restarts[slot.row.label] = self.outcome.restarts.get(slot.row.label, 0) + 1
+        slot.child, slot.start_at_s = None, now + slot.delay_s
+        slot.delay_s = min(2 * slot.delay_s, limits.restart_delay_max_s)
+
+    def _stop_all(self) -> None:
+        """In the order of the data: each stage ends when all that was sent to it has been handled."""
+        for slot in self._slots:
+            if slot.child is None:
+                continue
+            status = slot.child.stop(self._config.launcher.stop_timeout_s)
+            if status is None:
+                self.outcome.killed.append(slot.row.label)
+                self._say(f"{slot.row.label}: did not stop in {self._config.launcher.stop_timeout_s:.0f} s, killed")
+            slot.child = None
+
+
+def _listens_only(row: StageProcess) -> bool:
+    """Whether a stage has all its input from the bus, rather than from a device."""
+    return not load_stage(row.stage).process_per_tray

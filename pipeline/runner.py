@@ -1,0 +1,301 @@
+"""The one loop every stage runs in: receive, check the sequence, step, stamp, publish, count.
+
+Everything a stage reacts to comes through one inbox: messages from the bus, items from the stage's source, and
+the coming and going of other stages. It is bounded, and while it is full publishers wait; only a stage that may
+drop (the viewer) throws its oldest packets away instead, and counts them.
+"""
+
+from __future__ import annotations
+
+import queue
+import secrets
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pipeline.bus import Bus, Outlet
+from pipeline.config import Config
+from pipeline.errors import UserError
+from pipeline.health import HealthBook
+from pipeline.inlet import Inlet
+from pipeline.stage import Context, Packet, Parts, Stage
+from schemas.codec import CodecError, decode, encode, type_name
+from schemas.messages import Header, Health, Message, Output, StageStatus
+from schemas.topics import BY_NAME, TOPICS, alive_key, health_key, topic_of, tray_key
+
+INBOX_SIZE = 4096
+TICK_S = 0.05
+HEALTH_PERIOD_S = 1.0
+FAREWELL_S = 1.0  # how long a stopping stage waits for the last health of a producer that has just left
+
+
+@dataclass(frozen=True, slots=True)
+class _FromBus:
+    key: str
+    payload: bytes
+    received_t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _FromSource:
+    item: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _Alive:
+    key: str
+    alive: bool
+
+
+class _Inbox:
+    """The bounded queue before a stage."""
+
+    def __init__(self, drops_oldest: bool) -> None:
+        self._queue: queue.Queue[Any] = queue.Queue(INBOX_SIZE)
+        self._drops_oldest = drops_oldest
+        self._aside: deque[Any] = deque()
+        self.dropped = 0
+
+    def put(self, item: Any) -> None:
+        """Add an item; blocks while the inbox is full, or drops the oldest."""
+        if not self._drops_oldest:
+            self._queue.put(item)
+            return
+        while True:
+            try:
+                self._queue.put_nowait(item)
+                return
+            except queue.Full:
+                self._drop_one()
+
+    def _drop_one(self) -> None:
+        try:
+            self._queue.get_nowait()
+        except queue.Empty:
+            return
+        self.dropped += 1
+
+    def get(self, timeout_s: float) -> Any | None:
+        """The next item, or None when there is none in time."""
+        if self._aside:
+            return self._aside.popleft()
+        try:
+            return self._queue.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    def set_aside(self) -> None:
+        """Take an item out of the queue and keep it for later, in order: makes room while the stage waits."""
+        try:
+            self._aside.append(self._queue.get(timeout=0.005))
+        except queue.Empty:
+            return
+
+
+class Runner:
+    """Runs one stage in this process until `stop` is set, then brings what is in flight to its end."""
+
+    def __init__(self, stage: Stage, config: Config, tray: str | None, stop: threading.Event) -> None:
+        """Build the stage. `tray` names the tray of a stage that has one process for each; `stop` ends `run`.
+
+        Raises:
+            StageError, ConfigError, BusError: it cannot be built; nothing has been published.
+        """
+        trays = (config.tray(tray),) if tray else config.trays
+        if stage.process_per_tray and len(trays) != 1:
+            names = ", ".join(t.name for t in trays)
+            raise UserError(f"{stage.name} runs one process for each tray: say which with --tray (of {names})")
+        self.stage = stage
+        self.stop = stop
+        self._site = config.site
+        self._instance = trays[0].name if stage.process_per_tray else "all"
+        self.producer = f"{stage.name}-{self._instance}-{secrets.token_hex(4)}"
+        self._inbox = _Inbox(drops_oldest=stage.may_drop)
+        self._counts: Counter[str] = Counter()
+        started_t_ns = time.time_ns()
+        self._health = HealthBook(stage.name, self._instance, started_t_ns)
+        context = Context(
+            site=config.site,
+            trays=trays,
+            config=config.sections[stage.name],
+            folder=config.folder,
+            run_folder=config.run_folder,
+            started_t_ns=started_t_ns,
+            configuration_text=config.text,
+        )
+        self._parts: dict[str, Parts] = (
+            {t.name: stage.build(replace(context, trays=(t,))) for t in trays}
+            if stage.core_per_tray
+            else {"": stage.build(context)}
+        )
+        self._bus = Bus(config.bus)
+        self._inlet = Inlet(None if stage.may_drop else self._recover)
+        self._outlets: dict[tuple[str, str], Outlet] = {
+            (t.name, name): self._outlet(tray_key(config.site, t.name, name), name)
+            for t in trays
+            for name in stage.writes
+        }
+        self._health_outlet = self._outlet(health_key(config.site, stage.name, self._instance), "health")
+        self._read_keys = {
+            tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
+        }
+        self._left: dict[str, float] = {}
+        self._last_health: dict[str, Health] = {}
+
+    def run(self) -> Health:
+        """Run to the end and give the last health. Whatever happens, the cores are closed and it is published."""
+        for key in sorted(self._read_keys):
+            self._bus.subscribe(key, self._on_bus)
+        self._bus.subscribe(health_key(self._site, "*", "*"), self._on_bus)
+        self._bus.watch_alive(alive_key(self._site, "*", "*"), lambda key, alive: self._inbox.put(_Alive(key, alive)))
+        try:
+            self._publish_health(StageStatus.STARTING)
+            self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
+            for parts in self._parts.values():
+                if parts.source:
+                    parts.source.start(lambda item: self._inbox.put(_FromSource(item)))
+            self._loop(until=self.stop.is_set)
+            self._drain()
+        finally:
+            for tray, parts in self._parts.items():
+                self._publish(tray, parts.core.close())
+            last = self._publish_health(StageStatus.STOPPED)
+            self._bus.close()
+        return last
+
+    def _on_bus(self, key: str, payload: bytes) -> None:
+        self._inbox.put(_FromBus(key, payload, time.time_ns()))
+
+    def _loop(self, until: Callable[[], bool]) -> None:
+        next_tick = next_health = time.monotonic()
+        while not until():
+            item = self._inbox.get(max(0.0, next_tick - time.monotonic()))
+            if item is not None:
+                self._handle(item)
+            now = time.monotonic()
+            if now >= next_tick:
+                next_tick = now + TICK_S
+                for tray, parts in self._parts.items():
+                    self._publish(tray, parts.core.tick(time.time_ns()))
+            if now >= next_health:
+                next_health = now + HEALTH_PERIOD_S
+                self._publish_health(StageStatus.OK)
+
+    def _drain(self) -> None:
+        """Handle what has been sent to this stage before it was told to stop."""
+        stopped = threading.Event()
+
+        def stop_sources() -> None:
+            for parts in self._parts.values():
+                if parts.source:
+                    parts.source.stop()
+            stopped.set()
+
+        threading.Thread(target=stop_sources, daemon=True).start()
+        while True:
+            item = self._inbox.get(TICK_S)
+            if item is not None:
+                self._handle(item)
+            elif stopped.is_set() and not self._awaits_farewell():
+                return
+
+    def _awaits_farewell(self) -> bool:
+        """Whether a producer has just left whose last health, and so its last messages, may still be on the way."""
+        now = time.monotonic()
+        return any(
+            now - left < FAREWELL_S and self._last_health[key].status != StageStatus.STOPPED
+            for key, left in self._left.items()
+            if key in self._last_health
+        )
+
+    def _handle(self, item: _FromBus | _FromSource | _Alive) -> None:
+        if isinstance(item, _FromSource):
+            (parts,) = self._parts.values()
+            self._publish(self._instance, parts.core.step(item.item))
+        elif isinstance(item, _Alive):
+            self._note_alive(item)
+        else:
+            packet = self._decode(item.key, item.payload, item.received_t_ns)
+            if packet is None:
+                return
+            if isinstance(packet.message, Health):
+                self._note_health(packet)
+            else:
+                for due in self._inlet.accept(packet):
+                    self._step(due)
+
+    def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Packet | None:
+        try:
+            topic = topic_of(key)
+            return Packet(key, topic.name, payload, received_t_ns, decode(topic.message, payload))
+        except (KeyError, CodecError):
+            self._counts["lost_undecodable"] += 1
+            return None
+
+    def _step(self, packet: Packet) -> None:
+        tray = packet.message.header.tray
+        parts = self._parts.get(tray) or self._parts.get("")
+        if parts is None:
+            self._counts["unknown_tray"] += 1
+            return
+        self._publish(tray, parts.core.step(packet if self.stage.wants_packets else packet.message))
+
+    def _note_alive(self, change: _Alive) -> None:
+        if change.alive:
+            self._left.pop(change.key, None)
+        else:
+            self._left[change.key] = time.monotonic()
+
+    def _note_health(self, packet: Packet) -> None:
+        health = packet.message
+        assert isinstance(health, Health)
+        if health.header.producer == self.producer:
+            if "health" in self.stage.reads:
+                self._step(packet)
+            return
+        self._last_health[alive_key(self._site, health.stage, health.instance)] = health
+        for due in self._inlet.reconcile(health, self._read_keys):
+            self._step(due)
+        if "health" in self.stage.reads:
+            for due in self._inlet.accept(packet):
+                self._step(due)
+
+    def _recover(self, key: str, producer: str, first: int, last: int) -> Iterator[Packet]:
+        payloads = self._bus.recover(key, producer, first, last, self._inbox.set_aside)
+        packets = (self._decode(key, payload, time.time_ns()) for payload in payloads)
+        return (packet for packet in packets if packet is not None)
+
+    def _outlet(self, key: str, topic: str) -> Outlet:
+        return self._bus.outlet(key, BY_NAME[topic], type_name(BY_NAME[topic].message), self.producer)
+
+    def _publish(self, tray: str, messages: Sequence[Message]) -> None:
+        for message in messages:
+            outlet = self._outlets[tray, _TOPIC_NAMES[type(message)]]
+            stamped = replace(message, header=Header(self.producer, outlet.published, tray))
+            outlet.put(encode(stamped))
+            self._health.note_output(stamped, time.time_ns())
+
+    def _publish_health(self, status: StageStatus) -> Health:
+        counters: Counter[str] = Counter(self._counts)
+        for parts in self._parts.values():
+            counters.update(parts.core.counters())
+        if self._inbox.dropped:
+            counters["dropped"] = self._inbox.dropped
+        health = self._health.make(
+            status=status,
+            problems=[parts.core.problem() for parts in self._parts.values()],
+            inputs=self._inlet.inputs(),
+            outputs=[Output(key=outlet.key, published=outlet.published) for outlet in self._outlets.values()],
+            counters=counters,
+            now_ns=time.time_ns(),
+        )
+        header = Header(self.producer, self._health_outlet.published, "")
+        health = replace(health, header=header)
+        self._health_outlet.put(encode(health))
+        return health
+
+
+_TOPIC_NAMES = {topic.message: topic.name for topic in TOPICS}

@@ -1,0 +1,1 @@
+"""What travels: the messages, their wire form, and the one table of topics."""

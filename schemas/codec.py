@@ -1,0 +1,166 @@
+"""Messages to protobuf bytes and back.
+
+A packed field's bytes are the array's own little-endian bytes (enums and booleans: one byte a value while
+they stay below 128), so a column is appended to the serialised scalars as key, length and bytes. What comes
+out is standard protobuf that any reader decodes with `fan.proto`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any, get_args
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from google.protobuf.message import Message as ProtoMessage
+
+from schemas import fan_pb2
+from schemas.messages import (
+    MESSAGE_TYPES,
+    Counter,
+    Header,
+    Input,
+    Message,
+    Output,
+    Severity,
+    StageStatus,
+    columns,
+)
+
+_LENGTH_DELIMITED = 2
+_RECORDS = {"inputs": Input, "outputs": Output, "counters": Counter}
+_ENUMS = {"severity": Severity, "status": StageStatus}
+_COLUMNS = {t: columns(t) for t in MESSAGE_TYPES}
+_SCALARS = {
+    t: tuple(f.name for f in fields(t) if "shape" not in f.metadata and f.name != "header") for t in MESSAGE_TYPES
+}
+
+
+class CodecError(ValueError):
+    """Bytes that are not the message they should be."""
+
+
+def proto_type(message_type: type[Message]) -> type[ProtoMessage]:
+    """The generated protobuf class of a message type."""
+    return getattr(fan_pb2, message_type.__name__)
+
+
+def type_name(message_type: type[Message]) -> str:
+    """Full protobuf name, for example `fantwin.Raw`: the encoding on the bus and the schema name in recordings."""
+    return proto_type(message_type).DESCRIPTOR.full_name
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append((value & 0x7F) | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+_KEYS = {
+    t: {
+        name: _varint(proto_type(t).DESCRIPTOR.fields_by_name[name].number << 3 | _LENGTH_DELIMITED)
+        for name in _COLUMNS[t]
+    }
+    for t in MESSAGE_TYPES
+}
+
+
+def encode(message: Message) -> bytes:
+    """Serialise a message.
+
+    Raises:
+        CodecError: a column's shape does not fit the message's samples and fans.
+    """
+    kind = type(message)
+    proto: Any = proto_type(kind)()
+    proto.header.producer = message.header.producer
+    proto.header.sequence = message.header.sequence
+    proto.header.tray = message.header.tray
+    for name in _SCALARS[kind]:
+        value = getattr(message, name)
+        if name in _RECORDS:
+            for record in value:
+                getattr(proto, name).add(**{f.name: getattr(record, f.name) for f in fields(record)})
+        else:
+            setattr(proto, name, value)
+    parts = [proto.SerializeToString()]
+    samples = _sample_count(message)
+    for name, (shape, dtype) in _COLUMNS[kind].items():
+        column = np.asarray(getattr(message, name), dtype=dtype.newbyteorder("<"))
+        if column.size == 0:
+            continue
+        _check_shape(message, name, column, shape, samples)
+        data = column.tobytes()
+        parts += (_KEYS[kind][name], _varint(len(data)), data)
+    return b"".join(parts)
+
+
+def decode(message_type: type[Message], data: bytes) -> Message:
+    """Parse bytes into a message; columns come back read-only in their declared shape.
+
+    Raises:
+        CodecError: the bytes are not such a message.
+    """
+    proto: Any = proto_type(message_type)()
+    try:
+        proto.ParseFromString(data)
+    except DecodeError as error:
+        raise CodecError(f"{len(data)} bytes are not a {type_name(message_type)}: {error}") from error
+    values: dict[str, Any] = {
+        "header": Header(proto.header.producer, proto.header.sequence, proto.header.tray),
+    }
+    for name in _SCALARS[message_type]:
+        value = getattr(proto, name)
+        if name in _RECORDS:
+            record = _RECORDS[name]
+            value = tuple(record(**{f.name: getattr(item, f.name) for f in fields(record)}) for item in value)
+        elif name in _ENUMS:
+            value = _enum(name, value, message_type)
+        values[name] = value
+    fans = values.get("fans", 0)
+    for name, (shape, dtype) in _COLUMNS[message_type].items():
+        column = np.asarray(getattr(proto, name), dtype=dtype)
+        if shape == "samples x fans":
+            if fans == 0 or column.size % fans:
+                if column.size:
+                    raise CodecError(f"{type_name(message_type)}.{name} has {column.size} values for {fans} fans")
+                column = column.reshape(0, fans)
+            else:
+                column = column.reshape(-1, fans)
+        column.setflags(write=False)
+        values[name] = column
+    message = message_type(**values)
+    samples = _sample_count(message)
+    for name, (shape, _) in _COLUMNS[message_type].items():
+        column = values[name]
+        if column.size:
+            _check_shape(message, name, column, shape, samples)
+    return message
+
+
+def _enum(name: str, value: int, message_type: type[Message]) -> Any:
+    try:
+        return _ENUMS[name](value)
+    except ValueError as error:
+        raise CodecError(f"{type_name(message_type)}.{name} = {value} is not known here: a newer producer?") from error
+
+
+def _sample_count(message: Message) -> int:
+    """Samples in a message, by its time column; -1 for messages without one."""
+    for name, (shape, _) in _COLUMNS[type(message)].items():
+        if shape == "samples":
+            return len(getattr(message, name))
+    return -1
+
+
+def _check_shape(message: Message, name: str, column: np.ndarray[Any, Any], shape: str, samples: int) -> None:
+    fans = getattr(message, "fans", column.size)
+    expected = {"samples": (samples,), "samples x fans": (samples, fans), "fans": (fans,)}[shape]
+    if column.shape != expected:
+        raise CodecError(f"{type_name(type(message))}.{name} has shape {column.shape}, not {shape} = {expected}")
+
+
+assert set(get_args(Message)) == set(MESSAGE_TYPES)

@@ -1,0 +1,288 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class WhyNot(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    WHY_NOT_NONE: _ClassVar[WhyNot]
+    WHY_NOT_STALE: _ClassVar[WhyNot]
+    WHY_NOT_GAP: _ClassVar[WhyNot]
+    WHY_NOT_WARMING_UP: _ClassVar[WhyNot]
+    WHY_NOT_OUT_OF_RANGE: _ClassVar[WhyNot]
+    WHY_NOT_SATURATED: _ClassVar[WhyNot]
+    WHY_NOT_NO_SPEED: _ClassVar[WhyNot]
+    WHY_NOT_NO_TWIN: _ClassVar[WhyNot]
+
+class FanState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    FAN_STATE_UNKNOWN: _ClassVar[FanState]
+    FAN_STATE_NORMAL: _ClassVar[FanState]
+    FAN_STATE_SUSPECT: _ClassVar[FanState]
+    FAN_STATE_ALARM: _ClassVar[FanState]
+    FAN_STATE_RETURNING: _ClassVar[FanState]
+
+class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    SEVERITY_NONE: _ClassVar[Severity]
+    SEVERITY_WARNING: _ClassVar[Severity]
+    SEVERITY_ALARM: _ClassVar[Severity]
+
+class StageStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    STAGE_STATUS_STARTING: _ClassVar[StageStatus]
+    STAGE_STATUS_OK: _ClassVar[StageStatus]
+    STAGE_STATUS_DEGRADED: _ClassVar[StageStatus]
+    STAGE_STATUS_STOPPED: _ClassVar[StageStatus]
+WHY_NOT_NONE: WhyNot
+WHY_NOT_STALE: WhyNot
+WHY_NOT_GAP: WhyNot
+WHY_NOT_WARMING_UP: WhyNot
+WHY_NOT_OUT_OF_RANGE: WhyNot
+WHY_NOT_SATURATED: WhyNot
+WHY_NOT_NO_SPEED: WhyNot
+WHY_NOT_NO_TWIN: WhyNot
+FAN_STATE_UNKNOWN: FanState
+FAN_STATE_NORMAL: FanState
+FAN_STATE_SUSPECT: FanState
+FAN_STATE_ALARM: FanState
+FAN_STATE_RETURNING: FanState
+SEVERITY_NONE: Severity
+SEVERITY_WARNING: Severity
+SEVERITY_ALARM: Severity
+STAGE_STATUS_STARTING: StageStatus
+STAGE_STATUS_OK: StageStatus
+STAGE_STATUS_DEGRADED: StageStatus
+STAGE_STATUS_STOPPED: StageStatus
+
+class Header(_message.Message):
+    __slots__ = ("producer", "sequence", "tray")
+    PRODUCER_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    TRAY_FIELD_NUMBER: _ClassVar[int]
+    producer: str
+    sequence: int
+    tray: str
+    def __init__(self, producer: _Optional[str] = ..., sequence: _Optional[int] = ..., tray: _Optional[str] = ...) -> None: ...
+
+class Raw(_message.Message):
+    __slots__ = ("header", "fans", "host_receive_t_ns", "device_clock_us", "device_sequence", "command", "speed_rad_s")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    FANS_FIELD_NUMBER: _ClassVar[int]
+    HOST_RECEIVE_T_NS_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_CLOCK_US_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_FIELD_NUMBER: _ClassVar[int]
+    SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    fans: int
+    host_receive_t_ns: _containers.RepeatedScalarFieldContainer[int]
+    device_clock_us: _containers.RepeatedScalarFieldContainer[int]
+    device_sequence: _containers.RepeatedScalarFieldContainer[int]
+    command: _containers.RepeatedScalarFieldContainer[float]
+    speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., host_receive_t_ns: _Optional[_Iterable[int]] = ..., device_clock_us: _Optional[_Iterable[int]] = ..., device_sequence: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Grid(_message.Message):
+    __slots__ = ("header", "fans", "step_ns", "t_ns", "command", "speed_rad_s", "valid", "why_not")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    FANS_FIELD_NUMBER: _ClassVar[int]
+    STEP_NS_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_FIELD_NUMBER: _ClassVar[int]
+    SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    VALID_FIELD_NUMBER: _ClassVar[int]
+    WHY_NOT_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    fans: int
+    step_ns: int
+    t_ns: _containers.RepeatedScalarFieldContainer[int]
+    command: _containers.RepeatedScalarFieldContainer[float]
+    speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    valid: _containers.RepeatedScalarFieldContainer[bool]
+    why_not: _containers.RepeatedScalarFieldContainer[WhyNot]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., step_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., why_not: _Optional[_Iterable[_Union[WhyNot, str]]] = ...) -> None: ...
+
+class Prediction(_message.Message):
+    __slots__ = ("header", "fans", "step_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "why_not", "twin")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    FANS_FIELD_NUMBER: _ClassVar[int]
+    STEP_NS_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    PREDICTED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    SIGMA_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    VALID_FIELD_NUMBER: _ClassVar[int]
+    WHY_NOT_FIELD_NUMBER: _ClassVar[int]
+    TWIN_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    fans: int
+    step_ns: int
+    t_ns: _containers.RepeatedScalarFieldContainer[int]
+    command: _containers.RepeatedScalarFieldContainer[float]
+    measured_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    predicted_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    sigma_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    valid: _containers.RepeatedScalarFieldContainer[bool]
+    why_not: _containers.RepeatedScalarFieldContainer[WhyNot]
+    twin: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., step_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., why_not: _Optional[_Iterable[_Union[WhyNot, str]]] = ..., twin: _Optional[str] = ...) -> None: ...
+
+class Score(_message.Message):
+    __slots__ = ("header", "fans", "step_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "lower_bound_rad_s", "upper_bound_rad_s", "band_variance", "residual_rad_s", "smoothed_residual_rad_s", "outside", "state", "valid", "why_not")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    FANS_FIELD_NUMBER: _ClassVar[int]
+    STEP_NS_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    PREDICTED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    LOWER_BOUND_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    UPPER_BOUND_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    BAND_VARIANCE_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    SMOOTHED_RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    OUTSIDE_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    VALID_FIELD_NUMBER: _ClassVar[int]
+    WHY_NOT_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    fans: int
+    step_ns: int
+    t_ns: _containers.RepeatedScalarFieldContainer[int]
+    command: _containers.RepeatedScalarFieldContainer[float]
+    measured_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    predicted_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    lower_bound_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    upper_bound_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    band_variance: _containers.RepeatedScalarFieldContainer[float]
+    residual_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    smoothed_residual_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    outside: _containers.RepeatedScalarFieldContainer[bool]
+    state: _containers.RepeatedScalarFieldContainer[FanState]
+    valid: _containers.RepeatedScalarFieldContainer[bool]
+    why_not: _containers.RepeatedScalarFieldContainer[WhyNot]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., step_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., lower_bound_rad_s: _Optional[_Iterable[float]] = ..., upper_bound_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., residual_rad_s: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., outside: _Optional[_Iterable[bool]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., why_not: _Optional[_Iterable[_Union[WhyNot, str]]] = ...) -> None: ...
+
+class Alarm(_message.Message):
+    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "limit_rad_s", "message")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    FAN_FIELD_NUMBER: _ClassVar[int]
+    ACTIVE_FIELD_NUMBER: _ClassVar[int]
+    SEVERITY_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    ONSET_T_NS_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    LIMIT_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    fan: int
+    active: bool
+    severity: Severity
+    t_ns: int
+    onset_t_ns: int
+    residual_rad_s: float
+    limit_rad_s: float
+    message: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., limit_rad_s: _Optional[float] = ..., message: _Optional[str] = ...) -> None: ...
+
+class Command(_message.Message):
+    __slots__ = ("header", "fans", "t_ns", "command", "set_point_rad_s")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    FANS_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_FIELD_NUMBER: _ClassVar[int]
+    SET_POINT_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    fans: int
+    t_ns: int
+    command: _containers.RepeatedScalarFieldContainer[float]
+    set_point_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., t_ns: _Optional[int] = ..., command: _Optional[_Iterable[float]] = ..., set_point_rad_s: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class ModelCard(_message.Message):
+    __slots__ = ("header", "t_ns", "twin", "kind", "sha256", "sigma_rad_s", "card_json")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    TWIN_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    SHA256_FIELD_NUMBER: _ClassVar[int]
+    SIGMA_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    CARD_JSON_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    t_ns: int
+    twin: str
+    kind: str
+    sha256: str
+    sigma_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    card_json: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin: _Optional[str] = ..., kind: _Optional[str] = ..., sha256: _Optional[str] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., card_json: _Optional[str] = ...) -> None: ...
+
+class Counter(_message.Message):
+    __slots__ = ("name", "value")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    VALUE_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    value: int
+    def __init__(self, name: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
+
+class Input(_message.Message):
+    __slots__ = ("key", "producer", "received", "missing", "duplicated", "next_sequence")
+    KEY_FIELD_NUMBER: _ClassVar[int]
+    PRODUCER_FIELD_NUMBER: _ClassVar[int]
+    RECEIVED_FIELD_NUMBER: _ClassVar[int]
+    MISSING_FIELD_NUMBER: _ClassVar[int]
+    DUPLICATED_FIELD_NUMBER: _ClassVar[int]
+    NEXT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    key: str
+    producer: str
+    received: int
+    missing: int
+    duplicated: int
+    next_sequence: int
+    def __init__(self, key: _Optional[str] = ..., producer: _Optional[str] = ..., received: _Optional[int] = ..., missing: _Optional[int] = ..., duplicated: _Optional[int] = ..., next_sequence: _Optional[int] = ...) -> None: ...
+
+class Output(_message.Message):
+    __slots__ = ("key", "published")
+    KEY_FIELD_NUMBER: _ClassVar[int]
+    PUBLISHED_FIELD_NUMBER: _ClassVar[int]
+    key: str
+    published: int
+    def __init__(self, key: _Optional[str] = ..., published: _Optional[int] = ...) -> None: ...
+
+class Health(_message.Message):
+    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STAGE_FIELD_NUMBER: _ClassVar[int]
+    INSTANCE_FIELD_NUMBER: _ClassVar[int]
+    STATUS_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    UPTIME_S_FIELD_NUMBER: _ClassVar[int]
+    PROBLEM_FIELD_NUMBER: _ClassVar[int]
+    INPUTS_FIELD_NUMBER: _ClassVar[int]
+    OUTPUTS_FIELD_NUMBER: _ClassVar[int]
+    COUNTERS_FIELD_NUMBER: _ClassVar[int]
+    LATENCY_P50_MS_FIELD_NUMBER: _ClassVar[int]
+    LATENCY_P99_MS_FIELD_NUMBER: _ClassVar[int]
+    LOST_FIELD_NUMBER: _ClassVar[int]
+    PROCESS_ID_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    stage: str
+    instance: str
+    status: StageStatus
+    t_ns: int
+    uptime_s: float
+    problem: str
+    inputs: _containers.RepeatedCompositeFieldContainer[Input]
+    outputs: _containers.RepeatedCompositeFieldContainer[Output]
+    counters: _containers.RepeatedCompositeFieldContainer[Counter]
+    latency_p50_ms: float
+    latency_p99_ms: float
+    lost: int
+    process_id: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ...) -> None: ...

@@ -1,0 +1,255 @@
+"""The messages as the stages see them: frozen dataclasses with NumPy columns.
+
+Field names, order and units are those of `fan.proto`; a test holds the two together. Columns say their
+shape in their type: `Samples` (n,), `SamplesFans` (n, fans), `Fans` (fans,).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from enum import IntEnum
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array: TypeAlias = NDArray[Any]
+
+
+class WhyNot(IntEnum):
+    """Why a sample must not be judged."""
+
+    NONE = 0
+    STALE = 1
+    GAP = 2
+    WARMING_UP = 3
+    OUT_OF_RANGE = 4
+    SATURATED = 5
+    NO_SPEED = 6
+    NO_TWIN = 7
+
+
+class FanState(IntEnum):
+    """What the scorer says of a fan at one sample."""
+
+    UNKNOWN = 0
+    NORMAL = 1
+    SUSPECT = 2
+    ALARM = 3
+    RETURNING = 4
+
+
+class Severity(IntEnum):
+    """How much an alarm matters."""
+
+    NONE = 0
+    WARNING = 1
+    ALARM = 2
+
+
+class StageStatus(IntEnum):
+    """How a stage says it is."""
+
+    STARTING = 0
+    OK = 1
+    DEGRADED = 2
+    STOPPED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Who sent a message, which one of theirs it is, and the tray it is about."""
+
+    producer: str = ""
+    sequence: int = 0
+    tray: str = ""
+
+
+def _column(shape: str, dtype: type) -> Any:
+    """A column of one message: its shape in words, and the dtype its packed bytes have."""
+    return field(default_factory=lambda: np.zeros(0, dtype), metadata={"shape": shape, "dtype": np.dtype(dtype)})
+
+
+def _samples(dtype: type) -> Any:
+    return _column("samples", dtype)
+
+
+def _samples_fans(dtype: type) -> Any:
+    return _column("samples x fans", dtype)
+
+
+def _fans(dtype: type) -> Any:
+    return _column("fans", dtype)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Raw:
+    """Samples as the device sent them. Both clocks: `device_clock_us` and `device_sequence` are empty where the device has none."""
+
+    header: Header = Header()
+    fans: int
+    host_receive_t_ns: Array = _samples(np.int64)
+    device_clock_us: Array = _samples(np.uint32)
+    device_sequence: Array = _samples(np.uint32)
+    command: Array = _samples_fans(np.float64)
+    speed_rad_s: Array = _samples_fans(np.float64)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Grid:
+    """The samples on a uniform grid of time; command held, speed interpolated."""
+
+    header: Header = Header()
+    fans: int
+    step_ns: int
+    t_ns: Array = _samples(np.int64)
+    command: Array = _samples_fans(np.float64)
+    speed_rad_s: Array = _samples_fans(np.float64)
+    valid: Array = _samples_fans(np.bool_)
+    why_not: Array = _samples_fans(np.uint8)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Prediction:
+    """What the healthy twin says, in free run, beside what was measured."""
+
+    header: Header = Header()
+    fans: int
+    step_ns: int
+    t_ns: Array = _samples(np.int64)
+    command: Array = _samples_fans(np.float64)
+    measured_speed_rad_s: Array = _samples_fans(np.float64)
+    predicted_speed_rad_s: Array = _samples_fans(np.float64)
+    sigma_rad_s: Array = _fans(np.float64)
+    valid: Array = _samples_fans(np.bool_)
+    why_not: Array = _samples_fans(np.uint8)
+    twin: str = ""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Score:
+    """A judged sample, with everything a viewer needs to draw it."""
+
+    header: Header = Header()
+    fans: int
+    step_ns: int
+    t_ns: Array = _samples(np.int64)
+    command: Array = _samples_fans(np.float64)
+    measured_speed_rad_s: Array = _samples_fans(np.float64)
+    predicted_speed_rad_s: Array = _samples_fans(np.float64)
+    lower_bound_rad_s: Array = _samples_fans(np.float64)
+    upper_bound_rad_s: Array = _samples_fans(np.float64)
+    band_variance: Array = _samples_fans(np.float64)
+    residual_rad_s: Array = _samples_fans(np.float64)
+    smoothed_residual_rad_s: Array = _samples_fans(np.float64)
+    outside: Array = _samples_fans(np.bool_)
+    state: Array = _samples_fans(np.uint8)
+    valid: Array = _samples_fans(np.bool_)
+    why_not: Array = _samples_fans(np.uint8)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Alarm:
+    """An alarm was raised or cleared; tray, fan and `onset_t_ns` name it."""
+
+    header: Header = Header()
+    fan: int
+    active: bool
+    severity: Severity
+    t_ns: int
+    onset_t_ns: int
+    residual_rad_s: float
+    limit_rad_s: float
+    message: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Command:
+    """What an operator or a controller wants of the fans; NaN leaves a fan as it is."""
+
+    header: Header = Header()
+    fans: int
+    t_ns: int
+    command: Array = _fans(np.float64)
+    set_point_rad_s: Array = _fans(np.float64)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ModelCard:
+    """The twin in force."""
+
+    header: Header = Header()
+    t_ns: int
+    twin: str
+    kind: str
+    sha256: str
+    sigma_rad_s: Array = _fans(np.float64)
+    card_json: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counter:
+    """One counter of a stage; grows only, within a session."""
+
+    name: str
+    value: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Input:
+    """One input of a stage: the messages on one key from one producer."""
+
+    key: str
+    producer: str
+    received: int
+    missing: int
+    duplicated: int
+    next_sequence: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """One output of a stage; `published` is also the next sequence number."""
+
+    key: str
+    published: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Health:
+    """How a stage is, what it has received, sent and lost."""
+
+    header: Header = Header()
+    stage: str
+    instance: str
+    status: StageStatus
+    t_ns: int
+    uptime_s: float
+    problem: str = ""
+    inputs: tuple[Input, ...] = ()
+    outputs: tuple[Output, ...] = ()
+    counters: tuple[Counter, ...] = ()
+    latency_p50_ms: float = 0.0
+    latency_p99_ms: float = 0.0
+    lost: int = 0
+    process_id: int = 0
+
+
+Message: TypeAlias = Raw | Grid | Prediction | Score | Alarm | Command | ModelCard | Health
+MESSAGE_TYPES: tuple[type[Message], ...] = (Raw, Grid, Prediction, Score, Alarm, Command, ModelCard, Health)
+
+
+def newest_t_ns(message: Message) -> int:
+    """The time of the newest sample (or of the event) a message is about, ns since the epoch; 0 if it has none."""
+    if isinstance(message, Raw):
+        times = message.host_receive_t_ns
+    elif isinstance(message, Grid | Prediction | Score):
+        times = message.t_ns
+    else:
+        return message.t_ns
+    return int(times[-1]) if len(times) else 0
+
+
+def columns(message_type: type[Message]) -> dict[str, tuple[str, np.dtype[Any]]]:
+    """The columns of a message type: name -> (shape in words, dtype)."""
+    return {f.name: (f.metadata["shape"], f.metadata["dtype"]) for f in fields(message_type) if "shape" in f.metadata}

@@ -1,0 +1,321 @@
+"""The serial wire protocol, both directions: frames to bytes and back. Pure: bytes in, frames out.
+
+Up the line a device sends samples; down the line a host sends commands and set-points. Two forms, one
+meaning: `binary` (COBS, CRC-32) and `text` (lines that any sketch can print). Numbers are float32 in both, so
+that encoding and decoding are exact inverses on float32 values. Reference: docs/wire-protocol.md.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Literal, TypeAlias
+
+import numpy as np
+from cobs import cobs
+
+Protocol: TypeAlias = Literal["binary", "text"]
+End: TypeAlias = Literal["host", "device"]
+
+VERSION = 1
+MAX_FANS = 64
+MAX_FRAME_BYTES = 4096  # no frame of either protocol is longer; bounds what a decoder holds
+UINT32 = 1 << 32
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What a device measured. Clock in microseconds and sequence wrap at 2^32; a text device may have neither (None).
+
+    `command` is in the tray's command unit, `speed` in the tray's speed unit, one value a fan. A NaN speed means
+    that the tacho gave no reading.
+    """
+
+    clock_us: int | None
+    sequence: int | None
+    command: tuple[float, ...]
+    speed: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CommandFrame:
+    """Commands wanted, one a fan, in the tray's command unit; NaN leaves a fan as it is."""
+
+    command: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SetPointFrame:
+    """Speeds wanted, one a fan, in the tray's speed unit, for a device that closes its own loop; NaN leaves as is."""
+
+    set_point: tuple[float, ...]
+
+
+class FaultKind(Enum):
+    """Why a piece of the stream is not a frame."""
+
+    RESYNC = "resync"  # the rest of a frame that began before we listened: harmless
+    GARBAGE = "garbage"  # looks like no frame at all
+    TORN = "torn"  # begins like a frame, but has not the length it should have
+    OVERSIZED = "oversized"  # longer than any frame
+    WRONG_CRC = "wrong_crc"
+    WRONG_VERSION = "wrong_version"
+    WRONG_TYPE = "wrong_type"  # unknown, or not meant for this end of the line
+    WRONG_FAN_COUNT = "wrong_fan_count"
+    BAD_NUMBER = "bad_number"  # a field of a text line is no number, or does not fit
+    BAD_COMMAND = "bad_command"  # a sample's command is NaN or infinite
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A piece of the stream that is not a frame, and why."""
+
+    kind: FaultKind
+    detail: str
+
+
+Frame: TypeAlias = Sample | CommandFrame | SetPointFrame
+
+
+class _FrameError(Exception):
+    def __init__(self, kind: FaultKind, detail: str) -> None:
+        super().__init__(kind, detail)
+        self.fault = Fault(kind, detail)
+
+
+# ---- binary: 0x00 COBS(version, type, [clock, sequence,] fan count, float32 ..., CRC-32) 0x00, little-endian
+
+_HEAD = struct.Struct("<BB")  # version, type
+_CLOCK_SEQUENCE = struct.Struct("<II")
+_CRC = struct.Struct("<I")
+_TYPES: dict[type[Frame], int] = {Sample: 1, CommandFrame: 2, SetPointFrame: 3}
+_SHORTEST = _HEAD.size + 1 + _CRC.size
+
+
+def _float32_bytes(values: Sequence[float]) -> bytes:
+    return np.asarray(values, dtype="<f4").tobytes()
+
+
+def _encode_binary(frame: Frame) -> bytes:
+    payload = _HEAD.pack(VERSION, _TYPES[type(frame)])
+    if isinstance(frame, Sample):
+        pairs = [value for pair in zip(frame.command, frame.speed, strict=True) for value in pair]
+        payload += _CLOCK_SEQUENCE.pack(frame.clock_us, frame.sequence)
+        payload += bytes([len(frame.command)]) + _float32_bytes(pairs)
+    else:
+        values = frame.command if isinstance(frame, CommandFrame) else frame.set_point
+        payload += bytes([len(values)]) + _float32_bytes(values)
+    # A delimiter on both sides: noise on an idle line then ends before the frame and cannot spoil it.
+    return b"\0" + cobs.encode(payload + _CRC.pack(zlib.crc32(payload))) + b"\0"
+
+
+def _fan_count_at(frame_type: int) -> int:
+    """Where the fan count stands in a payload; the values follow it."""
+    return _HEAD.size + (_CLOCK_SEQUENCE.size if frame_type == _TYPES[Sample] else 0)
+
+
+def _fits_its_length(payload: bytes) -> bool:
+    """Whether a payload of a known type is as long as its own fan count asks for."""
+    frame_type = payload[1]
+    at = _fan_count_at(frame_type)
+    bytes_per_fan = 8 if frame_type == _TYPES[Sample] else 4
+    return len(payload) > at and len(payload) == at + 1 + bytes_per_fan * payload[at]
+
+
+def _decode_binary(piece: bytes) -> Frame:
+    try:
+        data = cobs.decode(piece)
+    except cobs.DecodeError as error:
+        raise _FrameError(FaultKind.TORN, f"{len(piece)} bytes end within a COBS block") from error
+    if len(data) < _SHORTEST:
+        raise _FrameError(FaultKind.TORN, f"{len(data)} bytes, the shortest frame has {_SHORTEST}")
+    payload, (crc,) = data[: -_CRC.size], _CRC.unpack(data[-_CRC.size :])
+    version, frame_type = _HEAD.unpack_from(payload)
+    known = version == VERSION and frame_type in _TYPES.values()
+    if crc != zlib.crc32(payload):
+        if not known:
+            raise _FrameError(FaultKind.GARBAGE, f"{len(data)} bytes that are no frame")
+        if not _fits_its_length(payload):
+            raise _FrameError(FaultKind.TORN, f"{len(data)} bytes are not the length of the frame they begin")
+        raise _FrameError(FaultKind.WRONG_CRC, f"CRC-32 {crc:08x} does not match the frame")
+    if version != VERSION:
+        raise _FrameError(FaultKind.WRONG_VERSION, f"version {version}, this side speaks {VERSION}")
+    if not known:
+        raise _FrameError(FaultKind.WRONG_TYPE, f"frame type {frame_type} is not known")
+    if not _fits_its_length(payload):
+        raise _FrameError(FaultKind.TORN, f"{len(data)} bytes are not the length its fan count asks for")
+    at = _fan_count_at(frame_type)
+    values = struct.unpack_from(f"<{(len(payload) - at - 1) // 4}f", payload, at + 1)
+    if frame_type == _TYPES[CommandFrame]:
+        return CommandFrame(values)
+    if frame_type == _TYPES[SetPointFrame]:
+        return SetPointFrame(values)
+    clock_us, sequence = _CLOCK_SEQUENCE.unpack_from(payload, _HEAD.size)
+    return Sample(clock_us, sequence, values[0::2], values[1::2])
+
+
+# ---- text: `S clock sequence command speed ...`, `C fan value`, `P fan value`, `# comment`
+
+_LETTER = re.compile(rb"[SCP]")  # begins a line and occurs nowhere else in one: a reader can always find the next
+_INTEGER = re.compile(rb"[0-9]{1,10}")
+_NUMBER = re.compile(rb"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|nan|[+-]?inf")
+_NONE = b"-"
+
+
+def _text_number(value: float) -> str:
+    return "-" if math.isnan(value) else str(np.float32(value))
+
+
+def _encode_text(frame: Frame) -> bytes:
+    if isinstance(frame, Sample):
+        head = ["-" if field is None else str(field) for field in (frame.clock_us, frame.sequence)]
+        pairs = [_text_number(v) for pair in zip(frame.command, frame.speed, strict=True) for v in pair]
+        return (" ".join(["S", *head, *pairs]) + "\n").encode()
+    letter, values = ("C", frame.command) if isinstance(frame, CommandFrame) else ("P", frame.set_point)
+    lines = [f"{letter} {fan} {_text_number(value)}\n" for fan, value in enumerate(values) if not math.isnan(value)]
+    return "".join(lines).encode()
+
+
+def _integer(field: bytes) -> int:
+    if not _INTEGER.fullmatch(field) or int(field) >= UINT32:
+        raise _FrameError(FaultKind.BAD_NUMBER, f"{field!r} is not an integer of 32 bits")
+    return int(field)
+
+
+def _number(field: bytes) -> float:
+    """A number as printed; `-` and nan are NaN, Arduino's `ovf` is an infinity."""
+    if field == _NONE:
+        return math.nan
+    field = field.lower().replace(b"ovf", b"inf")
+    if not _NUMBER.fullmatch(field):
+        raise _FrameError(FaultKind.BAD_NUMBER, f"{field!r} is not a number")
+    return float(field)
+
+
+def _numbers(fields: Sequence[bytes]) -> tuple[float, ...]:
+    """Fields as float32; what is too large for one becomes infinite."""
+    with np.errstate(over="ignore"):
+        return tuple(np.array([_number(field) for field in fields], np.float32).tolist())
+
+
+def _decode_text(line: bytes, fans: int) -> Frame:
+    fields = line[1:].split()
+    if not line[1:2].isspace():
+        raise _FrameError(FaultKind.GARBAGE, f"{line[:24]!r} is no line of this protocol")
+    if line[:1] == b"S":
+        if len(fields) < 4 or len(fields) % 2:
+            raise _FrameError(FaultKind.TORN, f"{len(fields)} fields; S needs clock, sequence, and two for each fan")
+        clock_us, sequence = (None if field == _NONE else _integer(field) for field in fields[:2])
+        values = _numbers(fields[2:])
+        return Sample(clock_us, sequence, values[0::2], values[1::2])
+    if len(fields) != 2:
+        raise _FrameError(FaultKind.TORN, f"{len(fields)} fields; {line[:1].decode()} needs fan and value")
+    fan, (value,) = _integer(fields[0]), _numbers(fields[1:])
+    if fan >= fans:
+        raise _FrameError(FaultKind.WRONG_FAN_COUNT, f"fan {fan}, this tray has {fans}, counted from 0")
+    values = tuple(value if i == fan else math.nan for i in range(fans))
+    return CommandFrame(values) if line[:1] == b"C" else SetPointFrame(values)
+
+
+# ---- both
+
+
+def encode(protocol: Protocol, frame: Frame) -> bytes:
+    """Bytes of a frame, delimiters included; what `Decoder` gives back from them is the same frame in float32.
+
+    In text, a command or set-point frame becomes one line for each fan that is not NaN, so possibly none.
+
+    Raises:
+        ValueError: no fans or more than 64, columns of different length, clock or sequence outside 32 bits, or
+            neither of them in a binary sample.
+    """
+    fans = len(frame.set_point if isinstance(frame, SetPointFrame) else frame.command)
+    if not 1 <= fans <= MAX_FANS:
+        raise ValueError(f"{fans} fans; a frame carries 1 to {MAX_FANS}")
+    if isinstance(frame, Sample):
+        for name, count in (("clock_us", frame.clock_us), ("sequence", frame.sequence)):
+            if count is None and protocol == "binary":
+                raise ValueError(f"{name} is missing; only a text sample may leave it out")
+            if count is not None and not 0 <= count < UINT32:
+                raise ValueError(f"{name} = {count} does not fit 32 bits")
+    return _encode_binary(frame) if protocol == "binary" else _encode_text(frame)
+
+
+class Decoder:
+    """Incremental parser of one end of a line: feed it bytes as they come, take frames and faults in their order.
+
+    It never raises on any bytes and holds at most `MAX_FRAME_BYTES + 1` of them between calls. How the bytes
+    are cut into calls makes no difference to what comes out.
+    """
+
+    def __init__(self, protocol: Protocol, fans: int, end: End = "host") -> None:
+        """`fans` is the number every frame must carry; `host` hears samples, `device` commands and set-points."""
+        self._text = protocol == "text"
+        self._delimiter = b"\n" if self._text else b"\0"
+        self._fans = fans
+        self._accepts = (Sample,) if end == "host" else (CommandFrame, SetPointFrame)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what is half received: the line was interrupted, and may be joined again in the middle of a frame."""
+        self._pending = b""
+        self._joining = True
+
+    def feed(self, data: bytes) -> list[Frame | Fault]:
+        """What `data` completes."""
+        *pieces, rest = (self._pending + data).split(self._delimiter)
+        # Too long already: keep the first byte (a comment?) and the newest (a frame may begin there). The
+        # length still tells that the piece is too long, and no cutting of the stream can change the outcome.
+        self._pending = rest if len(rest) <= MAX_FRAME_BYTES else rest[:1] + rest[-MAX_FRAME_BYTES:]
+        found: list[Frame | Fault] = []
+        for piece in pieces:
+            found += self._decode_line(piece) if self._text else self._decode_piece(piece)
+            self._joining = False
+        return found
+
+    def _decode_piece(self, piece: bytes) -> list[Frame | Fault]:
+        if not piece:
+            return []
+        if len(piece) > MAX_FRAME_BYTES:
+            return [self._fault(FaultKind.OVERSIZED, f"more than {MAX_FRAME_BYTES} bytes without an end")]
+        try:
+            return [self._checked(_decode_binary(piece))]
+        except _FrameError as error:
+            return [self._fault(error.fault.kind, error.fault.detail)]
+
+    def _decode_line(self, line: bytes) -> list[Frame | Fault]:
+        if line.startswith(b"#") or not line.strip():
+            return []
+        found: list[Frame | Fault] = []
+        tail = line[-MAX_FRAME_BYTES:]
+        starts = [match.start() for match in _LETTER.finditer(tail)]
+        before = tail[: starts[-1]] if starts else tail
+        if len(line) > MAX_FRAME_BYTES:
+            found.append(self._fault(FaultKind.OVERSIZED, f"more than {MAX_FRAME_BYTES} bytes without an end"))
+        elif before.strip():
+            found.append(self._fault(FaultKind.GARBAGE, f"{before[:24]!r} is no line of this protocol"))
+        if starts:
+            try:
+                found.append(self._checked(_decode_text(tail[starts[-1] :], self._fans)))
+            except _FrameError as error:
+                found.append(self._fault(error.fault.kind, error.fault.detail))
+        return found
+
+    def _checked(self, frame: Frame) -> Frame:
+        """The frame, if it is meant for this end and tray."""
+        if not isinstance(frame, self._accepts):
+            raise _FrameError(FaultKind.WRONG_TYPE, f"a {type(frame).__name__} is not for this end of the line")
+        fans = len(frame.set_point if isinstance(frame, SetPointFrame) else frame.command)
+        if fans != self._fans:
+            raise _FrameError(FaultKind.WRONG_FAN_COUNT, f"a frame of {fans} fans, this tray has {self._fans}")
+        if isinstance(frame, Sample) and not all(map(math.isfinite, frame.command)):
+            raise _FrameError(FaultKind.BAD_COMMAND, "a sample's command is NaN or infinite")
+        return frame
+
+    def _fault(self, kind: FaultKind, detail: str) -> Fault:
+        return Fault(FaultKind.RESYNC, detail) if self._joining else Fault(kind, detail)

@@ -1,0 +1,1 @@
+"""One independent stage a module; none imports another."""

@@ -1,0 +1,112 @@
+"""The bus between real processes: nothing lost, whoever starts first, whoever dies."""
+
+from __future__ import annotations
+
+import queue
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from pipeline.bus import Bus, BusError
+from pipeline.config import BusConfig
+from schemas.topics import alive_key
+from tests.bus_peer import KEY
+
+COUNT = 400
+
+
+def peer(role: str, endpoint: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.bus_peer", role, endpoint, str(COUNT)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parents[1],
+    )
+
+
+def line_of(process: subprocess.Popen[str]) -> str:
+    assert process.stdout
+    return process.stdout.readline().strip()
+
+
+def collected(collector: subprocess.Popen[str], publisher: subprocess.Popen[str]) -> str:
+    """What the collector prints in the end; until then the publisher is told to publish one more."""
+    result: queue.Queue[str] = queue.Queue()
+    threading.Thread(target=lambda: result.put(line_of(collector)), daemon=True).start()
+    assert publisher.stdin
+    for _ in range(300):
+        publisher.stdin.write("one more\n")
+        publisher.stdin.flush()
+        try:
+            return result.get(timeout=0.1)
+        except queue.Empty:
+            continue
+    pytest.fail("the collector did not get what it waits for")
+
+
+@pytest.fixture
+def peers(endpoint):
+    """Starts peers, waits for their first word, and ends them after the test."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(role: str) -> subprocess.Popen[str]:
+        started.append(peer(role, endpoint))
+        assert line_of(started[-1]) in {"published", "ready"}
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+ALL = " ".join(map(str, range(COUNT)))
+
+
+def test_every_message_arrives_in_order_when_the_consumer_starts_first(peers):
+    collector, publisher = peers("collect"), peers("publish")
+    assert collected(collector, publisher).startswith(ALL)
+
+
+def test_every_message_arrives_in_order_when_the_consumer_starts_last(peers):
+    publisher, collector = peers("publish"), peers("collect")
+    assert collected(collector, publisher).startswith(ALL)
+
+
+def test_peers_meet_after_the_process_that_held_the_endpoint_was_killed(peers):
+    holder, collector = peers("collect"), peers("collect")
+    holder.kill()
+    holder.wait()
+    assert collected(collector, peers("publish")).startswith(ALL)
+
+
+def test_a_token_tells_when_a_process_comes_and_when_it_is_gone(endpoint):
+    seen: list[bool] = []
+    changed = threading.Event()
+
+    def note(_key: str, alive: bool) -> None:
+        seen.append(alive)
+        changed.set()
+
+    with Bus(BusConfig(endpoint=endpoint)) as watcher:
+        watcher.watch_alive(alive_key("site", "*", "*"), note)
+        with Bus(BusConfig(endpoint=endpoint)) as other:
+            other.declare_alive(alive_key("site", "scorer", "all"))
+            assert changed.wait(20)
+            changed.clear()
+        assert changed.wait(20)
+    assert seen == [True, False]
+
+
+def test_asking_where_nobody_answers_ends_empty(endpoint):
+    with Bus(BusConfig(endpoint=endpoint)) as bus:
+        assert list(bus.recover(KEY, "nobody", 0, 5, lambda: None)) == []
+
+
+def test_a_wrong_endpoint_is_one_line():
+    with pytest.raises(BusError, match="bus.endpoint = 'nonsense' cannot be used"):
+        Bus(BusConfig(endpoint="nonsense"))
