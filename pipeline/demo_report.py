@@ -1,0 +1,142 @@
+"""What happened in a run of the demo: the truth of the simulated tray against what was recorded."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import UserError
+from pipeline.recording import read_recording
+from schemas.messages import Alarm, Grid, Raw, Score
+
+SETTLING_NS = 5_000_000_000  # after a fault has gone the fan runs back: an alarm until then is that fault's
+
+
+@dataclass(frozen=True)
+class FaultSeen:
+    """One fault, and the alarm it led to. Times are ns since the epoch; None where there was none."""
+
+    fan: int
+    kind: str
+    start_ns: int
+    stop_ns: int
+    alarm_ns: int | None
+    cleared_ns: int | None
+
+    @property
+    def delay_s(self) -> float | None:
+        """From the start of the fault to its alarm."""
+        return None if self.alarm_ns is None else (self.alarm_ns - self.start_ns) / 1e9
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The account of a run; `problems` is empty when all went as it must."""
+
+    faults: list[FaultSeen]
+    false_alarms: int
+    samples_sent: int
+    samples_recorded: int
+    lost: int
+    latency_ms: dict[str, float]
+    lost_by_stage: dict[str, int]
+    fans: int
+    problems: list[str] = field(default_factory=list)
+
+    def to_json(self) -> str:
+        """As `summary.json` holds it."""
+        return json.dumps(asdict(self), indent=2)
+
+
+@dataclass
+class _Recorded:
+    samples: int = 0
+    grid: int = 0
+    scored: int = 0
+    latencies_ms: list[float] = field(default_factory=list)
+    alarms: list[Alarm] = field(default_factory=list)
+
+
+def summarise(truth_path: Path, recordings: Iterable[Path], lost_by_stage: dict[str, int]) -> Summary:
+    """Hold the recordings of one run against the tray's own account.
+
+    Raises:
+        UserError: a file is missing or is not what it should be.
+    """
+    truth = _read_truth(truth_path)
+    recorded = _read(recordings)
+    faults = [_match(fault, recorded.alarms) for fault in truth["faults"]]
+    false_alarms = sum(alarm.active and not _explained(alarm, truth["faults"]) for alarm in recorded.alarms)
+    unrecorded = max(0, truth["samples_sent"] - recorded.samples)
+    lost = unrecorded + max(0, recorded.grid - recorded.scored) + sum(lost_by_stage.values())
+    p50, p99 = np.percentile(recorded.latencies_ms, (50, 99)) if recorded.latencies_ms else (float("nan"),) * 2
+    summary = Summary(
+        faults=faults,
+        false_alarms=false_alarms,
+        samples_sent=truth["samples_sent"],
+        samples_recorded=recorded.samples,
+        lost=lost,
+        latency_ms={"p50": round(float(p50), 3), "p99": round(float(p99), 3)},
+        lost_by_stage=lost_by_stage,
+        fans=truth["fans"],
+    )
+    summary.problems.extend(_problems(summary))
+    return summary
+
+
+def _read_truth(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: no account of the simulated tray: {error}; did `fantwin simulate` run?") from error
+
+
+def _read(recordings: Iterable[Path]) -> _Recorded:
+    recorded = _Recorded()
+    for path in recordings:
+        for entry in read_recording(path, topics=("raw", "grid", "score", "alarm")):
+            message = entry.message
+            if isinstance(message, Raw):
+                recorded.samples += len(message.host_receive_t_ns)
+            elif isinstance(message, Grid):
+                recorded.grid += len(message.t_ns)
+            elif isinstance(message, Score):
+                recorded.scored += len(message.t_ns)
+                recorded.latencies_ms += ((entry.log_time_ns - message.t_ns) / 1e6).tolist()
+            elif isinstance(message, Alarm):
+                recorded.alarms.append(message)
+    recorded.alarms.sort(key=lambda alarm: alarm.t_ns)
+    return recorded
+
+
+def _match(fault: dict[str, Any], alarms: list[Alarm]) -> FaultSeen:
+    mine = [alarm for alarm in alarms if alarm.fan == fault["fan"] and alarm.t_ns >= fault["start_ns"]]
+    raised = next((a.t_ns for a in mine if a.active and a.t_ns <= fault["stop_ns"]), None)
+    cleared = next((a.t_ns for a in mine if not a.active and raised is not None and a.t_ns > raised), None)
+    return FaultSeen(fault["fan"], fault["kind"], fault["start_ns"], fault["stop_ns"], raised, cleared)
+
+
+def _explained(alarm: Alarm, faults: Iterable[dict[str, Any]]) -> bool:
+    return any(
+        fault["fan"] == alarm.fan and fault["start_ns"] <= alarm.t_ns <= fault["stop_ns"] + SETTLING_NS
+        for fault in faults
+    )
+
+
+def _problems(summary: Summary) -> Iterable[str]:
+    for fault in summary.faults:
+        if fault.alarm_ns is None:
+            yield f"the {fault.kind} fault of fan {fault.fan} was missed"
+        elif fault.cleared_ns is None:
+            yield f"the alarm of fan {fault.fan} was never cleared"
+    if summary.false_alarms:
+        yield f"{summary.false_alarms} alarms of healthy fans"
+    if summary.lost:
+        yield f"{summary.lost} samples or messages were lost"
+    if not summary.samples_recorded:
+        yield "nothing was recorded"

@@ -1,0 +1,215 @@
+"""The one loop of all stages, driven with a toy stage over a real bus."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.bus import Bus
+from pipeline.config import BusConfig, Config, LauncherConfig, TrayConfig
+from pipeline.runner import Runner
+from pipeline.stage import Context, Core, Parts, Stage, StageConfig
+from schemas.codec import decode, encode, type_name
+from schemas.messages import Command, Grid, Header, Health, Message, Raw, StageStatus
+from schemas.topics import BY_NAME, health_key, tray_key
+
+TRAY_A, TRAY_B = "a", "b"
+
+
+class ToyConfig(StageConfig):
+    """Nothing to configure."""
+
+
+class Passer(Core):
+    """Makes a Grid of every Raw; at the end one more, so that a test sees `close` was called."""
+
+    def __init__(self) -> None:
+        self.fans = 0
+
+    def step(self, item: Any) -> Sequence[Message]:
+        self.fans = item.fans
+        return [self.grid(item.host_receive_t_ns)]
+
+    def close(self) -> Sequence[Message]:
+        return [self.grid(np.array([-1]))] if self.fans else []
+
+    def counters(self):
+        return {"lost_on_purpose": 2, "seen": 5}
+
+    def problem(self) -> str:
+        return ""
+
+    def grid(self, t_ns: Any) -> Grid:
+        return Grid(fans=self.fans, step_ns=1, t_ns=np.asarray(t_ns))
+
+
+class Burst:
+    """A source that delivers its items when it is told to stop: the hardest moment."""
+
+    def __init__(self, items: Sequence[Any]) -> None:
+        self.items = items
+
+    def start(self, deliver: Callable[[Any], None]) -> None:
+        self.deliver = deliver
+
+    def stop(self) -> None:
+        for item in self.items:
+            self.deliver(item)
+
+
+def toy(build: Callable[[Context], Parts] = lambda _context: Parts(Passer()), **declared: Any) -> Stage:
+    defaults = {"name": "resampler", "about": "", "reads": ("raw",), "writes": ("grid",), "config": ToyConfig}
+    return Stage(**{**defaults, **declared}, build=build)
+
+
+@pytest.fixture
+def config(endpoint, tmp_path) -> Config:
+    return Config(
+        path=tmp_path / "fan.toml",
+        text="",
+        site="s",
+        run_folder=tmp_path,
+        bus=BusConfig(endpoint=endpoint),
+        launcher=LauncherConfig(),
+        trays=tuple(TrayConfig(name=name, fans=1) for name in (TRAY_A, TRAY_B)),
+        sections={"resampler": ToyConfig(), "acquisition": ToyConfig()},
+    )
+
+
+class Bench:
+    """A stage running in a thread, and a second session on the bus that feeds it and listens."""
+
+    def __init__(self, stage: Stage, config, tray: str | None = None) -> None:
+        self.stop = threading.Event()
+        self.heard: queue.Queue[tuple[str, Message]] = queue.Queue()
+        self.bus = Bus(config.bus)
+        self.bus.subscribe(tray_key("s", "*", "grid"), self._hear(Grid))
+        self.bus.subscribe(health_key("s", "*", "*"), self._hear(Health))
+        self.outlet = {
+            name: self.bus.outlet(tray_key("s", name, "raw"), BY_NAME["raw"], type_name(Raw), "feeder")
+            for name in (TRAY_A, TRAY_B)
+        }
+        self.runner = Runner(stage, config, tray, self.stop)
+        self.last: list[Health] = []
+        self.thread = threading.Thread(target=lambda: self.last.append(self.runner.run()))
+        self.thread.start()
+        self.health_with(lambda health: health.status == StageStatus.OK)
+
+    def _hear(self, kind: type[Message]) -> Callable[[str, bytes], None]:
+        return lambda key, payload: self.heard.put((key, decode(kind, payload)))
+
+    def feed(self, tray: str, t_ns: int) -> None:
+        outlet = self.outlet[tray]
+        raw = Raw(header=Header("feeder", outlet.published, tray), fans=1, host_receive_t_ns=np.array([t_ns]))
+        outlet.put(encode(raw))
+
+    def next(self, kind: type[Message]) -> Any:
+        while True:
+            _, message = self.heard.get(timeout=20)
+            if isinstance(message, kind):
+                return message
+
+    def health_with(self, fits: Callable[[Health], bool]) -> Health:
+        while True:
+            health = self.next(Health)
+            if fits(health):
+                return health
+
+    def end(self) -> Health:
+        self.stop.set()
+        self.thread.join(20)
+        self.bus.close()
+        return self.last[0]
+
+
+def test_outputs_are_stamped_with_producer_sequence_and_tray(config):
+    bench = Bench(toy(), config)
+    for t_ns in (10, 11):
+        bench.feed(TRAY_A, t_ns)
+    first, second = bench.next(Grid), bench.next(Grid)
+    last = bench.end()
+    assert [first.header.sequence, second.header.sequence] == [0, 1]
+    assert first.header.tray == TRAY_A
+    assert first.header.producer == last.header.producer
+    assert first.t_ns.tolist() == [10]
+
+
+def test_each_tray_has_a_core_and_a_sequence_of_its_own(config):
+    bench = Bench(toy(), config)
+    bench.feed(TRAY_A, 1)
+    bench.feed(TRAY_B, 2)
+    got = {(g.header.tray, g.header.sequence) for g in (bench.next(Grid), bench.next(Grid))}
+    bench.end()
+    assert got == {(TRAY_A, 0), (TRAY_B, 0)}
+
+
+def test_health_accounts_for_inputs_outputs_counters_and_losses(config):
+    bench = Bench(toy(), config)
+    for t_ns in range(5):
+        bench.feed(TRAY_A, t_ns)
+    bench.outlet[TRAY_A].published += 3  # three that were never sent, nor kept
+    bench.feed(TRAY_A, 9)
+    health = bench.health_with(lambda h: any(line.received == 6 for line in h.inputs))
+    bench.end()
+    (line,) = health.inputs
+    assert (line.missing, line.duplicated, line.next_sequence) == (3, 0, 9)
+    assert {counter.name: counter.value for counter in health.counters} == {"lost_on_purpose": 4, "seen": 10}
+    assert health.lost == 3 + 4  # missing messages, and the counters of two cores
+    assert {output.key: output.published for output in health.outputs}[tray_key("s", TRAY_A, "grid")] == 6
+
+
+def test_bytes_that_are_no_message_are_counted_and_harm_nothing(config):
+    bench = Bench(toy(), config)
+    bench.outlet[TRAY_A]._publisher.put(b"\xff\xff\xff")
+    bench.feed(TRAY_A, 1)
+    assert bench.next(Grid).t_ns.tolist() == [1]
+    assert {c.name: c.value for c in bench.end().counters}["lost_undecodable"] == 1
+
+
+def test_what_a_source_still_delivers_when_told_to_stop_is_handled_before_the_end(config):
+    items = [Raw(fans=1, host_receive_t_ns=np.array([t])) for t in range(50)]
+    stage = toy(lambda _context: Parts(Passer(), Burst(items)), process_per_tray=True, name="acquisition")
+    bench = Bench(stage, config, TRAY_A)
+    last = bench.end()
+    grids = []
+    while not bench.heard.empty():
+        grids += [m.t_ns.tolist() for _, m in [bench.heard.get()] if isinstance(m, Grid)]
+    assert grids == [[t] for t in range(50)] + [[-1]]
+    assert last.status == StageStatus.STOPPED
+    assert last.outputs[0].published == 51
+
+
+def test_messages_of_trays_that_are_not_configured_are_not_read(config):
+    bench = Bench(toy(reads=("command",)), config)
+    outlet = bench.bus.outlet(tray_key("s", "stranger", "command"), BY_NAME["command"], type_name(Command), "x")
+    outlet.put(encode(Command(header=Header("x", 0, "stranger"), fans=1, t_ns=0)))
+    last = bench.end()
+    assert last.inputs == ()
+
+
+def test_a_stage_that_may_drop_throws_its_oldest_away_and_counts(config):
+    release = threading.Event()
+    taken: list[int] = []
+
+    class Slow(Passer):
+        def step(self, item: Any) -> Sequence[Message]:
+            release.wait(20)
+            taken.append(int(item.host_receive_t_ns[0]))
+            return []
+
+    bench = Bench(toy(lambda _context: Parts(Slow()), may_drop=True), config)
+    count = 6000
+    for t_ns in range(count):
+        bench.feed(TRAY_A, t_ns)
+    release.set()
+    last = bench.end()
+    counters = {c.name: c.value for c in last.counters}
+    assert taken[-1] == count - 1
+    assert taken == sorted(taken)
+    assert counters["dropped"] > 0
+    assert last.inputs[0].missing == count - len(taken)
