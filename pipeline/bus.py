@@ -15,6 +15,7 @@ import json
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Self
 
@@ -94,12 +95,19 @@ class Bus:
         return Outlet(self._session, key, topic, encoding, producer)
 
     def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> None:
-        """Call `on_message(key, payload)` from the bus's own thread; while it blocks, publishers wait."""
+        """Call `on_message(key, payload)` for what other sessions publish, from the bus's own thread.
+
+        While it blocks, publishers wait; and what one session has published arrives in that order, over all keys.
+        """
 
         def receive(sample: zenoh.Sample) -> None:
             on_message(str(sample.key_expr), sample.payload.to_bytes())
 
-        self._declared.append(self._session.declare_subscriber(key_expression, receive))
+        # not indirect: a thread and a queue for each subscriber would mix the order of keys, and never hold back
+        handler = zenoh.handlers.Callback(receive, indirect=False)
+        self._declared.append(
+            self._session.declare_subscriber(key_expression, handler, allowed_origin=zenoh.Locality.REMOTE)
+        )
 
     def declare_alive(self, key: str) -> None:
         """Show a liveliness token until this session ends, however it ends."""
@@ -111,7 +119,8 @@ class Bus:
         def receive(sample: zenoh.Sample) -> None:
             on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-        self._declared.append(self._session.liveliness().declare_subscriber(key_expression, receive, history=True))
+        handler = zenoh.handlers.Callback(receive, indirect=False)
+        self._declared.append(self._session.liveliness().declare_subscriber(key_expression, handler, history=True))
 
     def recover(
         self, key: str, producer: str, first: int, last: int, while_waiting: Callable[[], None]
@@ -140,6 +149,27 @@ class Bus:
     def close(self) -> None:
         """Leave the bus; what was published before has left this process."""
         self._session.close()
+
+
+@contextmanager
+def open_router(endpoint: str) -> Iterator[None]:
+    """A router that listens on `endpoint` until the block ends.
+
+    Raises:
+        BusError: it cannot listen there.
+    """
+    conf = zenoh.Config()
+    conf.insert_json5("mode", '"router"')
+    conf.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    conf.insert_json5("scouting/multicast/enabled", "false")
+    try:
+        session = zenoh.open(conf)
+    except zenoh.ZError as error:
+        raise BusError(f"the router cannot listen on {endpoint!r}: {error}; is one running already?") from error
+    try:
+        yield
+    finally:
+        session.close()
 
 
 def _zenoh_config(config: BusConfig) -> zenoh.Config:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from pipeline.errors import UserError
 
@@ -16,6 +18,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("run", "Watch"),
     "status": ("status", "Watch"),
     "doctor": ("doctor", "Watch"),
+    "router": ("router", "Watch"),
     "import": ("import_table", "Recordings"),
     "plot": ("plot", "Recordings"),
     "picture": ("picture", "Recordings"),
@@ -25,9 +28,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("simulate", "Simulated tray"),
 }
 
+VARIADIC: dict[str, tuple[str, ...]] = {"train": ("--validate",)}
+"""Options that take all words up to the next option, by command."""
+
 app = typer.Typer(
     name="fantwin",
-    help="Digital twins of fans: run a healthy twin beside each fan, raise an alarm when the two part.",
     epilog="Exit codes: 0 all well; 1 could not be done, one line says why; 2 wrong usage; 3 something was lost.",
     no_args_is_help=True,
     add_completion=False,
@@ -36,21 +41,42 @@ app = typer.Typer(
 )
 
 
-def _register() -> None:
-    for name, (module, panel) in COMMANDS.items():
+@app.callback()
+def _group() -> None:
+    """Digital twins of fans: run a healthy twin beside each fan, raise an alarm when the two part."""
+
+
+def _register(names: Iterable[str]) -> None:
+    for name in names:
+        module, panel = COMMANDS[name]
         function = getattr(import_module(f"pipeline.commands.{module}"), module)
         app.command(name, rich_help_panel=panel)(function)
 
 
+def spell_out(words: Sequence[str]) -> list[str]:
+    """The words of a command line with each word of a variadic option given its own: `--validate C D` becomes
+    `--validate C --validate D`, which is all the parser understands."""
+    variadic = VARIADIC.get(words[0], ()) if words else ()
+    spelt: list[str] = []
+    option, given = "", False
+    for word in words:
+        if word.startswith("-"):
+            option, given = (word, False) if word in variadic else ("", False)
+        elif option and given:
+            spelt.append(option)
+        else:
+            given = True
+        spelt.append(word)
+    return spelt
+
+
 def main() -> None:
     """Entry point: runs a command, turns a user's error into one line and exit code 1."""
-    _register()
+    words = spell_out(sys.argv[1:])
+    wanted = [word for word in words[:1] if word in COMMANDS]
+    _register(wanted or COMMANDS)  # a stage starts sooner when it does not import every command
     try:
-        app()
+        app(words)
     except UserError as error:
-        Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]fantwin:[/red] {_escape(str(error))}")
+        Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]fantwin:[/red] {escape(str(error))}")
         sys.exit(1)
-
-
-def _escape(text: str) -> str:
-    return text.replace("[", r"\[")

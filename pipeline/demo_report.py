@@ -46,6 +46,7 @@ class Summary:
     latency_ms: dict[str, float]
     lost_by_stage: dict[str, int]
     fans: int
+    start_ns: int
     problems: list[str] = field(default_factory=list)
 
     def to_json(self) -> str:
@@ -84,6 +85,7 @@ def summarise(truth_path: Path, recordings: Iterable[Path], lost_by_stage: dict[
         latency_ms={"p50": round(float(p50), 3), "p99": round(float(p99), 3)},
         lost_by_stage=lost_by_stage,
         fans=truth["fans"],
+        start_ns=truth["start_ns"],
     )
     summary.problems.extend(_problems(summary))
     return summary

@@ -90,6 +90,8 @@ class Launcher:
         sources = [slot for slot in self._slots if not _listens_only(slot.row)]
         listeners = [slot for slot in self._slots if _listens_only(slot.row)]
         for group in (listeners, sources):
+            if stop.is_set():
+                return
             for slot in reversed(group):
                 self._start(slot)
             self._wait_until_ready(group, stop)

@@ -7,6 +7,7 @@ are not judged are sent only where there are any.
 from __future__ import annotations
 
 import importlib.util
+import os
 import socket
 import subprocess
 import sys
@@ -14,6 +15,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+
+os.environ.setdefault(
+    "RUST_LOG", "warn,re_log_encoding=error"
+)  # else every start warns that we chose to have no footer
 import rerun as rr
 
 from pipeline.config import TrayConfig
@@ -44,17 +49,15 @@ def unused_path(path: Path) -> Path:
         StageError: it cannot be created.
     """
     candidate, number = path, 1
-    while True:
-        try:
-            candidate.parent.mkdir(parents=True, exist_ok=True)
-            candidate.open("xb").close()
-        except FileExistsError:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while candidate.exists():
             number += 1
             candidate = path.with_stem(f"{path.stem}-{number}")
-        except OSError as error:
-            raise StageError(f"{candidate}: cannot write the view: {error.strerror}; change viewer.file") from error
-        else:
-            return candidate
+        candidate.open("xb").close()
+    except OSError as error:
+        raise StageError(f"{candidate}: cannot write the view: {error.strerror}; change viewer.file") from error
+    return candidate
 
 
 class RerunSink:
@@ -94,6 +97,7 @@ class RerunSink:
         self._recording.send_recording_name(f"{name} {np.datetime64(started_t_ns, 'ns').astype('datetime64[s]')} UTC")
         for layout in layouts:
             log_styles(self._recording, layout)
+        self._recording.flush()  # the styles are in the file before anything that could be killed
         self._page = _serve_page(web_port, grpc_port) if web_port is not None and grpc_port is not None else None
 
     def draw(self, trace: Trace) -> None:
@@ -106,8 +110,14 @@ class RerunSink:
         self._send(state_path(tray, fan), t_ns, rr.StateChange.columns(state=list(names)))
 
     def log(self, where: str, t_ns: int, level: str, text: str) -> None:
-        """Add a line to the log of a tray or of the `stages`."""
-        self._send(log_path(where), np.array([t_ns]), rr.TextLog.columns(text=[text], level=[level]))
+        """Add a line to the log of a tray or of the `stages`, with its time of day (UTC)."""
+        times = np.array([t_ns])
+        clock = np.datetime_as_string(times.astype("datetime64[ns]"), unit="ms")[0].split("T")[1]
+        self._send(log_path(where), times, rr.TextLog.columns(text=[f"{clock}  {text}"], level=[level]))
+
+    def flush(self) -> None:
+        """Hand everything to the system: it outlives this process, however that ends."""
+        self._recording.flush()
 
     def close(self) -> None:
         """Write out everything, stop serving."""

@@ -30,6 +30,7 @@ INBOX_SIZE = 4096
 TICK_S = 0.05
 HEALTH_PERIOD_S = 1.0
 FAREWELL_S = 1.0  # how long a stopping stage waits for the last health of a producer that has just left
+ORPHAN_LIMIT_S = 10.0  # how long an orphaned stage waits for those it reads from to end
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +111,8 @@ class Runner:
             raise UserError(f"{stage.name} runs one process for each tray: say which with --tray (of {names})")
         self.stage = stage
         self.stop = stop
+        self.orphaned = threading.Event()
+        """Set when whoever started this stage has gone: it ends as soon as those it reads from have ended."""
         self._site = config.site
         self._instance = trays[0].name if stage.process_per_tray else "all"
         self.producer = f"{stage.name}-{self._instance}-{secrets.token_hex(4)}"
@@ -142,6 +145,8 @@ class Runner:
         self._read_keys = {
             tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
         }
+        self._orphan_until_s = 0.0
+        self._alive: set[str] = set()
         self._left: dict[str, float] = {}
         self._last_health: dict[str, Health] = {}
 
@@ -157,7 +162,7 @@ class Runner:
             for parts in self._parts.values():
                 if parts.source:
                     parts.source.start(lambda item: self._inbox.put(_FromSource(item)))
-            self._loop(until=self.stop.is_set)
+            self._loop(until=self._should_end)
             self._drain()
         finally:
             for tray, parts in self._parts.items():
@@ -183,6 +188,17 @@ class Runner:
             if now >= next_health:
                 next_health = now + HEALTH_PERIOD_S
                 self._publish_health(StageStatus.OK)
+
+    def _should_end(self) -> bool:
+        if self.stop.is_set() or not self.orphaned.is_set():
+            return self.stop.is_set()
+        now = time.monotonic()
+        self._orphan_until_s = self._orphan_until_s or now + ORPHAN_LIMIT_S
+        return now > self._orphan_until_s or not any(map(self._is_fed_by, self._alive))
+
+    def _is_fed_by(self, key: str) -> bool:
+        health = self._last_health.get(key)
+        return health is not None and any(output.key in self._read_keys for output in health.outputs)
 
     def _drain(self) -> None:
         """Handle what has been sent to this stage before it was told to stop."""
@@ -245,17 +261,15 @@ class Runner:
 
     def _note_alive(self, change: _Alive) -> None:
         if change.alive:
+            self._alive.add(change.key)
             self._left.pop(change.key, None)
         else:
+            self._alive.discard(change.key)
             self._left[change.key] = time.monotonic()
 
     def _note_health(self, packet: Packet) -> None:
         health = packet.message
         assert isinstance(health, Health)
-        if health.header.producer == self.producer:
-            if "health" in self.stage.reads:
-                self._step(packet)
-            return
         self._last_health[alive_key(self._site, health.stage, health.instance)] = health
         for due in self._inlet.reconcile(health, self._read_keys):
             self._step(due)
@@ -294,7 +308,10 @@ class Runner:
         )
         header = Header(self.producer, self._health_outlet.published, "")
         health = replace(health, header=header)
-        self._health_outlet.put(encode(health))
+        payload = encode(health)
+        self._health_outlet.put(payload)
+        if "health" in self.stage.reads and status != StageStatus.STOPPED:  # the bus brings what others publish
+            self._step(Packet(self._health_outlet.key, "health", payload, time.time_ns(), health))
         return health
 
 

@@ -27,7 +27,6 @@ _WAITING = {
     errno.EPERM: "not allowed to open it; add this user to the port's group (often dialout)",
     errno.EBUSY: "in use by another program; stop that one",
     errno.EWOULDBLOCK: "in use by another program; stop that one",
-    errno.ENOTTY: "not a serial port; check [[tray]] port",
 }
 _GONE = "the device has gone; waiting for it to come back"
 # pyserial's own errors are OSErrors, but it lets termios' through, and says ValueError to a baud rate it cannot set.

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from pipeline.account import losses
 from pipeline.bus import Bus
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Health
@@ -71,13 +72,9 @@ class Watcher:
             return sorted(self._alarms.values(), key=lambda alarm: alarm.t_ns)
 
     def losses(self) -> dict[str, int]:
-        """What every stage knows to be lost, over all its sessions."""
+        """What every stage has lost, over all its sessions; see `pipeline.account`."""
         with self._lock:
-            sums: dict[str, int] = {}
-            for health, _ in self._healths.values():
-                name = health.stage if health.instance == "all" else f"{health.stage}/{health.instance}"
-                sums[name] = sums.get(name, 0) + health.lost
-            return sums
+            return losses(health for health, _ in self._healths.values())
 
     def _note_alive(self, key: str, alive: bool) -> None:
         with self._lock:

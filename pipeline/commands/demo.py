@@ -15,22 +15,18 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console, Group
+from rich.box import SIMPLE
+from rich.console import Console
 from rich.live import Live
 from rich.table import Table
-from rich.text import Text
 
 from pipeline.bus import Bus
 from pipeline.commands.options import JsonOption
-from pipeline.commands.status import stage_table
-from pipeline.config import RAD_S_PER_UNIT, Config, load_config
+from pipeline.config import Config, load_config
+from pipeline.commands.demo_screen import DemoScreen
 from pipeline.demo_report import Summary, summarise
 from pipeline.errors import UserError
 from pipeline.signals import stop_on_signals
-from pipeline.watcher import Watcher
-from schemas.codec import decode
-from schemas.messages import FanState, Score, WhyNot
-from schemas.topics import tray_key
 
 DEMO_FOLDER = Path(__file__).parents[2] / "demo"
 DURATION_S = 32.0
@@ -58,6 +54,7 @@ def demo(
     out = out.resolve()
     _clear(out)
     overrides = [
+        "viewer.serve=false",
         f"run_folder='{out}'",
         f"tray.0.port='{out / 'tray'}'",
         f"bus.endpoint='tcp/127.0.0.1:{_free_port()}'",
@@ -113,7 +110,7 @@ def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Co
         _child(up, stdout=subprocess.PIPE, stderr=log) as pipeline,
         Bus(config.bus) as bus,
     ):
-        console.print(f"simulated tray of {tray.fans} fans on {tray.port}; six stages start as processes of their own")
+        console.print(f"simulated tray of {tray.fans} fans; six stages start as processes of their own")
         _watch(config, bus, device, pipeline, stop, console)
         if pipeline.poll() is None:
             pipeline.send_signal(signal.SIGINT)
@@ -148,58 +145,6 @@ def _child(arguments: list[str], **streams: object) -> Iterator[subprocess.Popen
                 process.kill()
 
 
-class _Screen:
-    """What is shown while the demo runs."""
-
-    def __init__(self, config: Config, bus: Bus) -> None:
-        self._tray = config.trays[0]
-        self._watcher = Watcher(bus, config.site)
-        self.score: Score | None = None
-        bus.subscribe(tray_key(config.site, self._tray.name, "score"), self._note_score)
-
-    def _note_score(self, _key: str, payload: bytes) -> None:
-        score = decode(Score, payload)
-        assert isinstance(score, Score)
-        self.score = score
-
-    def render(self) -> Group:
-        """Stages and alarms, and below them the fans."""
-        return Group(stage_table(self._watcher), self._fan_table())
-
-    def line(self) -> str:
-        """The same in a line, where there is no terminal."""
-        if self.score is None:
-            return "waiting for the first score"
-        states = " ".join(FanState(state).name.lower() for state in self.score.state[-1])
-        return f"fans: {states}; lost {sum(self._watcher.losses().values())}"
-
-    def _fan_table(self) -> Table:
-        unit = self._tray.speed_unit
-        table = Table("fan", title=f"{self._tray.name}, speeds in {unit}", title_justify="left")
-        for column in ("command", "measured", "twin", "residual"):
-            table.add_column(column, justify="right")
-        table.add_column("state")
-        score = self.score
-        if score is None:
-            return table
-        scale = 1 / RAD_S_PER_UNIT[unit]
-        for fan in range(score.fans):
-            state = FanState(score.state[-1, fan])
-            style = {FanState.NORMAL: "green", FanState.UNKNOWN: "dim", FanState.SUSPECT: "yellow"}.get(
-                state, "bold red"
-            )
-            why = "" if score.valid[-1, fan] else f" ({WhyNot(score.why_not[-1, fan]).name.lower().replace('_', ' ')})"
-            table.add_row(
-                str(fan),
-                f"{score.command[-1, fan]:.2f}",
-                f"{score.measured_speed_rad_s[-1, fan] * scale:.0f}",
-                f"{score.predicted_speed_rad_s[-1, fan] * scale:.0f}",
-                f"{score.smoothed_residual_rad_s[-1, fan] * scale:+.0f}",
-                Text(state.name.lower() + why, style=style),
-            )
-        return table
-
-
 def _watch(
     config: Config,
     bus: Bus,
@@ -209,8 +154,9 @@ def _watch(
     console: Console,
 ) -> None:
     """Show what happens until the tray has sent its last sample, or something ends too early."""
-    screen = _Screen(config, bus)
-    deadline_s = time.monotonic() + _START_TIMEOUT_S
+    screen = DemoScreen(config, bus)
+    began_s = time.monotonic()
+    deadline_s = began_s + _START_TIMEOUT_S
     next_line_s = 0.0
     live = Live(console=console, refresh_per_second=4, transient=True) if console.is_terminal else None
     if live:
@@ -221,8 +167,8 @@ def _watch(
                 live.update(screen.render())
             elif time.monotonic() >= next_line_s:
                 next_line_s = time.monotonic() + 4.0
-                console.print(f"  {screen.line()}")
-            if screen.score is None and time.monotonic() > deadline_s:
+                console.print(f"{time.monotonic() - began_s:5.0f} s  {screen.line()}")
+            if not screen.has_score and time.monotonic() > deadline_s:
                 raise UserError(f"no score came in {_START_TIMEOUT_S:.0f} s; see up.log, and `fantwin doctor`")
     finally:
         if live:
@@ -242,13 +188,12 @@ def _last_line(path: Path) -> str:
 
 
 def _tell(summary: Summary, out: Path, took_s: float, console: Console) -> None:
-    table = Table("fault", title="what happened", title_justify="left")
-    for column in ("fan", "start s", "alarm s", "delay s", "removed s", "cleared s"):
+    table = Table("fault", title="what happened, seconds since the first sample", title_justify="left", box=SIMPLE)
+    for column in ("fan", "start", "alarm", "delay", "removed", "cleared"):
         table.add_column(column, justify="right")
-    first_ns = min((fault.start_ns for fault in summary.faults), default=0)
     for fault in summary.faults:
         times = (fault.start_ns, fault.alarm_ns, None, fault.stop_ns, fault.cleared_ns)
-        cells = ["missed" if t is None else f"{(t - first_ns) / 1e9:.2f}" for t in times]
+        cells = ["missed" if t is None else f"{(t - summary.start_ns) / 1e9:.2f}" for t in times]
         cells[2] = "" if fault.delay_s is None else f"{fault.delay_s:.2f}"
         table.add_row(fault.kind, str(fault.fan), *cells)
     console.print(table)
@@ -258,6 +203,10 @@ def _tell(summary: Summary, out: Path, took_s: float, console: Console) -> None:
         f"sample to score {summary.latency_ms['p50']:.1f} ms (median), {summary.latency_ms['p99']:.1f} ms (p99); "
         f"{took_s:.0f} s in all"
     )
-    console.print(f"look at {out / 'bands.png'}, or live over time: rerun {out / 'view.rrd'}")
+    shown = out.relative_to(Path.cwd()) if out.is_relative_to(Path.cwd()) else out
+    console.print(f"all of it in {shown / 'summary.json'} and {shown / 'recording.mcap'}")
+    console.print(
+        f"look at {shown / 'bands.png'}, or over time: {Path(sys.executable).parent.name}/rerun {shown / 'view.rrd'}"
+    )
     for problem in summary.problems:
         console.print(f"[bold red]NOT AS IT MUST BE:[/bold red] {problem}")

@@ -7,6 +7,8 @@ from typing import Annotated, TypeAlias
 
 import typer
 
+from pipeline.errors import UserError
+
 ConfigOption: TypeAlias = Annotated[Path, typer.Option("-c", "--config", help="Configuration file (TOML).")]
 SetOption: TypeAlias = Annotated[
     list[str] | None,
@@ -15,3 +17,17 @@ SetOption: TypeAlias = Annotated[
 JsonOption: TypeAlias = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 
 DEFAULT_CONFIG = Path("fantwin.toml")
+
+
+def fan_numbers(text: str | None) -> list[int] | None:
+    """The fans of an option such as `--fans 2,5`.
+
+    Raises:
+        UserError: it is not a list of fan numbers.
+    """
+    if text is None:
+        return None
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError as error:
+        raise UserError(f"--fans {text}: give fan numbers counted from 0, with commas: --fans 2,5") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import threading
 from typing import Annotated
@@ -43,7 +44,7 @@ def run(
         typer.echo(error, err=True)
         raise typer.Exit(EXIT_CANNOT_START) from error
     if until_stdin_closes:
-        threading.Thread(target=_set_when_stdin_closes, args=(stop,), daemon=True).start()
+        threading.Thread(target=_set_when_stdin_closes, args=(runner.orphaned,), daemon=True).start()
     last = runner.run()
     if json_output:
         typer.echo(
@@ -54,7 +55,8 @@ def run(
         raise typer.Exit(3)
 
 
-def _set_when_stdin_closes(stop: threading.Event) -> None:
+def _set_when_stdin_closes(orphaned: threading.Event) -> None:
     """The launcher holds our standard input open for as long as it lives."""
-    sys.stdin.buffer.read()
-    stop.set()
+    while os.read(sys.stdin.fileno(), 1024):  # not sys.stdin.read(): its lock would be held at the interpreter's end
+        pass
+    orphaned.set()

@@ -9,6 +9,7 @@ from datetime import datetime
 from typing import Annotated
 
 import typer
+from rich.box import SIMPLE
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
@@ -68,21 +69,23 @@ def _require_someone(watcher: Watcher, config: Config) -> None:
 
 
 def stage_table(watcher: Watcher) -> Group:
-    """What a person is shown: a row for each stage, and the alarms below."""
-    table = Table("stage", "instance", "state", title="fantwin", title_justify="left")
+    """What a person is shown: a row for each stage, what is wrong, and the alarms."""
+    table = Table("stage", "state", title="stages", title_justify="left", box=SIMPLE)
     for column in ("in /s", "out /s", "p50 ms", "p99 ms", "lost"):
         table.add_column(column, justify="right")
-    table.add_column("problem", overflow="fold")
+    problems: list[Text] = []
     for view in watcher.stages():
         health = view.health
+        name = health.stage if health.instance == "all" else f"{health.stage}/{health.instance}"
         lost = Text(str(health.lost), style="red" if health.lost else "")
         latency = (
             (f"{health.latency_p50_ms:.1f}", f"{health.latency_p99_ms:.1f}") if health.latency_p99_ms else ("", "")
         )
-        rates = (f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}")
-        table.add_row(health.stage, health.instance, _state(view), *rates, *latency, lost, health.problem)
-    lines = [_alarm_line(alarm) for alarm in watcher.alarms()] or [Text("no alarms", style="green")]
-    return Group(table, *lines)
+        table.add_row(name, _state(view), f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}", *latency, lost)
+        if health.problem and view.alive:
+            problems.append(Text(f"{name}: {health.problem}", style="red"))
+    alarms = [_alarm_line(alarm) for alarm in watcher.alarms()] or [Text("no alarms", style="green")]
+    return Group(table, *problems, *alarms)
 
 
 def _state(view: StageView) -> Text:

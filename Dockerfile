@@ -1,0 +1,16 @@
+# One image for every stage; which stage a container runs is its command.
+FROM python:3.11-slim-bookworm
+WORKDIR /app
+COPY requirements.lock ./
+RUN pip install --no-cache-dir --require-hashes -r requirements.lock
+COPY pyproject.toml README.md LICENSE ./
+COPY schemas schemas
+COPY pipeline pipeline
+COPY stages stages
+COPY twin twin
+RUN pip install --no-cache-dir --no-deps . && useradd --create-home --uid 1000 fantwin \
+    && mkdir /runs && chown fantwin /runs
+COPY demo /demo
+USER fantwin
+WORKDIR /runs
+ENTRYPOINT ["fantwin"]

@@ -1,0 +1,130 @@
+"""A recording as the model maker wants it: time, command and speed of one tray as arrays.
+
+A sample's time is found as in the pipeline, from the device's clock where there is one (pipeline.device_time).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.device_time import DeviceClock
+from pipeline.recording import RecordingError, read_head, read_recording
+from pipeline.table import held
+from schemas.messages import Array, Raw
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedRun:
+    """A stretch of a tray's raw samples over which the device's clock ran on."""
+
+    path: Path
+    tray: str
+    t_s: Array
+    """(n,) strictly increasing, since the recording's first sample of this tray"""
+    command: Array
+    """(n, fans), never NaN"""
+    speed_rad_s: Array
+    """(n, fans), NaN where the tacho gave none"""
+
+
+@dataclass(frozen=True)
+class RecordedTray:
+    """All runs of one tray in a recording."""
+
+    runs: tuple[RecordedRun, ...]
+    speed_unit: str
+    """in which people are shown its speeds"""
+    damage: str
+    """one line on what of the file could not be read; empty when all could"""
+
+
+def read_runs(
+    path: Path,
+    tray: str | None = None,
+    fans: Sequence[int] | None = None,
+    from_s: float = 0.0,
+    to_s: float = math.inf,
+) -> RecordedTray:
+    """The raw samples of a tray with from_s <= t_s < to_s.
+
+    tray: needed only where there are several. fans: which, counted from 0; None for all.
+
+    Raises:
+        RecordingError: the file cannot be read, or holds no such samples.
+    """
+    reading = read_recording(path, topics=("raw",))
+    by_tray: dict[str, list[Raw]] = {}
+    for entry in reading:
+        assert isinstance(entry.message, Raw)
+        if tray is None or entry.message.header.tray == tray:
+            by_tray.setdefault(entry.message.header.tray, []).append(entry.message)
+    if not by_tray:
+        raise RecordingError(f"{path}: no raw samples{f' of a tray {tray!r}' if tray else ''} in this recording")
+    if len(by_tray) > 1:
+        raise RecordingError(f"{path}: several trays, {', '.join(sorted(by_tray))}: say which with --tray")
+    ((name, messages),) = by_tray.items()
+    segments = [segment for segment in _segments(path, messages) if len(segment[0])]
+    start_ns = segments[0][0][0] if segments else 0
+    runs = [
+        _run(path, name, (t_ns - start_ns) / 1e9, command, speed_rad_s, fans, from_s, to_s)
+        for t_ns, command, speed_rad_s in segments
+    ]
+    runs = [run for run in runs if len(run.t_s) > 1]
+    if not runs:
+        raise RecordingError(f"{path}: fewer than two raw samples from {from_s:g} s to {to_s:g} s; see --from and --to")
+    return RecordedTray(tuple(runs), read_head(path).speed_unit(name), reading.damage)
+
+
+Columns = tuple[Array, Array, Array]
+"""t_ns (n,), command (n, fans), speed_rad_s (n, fans)."""
+
+
+def _segments(path: Path, messages: Sequence[Raw]) -> list[Columns]:
+    """The samples in order, parted wherever the device's clock began anew."""
+    fans = {message.fans for message in messages}
+    if len(fans) > 1:
+        raise RecordingError(f"{path}: the number of fans changes from {' to '.join(map(str, sorted(fans)))}: split it")
+    clock = DeviceClock()
+    segments: list[tuple[list[int], list[Array], list[Array]]] = []
+    for message in messages:
+        clock_us = message.device_clock_us.tolist()
+        for k, received_ns in enumerate(message.host_receive_t_ns.tolist()):
+            t_ns = clock.to_host_ns(clock_us[k], received_ns) if clock_us else received_ns
+            if len(segments) < max(1, clock.segments):
+                segments.append(([], [], []))
+            times, commands, speeds = segments[-1]
+            times.append(t_ns)
+            commands.append(message.command[k])
+            speeds.append(message.speed_rad_s[k])
+    return [_in_order(np.array(t, np.int64), np.array(c), np.array(s)) for t, c, s in segments]
+
+
+def _in_order(t_ns: Array, command: Array, speed_rad_s: Array) -> Columns:
+    """The samples by rising time; of one time, the first that came, and only from the first known command on."""
+    t_ns, first = np.unique(t_ns, return_index=True)
+    command = held(command[first])
+    known = ~np.any(np.isnan(command), axis=1)
+    return t_ns[known], command[known], speed_rad_s[first][known]
+
+
+def _run(
+    path: Path,
+    tray: str,
+    t_s: Array,
+    command: Array,
+    speed_rad_s: Array,
+    fans: Sequence[int] | None,
+    from_s: float,
+    to_s: float,
+) -> RecordedRun:
+    if fans is None:
+        fans = range(command.shape[1])
+    if not all(0 <= fan < command.shape[1] for fan in fans):
+        raise RecordingError(f"{path}: it has fans 0 to {command.shape[1] - 1}; see --fans")
+    wanted = (t_s >= from_s) & (t_s < to_s)
+    return RecordedRun(path, tray, t_s[wanted], command[wanted][:, fans], speed_rad_s[wanted][:, fans])

@@ -1,0 +1,209 @@
+"""A twin as it is handed over: one ONNX file with its card inside.
+
+The graph (float64) takes `state` (fans, n_state), `command` (n, fans), `step_s` (n,) and `parameters`
+(fans, n_parameters), and gives `speed_rad_s` (n, fans), the speed at each sample before its command acts, and
+`state_out` (fans, n_state). The metadata property `fantwin.card` holds the card as JSON. docs/deciding.md tells how
+the card's healthy residual is used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from pipeline.stage import StageError
+from schemas.messages import Array
+
+CARD_PROPERTY = "fantwin.card"
+FORMAT_VERSION = 1
+INPUTS = ("state", "command", "step_s", "parameters")
+OUTPUTS = ("speed_rad_s", "state_out")
+
+Range: TypeAlias = tuple[float, float]
+Advance: TypeAlias = Callable[[Array, Array, Array], tuple[Array, Array]]
+"""(state (fans, n_state), command (n, fans), step_s (n,)) -> (speed_rad_s (n, fans), state (fans, n_state))."""
+
+
+class _OfCard(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
+
+
+class StateLayout(_OfCard):
+    """A state is `speed` past speeds and then `command` past commands, newest first."""
+
+    speed: int = Field(ge=1)
+    command: int = Field(ge=0)
+
+
+class TwinCard(_OfCard):
+    """What the stages need of the card; it holds more, for people."""
+
+    format_version: int
+    name: str
+    kind: str
+    fans: int = Field(ge=1)
+    n_state: int = Field(ge=1)
+    state_layout: StateLayout
+    parameters: tuple[tuple[float, ...], ...]
+    sigma_rad_s: tuple[Annotated[float, Field(gt=0)], ...]
+    command_range: Range
+    rate_hz: float = Field(gt=0)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> TwinCard:
+        if self.state_layout.speed + self.state_layout.command != self.n_state:
+            raise ValueError("state_layout does not add up to n_state")
+        if len(self.parameters) != self.fans or len({len(row) for row in self.parameters}) != 1:
+            raise ValueError("parameters must have one row of equal length for each fan")
+        if len(self.sigma_rad_s) != self.fans:
+            raise ValueError("sigma_rad_s must have one value for each fan")
+        if not self.command_range[0] < self.command_range[1]:
+            raise ValueError("command_range must rise")
+        return self
+
+
+@dataclass(frozen=True)
+class TwinFile:
+    """A twin ready to run for a tray. `advance` carries the state over a block of samples; it keeps nothing."""
+
+    name: str
+    kind: str
+    sha256: str
+    card_json: str
+    layout: StateLayout
+    sigma_rad_s: Array
+    """(fans,) standard deviation of the healthy residual"""
+    command_range: Range
+    rate_hz: float
+    """rate of the data it was made from"""
+    advance: Advance
+
+    @property
+    def fans(self) -> int:
+        """How many fans it runs for."""
+        return len(self.sigma_rad_s)
+
+    @property
+    def is_discrete(self) -> bool:
+        """Whether it steps from sample to sample and so holds at its own rate only."""
+        return self.layout.speed > 1 or self.layout.command > 0
+
+    def initial_state(self, speed_rad_s: Array, command: Array) -> Array:
+        """(fans, n_state) of fans that have long run at speed_rad_s (fans,) under command (fans,)."""
+        return np.column_stack([speed_rad_s] * self.layout.speed + [command] * self.layout.command)
+
+    @classmethod
+    def load(cls, path: Path, fans: int) -> TwinFile:
+        """Load a twin for a tray of `fans` fans. A twin of one fan serves every fan of the tray.
+
+        Raises:
+            StageError: the file is missing, not ONNX, not a twin, from a newer fantwin, or for other fans.
+        """
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise StageError(f"{path}: cannot read the twin: {error.strerror}; correct [[tray]] twin") from error
+        session = _session(path, content)
+        card_json = session.get_modelmeta().custom_metadata_map.get(CARD_PROPERTY)
+        if card_json is None:
+            raise StageError(
+                f"{path}: an ONNX file, but not a twin: it has no {CARD_PROPERTY}; make one: fantwin train"
+            )
+        card = _card(path, card_json)
+        if card.fans not in (1, fans):
+            raise StageError(
+                f"{path}: a twin of {card.fans} fans, [[tray]] says fans = {fans}: choose a twin that fits"
+            )
+        _check_graph(path, session, card)
+        parameters = np.broadcast_to(np.array(card.parameters), (fans, len(card.parameters[0]))).copy()
+        return cls(
+            name=card.name,
+            kind=card.kind,
+            sha256=hashlib.sha256(content).hexdigest(),
+            card_json=card_json,
+            layout=card.state_layout,
+            sigma_rad_s=np.broadcast_to(np.array(card.sigma_rad_s), fans).copy(),
+            command_range=card.command_range,
+            rate_hz=card.rate_hz,
+            advance=_advance(session, parameters),
+        )
+
+
+def _session(path: Path, content: bytes) -> Any:
+    # Imported here, so that stages that run no twin start without it.
+    import onnxruntime  # noqa: PLC0415
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1  # the graph is small; more threads only wait for one another
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its exceptions have no common base of their own
+        raise StageError(f"{path}: not an ONNX file that can be run: {_first_line(error)}") from error
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0]
+
+
+def _card(path: Path, card_json: str) -> TwinCard:
+    try:
+        card = TwinCard.model_validate_json(card_json)
+    except ValidationError as error:
+        version = _Version.of(card_json)
+        if version > FORMAT_VERSION:
+            raise _newer(path, version) from error
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "it"
+        raise StageError(f"{path}: the twin's card cannot be used: {where}: {first['msg']}; train it anew") from error
+    if card.format_version > FORMAT_VERSION:
+        raise _newer(path, card.format_version)
+    return card
+
+
+class _Version(_OfCard):
+    format_version: int = 0
+
+    @classmethod
+    def of(cls, card_json: str) -> int:
+        try:
+            return cls.model_validate_json(card_json).format_version
+        except ValidationError:
+            return 0
+
+
+def _newer(path: Path, version: int) -> StageError:
+    return StageError(f"{path}: twin format {version}, this fantwin knows {FORMAT_VERSION}: update fantwin")
+
+
+def _check_graph(path: Path, session: Any, card: TwinCard) -> None:
+    inputs = {node.name: node for node in session.get_inputs()}
+    outputs = [node.name for node in session.get_outputs()]
+    if set(inputs) != set(INPUTS) or not set(OUTPUTS) <= set(outputs):
+        raise StageError(
+            f"{path}: not a twin's graph: it has inputs {', '.join(inputs)} and outputs {', '.join(outputs)}; "
+            f"needed are {', '.join(INPUTS)} and {', '.join(OUTPUTS)}"
+        )
+    for name, width in (("state", card.n_state), ("parameters", len(card.parameters[0]))):
+        shape = inputs[name].shape
+        if len(shape) != 2 or (isinstance(shape[1], int) and shape[1] != width):
+            raise StageError(f"{path}: graph and card disagree: {name} is {shape}, the card says (fans, {width})")
+    for node in inputs.values():
+        if node.type != "tensor(double)":
+            raise StageError(f"{path}: input {node.name} is {node.type}, needed is tensor(double); export it anew")
+
+
+def _advance(session: Any, parameters: Array) -> Advance:
+    def advance(state: Array, command: Array, step_s: Array) -> tuple[Array, Array]:
+        feed = {"state": state, "command": command, "step_s": step_s, "parameters": parameters}
+        speed_rad_s, state_out = session.run(list(OUTPUTS), feed)
+        return speed_rad_s, state_out
+
+    return advance

@@ -1,0 +1,219 @@
+"""Viewer: shows live what the twin says, what was measured and what was decided, in Rerun.
+
+Reads `score`, `alarm`, `twin` and `health`; writes nothing. One core serves all trays. Speeds are shown in the
+tray's own unit. Samples are collected and drawn twice a second, because a call into Rerun costs much and a row in
+it costs nothing. This stage alone may drop: the runner holds a bounded queue before it and counts what it lets go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.config import TrayConfig
+from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.trace import Trace, state_changes, state_name, trace_of
+from schemas.messages import Alarm, Array, Health, Message, ModelCard, Score, StageStatus
+
+FLUSH_PERIOD_NS = 500_000_000
+REPEAT_STATES_NS = 5_000_000_000  # a viewer that joins late gets no state older than this
+SAMPLES_HELD = 4096  # of a tray, when a replay outruns the ticks
+
+
+class ViewerConfig(StageConfig):
+    """Section `[viewer]`."""
+
+    file: str = Field(
+        default="view.rrd",
+        description='file in run_folder that keeps the view; an older one is left alone, view-2.rrd written; "": none',
+    )
+    serve: bool = Field(default=True, description="serve live viewers on this host (127.0.0.1)")
+    grpc_port: int = Field(default=9876, ge=1, le=65535, description="port of the data, for native and browser viewer")
+    web_port: int = Field(default=9090, ge=0, le=65535, description="port of the browser viewer's page; 0: no page")
+    window_s: float = Field(default=30.0, gt=0, description="how much the rolling window shows")
+    memory_limit: str = Field(
+        default="256MB", pattern=r"^\d+(MB|GB|MiB|GiB)$", description="history kept for viewers that join late"
+    )
+
+
+class ViewSink(Protocol):
+    """Where a view goes. Times in ns since the epoch."""
+
+    def draw(self, trace: Trace) -> None:
+        """Show the next stretch of a tray."""
+        ...
+
+    def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
+        """Colour a fan's lane from each time on."""
+        ...
+
+    def log(self, where: str, t_ns: int, level: str, text: str) -> None:
+        """Add a line to a log: `where` is a tray's name or `stages`, `level` is INFO, WARN or ERROR."""
+        ...
+
+    def flush(self) -> None:
+        """Write out what has been handed over, so that it outlives this process."""
+        ...
+
+    def close(self) -> None:
+        """Write out everything and let go."""
+        ...
+
+
+def alarm_line(alarm: Alarm) -> tuple[str, str]:
+    """Level and text of an alarm for people."""
+    return ("ERROR", f"alarm raised: {alarm.message}") if alarm.active else ("INFO", f"alarm cleared: {alarm.message}")
+
+
+def health_line(health: Health) -> tuple[str, str]:
+    """Level and text of a stage's health for people."""
+    text = f"{health.stage} ({health.instance}) {health.status.name.lower()}"
+    if health.lost:
+        text += f", {health.lost} lost"
+    if health.problem:
+        text += f": {health.problem}"
+    return ("INFO" if health.status != StageStatus.DEGRADED and not health.lost else "WARN"), text
+
+
+@dataclass(slots=True)
+class _TrayView:
+    """What the core remembers of one tray between two flushes."""
+
+    config: TrayConfig
+    scores: list[Score] = field(default_factory=list)
+    samples: int = 0
+    states: dict[int, str] = field(default_factory=dict)
+    repeated_t_ns: int = 0
+
+
+class ViewerCore(Core):
+    """Collects scores and hands them to a sink in few, long pieces."""
+
+    def __init__(self, trays: Sequence[TrayConfig], sink: ViewSink) -> None:
+        self._views = {tray.name: _TrayView(tray) for tray in trays}
+        self._sink = sink
+        self._flushed_t_ns = 0
+        self._stages: dict[str, str] = {}
+        self._samples_drawn = 0
+        self._wrong_fans = 0
+
+    def step(self, item: Message) -> Sequence[Message]:
+        """Remember a score, write an alarm, a change of twin or a change of health into the log."""
+        if isinstance(item, Health):
+            self._note_health(item)
+            return ()
+        view = self._views[item.header.tray]
+        if isinstance(item, Score):
+            self._note_score(view, item)
+        elif isinstance(item, Alarm):
+            self._sink.log(view.config.name, item.t_ns, *alarm_line(item))
+        elif isinstance(item, ModelCard):
+            self._sink.log(view.config.name, item.t_ns, "INFO", f"twin in force: {item.twin} ({item.kind})")
+        return ()
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        """Draw what has come since the last flush, twice a second."""
+        if now_ns - self._flushed_t_ns >= FLUSH_PERIOD_NS:
+            self._flushed_t_ns = now_ns
+            self._flush_all()
+        return ()
+
+    def close(self) -> Sequence[Message]:
+        """Draw the rest and finish the file."""
+        self._flush_all()
+        self._sink.close()
+        return ()
+
+    def counters(self) -> Mapping[str, int]:
+        """Samples drawn, and scores refused because their number of fans is not that of the configuration."""
+        return {"samples_drawn": self._samples_drawn, "wrong_fan_count": self._wrong_fans}
+
+    def problem(self) -> str:
+        """Says when scores do not fit the configuration."""
+        if self._wrong_fans:
+            return f"{self._wrong_fans} scores have another number of fans than [[tray]] says: correct `fans`"
+        return ""
+
+    def _note_score(self, view: _TrayView, score: Score) -> None:
+        if score.fans != view.config.fans:
+            self._wrong_fans += 1
+            return
+        view.scores.append(score)
+        view.samples += len(score.t_ns)
+        if view.samples >= SAMPLES_HELD:
+            self._flush(view)
+
+    def _note_health(self, health: Health) -> None:
+        level, text = health_line(health)
+        name = f"{health.stage}/{health.instance}"
+        if self._stages.get(name) != text:
+            self._stages[name] = text
+            self._sink.log("stages", health.t_ns, level, text)
+
+    def _flush_all(self) -> None:
+        for view in self._views.values():
+            self._flush(view)
+        self._sink.flush()
+
+    def _flush(self, view: _TrayView) -> None:
+        if not view.samples:
+            return
+        trace = trace_of(view.config.name, view.scores, view.config.speed_unit)
+        view.scores, view.samples = [], 0
+        self._samples_drawn += len(trace.t_ns)
+        self._sink.draw(trace)
+        newest_t_ns = int(trace.t_ns[-1])
+        repeat = newest_t_ns - view.repeated_t_ns >= REPEAT_STATES_NS
+        if repeat:
+            view.repeated_t_ns = newest_t_ns
+        for fan in range(trace.fans):
+            t_ns, names = state_changes(trace, fan, view.states.get(fan))
+            if not names and repeat:
+                t_ns, names = trace.t_ns[-1:], [state_name(trace.state[-1, fan], trace.why_not[-1, fan])]
+            if names:
+                view.states[fan] = names[-1]
+                self._sink.change_states(trace.tray, fan, np.asarray(t_ns), names)
+
+
+def build(context: Context) -> Parts:
+    """Open the file, serve the viewers.
+
+    Raises:
+        StageError: Rerun is not installed, a port is taken, or the file cannot be written.
+    """
+    try:
+        from pipeline.rerun_sink import RerunSink  # noqa: PLC0415  the extra `view` may not be installed
+    except ModuleNotFoundError as error:
+        if error.name != "rerun":
+            raise
+        raise StageError(
+            "the viewer needs the `view` extra: pip install 'fantwin[view]', or take viewer out of launcher.stages"
+        ) from error
+    config: ViewerConfig = context.config
+    sink = RerunSink(
+        name=context.site,
+        trays=context.trays,
+        started_t_ns=context.started_t_ns,
+        window_s=config.window_s,
+        file=context.run_folder / config.file if config.file else None,
+        grpc_port=config.grpc_port if config.serve else None,
+        web_port=(config.web_port or None) if config.serve else None,
+        memory_limit=config.memory_limit,
+    )
+    return Parts(ViewerCore(context.trays, sink))
+
+
+STAGE = Stage(
+    name="viewer",
+    about="shows measured speed, twin, band, alarms and states live in Rerun, and keeps them in a file",
+    reads=("score", "alarm", "twin", "health"),
+    writes=(),
+    config=ViewerConfig,
+    build=build,
+    core_per_tray=False,
+    may_drop=True,
+)

@@ -1,0 +1,136 @@
+"""The codec: inverse of itself, and standard protobuf to everybody else."""
+
+import contextlib
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor import FieldDescriptor
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.records import Schema
+from mcap.well_known import MessageEncoding
+from mcap_protobuf.decoder import DecoderFactory
+from mcap_protobuf.schema import build_file_descriptor_set
+from message_strategies import any_message, same
+
+from schemas import fan_pb2, messages
+from schemas.codec import CodecError, decode, encode, proto_type, type_name
+from schemas.messages import MESSAGE_TYPES, Command, Counter, Grid, Header, Input, Message, Output, Raw, columns
+
+MESSAGES = st.sampled_from(MESSAGE_TYPES).flatmap(any_message)
+
+
+def everybody_elses_decoder(message_type: type[Message]) -> Any:
+    """What a reader of recordings uses that knows only the schema in the file."""
+    schema = Schema(
+        id=1,
+        name=type_name(message_type),
+        encoding="protobuf",
+        data=build_file_descriptor_set(proto_type(message_type)).SerializeToString(),
+    )
+    decoder = DecoderFactory().decoder_for(MessageEncoding.Protobuf, schema)
+    assert decoder is not None
+    return decoder
+
+
+@given(MESSAGES)
+def test_decoding_gives_back_what_was_encoded(message):
+    back = decode(type(message), encode(message))
+    for f in fields(message):
+        assert same(getattr(message, f.name), getattr(back, f.name)), f.name
+
+
+@given(MESSAGES)
+def test_what_is_encoded_is_read_without_our_code(message):
+    proto = everybody_elses_decoder(type(message))(encode(message))
+    assert proto.header.producer == message.header.producer
+    assert proto.header.sequence == message.header.sequence
+    assert proto.header.tray == message.header.tray
+    own_columns = columns(type(message))
+    for f in fields(message):
+        ours, theirs = getattr(message, f.name), getattr(proto, f.name)
+        if f.name in own_columns:
+            assert same(ours.ravel(), np.asarray(list(theirs), dtype=own_columns[f.name][1])), f.name
+        elif f.name in ("inputs", "outputs", "counters"):
+            assert [[getattr(o, g.name) for g in fields(o)] for o in ours] == [
+                [getattr(t, g.name) for g in fields(o)] for o, t in zip(ours, theirs, strict=True)
+            ]
+        elif f.name != "header":
+            assert same(ours, type(ours)(theirs)), f.name
+
+
+@given(MESSAGES)
+def test_what_protobuf_itself_writes_is_decoded(message):
+    proto = proto_type(type(message)).FromString(encode(message))
+    back = decode(type(message), proto.SerializeToString())
+    assert all(same(getattr(message, f.name), getattr(back, f.name)) for f in fields(message))
+
+
+@given(MESSAGES, st.data())
+def test_torn_bytes_are_refused_or_are_another_message_but_never_crash(message, data):
+    payload = encode(message)
+    torn = payload[: data.draw(st.integers(0, len(payload)))]
+    with contextlib.suppress(CodecError):
+        decode(type(message), torn)
+
+
+@given(st.sampled_from(MESSAGE_TYPES), st.binary(max_size=200))
+def test_any_bytes_are_refused_or_decoded_but_never_crash(message_type, payload):
+    with contextlib.suppress(CodecError):
+        decode(message_type, payload)
+
+
+@pytest.mark.parametrize("message_type", MESSAGE_TYPES, ids=lambda t: t.__name__)
+def test_a_message_has_the_fields_of_its_schema_in_their_order(message_type):
+    assert [f.name for f in fields(message_type)] == [f.name for f in proto_type(message_type).DESCRIPTOR.fields]
+
+
+@pytest.mark.parametrize("record", [Header, Counter, Input, Output], ids=lambda t: t.__name__)
+def test_a_record_has_the_fields_of_its_schema_in_their_order(record):
+    assert [f.name for f in fields(record)] == [f.name for f in getattr(fan_pb2, record.__name__).DESCRIPTOR.fields]
+
+
+@pytest.mark.parametrize("message_type", MESSAGE_TYPES, ids=lambda t: t.__name__)
+def test_a_column_is_what_its_schema_says(message_type):
+    wire_types = {
+        FieldDescriptor.TYPE_DOUBLE: np.dtype(np.float64),
+        FieldDescriptor.TYPE_SFIXED64: np.dtype(np.int64),
+        FieldDescriptor.TYPE_FIXED32: np.dtype(np.uint32),
+        FieldDescriptor.TYPE_BOOL: np.dtype(np.bool_),
+        FieldDescriptor.TYPE_ENUM: np.dtype(np.uint8),
+    }
+    repeated = {
+        f.name: wire_types[f.type]
+        for f in proto_type(message_type).DESCRIPTOR.fields
+        if f.is_repeated and f.type in wire_types
+    }
+    assert {name: dtype for name, (_, dtype) in columns(message_type).items()} == repeated
+
+
+@pytest.mark.parametrize("name", ["WhyNot", "FanState", "Severity", "StageStatus"])
+def test_an_enum_has_the_values_of_its_schema(name):
+    ours, theirs = getattr(messages, name), getattr(fan_pb2, name)
+    prefix = {"WhyNot": "WHY_NOT_", "FanState": "FAN_STATE_", "Severity": "SEVERITY_", "StageStatus": "STAGE_STATUS_"}
+    assert {prefix[name] + value.name: value.value for value in ours} == dict(theirs.items())
+
+
+def test_columns_that_do_not_fit_the_message_are_refused():
+    with pytest.raises(CodecError, match=r"Raw\.command has shape \(2,\)"):
+        encode(Raw(fans=1, host_receive_t_ns=np.arange(2), command=np.zeros(2), speed_rad_s=np.zeros((2, 1))))
+    with pytest.raises(CodecError, match=r"Command\.command has shape \(3,\)"):
+        encode(Command(fans=2, t_ns=0, command=np.zeros(3), set_point_rad_s=np.zeros(2)))
+
+
+def test_bytes_whose_columns_disagree_are_refused():
+    proto = fan_pb2.Grid(fans=2, t_ns=[1, 2], command=[1.0, 2.0])
+    with pytest.raises(CodecError, match="shape"):
+        decode(Grid, proto.SerializeToString())
+
+
+def test_decoded_columns_cannot_be_changed_by_mistake():
+    back = decode(Command, encode(Command(fans=1, t_ns=0, command=np.ones(1), set_point_rad_s=np.ones(1))))
+    assert isinstance(back, Command)
+    with pytest.raises(ValueError, match="read-only"):
+        back.command[0] = 2.0

@@ -1,0 +1,70 @@
+"""Small twins for the tests of the stages: real ONNX files, exported with made-up parameters."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+
+from twin.card import CARD_KEY, Card, NetworkCard, TrainingCard, ValidationCard
+from twin.export import export_onnx
+from twin.hybrid import Hybrid
+from twin.models import Model
+from twin.network import Scaling, TanhNetwork
+from twin.physical import PhysicalModel
+from twin.physics import PARAMETER_NAMES
+
+PARAMETERS = (0.15, 0.12, 0.0005)
+"""J, alpha, C_D of a fan that settles within about a second."""
+SIGMA_RAD_S = 3.0
+COMMAND_RANGE = (0.0, 100.0)
+
+
+def small_hybrid(seed: int = 1) -> Hybrid:
+    """Physics and a network with random weights that moves it by some rad/s."""
+    inputs = ("speed", "command")
+    scaling = Scaling(150.0, 150.0, 50.0, 50.0, 100.0)
+    network = TanhNetwork.zero(6, inputs, scaling)
+    rng = np.random.default_rng(seed)
+    return Hybrid(network.with_theta(rng.normal(0.0, 0.3, network.parameter_count)))
+
+
+def made_up_card(model: Model, fans: int) -> Card:
+    """A card that fits a model, each fan a little different."""
+    layout = model.state_layout
+    scale = 1.0 + 0.05 * np.arange(fans)
+    return Card(
+        kind=model.kind,
+        name=f"made up {model.kind}",
+        created="2024-01-01T00:00:00Z",
+        fans=fans,
+        n_state=layout.size,
+        state_layout=layout,
+        parameter_names=PARAMETER_NAMES,
+        parameters=tuple(tuple((np.array(PARAMETERS) * s).tolist()) for s in scale),
+        parameter_std_errors=tuple((0.0, 0.0, 0.0) for _ in scale),
+        sigma_rad_s=tuple((SIGMA_RAD_S * scale).tolist()),
+        speed_range_rad_s=(0.0, 500.0),
+        command_range=COMMAND_RANGE,
+        rate_hz=100.0,
+        network=NetworkCard(0, (), 0),
+        training=TrainingCard("none", 0, 0, 0.0, ()),
+        validation=ValidationCard("training", 0, None, None, None, None, None),
+        versions={},
+        command_unit="1",
+    )
+
+
+def write_twin(path: Path, model: Model | None = None, fans: int = 1, **changes: Any) -> Path:
+    """Write a twin. `changes` go into the card as it lies in the file, unchecked; None removes a key."""
+    model = model or PhysicalModel()
+    file = onnx.load_model_from_string(export_onnx(model, made_up_card(model, fans)))
+    properties = {entry.key: entry.value for entry in file.metadata_props}
+    card = json.loads(properties[CARD_KEY]) | changes
+    properties[CARD_KEY] = json.dumps({key: value for key, value in card.items() if value is not None})
+    onnx.helper.set_model_props(file, properties)
+    path.write_bytes(file.SerializeToString())
+    return path

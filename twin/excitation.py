@@ -1,0 +1,187 @@
+"""What the fans are told to do when nobody tells them: profiles of command over time.
+
+A profile is a function of time, `command(t_s) -> (fans,)`, within `low..high`; each fan has its own, and the same seed
+gives the same. Profiles repeat with their period, without a jump unless jumping is what they are for.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from typing import Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.errors import TwinError
+
+Array: TypeAlias = NDArray[np.float64]
+
+
+class Excitation(Protocol):
+    """A profile of commands."""
+
+    def command(self, t_s: float) -> Array:
+        """(fans,) commands in force at t_s >= 0."""
+        ...
+
+
+class Staircase:
+    """Up in equal steps and down again, each step held; the fans climb one after the other."""
+
+    def __init__(self, fans: int, seed: int, low: float, high: float, steps: int = 8, hold_s: float = 4.0) -> None:
+        climb = np.linspace(low, high, steps + 1)
+        self._levels = np.concatenate((climb, climb[-2:0:-1]))
+        self._hold_s = hold_s
+        self._shift = np.random.default_rng(seed).integers(len(self._levels), size=fans)
+
+    def command(self, t_s: float) -> Array:
+        """(fans,) levels in force at t_s."""
+        return self._levels[(int(t_s / self._hold_s) + self._shift) % len(self._levels)]
+
+
+class Prbs:
+    """Pseudo-random binary sequence: a maximum-length shift register x^10 + x^7 + 1 chooses between two levels."""
+
+    def __init__(self, fans: int, seed: int, low: float, high: float, bit_s: float = 0.5) -> None:
+        register = [1] * 10
+        bits = []
+        for _ in range(2**10 - 1):
+            bits.append(register[-1])
+            register = [register[9] ^ register[6], *register[:-1]]
+        self._levels = np.where(np.array(bits) == 1, high, low)
+        self._bit_s = bit_s
+        self._shift = np.random.default_rng(seed).integers(len(bits), size=fans)
+
+    def command(self, t_s: float) -> Array:
+        """(fans,) levels in force at t_s."""
+        return self._levels[(int(t_s / self._bit_s) + self._shift) % len(self._levels)]
+
+
+class Multisine:
+    """Sines of equal amplitude and random phase on harmonics of one period, about evenly spread in log frequency."""
+
+    HARMONICS = np.array([1, 2, 3, 5, 8, 13, 21, 34, 55, 89])
+
+    def __init__(self, fans: int, seed: int, low: float, high: float, period_s: float = 50.0) -> None:
+        self._omega_rad_s = 2.0 * np.pi * self.HARMONICS / period_s
+        self._phase_rad = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, size=(fans, len(self.HARMONICS)))
+        self._low, self._high = low, high
+        samples_s = np.linspace(0.0, period_s, 40 * int(self.HARMONICS[-1]))
+        waves = np.stack([self._wave(t_s) for t_s in samples_s])
+        self._bottom, self._top = waves.min(axis=0), waves.max(axis=0)
+
+    def command(self, t_s: float) -> Array:
+        """(fans,) commands at t_s; the extremes over a period are low and high."""
+        share = (self._wave(t_s) - self._bottom) / (self._top - self._bottom)
+        return self._low + (self._high - self._low) * np.clip(share, 0.0, 1.0)
+
+    def _wave(self, t_s: float) -> Array:
+        return np.sin(self._omega_rad_s * t_s + self._phase_rad).sum(axis=1)
+
+
+class Chirp:
+    """A sine whose frequency rises exponentially from first_hz to last_hz, then falls back the same way."""
+
+    def __init__(
+        self,
+        fans: int,
+        seed: int,
+        low: float,
+        high: float,
+        first_hz: float = 0.02,
+        last_hz: float = 2.0,
+        sweep_s: float = 60.0,
+    ) -> None:
+        self._rate = np.log(last_hz / first_hz) / sweep_s
+        self._first_hz, self._sweep_s = first_hz, sweep_s
+        self._centre, self._amplitude = (low + high) / 2.0, (high - low) / 2.0
+        self._phase_rad = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, size=fans)
+
+    def command(self, t_s: float) -> Array:
+        """(fans,) commands at t_s."""
+        sweeps, into_s = divmod(t_s, 2.0 * self._sweep_s)
+        whole = self._cycles(self._sweep_s)
+        falling_s = into_s - self._sweep_s
+        # On the way down the sweep runs backwards: what was left to go is subtracted from the whole.
+        cycles = self._cycles(into_s) if falling_s < 0.0 else 2.0 * whole - self._cycles(self._sweep_s - falling_s)
+        turn_rad = 2.0 * np.pi * (2.0 * whole * sweeps + cycles)
+        return self._centre + self._amplitude * np.sin(turn_rad + self._phase_rad)
+
+    def _cycles(self, into_s: float) -> float:
+        return self._first_hz * (np.exp(self._rate * into_s) - 1.0) / self._rate
+
+
+class Manual:
+    """A person at the knobs: turns one slowly to somewhere, leaves it for a while, turns again; each fan on its own."""
+
+    def __init__(
+        self,
+        fans: int,
+        seed: int,
+        low: float,
+        high: float,
+        period_s: float = 3600.0,
+        turn_s: tuple[float, float] = (0.5, 3.0),
+        hold_s: tuple[float, float] = (1.0, 6.0),
+    ) -> None:
+        self._period_s = period_s
+        # The knobs of all fans lie on one line of time, one after the other: a single interpolation serves them all.
+        self._offset_s = np.arange(fans) * period_s
+        times, levels = [], []
+        for offset_s, rng in zip(self._offset_s, np.random.default_rng(seed).spawn(fans), strict=True):
+            knob_s, knob = _knob(rng, low, high, period_s, turn_s, hold_s)
+            times.append(offset_s + knob_s)
+            levels.append(knob)
+        self._times_s, self._levels = np.concatenate(times), np.concatenate(levels)
+
+    def command(self, t_s: float) -> Array:
+        """(fans,) commands at t_s."""
+        return np.interp(t_s % self._period_s + self._offset_s, self._times_s, self._levels)
+
+
+def _knob(
+    rng: np.random.Generator,
+    low: float,
+    high: float,
+    period_s: float,
+    turn_s: tuple[float, float],
+    hold_s: tuple[float, float],
+) -> tuple[Array, Array]:
+    """Corners of one knob's movement: times (n,) from 0 up to, not including, period_s, and levels (n,).
+
+    The knob ends where it began, so that the next period joins without a jump.
+    """
+    turns = int(period_s / (turn_s[0] + hold_s[0])) + 1
+    durations_s = np.stack((rng.uniform(*hold_s, size=turns), rng.uniform(*turn_s, size=turns)), axis=1)
+    corners_s = np.concatenate(([0.0], np.cumsum(durations_s)))
+    levels = np.repeat(rng.uniform(low, high, size=turns + 1), 2)[: len(corners_s)]
+    # Whole turns that end a turn's time before the end, then back to the first level.
+    count = 2 * int(np.searchsorted(corners_s[::2], period_s - turn_s[1])) - 1
+    last_s = np.nextafter(period_s, 0.0)
+    return np.append(corners_s[:count], last_s), np.append(levels[:count], levels[0])
+
+
+PROFILES: dict[str, Callable[[int, int, float, float], Excitation]] = {
+    "staircase": Staircase,
+    "prbs": Prbs,
+    "multisine": Multisine,
+    "chirp": Chirp,
+    "manual": Manual,
+}
+LOW, HIGH = 0.1, 0.95
+
+
+def excitation(profile: str, fans: int, seed: int, low: float = LOW, high: float = HIGH) -> Excitation:
+    """The profile of that name.
+
+    Raises:
+        TwinError: no such profile, or low is not below high.
+    """
+    if profile not in PROFILES:
+        close = difflib.get_close_matches(profile, PROFILES, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(PROFILES)}"
+        raise TwinError(f"unknown profile {profile!r}; {hint}")
+    if not low < high:
+        raise TwinError(f"commands from {low:g} to {high:g}: the first must be the smaller")
+    return PROFILES[profile](fans, seed, low, high)

@@ -1,0 +1,187 @@
+"""Simulated fans: the equation of motion, and what real fans have that it leaves out.
+
+    J w' + alpha w + C_D w|w| = gain i - friction(w)       torques in V-equivalents
+    lag i' + i = supply * drive(duty)                      current follows the bridge
+    drive(duty) = clip((duty - dead) / (full - dead), 0, 1)
+    friction(w) = sign(w) (coulomb + (breakaway - coulomb) exp(-(w / stribeck)^2)), up to breakaway at standstill
+
+J, alpha and C_D are per volt, as identified on the real fan of Peng and Chen (equation (12) there); the Stribeck
+curve is that of Armstrong-Helouvry, Dupont and Canudas de Wit (Automatica 30, 1994).
+
+Time stepping: the current is exact for a held command, the smooth part of the motion is a midpoint step (order two),
+and friction is an impulse that can stop the rotor but never turn it round (Moreau), so that a rotor below breakaway
+stands exactly still.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.errors import TwinError
+
+Array: TypeAlias = NDArray[np.float64]
+
+MAX_SUBSTEP_S = 1e-3
+
+
+@dataclass(frozen=True)
+class FanParameters:
+    """One fan (numbers) or a tray of fans (each field (fans,)). V is torque in volt-equivalents."""
+
+    J: float | Array = 0.0148
+    """inertia, V s^2/rad"""
+    alpha: float | Array = 0.0074
+    """viscous drag, V s/rad"""
+    C_D: float | Array = 5.4772e-6
+    """aerodynamic drag, V s^2/rad^2"""
+    supply_v: float | Array = 12.0
+    """drive voltage at full duty, V"""
+    gain: float | Array = 1.0
+    """torque per volt, relative to the fan for which J, alpha and C_D hold"""
+    lag_s: float | Array = 0.012
+    """electrical time constant of the current, s"""
+    coulomb_v: float | Array = 0.08
+    """sliding friction, V"""
+    breakaway_v: float | Array = 0.25
+    """friction to be overcome from standstill, V; not below coulomb_v"""
+    stribeck_rad_s: float | Array = 6.0
+    """speed at which friction has fallen most of the way from breakaway to sliding, rad/s"""
+    duty_dead: float | Array = 0.02
+    """duty up to which the bridge gives nothing"""
+    duty_full: float | Array = 0.99
+    """duty from which the bridge is fully on"""
+
+
+SPREAD_OF = ("J", "alpha", "C_D", "gain", "lag_s", "coulomb_v", "breakaway_v", "stribeck_rad_s")
+
+
+def tray_of_fans(fans: int, seed: int, spread: float = 0.03, base: FanParameters | None = None) -> FanParameters:
+    """Parameters of a tray, each field (fans,): unit-to-unit spread is normal, cut at three standard deviations.
+
+    spread: relative standard deviation of each of `SPREAD_OF`. The same seed gives the same fans.
+
+    Raises:
+        TwinError: spread is negative or so large that a parameter could become negative.
+    """
+    if not 0.0 <= spread < 0.3:
+        raise TwinError(f"spread = {spread:g}: give a relative standard deviation from 0 to 0.3")
+    rng = np.random.default_rng(seed)
+    base = base or FanParameters()
+    scattered = {}
+    for field in fields(FanParameters):
+        values = np.full(fans, getattr(base, field.name), dtype=np.float64)
+        if field.name in SPREAD_OF:
+            values *= 1.0 + spread * np.clip(rng.normal(size=fans), -3.0, 3.0)
+        scattered[field.name] = values
+    scattered["breakaway_v"] = np.maximum(scattered["breakaway_v"], scattered["coulomb_v"])
+    return FanParameters(**scattered)
+
+
+def drive(duty: Array, parameters: FanParameters) -> Array:
+    """(fans,) share of the supply that the bridge lets through: dead zone, slope, saturation."""
+    return np.clip((duty - parameters.duty_dead) / (parameters.duty_full - parameters.duty_dead), 0.0, 1.0)
+
+
+def friction_v(speed_rad_s: Array, parameters: FanParameters) -> Array:
+    """(fans,) magnitude of Coulomb and Stribeck friction, V; at standstill the most it can hold."""
+    rise = np.exp(-np.square(speed_rad_s / parameters.stribeck_rad_s))
+    return parameters.coulomb_v + (parameters.breakaway_v - parameters.coulomb_v) * rise
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What works on the fans from outside or is wrong with them; each field (fans,). The defaults are health."""
+
+    drag_factor: float | Array = 1.0
+    """multiplies C_D"""
+    brake_v: float | Array = 0.0
+    """torque against the motion that adds to friction, V"""
+    supply_factor: float | Array = 1.0
+    """multiplies the supply voltage"""
+
+
+HEALTHY = Disturbance()
+
+
+@dataclass(frozen=True)
+class PlantState:
+    """Where the fans are: speed (fans,) in rad/s and current (fans,) as the voltage it answers to, V."""
+
+    speed_rad_s: Array
+    current_v: Array
+
+
+def at_rest(fans: int) -> PlantState:
+    """All fans stand and carry no current."""
+    return PlantState(np.zeros(fans), np.zeros(fans))
+
+
+def advance(
+    state: PlantState,
+    duty: Array,
+    duration_s: float,
+    parameters: FanParameters,
+    disturbance: Disturbance = HEALTHY,
+) -> PlantState:
+    """The fans `duration_s` later, duty (fans,) and disturbance held; substeps of at most 1 ms."""
+    if duration_s <= 0.0:
+        return state
+    substeps = int(np.ceil(duration_s / MAX_SUBSTEP_S))
+    step_s = duration_s / substeps
+    target_v = parameters.supply_v * disturbance.supply_factor * drive(duty, parameters)
+    decay = np.exp(-step_s / np.asarray(parameters.lag_s))
+    # The mean of the current over a substep: what its impulse on the rotor comes from.
+    mean_share = (1.0 - decay) * parameters.lag_s / step_s
+    drag = parameters.C_D * disturbance.drag_factor
+    coulomb = parameters.coulomb_v + disturbance.brake_v
+    rise = parameters.breakaway_v - parameters.coulomb_v
+    inverse_stribeck = 1.0 / np.asarray(parameters.stribeck_rad_s)
+    per_inertia_s = step_s / np.asarray(parameters.J)
+    speed, current = state.speed_rad_s, state.current_v
+    for _ in range(substeps):
+        torque = parameters.gain * (target_v + (current - target_v) * mean_share)
+        current = target_v + (current - target_v) * decay
+        half = speed + 0.5 * per_inertia_s * (torque - (parameters.alpha + drag * np.abs(speed)) * speed)
+        free = speed + per_inertia_s * (torque - (parameters.alpha + drag * np.abs(half)) * half)
+        impulse = per_inertia_s * (coulomb + rise * np.exp(-np.square(speed * inverse_stribeck)))
+        speed = np.sign(free) * np.maximum(np.abs(free) - impulse, 0.0)
+    return PlantState(speed, current)
+
+
+@dataclass(frozen=True)
+class Tacho:
+    """Reads the speed: white noise, then steps of `step_rad_s`; without direction, and 0 below `floor_rad_s`."""
+
+    noise_rad_s: float = 4.0
+    step_rad_s: float = 0.5
+    floor_rad_s: float = 2.0
+
+    def read(self, speed_rad_s: Array, rng: np.random.Generator) -> Array:
+        """(fans,) reading in rad/s of the speed (fans,)."""
+        magnitude = np.abs(speed_rad_s)
+        noisy = magnitude + self.noise_rad_s * rng.normal(size=magnitude.shape)
+        stepped = np.round(noisy / self.step_rad_s) * self.step_rad_s if self.step_rad_s > 0.0 else noisy
+        return np.where(magnitude < self.floor_rad_s, 0.0, np.maximum(stepped, 0.0))
+
+
+@dataclass(frozen=True)
+class DeviceClock:
+    """The device's own clock: microseconds in 32 bits, `drift_ppm` fast (negative: slow), `start_us` at time 0."""
+
+    drift_ppm: float = 0.0
+    start_us: int = 0
+
+    def at(self, t_s: float) -> int:
+        """What the clock shows at true time t_s; wraps at 2^32."""
+        return (self.start_us + round(t_s * (1e6 + self.drift_ppm))) % 2**32
+
+
+def fan(parameters: FanParameters, index: int) -> FanParameters:
+    """The parameters of one fan of a tray, as numbers."""
+    return replace(
+        parameters, **{f.name: float(np.asarray(getattr(parameters, f.name))[index]) for f in fields(parameters)}
+    )
