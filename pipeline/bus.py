@@ -79,7 +79,7 @@ class Bus:
         try:
             self._session = zenoh.open(_zenoh_config(config))
         except zenoh.ZError as error:
-            raise BusError(f"bus.endpoint = {config.endpoint!r} cannot be used: {error}") from error
+            raise BusError(f"bus.endpoint = {config.endpoint!r} cannot be used: {_reason(error)}") from error
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
 
     def __enter__(self) -> Self:
@@ -159,17 +159,24 @@ def open_router(endpoint: str) -> Iterator[None]:
         BusError: it cannot listen there.
     """
     conf = zenoh.Config()
-    conf.insert_json5("mode", '"router"')
-    conf.insert_json5("listen/endpoints", json.dumps([endpoint]))
-    conf.insert_json5("scouting/multicast/enabled", "false")
     try:
+        conf.insert_json5("mode", '"router"')
+        conf.insert_json5("listen/endpoints", json.dumps([endpoint]))
+        conf.insert_json5("scouting/multicast/enabled", "false")
         session = zenoh.open(conf)
     except zenoh.ZError as error:
-        raise BusError(f"the router cannot listen on {endpoint!r}: {error}; is one running already?") from error
+        reason = _reason(error)
+        raise BusError(f"the router cannot listen on {endpoint!r}: {reason}; is one running already?") from error
     try:
         yield
     finally:
         session.close()
+
+
+def _reason(error: zenoh.ZError) -> str:
+    """What Zenoh says, without where in its sources it says so."""
+    said = str(error)
+    return (said.partition('msg: "')[2] or said).split(" at /")[0].strip()
 
 
 def _zenoh_config(config: BusConfig) -> zenoh.Config:

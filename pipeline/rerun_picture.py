@@ -34,6 +34,7 @@ SIZE = (1920, 1080)
 TOP_BAR_SHARE = 0.035  # of the height; it stays, empty, when it is hidden
 PATIENCE_S = 60.0
 POLL_S = 0.2
+NOTICE_S = 6.0  # the viewer shows a notice on where it listens, over a corner of the window, for about five seconds
 _DRIVER_FOLDERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
 _DRIVER_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES", "VK_ADD_DRIVER_FILES")
 
@@ -100,6 +101,7 @@ def draw_picture(
     layout = _layout(rrd, kept, tray, fans)
     end_ns = kept.last_ns if at_s is None else kept.first_ns + round(at_s * 1e9)
     with _headless_viewer() as viewer:
+        began_s = time.monotonic()
         recording = rr.RecordingStream(APPLICATION)
         recording.connect_grpc(viewer.url, default_blueprint=blueprint([layout], window_s, for_picture=True))
         recording.send_chunks(kept.chunks)
@@ -113,6 +115,8 @@ def draw_picture(
             if chosen is None:
                 names = ", ".join(sorted(repr(shown.name) for shown in state.views))
                 raise PictureError(f"{rrd}: no view called {view!r}; there are {names}")
+        if chosen is None:
+            time.sleep(max(0.0, began_s + NOTICE_S - time.monotonic()))
         png = _settled_screenshot(viewer, chosen)
         reports = {shown.name: [str(report) for report in shown.reports] for shown in viewer.get_state().views}
         recording.disconnect()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -15,15 +16,15 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.box import SIMPLE
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
 from pipeline.bus import Bus
+from pipeline.commands.demo_screen import DemoScreen
 from pipeline.commands.options import JsonOption
 from pipeline.config import Config, load_config
-from pipeline.commands.demo_screen import DemoScreen
 from pipeline.demo_report import Summary, summarise
 from pipeline.errors import UserError
 from pipeline.signals import stop_on_signals
@@ -188,7 +189,7 @@ def _last_line(path: Path) -> str:
 
 
 def _tell(summary: Summary, out: Path, took_s: float, console: Console) -> None:
-    table = Table("fault", title="what happened, seconds since the first sample", title_justify="left", box=SIMPLE)
+    table = Table("fault", title="what happened, seconds since the first sample", title_justify="left", box=SIMPLE_HEAD)
     for column in ("fan", "start", "alarm", "delay", "removed", "cleared"):
         table.add_column(column, justify="right")
     for fault in summary.faults:
@@ -203,10 +204,8 @@ def _tell(summary: Summary, out: Path, took_s: float, console: Console) -> None:
         f"sample to score {summary.latency_ms['p50']:.1f} ms (median), {summary.latency_ms['p99']:.1f} ms (p99); "
         f"{took_s:.0f} s in all"
     )
-    shown = out.relative_to(Path.cwd()) if out.is_relative_to(Path.cwd()) else out
+    shown, programs = (Path(os.path.relpath(path)) for path in (out, Path(sys.executable).parent))
     console.print(f"all of it in {shown / 'summary.json'} and {shown / 'recording.mcap'}")
-    console.print(
-        f"look at {shown / 'bands.png'}, or over time: {Path(sys.executable).parent.name}/rerun {shown / 'view.rrd'}"
-    )
+    console.print(f"look at {shown / 'bands.png'}, or over time: {programs / 'rerun'} {shown / 'view.rrd'}")
     for problem in summary.problems:
         console.print(f"[bold red]NOT AS IT MUST BE:[/bold red] {problem}")

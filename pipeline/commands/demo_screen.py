@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rich.box import SIMPLE
+from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
@@ -53,7 +53,7 @@ class DemoScreen:
 
     def _fan_table(self) -> Table:
         unit = self._tray.speed_unit
-        table = Table("fan", title=f"{self._tray.name}, speeds in {unit}", title_justify="left", box=SIMPLE)
+        table = Table("fan", title=f"{self._tray.name}, speeds in {unit}", title_justify="left", box=SIMPLE_HEAD)
         for column in ("command", "measured", "twin", "residual"):
             table.add_column(column, justify="right")
         table.add_column("state")
@@ -63,9 +63,6 @@ class DemoScreen:
         scale = 1 / RAD_S_PER_UNIT[unit]
         for fan in range(score.fans):
             state = FanState(score.state[-1, fan])
-            style = {FanState.NORMAL: "green", FanState.UNKNOWN: "dim", FanState.SUSPECT: "yellow"}.get(
-                state, "bold red"
-            )
             why = "" if score.valid[-1, fan] else f" ({WhyNot(score.why_not[-1, fan]).name.lower().replace('_', ' ')})"
             table.add_row(
                 str(fan),

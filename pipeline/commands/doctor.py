@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
 import time
@@ -77,11 +78,10 @@ def _findings(config: Path | None, overrides: list[str] | None) -> Iterator[tupl
 
 def _check_run_folder(folder: Path) -> Iterator[tuple[bool, str]]:
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
-    try:
-        free = shutil.disk_usage(existing).free
-    except OSError as error:
-        yield False, f"run_folder {folder}: {error.strerror}"
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        yield False, f"run_folder {folder}: {existing} is no folder this user may write in; name another"
         return
+    free = shutil.disk_usage(existing).free
     enough = free > _LITTLE_DISK_BYTES
     yield (
         enough,

@@ -51,7 +51,9 @@ def identify(
     if json_output:
         typer.echo(json.dumps(account(found, material)))
         return
-    table = Table("fan", *PARAMETERS, "time constant s", f"rmse {material.speed_unit}")
+    table = Table("fan")
+    for header in (*PARAMETERS, "time constant s", f"rmse {material.speed_unit}"):
+        table.add_column(header, no_wrap=header in PARAMETERS, justify="right")
     for fan, of_fan in enumerate(account(found, material)["fans"]):
         parameters = (f"{of_fan[name]:.4g} ± {_half_width(of_fan[f'{name}_95']):.1g}" for name in PARAMETERS)
         table.add_row(str(fan), *parameters, f"{of_fan['time_constant_s']:.3g}", f"{of_fan['rmse']:.4g}")

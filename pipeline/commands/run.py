@@ -41,7 +41,9 @@ def run(
     try:
         runner = Runner(load_stage(stage), settings, tray, stop)
     except UserError as error:
-        typer.echo(error, err=True)
+        if not until_stdin_closes:
+            raise
+        typer.echo(error, err=True)  # for the launcher, which then gives up instead of starting it again
         raise typer.Exit(EXIT_CANNOT_START) from error
     if until_stdin_closes:
         threading.Thread(target=_set_when_stdin_closes, args=(runner.orphaned,), daemon=True).start()

@@ -9,7 +9,7 @@ from datetime import datetime
 from typing import Annotated
 
 import typer
-from rich.box import SIMPLE
+from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
@@ -70,7 +70,7 @@ def _require_someone(watcher: Watcher, config: Config) -> None:
 
 def stage_table(watcher: Watcher) -> Group:
     """What a person is shown: a row for each stage, what is wrong, and the alarms."""
-    table = Table("stage", "state", title="stages", title_justify="left", box=SIMPLE)
+    table = Table("stage", "state", title="stages", title_justify="left", box=SIMPLE_HEAD)
     for column in ("in /s", "out /s", "p50 ms", "p99 ms", "lost"):
         table.add_column(column, justify="right")
     problems: list[Text] = []
