@@ -14,6 +14,12 @@ LOSS_PREFIX = "lost_"
 _LATENCIES_KEPT = 2000
 
 
+def lost(inputs: Iterable[Input], counters: Mapping[str, int]) -> int:
+    """How much a stage has lost: missing messages, and counters that begin with `lost_`."""
+    counted = sum(value for name, value in counters.items() if name.startswith(LOSS_PREFIX))
+    return sum(line.missing for line in inputs) + counted
+
+
 class HealthBook:
     """Collects what a stage counts and makes `Health` messages of it."""
 
@@ -39,7 +45,7 @@ class HealthBook:
         counters: Mapping[str, int],
         now_ns: int,
     ) -> Health:
-        """The health message of this moment. Losses are missing messages and counters that begin with `lost_`."""
+        """The health message of this moment."""
         problem = "; ".join(filter(None, problems))
         if problem and status == StageStatus.OK:
             status = StageStatus.DEGRADED
@@ -56,7 +62,6 @@ class HealthBook:
             counters=tuple(Counter(name=name, value=value) for name, value in sorted(counters.items())),
             latency_p50_ms=float(p50),
             latency_p99_ms=float(p99),
-            lost=sum(line.missing for line in inputs)
-            + sum(value for name, value in counters.items() if name.startswith(LOSS_PREFIX)),
+            lost=lost(inputs, counters),
             process_id=os.getpid(),
         )

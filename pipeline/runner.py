@@ -19,7 +19,7 @@ from typing import Any
 from pipeline.bus import Bus, Outlet
 from pipeline.config import Config
 from pipeline.errors import UserError
-from pipeline.health import HealthBook
+from pipeline.health import HealthBook, lost
 from pipeline.inlet import Inlet
 from pipeline.stage import Context, Packet, Parts, Stage
 from schemas.codec import CodecError, decode, encode, type_name
@@ -29,6 +29,7 @@ from schemas.topics import BY_NAME, TOPICS, alive_key, health_key, topic_of, tra
 INBOX_SIZE = 4096
 TICK_S = 0.05
 HEALTH_PERIOD_S = 1.0
+LOSS_TOLD_S = 0.2  # a loss is told after this at the latest, so that a stage that is killed takes few to its grave
 FAREWELL_S = 1.0  # how long a stopping stage waits for the last health of a producer that has just left
 ORPHAN_LIMIT_S = 10.0  # how long an orphaned stage waits for those it reads from to end
 
@@ -175,7 +176,8 @@ class Runner:
         self._inbox.put(_FromBus(key, payload, time.time_ns()))
 
     def _loop(self, until: Callable[[], bool]) -> None:
-        next_tick = next_health = time.monotonic()
+        next_tick = next_health = next_loss = time.monotonic()
+        told = 0
         while not until():
             item = self._inbox.get(max(0.0, next_tick - time.monotonic()))
             if item is not None:
@@ -185,9 +187,9 @@ class Runner:
                 next_tick = now + TICK_S
                 for tray, parts in self._parts.items():
                     self._publish(tray, parts.core.tick(time.time_ns()))
-            if now >= next_health:
-                next_health = now + HEALTH_PERIOD_S
-                self._publish_health(StageStatus.OK)
+                if now >= next_health or (now >= next_loss and self._lost() > told):
+                    next_health, next_loss = now + HEALTH_PERIOD_S, now + LOSS_TOLD_S
+                    told = self._publish_health(StageStatus.OK).lost
 
     def _should_end(self) -> bool:
         if self.stop.is_set() or not self.orphaned.is_set():
@@ -292,18 +294,24 @@ class Runner:
             outlet.put(encode(stamped))
             self._health.note_output(stamped, time.time_ns())
 
-    def _publish_health(self, status: StageStatus) -> Health:
+    def _counters(self) -> Counter[str]:
         counters: Counter[str] = Counter(self._counts)
         for parts in self._parts.values():
             counters.update(parts.core.counters())
         if self._inbox.dropped:
             counters["dropped"] = self._inbox.dropped
+        return counters
+
+    def _lost(self) -> int:
+        return lost(self._inlet.inputs(), self._counters())
+
+    def _publish_health(self, status: StageStatus) -> Health:
         health = self._health.make(
             status=status,
             problems=[parts.core.problem() for parts in self._parts.values()],
             inputs=self._inlet.inputs(),
             outputs=[Output(key=outlet.key, published=outlet.published) for outlet in self._outlets.values()],
-            counters=counters,
+            counters=self._counters(),
             now_ns=time.time_ns(),
         )
         header = Header(self.producer, self._health_outlet.published, "")

@@ -18,18 +18,22 @@ from schemas import fan_pb2
 from schemas.messages import (
     MESSAGE_TYPES,
     Counter,
+    FanState,
     Header,
     Input,
     Message,
     Output,
     Severity,
     StageStatus,
+    WhyNot,
     columns,
 )
 
 _LENGTH_DELIMITED = 2
 _RECORDS = {"inputs": Input, "outputs": Output, "counters": Counter}
 _ENUMS = {"severity": Severity, "status": StageStatus}
+_ENUM_COLUMNS = {"why_not": max(WhyNot), "state": max(FanState)}
+_OF_SOME_DEVICES = {"device_clock_us", "device_sequence"}  # the only columns of samples that may be empty
 _COLUMNS = {t: columns(t) for t in MESSAGE_TYPES}
 _SCALARS = {
     t: tuple(f.name for f in fields(t) if "shape" not in f.metadata and f.name != "header") for t in MESSAGE_TYPES
@@ -90,9 +94,9 @@ def encode(message: Message) -> bytes:
     samples = _sample_count(message)
     for name, (shape, dtype) in _COLUMNS[kind].items():
         column = np.asarray(getattr(message, name), dtype=dtype.newbyteorder("<"))
+        _check_shape(message, name, column, shape, samples)
         if column.size == 0:
             continue
-        _check_shape(message, name, column, shape, samples)
         data = column.tobytes()
         parts += (_KEYS[kind][name], _varint(len(data)), data)
     return b"".join(parts)
@@ -122,7 +126,7 @@ def decode(message_type: type[Message], data: bytes) -> Message:
         values[name] = value
     fans = values.get("fans", 0)
     for name, (shape, dtype) in _COLUMNS[message_type].items():
-        column = np.asarray(getattr(proto, name), dtype=dtype)
+        column = _column(getattr(proto, name), name, dtype, message_type)
         if shape == "samples x fans":
             if fans == 0 or column.size % fans:
                 if column.size:
@@ -135,10 +139,17 @@ def decode(message_type: type[Message], data: bytes) -> Message:
     message = message_type(**values)
     samples = _sample_count(message)
     for name, (shape, _) in _COLUMNS[message_type].items():
-        column = values[name]
-        if column.size:
-            _check_shape(message, name, column, shape, samples)
+        _check_shape(message, name, values[name], shape, samples)
     return message
+
+
+def _column(field: Any, name: str, dtype: np.dtype[Any], message_type: type[Message]) -> np.ndarray[Any, Any]:
+    if name not in _ENUM_COLUMNS:
+        return np.asarray(field, dtype=dtype)
+    values = np.asarray(field, dtype=np.int64)
+    if values.size and not (values.min() >= 0 and values.max() <= _ENUM_COLUMNS[name]):
+        raise CodecError(f"{type_name(message_type)}.{name} holds values that are not known here: a newer producer?")
+    return values.astype(dtype)
 
 
 def _enum(name: str, value: int, message_type: type[Message]) -> Any:
@@ -157,6 +168,8 @@ def _sample_count(message: Message) -> int:
 
 
 def _check_shape(message: Message, name: str, column: np.ndarray[Any, Any], shape: str, samples: int) -> None:
+    if column.size == 0 and (shape == "fans" or samples == 0 or name in _OF_SOME_DEVICES):
+        return
     fans = getattr(message, "fans", column.size)
     expected = {"samples": (samples,), "samples x fans": (samples, fans), "fans": (fans,)}[shape]
     if column.shape != expected:

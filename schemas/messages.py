@@ -84,7 +84,7 @@ def _fans(dtype: type) -> Any:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Raw:
-    """Samples as the device sent them. Both clocks: `device_clock_us` and `device_sequence` are empty where the device has none."""
+    """Samples as the device sent them; `device_clock_us` and `device_sequence` are empty where it has none."""
 
     header: Header = Header()
     fans: int

@@ -17,7 +17,7 @@ RESERVED_TRAY_NAMES = (HEALTH_CHUNK, ALIVE_CHUNK)
 
 @dataclass(frozen=True)
 class Topic:
-    """One row: name, message, usual rate, whether recorders keep it, and how many messages a producer keeps for late joiners."""
+    """One row. `history` is how many messages a producer keeps for those who missed them."""
 
     name: str
     message: type[Message]

@@ -252,11 +252,23 @@ def build(context: Context) -> Parts:
     Raises:
         StageError: the tray names no twin, or one that cannot be used.
     """
+    return Parts(TwinIntegratorCore(_twin(context), context.config, context.started_t_ns))
+
+
+def check(context: Context) -> list[str]:
+    """What keeps the twin from being loaded."""
+    try:
+        _twin(context)
+    except StageError as error:
+        return [str(error)]
+    return []
+
+
+def _twin(context: Context) -> TwinFile:
     tray = context.tray
     if tray.twin is None:
         raise StageError(f'tray {tray.name} has no twin: set [[tray]] twin = "FILE.onnx"')
-    twin = TwinFile.load(context.resolve(tray.twin), tray.fans)
-    return Parts(TwinIntegratorCore(twin, context.config, context.started_t_ns))
+    return TwinFile.load(context.resolve(tray.twin), tray.fans)
 
 
 STAGE = Stage(
@@ -266,4 +278,5 @@ STAGE = Stage(
     writes=("prediction", "twin"),
     config=TwinIntegratorConfig,
     build=build,
+    check=check,
 )

@@ -29,7 +29,12 @@ DEADLINE_S = 60.0  # far beyond what anything takes, so that a slow machine fail
 def fantwin(*words: object, timeout_s: float = DEADLINE_S) -> subprocess.CompletedProcess[str]:
     """Run a command to its end."""
     return subprocess.run(
-        [*FANTWIN, *map(str, words)], capture_output=True, text=True, timeout=timeout_s, check=False, stdin=subprocess.DEVNULL
+        [*FANTWIN, *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+        stdin=subprocess.DEVNULL,
     )
 
 
@@ -163,9 +168,7 @@ class Chain:
 def view_of(watcher: Watcher, label: str) -> StageView | None:
     """What a watcher knows of a stage."""
     stage, _, tray = label.partition("/")
-    return next(
-        (v for v in watcher.stages() if v.health.stage == stage and v.health.instance == (tray or "all")), None
-    )
+    return next((v for v in watcher.stages() if v.health.stage == stage and v.health.instance == (tray or "all")), None)
 
 
 def published(view: StageView | None) -> int:

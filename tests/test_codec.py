@@ -13,11 +13,11 @@ from mcap.records import Schema
 from mcap.well_known import MessageEncoding
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
-from message_strategies import any_message, same
 
 from schemas import fan_pb2, messages
 from schemas.codec import CodecError, decode, encode, proto_type, type_name
-from schemas.messages import MESSAGE_TYPES, Command, Counter, Grid, Header, Input, Message, Output, Raw, columns
+from schemas.messages import MESSAGE_TYPES, Command, Counter, Grid, Header, Input, Message, Output, Raw, Score, columns
+from tests.message_strategies import any_message, same
 
 MESSAGES = st.sampled_from(MESSAGE_TYPES).flatmap(any_message)
 
@@ -134,3 +134,15 @@ def test_decoded_columns_cannot_be_changed_by_mistake():
     assert isinstance(back, Command)
     with pytest.raises(ValueError, match="read-only"):
         back.command[0] = 2.0
+
+
+def test_a_value_that_no_enum_knows_is_refused_and_not_wrapped():
+    state_300 = bytes((14 << 3 | 2, 2, 0xAC, 0x02))  # field 14, two bytes: the varint 300
+    with pytest.raises(CodecError, match="Score.state holds values that are not known here"):
+        decode(Score, state_300)
+
+
+def test_a_message_that_lacks_a_column_of_its_samples_is_refused():
+    proto = fan_pb2.Grid(fans=1, t_ns=[1])
+    with pytest.raises(CodecError, match=r"Grid.command has shape \(0, 1\), not samples x fans = \(1, 1\)"):
+        decode(Grid, proto.SerializeToString())

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fantwin_command import fantwin, said_instead
 
 from pipeline.recording import read_head, read_recording
 from pipeline.runs_of_recording import read_runs
 from schemas.messages import Array, Raw
+from tests.fantwin_command import fantwin, said_instead
 
 
 def measured(folder: Path, rows: int = 1234, start_s: float = 0.0) -> tuple[Path, Array]:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from message_strategies import any_message, same
 
 from pipeline.config import TrayConfig
 from pipeline.recording import RecordingError, read_head, read_recording
@@ -18,6 +17,7 @@ from schemas.codec import encode
 from schemas.messages import Header, Message, Raw
 from schemas.topics import TOPICS, health_key, tray_key
 from stages.recorder import STAGE, Recorder, RecorderConfig
+from tests.message_strategies import any_message, same
 
 SECOND_NS = 1_000_000_000
 

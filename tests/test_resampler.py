@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from schemas.messages import Grid, Raw, WhyNot
+from schemas.messages import Grid, Header, Raw, WhyNot
 from stages.resampler import ResamplerConfig, ResamplerCore
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -364,3 +364,38 @@ def test_samples_of_another_number_of_fans_are_lost_and_said_to_be() -> None:
 def test_limits_in_the_wrong_order_are_refused() -> None:
     with pytest.raises(ValidationError, match="must rise"):
         ResamplerConfig(gap_limit_s=1.0, watermark_s=0.5)
+
+
+def sent(producer: str, first: int, count: int, start_s: float, clock: bool = True, clock_start_us: int = 0) -> Raw:
+    """Samples of one session of acquisition, numbered by the device from `first` on, 10 ms apart."""
+    times_s = start_s + np.arange(count) * 0.01
+    clock_us = (clock_start_us + np.rint(times_s * 1e6).astype(np.int64)) % 2**32
+    return replace(
+        raw(at(*times_s), np.zeros(count)),
+        header=Header(producer, 0, "t"),
+        device_clock_us=clock_us.astype(np.uint32) if clock else np.zeros(0, np.uint32),
+        device_sequence=((first + np.arange(count)) % 2**32).astype(np.uint32),
+    )
+
+
+@pytest.mark.parametrize("clock", [True, False])
+@pytest.mark.parametrize("first", [0, 2**32 - 53])
+def test_what_the_device_sent_while_acquisition_was_dead_is_counted_by_its_sequence(clock: bool, first: int) -> None:
+    _, core = run([sent("a", first, 50, 0.0, clock), sent("b", first + 97, 50, 0.97, clock)])
+    assert core.counters()["lost_between_sessions"] == 47
+
+
+@pytest.mark.parametrize(
+    ("name", "messages"),
+    [
+        ("goes on without a gap", [sent("a", 0, 50, 0.0), sent("b", 50, 50, 0.5)]),
+        ("brings some again", [sent("a", 0, 50, 0.0), sent("b", 40, 60, 0.4)]),
+        ("is the same session, which counts for itself", [sent("a", 0, 50, 0.0), sent("a", 60, 50, 0.6)]),
+        ("device began anew", [sent("a", 0, 50, 5.0), sent("b", 60, 50, 6.0, clock_start_us=-6_000_000)]),
+        ("device began anew, without a clock", [sent("a", 900, 50, 0.0, False), sent("b", 0, 50, 0.6, False)]),
+        ("first there is", [sent("b", 4000, 50, 0.0)]),
+    ],
+)
+def test_no_loss_is_counted_when_a_new_session(name: str, messages: list[Raw]) -> None:
+    _, core = run(messages)
+    assert core.counters().get("lost_between_sessions", 0) == 0, name

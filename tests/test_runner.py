@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,10 @@ class Passer(Core):
         return ""
 
     def grid(self, t_ns: Any) -> Grid:
-        return Grid(fans=self.fans, step_ns=1, t_ns=np.asarray(t_ns))
+        t_ns = np.asarray(t_ns)
+        column = np.zeros((len(t_ns), self.fans))
+        states = {"valid": column == 0, "why_not": column.astype(np.uint8)}
+        return Grid(fans=self.fans, step_ns=1, t_ns=t_ns, command=column, speed_rad_s=column, **states)
 
 
 class Burst:
@@ -81,6 +85,10 @@ def config(endpoint, tmp_path) -> Config:
     )
 
 
+def raw(t_ns: int) -> Raw:
+    return Raw(fans=1, host_receive_t_ns=np.array([t_ns]), command=np.zeros((1, 1)), speed_rad_s=np.zeros((1, 1)))
+
+
 class Bench:
     """A stage running in a thread, and a second session on the bus that feeds it and listens."""
 
@@ -105,8 +113,7 @@ class Bench:
 
     def feed(self, tray: str, t_ns: int) -> None:
         outlet = self.outlet[tray]
-        raw = Raw(header=Header("feeder", outlet.published, tray), fans=1, host_receive_t_ns=np.array([t_ns]))
-        outlet.put(encode(raw))
+        outlet.put(encode(replace(raw(t_ns), header=Header("feeder", outlet.published, tray))))
 
     def next(self, kind: type[Message]) -> Any:
         while True:
@@ -172,7 +179,7 @@ def test_bytes_that_are_no_message_are_counted_and_harm_nothing(config):
 
 
 def test_what_a_source_still_delivers_when_told_to_stop_is_handled_before_the_end(config):
-    items = [Raw(fans=1, host_receive_t_ns=np.array([t])) for t in range(50)]
+    items = [raw(t_ns) for t_ns in range(50)]
     stage = toy(lambda _context: Parts(Passer(), Burst(items)), process_per_tray=True, name="acquisition")
     bench = Bench(stage, config, TRAY_A)
     last = bench.end()

@@ -1,0 +1,107 @@
+"""Parameters recovered, in any units, or refused."""
+
+import fan_data
+import numpy as np
+import pytest
+
+from twin.errors import TwinError
+from twin.filtering import filter_between_samples
+from twin.identification import Identification, filtering_operator, identify
+from twin.runs import Run
+
+
+@pytest.fixture(scope="module")
+def published() -> tuple[Run, Identification]:
+    run = fan_data.published_run(seed=11, duration_s=40.0, fans=8)
+    return run, identify([run])
+
+
+def test_the_published_fan_is_recovered_within_its_confidence_intervals(published) -> None:
+    _, found = published
+    low, high = found.interval_95[..., 0], found.interval_95[..., 1]
+    inside = (low <= fan_data.PUBLISHED_PARAMETERS) & (high >= fan_data.PUBLISHED_PARAMETERS)
+    assert inside.mean() >= 0.85
+    np.testing.assert_allclose(found.parameters[:, 0], 0.15, rtol=0.03)
+    np.testing.assert_allclose(found.parameters[:, 2], 0.0025, rtol=0.03)
+    assert found.warnings == ()
+
+
+def test_the_free_run_error_of_the_published_fan_is_its_noise(published) -> None:
+    _, found = published
+    np.testing.assert_allclose(found.rmse_rad_s, fan_data.NOISE_RAD_S, rtol=0.03)
+
+
+def test_standard_errors_predict_the_scatter_over_repeated_recordings() -> None:
+    found = [identify([fan_data.published_run(seed, duration_s=15.0, fans=8)]) for seed in (1, 2)]
+    parameters = np.concatenate([one.parameters for one in found])
+    claimed = np.concatenate([one.standard_errors for one in found]).mean(axis=0)
+    ratio = parameters.std(axis=0, ddof=1) / claimed
+    assert np.all((ratio > 0.5) & (ratio < 2.0)), ratio
+
+
+def test_the_filtering_operator_is_exact_without_noise() -> None:
+    command = fan_data.random_stairs(np.random.default_rng(3), 2000, 1)
+    run = fan_data.simulate(
+        lambda speed, u: fan_data.physics.acceleration(speed, u, fan_data.PUBLISHED_PARAMETERS[None]),
+        command,
+        np.random.default_rng(0),
+        noise_rad_s=0.0,
+    )
+    np.testing.assert_allclose(filtering_operator([run], 0, 2.0), fan_data.PUBLISHED_PARAMETERS, rtol=5e-3)
+
+
+def test_the_filter_of_a_ramp_is_its_closed_form_over_irregular_steps() -> None:
+    t_s = np.cumsum(np.random.default_rng(2).uniform(1e-4, 0.3, 40))
+    t_s -= t_s[0]
+    filtered = filter_between_samples(t_s[:-1, None], t_s[1:, None], np.diff(t_s), 1.7)
+    np.testing.assert_allclose(filtered[:, 0], t_s / 1.7 - (1.0 - np.exp(-1.7 * t_s)) / 1.7**2, atol=1e-12)
+
+
+def test_units_of_command_and_speed_do_not_matter(published) -> None:
+    run, found = published
+    scaled = identify([Run("counts", run.t_s, run.command * 655.35, run.speed_rad_s * 0.1)])
+    factors = 655.35 * np.array([10.0, 10.0, 100.0])
+    np.testing.assert_allclose(scaled.parameters, found.parameters * factors, rtol=1e-3)
+
+
+@pytest.mark.parametrize("stretch", [0.1, 60.0], ids=["23 ms", "14 s"])
+def test_a_fan_ten_times_faster_or_sixty_times_slower_is_recovered(published, stretch: float) -> None:
+    run, _ = published
+    found = identify([Run("stretched", run.t_s * stretch, run.command, run.speed_rad_s)])
+    np.testing.assert_allclose(found.parameters[:, 0], 0.15 * stretch, rtol=0.02)
+
+
+def test_missing_and_jittered_samples_do_not_bias(published) -> None:
+    run, _ = published
+    rng = np.random.default_rng(8)
+    keep = np.sort(rng.choice(run.samples, run.samples * 4 // 5, replace=False))
+    speed = run.speed_rad_s.copy()
+    speed[rng.random(speed.shape) < 0.2] = np.nan
+    found = identify([Run("lossy", run.t_s[keep], run.command[keep], speed[keep])])
+    np.testing.assert_allclose(found.parameters[:, 2], 0.0025, rtol=0.03)
+    np.testing.assert_allclose(found.parameters[:, 0], 0.15, rtol=0.08)
+
+
+def test_a_command_that_never_changes_is_refused() -> None:
+    rng = np.random.default_rng(1)
+    run = Run("constant", np.arange(500) / 100.0, np.full(500, 50.0), 140.0 + rng.normal(size=500))
+    with pytest.raises(TwinError, match="fan 0: the command never changes; record steps"):
+        identify([run])
+
+
+def test_swapped_columns_of_a_dead_sensor_are_refused() -> None:
+    command = fan_data.random_stairs(np.random.default_rng(3), 500, 1)
+    t_s = np.arange(500) / 100.0
+    with pytest.raises(TwinError, match="speed never changes"):
+        identify([Run("stuck", t_s, command, np.full_like(command, 3.0))])
+    with pytest.raises(TwinError, match="fewer than ten measured speeds"):
+        identify([Run("dead", t_s, command, np.full_like(command, np.nan))])
+
+
+def test_two_nearby_levels_are_warned_about() -> None:
+    rng = np.random.default_rng(4)
+    parameters = fan_data.PUBLISHED_PARAMETERS[None]
+    command = np.where(rng.random(10) < 0.5, 50.0, 51.0).repeat(100)[:, None]
+    run = fan_data.simulate(lambda speed, u: fan_data.physics.acceleration(speed, u, parameters), command, rng)
+    found = identify([run.between(2.0, 10.0)])
+    assert any("poorly determined" in line or "negative" in line for line in found.warnings)

@@ -1,0 +1,141 @@
+"""`fantwin up`: all stages from one file, stopped in the order of the data, or not started at all."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from chain import DEMO, SITE, TRAY, Chain, eventually, fantwin, is_running, published, view_of
+from mcap.reader import make_reader
+
+from pipeline.config import load_config
+from pipeline.launcher import Launcher, Outcome
+from pipeline.processes import process_list
+from pipeline.recording import read_recording
+from schemas.messages import Grid, Prediction, Raw, Score
+from schemas.topics import tray_key
+
+
+@pytest.fixture
+def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
+    chain = Chain(tmp_path, endpoint, viewer=False)
+    try:
+        yield chain
+    finally:
+        chain.close()
+
+
+def samples(path: Path) -> Counter[str]:
+    """Samples of each topic, repeats not counted."""
+    times: dict[str, set[int]] = {}
+    for entry in read_recording(path):
+        message = entry.message
+        if isinstance(message, Raw):
+            times.setdefault("raw", set()).update(message.device_sequence.tolist())
+        elif isinstance(message, Grid | Prediction | Score):
+            times.setdefault(entry.topic, set()).update(message.t_ns.tolist())
+    return Counter({topic: len(found) for topic, found in times.items()})
+
+
+@pytest.mark.slow
+def test_ctrl_c_stops_in_order_and_everything_sent_is_recorded_and_scored(chain):
+    chain.start_tray()
+    up = chain.start_up()
+    with chain.watcher() as watcher:
+        eventually(lambda: published(view_of(watcher, "scorer")) > 200, "scores flow")
+    status = up.end(signal.SIGINT)  # while the tray is sending
+    assert chain.tray and chain.tray.end() == 0
+    account, sent = up.output(), chain.tray.output()
+    assert status == 0, up.lines
+    assert account == {
+        "run_folder": str(chain.folder),
+        "restarts": {},
+        "killed": [],
+        "lost": dict.fromkeys(sorted(chain.stages), 0),
+    }
+    assert not any(map(is_running, chain.process_ids().values()))
+    (recording,) = chain.recordings()
+    found = samples(recording)
+    assert found["raw"] == sent["samples_sent"]
+    assert found["grid"] == found["prediction"] == found["score"] > 200
+    with recording.open("rb") as file:
+        summary = make_reader(file).get_summary()  # a plain reader, which wants a whole file
+    assert summary is not None
+    topics = {channel.topic for channel in summary.channels.values()}
+    assert {tray_key(SITE, TRAY, name) for name in ("raw", "grid", "prediction", "score", "twin")} <= topics
+
+
+@pytest.mark.slow
+def test_a_stage_that_cannot_start_ends_all_with_one_line(tmp_path, endpoint):
+    chain = Chain(tmp_path, endpoint, "tray.0.twin='none.onnx'", viewer=False)
+    try:
+        up = chain.start_up()
+        assert up.process.wait(60) == 1
+        up.kill()
+        errors = [line for line in up.lines if line.startswith("fantwin:")]
+        assert errors == [
+            f"fantwin: {DEMO}/none.onnx: cannot read the twin: No such file or directory; correct [[tray]] twin"
+        ]
+        assert "Traceback" not in "\n".join(up.lines)
+        started = chain.process_ids()
+        assert "twin_integrator" in started
+        assert not any(map(is_running, started.values()))
+    finally:
+        chain.close()
+
+
+def test_a_wrong_configuration_is_one_line_before_anything_starts(tmp_path, endpoint):
+    done = fantwin(*Chain(tmp_path, endpoint, "scorer.on_dealy_s=1").words("up"))
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "did you mean 'on_delay_s'" in done.stderr
+
+
+def test_the_process_list_has_one_acquisition_for_each_tray_in_the_order_of_the_data(tmp_path):
+    file = tmp_path / "two.toml"
+    trays = "".join(f'[[tray]]\nname = "{name}"\nfans = 2\n' for name in ("a", "b"))
+    file.write_text('[launcher]\nstages = ["scorer", "acquisition", "resampler"]\n' + trays)
+    assert [row.label for row in process_list(load_config(file))] == [
+        "acquisition/a",
+        "acquisition/b",
+        "resampler",
+        "scorer",
+    ]
+
+
+@pytest.mark.slow
+def test_told_to_stop_before_all_is_ready_it_starts_no_source(chain):
+    """The sources come last: what they would bring could go nowhere."""
+    stop = threading.Event()
+    said: list[str] = []
+
+    def say(line: str) -> None:
+        said.append(line)
+        if line.startswith("resampler: started"):
+            stop.set()
+
+    outcome = Launcher(load_config(DEMO / "demo.toml", chain.settings), chain.settings, say).run(stop)
+    assert outcome.killed == []
+    assert [line.split(":")[0] for line in said if ": started" in line] == [
+        "recorder",
+        "scorer",
+        "twin_integrator",
+        "resampler",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "code"),
+    [
+        (Outcome(), 0),
+        (Outcome(restarts={"scorer": 1}, lost={"scorer": 0}), 0),
+        (Outcome(lost={"scorer": 0, "resampler": 4}), 3),
+        (Outcome(killed=["viewer"], lost={"resampler": 4}), 1),
+    ],
+)
+def test_the_exit_code_says_whether_anything_was_lost(outcome, code):
+    assert outcome.exit_code == code

@@ -1,0 +1,51 @@
+"""What a run accepts, and how it is cut."""
+
+import numpy as np
+import pytest
+
+from twin.errors import TwinError
+from twin.runs import Run, run_from_samples, starting_speed_rad_s
+
+
+def ramp(times: list[float]) -> Run:
+    t_s = np.array(times)
+    return Run("ramp", t_s, np.ones_like(t_s), t_s)
+
+
+def test_repeated_times_become_one_sample_with_the_mean_speed_and_the_last_command() -> None:
+    run = run_from_samples("esc", [0.0, 0.1, 0.1, 0.2], [1.0, 2.0, 3.0, 4.0], [10.0, 20.0, 22.0, np.nan])
+    np.testing.assert_array_equal(run.t_s, [0.0, 0.1, 0.2])
+    np.testing.assert_array_equal(run.command[:, 0], [1.0, 3.0, 4.0])
+    np.testing.assert_array_equal(run.speed_rad_s[:, 0], [10.0, 21.0, np.nan])
+
+
+def test_a_run_splits_at_a_long_gap_and_leaves_out_a_lone_sample() -> None:
+    pieces = ramp([0.0, 0.1, 0.2, 0.3, 5.0, 9.0, 9.1]).split_at_gaps(1.0)
+    assert [piece.t_s.tolist() for piece in pieces] == [[0.0, 0.1, 0.2, 0.3], [9.0, 9.1]]
+
+
+def test_a_slice_of_time_and_of_a_fan_keeps_the_rest() -> None:
+    run = Run("two", np.arange(4.0), np.arange(8.0).reshape(4, 2), np.zeros((4, 2)))
+    part = run.between(1.0, 3.0).fan(1)
+    np.testing.assert_array_equal(part.command, [[3.0], [5.0]])
+
+
+@pytest.mark.parametrize(
+    ("t_s", "command", "speed", "words"),
+    [
+        ([0.0, 1.0, 0.5], [1, 1, 1], [1, 1, 1], "time does not increase at sample 2"),
+        ([0.0, 1.0], [1, np.nan], [1, 1], "is not a number"),
+        ([0.0, 1.0], [1, 1], [1, np.inf], "infinite"),
+        ([0.0, 1.0], [1, 1, 1], [1, 1], "disagree"),
+        ([0.0], [1], [1], "give 2 samples or more"),
+    ],
+)
+def test_a_bad_run_is_refused_in_one_line(t_s: list, command: list, speed: list, words: str) -> None:
+    with pytest.raises(TwinError, match=words) as refusal:
+        Run("bad", np.array(t_s), np.array(command), np.array(speed))
+    assert "\n" not in str(refusal.value)
+
+
+def test_the_starting_speed_skips_missing_samples() -> None:
+    speed = np.array([[np.nan, np.nan], [2.0, np.nan], [4.0, np.nan]])
+    np.testing.assert_array_equal(starting_speed_rad_s(speed), [3.0, np.nan])

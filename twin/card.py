@@ -1,0 +1,120 @@
+"""The model card: what a twin is and how good it is, as JSON inside its ONNX file (metadata `fantwin.card`)."""
+
+import json
+from dataclasses import asdict
+from typing import Any, Literal
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+
+from twin.errors import TwinError
+from twin.models import Kind
+from twin.state import StateLayout
+
+FORMAT_VERSION = 1
+CARD_KEY = "fantwin.card"
+
+STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+@dataclass(frozen=True, config=STRICT)
+class NetworkCard:
+    """The network, empty for the physical model. parameter_count: the trained weights, physics not counted."""
+
+    units: int
+    inputs: tuple[str, ...]
+    parameter_count: int
+
+
+@dataclass(frozen=True, config=STRICT)
+class DataCard:
+    """One file of training data."""
+
+    name: str
+    sha256: str
+    fans: int
+    samples: int
+
+
+@dataclass(frozen=True, config=STRICT)
+class TrainingCard:
+    """How the twin was made. duration_s: how long training took."""
+
+    trainer: str
+    seed: int
+    iterations: int
+    duration_s: float
+    data: tuple[DataCard, ...]
+
+
+@dataclass(frozen=True, config=STRICT)
+class ValidationCard:
+    """Free-run figures pooled over fans, in rad/s. None where a figure is undefined.
+
+    source says whether the runs were held out or are the training runs themselves.
+    """
+
+    source: Literal["held-out", "training"]
+    samples: int
+    rmse: float | None
+    max_error: float | None
+    r2: float | None
+    one_step_rmse: float | None
+    coverage_2_sigma: float | None
+
+
+@dataclass(frozen=True, config=STRICT)
+class Card:
+    """Everything a reader of the file needs to know. Lists per fan come in the order of the fans.
+
+    parameters, parameter_std_errors: per fan, in the order of parameter_names. sigma_rad_s: per fan, the healthy root
+    mean square free-run error. The ranges are those seen in training: outside them the twin is a guess.
+    """
+
+    kind: Kind
+    name: str
+    created: str
+    fans: int
+    n_state: int
+    state_layout: StateLayout
+    parameter_names: tuple[str, ...]
+    parameters: tuple[tuple[float, ...], ...]
+    parameter_std_errors: tuple[tuple[float, ...], ...]
+    sigma_rad_s: tuple[float, ...]
+    speed_range_rad_s: tuple[float, float]
+    command_range: tuple[float, float]
+    rate_hz: float
+    network: NetworkCard
+    training: TrainingCard
+    validation: ValidationCard
+    versions: dict[str, str]
+    command_unit: str
+    speed_unit: Literal["rad/s"] = "rad/s"
+    format_version: int = FORMAT_VERSION
+
+    def to_json(self) -> str:
+        """One line of JSON."""
+        return json.dumps(asdict(self), allow_nan=False)
+
+    @staticmethod
+    def from_json(text: str) -> "Card":
+        """Read a card. Raises TwinError, in one line, when it is not one or is of an unknown format."""
+        try:
+            fields: Any = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise TwinError(f"the model card is not JSON ({error}); export the twin again") from error
+        version = fields.get("format_version") if isinstance(fields, dict) else None
+        if version != FORMAT_VERSION:
+            raise TwinError(
+                f"the model card has format_version {version!r}, this program reads {FORMAT_VERSION}; "
+                "export the twin again, or use the program that made it"
+            )
+        try:
+            return _CARD.validate_python(fields)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise TwinError(f"the model card's {where} is wrong: {first['msg']}; export the twin again") from error
+
+
+_CARD = TypeAdapter(Card)

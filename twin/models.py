@@ -1,0 +1,34 @@
+"""What the four models have in common, and their table."""
+
+from typing import Literal, Protocol, get_args
+
+from twin.hybrid import Hybrid
+from twin.narx import Narx
+from twin.neural_ode import NeuralOde
+from twin.physical import PhysicalModel
+from twin.runs import Array
+from twin.state import StateLayout
+
+Kind = Literal["physical", "narx", "neural-ode", "hybrid"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+Model = PhysicalModel | Narx | NeuralOde | Hybrid
+NetworkOde = NeuralOde | Hybrid
+
+
+class TwinModel(Protocol):
+    """State and commands in, speeds and state out."""
+
+    @property
+    def state_layout(self) -> StateLayout:
+        """What the state holds."""
+        ...
+
+    def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
+        """Free run over a block of samples.
+
+        state: (fans, n_state). command: (n, fans), held. step_s: (n,) time from sample k to k + 1. parameters:
+        (fans, 3). Returns speed_rad_s (n, fans), at each sample before its command acts, and the state after the last
+        step. Two blocks with the state carried over give what one block gives.
+        """
+        ...

@@ -1,0 +1,111 @@
+"""One hidden layer of tanh units: W_o tanh(W_i x + b_i) + b_o (equation (28) of Peng and Chen).
+
+Its inputs are the speed, or the speed and the command. It works on scaled quantities, so that its weights are of
+order one whatever the units; the scaling belongs to it. theta holds all weights in one vector:
+W_i by input (inputs * units), b_i (units), W_o (units), b_o (1). Ten units count 41 parameters with both inputs and
+31 with the speed alone; with the three physical ones, 44 and 34.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from twin.errors import TwinError
+from twin.runs import Array
+
+INPUT_CHOICES = (("speed", "command"), ("speed",))
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Offsets and scales that bring speed, command and acceleration to order one."""
+
+    speed_offset_rad_s: float
+    speed_scale_rad_s: float
+    command_offset: float
+    command_scale: float
+    acceleration_scale_rad_s2: float
+
+
+@dataclass(frozen=True, eq=False)
+class TanhNetwork:
+    """An acceleration in rad/s^2 from speed and command. theta: (parameter_count,), in scaled units.
+
+    Raises TwinError when theta's length or the inputs are not those of the layer.
+    """
+
+    units: int
+    inputs: tuple[str, ...]
+    scaling: Scaling
+    theta: Array
+
+    def __post_init__(self) -> None:
+        if self.inputs not in INPUT_CHOICES:
+            raise TwinError(f"network inputs {self.inputs} are unknown; use one of {INPUT_CHOICES}")
+        if self.theta.shape != (self.parameter_count,):
+            raise TwinError(f"theta has shape {self.theta.shape}; {self.units} units need ({self.parameter_count},)")
+
+    @classmethod
+    def zero(cls, units: int, inputs: tuple[str, ...], scaling: Scaling) -> "TanhNetwork":
+        """A network with all weights zero."""
+        return cls(units, inputs, scaling, np.zeros(units * (len(inputs) + 2) + 1))
+
+    @property
+    def parameter_count(self) -> int:
+        """The length of theta."""
+        return self.units * (len(self.inputs) + 2) + 1
+
+    def with_theta(self, theta: Array) -> "TanhNetwork":
+        """The same network with other weights."""
+        return replace(self, theta=theta)
+
+    def weights(self) -> tuple[Array, Array, Array, float]:
+        """W_i (inputs, units), b_i (units,), W_o (units,) and b_o, in scaled units."""
+        rows = self.theta[:-1].reshape(len(self.inputs) + 2, self.units)
+        return rows[:-2], rows[-2], rows[-1], float(self.theta[-1])
+
+    def physical_weights(self) -> tuple[Array, Array, Array, float]:
+        """The same weights for inputs in rad/s and command units and an output in rad/s^2: W_i, b_i, W_o, b_o."""
+        input_weights, input_bias, output_weights, output_bias = self.weights()
+        offsets = np.array([self.scaling.speed_offset_rad_s, self.scaling.command_offset])[: len(self.inputs)]
+        scales = np.array([self.scaling.speed_scale_rad_s, self.scaling.command_scale])[: len(self.inputs)]
+        per_unit = input_weights / scales[:, np.newaxis]
+        rate = self.scaling.acceleration_scale_rad_s2
+        return per_unit, input_bias - offsets @ per_unit, rate * output_weights, rate * output_bias
+
+    def hidden(self, speed_rad_s: Array, command: Array) -> Array:
+        """(..., batch, units) outputs of the hidden layer."""
+        input_weights, input_bias, _, _ = self.weights()
+        scaled = self._scaled_inputs(speed_rad_s, command)
+        pre = scaled[0][..., np.newaxis] * input_weights[0] + input_bias
+        if len(scaled) == 2:
+            pre += scaled[1][..., np.newaxis] * input_weights[1]
+        return np.tanh(pre)
+
+    def acceleration(self, speed_rad_s: Array, command: Array) -> Array:
+        """(..., batch) in rad/s^2."""
+        _, _, output_weights, output_bias = self.weights()
+        scaled = self.hidden(speed_rad_s, command) @ output_weights + output_bias
+        return self.scaling.acceleration_scale_rad_s2 * scaled
+
+    def linearise(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array]:
+        """The acceleration (..., batch), its derivative by speed (..., batch) and by theta (..., batch, P)."""
+        input_weights, _, output_weights, output_bias = self.weights()
+        rate = self.scaling.acceleration_scale_rad_s2
+        hidden = self.hidden(speed_rad_s, command)
+        by_bias = rate * output_weights * (1.0 - hidden * hidden)
+        by_theta = np.empty((*speed_rad_s.shape, self.parameter_count))
+        for index, scaled in enumerate(self._scaled_inputs(speed_rad_s, command)):
+            by_theta[..., index * self.units : (index + 1) * self.units] = by_bias * scaled[..., np.newaxis]
+        by_theta[..., -2 * self.units - 1 : -self.units - 1] = by_bias
+        by_theta[..., -self.units - 1 : -1] = rate * hidden
+        by_theta[..., -1] = rate
+        by_speed = by_bias @ (input_weights[0] / self.scaling.speed_scale_rad_s)
+        return rate * (hidden @ output_weights + output_bias), by_speed, by_theta
+
+    def _scaled_inputs(self, speed_rad_s: Array, command: Array) -> tuple[Array, ...]:
+        scale = self.scaling
+        speed = (speed_rad_s - scale.speed_offset_rad_s) / scale.speed_scale_rad_s
+        if len(self.inputs) == 1:
+            return (speed,)
+        return speed, (command - scale.command_offset) / scale.command_scale

@@ -1,0 +1,154 @@
+"""Measured runs: command in, speed out, for one or many fans on one clock.
+
+Units: time in seconds, speed in rad/s, command in whatever unit the caller uses (duty, volts, percent, counts).
+A speed of NaN is a missing sample; a command is never missing, because the twin is driven by it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twin.errors import TwinError
+
+Array = NDArray[np.float64]
+
+GAP_IN_MEDIAN_STEPS = 5.0
+STARTING_SAMPLES = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One uninterrupted recording.
+
+    t_s: (n,) strictly increasing, irregular steps allowed. command: (n, fans), held from its sample to the next.
+    speed_rad_s: (n, fans), NaN where missing. One-dimensional command and speed mean a single fan.
+    Raises TwinError when the shapes disagree, time does not increase, or a time or command is not finite.
+    """
+
+    name: str
+    t_s: Array
+    command: Array
+    speed_rad_s: Array
+
+    def __post_init__(self) -> None:
+        t_s = np.array(self.t_s, dtype=np.float64)
+        command = _columns(self.command)
+        speed_rad_s = _columns(self.speed_rad_s)
+        if t_s.ndim != 1 or command.ndim != 2 or command.shape != speed_rad_s.shape or len(t_s) != len(command):
+            raise TwinError(
+                f"run {self.name!r}: time {t_s.shape}, command {command.shape} and speed {speed_rad_s.shape} disagree; "
+                "give (n,), (n, fans) and (n, fans)"
+            )
+        if len(t_s) < 2 or command.shape[1] == 0:
+            raise TwinError(f"run {self.name!r}: {len(t_s)} samples of {command.shape[1]} fans; give 2 samples or more")
+        if not np.all(np.isfinite(t_s)) or not np.all(np.isfinite(command)):
+            raise TwinError(f"run {self.name!r}: a time or command is not a number; only speeds may be missing (NaN)")
+        if not np.all(np.diff(t_s) > 0.0):
+            sample = int(np.argmin(np.diff(t_s) > 0.0)) + 1
+            raise TwinError(
+                f"run {self.name!r}: time does not increase at sample {sample}; merge repeated times "
+                "with run_from_samples, or split the recording where its clock jumps back"
+            )
+        if np.any(np.isinf(speed_rad_s)):
+            raise TwinError(f"run {self.name!r}: a speed is infinite; mark missing speeds with NaN")
+        for field, value in (("t_s", t_s), ("command", command), ("speed_rad_s", speed_rad_s)):
+            value.setflags(write=False)
+            object.__setattr__(self, field, value)
+
+    @property
+    def samples(self) -> int:
+        """The number of samples."""
+        return len(self.t_s)
+
+    @property
+    def fans(self) -> int:
+        """The number of fans."""
+        return self.command.shape[1]
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first sample to the last."""
+        return float(self.t_s[-1] - self.t_s[0])
+
+    @property
+    def median_step_s(self) -> float:
+        """The typical time between samples."""
+        return float(np.median(np.diff(self.t_s)))
+
+    @property
+    def step_s(self) -> Array:
+        """(n,) time from each sample to the next; the last one, whose next is unknown, repeats the one before."""
+        steps = np.diff(self.t_s)
+        return np.append(steps, steps[-1])
+
+    def fan(self, index: int) -> "Run":
+        """The run of one fan alone."""
+        if not 0 <= index < self.fans:
+            raise TwinError(f"run {self.name!r}: no fan {index} among {self.fans}; count from 0")
+        column = slice(index, index + 1)
+        return replace(self, command=self.command[:, column], speed_rad_s=self.speed_rad_s[:, column])
+
+    def between(self, start_s: float, stop_s: float) -> "Run":
+        """The samples with start_s <= t_s < stop_s."""
+        first, last = np.searchsorted(self.t_s, (start_s, stop_s))
+        return self.rows(int(first), int(last))
+
+    def rows(self, first: int, last: int) -> "Run":
+        """The samples first <= k < last."""
+        part = slice(first, last)
+        return Run(self.name, self.t_s[part], self.command[part], self.speed_rad_s[part])
+
+    def split_at_gaps(self, max_gap_s: float | None = None) -> list["Run"]:
+        """The stretches between steps longer than max_gap_s (default: five median steps).
+
+        A held command says nothing about a long gap. Stretches of a single sample hold no step and are left out.
+        """
+        limit_s = GAP_IN_MEDIAN_STEPS * self.median_step_s if max_gap_s is None else max_gap_s
+        cuts = [0, *(np.flatnonzero(np.diff(self.t_s) > limit_s) + 1).tolist(), self.samples]
+        spans = [(first, last) for first, last in pairwise(cuts) if last - first >= 2]
+        return [self.rows(first, last) for first, last in spans]
+
+
+def run_from_samples(name: str, t_s: ArrayLike, command: ArrayLike, speed_rad_s: ArrayLike) -> Run:
+    """A Run from samples whose time may repeat: samples of one time become one, mean speed and last command.
+
+    Shapes as in Run. Raises TwinError when time goes back.
+    """
+    times, commands, speeds = np.asarray(t_s, dtype=np.float64), _columns(command), _columns(speed_rad_s)
+    if times.ndim != 1 or commands.shape != speeds.shape or len(times) != len(commands) or np.all(np.diff(times) > 0):
+        return Run(name, times, commands, speeds)
+    first = np.flatnonzero(np.diff(times, prepend=-np.inf) != 0.0)
+    last = np.append(first[1:], len(times)) - 1
+    measured = np.isfinite(speeds)
+    count = np.add.reduceat(measured, first, axis=0, dtype=np.float64)
+    total = np.add.reduceat(np.where(measured, speeds, 0.0), first, axis=0)
+    mean = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
+    return Run(name, times[first], commands[last], mean)
+
+
+def common_fans(runs: Sequence[Run]) -> int:
+    """The number of fans that all runs share. Raises TwinError when there are no runs or they differ."""
+    if not runs:
+        raise TwinError("no runs given; give at least one")
+    fans = {run.fans for run in runs}
+    if len(fans) > 1:
+        raise TwinError(f"runs of {sorted(fans)} fans are mixed; give runs of one fan count")
+    return fans.pop()
+
+
+def starting_speed_rad_s(speed_rad_s: Array) -> Array:
+    """(fans,) mean of the first five measured speeds of (n, fans); NaN for a fan never measured."""
+    start = np.full(speed_rad_s.shape[1], np.nan)
+    for fan, column in enumerate(speed_rad_s.T):
+        measured = column[np.isfinite(column)][:STARTING_SAMPLES]
+        if measured.size:
+            start[fan] = measured.mean()
+    return start
+
+
+def _columns(values: ArrayLike) -> Array:
+    array = np.array(values, dtype=np.float64)
+    return array[:, np.newaxis] if array.ndim == 1 else array

@@ -1,0 +1,78 @@
+"""Runs cut into many short free runs that are integrated side by side.
+
+Time is the only axis that has to be walked in order, so fitting cuts runs into stretches of a few time constants and
+treats stretches and fans alike as one batch. Each stretch has its own initial speed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.errors import TwinError
+from twin.runs import Array, Run, starting_speed_rad_s
+
+MIN_SAMPLES = 200
+MAX_SAMPLES = 12_000
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """A batch of stretches, padded at the end to one length.
+
+    fan: (batch,) which fan each stretch belongs to. command, speed_rad_s, step_s: (n, batch). Padding has a step of
+    zero, which leaves the state where it is, and a speed of NaN, which counts as missing.
+    """
+
+    fan: NDArray[np.intp]
+    command: Array
+    speed_rad_s: Array
+    step_s: Array
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(n, batch) which samples hold a measured speed."""
+        return np.isfinite(self.speed_rad_s)
+
+    def starting_speed_rad_s(self) -> Array:
+        """(batch,) mean of the first measured speeds of each stretch."""
+        return starting_speed_rad_s(self.speed_rad_s)
+
+
+def cut_into_trajectories(runs: Sequence[Run], max_samples: int) -> Trajectories:
+    """Every fan of every run, in equal stretches of at most max_samples. Stretches without two speeds are left out.
+
+    The runs must not hold gaps (Run.split_at_gaps). Raises TwinError when nothing is left.
+    """
+    stretches = [part for run in runs for part in _equal_parts(run, max_samples)]
+    length = max((part.samples for part in stretches), default=0)
+    fans = runs[0].fans if runs else 0
+    shape = (length, len(stretches), fans)
+    command, step_s, speed = np.zeros(shape), np.zeros(shape), np.full(shape, np.nan)
+    for index, part in enumerate(stretches):
+        command[: part.samples, index] = part.command
+        speed[: part.samples, index] = part.speed_rad_s
+        step_s[: part.samples - 1, index] = part.step_s[:-1, np.newaxis]
+    usable = np.flatnonzero(np.isfinite(speed).sum(axis=0).ravel() >= 2)
+    if not usable.size:
+        raise TwinError("the runs hold no stretch with two measured speeds; check the speed column")
+    flat = (length, -1)
+    return Trajectories(
+        fan=np.tile(np.arange(fans), len(stretches))[usable],
+        command=command.reshape(flat)[:, usable],
+        speed_rad_s=speed.reshape(flat)[:, usable],
+        step_s=step_s.reshape(flat)[:, usable],
+    )
+
+
+def stretch_samples(time_constant_s: float, step_s: float, time_constants: float) -> int:
+    """How many samples span a number of time constants, within bounds that keep the batch efficient."""
+    return int(np.clip(time_constants * time_constant_s / step_s, MIN_SAMPLES, MAX_SAMPLES))
+
+
+def _equal_parts(run: Run, max_samples: int) -> list[Run]:
+    count = -(-run.samples // max_samples)
+    bounds = np.linspace(0, run.samples, count + 1).astype(int).tolist()
+    return [run.rows(a, b) for a, b in pairwise(bounds) if b - a >= 2]
