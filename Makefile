@@ -37,7 +37,7 @@ schema: $(VENV)/.development
 	$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. schemas/fan.proto
 
 twin: $(VENV)/.development
-	sh demo/train_twin.sh $(BIN)/fantwin
+	sh pipeline/demo/train_twin.sh $(BIN)/fantwin
 
 lock: $(VENV)/.development
 	$(COMPILE) --extra view --output-file requirements.lock

@@ -27,6 +27,13 @@ from schemas.topics import Topic
 
 _RETRY = '{"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}'
 
+KEPT_BYTES = 16 << 20
+"""What an outlet keeps at most, whatever its history: large messages of a large fleet would fill the memory."""
+
+_ROUTER_TIMEOUT_MS = "1000"
+_ROUTER_RETRY_S = 0.2
+_RECOVER = "/recover/"
+
 
 class BusError(UserError):
     """The bus cannot be used: one line that says what, where and what to do."""
@@ -38,7 +45,9 @@ class Outlet:
     def __init__(self, session: zenoh.Session, key: str, topic: Topic, encoding: str, producer: str) -> None:
         self.key = key
         self.published = 0
-        self._kept: deque[tuple[int, bytes]] = deque(maxlen=topic.history)
+        self._history = topic.history
+        self._kept: deque[tuple[int, bytes]] = deque()
+        self._kept_bytes = 0
         self._lock = threading.Lock()
         self._publisher = session.declare_publisher(
             key,
@@ -53,6 +62,10 @@ class Outlet:
         """Publish the message whose sequence number is `published`."""
         with self._lock:
             self._kept.append((self.published, payload))
+            self._kept_bytes += len(payload)
+            while len(self._kept) > self._history or self._kept_bytes > KEPT_BYTES:
+                _, forgotten = self._kept.popleft()
+                self._kept_bytes -= len(forgotten)
         self.published += 1
         self._publisher.put(payload)
 
@@ -68,18 +81,20 @@ class Outlet:
 
 def recovery_key(key: str, producer: str) -> str:
     """Where a producer answers for what it published on `key`."""
-    return f"{key}/recover/{producer}"
+    return f"{key}{_RECOVER}{producer}"
 
 
 class Bus:
     """One session on the bus."""
 
-    def __init__(self, config: BusConfig) -> None:
+    def __init__(self, config: BusConfig, stop: threading.Event | None = None) -> None:
+        """Open a session. Peers need nobody; a client needs its router, and with `stop` waits for it until that is set.
+
+        Raises:
+            BusError: the endpoint cannot be used, or a client's router is not there.
+        """
         self._config = config
-        try:
-            self._session = zenoh.open(_zenoh_config(config))
-        except zenoh.ZError as error:
-            raise BusError(f"bus.endpoint = {config.endpoint!r} cannot be used: {_reason(error)}") from error
+        self._session = _open(config, stop)
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
 
     def __enter__(self) -> Self:
@@ -122,16 +137,22 @@ class Bus:
         handler = zenoh.handlers.Callback(receive, indirect=False)
         self._declared.append(self._session.liveliness().declare_subscriber(key_expression, handler, history=True))
 
+    def alive(self, key_expression: str) -> set[str]:
+        """The keys of the tokens that are there now."""
+        replies = self._session.liveliness().get(key_expression, timeout=self._config.recovery_timeout_s)
+        return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+
     def recover(
         self, key: str, producer: str, first: int, last: int, while_waiting: Callable[[], None]
-    ) -> Iterator[bytes]:
-        """Ask `producer` (or all, `*`) for its messages `first..last` on `key`; yields what it still has.
+    ) -> Iterator[tuple[str, bytes]]:
+        """Ask `producer` (or all, `*`) for its messages `first..last` on `key`; yields what it still has, with the key.
 
         `while_waiting` is called again and again so that the caller can keep its inbox from filling: replies come
         through the same threads that fill it.
         """
         replies = self._session.get(
             f"{recovery_key(key, producer)}?first={first};last={last}",
+            target=zenoh.QueryTarget.ALL,
             timeout=self._config.recovery_timeout_s,
             consolidation=zenoh.ConsolidationMode.NONE,
             congestion_control=zenoh.CongestionControl.BLOCK,
@@ -144,7 +165,7 @@ class Bus:
             if reply is None:
                 while_waiting()
             elif reply.ok is not None:
-                yield reply.ok.payload.to_bytes()
+                yield str(reply.ok.key_expr).partition(_RECOVER)[0], reply.ok.payload.to_bytes()
 
     def close(self) -> None:
         """Leave the bus; what was published before has left this process."""
@@ -179,11 +200,28 @@ def _reason(error: zenoh.ZError) -> str:
     return (said.partition('msg: "')[2] or said).split(" at /")[0].strip()
 
 
+def _open(config: BusConfig, stop: threading.Event | None) -> zenoh.Session:
+    try:
+        conf = _zenoh_config(config)
+        if config.mode == "peer":
+            return zenoh.open(conf)
+    except zenoh.ZError as error:
+        raise BusError(f"bus.endpoint = {config.endpoint!r} cannot be used: {_reason(error)}") from error
+    while True:  # Zenoh would wait for the router by itself, but deaf to Ctrl-C
+        try:
+            return zenoh.open(conf)
+        except zenoh.ZError as error:
+            if stop is None or stop.wait(_ROUTER_RETRY_S):
+                raise BusError(
+                    f"bus.endpoint = {config.endpoint!r}: no router answers: {_reason(error)}; start `fantwin router`"
+                ) from error
+
+
 def _zenoh_config(config: BusConfig) -> zenoh.Config:
     conf = zenoh.Config()
     conf.insert_json5("mode", json.dumps(config.mode))
     conf.insert_json5("connect/endpoints", json.dumps([config.endpoint]))
-    conf.insert_json5("connect/timeout_ms", "-1")
+    conf.insert_json5("connect/timeout_ms", "-1" if config.mode == "peer" else _ROUTER_TIMEOUT_MS)
     conf.insert_json5("connect/exit_on_failure", "false")
     conf.insert_json5("connect/retry", _RETRY)
     conf.insert_json5("scouting/multicast/enabled", "false")

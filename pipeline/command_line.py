@@ -17,6 +17,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "up": ("up", "Watch"),
     "run": ("run", "Watch"),
     "status": ("status", "Watch"),
+    "command": ("command", "Watch"),
     "doctor": ("doctor", "Watch"),
     "router": ("router", "Watch"),
     "import": ("import_table", "Recordings"),

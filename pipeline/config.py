@@ -29,7 +29,7 @@ class ConfigError(UserError):
 
 
 class _Section(BaseModel):
-    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class BusConfig(_Section):
@@ -41,7 +41,7 @@ class BusConfig(_Section):
         default="tcp/127.0.0.1:7447", description="where peers meet, or the router's address for clients"
     )
     recovery_timeout_s: float = Field(
-        default=1.0, gt=0, description="how long to wait for missed messages asked for again"
+        default=5.0, gt=0, description="how long to wait for missed messages asked for again"
     )
 
 
@@ -131,12 +131,14 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> Config:
     """Read and check a configuration file; `overrides` are `key=value` pairs such as `scorer.on_delay_s=1.0`.
 
     Raises:
-        ConfigError: the file is missing, is not TOML, or holds a wrong key or value.
+        ConfigError: the file is missing, is not UTF-8, is not TOML, or holds a wrong key or value.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the configuration: {error.strerror}; give one with -c FILE") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: the configuration is not UTF-8 (byte {error.start}); save it as UTF-8") from error
     return parse_config(text, path, overrides)
 
 
@@ -181,10 +183,12 @@ def _override(table: dict[str, Any], override: str) -> None:
         raise ConfigError(f"--set {override}: write KEY=VALUE, for example --set scorer.on_delay_s=1.0")
     try:
         value = tomllib.loads(f"value = {value_text}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = value_text  # a bare word is a string
+    except tomllib.TOMLDecodeError as error:
+        value = value_text.strip()  # a bare word is a string
+        if value.startswith(("'", '"')):
+            raise ConfigError(f"--set {override}: not a TOML string: {error}; write it in double quotes") from error
     here: Any = table
-    *parents, last = (int(part) if part.isdigit() else part for part in dotted.strip().split("."))
+    *parents, last = (int(part) if part.isascii() and part.isdecimal() else part for part in dotted.strip().split("."))
     try:
         for part in parents:
             here = here[part] if isinstance(part, int) else here.setdefault(part, {})
@@ -206,7 +210,8 @@ def _check(model: type[_Model], values: Any, path: Path, section: str) -> _Model
 
 
 def _first_problem(error: ValidationError, model: type[BaseModel], section: str) -> str:
-    first = error.errors()[0]
+    # a misspelt key is both unknown and missing: it is the unknown one that says what to mend
+    first = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in ((section,) if section else ()) + first["loc"])
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     if first["type"] == "extra_forbidden":

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.recording import read_recording
-from schemas.messages import Alarm, Grid, Raw, Score
+from schemas.messages import Alarm, Array, Grid, Raw, Score
 
 SETTLING_NS = 5_000_000_000  # after a fault has gone the fan runs back: an alarm until then is that fault's
 
@@ -43,7 +43,7 @@ class Summary:
     samples_sent: int
     samples_recorded: int
     lost: int
-    latency_ms: dict[str, float]
+    latency_ms: dict[str, float | None]
     lost_by_stage: dict[str, int]
     fans: int
     start_ns: int
@@ -51,14 +51,16 @@ class Summary:
 
     def to_json(self) -> str:
         """As `summary.json` holds it."""
-        return json.dumps(asdict(self), indent=2)
+        return json.dumps(asdict(self), indent=2, allow_nan=False)
 
 
 @dataclass
 class _Recorded:
-    samples: int = 0
-    grid: int = 0
-    scored: int = 0
+    """Each sample once, by tray and what names it there: what was sent twice makes up for nothing that was lost."""
+
+    samples: set[tuple[str, int]] = field(default_factory=set)
+    grid: set[tuple[str, int]] = field(default_factory=set)
+    scored: set[tuple[str, int]] = field(default_factory=set)
     latencies_ms: list[float] = field(default_factory=list)
     alarms: list[Alarm] = field(default_factory=list)
 
@@ -73,16 +75,19 @@ def summarise(truth_path: Path, recordings: Iterable[Path], lost_by_stage: dict[
     recorded = _read(recordings)
     faults = [_match(fault, recorded.alarms) for fault in truth["faults"]]
     false_alarms = sum(alarm.active and not _explained(alarm, truth["faults"]) for alarm in recorded.alarms)
-    unrecorded = max(0, truth["samples_sent"] - recorded.samples)
-    lost = unrecorded + max(0, recorded.grid - recorded.scored) + sum(lost_by_stage.values())
-    p50, p99 = np.percentile(recorded.latencies_ms, (50, 99)) if recorded.latencies_ms else (float("nan"),) * 2
+    unrecorded = max(0, truth["samples_sent"] - len(recorded.samples))
+    lost = unrecorded + len(recorded.grid - recorded.scored) + sum(lost_by_stage.values())
+    latency_ms: dict[str, float | None] = {"p50": None, "p99": None}
+    if recorded.latencies_ms:
+        percentiles = np.percentile(recorded.latencies_ms, (50, 99))
+        latency_ms = {name: round(float(value), 3) for name, value in zip(latency_ms, percentiles, strict=True)}
     summary = Summary(
         faults=faults,
         false_alarms=false_alarms,
         samples_sent=truth["samples_sent"],
-        samples_recorded=recorded.samples,
+        samples_recorded=len(recorded.samples),
         lost=lost,
-        latency_ms={"p50": round(float(p50), 3), "p99": round(float(p99), 3)},
+        latency_ms=latency_ms,
         lost_by_stage=lost_by_stage,
         fans=truth["fans"],
         start_ns=truth["start_ns"],
@@ -104,16 +109,20 @@ def _read(recordings: Iterable[Path]) -> _Recorded:
         for entry in read_recording(path, topics=("raw", "grid", "score", "alarm")):
             message = entry.message
             if isinstance(message, Raw):
-                recorded.samples += len(message.host_receive_t_ns)
+                recorded.samples |= _named(message, message.device_sequence)
             elif isinstance(message, Grid):
-                recorded.grid += len(message.t_ns)
+                recorded.grid |= _named(message, message.t_ns)
             elif isinstance(message, Score):
-                recorded.scored += len(message.t_ns)
+                recorded.scored |= _named(message, message.t_ns)
                 recorded.latencies_ms += ((entry.log_time_ns - message.t_ns) / 1e6).tolist()
             elif isinstance(message, Alarm):
                 recorded.alarms.append(message)
     recorded.alarms.sort(key=lambda alarm: alarm.t_ns)
     return recorded
+
+
+def _named(message: Raw | Grid | Score, names: Array) -> set[tuple[str, int]]:
+    return {(message.header.tray, name) for name in names.tolist()}
 
 
 def _match(fault: dict[str, Any], alarms: list[Alarm]) -> FaultSeen:

@@ -14,19 +14,20 @@ LOSS_PREFIX = "lost_"
 _LATENCIES_KEPT = 2000
 
 
-def lost(inputs: Iterable[Input], counters: Mapping[str, int]) -> int:
-    """How much a stage has lost: missing messages, and counters that begin with `lost_`."""
+def lost(inputs: Iterable[Input], counters: Mapping[str, int], *, may_drop: bool) -> int:
+    """How much a stage has lost: missing messages, unless it may drop, and counters that begin with `lost_`."""
     counted = sum(value for name, value in counters.items() if name.startswith(LOSS_PREFIX))
-    return sum(line.missing for line in inputs) + counted
+    return counted if may_drop else sum(line.missing for line in inputs) + counted
 
 
 class HealthBook:
     """Collects what a stage counts and makes `Health` messages of it."""
 
-    def __init__(self, stage: str, instance: str, started_t_ns: int) -> None:
+    def __init__(self, stage: str, instance: str, started_t_ns: int, *, may_drop: bool) -> None:
         self._stage = stage
         self._instance = instance
         self._started_t_ns = started_t_ns
+        self._may_drop = may_drop
         self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES_KEPT)
 
     def note_output(self, message: Message, now_ns: int) -> None:
@@ -62,6 +63,6 @@ class HealthBook:
             counters=tuple(Counter(name=name, value=value) for name, value in sorted(counters.items())),
             latency_p50_ms=float(p50),
             latency_p99_ms=float(p99),
-            lost=lost(inputs, counters),
+            lost=lost(inputs, counters, may_drop=self._may_drop),
             process_id=os.getpid(),
         )

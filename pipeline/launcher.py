@@ -17,6 +17,7 @@ from pipeline.watcher import Watcher
 from schemas.topics import alive_key
 
 _LOOK_S = 0.05
+_ORDERLY = (0, 3)  # how a stage ends in order: all well, or something was lost
 _READY_TIMEOUT_S = 30.0
 _STABLE_S = 10.0  # a stage that ran this long starts again at the shortest delay
 
@@ -38,13 +39,14 @@ class Outcome:
 
     restarts: dict[str, int] = field(default_factory=dict)
     killed: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
     lost: dict[str, int] = field(default_factory=dict)
     run_folder: str = ""
 
     @property
     def exit_code(self) -> int:
-        """0: all in order; 3: something was lost; 1: a stage did not stop in time and was killed."""
-        if self.killed:
+        """0: all in order; 3: something was lost; 1: a stage failed at the end, or had to be killed."""
+        if self.killed or self.failed:
             return 1
         return 3 if any(self.lost.values()) else 0
 
@@ -59,8 +61,6 @@ class Launcher:
         self._overrides = tuple(overrides)
         self._say = say
         self._slots = [_Slot(row, delay_s=config.launcher.restart_delay_s) for row in process_list(config)]
-        self._alive: set[str] = set()
-        self._changed = threading.Event()
         self.outcome = Outcome(run_folder=str(config.run_folder))
 
     def run(self, stop: threading.Event) -> Outcome:
@@ -69,21 +69,28 @@ class Launcher:
         Raises:
             UserError: a stage cannot run as configured; the others have been stopped.
         """
-        with Bus(self._config.bus) as bus:
-            bus.watch_alive(alive_key(self._config.site, "*", "*"), self._note_alive)
-            watcher = Watcher(bus, self._config.site)
+        with Bus(self._config.bus, stop) as bus:
+            self._refuse_a_second(bus)
+            self._watcher = Watcher(bus, self._config.site)
             try:
                 self._start_all(stop)
                 while not stop.wait(_LOOK_S):
                     self._look()
+                self._bring_back()
             finally:
                 self._stop_all()
-                self.outcome.lost = watcher.losses()
+                self.outcome.lost = self._watcher.losses()
         return self.outcome
 
-    def _note_alive(self, key: str, alive: bool) -> None:
-        (self._alive.add if alive else self._alive.discard)(key)
-        self._changed.set()
+    def _refuse_a_second(self, bus: Bus) -> None:
+        alive = bus.alive(alive_key(self._config.site, "*", "*"))
+        ours = {alive_key(self._config.site, slot.row.stage, slot.row.instance): slot.row.label for slot in self._slots}
+        running = [label for key, label in ours.items() if key in alive]
+        if running:
+            raise UserError(
+                f"site {self._config.site!r} already runs at {self._config.bus.endpoint} ({', '.join(running)}): "
+                "stop that, or give this one another site or bus.endpoint"
+            )
 
     def _start_all(self, stop: threading.Event) -> None:
         """Whoever listens first: sources start when all others are ready, so that no first sample is missed."""
@@ -99,8 +106,7 @@ class Launcher:
     def _wait_until_ready(self, slots: list[_Slot], stop: threading.Event) -> None:
         deadline = time.monotonic() + _READY_TIMEOUT_S
         while not stop.is_set() and any(not slot.was_ready for slot in slots):
-            self._changed.wait(_LOOK_S)
-            self._changed.clear()
+            stop.wait(_LOOK_S)
             self._look()
             if time.monotonic() > deadline:
                 late = ", ".join(slot.row.label for slot in slots if not slot.was_ready)
@@ -121,7 +127,7 @@ class Launcher:
                 continue
             status = slot.child.exit_status()
             if status is None:
-                slot.was_ready |= alive_key(self._config.site, slot.row.stage, slot.row.instance) in self._alive
+                slot.was_ready = slot.was_ready or self._watcher.is_ready(slot.child.process_id)
                 continue
             if status == EXIT_CANNOT_START and not slot.was_ready:
                 slot.child.stop(0.1)
@@ -139,6 +145,20 @@ class Launcher:
         slot.child, slot.start_at_s = None, now + slot.delay_s
         slot.delay_s = min(2 * slot.delay_s, limits.restart_delay_max_s)
 
+    def _bring_back(self) -> None:
+        """A stage that is down at the end starts once more: it asks for what it missed, and so nothing is lost."""
+        started = [slot for slot in self._slots if slot.child or slot.start_at_s]
+        down = [slot for slot in started if slot.child is None or slot.child.exit_status() is not None]
+        for slot in down:
+            self._start(slot)
+        until_s = time.monotonic() + self._config.launcher.stop_timeout_s
+        while time.monotonic() < until_s and not all(map(self._is_back, down)):
+            time.sleep(_LOOK_S)
+
+    def _is_back(self, slot: _Slot) -> bool:
+        assert slot.child is not None
+        return slot.child.exit_status() is not None or self._watcher.is_ready(slot.child.process_id)
+
     def _stop_all(self) -> None:
         """In the order of the data: each stage ends when all that was sent to it has been handled."""
         for slot in self._slots:
@@ -148,6 +168,9 @@ class Launcher:
             if status is None:
                 self.outcome.killed.append(slot.row.label)
                 self._say(f"{slot.row.label}: did not stop in {self._config.launcher.stop_timeout_s:.0f} s, killed")
+            elif status not in _ORDERLY:
+                self.outcome.failed.append(slot.row.label)
+                self._say(f"{slot.row.label}: ended with status {status}: {slot.child.last_line}")
             slot.child = None
 
 

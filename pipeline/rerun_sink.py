@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import socket
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -22,12 +21,12 @@ os.environ.setdefault(
 import rerun as rr
 
 from pipeline.config import TrayConfig
+from pipeline.loopback import LOOPBACK, check_free
 from pipeline.rerun_layout import TIMELINE, TrayLayout, blueprint, fan_path, log_path, log_styles, state_path
 from pipeline.stage import StageError
 from pipeline.trace import Trace
 from schemas.messages import Array
 
-LOOPBACK = "127.0.0.1"
 APPLICATION = "fantwin"
 ZONE_HEIGHT = 2.0  # of an alarm zone, in half heights of the band
 # Rerun's own page server in a shell that ends with us, however we end: the pipe to its standard input closes.
@@ -82,7 +81,7 @@ class RerunSink:
         """
         for key, port in (("grpc_port", grpc_port), ("web_port", web_port)):
             if port is not None:
-                _check_free(port, key)
+                check_free(port, key)
         layouts = [TrayLayout(tray.name, range(tray.fans), tray.speed_unit) for tray in trays]
         self._recording = rr.RecordingStream(APPLICATION)
         self._zone_is_open: set[str] = set()
@@ -172,23 +171,6 @@ class RerunSink:
     def _send(self, path: str, t_ns: Array, columns: rr.ComponentColumnList) -> None:
         time = rr.TimeColumn(TIMELINE, timestamp=t_ns.astype("datetime64[ns]"))
         self._recording.send_columns(path, indexes=[time], columns=columns)
-
-
-def _check_free(port: int, key: str) -> None:
-    """Rerun itself only writes a line into its log when a port is taken.
-
-    Raises:
-        StageError: the port is taken.
-    """
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((LOOPBACK, port))
-        except OSError as error:
-            raise StageError(
-                f"viewer.{key}: port {port} on {LOOPBACK} is taken ({error.strerror}); "
-                f"set another one, or viewer.serve = false"
-            ) from error
 
 
 def _serve_page(web_port: int, grpc_port: int) -> subprocess.Popen[bytes]:

@@ -59,19 +59,26 @@ class _Inbox:
         self._queue: queue.Queue[Any] = queue.Queue(INBOX_SIZE)
         self._drops_oldest = drops_oldest
         self._aside: deque[Any] = deque()
+        self._closed = False
         self.dropped = 0
 
     def put(self, item: Any) -> None:
-        """Add an item; blocks while the inbox is full, or drops the oldest."""
-        if not self._drops_oldest:
-            self._queue.put(item)
-            return
-        while True:
+        """Add an item; while the inbox is full it blocks, or drops the oldest. Nothing more once it is closed."""
+        while not self._closed:
             try:
-                self._queue.put_nowait(item)
+                self._queue.put(item, block=not self._drops_oldest, timeout=TICK_S)
                 return
             except queue.Full:
-                self._drop_one()
+                if self._drops_oldest:
+                    self._drop_one()
+
+    def close(self) -> None:
+        """Let go of whoever is blocked in `put`: it is a thread of the bus, which cannot close while it is."""
+        self._closed = True
+
+    def waiting(self) -> int:
+        """How many items are there now."""
+        return self._queue.qsize() + len(self._aside)
 
     def _drop_one(self) -> None:
         try:
@@ -120,7 +127,7 @@ class Runner:
         self._inbox = _Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
         started_t_ns = time.time_ns()
-        self._health = HealthBook(stage.name, self._instance, started_t_ns)
+        self._health = HealthBook(stage.name, self._instance, started_t_ns, may_drop=stage.may_drop)
         context = Context(
             site=config.site,
             trays=trays,
@@ -135,7 +142,7 @@ class Runner:
             if stage.core_per_tray
             else {"": stage.build(context)}
         )
-        self._bus = Bus(config.bus)
+        self._bus = Bus(config.bus, stop)
         self._inlet = Inlet(None if stage.may_drop else self._recover)
         self._outlets: dict[tuple[str, str], Outlet] = {
             (t.name, name): self._outlet(tray_key(config.site, t.name, name), name)
@@ -146,6 +153,7 @@ class Runner:
         self._read_keys = {
             tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
         }
+        self._crash = ""
         self._orphan_until_s = 0.0
         self._alive: set[str] = set()
         self._left: dict[str, float] = {}
@@ -159,16 +167,22 @@ class Runner:
         self._bus.watch_alive(alive_key(self._site, "*", "*"), lambda key, alive: self._inbox.put(_Alive(key, alive)))
         try:
             self._publish_health(StageStatus.STARTING)
+            if not self.stage.may_drop:
+                self._catch_up()
             self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
             for parts in self._parts.values():
                 if parts.source:
                     parts.source.start(lambda item: self._inbox.put(_FromSource(item)))
             self._loop(until=self._should_end)
             self._drain()
+        except BaseException as error:
+            self._crash = f"crashed: {type(error).__name__}: {error}"
+            raise
         finally:
+            self._inbox.close()
             for tray, parts in self._parts.items():
                 self._publish(tray, parts.core.close())
-            last = self._publish_health(StageStatus.STOPPED)
+            last = self._publish_health(StageStatus.DEGRADED if self._crash else StageStatus.STOPPED)
             self._bus.close()
         return last
 
@@ -203,7 +217,7 @@ class Runner:
         return health is not None and any(output.key in self._read_keys for output in health.outputs)
 
     def _drain(self) -> None:
-        """Handle what has been sent to this stage before it was told to stop."""
+        """Handle what has been sent to this stage before it was told to stop, however much more is being sent."""
         stopped = threading.Event()
 
         def stop_sources() -> None:
@@ -213,12 +227,15 @@ class Runner:
             stopped.set()
 
         threading.Thread(target=stop_sources, daemon=True).start()
-        while True:
+        left: int | None = None  # items still to be handled, known once all that must come has come
+        while left != 0:
+            if left is None and stopped.is_set() and not self._awaits_farewell():
+                left = self._inbox.waiting()
+                continue
             item = self._inbox.get(TICK_S)
             if item is not None:
                 self._handle(item)
-            elif stopped.is_set() and not self._awaits_farewell():
-                return
+                left = None if left is None else left - 1
 
     def _awaits_farewell(self) -> bool:
         """Whether a producer has just left whose last health, and so its last messages, may still be on the way."""
@@ -280,9 +297,20 @@ class Runner:
                 self._step(due)
 
     def _recover(self, key: str, producer: str, first: int, last: int) -> Iterator[Packet]:
-        payloads = self._bus.recover(key, producer, first, last, self._inbox.set_aside)
-        packets = (self._decode(key, payload, time.time_ns()) for payload in payloads)
+        found = self._bus.recover(key, producer, first, last, self._inbox.set_aside)
+        packets = (self._decode(its_key, payload, time.time_ns()) for its_key, payload in found)
         return (packet for packet in packets if packet is not None)
+
+    def _catch_up(self) -> None:
+        """Take what producers still keep from before this stage came: only then is it ready."""
+        keys = sorted(self._read_keys)
+        if "health" in self.stage.reads:
+            keys.append(health_key(self._site, "*", "*"))
+        for key in keys:
+            kept = self._recover(key, "*", 0, 2**63)
+            for packet in sorted(kept, key=lambda p: (p.message.header.producer, p.message.header.sequence)):
+                for due in self._inlet.accept(packet):
+                    self._step(due)
 
     def _outlet(self, key: str, topic: str) -> Outlet:
         return self._bus.outlet(key, BY_NAME[topic], type_name(BY_NAME[topic].message), self.producer)
@@ -303,12 +331,12 @@ class Runner:
         return counters
 
     def _lost(self) -> int:
-        return lost(self._inlet.inputs(), self._counters())
+        return lost(self._inlet.inputs(), self._counters(), may_drop=self.stage.may_drop)
 
     def _publish_health(self, status: StageStatus) -> Health:
         health = self._health.make(
             status=status,
-            problems=[parts.core.problem() for parts in self._parts.values()],
+            problems=[self._crash, *(parts.core.problem() for parts in self._parts.values())],
             inputs=self._inlet.inputs(),
             outputs=[Output(key=outlet.key, published=outlet.published) for outlet in self._outlets.values()],
             counters=self._counters(),

@@ -21,7 +21,7 @@ from schemas.messages import Message
 class StageConfig(BaseModel):
     """Base of every stage's section in the configuration file: frozen, unknown keys refused."""
 
-    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class StageError(UserError):

@@ -20,6 +20,7 @@ import numpy as np
 
 from pipeline.config import RAD_S_PER_UNIT
 from pipeline.errors import UserError
+from schemas.codec import FURTHEST_T_NS
 from schemas.messages import Array
 
 NS_PER_UNIT = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
@@ -31,6 +32,7 @@ OUT_OF_ORDER_NS = 1_000_000_000  # rows further back than this are a clock that 
 _DELIMITERS = ",;\t"
 _UNIX_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _DATE_AND_FRACTION = re.compile(r"(\d\d:\d\d:\d\d)[:,](\d+)")  # some loggers write 17:14:08:947, or 17:14:08,947
+_FINER = {"s": "ms", "ms": "us", "us": "ns"}
 _NOT_MEASURED = {"", "nan", "na", "n/a", "null", "none", "-"}
 
 
@@ -221,6 +223,10 @@ def _times(path: Path, names: list[str], cells: list[list[str]], given: str) -> 
             f"{path}: column {names[column]!r} holds no time in {unit}, but for example {first!r}; "
             "known are numbers in s, ms, us or ns, and dates such as 2026-01-31 13:45:00.250"
         )
+    if any(time is not None and abs(time) >= FURTHEST_T_NS for time in times):
+        name, finer = names[column], _FINER.get(unit)
+        hint = f"is it in ms, us or ns? write --time {name}:{finer}" if finer else "choose another time column"
+        raise UserError(f"{path}: column {name!r} in {unit} gives times beyond the year 2116: {hint}")
     return times
 
 
@@ -240,8 +246,8 @@ def _count_ns(scale: int) -> Callable[[str], int | None]:
         try:
             return int(cell) * scale  # exact, where a float would lose nanoseconds since 1970
         except ValueError:
-            value = _number(cell)
-            return round(value * scale) if math.isfinite(value) else None
+            value = _number(cell) * scale
+            return round(value) if math.isfinite(value) else None
 
     return read
 

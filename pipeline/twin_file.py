@@ -9,6 +9,7 @@ the card's healthy residual is used.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -136,6 +137,7 @@ class TwinFile:
 
 
 def _session(path: Path, content: bytes) -> Any:
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # it sends as soon as it is imported, on Linux too since 1.31
     # Imported here, so that stages that run no twin start without it.
     import onnxruntime  # noqa: PLC0415
 

@@ -54,7 +54,9 @@ class Watcher:
 
     def ask_for_past_alarms(self) -> None:
         """Fetch the alarms that were raised before this watcher came."""
-        for payload in self._bus.recover(tray_key(self._site, "*", "alarm"), "*", 0, 2**63, lambda: time.sleep(0.005)):
+        for _, payload in self._bus.recover(
+            tray_key(self._site, "*", "alarm"), "*", 0, 2**63, lambda: time.sleep(0.005)
+        ):
             self._note_alarm("", payload)
 
     def stages(self) -> list[StageView]:
@@ -65,6 +67,10 @@ class Watcher:
                 alive = alive_key(self._site, health.stage, health.instance) in self._alive
                 latest[health.stage, health.instance] = StageView(health, previous, alive)
             return [latest[name] for name in sorted(latest)]
+
+    def is_ready(self, process_id: int) -> bool:
+        """Whether the session of this process is there and has begun its work."""
+        return any(view.alive and view.health.process_id == process_id for view in self.stages())
 
     def alarms(self) -> list[Alarm]:
         """The last alarm message of every fan that had one, oldest first."""

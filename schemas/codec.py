@@ -23,6 +23,7 @@ from schemas.messages import (
     Input,
     Message,
     Output,
+    Prediction,
     Severity,
     StageStatus,
     WhyNot,
@@ -34,6 +35,9 @@ _RECORDS = {"inputs": Input, "outputs": Output, "counters": Counter}
 _ENUMS = {"severity": Severity, "status": StageStatus}
 _ENUM_COLUMNS = {"why_not": max(WhyNot), "state": max(FanState)}
 _OF_SOME_DEVICES = {"device_clock_us", "device_sequence"}  # the only columns of samples that may be empty
+LARGEST_STEP_NS = 86_400_000_000_000  # a day
+FURTHEST_T_NS = (1 << 62) - LARGEST_STEP_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits
+_FURTHEST = {"host_receive_t_ns": FURTHEST_T_NS, "t_ns": 1 << 62}  # the grid may go a little beyond what was received
 _COLUMNS = {t: columns(t) for t in MESSAGE_TYPES}
 _SCALARS = {
     t: tuple(f.name for f in fields(t) if "shape" not in f.metadata and f.name != "header") for t in MESSAGE_TYPES
@@ -76,9 +80,10 @@ def encode(message: Message) -> bytes:
     """Serialise a message.
 
     Raises:
-        CodecError: a column's shape does not fit the message's samples and fans.
+        CodecError: a column's shape does not fit the message's samples and fans, or its times make no sense.
     """
     kind = type(message)
+    _check_step(message)
     proto: Any = proto_type(kind)()
     proto.header.producer = message.header.producer
     proto.header.sequence = message.header.sequence
@@ -94,7 +99,7 @@ def encode(message: Message) -> bytes:
     samples = _sample_count(message)
     for name, (shape, dtype) in _COLUMNS[kind].items():
         column = np.asarray(getattr(message, name), dtype=dtype.newbyteorder("<"))
-        _check_shape(message, name, column, shape, samples)
+        _check_column(message, name, column, shape, samples)
         if column.size == 0:
             continue
         data = column.tobytes()
@@ -137,9 +142,10 @@ def decode(message_type: type[Message], data: bytes) -> Message:
         column.setflags(write=False)
         values[name] = column
     message = message_type(**values)
+    _check_step(message)
     samples = _sample_count(message)
     for name, (shape, _) in _COLUMNS[message_type].items():
-        _check_shape(message, name, values[name], shape, samples)
+        _check_column(message, name, values[name], shape, samples)
     return message
 
 
@@ -167,13 +173,27 @@ def _sample_count(message: Message) -> int:
     return -1
 
 
-def _check_shape(message: Message, name: str, column: np.ndarray[Any, Any], shape: str, samples: int) -> None:
-    if column.size == 0 and (shape == "fans" or samples == 0 or name in _OF_SOME_DEVICES):
+def _check_step(message: Message) -> None:
+    step_ns = getattr(message, "step_ns", 1)
+    if not 0 < step_ns <= LARGEST_STEP_NS:
+        raise CodecError(f"{type_name(type(message))}.step_ns = {step_ns}: a step is 1 ns to a day")
+
+
+def _check_column(message: Message, name: str, column: np.ndarray[Any, Any], shape: str, samples: int) -> None:
+    if column.size == 0 and _may_be_empty(message, name, shape, samples):
         return
+    if name in _FURTHEST and not (-_FURTHEST[name] < column.min() and column.max() < _FURTHEST[name]):
+        raise CodecError(f"{type_name(type(message))}.{name} has times that are no ns since 1970: beyond the year 2116")
     fans = getattr(message, "fans", column.size)
     expected = {"samples": (samples,), "samples x fans": (samples, fans), "fans": (fans,)}[shape]
     if column.shape != expected:
         raise CodecError(f"{type_name(type(message))}.{name} has shape {column.shape}, not {shape} = {expected}")
+
+
+def _may_be_empty(message: Message, name: str, shape: str, samples: int) -> bool:
+    if shape == "fans":
+        return samples <= 0 or not isinstance(message, Prediction)  # without sigma nothing can be judged
+    return samples == 0 or name in _OF_SOME_DEVICES
 
 
 assert set(get_args(Message)) == set(MESSAGE_TYPES)

@@ -263,7 +263,7 @@ def build(context: Context) -> Parts:
     tray = context.tray
     if not tray.port:
         raise StageError(f'[[tray]] {tray.name}: port is missing; add for example port = "/dev/ttyUSB0"')
-    line = SerialLine(tray.port, tray.baud)
+    line = SerialLine(str(context.resolve(Path(tray.port))), tray.baud)
     return Parts(AcquisitionCore(tray, context.config, line, context.started_t_ns), line)
 
 
@@ -272,7 +272,7 @@ def check(context: Context) -> list[str]:
     tray = context.tray
     if not tray.port:
         return [f'[[tray]] {tray.name}: port is missing; add for example port = "/dev/ttyUSB0"']
-    port = Path(tray.port)
+    port = context.resolve(Path(tray.port))
     if not port.exists():
         return [f"{port}: no such port; connect the device, or correct [[tray]] port"]
     if not os.access(port, os.R_OK | os.W_OK):

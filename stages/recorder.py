@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -140,6 +141,15 @@ def build(context: Context) -> Parts:
     return Parts(Recorder(writer, config.flush_interval_s))
 
 
+def check(context: Context) -> list[str]:
+    """A folder that the file cannot be written in."""
+    folder = (context.run_folder / context.config.file).parent
+    existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    if existing.is_dir() and os.access(existing, os.W_OK | os.X_OK):
+        return []
+    return [f"{folder}: {existing} is no folder this user may write in; change run_folder or recorder.file"]
+
+
 STAGE = Stage(
     name="recorder",
     about="keeps every message, with configuration and twin, in an MCAP file",
@@ -149,4 +159,5 @@ STAGE = Stage(
     build=build,
     core_per_tray=False,
     wants_packets=True,
+    check=check,
 )

@@ -28,6 +28,7 @@ from schemas.messages import Array, Grid, Raw, WhyNot
 
 LONGEST_TICK_NS = 100_000_000  # a longer pause between ticks is the host's own, and says nothing of the line
 LONG_AGO_NS = -(1 << 62)
+SET_BACK_NS = NS_PER_S  # a new sample so much older than the newest: the host's clock was set back
 LARGEST_GAP = 1 << 24  # samples; a larger step of the device's sequence is a device that began anew
 
 
@@ -128,7 +129,10 @@ class ResamplerCore(Core):
         self._silence_ns = 0
         self._tick_t_ns: int | None = None
         self._wrong_fans = 0
+        self._set_back_ns = 0  # by how much the host's clock was set back, while that lasts
         self._producer = ""
+        self._sequence = -1  # of this producer's newest message
+        self._ended: set[str] = set()  # producers that another one has followed
         self._device_sequence: int | None = None  # of the newest raw sample
         self._counts: Counter[str] = Counter()
 
@@ -138,15 +142,17 @@ class ResamplerCore(Core):
             self._wrong_fans = item.fans
             self._counts["lost_wrong_fan_count"] += len(item.host_receive_t_ns)
             return []
+        self._wrong_fans = 0
         self._silence_ns = 0
+        is_new = self._is_new(item)
         receive_t_ns = item.host_receive_t_ns.tolist()
         clock_us = item.device_clock_us.tolist()
         for k, received in enumerate(receive_t_ns):
             segments = self._clock.segments
             t_ns = self._clock.to_host_ns(clock_us[k], received) if clock_us else received
-            if k == 0:
+            if k == 0 and is_new:
                 self._follow_device(item, same_device_run=self._clock.segments == segments)
-            self._take(Sample(t_ns, item.command[k], item.speed_rad_s[k]))
+            self._take(Sample(t_ns, item.command[k], item.speed_rad_s[k]), is_new)
         return self._blocks()
 
     def tick(self, now_ns: int) -> list[Grid]:
@@ -169,12 +175,24 @@ class ResamplerCore(Core):
         return {**self._counts, "clock_restarts": max(0, self._clock.segments - 1)}
 
     def problem(self) -> str:
-        """A silent line, or one with another number of fans."""
+        """A silent line, one with another number of fans, or a host whose clock went back."""
         if self._wrong_fans:
             return f"raw samples of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
         if self._silence_ns >= self._watermark_ns:
             return f"no raw samples for {self._silence_ns / NS_PER_S:.1f} s: look at acquisition"
+        if self._set_back_ns:
+            return (
+                f"the host's clock was set back by {self._set_back_ns / NS_PER_S:.0f} s: "
+                "samples are refused until it has caught up; restart the stages"
+            )
         return ""
+
+    def _is_new(self, item: Raw) -> bool:
+        """Whether a message is later than all before; the bus may hand one again, or late from an ended session."""
+        producer, sequence = item.header.producer, item.header.sequence
+        if producer in self._ended:
+            return False
+        return producer != self._producer or sequence > self._sequence
 
     def _follow_device(self, item: Raw, same_device_run: bool) -> None:
         """Count what the device sent while acquisition was dead: only the next session's samples show that."""
@@ -183,14 +201,22 @@ class ResamplerCore(Core):
             missing = (int(sequence[0]) - self._device_sequence) % UINT32 - 1
             if same_device_run and 0 < missing < LARGEST_GAP:
                 self._counts["lost_between_sessions"] += missing
-        self._producer = item.header.producer
+        if item.header.producer != self._producer:
+            self._ended.add(self._producer)
+        self._producer, self._sequence = item.header.producer, item.header.sequence
         self._device_sequence = int(sequence[-1]) if len(sequence) else None
 
-    def _take(self, sample: Sample) -> None:
+    def _take(self, sample: Sample, is_new: bool) -> None:
         self._counts["samples_in"] += 1
+        behind_ns = self._newest_t_ns - sample.t_ns
+        if is_new and behind_ns > SET_BACK_NS:
+            self._counts["lost_clock_set_back"] += 1
+            self._set_back_ns = self._set_back_ns or behind_ns
+            return
         if sample.t_ns <= self._newest_t_ns:
             self._counts["repeated" if sample.t_ns == self._newest_t_ns else "out_of_order"] += 1
             return
+        self._set_back_ns = 0
         if self._newest_t_ns == LONG_AGO_NS:
             self._next_t_ns = first_grid_time(sample.t_ns, self._step_ns)
         elif sample.t_ns <= self._next_t_ns - self._step_ns:  # its grid samples were given up by `tick`

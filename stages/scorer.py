@@ -26,6 +26,17 @@ from schemas.messages import Alarm, Array, FanState, Prediction, Score, Severity
 
 NS_PER_S = 1_000_000_000
 BAND_SIGMAS = 2.0
+FIRST_WARM_UP_NS = 60 * NS_PER_S  # a fan that was never judged may warm up for so long before that is told
+IN_WORDS = {
+    WhyNot.NONE: "no reason given",
+    WhyNot.STALE: "the line is silent",
+    WhyNot.GAP: "samples are missing",
+    WhyNot.WARMING_UP: "the twin is warming up",
+    WhyNot.OUT_OF_RANGE: "the command is out of the twin's range, or a value is no number",
+    WhyNot.SATURATED: "saturated",
+    WhyNot.NO_SPEED: "no speed",
+    WhyNot.NO_TWIN: "the twin does not fit the grid's rate",
+}
 
 
 class ScorerConfig(StageConfig):
@@ -36,6 +47,9 @@ class ScorerConfig(StageConfig):
     deadband_sigmas: float = Field(default=0.5, ge=0, description="so much below the limit an alarm begins to return")
     on_delay_s: float = Field(default=0.5, ge=0, description="how long the limit must be exceeded to raise")
     off_delay_s: float = Field(default=1.0, ge=0, description="how long a return must last to clear")
+    not_judged_s: float = Field(
+        default=10.0, gt=0, description="a fan that is not judged for so long is told; above twin_integrator.warm_up_s"
+    )
 
     @model_validator(mode="after")
     def _can_return(self) -> Self:
@@ -121,6 +135,39 @@ class AlarmStates:
         return Changes(raised, cleared, too_short)
 
 
+class NotJudged:
+    """For how long each fan has not been judged, in the time of its samples, and why."""
+
+    def __init__(self, fans: int, limit_ns: int) -> None:
+        self._limit_ns = limit_ns
+        self._lasted_ns = np.zeros(fans, np.int64)
+        self._why_not = np.zeros(fans, np.uint8)
+        self._was_judged = np.zeros(fans, np.bool_)
+
+    def update(self, step_ns: int, valid: Array, why_not: Array) -> None:
+        """Take a block, (n, fans) each."""
+        judged = valid.any(axis=0)
+        since = np.where(judged, np.argmax(valid[::-1], axis=0), len(valid))
+        self._lasted_ns = np.where(judged, 0, self._lasted_ns) + since * step_ns
+        self._why_not = why_not[-1]
+        self._was_judged |= judged
+
+    def problem(self) -> str:
+        """Which fans are not judged; times only as multiples, so that the line does not change all the time."""
+        first_warm_up = ~self._was_judged & (self._why_not == WhyNot.WARMING_UP)
+        limit_ns = np.where(first_warm_up, max(self._limit_ns, FIRST_WARM_UP_NS), self._limit_ns)
+        late = self._lasted_ns >= limit_ns
+        parts = []
+        for why in np.unique(self._why_not[late]).tolist():
+            fans = np.flatnonzero(late & (self._why_not == why))
+            doubled = int(self._lasted_ns[fans].min() // self._limit_ns).bit_length() - 1
+            names = ", ".join(map(str, fans.tolist()))
+            who = f"fan {names} is" if len(fans) == 1 else f"fans {names} are"
+            lasted_s = self._limit_ns * 2**doubled / NS_PER_S
+            parts.append(f"{who} not judged: {IN_WORDS[WhyNot(why)]} for {lasted_s:g} s and more")
+        return "; ".join(parts)
+
+
 class ScorerCore(Core):
     """One tray's fans, each judged for itself."""
 
@@ -133,6 +180,7 @@ class ScorerCore(Core):
         self._threshold = Threshold(config.alarm_sigmas, config.deadband_sigmas)
         on_delay_ns, off_delay_ns = round(config.on_delay_s * NS_PER_S), round(config.off_delay_s * NS_PER_S)
         self._states = AlarmStates(fans, on_delay_ns, off_delay_ns)
+        self._not_judged = NotJudged(fans, max(1, round(config.not_judged_s * NS_PER_S)))
         self._last_t_ns = np.iinfo(np.int64).min
         self._wrong_fans = 0
         self._counts: Counter[str] = Counter()
@@ -143,6 +191,7 @@ class ScorerCore(Core):
             self._wrong_fans = item.fans
             self._counts["lost_wrong_fan_count"] += len(item.t_ns)
             return []
+        self._wrong_fans = 0
         before = np.maximum.accumulate(np.concatenate(([self._last_t_ns], item.t_ns)))[:-1]
         new = item.t_ns > before
         self._counts["repeated"] += int((~new).sum())
@@ -160,6 +209,8 @@ class ScorerCore(Core):
             smoothed[k] = self._smoother.update(residual[k], valid[k], item.step_ns / NS_PER_S)
             alarms += self._judge(time_ns, item.step_ns, smoothed[k], valid[k], item.sigma_rad_s)
             state[k] = np.where(valid[k], self._states.state, FanState.UNKNOWN)
+        why_not = np.where(item.valid[new] & ~finite, WhyNot.OUT_OF_RANGE, item.why_not[new]).astype(np.uint8)
+        self._not_judged.update(item.step_ns, valid, why_not)
         band = BAND_SIGMAS * item.sigma_rad_s
         score = Score(
             fans=self._fans,
@@ -176,7 +227,7 @@ class ScorerCore(Core):
             outside=np.abs(residual) > band,
             state=state,
             valid=valid,
-            why_not=np.where(item.valid[new] & ~finite, WhyNot.OUT_OF_RANGE, item.why_not[new]).astype(np.uint8),
+            why_not=why_not,
         )
         return [score, *alarms]
 
@@ -185,10 +236,10 @@ class ScorerCore(Core):
         return dict(self._counts)
 
     def problem(self) -> str:
-        """Predictions of another number of fans."""
+        """Predictions of another number of fans, or fans that have not been judged for long."""
         if self._wrong_fans:
             return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
-        return ""
+        return self._not_judged.problem()
 
     def _judge(self, t_ns: int, step_ns: int, smoothed: Array, valid: Array, sigma: Array) -> list[Alarm]:
         limit, return_limit = self._threshold.limit(sigma), self._threshold.return_limit(sigma)

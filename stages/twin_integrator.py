@@ -24,6 +24,7 @@ from schemas.messages import Array, Grid, ModelCard, Prediction, WhyNot
 
 NS_PER_S = 1_000_000_000
 RANGE_MARGIN = 0.05  # of the range's width: so far beyond the commands it was made from a twin is still believed
+LONGEST_BRIDGE = 1 << 16  # grid samples; more than half a second at 100 kHz takes longer to run than to start anew
 RATE_TOLERANCE = 0.01  # a card gives the rate as it was measured
 
 
@@ -128,6 +129,7 @@ class TwinIntegratorCore(Core):
             self._counts["lost_wrong_fan_count"] += len(item.t_ns)
             self._problem = f"grid of {item.fans} fans, [[tray]] says fans = {self._twin.fans}: correct one of them"
             return messages
+        self._problem = ""
         grid = self._only_new(item)
         if not len(grid.t_ns):
             return messages
@@ -190,7 +192,7 @@ class TwinIntegratorCore(Core):
             if missing or cut.any():
                 predicted[done:k] = self._advance(used[done:k])
                 done = k
-                run.stop(cut)
+                run.stop(cut | (missing > LONGEST_BRIDGE))
                 self._advance(np.tile(run.held_command, (missing if run.running.any() else 0, 1)))
             starting = run.note(t_ns, grid.command[k], known[k], speed[k])
             if starting.any():

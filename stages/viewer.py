@@ -7,6 +7,8 @@ it costs nothing. This stage alone may drop: the runner holds a bounded queue be
 
 from __future__ import annotations
 
+import importlib.util
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -15,10 +17,12 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.config import TrayConfig
+from pipeline.loopback import check_free
 from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from pipeline.trace import Trace, state_changes, state_name, trace_of
 from schemas.messages import Alarm, Array, Health, Message, ModelCard, Score, StageStatus
 
+NO_RERUN = "the viewer needs the `view` extra: pip install 'fantwin[view]', or take viewer out of launcher.stages"
 FLUSH_PERIOD_NS = 500_000_000
 REPEAT_STATES_NS = 5_000_000_000  # a viewer that joins late gets no state older than this
 SAMPLES_HELD = 4096  # of a tray, when a replay outruns the ticks
@@ -87,6 +91,7 @@ class _TrayView:
     scores: list[Score] = field(default_factory=list)
     samples: int = 0
     states: dict[int, str] = field(default_factory=dict)
+    wrong_fans: int = 0  # of the last score, if they are not those of the configuration
     repeated_t_ns: int = 0
 
 
@@ -99,14 +104,17 @@ class ViewerCore(Core):
         self._flushed_t_ns = 0
         self._stages: dict[str, str] = {}
         self._samples_drawn = 0
-        self._wrong_fans = 0
+        self._counts: Counter[str] = Counter()
 
     def step(self, item: Message) -> Sequence[Message]:
         """Remember a score, write an alarm, a change of twin or a change of health into the log."""
         if isinstance(item, Health):
             self._note_health(item)
             return ()
-        view = self._views[item.header.tray]
+        view = self._views.get(item.header.tray)
+        if view is None:
+            self._counts["unknown_tray"] += 1
+            return ()
         if isinstance(item, Score):
             self._note_score(view, item)
         elif isinstance(item, Alarm):
@@ -129,19 +137,24 @@ class ViewerCore(Core):
         return ()
 
     def counters(self) -> Mapping[str, int]:
-        """Samples drawn, and scores refused because their number of fans is not that of the configuration."""
-        return {"samples_drawn": self._samples_drawn, "wrong_fan_count": self._wrong_fans}
+        """Samples drawn; scores of another number of fans, and messages of another tray, than the configuration's."""
+        return {"samples_drawn": self._samples_drawn, "wrong_fan_count": 0, **self._counts}
 
     def problem(self) -> str:
         """Says when scores do not fit the configuration."""
-        if self._wrong_fans:
-            return f"{self._wrong_fans} scores have another number of fans than [[tray]] says: correct `fans`"
+        for name, view in self._views.items():
+            if view.wrong_fans:
+                return (
+                    f"scores of {view.wrong_fans} fans, [[tray]] {name} says fans = {view.config.fans}: correct `fans`"
+                )
         return ""
 
     def _note_score(self, view: _TrayView, score: Score) -> None:
         if score.fans != view.config.fans:
-            self._wrong_fans += 1
+            self._counts["wrong_fan_count"] += 1
+            view.wrong_fans = score.fans
             return
+        view.wrong_fans = 0
         view.scores.append(score)
         view.samples += len(score.t_ns)
         if view.samples >= SAMPLES_HELD:
@@ -190,9 +203,7 @@ def build(context: Context) -> Parts:
     except ModuleNotFoundError as error:
         if error.name != "rerun":
             raise
-        raise StageError(
-            "the viewer needs the `view` extra: pip install 'fantwin[view]', or take viewer out of launcher.stages"
-        ) from error
+        raise StageError(NO_RERUN) from error
     config: ViewerConfig = context.config
     sink = RerunSink(
         name=context.site,
@@ -207,6 +218,19 @@ def build(context: Context) -> Parts:
     return Parts(ViewerCore(context.trays, sink))
 
 
+def check(context: Context) -> list[str]:
+    """A missing extra, and ports that are taken."""
+    config: ViewerConfig = context.config
+    problems = [] if importlib.util.find_spec("rerun") else [NO_RERUN]
+    ports = {"grpc_port": config.grpc_port, "web_port": config.web_port} if config.serve else {}
+    for key, port in ports.items():
+        try:
+            check_free(port, key)
+        except StageError as error:
+            problems.append(str(error))
+    return problems
+
+
 STAGE = Stage(
     name="viewer",
     about="shows measured speed, twin, band, alarms and states live in Rerun, and keeps them in a file",
@@ -216,4 +240,5 @@ STAGE = Stage(
     build=build,
     core_per_tray=False,
     may_drop=True,
+    check=check,
 )

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import queue
 import sys
+import time
+from functools import partial
 
 from pipeline.bus import Bus
 from pipeline.config import BusConfig
@@ -17,6 +19,7 @@ from schemas.codec import decode, encode, type_name
 from schemas.messages import Alarm, Header, Severity
 from schemas.topics import BY_NAME, tray_key
 
+pause = partial(time.sleep, 0.001)
 KEY = tray_key("site", "tray", "alarm")
 TOPIC = BY_NAME["alarm"]
 
@@ -50,7 +53,9 @@ def collect(bus: Bus, count: int) -> None:
     def packet(payload: bytes) -> Packet:
         return Packet(KEY, "alarm", payload, 0, decode(Alarm, payload))
 
-    inlet = Inlet(lambda key, who, first, last: map(packet, bus.recover(key, who, first, last, lambda: None)))
+    inlet = Inlet(
+        lambda key, who, first, last: [packet(found) for _, found in bus.recover(key, who, first, last, pause)]
+    )
     bus.subscribe(KEY, lambda _key, payload: inbox.put(payload))
     print("ready", flush=True)
     got: list[int] = []

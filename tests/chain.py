@@ -20,7 +20,7 @@ from pipeline.bus import Bus
 from pipeline.config import BusConfig
 from pipeline.watcher import StageView, Watcher
 
-DEMO = Path(__file__).parents[1] / "demo"
+DEMO = Path(__file__).parents[1] / "pipeline" / "demo"
 SITE, TRAY, FANS = "demo", "tray1", 8
 FANTWIN = (sys.executable, "-P", "-m", "pipeline")
 DEADLINE_S = 60.0  # far beyond what anything takes, so that a slow machine fails no test
@@ -132,8 +132,10 @@ class Chain:
     def start_tray(self, *words: str) -> Running:
         truth = self.folder / "truth.json"
         self.tray = Running(
-            ["simulate", "--fans", FANS, "--speed-unit", "rpm", "--link", self.port, "--truth", truth, *words]
-            + ["--wait-for-reader", "--json"]
+            [
+                *("simulate", "--fans", FANS, "--speed-unit", "rpm", "--link", self.port, "--truth", truth),
+                *("--wait-for-reader", "--json", *words),
+            ]
         )
         self.tray.line_with("8 fans on")
         return self.tray
@@ -152,6 +154,19 @@ class Chain:
         assert self.up
         found = (re.match(r"(\S+): started, process (\d+)", line) for line in self.up.lines)
         return {match[1]: int(match[2]) for match in found if match}
+
+    def kill(self, watcher: Watcher, label: str) -> float:
+        """kill -9 of a stage; how long until its successor was on the bus, s."""
+        old = self.process_ids()[label]
+        began_s = time.monotonic()
+        os.kill(old, signal.SIGKILL)
+
+        def is_back() -> bool:
+            view = view_of(watcher, label)
+            return view is not None and view.alive and view.health.process_id != old
+
+        eventually(is_back, f"{label} is back")
+        return time.monotonic() - began_s
 
     def recordings(self) -> list[Path]:
         return sorted(self.folder.glob("recording*.mcap"))

@@ -9,8 +9,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 
 from schemas import messages
+from schemas.codec import FURTHEST_T_NS, LARGEST_STEP_NS
 from schemas.messages import Counter, FanState, Header, Input, Message, Output, WhyNot, columns
 
+TIME_NS = st.integers(1 - FURTHEST_T_NS, FURTHEST_T_NS - 1)
+STEP_NS = st.integers(1, LARGEST_STEP_NS)
 INT64 = st.integers(-(2**63), 2**63 - 1)
 UINT64 = st.integers(0, 2**64 - 1)
 UINT32 = st.integers(0, 2**32 - 1)
@@ -18,7 +21,8 @@ TEXT = st.text(max_size=20)
 FLOAT = st.floats(width=64)
 ENUM_COLUMNS = {"why_not": WhyNot, "state": FanState}
 SCALARS: dict[str, st.SearchStrategy[Any]] = {
-    **dict.fromkeys(("t_ns", "onset_t_ns", "step_ns"), INT64),
+    **dict.fromkeys(("t_ns", "onset_t_ns"), INT64),
+    "step_ns": STEP_NS,
     **dict.fromkeys(("fan", "process_id"), UINT32),
     "lost": UINT64,
 }
@@ -40,13 +44,17 @@ def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
 
 def column(name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> st.SearchStrategy[Any]:
     elements = st.sampled_from([int(value) for value in ENUM_COLUMNS[name]]) if name in ENUM_COLUMNS else None
+    if name in ("t_ns", "host_receive_t_ns"):
+        elements = TIME_NS
     return st_numpy.arrays(dtype, shape, elements=elements)
 
 
 @st.composite
-def any_message(draw: st.DrawFn, message_type: type[Message]) -> Message:
-    samples, fans = draw(st.integers(0, 5)), draw(st.integers(1, 4))
-    shapes = {"samples": (samples,), "samples x fans": (samples, fans), "fans": (fans,)}
+def any_message(
+    draw: st.DrawFn, message_type: type[Message], fans: st.SearchStrategy[int] = st.integers(1, 4)
+) -> Message:
+    samples, own_fans = draw(st.integers(0, 5)), draw(fans)
+    shapes = {"samples": (samples,), "samples x fans": (samples, own_fans), "fans": (own_fans,)}
     own_columns = columns(message_type)
     hints = get_type_hints(message_type, dict(vars(messages)))
     values: dict[str, Any] = {"header": Header(draw(TEXT), draw(UINT64), draw(TEXT))}
@@ -55,7 +63,7 @@ def any_message(draw: st.DrawFn, message_type: type[Message]) -> Message:
             shape, dtype = own_columns[f.name]
             values[f.name] = draw(column(f.name, dtype, shapes[shape]))
         elif f.name == "fans":
-            values["fans"] = fans
+            values["fans"] = own_fans
         elif f.name != "header":
             values[f.name] = draw(scalar(f.name, hints[f.name]))
     return message_type(**values)

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.bus import Bus, BusError
+from pipeline.bus import KEPT_BYTES, Bus, BusError
 from pipeline.config import BusConfig
 from schemas.topics import alive_key
-from tests.bus_peer import KEY
+from tests.bus_peer import KEY, TOPIC
 
 COUNT = 400
 
@@ -100,6 +100,25 @@ def test_a_token_tells_when_a_process_comes_and_when_it_is_gone(endpoint):
             changed.clear()
         assert changed.wait(20)
     assert seen == [True, False]
+
+
+def test_an_outlet_keeps_the_newest_messages_that_fit_its_memory(endpoint):
+    size, count = KEPT_BYTES // 4, 6
+    patient = BusConfig(endpoint=endpoint, recovery_timeout_s=30)
+    pause = threading.Event()
+
+    def wait() -> None:
+        pause.wait(0.002)
+
+    with Bus(patient) as publisher, Bus(patient) as asker:
+        outlet = publisher.outlet(KEY, TOPIC, "", "big")
+        for number in range(count):
+            outlet.put(bytes([number]) * size)
+        kept = [payload[0] for _, payload in asker.recover(KEY, "big", 0, count, wait)]
+        assert kept == [2, 3, 4, 5]
+        for _ in range(TOPIC.history + 1):
+            outlet.put(b"small")
+        assert len(list(asker.recover(KEY, "big", 0, 2**63, wait))) == TOPIC.history
 
 
 def test_asking_where_nobody_answers_ends_empty(endpoint):

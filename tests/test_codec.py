@@ -1,7 +1,7 @@
 """The codec: inverse of itself, and standard protobuf to everybody else."""
 
 import contextlib
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,20 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from schemas import fan_pb2, messages
 from schemas.codec import CodecError, decode, encode, proto_type, type_name
-from schemas.messages import MESSAGE_TYPES, Command, Counter, Grid, Header, Input, Message, Output, Raw, Score, columns
+from schemas.messages import (
+    MESSAGE_TYPES,
+    Command,
+    Counter,
+    Grid,
+    Header,
+    Input,
+    Message,
+    Output,
+    Prediction,
+    Raw,
+    Score,
+    columns,
+)
 from tests.message_strategies import any_message, same
 
 MESSAGES = st.sampled_from(MESSAGE_TYPES).flatmap(any_message)
@@ -124,7 +137,7 @@ def test_columns_that_do_not_fit_the_message_are_refused():
 
 
 def test_bytes_whose_columns_disagree_are_refused():
-    proto = fan_pb2.Grid(fans=2, t_ns=[1, 2], command=[1.0, 2.0])
+    proto = fan_pb2.Grid(fans=2, step_ns=1, t_ns=[1, 2], command=[1.0, 2.0])
     with pytest.raises(CodecError, match="shape"):
         decode(Grid, proto.SerializeToString())
 
@@ -143,6 +156,44 @@ def test_a_value_that_no_enum_knows_is_refused_and_not_wrapped():
 
 
 def test_a_message_that_lacks_a_column_of_its_samples_is_refused():
-    proto = fan_pb2.Grid(fans=1, t_ns=[1])
+    proto = fan_pb2.Grid(fans=1, step_ns=1, t_ns=[1])
     with pytest.raises(CodecError, match=r"Grid.command has shape \(0, 1\), not samples x fans = \(1, 1\)"):
         decode(Grid, proto.SerializeToString())
+
+
+def grid_with(step_ns: int, t_ns: int) -> Grid:
+    one = np.zeros((1, 1))
+    return Grid(
+        fans=1, step_ns=step_ns, t_ns=np.array([t_ns]), command=one, speed_rad_s=one, valid=one > 0, why_not=one
+    )
+
+
+@pytest.mark.parametrize("step_ns", [0, -1, 2**62])
+@pytest.mark.parametrize("kind", [Grid, Prediction, Score])
+def test_a_step_that_is_none_is_refused_on_both_ways(kind, step_ns):
+    with pytest.raises(CodecError, match="step_ns"):
+        encode(kind(fans=1, step_ns=step_ns))
+    with pytest.raises(CodecError, match="step_ns"):
+        decode(kind, proto_type(kind)(fans=1, step_ns=step_ns).SerializeToString())
+
+
+@pytest.mark.parametrize("t_ns", [2**62, -(2**62)])
+def test_a_time_beyond_2116_is_refused_on_both_ways(t_ns):
+    with pytest.raises(CodecError, match="2116"):
+        encode(grid_with(1, t_ns))
+    proto = fan_pb2.Grid.FromString(encode(grid_with(1, t_ns // 2)))
+    proto.t_ns[0] = t_ns
+    with pytest.raises(CodecError, match="2116"):
+        decode(Grid, proto.SerializeToString())
+
+
+def test_a_prediction_with_samples_but_no_sigma_is_refused_on_both_ways():
+    one = np.zeros((1, 1))
+    speeds = dict.fromkeys(("command", "measured_speed_rad_s", "predicted_speed_rad_s", "valid", "why_not"), one)
+    good = Prediction(fans=1, step_ns=1, t_ns=np.array([5]), sigma_rad_s=np.ones(1), **speeds)
+    with pytest.raises(CodecError, match="sigma_rad_s"):
+        encode(replace(good, sigma_rad_s=np.zeros(0)))
+    proto = proto_type(Prediction).FromString(encode(good))
+    proto.ClearField("sigma_rad_s")
+    with pytest.raises(CodecError, match="sigma_rad_s"):
+        decode(Prediction, proto.SerializeToString())

@@ -15,7 +15,7 @@ from pipeline import command_line
 from pipeline.command_line import COMMANDS, spell_out
 
 CONFIG = DEMO / "demo.toml"
-README = DEMO.parent / "README.md"
+README = DEMO.parents[1] / "README.md"
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -41,6 +41,8 @@ def test_a_good_file_gives_every_stage_its_section():
         (GOOD.replace('name = "a"', 'name = "health"'), ["reserved name"]),
         ("site = 'x'\n", ["'tray' is missing"]),
         ("site = \n", ["not valid TOML"]),
+        (GOOD.replace("0.25", "inf"), ["scorer.on_delay_s = inf", "finite"]),
+        (GOOD.replace("fans = 8", "fans = 8\nspeed_max = nan"), ["tray.0.speed_max = nan", "finite"]),
         (GOOD + '[launcher]\nstages = ["scorr"]\n', ["unknown stage 'scorr'", "did you mean 'scorer'"]),
         ("scorer = 3\n" + GOOD.replace("[scorer]\non_delay_s = 0.25", ""), ["'scorer' must be a section"]),
     ],
@@ -67,7 +69,15 @@ def test_overrides_set_nested_keys_and_keep_their_types():
     assert config.bus.endpoint == "tcp/127.0.0.1:1"
 
 
-@pytest.mark.parametrize(("override", "words"), [("on_delay", "KEY=VALUE"), ("tray.4.port=x", "no such place")])
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("on_delay", "KEY=VALUE"),
+        ("tray.4.port=x", "no such place"),
+        ("tray.².port=x", "no such place"),
+        ("run_folder='/tmp/it's here'", "not a TOML string"),
+    ],
+)
 def test_an_override_that_fits_nowhere_is_refused(override, words):
     with pytest.raises(ConfigError, match=words):
         parse(GOOD, override)
@@ -76,3 +86,10 @@ def test_an_override_that_fits_nowhere_is_refused(override, words):
 def test_a_missing_file_is_one_line(tmp_path):
     with pytest.raises(ConfigError, match="cannot read the configuration: No such file"):
         load_config(tmp_path / "none.toml")
+
+
+def test_a_file_that_is_not_utf_8_is_one_line(tmp_path):
+    path = tmp_path / "fantwin.toml"
+    path.write_bytes('site = "Prüfstand"'.encode("latin-1"))
+    with pytest.raises(ConfigError, match=r"fantwin.toml: the configuration is not UTF-8 \(byte 10\)"):
+        load_config(path)

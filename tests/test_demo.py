@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from PIL import Image
 
+from pipeline.commands.demo import DEMO_FOLDER, demo
+from pipeline.config import Config, load_config
+from pipeline.errors import UserError
 from tests.chain import fantwin
 
 
@@ -39,6 +47,41 @@ def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
     with Image.open(out / "bands.png") as picture:
         assert picture.width > 1000
     assert (out / "view.rrd").stat().st_size > 100_000
+
+
+def test_a_wheel_brings_what_the_demo_reads(tmp_path):
+    root = Path(__file__).parents[1]
+    for part in ("pyproject.toml", "README.md", "LICENSE"):  # a copy: a build leaves its traces in the source
+        shutil.copy(root / part, tmp_path)
+    for part in ("schemas", "pipeline", "stages", "twin"):
+        shutil.copytree(root / part, tmp_path / part, ignore=shutil.ignore_patterns("__pycache__"))
+    build = "import sys, setuptools.build_meta as backend; print(backend.build_wheel(sys.argv[1]))"
+    done = subprocess.run(
+        [sys.executable, "-c", build, str(tmp_path)], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    installed = tmp_path / "installed"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(installed)
+    folder = installed / DEMO_FOLDER.relative_to(root)
+    config = load_config(folder / "demo.toml")
+    assert config.trays[0].twin
+    assert (folder / config.trays[0].twin).is_file()
+
+
+def test_a_folder_with_an_apostrophe_is_a_folder_like_any_other(tmp_path, monkeypatch):
+    seen: list[Config] = []
+
+    def note(config: Config, *_: object) -> dict[str, int]:
+        seen.append(config)
+        raise UserError("far enough")
+
+    monkeypatch.setattr("pipeline.commands.demo._run", note)
+    out = tmp_path / 'o\'clock "demo"'
+    with pytest.raises(UserError, match="far enough"):
+        demo(out)
+    assert (seen[0].run_folder, seen[0].trays[0].port) == (out, str(out / "tray"))
 
 
 def test_a_folder_that_cannot_be_used_is_one_line(tmp_path):

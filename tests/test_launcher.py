@@ -55,6 +55,7 @@ def test_ctrl_c_stops_in_order_and_everything_sent_is_recorded_and_scored(chain)
         "run_folder": str(chain.folder),
         "restarts": {},
         "killed": [],
+        "failed": [],
         "lost": dict.fromkeys(sorted(chain.stages), 0),
     }
     assert not any(map(is_running, chain.process_ids().values()))

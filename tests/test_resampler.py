@@ -399,3 +399,66 @@ def test_what_the_device_sent_while_acquisition_was_dead_is_counted_by_its_seque
 def test_no_loss_is_counted_when_a_new_session(name: str, messages: list[Raw]) -> None:
     _, core = run(messages)
     assert core.counters().get("lost_between_sessions", 0) == 0, name
+
+
+def stamped(message: Raw, producer: str, sequence: int) -> Raw:
+    return replace(message, header=Header(producer, sequence, "tray1"))
+
+
+def moved(message: Raw, by_s: float) -> Raw:
+    return replace(message, host_receive_t_ns=message.host_receive_t_ns + round(by_s * NS_PER_S))
+
+
+@pytest.mark.parametrize("producer", ["a", "b"], ids=["running on", "acquisition restarted"])
+def test_a_clock_set_back_is_lost_and_said_until_it_has_caught_up(producer: str) -> None:
+    message = raw(at(0.0, 0.01), np.zeros(2))
+    core = ResamplerCore(1, ResamplerConfig())
+    core.step(stamped(message, "a", 0))
+    assert core.problem() == ""
+    core.step(stamped(moved(message, -3600), producer, 1))
+    core.step(stamped(moved(message, -3599), producer, 2))
+    assert core.counters()["lost_clock_set_back"] == 4
+    assert core.counters().get("out_of_order", 0) == 0
+    assert core.problem() == (
+        "the host's clock was set back by 3600 s: samples are refused until it has caught up; restart the stages"
+    )
+    core.step(stamped(moved(message, 1), producer, 3))
+    assert core.problem() == ""
+
+
+def test_one_time_far_in_the_future_is_said_as_a_clock_set_back() -> None:
+    message = raw(at(0.0, 0.01), np.zeros(2))
+    core = ResamplerCore(1, ResamplerConfig())
+    for sequence, by_s in enumerate((0, 1e8, 1)):
+        core.step(stamped(moved(message, by_s), "a", sequence))
+    assert "set back by 99999999 s" in core.problem()
+
+
+def test_what_the_bus_hands_again_or_late_from_an_ended_session_is_no_clock_set_back() -> None:
+    message = raw(at(0.0, 0.01), np.zeros(2))
+    core = ResamplerCore(1, ResamplerConfig())
+    core.step(stamped(message, "a", 0))
+    core.step(stamped(moved(message, 5), "a", 2))
+    core.step(stamped(message, "a", 0))
+    core.step(stamped(moved(message, 10), "b", 0))
+    core.step(stamped(moved(message, 6), "a", 3))
+    assert core.problem() == ""
+    assert core.counters()["out_of_order"] == 4
+    assert "lost_clock_set_back" not in core.counters()
+
+
+def test_a_late_message_of_an_ended_session_counts_no_loss_between_sessions() -> None:
+    message = raw(at(0.0, 0.01), np.zeros(2))
+    core = ResamplerCore(1, ResamplerConfig())
+    for producer, sequence, by_s, first in (("a", 0, 0, 0), ("b", 0, 10, 10), ("a", 1, 1, 2), ("b", 1, 11, 12)):
+        numbered = replace(moved(message, by_s), device_sequence=np.array([first, first + 1], np.uint32))
+        core.step(stamped(numbered, producer, sequence))
+    assert core.counters()["lost_between_sessions"] == 8
+
+
+def test_another_number_of_fans_is_said_only_until_the_right_one_comes() -> None:
+    core = ResamplerCore(1, ResamplerConfig())
+    core.step(raw(at(0.0), np.zeros(1), fans=2))
+    assert "raw samples of 2 fans" in core.problem()
+    core.step(raw(at(0.01), np.zeros(1)))
+    assert core.problem() == ""

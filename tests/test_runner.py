@@ -13,11 +13,11 @@ import pytest
 
 from pipeline.bus import Bus
 from pipeline.config import BusConfig, Config, LauncherConfig, TrayConfig
-from pipeline.runner import Runner
+from pipeline.runner import INBOX_SIZE, Runner
 from pipeline.stage import Context, Core, Parts, Stage, StageConfig
 from schemas.codec import decode, encode, type_name
-from schemas.messages import Command, Grid, Header, Health, Message, Raw, StageStatus
-from schemas.topics import BY_NAME, health_key, tray_key
+from schemas.messages import Command, Grid, Header, Health, Message, Output, Raw, StageStatus
+from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
 TRAY_A, TRAY_B = "a", "b"
 
@@ -104,9 +104,16 @@ class Bench:
         }
         self.runner = Runner(stage, config, tray, self.stop)
         self.last: list[Health] = []
-        self.thread = threading.Thread(target=lambda: self.last.append(self.runner.run()))
+        self.crashes: list[ZeroDivisionError] = []
+        self.thread = threading.Thread(target=self._run)
         self.thread.start()
         self.health_with(lambda health: health.status == StageStatus.OK)
+
+    def _run(self) -> None:
+        try:
+            self.last.append(self.runner.run())
+        except ZeroDivisionError as crash:
+            self.crashes.append(crash)
 
     def _hear(self, kind: type[Message]) -> Callable[[str, bytes], None]:
         return lambda key, payload: self.heard.put((key, decode(kind, payload)))
@@ -200,23 +207,112 @@ def test_messages_of_trays_that_are_not_configured_are_not_read(config):
 
 
 def test_a_stage_that_may_drop_throws_its_oldest_away_and_counts(config):
-    release = threading.Event()
+    release, newest = threading.Event(), threading.Event()
     taken: list[int] = []
+    count = 6000
 
     class Slow(Passer):
         def step(self, item: Any) -> Sequence[Message]:
             release.wait(20)
             taken.append(int(item.host_receive_t_ns[0]))
+            if taken[-1] == count - 1:
+                newest.set()
             return []
 
     bench = Bench(toy(lambda _context: Parts(Slow()), may_drop=True), config)
-    count = 6000
     for t_ns in range(count):
         bench.feed(TRAY_A, t_ns)
     release.set()
+    assert newest.wait(20)
     last = bench.end()
     counters = {c.name: c.value for c in last.counters}
-    assert taken[-1] == count - 1
     assert taken == sorted(taken)
     assert counters["dropped"] > 0
     assert last.inputs[0].missing == count - len(taken)
+    assert last.lost == 4  # the counters of the two cores: what it may drop is no loss
+
+
+def test_a_stage_stops_while_its_producer_goes_on(config):
+    bench = Bench(toy(), config)
+    enough = threading.Event()
+
+    def feed_on() -> None:
+        t_ns = 0
+        while not enough.wait(0.002):
+            bench.feed(TRAY_A, t_ns)
+            t_ns += 1
+
+    feeder = threading.Thread(target=feed_on)
+    feeder.start()
+    bench.next(Grid)
+    bench.stop.set()
+    bench.thread.join(20)
+    stopped = not bench.thread.is_alive()
+    enough.set()
+    feeder.join()
+    bench.end()
+    assert stopped
+
+
+def test_a_stage_that_crashes_says_so_and_not_that_it_stopped_in_order(config):
+    class Broken(Passer):
+        def step(self, item: Any) -> Sequence[Message]:
+            raise ZeroDivisionError("on purpose")
+
+    bench = Bench(toy(lambda _context: Parts(Broken())), config)
+    bench.feed(TRAY_A, 1)
+    last = bench.health_with(lambda health: "crashed" in health.problem)
+    bench.thread.join(20)
+    bench.bus.close()
+    assert bench.crashes
+    assert last.status == StageStatus.DEGRADED
+    assert "ZeroDivisionError: on purpose" in last.problem
+
+
+def test_a_stage_that_crashes_with_a_full_inbox_leaves_the_bus_at_once(config):
+    fed = threading.Event()
+
+    class BrokenLater(Passer):
+        def step(self, item: Any) -> Sequence[Message]:
+            fed.wait(20)
+            raise ZeroDivisionError("on purpose")
+
+    bench = Bench(toy(lambda _context: Parts(BrokenLater())), config)
+    for t_ns in range(INBOX_SIZE + 500):
+        bench.feed(TRAY_A, t_ns)
+    fed.set()
+    bench.thread.join(20)
+    bench.bus.close()
+    assert not bench.thread.is_alive()
+    assert str(bench.crashes[0]) == "on purpose"  # and not that the bus could not be closed
+
+
+def test_an_orphaned_stage_goes_on_until_those_it_reads_from_have_ended(config):
+    bench = Bench(toy(), config)
+    with Bus(config.bus) as feeder:
+        key, stage = health_key("s", "acquisition", TRAY_A), ("acquisition", TRAY_A)
+        health = Health(
+            header=Header("feeder", 0, ""),
+            stage=stage[0],
+            instance=stage[1],
+            status=StageStatus.OK,
+            t_ns=0,
+            uptime_s=0.0,
+            outputs=(Output(key=tray_key("s", TRAY_A, "raw"), published=0),),
+        )
+        feeder.declare_alive(alive_key("s", *stage))
+        outlet = feeder.outlet(key, BY_NAME["health"], type_name(Health), "feeder")
+        while not any(map(bench.runner._is_fed_by, set(bench.runner._alive))):  # until they have met
+            outlet.put(encode(health))
+            bench.next(Health)
+        bench.runner.orphaned.set()
+        last = None
+        for _ in range(3):  # seconds in which it could have ended
+            last = bench.health_with(lambda h: h.stage == "resampler")
+            if last.status == StageStatus.STOPPED:
+                break
+    bench.thread.join(20)
+    ended_by_itself = not bench.thread.is_alive()
+    bench.end()
+    assert last and last.status == StageStatus.OK, "it ended while there was still somebody to read from"
+    assert ended_by_itself

@@ -249,3 +249,50 @@ def test_another_number_of_fans_is_lost_and_said_to_be() -> None:
 def test_a_deadband_that_no_alarm_could_ever_leave_is_refused() -> None:
     with pytest.raises(ValidationError, match="no alarm could ever clear"):
         ScorerConfig(alarm_sigmas=2.0, deadband_sigmas=2.0)
+
+
+def unjudged(seconds: float, why: Sequence[WhyNot], first_s: float = 0.0) -> Prediction:
+    """Fans that are judged where `why` is NONE."""
+    samples = round(seconds * 100)
+    valid = np.tile([reason == WhyNot.NONE for reason in why], (samples, 1))
+    prediction = prediction_of(np.zeros(valid.shape), valid, first=round(first_s * 100))
+    prediction.why_not[:] = np.array(why, np.uint8)
+    return prediction
+
+
+def test_fans_that_are_not_judged_for_long_are_told_with_the_reason_until_they_are_again() -> None:
+    core = core_of(fans=4)
+    why = [WhyNot.NONE, WhyNot.NO_SPEED, WhyNot.OUT_OF_RANGE, WhyNot.NO_SPEED]
+    feed(core, [unjudged(9.99, why)])
+    assert core.problem() == ""
+    feed(core, [unjudged(0.01, why, first_s=9.99)])
+    assert core.problem() == (
+        "fan 2 is not judged: the command is out of the twin's range, or a value is no number for 10 s and more; "
+        "fans 1, 3 are not judged: no speed for 10 s and more"
+    )
+    feed(core, [unjudged(15, why, first_s=10)])
+    assert "no speed for 20 s and more" in core.problem()
+    feed(core, [unjudged(0.01, [WhyNot.NONE] * 4, first_s=25)])
+    assert core.problem() == ""
+
+
+def test_a_first_warm_up_is_not_told_but_one_without_an_end_is() -> None:
+    core = core_of()
+    feed(core, [unjudged(59.99, [WhyNot.WARMING_UP])])
+    assert core.problem() == ""
+    feed(core, [unjudged(0.01, [WhyNot.WARMING_UP], first_s=59.99)])
+    assert "fan 0 is not judged: the twin is warming up" in core.problem()
+
+
+def test_a_silent_line_does_not_count_as_not_judged() -> None:
+    core = core_of()
+    feed(core, [unjudged(1, [WhyNot.NONE]), unjudged(1, [WhyNot.WARMING_UP], first_s=1000)])
+    assert core.problem() == ""
+
+
+def test_another_number_of_fans_is_said_only_until_the_right_one_comes() -> None:
+    core = core_of()
+    feed(core, [prediction_of(np.zeros((1, 2)))])
+    assert "predictions of 2 fans" in core.problem()
+    feed(core, [prediction_of(np.zeros(1))])
+    assert core.problem() == ""

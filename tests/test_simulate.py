@@ -429,3 +429,10 @@ def test_a_part_of_a_file_that_holds_nothing_is_refused(tmp_path: Path) -> None:
     path.write_text(TABLE)
     with pytest.raises(UserError, match=r"no row from 100 s to inf s; it is 8 s long"):
         PlayedTable(read_table(path, "t ms:ms", ["duty"], ["rpm:rpm"]), 100.0, float("inf"))
+
+
+@pytest.mark.parametrize("duration", [float("inf"), float("nan")])
+def test_a_recording_without_an_end_is_refused(tmp_path, duration):
+    with pytest.raises(UserError, match="duration"):
+        simulate(duration=duration, recording=tmp_path / "x.mcap")
+    assert not (tmp_path / "x.mcap").exists()

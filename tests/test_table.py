@@ -219,3 +219,15 @@ def test_what_csv_writes_with_quotes_is_read(tmp_path):
         writer = csv.writer(file, quoting=csv.QUOTE_ALL)
         writer.writerows([["time, s", "u", "y"], [0, 1, 10], [1, 2, 20]])
     assert read_table(path, "time, s", ["u"], ["y"]).speed_rad_s.tolist() == [[10.0], [20.0]]
+
+
+@pytest.mark.parametrize(("unit", "finer"), [("", "ms"), (":s", "ms"), (":ms", "us")])
+@pytest.mark.parametrize("fraction", ["", ".5"])
+def test_times_read_in_too_large_a_unit_are_told_with_the_unit_to_try(tmp_path, unit, finer, fraction):
+    t = f"1700000000123{'' if finer == 'ms' else '000'}{fraction}"
+    with pytest.raises(UserError, match=rf"beyond the year 2116: is it in ms, us or ns\? write --time t:{finer}"):
+        table(tmp_path, f"t,u,y\n{t},1,10\n{t},2,20\n", time=f"t{unit}")
+
+
+def test_a_time_too_large_for_a_float_is_no_time(tmp_path):
+    assert table(tmp_path, "t,u,y\n0,1,10\n1e305,1,10\n1,2,20\n").mended.without_time == 1

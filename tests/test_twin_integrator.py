@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -354,3 +355,27 @@ def test_a_tray_without_a_twin_is_told_what_to_set(tmp_path: Path) -> None:
 def test_the_twin_is_found_beside_the_configuration(tmp_path: Path) -> None:
     write_twin(tmp_path / "twin.onnx")
     assert STAGE.build(_context(tmp_path, Path("twin.onnx"))).core.tick(0)
+
+
+def test_a_bridge_of_absurdly_many_samples_is_not_run() -> None:
+    steps: list[int] = []
+    twin = physical_twin()
+
+    def counted(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+        steps.append(len(command))
+        return np.zeros(command.shape), state
+
+    core = core_of(replace(twin, advance=counted))
+    grid = grid_of(np.zeros(2), step_ns=1)
+    grid.t_ns[1] = grid.t_ns[0] + 300_000_000  # within hold_limit_s
+    core.step(grid)
+    assert sum(steps) <= 4
+    assert core.counters()["free_runs"] == 2
+
+
+def test_a_problem_is_said_only_until_a_grid_comes_that_fits() -> None:
+    core = core_of()
+    core.step(grid_of(np.zeros((1, 2))))
+    assert "grid of 2 fans" in core.problem()
+    core.step(grid_of(np.zeros(1)))
+    assert core.problem() == ""

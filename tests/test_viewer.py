@@ -391,3 +391,22 @@ def rows_of(path: Path) -> dict[str, list[tuple[int, dict[str, Any]]]]:
 def styles_of(path: Path, entity: str, component: str) -> list[str]:
     (chunk,) = (chunk for chunk in chunks_of(path) if chunk.is_static and chunk.entity_path == entity)
     return chunk.to_record_batch().column(component)[0].as_py()
+
+
+def test_messages_of_a_tray_that_is_not_configured_are_counted_and_ignored() -> None:
+    sink = FakeSink()
+    core = core_of(sink)
+    scores, alarms = made_up_tray(tray="elsewhere", seconds=1)
+    for message in (*scores, *alarms):
+        core.step(message)
+    core.close()
+    assert core.counters()["unknown_tray"] == len(scores) + len(alarms) > 2
+    assert not sink.traces and not sink.lines
+
+
+def test_scores_of_another_number_of_fans_are_told_only_until_the_right_ones_come() -> None:
+    core = core_of(FakeSink(), fans=3)
+    core.step(made_up_tray(fans=2, seconds=1, faulty_fan=None)[0][0])
+    assert core.problem() == "scores of 2 fans, [[tray]] tray1 says fans = 3: correct `fans`"
+    core.step(made_up_tray(fans=3, seconds=1)[0][0])
+    assert core.problem() == ""

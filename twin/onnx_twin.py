@@ -1,9 +1,10 @@
 """An exported twin, run by onnxruntime behind the interface of a model in memory: what ships is what is judged."""
 
+import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import onnxruntime
 
 from twin.card import CARD_KEY, Card
 from twin.errors import TwinError
@@ -49,7 +50,10 @@ class OnnxTwin:
         return np.asarray(speed_rad_s), np.asarray(state_out)
 
 
-def _session(path: Path) -> onnxruntime.InferenceSession:
+def _session(path: Path) -> Any:
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # it sends as soon as it is imported, on Linux too since 1.31
+    import onnxruntime  # noqa: PLC0415
+
     options = onnxruntime.SessionOptions()
     # A body of sixty tiny nodes gains nothing from threads, and their hand-over costs more than the work.
     options.intra_op_num_threads = 1

@@ -29,7 +29,7 @@ from pipeline.demo_report import Summary, summarise
 from pipeline.errors import UserError
 from pipeline.signals import stop_on_signals
 
-DEMO_FOLDER = Path(__file__).parents[2] / "demo"
+DEMO_FOLDER = Path(__file__).parents[1] / "demo"
 DURATION_S = 32.0
 FAULTS = (
     ("inlet", "fan=2,start=8,stop=14,size=1.8"),
@@ -56,8 +56,8 @@ def demo(
     _clear(out)
     overrides = [
         "viewer.serve=false",
-        f"run_folder='{out}'",
-        f"tray.0.port='{out / 'tray'}'",
+        f"run_folder={json.dumps(str(out))}",
+        f"tray.0.port={json.dumps(str(out / 'tray'))}",
         f"bus.endpoint='tcp/127.0.0.1:{_free_port()}'",
     ]
     config = load_config(DEMO_FOLDER / "demo.toml", overrides)
@@ -198,10 +198,11 @@ def _tell(summary: Summary, out: Path, took_s: float, console: Console) -> None:
         cells[2] = "" if fault.delay_s is None else f"{fault.delay_s:.2f}"
         table.add_row(fault.kind, str(fault.fan), *cells)
     console.print(table)
+    p50, p99 = ("unknown" if t is None else f"{t:.1f} ms" for t in summary.latency_ms.values())
     console.print(
         f"{summary.fans} fans, {summary.samples_sent} samples sent, {summary.samples_recorded} recorded, "
         f"{summary.lost} lost, {summary.false_alarms} false alarms; "
-        f"sample to score {summary.latency_ms['p50']:.1f} ms (median), {summary.latency_ms['p99']:.1f} ms (p99); "
+        f"sample to score {p50} (median), {p99} (p99); "
         f"{took_s:.0f} s in all"
     )
     shown, programs = (Path(os.path.relpath(path)) for path in (out, Path(sys.executable).parent))

@@ -22,6 +22,7 @@ class DemoScreen:
     """What is shown while the demo runs."""
 
     def __init__(self, config: Config, bus: Bus) -> None:
+        self._config = config
         self._tray = config.trays[0]
         self._watcher = Watcher(bus, config.site)
         self._score: Score | None = None
@@ -39,7 +40,9 @@ class DemoScreen:
 
     def render(self) -> Group:
         """Stages and alarms, and below them the fans."""
-        return Group(stage_table(self._watcher), self._fan_table())
+        starting = Text("the stages start", style="dim")
+        stages = stage_table(self._watcher, self._config) if self._watcher.stages() else starting
+        return Group(stages, self._fan_table())
 
     def line(self) -> str:
         """The same in a line, where there is no terminal."""

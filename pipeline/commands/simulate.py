@@ -152,6 +152,8 @@ def simulate(
     if recording:
         if duration is None or link or wait:
             raise UserError("--recording needs --duration; a line's --link and --wait-for-reader do not go with it")
+        if not math.isfinite(duration):
+            raise UserError(f"--duration {duration}: a recording must end; give a number of seconds")
         if recording.exists() and not force:
             raise UserError(f"{recording}: exists; name another file with --recording, or replace it with --force")
         played = record(device, recording, clock.time_ns() if epoch_ns is None else epoch_ns, duration, speed_unit)

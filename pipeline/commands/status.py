@@ -50,31 +50,34 @@ def status(
             if json_output:
                 typer.echo(json.dumps(as_json(watcher)))
             else:
-                Console().print(stage_table(watcher))
+                Console().print(stage_table(watcher, settings))
         else:
             watcher.ask_for_past_alarms()
             with Live(console=Console(), refresh_per_second=4) as live:
                 while not stop.wait(0.25):
-                    live.update(stage_table(watcher))
+                    live.update(stage_table(watcher, settings))
+            _require_someone(watcher, settings)
         if any(watcher.losses().values()):
             raise typer.Exit(3)
 
 
 def _require_someone(watcher: Watcher, config: Config) -> None:
     if not watcher.stages():
-        raise UserError(
-            f"no stage of site {config.site!r} answers at {config.bus.endpoint}; "
-            f"is `fantwin up -c {config.path}` running?"
-        )
+        raise UserError(f"{_nobody(config)}; is `fantwin up -c {config.path}` running?")
 
 
-def stage_table(watcher: Watcher) -> Group:
+def _nobody(config: Config) -> str:
+    return f"no stage of site {config.site!r} answers at {config.bus.endpoint}"
+
+
+def stage_table(watcher: Watcher, config: Config) -> Group:
     """What a person is shown: a row for each stage, what is wrong, and the alarms."""
     table = Table("stage", "state", title="stages", title_justify="left", box=SIMPLE_HEAD)
     for column in ("in /s", "out /s", "p50 ms", "p99 ms", "lost"):
         table.add_column(column, justify="right")
-    problems: list[Text] = []
-    for view in watcher.stages():
+    views = watcher.stages()
+    problems = [] if any(view.alive for view in views) else [Text(_nobody(config), style="red")]
+    for view in views:
         health = view.health
         name = health.stage if health.instance == "all" else f"{health.stage}/{health.instance}"
         lost = Text(str(health.lost), style="red" if health.lost else "")
@@ -84,8 +87,10 @@ def stage_table(watcher: Watcher) -> Group:
         table.add_row(name, _state(view), f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}", *latency, lost)
         if health.problem and view.alive:
             problems.append(Text(f"{name}: {health.problem}", style="red"))
-    alarms = [_alarm_line(alarm) for alarm in watcher.alarms()] or [Text("no alarms", style="green")]
-    return Group(table, *problems, *alarms)
+    alarms = [_alarm_line(alarm) for alarm in watcher.alarms()]
+    if not any(view.alive and view.health.stage == "scorer" for view in views):
+        alarms.append(Text("alarms unknown: no scorer is alive", style="red"))
+    return Group(*([table] if views else []), *problems, *(alarms or [Text("no alarms", style="green")]))
 
 
 def _state(view: StageView) -> Text:

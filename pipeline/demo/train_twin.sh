@@ -1,6 +1,6 @@
 #!/bin/sh
-# Trains demo/twin.onnx, the twin of the demo's tray, on recordings of that tray that hold no fault. The demo runs the
-# same fans on commands that none of these recordings has.   sh demo/train_twin.sh [FANTWIN] [OUT.onnx]
+# Trains twin.onnx, the twin of the demo's tray, on recordings of that tray that hold no fault. The demo runs the
+# same fans on commands that none of these recordings has.   sh train_twin.sh [FANTWIN] [OUT.onnx]
 set -eu
 fantwin=${1:-fantwin}
 out=${2:-$(dirname "$0")/twin.onnx}
