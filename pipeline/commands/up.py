@@ -17,7 +17,8 @@ from pipeline.signals import stop_on_signals
 def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_output: JsonOption = False) -> None:
     """Start all stages, restart what dies, stop all in order on Ctrl-C.
 
-    Exit codes: 0 stopped in order, nothing lost; 1 could not start, or a stage failed or was killed at the end; 3 something was lost.
+    Exit codes: 0 stopped in order, nothing lost; 1 could not start, or a stage failed or was killed at the end;
+    3 something was lost.
 
     Example: fantwin up -c fantwin.toml
     """
