@@ -307,7 +307,7 @@ class Runner:
         if "health" in self.stage.reads:
             keys.append(health_key(self._site, "*", "*"))
         for key in keys:
-            kept = self._recover(key, "*", 0, 2**63)
+            kept = (p for p in self._recover(key, "*", 0, 2**63) if p.message.header.producer != self.producer)
             for packet in sorted(kept, key=lambda p: (p.message.header.producer, p.message.header.sequence)):
                 for due in self._inlet.accept(packet):
                     self._step(due)

@@ -108,7 +108,7 @@ def test_a_killed_recorder_loses_nothing(chain):
         eventually(lambda: received(view_of(watcher, "recorder")) > 300, "the recorder records")
         kill(chain, watcher, "recorder")
     assert chain.tray and chain.tray.end() == 0
-    assert up.end() == 0, up.lines
+    assert up.end() == 0, (up.output()["lost"], up.lines[-3:])
     assert chain.tray.output()["samples_sent"] == len(recorded_samples(chain))
     assert len(chain.recordings()) == 2
     for (topic, producer), numbers in recorded_sequences(chain).items():
