@@ -280,7 +280,7 @@ def _series_handles(with_truth: bool) -> list[Line2D | Patch]:
         Line2D([], [], color=MEASURED, lw=1.2, label="measured"),
         Line2D([], [], color=TWIN, lw=1.8, label="twin"),
         Patch(color=BAND, lw=0, label="twin ± 2σ"),
-        Line2D([], [], color=OUTSIDE, marker=".", ls="", label="sample outside the band"),
+        Line2D([], [], color=OUTSIDE, marker=".", ls="", label="outside the band (1 in 20 when healthy)"),
         Patch(color=ZONE, alpha=0.6, lw=0, label="alarm active"),
     ]
     return [*handles, Patch(color=FAULT, lw=0, label="true fault")] if with_truth else handles

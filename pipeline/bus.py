@@ -12,6 +12,7 @@ questions for them, so that a consumer that was not yet connected, or was restar
 from __future__ import annotations
 
 import json
+import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -94,6 +95,8 @@ class Bus:
             BusError: the endpoint cannot be used, or a client's router is not there.
         """
         self._config = config
+        self.came_second = _somebody_listens(config.endpoint)
+        """Whether others were there before: it takes a moment until they are met."""
         self._session = _open(config, stop)
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
 
@@ -198,6 +201,20 @@ def _reason(error: zenoh.ZError) -> str:
     """What Zenoh says, without where in its sources it says so."""
     said = str(error)
     return (said.partition('msg: "')[2] or said).split(" at /")[0].strip()
+
+
+def _somebody_listens(endpoint: str) -> bool:
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.rpartition(":")
+    if protocol != "tcp" or not port.isdecimal():
+        return False
+    with socket.socket() as probe:  # bound and not connected: the other end would take it for a peer
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, int(port)))
+        except OSError:
+            return True
+    return False
 
 
 def _open(config: BusConfig, stop: threading.Event | None) -> zenoh.Session:

@@ -7,6 +7,7 @@ stage and is checked by the model that stage declares. Unknown keys are refused 
 from __future__ import annotations
 
 import difflib
+import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -168,7 +169,7 @@ def parse_config(text: str, path: Path, overrides: Iterable[str] = ()) -> Config
         path=path,
         text=text,
         site=file.site,
-        run_folder=file.run_folder if file.run_folder.is_absolute() else folder / file.run_folder,
+        run_folder=Path(os.path.normpath(folder / file.run_folder)),
         bus=file.bus,
         launcher=file.launcher,
         trays=file.tray,

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from pipeline.account import label
 from pipeline.bus import Bus
 from pipeline.config import Config
 from pipeline.errors import UserError
@@ -17,6 +18,7 @@ from pipeline.watcher import Watcher
 from schemas.topics import alive_key
 
 _LOOK_S = 0.05
+_MEETING_S = 2.0  # within which those who were there before are met
 _ORDERLY = (0, 3)  # how a stage ends in order: all well, or something was lost
 _READY_TIMEOUT_S = 30.0
 _STABLE_S = 10.0  # a stage that ran this long starts again at the shortest delay
@@ -60,6 +62,7 @@ class Launcher:
         self._path: Path = config.path
         self._overrides = tuple(overrides)
         self._say = say
+        self._told: dict[str, str] = {}
         self._slots = [_Slot(row, delay_s=config.launcher.restart_delay_s) for row in process_list(config)]
         self.outcome = Outcome(run_folder=str(config.run_folder))
 
@@ -76,6 +79,7 @@ class Launcher:
                 self._start_all(stop)
                 while not stop.wait(_LOOK_S):
                     self._look()
+                    self._tell()
                 self._bring_back()
             finally:
                 self._stop_all()
@@ -83,7 +87,10 @@ class Launcher:
         return self.outcome
 
     def _refuse_a_second(self, bus: Bus) -> None:
-        alive = bus.alive(alive_key(self._config.site, "*", "*"))
+        key = alive_key(self._config.site, "*", "*")
+        until_s = time.monotonic() + (_MEETING_S if bus.came_second else 0.0)
+        while not (alive := bus.alive(key)) and time.monotonic() < until_s:
+            time.sleep(_LOOK_S)
         ours = {alive_key(self._config.site, slot.row.stage, slot.row.instance): slot.row.label for slot in self._slots}
         running = [label for key, label in ours.items() if key in alive]
         if running:
@@ -133,6 +140,20 @@ class Launcher:
                 slot.child.stop(0.1)
                 raise UserError(slot.child.last_line or f"{slot.row.label} cannot start as configured")
             self._plan_restart(slot, status, now)
+
+    def _tell(self) -> None:
+        """Say what has changed: troubles of stages, and alarms."""
+        for view in self._watcher.stages():
+            name, problem = label(view.health), view.health.problem
+            if view.alive and problem != self._told.get(name, ""):
+                self._told[name] = problem
+                self._say(f"{name}: {problem or 'all well again'}")
+        for alarm in self._watcher.alarms():
+            fan = f"{alarm.header.tray} fan {alarm.fan}"
+            now = f"{'ALARM' if alarm.active else 'cleared'}  {alarm.header.tray}  {alarm.message}"
+            if now != self._told.get(fan):
+                self._told[fan] = now
+                self._say(now)
 
     def _plan_restart(self, slot: _Slot, status: int, now: float) -> None:
         assert slot.child is not None

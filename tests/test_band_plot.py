@@ -58,7 +58,7 @@ def test_title_axis_and_legend_name_everything_with_its_unit(tmp_path: Path) -> 
     assert panels[1].get_title(loc="left") == "fan 2   covered inlet at 8.0 s, alarm 0.50 s later"
     assert figure.axes[-1].get_xlabel() == "time since 2023-11-14 22:13:20 UTC (s)"
     texts = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    assert texts[:5] == ["measured", "twin", "twin ± 2σ", "sample outside the band", "alarm active"]
+    assert texts[:5] == ["measured", "twin", "twin ± 2σ", "outside the band (1 in 20 when healthy)", "alarm active"]
     assert set(texts[5:]) == {"true fault", "state: normal", "suspect", "alarm", "returning", "unknown: not judged"}
     assert (tmp_path / "bands.svg").stat().st_size > 0
 

@@ -110,7 +110,11 @@ def test_an_outlet_keeps_the_newest_messages_that_fit_its_memory(endpoint):
     def wait() -> None:
         pause.wait(0.002)
 
+    met = threading.Event()
     with Bus(patient) as publisher, Bus(patient) as asker:
+        publisher.declare_alive(alive_key("site", "big", "all"))
+        asker.watch_alive(alive_key("site", "*", "*"), lambda _key, _alive: met.set())
+        assert met.wait(20)
         outlet = publisher.outlet(KEY, TOPIC, "", "big")
         for number in range(count):
             outlet.put(bytes([number]) * size)

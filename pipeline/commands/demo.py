@@ -200,7 +200,7 @@ def _tell(summary: Summary, out: Path, took_s: float, console: Console) -> None:
     console.print(table)
     p50, p99 = ("unknown" if t is None else f"{t:.1f} ms" for t in summary.latency_ms.values())
     console.print(
-        f"{summary.fans} fans, {summary.samples_sent} samples sent, {summary.samples_recorded} recorded, "
+        f"{summary.fans} fans, {summary.samples_sent} samples of the tray sent, {summary.samples_recorded} recorded, "
         f"{summary.lost} lost, {summary.false_alarms} false alarms; "
         f"sample to score {p50} (median), {p99} (p99); "
         f"{took_s:.0f} s in all"

@@ -51,8 +51,11 @@ class DemoScreen:
         states = [FanState(state) for state in self._score.state[-1]]
         notable = [f"fan {fan} {state.name.lower()}" for fan, state in enumerate(states) if state != FanState.NORMAL]
         if len(notable) == len(states):
-            return "all fans: " + states[0].name.lower()
+            return f"all fans {states[0].name.lower()}" + (" (twins warming up)" if self._warming_up() else "")
         return (", ".join(notable) or "all fans normal") + f"; lost {sum(self._watcher.losses().values())}"
+
+    def _warming_up(self) -> bool:
+        return self._score is not None and bool((self._score.why_not[-1] == WhyNot.WARMING_UP).all())
 
     def _fan_table(self) -> Table:
         unit = self._tray.speed_unit
