@@ -58,15 +58,6 @@ class Inlet:
                 line = self._line(output.key, health.header.producer)
                 yield from self._fill(output.key, health.header.producer, line, output.published)
 
-    def is_complete(self, health: Health, keys: Iterable[str]) -> bool:
-        """Whether everything that a producer says it has published on `keys` has come (or has been given up)."""
-        wanted = set(keys)
-        return all(
-            (self._line(output.key, health.header.producer).next_sequence or 0) >= output.published
-            for output in health.outputs
-            if output.key in wanted
-        )
-
     def inputs(self) -> tuple[Input, ...]:
         """The account, for health."""
         return tuple(

@@ -179,7 +179,7 @@ class ResamplerCore(Core):
         if self._wrong_fans:
             return f"raw samples of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
         if self._silence_ns >= self._watermark_ns:
-            return f"no raw samples for {self._silence_ns / NS_PER_S:.1f} s: look at acquisition"
+            return f"no raw samples for {self._watermark_ns / NS_PER_S:g} s and more: look at acquisition"
         if self._set_back_ns:
             return (
                 f"the host's clock was set back by {self._set_back_ns / NS_PER_S:.0f} s: "

@@ -210,7 +210,10 @@ def test_nothing_is_said_before_the_watermark_and_nothing_beyond_the_end() -> No
     assert core.problem() == ""
     grid = joined(_ticks(core, 0.5, 60.0))
     assert seconds_of(grid.t_ns[[0, -1]]).tolist() == [0.01, 5.0]
-    assert "acquisition" in core.problem()
+    told = core.problem()
+    assert "acquisition" in told
+    _ticks(core, 60.0, 63.0)
+    assert core.problem() == told  # a state and no stopwatch: whoever tells changes must not tell it every second
 
 
 def test_a_host_that_stood_still_does_not_take_that_for_silence() -> None:
