@@ -26,10 +26,12 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "identify": ("identify", "Twins"),
     "train": ("train", "Twins"),
     "evaluate": ("evaluate", "Twins"),
+    "compare": ("compare", "Twins"),
+    "report": ("report", "Twins"),
     "simulate": ("simulate", "Simulated tray"),
 }
 
-VARIADIC: dict[str, tuple[str, ...]] = {"train": ("--validate",)}
+VARIADIC: dict[str, tuple[str, ...]] = {"train": ("--validate",), "compare": ("--validate", "--test")}
 """Options that take all words up to the next option, by command."""
 
 app = typer.Typer(

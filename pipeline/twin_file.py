@@ -2,8 +2,9 @@
 
 The graph (float64) takes `state` (fans, n_state), `command` (n, fans), `step_s` (n,) and `parameters`
 (fans, n_parameters), and gives `speed_rad_s` (n, fans), the speed at each sample before its command acts, and
-`state_out` (fans, n_state). The metadata property `fantwin.card` holds the card as JSON. docs/deciding.md tells how
-the card's healthy residual is used.
+`state_out` (fans, n_state). A continuous twin carries its speed and what is left of the commands before (the lagged
+command), a discrete one as many past speeds and commands as its order. The metadata property `fantwin.card` holds the
+card as JSON. docs/deciding.md tells how the card's healthy residual is used.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -22,7 +23,7 @@ from pipeline.stage import StageError
 from schemas.messages import Array
 
 CARD_PROPERTY = "fantwin.card"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 INPUTS = ("state", "command", "step_s", "parameters")
 OUTPUTS = ("speed_rad_s", "state_out")
 
@@ -47,7 +48,7 @@ class TwinCard(_OfCard):
 
     format_version: int
     name: str
-    kind: str
+    kind: Literal["physical", "narx", "neural-ode", "hybrid"]
     fans: int = Field(ge=1)
     n_state: int = Field(ge=1)
     state_layout: StateLayout
@@ -93,7 +94,7 @@ class TwinFile:
     @property
     def is_discrete(self) -> bool:
         """Whether it steps from sample to sample and so holds at its own rate only."""
-        return self.layout.speed > 1 or self.layout.command > 0
+        return self.kind == "narx"
 
     def initial_state(self, speed_rad_s: Array, command: Array) -> Array:
         """(fans, n_state) of fans that have long run at speed_rad_s (fans,) under command (fans,)."""
@@ -104,7 +105,7 @@ class TwinFile:
         """Load a twin for a tray of `fans` fans. A twin of one fan serves every fan of the tray.
 
         Raises:
-            StageError: the file is missing, not ONNX, not a twin, from a newer fantwin, or for other fans.
+            StageError: the file is missing, not ONNX, not a twin, from another fantwin, or for other fans.
         """
         try:
             content = path.read_bytes()
@@ -123,7 +124,7 @@ class TwinFile:
             )
         _check_graph(path, session, card)
         parameters = np.broadcast_to(np.array(card.parameters), (fans, len(card.parameters[0]))).copy()
-        return cls(
+        twin = cls(
             name=card.name,
             kind=card.kind,
             sha256=hashlib.sha256(content).hexdigest(),
@@ -134,6 +135,8 @@ class TwinFile:
             rate_hz=card.rate_hz,
             advance=_advance(session, parameters),
         )
+        _check_run(path, twin)
+        return twin
 
 
 def _session(path: Path, content: bytes) -> Any:
@@ -157,49 +160,55 @@ def _first_line(error: Exception) -> str:
 
 def _card(path: Path, card_json: str) -> TwinCard:
     try:
-        card = TwinCard.model_validate_json(card_json)
+        version = _Version.model_validate_json(card_json).format_version
+        if version != FORMAT_VERSION:
+            what = "update fantwin" if version > FORMAT_VERSION else "train it anew"
+            raise StageError(f"{path}: twin format {version}, this fantwin knows {FORMAT_VERSION}: {what}")
+        return TwinCard.model_validate_json(card_json)
     except ValidationError as error:
-        version = _Version.of(card_json)
-        if version > FORMAT_VERSION:
-            raise _newer(path, version) from error
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "it"
         raise StageError(f"{path}: the twin's card cannot be used: {where}: {first['msg']}; train it anew") from error
-    if card.format_version > FORMAT_VERSION:
-        raise _newer(path, card.format_version)
-    return card
 
 
 class _Version(_OfCard):
-    format_version: int = 0
+    """What a card of any format has."""
 
-    @classmethod
-    def of(cls, card_json: str) -> int:
-        try:
-            return cls.model_validate_json(card_json).format_version
-        except ValidationError:
-            return 0
-
-
-def _newer(path: Path, version: int) -> StageError:
-    return StageError(f"{path}: twin format {version}, this fantwin knows {FORMAT_VERSION}: update fantwin")
+    format_version: int
 
 
 def _check_graph(path: Path, session: Any, card: TwinCard) -> None:
     inputs = {node.name: node for node in session.get_inputs()}
-    outputs = [node.name for node in session.get_outputs()]
+    outputs = {node.name: node for node in session.get_outputs()}
     if set(inputs) != set(INPUTS) or not set(OUTPUTS) <= set(outputs):
         raise StageError(
             f"{path}: not a twin's graph: it has inputs {', '.join(inputs)} and outputs {', '.join(outputs)}; "
             f"needed are {', '.join(INPUTS)} and {', '.join(OUTPUTS)}"
         )
+    for name, node in (inputs | {name: outputs[name] for name in OUTPUTS}).items():
+        if node.type != "tensor(double)":
+            raise StageError(f"{path}: {name} is {node.type}, needed is tensor(double); export it anew")
     for name, width in (("state", card.n_state), ("parameters", len(card.parameters[0]))):
         shape = inputs[name].shape
         if len(shape) != 2 or (isinstance(shape[1], int) and shape[1] != width):
-            raise StageError(f"{path}: graph and card disagree: {name} is {shape}, the card says (fans, {width})")
-    for node in inputs.values():
-        if node.type != "tensor(double)":
-            raise StageError(f"{path}: input {node.name} is {node.type}, needed is tensor(double); export it anew")
+            raise StageError(
+                f"{path}: graph and card disagree: {name} is {shape}, the card says (fans, {width}); export it anew"
+            )
+
+
+def _check_run(path: Path, twin: TwinFile) -> None:
+    """Two samples at rest: what neither the card nor the names of the inputs tell shows here, not while fans run."""
+    command = np.full((2, twin.fans), twin.command_range[0])
+    state = twin.initial_state(np.zeros(twin.fans), command[0])
+    try:
+        speed_rad_s, state_out = twin.advance(state, command, np.full(2, 1.0 / twin.rate_hz))
+    except Exception as error:  # as in _session
+        raise StageError(f"{path}: the twin does not run: {_first_line(error)}; export it anew") from error
+    if speed_rad_s.shape != command.shape or state_out.shape != state.shape:
+        raise StageError(
+            f"{path}: the twin gives speeds {speed_rad_s.shape} and state {state_out.shape}, "
+            f"needed are {command.shape} and {state.shape}; export it anew"
+        )
 
 
 def _advance(session: Any, parameters: Array) -> Advance:

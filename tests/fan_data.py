@@ -5,10 +5,12 @@ from collections.abc import Callable
 import numpy as np
 
 from twin import physics
-from twin.integration import free_run
+from twin.integration import step_through
 from twin.runs import Array, Run
 
 PUBLISHED_PARAMETERS = np.array([0.15, 0.012, 0.0025])
+PUBLISHED = np.array([[*PUBLISHED_PARAMETERS, 0.0]])
+"""the same in the order of physics.PARAMETER_NAMES, for one fan"""
 NOISE_RAD_S = np.sqrt(10.0)
 RATE_HZ = 100.0
 
@@ -36,7 +38,7 @@ def simulate(
     samples, fans = command.shape
     fine_command = np.repeat(command, substeps, axis=0)
     fine_step_s = np.full(len(fine_command), 1.0 / (RATE_HZ * substeps))
-    speed, _ = free_run(acceleration, np.zeros(fans), fine_command, fine_step_s)
+    speed, _ = step_through(acceleration, np.zeros(fans), fine_command, fine_step_s)
     noisy = speed[::substeps] + rng.normal(0.0, noise_rad_s, size=(samples, fans))
     return Run(name, np.arange(samples) / RATE_HZ, command, noisy)
 
@@ -44,20 +46,21 @@ def simulate(
 def published_run(seed: int, duration_s: float = 40.0, fans: int = 1) -> Run:
     """The published simulated fan: exact physics, noise variance 10."""
     rng = np.random.default_rng(seed)
-    parameters = np.tile(PUBLISHED_PARAMETERS, (fans, 1))
+    parameters = np.tile(PUBLISHED, (fans, 1))
     command = random_stairs(rng, round(duration_s * RATE_HZ), fans)
     return simulate(lambda speed, u: physics.acceleration(speed, u, parameters), command, rng, name=f"published {seed}")
 
 
-def rough_run(seed: int, duration_s: float = 40.0, fans: int = 1, spread: float = 0.1) -> Run:
+def rough_run(seed: int, duration_s: float = 40.0, fans: int = 1, spread: float = 0.1, low: float = 0.0) -> Run:
     """Fans with a dead zone in the drive and Stribeck friction, whose physics differ by spread, from fan to fan."""
     rng = np.random.default_rng(seed)
     scatter = 1.0 + spread * np.linspace(-1.0, 1.0, fans)[:, np.newaxis] if fans > 1 else np.ones((1, 1))
-    parameters = PUBLISHED_PARAMETERS * scatter
+    parameters = PUBLISHED * scatter
 
     def acceleration(speed: Array, command: Array) -> Array:
         effective = np.maximum(command - 8.0, 0.0)
         friction = (4.0 + 8.0 * np.exp(-((speed / 25.0) ** 2))) * np.tanh(speed / 3.0)
         return physics.acceleration(speed, effective - friction, parameters)
 
-    return simulate(acceleration, random_stairs(rng, round(duration_s * RATE_HZ), fans), rng, name=f"rough {seed}")
+    command = random_stairs(rng, round(duration_s * RATE_HZ), fans, low)
+    return simulate(acceleration, command, rng, name=f"rough {seed}")

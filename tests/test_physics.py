@@ -4,7 +4,7 @@ import numpy as np
 
 from twin import physics
 
-PARAMETERS = np.array([[0.15, 0.012, 0.0025], [0.003, 0.03, 1e-5]])
+PARAMETERS = np.array([[0.15, 0.012, 0.0025, 0.0], [0.003, 0.03, 1e-5, 0.01]])
 
 
 def test_at_steady_state_the_command_balances_friction_and_drag() -> None:

@@ -24,30 +24,85 @@ def hybrid(rough) -> TrainedTwin:
     return train_twin([rough[0]], [rough[1]], "hybrid", name="hybrid", max_iterations=30)
 
 
-def excess_over_noise(rmse_rad_s: float) -> float:
-    return float(np.sqrt(max(rmse_rad_s**2 - fan_data.NOISE_RAD_S**2, 0.0)))
+def times_noise(twin: TrainedTwin, run: Run) -> float:
+    return evaluate(twin, [run]).pooled.rmse_rad_s / fan_data.NOISE_RAD_S
 
 
-def test_the_hybrid_halves_what_the_physics_leave_above_the_noise(rough, hybrid: TrainedTwin) -> None:
+def test_the_hybrid_comes_to_the_noise_where_the_physics_stay_far_from_it(rough, hybrid: TrainedTwin) -> None:
     physical = train_twin([rough[0]], [rough[1]], "physical", name="physical")
-    left_by_physics = excess_over_noise(evaluate(physical, [rough[2]]).pooled.rmse_rad_s)
-    left_by_hybrid = excess_over_noise(evaluate(hybrid, [rough[2]]).pooled.rmse_rad_s)
-    assert left_by_hybrid < 0.5 * left_by_physics
+    assert times_noise(physical, rough[2]) > 1.5
+    assert times_noise(hybrid, rough[2]) < 1.05
 
 
-def test_training_does_not_move_the_physics(rough, hybrid: TrainedTwin) -> None:
-    np.testing.assert_array_equal(hybrid.parameters, hybrid.identification.parameters)
+def test_any_seed_finds_the_way_to_the_noise(rough) -> None:
+    errors = [
+        times_noise(train_twin([rough[0]], [], "hybrid", name="x", seed=seed, max_iterations=45), rough[0])
+        for seed in range(4)
+    ]
+    assert max(errors) < 1.02, errors
 
 
-def test_the_neural_ode_learns_without_physics(rough) -> None:
-    twin = train_twin([rough[0]], [rough[1]], "neural-ode", name="neural", max_iterations=10)
-    assert evaluate(twin, [rough[2]]).pooled.r2 > 0.97
+def test_fixed_physics_stay_as_identified_and_refined_ones_move(rough) -> None:
+    fixed, refined = (
+        train_twin([rough[1]], [], "hybrid", name="x", physics=physics, max_iterations=30)
+        for physics in ("fixed", "refined")
+    )
+    np.testing.assert_allclose(fixed.parameters, fixed.identification.parameters, rtol=1e-12)
+    assert np.all(refined.parameters[:, :3] != refined.identification.parameters[:, :3])
+    assert (fixed.card.training.physics, refined.card.training.physics) == ("fixed", "refined")
 
 
-def test_narx_predicts_one_step_close_to_the_noise(rough) -> None:
-    twin = train_twin([rough[0]], [], "narx", name="narx", max_iterations=4)
-    # Predicting a noisy sample cannot beat the noise.
-    assert fan_data.NOISE_RAD_S < evaluate(twin, [rough[2]]).pooled.one_step_rmse_rad_s < 1.5 * fan_data.NOISE_RAD_S
+@pytest.mark.slow
+def test_the_neural_ode_comes_to_the_noise_without_physics(rough) -> None:
+    twin = train_twin([rough[0]], [], "neural-ode", name="neural")
+    assert times_noise(twin, rough[0]) < 1.02
+    assert times_noise(twin, rough[2]) < 1.1
+
+
+@pytest.mark.slow
+def test_fans_that_differ_share_one_network_and_keep_their_own_physics() -> None:
+    tray, test = fan_data.rough_run(1, 40.0, fans=4), fan_data.rough_run(3, 30.0, fans=4)
+    together = train_twin([tray], [], "hybrid", name="tray")
+    assert np.ptp(together.parameters[:, 0]) > 0.1 * together.parameters[:, 0].mean()
+    assert times_noise(together, test) < 1.1
+
+
+def test_several_recordings_teach_more_than_one(rough) -> None:
+    parts = [rough[0].between(0.0, 12.0), rough[0].between(30.0, 42.0), rough[0].between(60.0, 72.0)]
+    one, all_three = (train_twin(runs, [], "hybrid", name="x", max_iterations=40) for runs in (parts[:1], parts))
+    assert times_noise(all_three, rough[2]) < times_noise(one, rough[2])
+
+
+def test_irregular_samples_are_as_good_as_regular_ones(rough) -> None:
+    rng = np.random.default_rng(3)
+    keep = np.sort(rng.choice(rough[0].samples, rough[0].samples * 2 // 3, replace=False))
+    run = rough[0]
+    thinned = Run("irregular", run.t_s[keep], _mean_command(run, keep), run.speed_rad_s[keep])
+    twin = train_twin([thinned], [], "hybrid", name="x", max_iterations=60)
+    assert times_noise(twin, rough[2]) < 1.1
+
+
+def _mean_command(run: Run, keep: np.ndarray) -> np.ndarray:
+    """The mean of the held command from each kept sample to the next."""
+    return np.add.reduceat(run.command, keep, axis=0) / np.diff(keep, append=run.samples)[:, None]
+
+
+def test_tacho_dropouts_and_outliers_hardly_matter(rough) -> None:
+    rng = np.random.default_rng(6)
+    speed = rough[0].speed_rad_s.copy()
+    speed[rng.random(speed.shape) < 0.1] = np.nan
+    speed[rng.random(speed.shape) < 0.03] = 0.0
+    speed[rng.random(speed.shape) < 0.01] *= 2.0
+    dirty = Run("dirty", rough[0].t_s, rough[0].command, speed)
+    twin = train_twin([dirty], [], "hybrid", name="dirty", max_iterations=60)
+    assert times_noise(twin, rough[2]) < 1.1
+
+
+def test_where_no_data_speak_the_hybrid_keeps_to_its_physics(rough) -> None:
+    """Trained on the upper half of the commands alone, run from rest through the lower half."""
+    upper = fan_data.rough_run(5, 60.0, low=50.0)
+    twin, physical = (train_twin([upper], [], kind, name="x") for kind in ("hybrid", "physical"))
+    assert times_noise(twin, rough[2]) < 1.5 * times_noise(physical, rough[2])
 
 
 def test_the_same_seed_gives_the_same_model_and_another_seed_another(rough) -> None:
@@ -60,25 +115,14 @@ def test_the_same_seed_gives_the_same_model_and_another_seed_another(rough) -> N
     assert not np.array_equal(weights(4), weights(5))
 
 
-def test_missing_samples_and_outliers_hardly_matter(rough) -> None:
-    rng = np.random.default_rng(6)
-    clean = rough[1]
-    speed = clean.speed_rad_s.copy()
-    speed[rng.random(speed.shape) < 0.3] = np.nan
-    speed[rng.random(speed.shape) < 0.01] *= 1.5
-    twin = train_twin([Run("dirty", clean.t_s, clean.command, speed)], [], "physical", name="dirty")
-    reference = train_twin([clean], [], "physical", name="clean")
-    dirty, best = (evaluate(one, [rough[2]]).pooled.rmse_rad_s for one in (twin, reference))
-    assert dirty < 1.1 * best
-
-
 def test_progress_is_told_after_every_step_taken(rough) -> None:
     told: list[tuple[int, int, float]] = []
     short = rough[1].between(0.0, 10.0)
     train_twin([short], [], "hybrid", name="x", max_iterations=5, progress=lambda *values: told.append(values))
     done = [values[0] for values in told]
     assert done == sorted(set(done))
-    assert all(total == 5 and rmse > 0.0 for _, total, rmse in told)
+    assert done[-1] <= told[-1][1]
+    assert all(rmse > 0.0 for _, _, rmse in told)
 
 
 def test_adam_lowers_the_free_run_error_from_the_physics_on(rough) -> None:

@@ -14,10 +14,10 @@ from onnx import TensorProto, helper
 
 from pipeline.stage import StageError
 from pipeline.twin_file import CARD_PROPERTY, TwinFile
+from tests.test_models import random_narx
 from tests.twin_files import PARAMETERS, SIGMA_RAD_S, small_hybrid, write_twin
-from twin import physics
-from twin.integration import free_run
 from twin.neural_ode import NeuralOde
+from twin.physical import PhysicalModel
 
 
 def _refusal(path: Path, fans: int = 2) -> str:
@@ -39,41 +39,47 @@ def test_the_card_is_read_and_the_file_is_named_by_its_hash(tmp_path: Path) -> N
     assert not twin.is_discrete
 
 
-def test_each_fan_runs_with_its_own_parameters(tmp_path: Path) -> None:
+def test_each_fan_runs_with_its_own_parameters_and_lag(tmp_path: Path) -> None:
     twin = TwinFile.load(write_twin(tmp_path / "twin.onnx", fans=2), 2)
     command, step_s = np.full((50, 2), 40.0), np.full(50, 0.01)
-    speed, state = twin.advance(twin.initial_state(np.array([10.0, 20.0]), command[0]), command, step_s)
+    start = twin.initial_state(np.array([10.0, 20.0]), np.array([0.0, 5.0]))
     parameters = np.array(PARAMETERS) * np.array([[1.0], [1.05]])
-    expected, last = free_run(
-        lambda w, u: physics.acceleration(w, u, parameters), np.array([10.0, 20.0]), command, step_s
-    )
+    expected, last = PhysicalModel().advance(start, command, step_s, parameters)
+    speed, state = twin.advance(start, command, step_s)
     np.testing.assert_allclose(speed, expected, rtol=1e-12)
-    np.testing.assert_allclose(state[:, 0], last, rtol=1e-12)
+    np.testing.assert_allclose(state, last, rtol=1e-12)
 
 
 def test_a_twin_of_one_fan_serves_every_fan_of_the_tray(tmp_path: Path) -> None:
     path = write_twin(tmp_path / "twin.onnx", small_hybrid())
     command, step_s = np.full((50, 1), 40.0), np.full(50, 0.01)
     one, five = TwinFile.load(path, 1), TwinFile.load(path, 5)
-    speed, _ = one.advance(np.zeros((1, 1)), command, step_s)
-    speeds, _ = five.advance(np.zeros((5, 1)), np.repeat(command, 5, axis=1), step_s)
+    speed, _ = one.advance(one.initial_state(np.zeros(1), command[0]), command, step_s)
+    commands = np.repeat(command, 5, axis=1)
+    speeds, _ = five.advance(five.initial_state(np.zeros(5), commands[0]), commands, step_s)
     assert five.sigma_rad_s.shape == (5,)
     np.testing.assert_allclose(speeds, np.repeat(speed, 5, axis=1), rtol=1e-12)
 
 
-def test_a_state_of_past_values_is_filled_with_the_start(tmp_path: Path) -> None:
-    path = write_twin(tmp_path / "twin.onnx")
-    twin = TwinFile.load(path, 2)
-    layout = twin.layout.model_copy(update={"speed": 3, "command": 2})
-    past = TwinFile(**{**vars(twin), "layout": layout})
-    assert past.is_discrete
-    state = past.initial_state(np.array([1.0, 2.0]), np.array([8.0, 9.0]))
-    np.testing.assert_array_equal(state, [[1, 1, 1, 8, 8], [2, 2, 2, 9, 9]])
+def test_a_continuous_twin_starts_with_its_lagged_command_settled(tmp_path: Path) -> None:
+    twin = TwinFile.load(write_twin(tmp_path / "twin.onnx"), 2)
+    assert not twin.is_discrete
+    state = twin.initial_state(np.array([1.0, 2.0]), np.array([8.0, 9.0]))
+    np.testing.assert_array_equal(state, [[1.0, 8.0], [2.0, 9.0]])
+
+
+def test_a_discrete_twin_starts_with_its_past_filled_by_the_start(tmp_path: Path) -> None:
+    twin = TwinFile.load(write_twin(tmp_path / "twin.onnx", random_narx()), 2)
+    assert twin.is_discrete
+    state = twin.initial_state(np.array([1.0, 2.0]), np.array([8.0, 9.0]))
+    np.testing.assert_array_equal(state, [[1.0] * 10 + [8.0] * 10, [2.0] * 10 + [9.0] * 10])
+    speed, _ = twin.advance(state, np.full((2, 2), 40.0), np.full(2, 0.01))
+    assert np.isfinite(speed).all()
 
 
 def test_a_kind_that_needs_no_parameters_is_loaded_all_the_same(tmp_path: Path) -> None:
     twin = TwinFile.load(write_twin(tmp_path / "twin.onnx", NeuralOde(small_hybrid().network)), 3)
-    speed, _ = twin.advance(np.zeros((3, 1)), np.full((2, 3), 40.0), np.full(2, 0.01))
+    speed, _ = twin.advance(np.zeros((3, 2)), np.full((2, 3), 40.0), np.full(2, 0.01))
     assert np.isfinite(speed).all()
 
 
@@ -108,8 +114,17 @@ def test_a_card_on_another_graph_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_newer_format_is_refused_even_if_its_card_looks_different(tmp_path: Path) -> None:
-    assert "update fantwin" in _refusal(write_twin(tmp_path / "a.onnx", format_version=2))
-    assert "update fantwin" in _refusal(write_twin(tmp_path / "b.onnx", format_version=2, sigma_rad_s=None))
+    assert "update fantwin" in _refusal(write_twin(tmp_path / "a.onnx", format_version=3))
+    assert "update fantwin" in _refusal(write_twin(tmp_path / "b.onnx", format_version=3, sigma_rad_s=None))
+
+
+def test_an_older_format_is_to_be_trained_anew(tmp_path: Path) -> None:
+    line = _refusal(write_twin(tmp_path / "a.onnx", format_version=1, parameters=[[0.15, 0.12, 0.0005]], n_state=1))
+    assert "twin format 1, this fantwin knows 2: train it anew" in line
+
+
+def test_a_card_without_a_format_is_refused(tmp_path: Path) -> None:
+    assert "format_version" in _refusal(write_twin(tmp_path / "a.onnx", format_version=None))
 
 
 @pytest.mark.parametrize(
@@ -117,10 +132,13 @@ def test_a_newer_format_is_refused_even_if_its_card_looks_different(tmp_path: Pa
     [
         ({"sigma_rad_s": None}, "sigma_rad_s"),
         ({"sigma_rad_s": [0.0]}, "sigma_rad_s"),
-        ({"parameters": [[0.1, 0.1, 0.1]] * 2}, "parameters"),
+        ({"parameters": [[0.1, 0.1, 0.1, 0.0]] * 2}, "parameters"),
+        ({"parameters": [[0.1, 0.1, 0.1]]}, "parameters is ['fans', 4], the card says (fans, 3)"),
+        ({"kind": "oracle"}, "kind"),
+        ({"rate_hz": 0.0}, "rate_hz"),
         ({"command_range": [1.0, 0.0]}, "command_range"),
-        ({"n_state": 2}, "state_layout"),
-        ({"n_state": 2, "state_layout": {"speed": 2, "command": 0}}, "state"),
+        ({"n_state": 3}, "state_layout"),
+        ({"n_state": 1, "state_layout": {"speed": 1, "command": 0}}, "state is ['fans', 2], the card says (fans, 1)"),
     ],
 )
 def test_a_card_that_makes_no_sense_is_refused_by_name(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
@@ -133,3 +151,47 @@ def test_text_in_place_of_a_card_is_refused(tmp_path: Path) -> None:
 
 def test_a_twin_of_two_fans_does_not_serve_three(tmp_path: Path) -> None:
     assert "fans = 3" in _refusal(write_twin(tmp_path / "twin.onnx", fans=2), fans=3)
+
+
+def test_a_truncated_file_is_refused_wherever_it_was_cut(tmp_path: Path) -> None:
+    path = write_twin(tmp_path / "twin.onnx", fans=2)
+    whole = path.read_bytes()
+    for length in np.linspace(0, len(whole) - 1, 60).astype(int):
+        path.write_bytes(whole[:length])
+        _refusal(path)
+
+
+def _of_the_right_names(path: Path, dtype: int, nodes: list[onnx.NodeProto], card: str) -> Path:
+    shapes: dict[str, list[str | int]] = {
+        "state": ["fans", 2],
+        "command": ["n", "fans"],
+        "step_s": ["n"],
+        "parameters": ["fans", 4],
+        "speed_rad_s": ["n", "fans"],
+        "state_out": ["fans", 2],
+    }
+    values = [helper.make_tensor_value_info(name, dtype, shape) for name, shape in shapes.items()]
+    graph = helper.make_graph(nodes, "g", values[:4], values[4:])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    helper.set_model_props(model, {CARD_PROPERTY: card})
+    onnx.save(model, str(path))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("dtype", "second", "named"),
+    [
+        (TensorProto.FLOAT, ("Identity", ["state"]), "state is tensor(float), needed is tensor(double)"),
+        (TensorProto.DOUBLE, ("MatMul", ["state", "parameters"]), "the twin does not run"),
+        (TensorProto.DOUBLE, ("MatMul", ["state", "command"]), "the twin gives speeds"),
+    ],
+)
+def test_a_graph_that_only_looks_like_a_twin_is_refused(
+    tmp_path: Path, dtype: int, second: tuple[str, list[str]], named: str
+) -> None:
+    card = TwinFile.load(write_twin(tmp_path / "twin.onnx", fans=3), 3).card_json
+    nodes = [
+        helper.make_node("Identity", ["command"], ["speed_rad_s"]),
+        helper.make_node(second[0], second[1], ["state_out"]),
+    ]
+    assert named in _refusal(_of_the_right_names(tmp_path / "other.onnx", dtype, nodes, card), fans=3)

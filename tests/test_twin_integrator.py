@@ -16,9 +16,11 @@ from pipeline.stage import Context, StageError
 from pipeline.twin_file import StateLayout, TwinFile
 from schemas.messages import Grid, ModelCard, Prediction, WhyNot
 from stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
-from tests.twin_files import PARAMETERS, small_hybrid, write_twin
+from tests.twin_files import PARAMETERS, SIGMA_RAD_S, small_hybrid, write_twin
 from twin import physics
-from twin.integration import free_run
+from twin.integration import step_through
+from twin.lag import effective_command
+from twin.physics import LAG
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -26,25 +28,29 @@ NAN = float("nan")
 Floats = NDArray[np.float64]
 
 
-def physical_twin(fans: int = 1, rate_hz: float = 100.0, layout: tuple[int, int] = (1, 0)) -> TwinFile:
-    """The equation of motion itself, integrated in NumPy."""
-    parameters = np.tile(PARAMETERS, (fans, 1))
+def run_freely(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+    """The lag and the equation of motion themselves, sample by sample in NumPy."""
+    parameters = np.tile(PARAMETERS, (command.shape[1], 1))
+    acting, lagged = effective_command(command, step_s[:, np.newaxis], parameters[:, LAG], state[:, 1])
+    speed, last = step_through(lambda w, u: physics.acceleration(w, u, parameters), state[:, 0], acting, step_s)
+    return speed, np.column_stack((last, lagged))
 
+
+def physical_twin(fans: int = 1, kind: str = "physical") -> TwinFile:
     def advance(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
         assert np.isfinite(state).all()
         assert np.isfinite(command).all()
-        speed, last = free_run(lambda w, u: physics.acceleration(w, u, parameters), state[:, 0], command, step_s)
-        return speed, np.column_stack((last, state[:, 1:]))
+        return run_freely(state, command, step_s)
 
     return TwinFile(
         name="fake",
-        kind="physical",
+        kind=kind,
         sha256="0",
         card_json="{}",
-        layout=StateLayout(speed=layout[0], command=layout[1]),
+        layout=StateLayout(speed=1, command=1),
         sigma_rad_s=np.full(fans, 3.0),
         command_range=(0.0, 100.0),
-        rate_hz=rate_hz,
+        rate_hz=100.0,
         advance=advance,
     )
 
@@ -147,13 +153,22 @@ def test_the_block_size_does_not_change_a_bit_of_the_prediction(tmp_path: Path, 
 
 
 def test_the_grid_rate_changes_the_prediction_by_the_integration_error_only(tmp_path: Path) -> None:
-    twin = TwinFile.load(write_twin(tmp_path / "twin.onnx", small_hybrid()), 1)
+    """Of order four without a lag. With one of order two: the lagged command acts by its mean over each step."""
+
+    def difference_rad_s(lag_s: float, every: int) -> float:
+        path = write_twin(tmp_path / "twin.onnx", small_hybrid(), parameters=[[*PARAMETERS[:LAG], lag_s]])
+        twin = TwinFile.load(path, 1)
+        fast = feed(core_of(twin), [grid_of(command)]).predicted_speed_rad_s
+        slow = feed(core_of(twin), [grid_of(command[::every], step_ns=every * STEP_NS)]).predicted_speed_rad_s
+        assert np.ptp(fast) > 100
+        return float(np.abs(fast[::every] - slow).max())
+
     command = stairs(2000)
-    fast = feed(core_of(twin), [grid_of(command)])
-    slow = feed(core_of(twin), [grid_of(command[::2], step_ns=2 * STEP_NS)])
-    difference = np.abs(fast.predicted_speed_rad_s[::2] - slow.predicted_speed_rad_s)
-    assert np.ptp(fast.predicted_speed_rad_s) > 100
-    assert 0 < difference.max() < 1e-4
+    assert 0 < difference_rad_s(0.0, 2) < 1e-4
+    lagged = difference_rad_s(0.05, 2)
+    assert 0 < lagged < 0.01 * SIGMA_RAD_S
+    # What the two grids differ by goes with step^2: 5^2 - 1 to 2^2 - 1.
+    assert difference_rad_s(0.05, 5) / lagged == pytest.approx(24 / 3, rel=0.1)
 
 
 def test_the_prediction_is_never_corrected_by_what_is_measured() -> None:
@@ -173,10 +188,7 @@ def test_the_free_run_is_the_model_run_from_the_mean_of_the_first_readings() -> 
     command = np.array([5.0, 5.0, 5.0, 40.0, 41.0, 42.0])
     prediction = feed(core_of(start_samples=3), [grid_of(command, speed)])
     predicted = prediction.predicted_speed_rad_s[:, 0]
-    parameters = np.array([PARAMETERS])
-    expected, _ = free_run(
-        lambda w, u: physics.acceleration(w, u, parameters), np.array([30.0]), command[3:, np.newaxis], np.full(3, 0.01)
-    )
+    expected, _ = run_freely(np.array([[30.0, 40.0]]), command[3:, np.newaxis], np.full(3, 0.01))
     assert np.isnan(predicted[:3]).all()
     np.testing.assert_allclose(predicted[3:], expected[:, 0], rtol=1e-12)
     assert prediction.why_not[:, 0].tolist() == [WhyNot.NO_SPEED] + [WhyNot.WARMING_UP] * 2 + [WhyNot.NONE] * 3
@@ -280,7 +292,7 @@ def test_a_fan_whose_twin_diverged_never_feeds_the_graph_what_is_no_number() -> 
     def advance(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
         assert np.isfinite(state).all()
         speed = np.where(command > 50, np.inf, command)
-        return speed, speed[-1][:, np.newaxis]
+        return speed, np.column_stack((speed[-1], command[-1]))
 
     core = core_of(TwinFile(**{**vars(physical_twin(2)), "advance": advance}), start_samples=2)
     command = np.full((20, 2), 40.0)
@@ -298,11 +310,11 @@ def test_readings_from_before_a_silence_do_not_start_a_free_run_after_it() -> No
 
 
 def test_a_discrete_twin_at_another_rate_says_so_and_judges_nothing() -> None:
-    core = core_of(physical_twin(layout=(10, 10)))
+    core = core_of(physical_twin(kind="narx"))
     prediction = feed(core, [grid_of(stairs(20), step_ns=2 * STEP_NS)])
     assert (prediction.why_not == WhyNot.NO_TWIN).all()
     assert "rate_hz = 100" in core.problem()
-    assert feed(core_of(physical_twin(layout=(10, 10))), [grid_of(stairs(20))]).valid.all()
+    assert feed(core_of(physical_twin(kind="narx")), [grid_of(stairs(20))]).valid.all()
 
 
 def test_the_whole_block_of_all_fans_is_one_run_of_the_graph() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import onnx
 
-from twin.card import CARD_KEY, Card, NetworkCard, TrainingCard, ValidationCard
+from twin.card import CARD_KEY, Card, HealthyCard, NetworkCard, TrainingCard, ValidationCard
 from twin.export import export_onnx
 from twin.hybrid import Hybrid
 from twin.models import Model
@@ -17,8 +17,8 @@ from twin.network import Scaling, TanhNetwork
 from twin.physical import PhysicalModel
 from twin.physics import PARAMETER_NAMES
 
-PARAMETERS = (0.15, 0.12, 0.0005)
-"""J, alpha, C_D of a fan that settles within about a second."""
+PARAMETERS = (0.15, 0.12, 0.0005, 0.02)
+"""J, alpha, C_D, lag_s of a fan that settles within about a second."""
 SIGMA_RAD_S = 3.0
 COMMAND_RANGE = (0.0, 100.0)
 
@@ -36,6 +36,8 @@ def made_up_card(model: Model, fans: int) -> Card:
     """A card that fits a model, each fan a little different."""
     layout = model.state_layout
     scale = 1.0 + 0.05 * np.arange(fans)
+    parameters = tuple(tuple((np.array(PARAMETERS) * s).tolist()) for s in scale)
+    unknown = (None,) * fans
     return Card(
         kind=model.kind,
         name=f"made up {model.kind}",
@@ -44,15 +46,18 @@ def made_up_card(model: Model, fans: int) -> Card:
         n_state=layout.size,
         state_layout=layout,
         parameter_names=PARAMETER_NAMES,
-        parameters=tuple(tuple((np.array(PARAMETERS) * s).tolist()) for s in scale),
-        parameter_std_errors=tuple((0.0, 0.0, 0.0) for _ in scale),
+        parameters=parameters,
+        identified_parameters=parameters,
+        parameter_std_errors=tuple((0.0,) * len(PARAMETER_NAMES) for _ in scale),
+        parameter_interval_95=tuple(tuple((value, value) for value in fan) for fan in parameters),
         sigma_rad_s=tuple((SIGMA_RAD_S * scale).tolist()),
+        healthy=HealthyCard(unknown, unknown, (), ((),) * fans, unknown),
         speed_range_rad_s=(0.0, 500.0),
         command_range=COMMAND_RANGE,
         rate_hz=100.0,
         network=NetworkCard(0, (), 0),
-        training=TrainingCard("none", 0, 0, 0.0, ()),
-        validation=ValidationCard("training", 0, None, None, None, None, None),
+        training=TrainingCard("none", "fixed", 0, 0, 0.0, ()),
+        validation=ValidationCard("training", (), 0, None, None, None, None, None),
         versions={},
         command_unit="1",
     )

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -10,7 +10,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from twin.card import Card, DataCard, NetworkCard, TrainingCard, ValidationCard
+from twin.card import Card, DataCard, HealthyCard, NetworkCard, TrainingCard, ValidationCard
+from twin.cross_validation import chosen_spread
 from twin.errors import TwinError
 from twin.evaluation import (
     Evaluation,
@@ -18,7 +19,6 @@ from twin.evaluation import (
     evaluate_model,
     evaluation_pieces,
     free_run_residuals,
-    healthy_sigma_rad_s,
 )
 from twin.export import export_onnx
 from twin.hybrid import UNITS as HYBRID_UNITS
@@ -32,20 +32,23 @@ from twin.network import TanhNetwork
 from twin.neural_ode import UNITS as NEURAL_ODE_UNITS
 from twin.neural_ode import NeuralOde
 from twin.onnx_twin import OnnxTwin
+from twin.outliers import without_outliers
 from twin.physical import PhysicalModel
 from twin.physics import PARAMETER_NAMES
+from twin.placement import initial_weights
+from twin.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
 from twin.runs import Array, Run, common_fans
-from twin.training import Progress, data_scaling, initial_weights, train_network
+from twin.training import GRID_SPREAD, Physics, Progress, data_scaling, train_network
 
 Trainer = Literal["levenberg-marquardt", "adam"]
 NETWORK_UNITS: dict[Kind, int] = {"neural-ode": NEURAL_ODE_UNITS, "hybrid": HYBRID_UNITS}
-DEFAULT_ITERATIONS: dict[Trainer, int] = {"levenberg-marquardt": 60, "adam": 400}
-NARX_ITERATIONS = 25
+DEFAULT_ITERATIONS: dict[Trainer, int] = {"levenberg-marquardt": 120, "adam": 400}
+NARX_ITERATIONS = 100
 
 
 @dataclass(frozen=True, eq=False)
 class TrainedTwin:
-    """A model with everything that is known about it. parameters: (fans, 3)."""
+    """A model with everything that is known about it. parameters: (fans, 4)."""
 
     model: Model
     parameters: Array
@@ -73,8 +76,10 @@ def train_twin(
     trainer: Trainer = "levenberg-marquardt",
     max_iterations: int | None = None,
     network_inputs: tuple[str, ...] = ("speed", "command"),
+    physics: Physics = "refined",
     command_unit: str = "",
     data: Sequence[DataCard] = (),
+    validation_data: Sequence[DataCard] = (),
     created: datetime | None = None,
     progress: Progress | None = None,
 ) -> TrainedTwin:
@@ -82,26 +87,33 @@ def train_twin(
 
     validation_runs: held out of the fit; they choose the best weights and give the healthy sigma and the card's
     figures. Empty: the training runs do, and the card says so. network_inputs: of the hybrid's and neural ODE's
-    network. command_unit, data, created (default: now) go into the card. The same seed and runs give the same model.
+    network. physics: whether a hybrid's physics are refined along with its network, or stay as they were identified.
+    Outliers (twin.outliers) are left out of all runs. command_unit, data and validation_data (the files
+    that the runs are from) and created (default: now) go into the card. The same seed and runs give the same model.
     Raises TwinError when the runs do not tell the parameters, or the result cannot serve as a twin.
     """
     _require_known(kind, trainer)
     fans = common_fans([*runs, *validation_runs])
     started_s = time.monotonic()
     identification = identify(runs)
+    runs, validation_runs = ([without_outliers(run)[0] for run in part] for part in (runs, validation_runs))
     limit = max_iterations or (NARX_ITERATIONS if kind == "narx" else DEFAULT_ITERATIONS[trainer])
-    model, iterations = _train(
-        kind, runs, validation_runs, identification, seed, trainer, limit, network_inputs, progress
+    model, parameters, iterations = _train(
+        kind, runs, validation_runs, identification, seed, trainer, limit, network_inputs, physics, progress
     )
     duration_s = time.monotonic() - started_s
+    if isinstance(model, Hybrid) and not np.any(model.network.theta):
+        silent = "the network stays silent: recordings left out were predicted no better with it than by physics alone"
+        identification = replace(identification, warnings=(*identification.warnings, silent))
     judged = validation_runs or runs
-    residual = free_run_residuals(model, identification.parameters, evaluation_pieces(judged))
-    sigma_rad_s = healthy_sigma_rad_s(residual)
+    pieces = evaluation_pieces(judged)
+    healthy = healthy_residual(free_run_residuals(model, parameters, pieces), pieces)
+    sigma_rad_s = np.array(healthy.sigma_rad_s)
     if not np.all(np.isfinite(sigma_rad_s)):
         raise TwinError(
             f"the {kind} model of {name!r} diverges when run freely; record more levels, or try another kind"
         )
-    validation = evaluate_model(model, identification.parameters, sigma_rad_s, judged)
+    validation = evaluate_model(model, parameters, sigma_rad_s, judged)
     speeds = np.concatenate([run.speed_rad_s.ravel() for run in runs])
     commands = np.concatenate([run.command.ravel() for run in runs])
     card = Card(
@@ -112,19 +124,26 @@ def train_twin(
         n_state=model.state_layout.size,
         state_layout=model.state_layout,
         parameter_names=PARAMETER_NAMES,
-        parameters=_rows(identification.parameters),
+        parameters=_rows(parameters),
+        identified_parameters=_rows(identification.parameters),
         parameter_std_errors=_rows(identification.standard_errors),
-        sigma_rad_s=tuple(sigma_rad_s.tolist()),
+        parameter_interval_95=tuple(
+            tuple((float(low), float(high)) for low, high in fan) for fan in identification.interval_95
+        ),
+        sigma_rad_s=healthy.sigma_rad_s,
+        healthy=_healthy_card(healthy),
         speed_range_rad_s=(float(np.nanmin(speeds)), float(np.nanmax(speeds))),
         command_range=(float(commands.min()), float(commands.max())),
         rate_hz=1.0 / float(np.median(np.concatenate([np.diff(run.t_s) for run in runs]))),
         network=_network_card(model),
-        training=TrainingCard(trainer, seed, iterations, round(duration_s, 3), tuple(data)),
-        validation=_validation_card(validation.pooled, "held-out" if validation_runs else "training"),
+        training=TrainingCard(trainer, physics, seed, iterations, round(duration_s, 3), tuple(data)),
+        validation=_validation_card(
+            validation.pooled, "held-out" if validation_runs else "training", tuple(validation_data)
+        ),
         versions=_versions(),
         command_unit=command_unit,
     )
-    return TrainedTwin(model, identification.parameters, card, identification, validation)
+    return TrainedTwin(model, parameters, card, identification, validation)
 
 
 def evaluate(twin: str | Path | OnnxTwin | TrainedTwin, runs: Sequence[Run]) -> Evaluation:
@@ -162,23 +181,43 @@ def _train(
     trainer: Trainer,
     max_iterations: int,
     network_inputs: tuple[str, ...],
+    physics: Physics,
     progress: Progress | None,
-) -> tuple[Model, int]:
+) -> tuple[Model, Array, int]:
     if kind == "physical":
-        return PhysicalModel(), identification.iterations
+        return PhysicalModel(), identification.parameters, identification.iterations
     scaling = data_scaling(runs, identification)
     if kind == "narx":
-        return train_narx(runs, validation_runs, scaling, seed=seed, max_iterations=max_iterations, progress=progress)
+        narx, iterations = train_narx(
+            runs, validation_runs, scaling, seed=seed, max_iterations=max_iterations, progress=progress
+        )
+        return narx, identification.parameters, iterations
     units = NETWORK_UNITS[kind]
     network = TanhNetwork.zero(units, network_inputs, scaling)
     untrained: NetworkOde = Hybrid(network) if kind == "hybrid" else NeuralOde(network)
-    start = initial_weights(untrained, runs, identification, np.random.default_rng(seed))
     if trainer == "adam":
         # torch is needed by this trainer alone, and takes seconds to import.
         from twin.torch_reference import train_adam  # noqa: PLC0415
 
-        return train_adam(start, runs, identification, max_iterations=max_iterations, progress=progress)
-    return train_network(start, runs, validation_runs, identification, max_iterations=max_iterations, progress=progress)
+        pieces = evaluation_pieces(runs)
+        (theta,) = initial_weights(untrained, pieces, identification, np.random.default_rng(seed), 1)
+        start = untrained.with_theta(theta)
+        model, iterations = train_adam(start, runs, identification, max_iterations=max_iterations, progress=progress)
+        return model, identification.parameters, iterations
+    spread = GRID_SPREAD
+    if not validation_runs:
+        spread = chosen_spread(untrained, runs, seed=seed, physics=physics, progress=progress)
+    return train_network(
+        untrained,
+        runs,
+        validation_runs,
+        identification,
+        max_iterations=max_iterations,
+        seed=seed,
+        physics=physics,
+        spread=spread,
+        progress=progress,
+    )
 
 
 def _network_card(model: Model) -> NetworkCard:
@@ -189,19 +228,33 @@ def _network_card(model: Model) -> NetworkCard:
     return NetworkCard(model.network.units, model.network.inputs, model.network.parameter_count)
 
 
-def _validation_card(figures: Figures, source: Literal["held-out", "training"]) -> ValidationCard:
-    def finite(value: float) -> float | None:
-        return value if np.isfinite(value) else None
+def _healthy_card(healthy: HealthyResidual) -> HealthyCard:
+    return HealthyCard(
+        autocorrelation_time_s=tuple(map(_finite, healthy.autocorrelation_time_s)),
+        independent_samples=tuple(map(_finite, healthy.independent_samples)),
+        probabilities=QUANTILES,
+        quantiles_sigma=tuple(tuple(map(_finite, fan)) for fan in healthy.quantiles_sigma),
+        max_sigma=tuple(map(_finite, healthy.max_sigma)),
+    )
 
+
+def _validation_card(
+    figures: Figures, source: Literal["held-out", "training"], data: tuple[DataCard, ...]
+) -> ValidationCard:
     return ValidationCard(
         source=source,
+        data=data,
         samples=figures.samples,
-        rmse=finite(figures.rmse_rad_s),
-        max_error=finite(figures.max_error_rad_s),
-        r2=finite(figures.r2),
-        one_step_rmse=finite(figures.one_step_rmse_rad_s),
-        coverage_2_sigma=finite(figures.coverage_2_sigma),
+        rmse=_finite(figures.rmse_rad_s),
+        max_error=_finite(figures.max_error_rad_s),
+        r2=_finite(figures.r2),
+        one_step_rmse=_finite(figures.one_step_rmse_rad_s),
+        coverage_2_sigma=_finite(figures.coverage_2_sigma),
     )
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def _versions() -> dict[str, str]:

@@ -11,7 +11,7 @@ from twin.errors import TwinError
 from twin.models import Kind
 from twin.state import StateLayout
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 CARD_KEY = "fantwin.card"
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -38,9 +38,10 @@ class DataCard:
 
 @dataclass(frozen=True, config=STRICT)
 class TrainingCard:
-    """How the twin was made. duration_s: how long training took."""
+    """How the twin was made. physics: whether refined along with the network. duration_s: how long training took."""
 
     trainer: str
+    physics: Literal["fixed", "refined"]
     seed: int
     iterations: int
     duration_s: float
@@ -51,10 +52,11 @@ class TrainingCard:
 class ValidationCard:
     """Free-run figures pooled over fans, in rad/s. None where a figure is undefined.
 
-    source says whether the runs were held out or are the training runs themselves.
+    source says whether the runs were held out or are the training runs themselves. data: the files held out.
     """
 
     source: Literal["held-out", "training"]
+    data: tuple[DataCard, ...]
     samples: int
     rmse: float | None
     max_error: float | None
@@ -64,11 +66,28 @@ class ValidationCard:
 
 
 @dataclass(frozen=True, config=STRICT)
+class HealthyCard:
+    """The healthy free-run residual, one entry a fan; None where the runs were too short to tell.
+
+    autocorrelation_time_s, independent_samples: see residual_analysis.ResidualAnalysis. quantiles_sigma: the
+    magnitudes, in sigma, that a healthy sample stays below with the given probabilities. max_sigma: the largest seen.
+    """
+
+    autocorrelation_time_s: tuple[float | None, ...]
+    independent_samples: tuple[float | None, ...]
+    probabilities: tuple[float, ...]
+    quantiles_sigma: tuple[tuple[float | None, ...], ...]
+    max_sigma: tuple[float | None, ...]
+
+
+@dataclass(frozen=True, config=STRICT)
 class Card:
     """Everything a reader of the file needs to know. Lists per fan come in the order of the fans.
 
-    parameters, parameter_std_errors: per fan, in the order of parameter_names. sigma_rad_s: per fan, the healthy root
-    mean square free-run error. The ranges are those seen in training: outside them the twin is a guess.
+    parameters: those in force, per fan, in the order of parameter_names. identified_parameters, parameter_std_errors:
+    those of the physical model alone, with their standard errors; a refined twin's own differ, because its network
+    has taken a share. sigma_rad_s: per fan, the healthy root mean square free-run error. The ranges are those seen in
+    training: outside them the twin is a guess.
     """
 
     kind: Kind
@@ -79,8 +98,11 @@ class Card:
     state_layout: StateLayout
     parameter_names: tuple[str, ...]
     parameters: tuple[tuple[float, ...], ...]
+    identified_parameters: tuple[tuple[float, ...], ...]
     parameter_std_errors: tuple[tuple[float, ...], ...]
+    parameter_interval_95: tuple[tuple[tuple[float, float], ...], ...]
     sigma_rad_s: tuple[float, ...]
+    healthy: HealthyCard
     speed_range_rad_s: tuple[float, float]
     command_range: tuple[float, float]
     rate_hz: float

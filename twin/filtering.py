@@ -14,6 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from twin.recursion import linear_recursion
 from twin.runs import Array
 
 Basis = Callable[[Array, Array], Array]
@@ -33,10 +34,8 @@ def filter_between_samples(start: Array, end: Array, step_s: Array, lambda_per_s
     safe = np.where(small, 1.0, x)
     late_s = step_s * np.where(small, 0.5 - x / 6.0 + x * x / 24.0, (1.0 + np.expm1(-safe) / safe) / safe)
     forced = (whole_s - late_s)[:, np.newaxis] * start + late_s[:, np.newaxis] * end
-    filtered = np.zeros((len(start) + 1, start.shape[1]))
-    for k in range(len(start)):
-        filtered[k + 1] = decay[k] * filtered[k] + forced[k]
-    return filtered
+    forcing = np.concatenate((np.zeros((1, start.shape[1])), forced))
+    return linear_recursion(decay[:, np.newaxis], forcing[:, np.newaxis])[:, 0]
 
 
 def filtered_regression(

@@ -9,67 +9,89 @@ Least squares on noisy regressors is biased, so that result only starts the refi
 (twin.free_run_fit). The inertia stays anchored to the start: under closed-loop control the speed hardly moves, and a
 model so slow that it keeps its initial speed would otherwise be the best of all.
 
-Standard errors come from the sandwich H^-1 (sum over blocks of g g^T) H^-1, with g the summed score of a block of
-samples: unlike the plain inverse Hessian they stay honest when the residual is correlated in time, which it is
-whenever the physics are not the whole truth.
+The lag of the command (twin.lag) is estimated with the rest and kept only where it is larger than its uncertainty;
+otherwise it is zero, and the model is the published one of three parameters.
+
+Covariances come from the jackknife over blocks of time, linearised: leaving out block b moves the estimate by
+-(H - H_b)^-1 g_b, with g_b the summed score and H_b the curvature of that block. Unlike the plain inverse Hessian it
+stays honest when the residual is correlated in time, which it is whenever the physics are not the whole truth, and
+unlike the sandwich of raw scores when a few transients tell most of what is known. Efron and Stein, Annals of
+Statistics 9 (1981).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
 from twin import physics
 from twin.errors import TwinError
 from twin.filtering import filtered_regression
-from twin.free_run_fit import HUBER_DELTA, FreeRunFit, fit_free_run, robust_scale
-from twin.integration import free_run, free_run_sensitivities
-from twin.physical import (
-    PhysicalRightHandSide,
-    fitted_physics,
-    fitted_unknowns,
-    parameters_by_unknowns,
-    physical_parameters,
-)
+from twin.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, fit_free_run
+from twin.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings
+from twin.integration import free_run
+from twin.outliers import without_outliers
+from twin.physical import PhysicalModel, fitted_unknowns, parameters_by_unknowns, physical_parameters
+from twin.physics import LAG, PARAMETER_NAMES
+from twin.right_hand_side import FanEquation
 from twin.runs import Array, Run, common_fans
 from twin.trajectories import Trajectories, cut_into_trajectories, stretch_samples
 
 LAMBDA_LADDER = 9
 STRETCH_TIME_CONSTANTS = 10.0
-MAX_ITERATIONS = 30
-SCORE_BLOCKS = 40
-UNCERTAIN = 0.5
-# The top speed is one that a fan reaches, not one that a sensor once told.
-TOP_SPEED_QUANTILE = 0.99
+MAX_ITERATIONS = 60
+BLOCKS = 40
+# A lag counts from this many standard errors on: one fan in a thousand without any is then said to have some.
+LAG_IN_STANDARD_ERRORS = 3.3
 # Data that excite a fan hold ten or more units of information about ln J per sample, a hundred times this anchor.
 ANCHOR_PER_SAMPLE = 0.1
 NEARLY_BEST = 1.25
+MANY_OUTLIERS = 0.001
 
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """Physical parameters per fan. Arrays of three hold J, alpha and C_D.
+    """Physical parameters per fan, in the order of physics.PARAMETER_NAMES.
 
-    parameters, standard_errors: (fans, 3). interval_95: (fans, 3, 2). lambda_per_s, rmse_rad_s, time_constant_s:
-    (fans,); the time constant is taken at the median speed. iterations: those of the refinement. warnings: one line
-    each, empty when all is well.
+    parameters, standard_errors: (fans, 4). covariance: (fans, 4, 4), degrees_of_freedom: (fans, 4) that it has.
+    interval_95: (fans, 4, 2). A lag that was not found is zero, and so is its uncertainty. lambda_per_s, rmse_rad_s,
+    time_constant_s, top_speed_rad_s: (fans,); the time constant is taken at the median speed. iterations: those of the
+    refinement. warnings: one line each, empty when all is well.
     """
 
     parameters: Array
-    standard_errors: Array
-    interval_95: Array
+    covariance: Array
+    degrees_of_freedom: Array
     lambda_per_s: Array
     rmse_rad_s: Array
     time_constant_s: Array
+    top_speed_rad_s: Array
     iterations: int
     warnings: tuple[str, ...]
 
+    @property
+    def standard_errors(self) -> Array:
+        """(fans, 4)"""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
-def identify(runs: Sequence[Run]) -> Identification:
-    """Identify every fan of the runs. Raises TwinError when the data cannot tell the parameters."""
+    @property
+    def interval_95(self) -> Array:
+        """(fans, 4, 2), of the t distribution with the degrees of freedom of each."""
+        reach = student_t.ppf(0.975, self.degrees_of_freedom) * self.standard_errors
+        return np.stack((self.parameters - reach, self.parameters + reach), axis=-1)
+
+
+def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
+    """Identify every fan of the runs. Raises TwinError when the data cannot tell the parameters.
+
+    with_lag: false holds the lag at zero, which is the published model.
+    """
     fans = common_fans(runs)
-    pieces = [piece for run in runs for piece in run.split_at_gaps()]
+    cleaned = [without_outliers(run) for run in runs]
+    pieces = [piece for run, _ in cleaned for piece in run.split_at_gaps()]
     for fan in range(fans):
         require_excitation(pieces, fan)
     top_speed = np.array([np.nanquantile(np.abs(_pooled(pieces, fan)[1]), TOP_SPEED_QUANTILE) for fan in range(fans)])
@@ -78,33 +100,35 @@ def identify(runs: Sequence[Run]) -> Identification:
     longest_s = float(np.max(_positive(physics.time_constant_s(speed, start), pieces)))
     step_s = min(piece.median_step_s for piece in pieces)
     trajectories = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, STRETCH_TIME_CONSTANTS))
-    theta = fitted_unknowns(start, top_speed)
-    fit = fit_free_run(
-        lambda theta, fan: fitted_physics(theta[fan], top_speed[fan]),
-        theta,
-        trajectories,
-        max_iterations=MAX_ITERATIONS,
-        prior_precision=np.array([ANCHOR_PER_SAMPLE, 0.0, 0.0]) * np.count_nonzero(trajectories.measured) / fans,
-        prior_mean=theta,
-    )
-    parameters = physical_parameters(fit.theta, top_speed)
-    standard_errors, rmse = _standard_errors(fit, top_speed, trajectories)
-    reach = student_t.ppf(0.975, SCORE_BLOCKS - 1) * standard_errors
-    interval = np.stack((parameters - reach, parameters + reach), axis=-1)
+    free = np.tile(ALL_FREE, (fans, 1))
+    free[:, LAG] = with_lag
+    fit, covariance, freedom = _refine(start, free, top_speed, trajectories)
+    lag_s = physical_parameters(fit.point.unknowns.own, top_speed)[:, LAG]
+    unseen = free[:, LAG] & (lag_s <= LAG_IN_STANDARD_ERRORS * np.sqrt(covariance[:, LAG, LAG]))
+    iterations = fit.iterations
+    if np.any(unseen):
+        free[:, LAG] &= ~unseen
+        without = physical_parameters(fit.point.unknowns.own, top_speed)
+        without[unseen, LAG] = 0.0
+        fit, covariance, freedom = _refine(without, free, top_speed, trajectories, start)
+        iterations += fit.iterations
+    parameters = physical_parameters(fit.point.unknowns.own, top_speed)
     return Identification(
         parameters=parameters,
-        standard_errors=standard_errors,
-        interval_95=interval,
+        covariance=covariance,
+        degrees_of_freedom=freedom,
         lambda_per_s=lambda_per_s,
-        rmse_rad_s=rmse,
+        rmse_rad_s=_rmse_rad_s(fit, trajectories, fans),
         time_constant_s=_positive(physics.time_constant_s(speed, parameters), pieces),
-        iterations=fit.iterations,
-        warnings=_warnings(parameters, standard_errors),
+        top_speed_rad_s=top_speed,
+        iterations=iterations,
+        warnings=_outlier_warnings(np.max([share for _, share in cleaned], axis=0))
+        + identifiability_warnings([run for run, _ in cleaned], parameters, covariance),
     )
 
 
 def filtering_operator(runs: Sequence[Run], fan: int, lambda_per_s: float) -> Array:
-    """(3,) J, alpha, C_D of one fan by the filtering operator alone; NaN when the command does not drive the speed."""
+    """(4,) J, alpha, C_D of one fan by the filtering operator alone, lag 0; NaN when the command does not drive it."""
     parts = [
         filtered_regression(run.t_s, run.speed_rad_s[:, fan], run.command[:, fan], _physical_basis, lambda_per_s)
         for run in runs
@@ -115,8 +139,8 @@ def filtering_operator(runs: Sequence[Run], fan: int, lambda_per_s: float) -> Ar
     size = np.linalg.norm(regressors, axis=0) + np.finfo(float).tiny
     viscous_rate, drag_rate, gain = np.linalg.lstsq(regressors / size, target, rcond=None)[0] / size
     if not gain > 0.0:
-        return np.full(3, np.nan)
-    return np.array([1.0, viscous_rate, drag_rate]) / gain
+        return np.full(len(PARAMETER_NAMES), np.nan)
+    return np.array([1.0 / gain, viscous_rate / gain, drag_rate / gain, 0.0])
 
 
 def require_excitation(runs: Sequence[Run], fan: int) -> None:
@@ -131,7 +155,7 @@ def require_excitation(runs: Sequence[Run], fan: int) -> None:
 
 
 def _filtered_start(pieces: Sequence[Run], top_speed_rad_s: Array) -> tuple[Array, Array]:
-    """(fans, 3) parameters and (fans,) lambda: the largest rung that is nearly the best."""
+    """(fans, 4) parameters and (fans,) lambda: the largest rung that is nearly the best."""
     fans = len(top_speed_rad_s)
     longest_s = max(piece.duration_s for piece in pieces)
     step_s = min(piece.median_step_s for piece in pieces)
@@ -148,15 +172,15 @@ def _filtered_start(pieces: Sequence[Run], top_speed_rad_s: Array) -> tuple[Arra
 
 
 def _stable(parameters: Array, top_speed_rad_s: Array) -> Array:
-    """The parameters (fans, 3) with their damping made positive up to the top speed."""
+    """The parameters (fans, 4) with their damping made positive up to the top speed."""
     return physical_parameters(fitted_unknowns(parameters, top_speed_rad_s), top_speed_rad_s)
 
 
 def _free_run_errors(parameters: Array, trajectories: Trajectories) -> Array:
     """(fans,) mean absolute free-run error in rad/s, the published loss; infinite when it does not exist."""
-    rhs = PhysicalRightHandSide(parameters[trajectories.fan], np.zeros((len(trajectories.fan), 3, 3)))
-    initial = trajectories.starting_speed_rad_s()
-    speed, _ = free_run(rhs.acceleration, initial, trajectories.command, trajectories.step_s)
+    equation = FanEquation(parameters[trajectories.fan], None)
+    initial, guess = trajectories.starting_speed_rad_s(), trajectories.interpolated_speed_rad_s()
+    speed, _ = free_run(equation, initial, trajectories.command, trajectories.step_s, guess)
     measured = trajectories.measured
     error = np.where(measured, np.abs(trajectories.speed_rad_s - speed), 0.0).sum(axis=0)
     fans = len(parameters)
@@ -164,51 +188,87 @@ def _free_run_errors(parameters: Array, trajectories: Trajectories) -> Array:
     return np.where(np.isfinite(mean), mean, np.inf)
 
 
-def _standard_errors(fit: FreeRunFit, top_speed_rad_s: Array, trajectories: Trajectories) -> tuple[Array, Array]:
-    """(fans, 3) standard errors of J, alpha, C_D, and (fans,) free-run rmse in rad/s at the fit."""
-    rhs = fitted_physics(fit.theta[trajectories.fan], top_speed_rad_s[trajectories.fan])
-    data = trajectories
-    speed, _ = free_run(rhs.acceleration, fit.initial_speed_rad_s, data.command, data.step_s)
-    residual = np.where(data.measured, data.speed_rad_s - speed, 0.0)
-    sensitivity = free_run_sensitivities(rhs, speed, data.command, data.step_s)
-    scaled = residual / robust_scale(residual, data)[data.fan]
-    weight = np.where(data.measured, 1.0 / np.hypot(1.0, scaled / HUBER_DELTA), 0.0)
+def _refine(
+    start: Array,
+    free: NDArray[np.bool_],
+    top_speed_rad_s: Array,
+    trajectories: Trajectories,
+    anchor: Array | None = None,
+) -> tuple[FreeRunFit, Array, Array]:
+    """The fit of the free run from parameters (fans, 4), and what _covariance says of it."""
+    fans = len(start)
+    own = fitted_unknowns(start, top_speed_rad_s)
+    pull = inertia_anchor(np.count_nonzero(trajectories.measured) / fans)
+    prior = Prior(0.0, pull, own if anchor is None else fitted_unknowns(anchor, top_speed_rad_s))
+    fit = fit_free_run(
+        PhysicalModel(), own, top_speed_rad_s, trajectories, free=free, prior=prior, max_iterations=MAX_ITERATIONS
+    )
+    return fit, *_covariance(fit, free, top_speed_rad_s, trajectories, prior)
+
+
+def inertia_anchor(samples: float) -> Array:
+    """(4,) precision with which the own unknowns of a fan with so many samples are held to where they started."""
+    pull = np.zeros(len(PARAMETER_NAMES))
+    pull[0] = ANCHOR_PER_SAMPLE * samples
+    return pull
+
+
+def _covariance(
+    fit: FreeRunFit, free: NDArray[np.bool_], top_speed_rad_s: Array, trajectories: Trajectories, prior: Prior
+) -> tuple[Array, Array]:
+    """Covariance (fans, 4, 4) of J, alpha, C_D, lag_s by the block jackknife, zero where one is held, and its degrees
+    of freedom (fans, 4).
+
+    Few where few blocks tell most: the variance of a sum of squares d_b^2 of normal moves is 2/3 of sum d_b^4, and a
+    chi-square with that variance has 3 (sum d_b^2)^2 / sum d_b^4 of them (Satterthwaite, Biometrics Bulletin 2, 1946).
+    """
+    problem = FreeRunProblem(PhysicalModel(), trajectories, top_speed_rad_s, free, prior)
+    problem.scale_rad_s = fit.scale_rad_s
+    everything = slice(None)
+    sensitivity = problem.sensitivities(fit.point, everything)
+    weight = problem.sample_weights(fit.point.residual, everything)
     by_initial = sensitivity[:, :, -1:]
     weighted_initial = weight[:, :, np.newaxis] * by_initial
     overlap = np.sum(weighted_initial * sensitivity[:, :, :-1], axis=0) / np.sum(weighted_initial * by_initial, axis=0)
-    own = sensitivity[:, :, :-1] - by_initial * overlap
-    chain = parameters_by_unknowns(fit.theta, top_speed_rad_s)
-    errors, rmse = np.empty_like(fit.theta), np.empty(len(fit.theta))
-    for fan in range(len(fit.theta)):
-        columns = data.fan == fan
+    slopes_of_all = sensitivity[:, :, :-1] - by_initial * overlap
+    chain = parameters_by_unknowns(fit.point.unknowns.own, top_speed_rad_s)
+    covariance = np.zeros((len(chain), len(PARAMETER_NAMES), len(PARAMETER_NAMES)))
+    freedom = np.full((len(chain), len(PARAMETER_NAMES)), BLOCKS - 1.0)
+    for fan in range(len(chain)):
+        columns, known = trajectories.fan == fan, np.flatnonzero(free[fan])
         # Stretches one after the other, so that a block is a piece of time.
-        slopes = own[:, columns].transpose(1, 0, 2).reshape(-1, 3)
-        weights, residuals = weight[:, columns].T.ravel(), residual[:, columns].T.ravel()
-        hessian = slopes.T @ (slopes * weights[:, np.newaxis])
-        scores = np.array_split(slopes * (weights * residuals)[:, np.newaxis], SCORE_BLOCKS)
-        blocks = np.array([block.sum(axis=0) for block in scores])
-        bread = np.linalg.pinv(hessian)
-        covariance = chain[fan] @ bread @ (blocks.T @ blocks) @ bread @ chain[fan].T
-        errors[fan] = np.sqrt(np.diag(covariance))
-        rmse[fan] = np.sqrt(np.sum(residuals**2) / np.count_nonzero(data.measured[:, columns]))
-    return errors, rmse
+        slopes = slopes_of_all[:, columns].transpose(1, 0, 2).reshape(-1, len(PARAMETER_NAMES))[:, known]
+        weights, residual = weight[:, columns].T.ravel(), fit.point.residual[:, columns].T.ravel()
+        scores = slopes * (weights * residual)[:, np.newaxis]
+        # The second derivative of the pseudo-Huber loss, where a step of the fit makes do with its secant.
+        weighted = slopes * weights[:, np.newaxis] ** 3
+        bounds = np.linspace(0, len(slopes), BLOCKS + 1).astype(int)
+        blocks = [slice(first, last) for first, last in pairwise(bounds)]
+        curvatures = np.array([slopes[block].T @ weighted[block] for block in blocks])
+        rest = curvatures.sum(axis=0) - curvatures
+        if not np.all(np.isfinite(rest)):
+            raise TwinError(f"fan {fan}: the free run of its physical model overflows; record open-loop steps")
+        moves = np.einsum("bpq,bq->bp", np.linalg.pinv(rest), [scores[block].sum(axis=0) for block in blocks])
+        moves = (moves - moves.mean(axis=0)) @ chain[fan][:, known].T
+        covariance[fan] = (BLOCKS - 1) / BLOCKS * moves.T @ moves
+        fourth = np.sum(moves**4, axis=0)
+        told = fourth > 0.0
+        freedom[fan, told] = np.clip(3.0 * np.sum(moves**2, axis=0)[told] ** 2 / fourth[told], 2.0, BLOCKS - 1)
+    return covariance, freedom
 
 
-def _warnings(parameters: Array, standard_errors: Array) -> tuple[str, ...]:
-    lines = []
-    for fan, (values, errors) in enumerate(zip(parameters, standard_errors, strict=True)):
-        for name, value, error in zip(physics.PARAMETER_NAMES, values, errors, strict=True):
-            if value < 0.0:
-                lines.append(
-                    f"fan {fan}: {name} is negative ({value:.3g}): the physical model does not describe this data "
-                    "(friction, dead zone or offset); do not trust it outside the recorded speeds"
-                )
-            elif error > UNCERTAIN * value:
-                lines.append(
-                    f"fan {fan}: {name} is poorly determined ({value:.3g}, standard error {error:.2g}); "
-                    "record more and wider command levels"
-                )
-    return tuple(lines)
+def _rmse_rad_s(fit: FreeRunFit, trajectories: Trajectories, fans: int) -> Array:
+    """(fans,) root mean square of the free-run residual."""
+    squares = np.bincount(trajectories.fan, np.sum(fit.point.residual**2, axis=0), fans)
+    return np.sqrt(squares / np.bincount(trajectories.fan, trajectories.measured.sum(axis=0), fans))
+
+
+def _outlier_warnings(share: Array) -> tuple[str, ...]:
+    return tuple(
+        f"fan {fan}: {value:.1%} of the speeds are outliers and were left out; check the tacho and its line"
+        for fan, value in enumerate(share)
+        if value > MANY_OUTLIERS
+    )
 
 
 def _physical_basis(speed_rad_s: Array, command: Array) -> Array:

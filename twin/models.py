@@ -14,6 +14,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 
 Model = PhysicalModel | Narx | NeuralOde | Hybrid
 NetworkOde = NeuralOde | Hybrid
+OdeModel = PhysicalModel | NeuralOde | Hybrid
 
 
 class TwinModel(Protocol):
@@ -28,7 +29,7 @@ class TwinModel(Protocol):
         """Free run over a block of samples.
 
         state: (fans, n_state). command: (n, fans), held. step_s: (n,) time from sample k to k + 1. parameters:
-        (fans, 3). Returns speed_rad_s (n, fans), at each sample before its command acts, and the state after the last
+        (fans, 4). Returns speed_rad_s (n, fans), at each sample before its command acts, and the state after the last
         step. Two blocks with the state carried over give what one block gives.
         """
         ...

@@ -2,13 +2,15 @@
 
 x = [w_k .. w_{k-9}, u_k, u_{k-1} .. u_{k-10}], w_{k+1} = W_o tanh(W_i x + b_i) + b_o with 50 units: the tenth order has
 ten speeds, and the present command beside ten delayed ones, so 50 * 21 + 50 + 50 + 1 = 1151 parameters. It is discrete:
-it knows no step length and no physics, and holds only at the rate it was trained at.
+it knows no step length and no physics, and holds only at the rate it was trained at. Irregular samples are taken as if
+they came at their median rate.
 """
 
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from twin.network import Scaling
 from twin.runs import Array
@@ -48,10 +50,25 @@ class Narx:
     def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
         """Free run from state; see models.TwinModel. step_s and parameters are not used."""
         input_weights, input_bias, output_weights, output_bias = self.physical_weights()
-        speed_rad_s = np.empty_like(command)
+        # Time runs forwards in memory, lags backwards in the weights: turned round once, a past is a plain slice.
+        by_speed, by_command = input_weights[ORDER - 1 :: -1].T, input_weights[: ORDER - 1 : -1].T
+        speeds = np.concatenate((state[:, ORDER - 1 :: -1].T, np.empty_like(command)))
+        commands = np.concatenate((state[:, : ORDER - 1 : -1].T, command))
+        bias = input_bias[:, np.newaxis]
         for k in range(len(command)):
-            speed_rad_s[k] = state[:, 0]
-            regressors = np.column_stack((state[:, :ORDER], command[k], state[:, ORDER:]))
-            following = np.tanh(regressors @ input_weights + input_bias) @ output_weights + output_bias
-            state = np.column_stack((following, state[:, : ORDER - 1], command[k], state[:, ORDER:-1]))
-        return speed_rad_s, state
+            past, driven = speeds[k : k + ORDER], commands[k : k + ORDER + 1]
+            speeds[k + ORDER] = output_weights @ np.tanh(by_speed @ past + by_command @ driven + bias) + output_bias
+        final = np.column_stack((speeds[: -ORDER - 1 : -1].T, commands[: -ORDER - 1 : -1].T))
+        return speeds[ORDER - 1 : -1].copy(), final
+
+
+def regressor_rows(speed: Array, command: Array) -> Array:
+    """(n, 21) past speeds and present and past commands at each sample, newest first, from (n,) each.
+
+    Before the first sample, speed and command are what they are at the first.
+    """
+    speeds = np.concatenate((np.full(ORDER - 1, speed[0]), speed))
+    commands = np.concatenate((np.full(ORDER, command[0]), command))
+    return np.concatenate(
+        (sliding_window_view(speeds, ORDER)[:, ::-1], sliding_window_view(commands, ORDER + 1)[:, ::-1]), axis=1
+    )

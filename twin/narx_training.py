@@ -1,26 +1,47 @@
-"""Training of the NARX network: series-parallel, by Levenberg-Marquardt with regularisation.
+"""Training of the NARX network: from the best linear filter to as much curvature as unseen speeds confirm.
 
-Series-parallel means that each row predicts one sample from measured ones; the free run, where predictions feed back,
-is only what comes of it. That is the published way, and the reason why a good one-step error promises little.
-Rows beyond MAX_ROWS are drawn at random: 1151 weights do not need more, and the normal equations cost by the row.
+Fitting each next sample from measured ones (series-parallel, the published way) is biased by the noise in its own
+regressors, and a good one-step error promises little about the free run. So the free run itself is fitted (parallel
+training: Narendra and Parthasarathy, IEEE Transactions on Neural Networks 1, 1990):
+
+1. The start is a layer that acts as the best first-order filter of the data (twin.narx_start).
+2. Its 1151 weights are held to the start by a prior, those of old samples more firmly than those of recent ones. The
+   prior is firm at first and relaxed tenfold at a time, each fit starting from the one before (twin.narx_fit).
+3. Each precision of the prior is judged by the free run over speeds that its fit does not see: those of the held-out
+   runs; where none are given, those of whole runs left out in turn; of a single run, those of blocks left out. Relaxing
+   ends where it no longer helps.
+4. All speeds of the training runs are fitted at the precision chosen, or at the next firmer one whose free run forgets
+   its start (twin.narx_stability); the firmest, where none does.
+
+A fit costs by the sample: of long recordings, stretches of MAX_SAMPLES in all are drawn at random.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from twin.errors import TwinError
 from twin.evaluation import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
-from twin.narx import INPUTS, ORDER, UNITS, Narx
+from twin.narx import Narx
+from twin.narx_fit import FreeRunFit
+from twin.narx_stability import forgets_its_start
+from twin.narx_start import lag_scale, starting_weights
 from twin.network import Scaling
-from twin.runs import Array, Run
+from twin.physics import PARAMETER_NAMES
+from twin.runs import STARTING_SAMPLES, Array, Run
 from twin.training import Progress
 
-MAX_ROWS = 6000
-# Relative to a residual of order of the noise: strong enough to damp directions that no row sees.
-PRIOR_PRECISION = 1e-4
-SMALLEST_DAMPING, LARGEST_DAMPING = 1e-9, 1e9
+MAX_SAMPLES, DRAWN_STRETCHES = 16_000, 16
+PRIOR_PRECISIONS = (1e5, 1e4, 1e3, 1e2, 1e1, 1e0)
+# A looser prior must lower the error by this share: what is less is chance, and a firm one is safer on new commands.
+NEEDED_GAIN = 0.002
+ITERATIONS_A_PRECISION = 20
+# Of all iterations; the rest are for the fit at the precision chosen.
+CHOOSING_SHARE = 0.6
+FOLDS = 3
+BLOCKS, LEFT_OUT_EVERY = 20, 4
 
 
 def train_narx(
@@ -32,85 +53,131 @@ def train_narx(
     max_iterations: int,
     progress: Progress | None = None,
 ) -> tuple[Narx, int]:
-    """The trained network and the iterations taken. With held-out runs the best of all iterates on their free run.
+    """The trained network and the iterations taken. validation_runs: held out of the fit, they choose the prior.
 
-    Raises TwinError when no stretch of measured speeds is longer than the ten past samples.
+    Raises TwinError when no stretch of the runs holds two measured speeds.
     """
     rng = np.random.default_rng(seed)
     pieces = evaluation_pieces(runs)
-    inputs, target = _rows(pieces, scaling, rng)
-    held_out = evaluation_pieces(validation_runs) if validation_runs else []
-    fans = pieces[0].fans
-    theta = _random_weights(rng)
-    cost, best, best_error = _cost(theta, inputs, target), theta, np.inf
-    damping, iteration = 1e-2, 0
-    for iteration in range(1, max_iterations + 1):
-        jacobian, residual = _jacobian(theta, inputs, target)
-        squares = jacobian.T @ jacobian
-        downhill = jacobian.T @ residual - PRIOR_PRECISION * len(target) * theta
-        diagonal = np.diag(squares).copy()
-        previous = cost
-        while damping < LARGEST_DAMPING:
-            ridge = damping * diagonal + PRIOR_PRECISION * len(target)
-            factor = cho_factor(squares + np.diag(ridge), lower=True, check_finite=False)
-            trial = theta + cho_solve(factor, downhill, check_finite=False)
-            trial_cost = _cost(trial, inputs, target)
-            if trial_cost < cost:
-                theta, cost, damping = trial, trial_cost, max(damping / 5.0, SMALLEST_DAMPING)
-                break
-            damping *= 4.0
-        error = _free_run_error(Narx(theta, scaling), held_out, fans) if held_out else cost
-        if error < best_error:
-            best, best_error = theta, error
-        if progress is not None:
-            progress(iteration, max_iterations, scaling.speed_scale_rad_s * float(np.sqrt(np.mean(residual**2))))
-        if previous - cost < 1e-4 * previous:
+    stretches = draw_stretches(pieces, rng)
+    start, time_constant = starting_weights(
+        [(stretch.command[:, 0] - scaling.command_offset) / scaling.command_scale for stretch in stretches],
+        [(stretch.speed_rad_s[:, 0] - scaling.speed_offset_rad_s) / scaling.speed_scale_rad_s for stretch in stretches],
+        rng,
+    )
+    count = _Count(max_iterations, progress)
+    parted = [(pieces, evaluation_pieces(validation_runs))] if validation_runs else leave_out(runs)
+    folds = [_Fold(*parts, start, scaling, rng) for parts in parted]
+    chosen = _relax_prior(folds, count, round(CHOOSING_SHARE * max_iterations))
+    whole = FreeRunFit(stretches, scaling, start, lag_scale() ** -2)
+    model = Narx(start, scaling)
+    for precision, theta in reversed(chosen):
+        limit = min(max_iterations - count.iterations, ITERATIONS_A_PRECISION)
+        model = Narx(whole.minimise(theta, precision, limit, count.iteration_done), scaling)
+        if forgets_its_start(model, time_constant):
             break
-    return Narx(best, scaling), iteration
+    return model, count.iterations
 
 
-def _rows(pieces: Sequence[Run], scaling: Scaling, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Scaled regressors (rows, 21) and next speeds (rows,), all of them measured, of all fans."""
-    blocks = []
+def draw_stretches(pieces: Sequence[Run], rng: np.random.Generator) -> list[Run]:
+    """Runs of one fan each: all of them, or random parts of MAX_SAMPLES in all. Raises TwinError when nothing is left.
+
+    Parts start from their first measured speeds, as a deployed twin does.
+    """
+    single = [piece.fan(index) for piece in pieces for index in range(piece.fans)]
+    if sum(run.samples for run in single) > MAX_SAMPLES:
+        single = [part for run in single for part in _equal_parts(run, MAX_SAMPLES // DRAWN_STRETCHES)]
+        single = [single[index] for index in rng.permutation(len(single))]
+    usable = [run for run in single if np.isfinite(run.speed_rad_s).sum() >= 2]
+    if not usable:
+        raise TwinError("no stretch of the runs holds two measured speeds; NARX has nothing to learn from")
+    room = np.cumsum([run.samples for run in usable]) <= MAX_SAMPLES
+    return [run for run, fits in zip(usable, room, strict=True) if fits]
+
+
+def leave_out(runs: Sequence[Run]) -> list[tuple[list[Run], list[Run]]]:
+    """Pieces to fit and pieces to judge by: three folds of whole runs, as many as there are runs, or blocks of one."""
+    folds = min(len(runs), FOLDS)
+    if folds == 1:
+        return [leave_out_blocks(evaluation_pieces(runs))]
+    return [
+        (
+            evaluation_pieces([run for index, run in enumerate(runs) if index % folds != fold]),
+            evaluation_pieces([run for index, run in enumerate(runs) if index % folds == fold]),
+        )
+        for fold in range(folds)
+    ]
+
+
+def leave_out_blocks(pieces: Sequence[Run]) -> tuple[list[Run], list[Run]]:
+    """The pieces twice: without the speeds of every fourth of twenty blocks, and with those alone.
+
+    The commands stay, so both are free runs over the whole. The second keeps the speeds that a free run starts from.
+    """
+    kept, left_out = [], []
     for piece in pieces:
-        speed = (piece.speed_rad_s - scaling.speed_offset_rad_s) / scaling.speed_scale_rad_s
-        command = (piece.command - scaling.command_offset) / scaling.command_scale
-        present = np.arange(ORDER, piece.samples - 1)
-        past = [speed[present - lag] for lag in range(ORDER)] + [command[present - lag] for lag in range(ORDER + 1)]
-        blocks.append(np.stack([*past, speed[present + 1]], axis=-1).reshape(-1, INPUTS + 1))
-    rows = np.concatenate(blocks)
-    rows = rows[np.all(np.isfinite(rows), axis=1)]
-    if not len(rows):
-        raise TwinError("no stretch of eleven measured speeds in a row; NARX needs runs without so many gaps")
-    if len(rows) > MAX_ROWS:
-        rows = rows[rng.choice(len(rows), MAX_ROWS, replace=False)]
-    return rows[:, :-1], rows[:, -1]
+        count = np.cumsum(np.isfinite(piece.speed_rad_s), axis=0)
+        block = (count - 1) * BLOCKS // np.maximum(count[-1], 1)
+        out = block % LEFT_OUT_EVERY == LEFT_OUT_EVERY // 2
+        kept.append(replace(piece, speed_rad_s=np.where(out, np.nan, piece.speed_rad_s)))
+        judged = out | (count <= STARTING_SAMPLES)
+        left_out.append(replace(piece, speed_rad_s=np.where(judged, piece.speed_rad_s, np.nan)))
+    return kept, left_out
 
 
-def _random_weights(rng: np.random.Generator) -> Array:
-    hidden = rng.normal(scale=INPUTS**-0.5, size=INPUTS * UNITS)
-    return np.concatenate((hidden, rng.uniform(-1.0, 1.0, UNITS), rng.normal(scale=UNITS**-0.5, size=UNITS), [0.0]))
+def _equal_parts(run: Run, max_samples: int) -> list[Run]:
+    parts = -(-run.samples // max_samples)
+    cuts = np.linspace(0, run.samples, parts + 1).round().astype(int).tolist()
+    return [run.rows(first, last) for first, last in pairwise(cuts) if last - first >= 2]
 
 
-def _hidden(theta: Array, inputs: Array) -> Array:
-    rows = theta[:-1].reshape(INPUTS + 2, UNITS)
-    return np.tanh(inputs @ rows[:INPUTS] + rows[INPUTS])
+class _Fold:
+    """A fit to some speeds, judged by others."""
+
+    def __init__(
+        self, fitted: Sequence[Run], judged: Sequence[Run], start: Array, scaling: Scaling, rng: np.random.Generator
+    ) -> None:
+        self.fit = FreeRunFit(draw_stretches(fitted, rng), scaling, start, lag_scale() ** -2)
+        self.judged = judged
+        self.theta = start
+
+    def residual(self) -> Array:
+        """(m,) measured minus free run, in rad/s, of the judged speeds."""
+        unused = np.ones((self.judged[0].fans, len(PARAMETER_NAMES)))
+        return free_run_residuals(Narx(self.theta, self.fit.scaling), unused, self.judged).ravel()
 
 
-def _cost(theta: Array, inputs: Array, target: Array) -> float:
-    residual = target - _hidden(theta, inputs) @ theta[-UNITS - 1 : -1] - theta[-1]
-    return 0.5 * float(residual @ residual + PRIOR_PRECISION * len(target) * (theta @ theta))
+@dataclass
+class _Count:
+    """Counts the iterations of all fits together."""
+
+    max_iterations: int
+    progress: Progress | None
+    iterations: int = 0
+
+    def iteration_done(self, rmse_rad_s: float) -> None:
+        """See narx_fit.IterationDone."""
+        self.iterations += 1
+        if self.progress is not None:
+            self.progress(self.iterations, self.max_iterations, rmse_rad_s)
 
 
-def _jacobian(theta: Array, inputs: Array, target: Array) -> tuple[Array, Array]:
-    """Derivatives of the prediction by theta (rows, 1151), and the residual (rows,)."""
-    hidden = _hidden(theta, inputs)
-    output_weights = theta[-UNITS - 1 : -1]
-    by_bias = (1.0 - hidden * hidden) * output_weights
-    by_input = (inputs[:, :, np.newaxis] * by_bias[:, np.newaxis, :]).reshape(len(inputs), -1)
-    residual = target - hidden @ output_weights - theta[-1]
-    return np.column_stack((by_input, by_bias, hidden, np.ones(len(inputs)))), residual
+def _relax_prior(folds: Sequence[_Fold], count: _Count, max_iterations: int) -> list[tuple[float, Array]]:
+    """Precisions of the prior, from the firmest to the best one, each with the weights (1151,) of the first fold.
 
-
-def _free_run_error(model: Narx, pieces: Sequence[Run], fans: int) -> float:
-    return pooled_rmse_rad_s(free_run_residuals(model, np.ones((fans, 3)), pieces))
+    Fits at one precision after the other, until one brings nothing better.
+    """
+    better: list[tuple[float, Array]] = []
+    best_rmse_rad_s = np.inf
+    for precision in PRIOR_PRECISIONS:
+        for index, fold in enumerate(folds):
+            share = (max_iterations - count.iterations) // (len(folds) - index)
+            fold.theta = fold.fit.minimise(
+                fold.theta, precision, min(share, ITERATIONS_A_PRECISION), count.iteration_done
+            )
+        rmse_rad_s = pooled_rmse_rad_s(np.concatenate([fold.residual() for fold in folds]))
+        if rmse_rad_s >= (1.0 - NEEDED_GAIN) * best_rmse_rad_s:
+            break
+        better.append((precision, folds[0].theta))
+        best_rmse_rad_s = rmse_rad_s
+    return better

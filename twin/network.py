@@ -88,8 +88,18 @@ class TanhNetwork:
         scaled = self.hidden(speed_rad_s, command) @ output_weights + output_bias
         return self.scaling.acceleration_scale_rad_s2 * scaled
 
-    def linearise(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array]:
-        """The acceleration (..., batch), its derivative by speed (..., batch) and by theta (..., batch, P)."""
+    def slope(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array]:
+        """The acceleration and its derivative by speed, both (..., batch)."""
+        input_weights, _, output_weights, output_bias = self.weights()
+        hidden = self.hidden(speed_rad_s, command)
+        rate = self.scaling.acceleration_scale_rad_s2
+        per_speed = output_weights * (input_weights[0] / self.scaling.speed_scale_rad_s)
+        # (1 - h^2) . p as sum(p) - h^2 . p: one pass over the largest array less.
+        by_speed = per_speed.sum() - (hidden * hidden) @ per_speed
+        return rate * (hidden @ output_weights + output_bias), rate * by_speed
+
+    def linearise(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array, Array]:
+        """The acceleration and its derivatives by speed and by command (..., batch), and by theta (..., batch, P)."""
         input_weights, _, output_weights, output_bias = self.weights()
         rate = self.scaling.acceleration_scale_rad_s2
         hidden = self.hidden(speed_rad_s, command)
@@ -101,7 +111,10 @@ class TanhNetwork:
         by_theta[..., -self.units - 1 : -1] = rate * hidden
         by_theta[..., -1] = rate
         by_speed = by_bias @ (input_weights[0] / self.scaling.speed_scale_rad_s)
-        return rate * (hidden @ output_weights + output_bias), by_speed, by_theta
+        by_command = np.zeros_like(by_speed)
+        if len(self.inputs) > 1:
+            by_command = by_bias @ (input_weights[1] / self.scaling.command_scale)
+        return rate * (hidden @ output_weights + output_bias), by_speed, by_command, by_theta
 
     def _scaled_inputs(self, speed_rad_s: Array, command: Array) -> tuple[Array, ...]:
         scale = self.scaling

@@ -30,12 +30,7 @@ class OnnxTwin:
             self.card = Card.from_json(metadata[CARD_KEY])
         except TwinError as error:
             raise TwinError(f"{self.path}: {error}") from error
-        inputs = [value.name for value in self._session.get_inputs()]
-        outputs = [value.name for value in self._session.get_outputs()]
-        if inputs != INPUTS or outputs != OUTPUTS:
-            raise TwinError(f"{self.path}: inputs {inputs} and outputs {outputs}; expected {INPUTS} and {OUTPUTS}")
-        if any(value.type != "tensor(double)" for value in (*self._session.get_inputs(), *self._session.get_outputs())):
-            raise TwinError(f"{self.path}: inputs and outputs must be float64; export the twin again")
+        _require_fit(self.path, self._session, self.card)
         self.parameters = np.array(self.card.parameters, dtype=np.float64)
 
     @property
@@ -50,12 +45,29 @@ class OnnxTwin:
         return np.asarray(speed_rad_s), np.asarray(state_out)
 
 
+def _require_fit(path: Path, session: Any, card: Card) -> None:
+    """Raise TwinError unless card and graph tell of the same arrays."""
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    names = [value.name for value in inputs], [value.name for value in outputs]
+    if names != (INPUTS, OUTPUTS):
+        raise TwinError(f"{path}: inputs {names[0]} and outputs {names[1]}; expected {INPUTS} and {OUTPUTS}")
+    if any(value.type != "tensor(double)" for value in (*inputs, *outputs)):
+        raise TwinError(f"{path}: inputs and outputs must be float64; export the twin again")
+    widths = {"state": card.state_layout.size, "parameters": len(card.parameter_names)}
+    for name, width in widths.items():
+        shape = inputs[INPUTS.index(name)].shape
+        if len(shape) != 2 or shape[1] != width:
+            raise TwinError(f"{path}: {name} is {shape}, the card says (fans, {width}); export the twin again")
+    if card.n_state != widths["state"] or [len(row) for row in card.parameters] != [widths["parameters"]] * card.fans:
+        raise TwinError(f"{path}: n_state or parameters of the model card do not fit the rest; export the twin again")
+
+
 def _session(path: Path) -> Any:
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # it sends as soon as it is imported, on Linux too since 1.31
     import onnxruntime  # noqa: PLC0415
 
     options = onnxruntime.SessionOptions()
-    # A body of sixty tiny nodes gains nothing from threads, and their hand-over costs more than the work.
+    # A body of fifty tiny nodes gains nothing from threads, and their hand-over costs more than the work.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 3

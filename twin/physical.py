@@ -1,76 +1,19 @@
-"""The physical model: w' = (tau - alpha w - C_D w|w|) / J, three parameters per fan."""
+"""The physical model: w' = (tau - alpha w - C_D w|w|) / J, three parameters per fan, and the unknowns it is fitted in.
+
+What is fitted are logarithms of J, of the damping at rest and of the damping at top speed, and the lag. The damping
+d torque / d speed is alpha + 2 C_D |w|. That it is positive at both ends makes the model stable at every recorded
+speed, which is all that physics demands: C_D may come out negative where friction or a dead zone bends the curve.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from twin import physics
-from twin.integration import free_run
+from twin.physics import LAG
+from twin.right_hand_side import FanEquation, advance
 from twin.runs import Array
 from twin.state import ODE_LAYOUT, StateLayout
-
-
-@dataclass(frozen=True, eq=False)
-class PhysicalRightHandSide:
-    """w' of the physical fan. parameters: (batch, 3).
-
-    theta of linearise is what is fitted; by_theta: (batch, 3, 3), the parameters' derivatives by it.
-    """
-
-    parameters: Array
-    by_theta: Array
-
-    def acceleration(self, speed_rad_s: Array, command: Array) -> Array:
-        """(..., batch) in rad/s^2."""
-        return physics.acceleration(speed_rad_s, command, self.parameters)
-
-    def linearise(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array]:
-        """See integration.RightHandSide."""
-        return (
-            physics.acceleration(speed_rad_s, command, self.parameters),
-            physics.acceleration_by_speed(speed_rad_s, self.parameters),
-            np.einsum(
-                "...bp,bpq->...bq",
-                physics.acceleration_by_parameters(speed_rad_s, command, self.parameters),
-                self.by_theta,
-            ),
-        )
-
-
-def fitted_physics(theta: Array, top_speed_rad_s: Array) -> PhysicalRightHandSide:
-    """The physical fan in the unknowns it is fitted in; see physical_parameters."""
-    parameters = physical_parameters(theta, top_speed_rad_s)
-    return PhysicalRightHandSide(parameters, parameters_by_unknowns(theta, top_speed_rad_s))
-
-
-def physical_parameters(theta: Array, top_speed_rad_s: Array) -> Array:
-    """(fans, 3) J, alpha, C_D from the logarithms of J, of the damping at rest and of the damping at top speed.
-
-    The damping d torque / d speed is alpha + 2 C_D |w|. That it is positive at both ends makes the model stable at
-    every recorded speed, which is all that physics demands: C_D may come out negative where friction or a dead zone
-    bends the curve. theta: (fans, 3). top_speed_rad_s: (fans,), the largest recorded.
-    """
-    inertia, at_rest, at_top = np.exp(theta.T)
-    return np.column_stack((inertia, at_rest, (at_top - at_rest) / (2.0 * top_speed_rad_s)))
-
-
-def parameters_by_unknowns(theta: Array, top_speed_rad_s: Array) -> Array:
-    """(fans, 3, 3) derivatives of J, alpha, C_D (rows) by the fitted unknowns (columns)."""
-    inertia, at_rest, at_top = np.exp(theta.T)
-    derivatives = np.zeros((len(theta), 3, 3))
-    derivatives[:, 0, 0] = inertia
-    derivatives[:, 1, 1] = at_rest
-    derivatives[:, 2, 1] = -at_rest / (2.0 * top_speed_rad_s)
-    derivatives[:, 2, 2] = at_top / (2.0 * top_speed_rad_s)
-    return derivatives
-
-
-def fitted_unknowns(parameters: Array, top_speed_rad_s: Array) -> Array:
-    """(fans, 3) the inverse of physical_parameters. Damping that is not positive becomes a hundredth of the larger."""
-    inertia, viscous, drag = parameters.T
-    damping = np.stack((viscous, viscous + 2.0 * drag * top_speed_rad_s))
-    return np.log(np.column_stack((inertia, *np.maximum(damping, 0.01 * np.abs(damping).max(axis=0)))))
 
 
 @dataclass(frozen=True)
@@ -80,8 +23,43 @@ class PhysicalModel:
     kind: Literal["physical"] = "physical"
     state_layout: StateLayout = ODE_LAYOUT
 
+    def equation(self, parameters: Array) -> FanEquation:
+        """w' of a batch of fans with the physical parameters (batch, 4)."""
+        return FanEquation(parameters, None)
+
     def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
         """Free run from state; see models.TwinModel."""
-        rhs = PhysicalRightHandSide(parameters, np.tile(np.eye(3), (len(parameters), 1, 1)))
-        speed_rad_s, final = free_run(rhs.acceleration, state[:, 0], command, step_s)
-        return speed_rad_s, final[:, np.newaxis]
+        return advance(self.equation(parameters), state, command, step_s, parameters[:, LAG])
+
+
+def physical_parameters(unknowns: Array, top_speed_rad_s: Array) -> Array:
+    """(fans, 4) J, alpha, C_D, lag_s. unknowns: (fans, 4). top_speed_rad_s: (fans,), the largest recorded.
+
+    A lag below zero counts as zero.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        # A trial step may go beyond all numbers; the fit then rejects it.
+        inertia, at_rest, at_top = np.exp(unknowns.T[:LAG])
+        drag = (at_top - at_rest) / (2.0 * top_speed_rad_s)
+    # Adding zero makes a lag of -0.0 one of 0.0.
+    return np.column_stack((inertia, at_rest, drag, np.maximum(unknowns[:, LAG], 0.0) + 0.0))
+
+
+def parameters_by_unknowns(unknowns: Array, top_speed_rad_s: Array) -> Array:
+    """(fans, 4, 4) derivatives of J, alpha, C_D, lag_s (rows) by the unknowns (columns)."""
+    inertia, at_rest, at_top = np.exp(unknowns.T[:LAG])
+    derivatives = np.zeros((len(unknowns), 4, 4))
+    derivatives[:, 0, 0] = inertia
+    derivatives[:, 1, 1] = at_rest
+    derivatives[:, 2, 1] = -at_rest / (2.0 * top_speed_rad_s)
+    derivatives[:, 2, 2] = at_top / (2.0 * top_speed_rad_s)
+    derivatives[:, LAG, LAG] = 1.0
+    return derivatives
+
+
+def fitted_unknowns(parameters: Array, top_speed_rad_s: Array) -> Array:
+    """(fans, 4) the inverse of physical_parameters. Damping that is not positive becomes a hundredth of the larger."""
+    inertia, viscous, drag, lag_s = parameters.T
+    damping = np.stack((viscous, viscous + 2.0 * drag * top_speed_rad_s))
+    damping = np.maximum(damping, 0.01 * np.abs(damping).max(axis=0))
+    return np.column_stack((np.log(inertia), *np.log(damping), lag_s))

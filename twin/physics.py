@@ -1,26 +1,28 @@
-"""The physical fan: J w' + alpha w + C_D w|w| = tau.
+"""The physical fan: J w' + alpha w + C_D w|w| = tau, and the electrical lag of tau (twin.lag).
 
 w is the rotor speed in rad/s and tau the applied torque command. The command enters as it was recorded, so J, alpha
 and C_D are per unit of command. Drag is written w|w|, equal to the published w^2 for a fan that turns forwards, so
-that it opposes the motion of one driven backwards. Equations (10) to (12) and (31) of Peng and Chen.
+that it opposes the motion of one driven backwards. Equations (10) to (12) and (31) of Peng and Chen; they neglect the
+lag, which is lag_s = 0. `command` here is the effective command, that is after the lag.
 """
 
 import numpy as np
 
 from twin.runs import Array
 
-PARAMETER_NAMES = ("J", "alpha", "C_D")
+PARAMETER_NAMES = ("J", "alpha", "C_D", "lag_s")
+LAG = PARAMETER_NAMES.index("lag_s")
 
 
 def acceleration(speed_rad_s: Array, command: Array, parameters: Array) -> Array:
-    """(..., fans) rotor acceleration in rad/s^2. parameters: (fans, 3), columns J, alpha, C_D."""
-    inertia, viscous, drag = parameters.T
+    """(..., fans) rotor acceleration in rad/s^2. parameters: (fans, 4), in the order of PARAMETER_NAMES."""
+    inertia, viscous, drag = parameters.T[:LAG]
     return (command - (viscous + drag * np.abs(speed_rad_s)) * speed_rad_s) / inertia
 
 
 def acceleration_by_speed(speed_rad_s: Array, parameters: Array) -> Array:
     """(..., fans) derivative of the acceleration by the speed, in 1/s."""
-    inertia, viscous, drag = parameters.T
+    inertia, viscous, drag = parameters.T[:LAG]
     return -(viscous + 2.0 * drag * np.abs(speed_rad_s)) / inertia
 
 

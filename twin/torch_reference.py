@@ -12,7 +12,9 @@ import torch
 from twin.evaluation import evaluation_pieces
 from twin.hybrid import Hybrid
 from twin.identification import Identification
+from twin.lag import effective_command
 from twin.models import NetworkOde
+from twin.physics import LAG
 from twin.runs import Array, Run
 from twin.training import SHORT_STRETCH_TIME_CONSTANTS, Progress
 from twin.trajectories import cut_into_trajectories, stretch_samples
@@ -30,11 +32,12 @@ def torch_free_run(
 ) -> torch.Tensor:
     """(n, batch) speeds of a free run, differentiable by theta.
 
-    theta: (P,). parameters: (batch, 3). initial_speed_rad_s: (batch,). command: (n, batch). step_s: (n,) or (n, batch).
+    theta: (P,). parameters: (batch, 4). initial_speed_rad_s: (batch,). command: (n, batch), the effective one: after
+    the lag (lag.effective_command). step_s: (n,) or (n, batch).
     """
     network, scale = model.network, model.network.scaling
     rows = theta[:-1].reshape(len(network.inputs) + 2, network.units)
-    inertia, viscous, drag = parameters.T
+    inertia, viscous, drag = parameters.T[:LAG]
 
     def acceleration(speed: torch.Tensor, held: torch.Tensor) -> torch.Tensor:
         pre = rows[-2] + ((speed - scale.speed_offset_rad_s) / scale.speed_scale_rad_s)[:, None] * rows[0]
@@ -66,7 +69,8 @@ def train_adam(
 ) -> tuple[NetworkOde, int]:
     """Train from the model's weights on stretches of ten time constants; returns the best iterate, and max_iterations.
 
-    Each stretch starts from the mean of its first five measured speeds.
+    Each stretch starts from the mean of its first five measured speeds. Its physics, the lag included, stay as they
+    were identified.
     """
     pieces = evaluation_pieces(runs)
     step_s = min(piece.median_step_s for piece in pieces)
@@ -74,14 +78,16 @@ def train_adam(
     data = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, SHORT_STRETCH_TIME_CONSTANTS))
     measured = _tensor(data.measured)
     speed = _tensor(np.nan_to_num(data.speed_rad_s))
-    parameters, initial = _tensor(identification.parameters[data.fan]), _tensor(data.starting_speed_rad_s())
-    command, steps = _tensor(data.command), _tensor(data.step_s)
+    parameters = identification.parameters[data.fan]
+    acting, _ = effective_command(data.command, data.step_s, parameters[:, LAG], data.command_before)
+    physics, initial = _tensor(parameters), _tensor(data.starting_speed_rad_s())
+    command, steps = _tensor(acting), _tensor(data.step_s)
     theta = _tensor(model.network.theta).requires_grad_()
     optimiser = torch.optim.Adam([theta], lr=LEARNING_RATE)
     best, best_loss = model.network.theta, np.inf
     for iteration in range(1, max_iterations + 1):
         optimiser.zero_grad()
-        error = measured * (torch_free_run(model, theta, parameters, initial, command, steps) - speed)
+        error = measured * (torch_free_run(model, theta, physics, initial, command, steps) - speed)
         loss = error.abs().sum() / measured.sum()
         if float(loss.detach()) < best_loss:
             best, best_loss = theta.detach().numpy().copy(), float(loss.detach())

@@ -1,12 +1,12 @@
 """Training of the network of a neural ODE or hybrid on the free-run error.
 
 The published recipe is Adam on the mean absolute error (twin.torch_reference). This one needs tens of iterations
-instead of hundreds, because the model is small enough for second-order steps:
+instead of thousands, because the model is small enough for second-order steps with exact sensitivities:
 
-1. Random tanh units placed on the data, their output weights by linear least squares through the filtering operator
-   (twin.filtering): the network is one more set of regressors, so it starts near the solution.
-2. Levenberg-Marquardt over stretches of a few time constants, each with its own initial speed.
-3. The same over stretches as long as is practical and from their measured speeds: the free run itself.
+1. A few starts from twin.placement, each taken some steps of Levenberg-Marquardt over stretches of a few time
+   constants, each stretch with its own initial speed (multiple shooting). The best one goes on.
+2. The same until nothing is gained.
+3. Over stretches as long as is practical and from their measured speeds: the free run itself.
 
 Every iterate is judged as it would serve: by its free run from the measured start, over the held-out runs, or over the
 training runs where none are given. The best one is kept, the untrained network (all weights zero: for a hybrid, its
@@ -14,29 +14,45 @@ physics) being a candidate, and training stops when held-out runs have ceased to
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
-from twin.evaluation import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
-from twin.filtering import filtered_regression
-from twin.free_run_fit import Family, fit_free_run
-from twin.identification import Identification
+from twin.evaluation import evaluation_pieces
+from twin.free_run_fit import (
+    NONE_FREE,
+    FreeRunProblem,
+    NetworkPrior,
+    Point,
+    Prior,
+    Unknowns,
+    fit_free_run,
+    robust_scale,
+)
+from twin.identification import Identification, inertia_anchor
 from twin.models import NetworkOde
 from twin.network import Scaling
-from twin.runs import Array, Run
+from twin.physical import PhysicalModel, fitted_unknowns, physical_parameters
+from twin.physics import LAG, PARAMETER_NAMES
+from twin.placement import initial_weights
+from twin.runs import STARTING_SAMPLES, Array, Run
 from twin.trajectories import MAX_SAMPLES, cut_into_trajectories, stretch_samples
 
 Progress = Callable[[int, int, float], None]
 """Called with iterations done, iterations at most, and the present free-run rmse in rad/s."""
+Physics = Literal["fixed", "refined"]
 
 SHORT_STRETCH_TIME_CONSTANTS = 10.0
-SHORT_SHARE = 0.6
+STARTS, START_ITERATIONS, START_SAMPLES = 4, 5, 30_000
+SHORT_SHARE = 0.75
 TOLERANCE = 1e-4
-
 PATIENCE = 10
-PLACEMENTS = 12
 # Weights have a prior standard deviation of ten in scaled units: wide enough to be invisible where data speak.
 PRIOR_PRECISION = 0.01
+# Each point of the grid counts as much as one sample that tells the acceleration to a spread of its scale; a tenth
+# of a second in which the fan was really there counts a hundred times that.
+GRID_POINTS, GRID_REACH, GRID_SPREAD = 15, 1.5, 0.1
 
 
 def data_scaling(runs: Sequence[Run], identification: Identification) -> Scaling:
@@ -60,153 +76,145 @@ def train_network(
     identification: Identification,
     *,
     max_iterations: int,
+    seed: int = 0,
+    physics: Physics = "refined",
+    spread: float = GRID_SPREAD,
     progress: Progress | None = None,
-) -> tuple[NetworkOde, int]:
-    """Train the model's network, starting from its weights; returns the trained model and the iterations taken.
+) -> tuple[NetworkOde, Array, int]:
+    """Train the model's network. Returns the trained model, the parameters (fans, 4) and the iterations taken.
 
-    identification: the physics of the fans of the runs, which stay as they are.
+    max_iterations: of the start that goes on; those of all starts come before. physics: "refined" fits J, alpha, C_D
+    and the lag of each fan along with the network; "fixed" leaves them as they were identified, as published.
+    spread: how far the network's acceleration may be from the physics where no data speak, in units of its scale
+    (twin.cross_validation chooses it). Zero: the weights stay zero.
     """
+    if spread == 0.0:
+        return model.with_theta(np.zeros_like(model.network.theta)), identification.parameters, 0
     pieces = evaluation_pieces(runs)
     step_s = min(piece.median_step_s for piece in pieces)
-    longest_s = float(identification.time_constant_s.max())
-    short = stretch_samples(longest_s, step_s, SHORT_STRETCH_TIME_CONSTANTS)
-    judge = _Judge(model, runs, validation_runs, identification.parameters, max_iterations, progress)
-    judge.consider(model.network.theta)
-    theta = model.network.theta
-    for stretch, share, estimate in ((short, SHORT_SHARE, True), (MAX_SAMPLES, 1.0, False)):
+    short = stretch_samples(float(identification.time_constant_s.max()), step_s, SHORT_STRETCH_TIME_CONSTANTS)
+    top_speed = identification.top_speed_rad_s
+    own = fitted_unknowns(identification.parameters, top_speed)
+    free = np.full(own.shape, physics == "refined")
+    # A lag that identification has not found stays out of the model.
+    free[:, LAG] &= identification.parameters[:, LAG] > 0.0
+    pull = inertia_anchor(sum(piece.samples for piece in pieces))
+    prior = Prior(PRIOR_PRECISION, pull, own, _network_prior(model, identification, spread))
+    in_all = STARTS * START_ITERATIONS + max_iterations
+    untrained = Unknowns(np.zeros_like(model.network.theta), own, np.zeros(0))
+    judge = _Judge(model, untrained, validation_runs or runs, bool(validation_runs), top_speed, in_all, progress)
+
+    stretches = cut_into_trajectories(pieces, short)
+    few = stretches.thinned(START_SAMPLES)
+    starts = []
+    for theta in initial_weights(model, pieces, identification, np.random.default_rng(seed), STARTS):
         fit = fit_free_run(
-            _network_family(model, identification.parameters),
-            theta[np.newaxis],
-            cut_into_trajectories(pieces, stretch),
-            max_iterations=round(share * max_iterations) - judge.iterations,
-            prior_precision=PRIOR_PRECISION,
+            model.with_theta(theta),
+            own,
+            top_speed,
+            few,
+            free=np.zeros_like(free),
+            prior=prior,
+            max_iterations=START_ITERATIONS,
+            iteration_done=judge.start_iteration_done,
+        )
+        judge.stage_done(fit.iterations)
+        starts.append(fit)
+    best = min(starts, key=lambda fit: fit.rmse_rad_s).point.unknowns
+    judge.consider(best)
+    tried = judge.iterations
+    for data, share, estimate in (
+        (stretches, SHORT_SHARE, True),
+        (cut_into_trajectories(pieces, MAX_SAMPLES), 1.0, False),
+    ):
+        fit = fit_free_run(
+            model.with_theta(best.weights),
+            best.own,
+            top_speed,
+            data,
+            free=free,
+            prior=prior,
+            max_iterations=max(round(share * max_iterations) + tried - judge.iterations, 1),
             tolerance=TOLERANCE,
             estimate_initial_speed=estimate,
             iteration_done=judge.iteration_done,
         )
         judge.stage_done(fit.iterations)
-        theta = judge.best
-    judge.consider(np.zeros_like(theta))
-    return model.with_theta(judge.best), judge.iterations
+        best = judge.best
+    return model.with_theta(best.weights), physical_parameters(best.own, top_speed), judge.iterations
 
 
-def initial_weights(
-    model: NetworkOde, runs: Sequence[Run], identification: Identification, rng: np.random.Generator
-) -> NetworkOde:
-    """Random hidden units placed on the data, and output weights by the filtering operator.
-
-    The best of several placements: least squares is so much cheaper than training that a bad draw need not be trained.
-    """
-    pieces = evaluation_pieces(runs)
-    candidates = [
-        _fit_output_layer(_place_hidden_units(model, pieces, rng), pieces, identification) for _ in range(PLACEMENTS)
-    ]
-    return min(candidates, key=lambda candidate: candidate[1])[0]
-
-
-def _fit_output_layer(
-    placed: NetworkOde, pieces: Sequence[Run], identification: Identification
-) -> tuple[NetworkOde, float]:
-    """The model with its output weights fitted, and the sum of squares that is left."""
-    target, regressors = _output_regression(placed, pieces, identification)
-    # Random tanh units are close to collinear; the ridge keeps their weights of order one.
-    squares = regressors.T @ regressors
-    ridge = 1e-4 * np.trace(squares) / len(squares) * np.eye(len(squares))
-    output = np.linalg.solve(squares + ridge, regressors.T @ target)
-    theta = np.concatenate((placed.network.theta[: -len(output)], output))
-    return placed.with_theta(theta), float(np.sum((target - regressors @ output) ** 2))
-
-
-def _place_hidden_units(model: NetworkOde, pieces: Sequence[Run], rng: np.random.Generator) -> NetworkOde:
-    """Hidden units of random direction and steepness, each centred on a random sample of the data."""
-    network, scale = model.network, model.network.scaling
-    speeds = np.concatenate([piece.speed_rad_s.ravel() for piece in pieces])
-    commands = np.concatenate([piece.command.ravel() for piece in pieces])
-    chosen = rng.choice(np.flatnonzero(np.isfinite(speeds)), size=network.units)
-    centres = np.stack(
-        (
-            (speeds[chosen] - scale.speed_offset_rad_s) / scale.speed_scale_rad_s,
-            (commands[chosen] - scale.command_offset) / scale.command_scale,
-        )
-    )[: len(network.inputs)]
-    directions = rng.normal(size=centres.shape)
-    slopes = directions / np.linalg.norm(directions, axis=0) * rng.uniform(0.5, 3.0, size=network.units)
-    bias = -np.sum(slopes * centres, axis=0)
-    return model.with_theta(np.concatenate((slopes.ravel(), bias, np.zeros(network.units + 1))))
-
-
-def _output_regression(model: NetworkOde, pieces: Sequence[Run], identification: Identification) -> tuple[Array, Array]:
-    """Filtered target (m,), less the known acceleration, and output-layer regressors (m, units + 1) of all fans."""
-    targets, regressors = [], []
-    lambda_per_s = float(np.median(identification.lambda_per_s))
-    for piece in pieces:
-        for fan, parameters in enumerate(identification.parameters):
-            speed_rad_s, command = piece.speed_rad_s[:, fan], piece.command[:, fan]
-            if np.isfinite(speed_rad_s).sum() < 2:
-                continue
-            basis = _output_basis(model, parameters)
-            target, columns = filtered_regression(piece.t_s, speed_rad_s, command, basis, lambda_per_s)
-            targets.append(target - columns[:, 0])
-            regressors.append(columns[:, 1:])
-    return np.concatenate(targets), np.concatenate(regressors)
-
-
-def _output_basis(model: NetworkOde, parameters: Array) -> Callable[[Array, Array], Array]:
-    """Speed (n,) and command (n,) to the known acceleration, each hidden unit and a constant: (n, units + 2)."""
-    rate = model.network.scaling.acceleration_scale_rad_s2
-
-    def basis(speed_rad_s: Array, command: Array) -> Array:
-        known = model.known_acceleration(speed_rad_s[:, np.newaxis], command[:, np.newaxis], parameters[np.newaxis])
-        hidden = model.network.hidden(speed_rad_s, command)
-        return np.column_stack((known, rate * hidden, np.full(len(known), rate)))
-
-    return basis
-
-
-def _network_family(model: NetworkOde, parameters: Array) -> Family:
-    return lambda theta, fan: model.with_theta(theta[0]).right_hand_side(parameters[fan])
+def _network_prior(model: NetworkOde, identification: Identification, spread: float) -> NetworkPrior:
+    """Where no data speak, the model is the mean fan's physics: on a grid over and around the recorded ranges."""
+    scale = model.network.scaling
+    side = np.linspace(-GRID_REACH, GRID_REACH, GRID_POINTS)
+    speed, command = (values.ravel() for values in np.meshgrid(side, side))
+    speed_rad_s = scale.speed_offset_rad_s + scale.speed_scale_rad_s * speed
+    commands = scale.command_offset + scale.command_scale * command
+    mean_fan = identification.parameters.mean(axis=0, keepdims=True)
+    untrained = model.with_theta(np.zeros_like(model.network.theta)).equation(mean_fan)
+    physics = PhysicalModel().equation(mean_fan).acceleration(speed_rad_s[:, None], commands[:, None])
+    known = untrained.acceleration(speed_rad_s[:, None], commands[:, None])
+    weight = (spread * scale.acceleration_scale_rad_s2) ** -2
+    return NetworkPrior(speed_rad_s, commands, (physics - known)[:, 0], weight)
 
 
 class _Judge:
-    """Keeps the weights with the best free run, and says when held-out runs have ceased to improve."""
+    """Keeps the unknowns with the best free run, and says when held-out runs have ceased to improve."""
 
     def __init__(
         self,
         model: NetworkOde,
+        untrained: Unknowns,
         runs: Sequence[Run],
-        validation_runs: Sequence[Run],
-        parameters: Array,
+        held_out: bool,
+        top_speed_rad_s: Array,
         max_iterations: int,
         progress: Progress | None,
     ) -> None:
-        self.model = model
-        self.parameters = parameters
-        self.pieces = evaluation_pieces(validation_runs or runs)
-        self.held_out = bool(validation_runs)
+        pieces = evaluation_pieces(runs)
+        self.data = cut_into_trajectories(pieces, max(piece.samples for piece in pieces))
+        nothing = Prior(0.0, np.zeros(len(PARAMETER_NAMES)), np.zeros((len(top_speed_rad_s), len(PARAMETER_NAMES))))
+        self.problem = FreeRunProblem(model, self.data, top_speed_rad_s, NONE_FREE, nothing)
+        self.held_out = held_out
         self.max_iterations = max_iterations
         self.progress = progress
         self.iterations = 0
-        self.best = model.network.theta
-        self.best_rmse_rad_s = np.inf
+        self.guess_rad_s = self.data.interpolated_speed_rad_s()
+        self.early = self.data.measured & (np.cumsum(self.data.measured, axis=0) <= STARTING_SAMPLES)
+        self.problem.scale_rad_s = robust_scale(self._free_run(untrained).residual, self.data)
+        self.best, self.best_loss = untrained, float(self._free_run(untrained).cost.sum())
         self.worse_in_a_row = 0
 
-    def consider(self, theta: Array) -> None:
-        """Judge one set of weights (P,)."""
-        residual = free_run_residuals(self.model.with_theta(theta), self.parameters, self.pieces)
-        rmse_rad_s = pooled_rmse_rad_s(residual)
-        if rmse_rad_s < self.best_rmse_rad_s:
-            self.best, self.best_rmse_rad_s, self.worse_in_a_row = theta, rmse_rad_s, 0
+    def consider(self, unknowns: Unknowns) -> None:
+        """Judge weights and physics by the robust loss of their free run from the measured start."""
+        loss = float(self._free_run(unknowns).cost.sum())
+        if loss < self.best_loss:
+            self.best, self.best_loss, self.worse_in_a_row = unknowns, loss, 0
         else:
             self.worse_in_a_row += 1
 
-    def iteration_done(self, iteration: int, theta: Array, rmse_rad_s: float) -> bool:
-        """See free_run_fit.IterationDone."""
+    def start_iteration_done(self, iteration: int, unknowns: Unknowns, rmse_rad_s: float) -> bool:
+        """One of several starts has taken a step: that is only told."""
         if self.progress is not None:
             self.progress(self.iterations + iteration, self.max_iterations, rmse_rad_s)
-        self.consider(theta[0])
+        return False
+
+    def iteration_done(self, iteration: int, unknowns: Unknowns, rmse_rad_s: float) -> bool:
+        """See free_run_fit.IterationDone."""
+        self.start_iteration_done(iteration, unknowns, rmse_rad_s)
+        self.consider(unknowns)
         return self.held_out and self.worse_in_a_row >= PATIENCE
 
     def stage_done(self, iterations: int) -> None:
         """Count a stage's iterations; the next one has its own patience."""
         self.iterations += iterations
         self.worse_in_a_row = 0
+
+    def _free_run(self, unknowns: Unknowns) -> Point:
+        """From the speeds whose free runs are nearest to the first measured ones, as in twin.evaluation."""
+        started = Unknowns(unknowns.weights, unknowns.own, self.data.starting_speed_rad_s())
+        point = self.problem.evaluate(started, self.guess_rad_s)
+        missed = np.sum(point.residual, axis=0, where=self.early) / self.early.sum(axis=0)
+        nearer = started.initial_speed_rad_s + np.where(np.isfinite(missed), missed, 0.0)
+        return self.problem.evaluate(replace(started, initial_speed_rad_s=nearer), point.speed_rad_s)

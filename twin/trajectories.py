@@ -23,10 +23,12 @@ class Trajectories:
     """A batch of stretches, padded at the end to one length.
 
     fan: (batch,) which fan each stretch belongs to. command, speed_rad_s, step_s: (n, batch). Padding has a step of
-    zero, which leaves the state where it is, and a speed of NaN, which counts as missing.
+    zero, which leaves the state where it is, and a speed of NaN, which counts as missing. command_before: (batch,), the
+    command in force before each stretch.
     """
 
     fan: NDArray[np.intp]
+    command_before: Array
     command: Array
     speed_rad_s: Array
     step_s: Array
@@ -35,6 +37,28 @@ class Trajectories:
     def measured(self) -> NDArray[np.bool_]:
         """(n, batch) which samples hold a measured speed."""
         return np.isfinite(self.speed_rad_s)
+
+    def thinned(self, max_samples: int) -> "Trajectories":
+        """Some of the stretches, always the same ones of a random choice, with at most about max_samples in all."""
+        count = min(len(self.fan), max(1, max_samples // len(self.command)))
+        chosen = np.sort(np.random.default_rng(0).permutation(len(self.fan))[:count])
+        return Trajectories(
+            self.fan[chosen],
+            self.command_before[chosen],
+            self.command[:, chosen],
+            self.speed_rad_s[:, chosen],
+            self.step_s[:, chosen],
+        )
+
+    def interpolated_speed_rad_s(self) -> Array:
+        """(n, batch) the speeds, the missing ones interpolated: a first guess of a free run."""
+        samples = np.arange(len(self.speed_rad_s))
+        measured = self.measured
+        columns = [
+            np.interp(samples, samples[known], speed[known])
+            for speed, known in zip(self.speed_rad_s.T, measured.T, strict=True)
+        ]
+        return np.stack(columns, axis=1)
 
     def starting_speed_rad_s(self) -> Array:
         """(batch,) mean of the first measured speeds of each stretch."""
@@ -46,21 +70,25 @@ def cut_into_trajectories(runs: Sequence[Run], max_samples: int) -> Trajectories
 
     The runs must not hold gaps (Run.split_at_gaps). Raises TwinError when nothing is left.
     """
-    stretches = [part for run in runs for part in _equal_parts(run, max_samples)]
-    length = max((part.samples for part in stretches), default=0)
+    parts = [(run, first, last) for run in runs for first, last in _equal_parts(run, max_samples)]
+    length = max((last - first for _, first, last in parts), default=0)
     fans = runs[0].fans if runs else 0
-    shape = (length, len(stretches), fans)
+    shape = (length, len(parts), fans)
     command, step_s, speed = np.zeros(shape), np.zeros(shape), np.full(shape, np.nan)
-    for index, part in enumerate(stretches):
+    before = np.zeros(shape[1:])
+    for index, (run, first, last) in enumerate(parts):
+        part = run.rows(first, last)
         command[: part.samples, index] = part.command
         speed[: part.samples, index] = part.speed_rad_s
         step_s[: part.samples - 1, index] = part.step_s[:-1, np.newaxis]
+        before[index] = run.command[max(first - 1, 0)]
     usable = np.flatnonzero(np.isfinite(speed).sum(axis=0).ravel() >= 2)
     if not usable.size:
         raise TwinError("the runs hold no stretch with two measured speeds; check the speed column")
     flat = (length, -1)
     return Trajectories(
-        fan=np.tile(np.arange(fans), len(stretches))[usable],
+        fan=np.tile(np.arange(fans), len(parts))[usable],
+        command_before=before.ravel()[usable],
         command=command.reshape(flat)[:, usable],
         speed_rad_s=speed.reshape(flat)[:, usable],
         step_s=step_s.reshape(flat)[:, usable],
@@ -72,7 +100,7 @@ def stretch_samples(time_constant_s: float, step_s: float, time_constants: float
     return int(np.clip(time_constants * time_constant_s / step_s, MIN_SAMPLES, MAX_SAMPLES))
 
 
-def _equal_parts(run: Run, max_samples: int) -> list[Run]:
+def _equal_parts(run: Run, max_samples: int) -> list[tuple[int, int]]:
     count = -(-run.samples // max_samples)
     bounds = np.linspace(0, run.samples, count + 1).astype(int).tolist()
-    return [run.rows(a, b) for a, b in pairwise(bounds) if b - a >= 2]
+    return [(a, b) for a, b in pairwise(bounds) if b - a >= 2]

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -24,8 +27,14 @@ from pipeline.commands.options import JsonOption
 
 if TYPE_CHECKING:
     from twin.identification import Identification
+    from twin.runs import Array
 
-PARAMETERS = ("J", "alpha", "C_D")
+UNITS = {
+    "J": "command units per rad/s²",
+    "alpha": "command units per rad/s",
+    "C_D": "command units per (rad/s)²",
+    "lag_s": "seconds",
+}
 
 
 def identify(
@@ -36,10 +45,10 @@ def identify(
     fans: FansOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Find J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, with 95 % intervals.
+    """Find J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, and the lag of its command.
 
-    w is in rad/s and the command in its own unit, so the parameters are in that unit too: only their ratios are
-    mechanical.
+    Each comes with its 95 % interval. w is in rad/s and the command in its own unit, so the parameters are in that unit
+    too: only their ratios are mechanical. What the recordings cannot tell, and why, is said on stderr.
 
     Example: fantwin identify REC.mcap --json
     """
@@ -47,35 +56,89 @@ def identify(
         from twin.identification import identify as identify_fans  # noqa: PLC0415  loads twin only when it is needed
 
         material = read_material(recordings, tray, fans, from_s, to_s)
-        found = identify_fans(material.runs)
+        with _spinner(material):
+            found = identify_fans(material.runs)
+    told = account(found, material)
     if json_output:
-        typer.echo(json.dumps(account(found, material)))
+        typer.echo(json.dumps(told))
         return
-    table = Table("fan")
-    for header in (*PARAMETERS, "time constant s", f"rmse {material.speed_unit}"):
-        table.add_column(header, no_wrap=header in PARAMETERS, justify="right")
-    for fan, of_fan in enumerate(account(found, material)["fans"]):
-        parameters = (f"{of_fan[name]:.4g} ± {_half_width(of_fan[f'{name}_95']):.1g}" for name in PARAMETERS)
-        table.add_row(str(fan), *parameters, f"{of_fan['time_constant_s']:.3g}", f"{of_fan['rmse']:.4g}")
-    Console().print(table)
-    for warning in found.warnings:
-        typer.echo(warning, err=True)
+    Console().print(_table(told))
+    for warning in told["warnings"]:
+        typer.secho(f"warning: {warning}", fg=typer.colors.YELLOW, err=True)
 
 
 def account(found: Identification, material: Material) -> dict[str, Any]:
-    """What a machine is told of an identification."""
+    """What a machine is told of an identification; None where a figure is undefined.
+
+    Rows and columns of covariance and correlation are in the order of `parameters`; those of a lag that was not found
+    are zero, and undefined.
+    """
+    from twin.physics import PARAMETER_NAMES  # noqa: PLC0415
+
     fans = [
         {
-            **dict(zip(PARAMETERS, found.parameters[fan].tolist(), strict=True)),
-            **{f"{name}_95": found.interval_95[fan, k].tolist() for k, name in enumerate(PARAMETERS)},
+            **dict(zip(PARAMETER_NAMES, found.parameters[fan].tolist(), strict=True)),
+            **{f"{name}_95": found.interval_95[fan, k].tolist() for k, name in enumerate(PARAMETER_NAMES)},
+            "covariance": found.covariance[fan].tolist(),
+            "correlation": _correlation(found.covariance[fan]),
             "time_constant_s": float(found.time_constant_s[fan]),
             "lambda_per_s": float(found.lambda_per_s[fan]),
             "rmse": float(found.rmse_rad_s[fan]) / material.rad_s_per_unit,
         }
         for fan in range(len(found.parameters))
     ]
-    return {"fans": fans, "speed_unit": material.speed_unit, "warnings": list(found.warnings)}
+    return {
+        "fans": fans,
+        "parameters": list(PARAMETER_NAMES),
+        "units": {name: UNITS[name] for name in PARAMETER_NAMES},
+        "speed_unit": material.speed_unit,
+        "iterations": found.iterations,
+        "warnings": list(found.warnings),
+    }
 
 
-def _half_width(interval: list[float]) -> float:
-    return (interval[1] - interval[0]) / 2
+def _correlation(covariance: Array) -> list[list[float | None]]:
+    errors = [math.sqrt(covariance[k, k]) for k in range(len(covariance))]
+
+    def between(row: int, column: int) -> float | None:
+        product = errors[row] * errors[column]
+        return min(max(float(covariance[row, column]) / product, -1.0), 1.0) if product > 0.0 else None
+
+    return [[between(row, column) for column in range(len(errors))] for row in range(len(errors))]
+
+
+def _table(told: dict[str, Any]) -> Table:
+    """A row for each fan, the half width of each interval below its value."""
+    mechanical = [name for name in told["parameters"] if name != "lag_s"]
+    units = "; ".join(f"{name} in {told['units'][name]}" for name in mechanical)
+    table = Table(
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        caption=f"{units}. ± is half a 95 % interval; the time constant is that at the median speed.",
+        caption_justify="left",
+    )
+    table.add_column("fan", no_wrap=True)
+    for header in (*mechanical, "lag\nms", "time\nconst. s", f"rmse\n{told['speed_unit']}", "lambda\n1/s"):
+        table.add_column(header, justify="right", no_wrap=True)
+    for number, fan in enumerate(told["fans"]):
+        values = [_with_interval(fan[name], fan[f"{name}_95"]) for name in mechanical]
+        figures = (f"{fan['time_constant_s']:.3g}", f"{fan['rmse']:.4g}", f"{fan['lambda_per_s']:.3g}")
+        table.add_row(str(number), *values, _lag(fan), *figures)
+    return table
+
+
+def _lag(fan: dict[str, Any]) -> str:
+    low, high = fan["lag_s_95"]
+    return _with_interval(1e3 * fan["lag_s"], [1e3 * low, 1e3 * high]) if high > low else "none seen"
+
+
+def _with_interval(value: float, interval: list[float]) -> str:
+    return f"{value:.4g}\n± {(interval[1] - interval[0]) / 2:.1g}"
+
+
+@contextmanager
+def _spinner(material: Material) -> Iterator[None]:
+    """Something that moves on stderr meanwhile; without a terminal it stays silent."""
+    samples = sum(run.samples for run in material.runs)
+    with Console(stderr=True).status(f"identifying {material.runs[0].fans} fan(s) from {samples:,} samples each"):
+        yield

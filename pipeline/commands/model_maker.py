@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pipeline.commands.options import fan_numbers
 from pipeline.errors import UserError
@@ -17,8 +20,10 @@ from pipeline.runs_of_recording import RecordedRun, read_runs
 from pipeline.table import RAD_S_PER_TABLE_UNIT
 
 if TYPE_CHECKING:
+    from twin.card import DataCard
     from twin.evaluation import Figures
     from twin.runs import Run
+    from twin.training import Progress as ProgressCallback
 
 RecordingsArgument: TypeAlias = Annotated[
     list[Path], typer.Argument(metavar="REC.mcap...", help="Recordings; each counts its seconds from its own start.")
@@ -28,7 +33,7 @@ ToOption: TypeAlias = Annotated[float, typer.Option("--to", help="Use each recor
 TrayOption: TypeAlias = Annotated[str | None, typer.Option(help="Which tray, where a recording has several.")]
 FansOption: TypeAlias = Annotated[str | None, typer.Option(help="Only these fans, counted from 0, e.g. 0,2.")]
 
-_EXTRA_MODULES = ("onnx", "scipy", "torch")
+_EXTRA_MODULES = ("jinja2", "matplotlib", "onnx", "scipy", "torch")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +93,53 @@ def model_maker() -> Iterator[None]:
         if error.name is None or error.name.split(".")[0] not in _EXTRA_MODULES:
             raise
         raise UserError(f"this needs the extra `train` ({error.name}): pip install 'fantwin[train]'") from error
+
+
+def data_cards(material: Material) -> list[DataCard]:
+    """The files of some material, for a card: one entry a file."""
+    from twin.card import DataCard  # noqa: PLC0415
+
+    samples: dict[Path, int] = {}
+    for run in material.recorded:
+        samples[run.path] = samples.get(run.path, 0) + len(run.t_s)
+    fans = material.runs[0].fans
+    return [
+        DataCard(name=path.name, sha256=hashlib.sha256(path.read_bytes()).hexdigest(), fans=fans, samples=count)
+        for path, count in samples.items()
+    ]
+
+
+@contextmanager
+def training_bars(material: Material) -> Iterator[Callable[[str], ProgressCallback]]:
+    """Gives what starts a bar on stderr for each training, by the name it is given. The bars go when all is done;
+    without a terminal they stay silent."""
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bars:
+
+        def start(name: str) -> ProgressCallback:
+            said = f"{name}: " if name else ""
+            task = bars.add_task(f"{said}identifying", total=None)
+
+            def show(done: int, at_most: int, rmse_rad_s: float) -> None:
+                error = f"free-run rmse {rmse_rad_s / material.rad_s_per_unit:.4g} {material.speed_unit}"
+                bars.update(task, completed=done, total=at_most, description=said + error)
+
+            return show
+
+        yield start
+
+
+def made_folder(folder: Path) -> Path:
+    """The folder, made where it was missing.
+
+    Raises:
+        UserError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be made: {error.strerror}; name another folder with -o") from error
+    return folder
 
 
 def figures_in(figures: Figures, rad_s_per_unit: float) -> dict[str, float | int | None]:

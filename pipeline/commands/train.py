@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pipeline.commands.model_maker import (
     FansOption,
@@ -21,22 +16,23 @@ from pipeline.commands.model_maker import (
     RecordingsArgument,
     ToOption,
     TrayOption,
+    data_cards,
     figures_in,
+    made_folder,
     model_maker,
     read_material,
     sentence,
+    training_bars,
 )
 from pipeline.commands.options import JsonOption
-from pipeline.errors import UserError
 
 if TYPE_CHECKING:
     from twin.build import TrainedTwin
-    from twin.card import DataCard
-    from twin.training import Progress as ProgressCallback
 
 
 Model: TypeAlias = Literal["physical", "narx", "neural-ode", "hybrid"]
 Trainer: TypeAlias = Literal["levenberg-marquardt", "adam"]
+Physics: TypeAlias = Literal["fixed", "refined"]
 NetworkInputs: TypeAlias = Literal["speed,command", "speed"]
 
 
@@ -61,6 +57,9 @@ def train(
     network_inputs: Annotated[
         NetworkInputs, typer.Option(help="Of the hybrid's and the neural ODE's network.")
     ] = "speed,command",
+    physics: Annotated[
+        Physics, typer.Option(help="Of a hybrid: refined with its network, or fixed as identified.")
+    ] = "refined",
     command_unit: Annotated[str, typer.Option(help="For the card, e.g. %.")] = "",
     json_output: JsonOption = False,
 ) -> None:
@@ -76,7 +75,7 @@ def train(
 
         material = read_material(recordings, tray, fans, from_s, to_s)
         held_out = read_material(validate, tray, fans, validate_from_s, validate_to_s) if validate else None
-        with _progress(material.rad_s_per_unit, material.speed_unit) as progress:
+        with training_bars(material) as start_bar:
             trained = train_twin(
                 material.runs,
                 held_out.runs if held_out else [],
@@ -86,16 +85,13 @@ def train(
                 trainer=trainer,
                 max_iterations=iterations,
                 network_inputs=tuple(network_inputs.split(",")),
+                physics=physics,
                 command_unit=command_unit,
-                data=_data(material),
-                progress=progress,
+                data=data_cards(material),
+                validation_data=data_cards(held_out) if held_out else (),
+                progress=start_bar(""),
             )
-        try:
-            output.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(
-                f"{output.parent}: cannot be made: {error.strerror}; name another folder with -o"
-            ) from error
+        made_folder(output.parent)
         trained.save(output)
     told = account(trained, material, output)
     if json_output:
@@ -123,31 +119,3 @@ def account(trained: TrainedTwin, material: Material, output: Path) -> dict[str,
         "duration_s": card.training.duration_s,
         "warnings": list(trained.identification.warnings),
     }
-
-
-def _data(material: Material) -> list[DataCard]:
-    """What the twin was trained on, for its card: one entry a file."""
-    from twin.card import DataCard  # noqa: PLC0415
-
-    samples: dict[Path, int] = {}
-    for run in material.recorded:
-        samples[run.path] = samples.get(run.path, 0) + len(run.t_s)
-    fans = material.runs[0].fans
-    return [
-        DataCard(name=path.name, sha256=hashlib.sha256(path.read_bytes()).hexdigest(), fans=fans, samples=count)
-        for path, count in samples.items()
-    ]
-
-
-@contextmanager
-def _progress(rad_s_per_unit: float, unit: str) -> Iterator[ProgressCallback]:
-    """A bar on stderr that goes when all is done; without a terminal it stays silent."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("identifying", total=None)
-
-        def show(done: int, at_most: int, rmse_rad_s: float) -> None:
-            said = f"free-run rmse {rmse_rad_s / rad_s_per_unit:.4g} {unit}"
-            bar.update(task, completed=done, total=at_most, description=said)
-
-        yield show

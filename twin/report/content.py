@@ -1,0 +1,140 @@
+"""What a report says, in numbers: a twin run freely over recordings, fan by fan."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.build import evaluate
+from twin.card import Card, DataCard
+from twin.evaluation import Evaluation, Figures, evaluation_pieces, free_run_speeds
+from twin.onnx_twin import OnnxTwin
+from twin.report.speed_bins import SpeedBin, speed_bins
+from twin.report.steady_states import StaticCurve, static_curve
+from twin.report.timeline import Timeline, timeline
+from twin.residual_analysis import ResidualAnalysis, analyse_residual
+from twin.runs import Array, Run
+
+
+@dataclass(frozen=True)
+class SpeedUnit:
+    """The unit in which people are shown speeds, and how much of a rad/s one of it is."""
+
+    name: str
+    rad_s: float
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A physical parameter of one fan: as identified, its 95 % interval (normal), and in force.
+
+    The last differs where a hybrid has refined its physics along with its network, which has taken a share.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+    in_force: float
+
+
+@dataclass(frozen=True, eq=False)
+class FanContent:
+    """One fan. Arrays (n,) are in rad/s or command units, over all pieces one after the other.
+
+    number: as the recording counts fans. predicted_rad_s: NaN where the free run diverged. error_rad_s: measured minus
+    free run, NaN where nothing was measured, infinite where the free run diverged.
+    """
+
+    number: int
+    figures: Figures
+    sigma_rad_s: float
+    command: Array
+    measured_rad_s: Array
+    predicted_rad_s: Array
+    error_rad_s: Array
+    parameters: tuple[Parameter, ...]
+    residual: ResidualAnalysis
+    by_speed: tuple[SpeedBin, ...]
+    curve: StaticCurve
+
+    @property
+    def rmse_in_sigma(self) -> float:
+        """The free-run error in healthy standard deviations; NaN where nothing was measured."""
+        return float(np.divide(self.figures.rmse_rad_s, self.sigma_rad_s))
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """All that a page shows. recordings: the files judged, the name of one appearing in Timeline without its ending."""
+
+    file: str
+    card: Card
+    unit: SpeedUnit
+    recordings: tuple[DataCard, ...]
+    evaluation: Evaluation
+    timeline: Timeline
+    rate_hz: float
+    fans: tuple[FanContent, ...]
+
+
+def report_content(
+    twin: OnnxTwin,
+    runs: Sequence[Run],
+    recordings: Sequence[DataCard],
+    unit: SpeedUnit,
+    fan_numbers: Sequence[int] | None = None,
+) -> Content:
+    """Run the twin over the runs. recordings: the files that the runs came from. fan_numbers: of the runs' fans, where
+    they are not all of the recording's.
+
+    Raises TwinError when the twin does not fit the runs, or there is nothing to evaluate.
+    """
+    evaluation = evaluate(twin, runs)
+    pieces = evaluation_pieces(runs)
+    fans = pieces[0].fans
+    parameters = np.broadcast_to(twin.parameters, (fans, twin.parameters.shape[1]))
+    sigma_rad_s = np.broadcast_to(np.array(twin.card.sigma_rad_s), (fans,))
+    identified = np.broadcast_to(np.array(twin.card.identified_parameters), parameters.shape)
+    intervals_95 = np.broadcast_to(np.array(twin.card.parameter_interval_95), (*parameters.shape, 2))
+    command, measured = (
+        np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("command", "speed_rad_s")
+    )
+    predicted = np.concatenate([free_run_speeds(twin, parameters, piece) for piece in pieces])
+    predicted[~np.isfinite(predicted)] = np.nan
+    error = np.where(np.isfinite(measured) & ~np.isfinite(predicted), np.inf, measured - predicted)
+    residuals = analyse_residual(error, pieces)
+    return Content(
+        file=twin.path.name,
+        card=twin.card,
+        unit=unit,
+        recordings=tuple(recordings),
+        evaluation=evaluation,
+        timeline=timeline(pieces),
+        rate_hz=1.0 / float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces]))),
+        fans=tuple(
+            FanContent(
+                number=fan_numbers[fan] if fan_numbers is not None else fan,
+                figures=evaluation.per_fan[fan],
+                sigma_rad_s=float(sigma_rad_s[fan]),
+                command=command[:, fan],
+                measured_rad_s=measured[:, fan],
+                predicted_rad_s=predicted[:, fan],
+                error_rad_s=error[:, fan],
+                parameters=_parameters(twin.card, identified[fan], intervals_95[fan], parameters[fan]),
+                residual=residuals[fan],
+                by_speed=speed_bins(predicted[:, fan], error[:, fan]),
+                curve=static_curve(
+                    twin, parameters[fan], pieces, fan, twin.card.rate_hz, twin.card.speed_range_rad_s[1]
+                ),
+            )
+            for fan in range(fans)
+        ),
+    )
+
+
+def _parameters(card: Card, values: Array, intervals_95: Array, in_force: Array) -> tuple[Parameter, ...]:
+    return tuple(
+        Parameter(name, float(value), float(low), float(high), float(used))
+        for name, value, (low, high), used in zip(card.parameter_names, values, intervals_95, in_force, strict=True)
+    )

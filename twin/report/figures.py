@@ -1,0 +1,244 @@
+"""The figures of a report, as SVG to stand inside HTML. Colours and marks are those of `fantwin plot`."""
+
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from twin.report.content import Content, FanContent
+from twin.report.timeline import broken_at, kept_samples
+from twin.runs import Array
+
+MEASURED, TWIN, BAND, OUTSIDE, COMMAND, GAP = "#454545", "#006e30", "#a6dfb9", "#d62020", "#3b5ba5", "#ebebeb"
+STYLE: dict[Any, Any] = {
+    "svg.hashsalt": "fantwin",
+    "svg.fonttype": "path",
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "axes.grid": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "legend.handlelength": 1.4,
+}
+WIDE_IN, NARROW_IN, SMALL_IN = (11.5, 5.4), (4.2, 6.0), (4.0, 2.9)
+WIDE_COLUMNS, NARROW_COLUMNS = 500, 200
+AROUND_PEAK_SAMPLES = 300
+HISTOGRAM_SIGMAS = 5.0
+HISTOGRAM_BINS = 50
+LONG_DECIMALS = re.compile(r"(\.\d\d)\d+")
+"""Of coordinates: a hundredth of a point cannot be seen, and half of the page would be digits."""
+LINE = {"lw": 0.5, "color": MEASURED, "solid_joinstyle": "round"}
+
+
+def over_time(content: Content, fan: FanContent, *, narrow: bool) -> str:
+    """Measured speed on free run and band, the error in its band, and the command."""
+    with _figure(NARROW_IN if narrow else WIDE_IN) as figure:
+        speed, error, command = figure.subplots(3, 1, sharex=True, height_ratios=[2.4, 1.5, 0.8])
+        _draw_over_time(content, fan, (speed, error, command), NARROW_COLUMNS if narrow else WIDE_COLUMNS)
+        line = content.timeline
+        for axes in (speed, error, command):
+            for gap in line.gaps:
+                axes.axvspan(gap.start_s, gap.stop_s, color=GAP, lw=0, zorder=0.5)
+            for start_s, _ in line.recordings[1:]:
+                axes.axvline(start_s, color="#888888", lw=0.8, ls=(0, (4, 3)))
+        if len(line.recordings) > 1 and not narrow:
+            for start_s, name in line.recordings:
+                speed.text(start_s, 1.01, f" {name}", transform=speed.get_xaxis_transform(), size=7.5, color="#555555")
+        command.set_xlabel("time in the recording (s)" if line.keeps_the_clock else "measured time (s)")
+        speed.legend(loc="lower left", bbox_to_anchor=(0, 1.04), ncols=2 if narrow else 4, borderaxespad=0.0)
+        figure.align_ylabels()
+        return _svg(
+            figure, f"fan{fan.number}-time-{'narrow' if narrow else 'wide'}", "Speed, error and command over time"
+        )
+
+
+def around_the_largest_error(content: Content, fan: FanContent) -> str:
+    """The same close up, where the free run was furthest off."""
+    line, each = content.timeline, content.unit.rad_s
+    errors = np.where(np.isfinite(fan.error_rad_s), np.abs(fan.error_rad_s), -1.0)
+    peak = int(np.argmax(errors))
+    piece = int(np.searchsorted(line.starts, peak, side="right")) - 1
+    first = max(int(line.starts[piece]), peak - AROUND_PEAK_SAMPLES)
+    end = int(line.starts[piece + 1]) if piece + 1 < len(line.starts) else len(line.t_s)
+    part = slice(first, min(end, peak + AROUND_PEAK_SAMPLES))
+    t_s, twin, half = line.t_s[part], fan.predicted_rad_s[part] / each, 2.0 * fan.sigma_rad_s / each
+    with _figure(SMALL_IN) as figure:
+        axes = figure.subplots()
+        axes.fill_between(t_s, twin - half, twin + half, color=BAND, lw=0, label="twin ± 2σ")
+        axes.plot(t_s, fan.measured_rad_s[part] / each, **{**LINE, "lw": 0.8}, label="measured")
+        axes.plot(t_s, twin, color=TWIN, lw=1.4, label="free run")
+        axes.plot(line.t_s[peak], fan.measured_rad_s[peak] / each, "o", color=OUTSIDE, ms=4, label="largest error")
+        axes.set_xlabel("time (s)")
+        axes.set_ylabel(f"speed ({content.unit.name})")
+        _legend_above(axes, 2)
+        return _svg(figure, f"fan{fan.number}-peak", "Measured speed and free run around the largest error")
+
+
+def histogram(content: Content, fan: FanContent) -> str:
+    """The errors against the normal curve of the declared sigma; errors beyond the axis are counted at its ends."""
+    sigma = fan.sigma_rad_s / content.unit.rad_s
+    error = fan.error_rad_s[np.isfinite(fan.error_rad_s)] / content.unit.rad_s
+    reach = HISTOGRAM_SIGMAS * max(sigma, float(np.sqrt(np.mean(error**2))) if error.size else 0.0)
+    with _figure(SMALL_IN) as figure:
+        axes = figure.subplots()
+        axes.axvspan(-2.0 * sigma, 2.0 * sigma, color=BAND, lw=0, alpha=0.6, label="± 2σ of the card")
+        if error.size and reach > 0.0:
+            inside = np.clip(error, -reach, reach)
+            axes.hist(
+                inside,
+                np.linspace(-reach, reach, HISTOGRAM_BINS + 1).tolist(),
+                density=True,
+                color="#8a8a8a",
+                label="errors",
+            )
+        if sigma > 0.0:
+            x = np.linspace(-reach, reach, 201)
+            normal = np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi))
+            axes.plot(x, normal, color=TWIN, lw=1.4, label="normal, σ of the card")
+        axes.set_xlim(-reach or -1.0, reach or 1.0)
+        axes.set_xlabel(f"measured minus free run ({content.unit.name})")
+        axes.set_ylabel(f"share per {content.unit.name}")
+        _legend_above(axes, 2)
+        return _svg(figure, f"fan{fan.number}-histogram", "Histogram of the errors with the normal curve")
+
+
+def autocorrelation(fan: FanContent) -> str:
+    """Of the error, with the bound that white noise keeps at 95 % of the lags."""
+    its = fan.residual
+    with _figure(SMALL_IN) as figure:
+        axes = figure.subplots()
+        _draw_correlation(axes, its.lags_s, its.autocorrelation, its.bound_95, "bound of white noise, 95 %")
+        axes.set_xlim(0.0, its.lags_s[-1])
+        axes.set_xlabel("lag (s)")
+        axes.set_ylabel("autocorrelation")
+        return _svg(figure, f"fan{fan.number}-autocorrelation", "Autocorrelation of the error with its bound")
+
+
+def cross_correlation(fan: FanContent) -> str:
+    """Of the error with the command, with the bound that unrelated signals keep at 95 % of the lags."""
+    its = fan.residual
+    with _figure(SMALL_IN) as figure:
+        axes = figure.subplots()
+        bound = "bound of unrelated signals, 95 %"
+        _draw_correlation(axes, its.cross_lags_s, its.cross_correlation, its.cross_bound_95, bound)
+        axes.axvline(0.0, color="#888888", lw=0.6)
+        axes.set_xlim(its.cross_lags_s[0], its.cross_lags_s[-1])
+        axes.set_xlabel("lag of the error behind the command (s)")
+        axes.set_ylabel("cross-correlation")
+        return _svg(figure, f"fan{fan.number}-cross", "Cross-correlation of the error with the command, with its bound")
+
+
+def static_curve(content: Content, fan: FanContent) -> str:
+    """Steady speeds over the command: the twin's, and the measured ones."""
+    each, unit = content.unit.rad_s, content.card.command_unit
+    with _figure(SMALL_IN) as figure:
+        axes = figure.subplots()
+        axes.plot(fan.curve.twin[:, 0], fan.curve.twin[:, 1] / each, color=TWIN, lw=1.4, label="twin, settled")
+        if len(fan.curve.measured):
+            command, speed = fan.curve.measured.T
+            axes.plot(command, speed / each, "o", ms=3.5, mfc="none", color=MEASURED, label="measured, settled")
+        axes.set_xlabel(f"command ({unit})" if unit else "command")
+        axes.set_ylabel(f"speed ({content.unit.name})")
+        _legend_above(axes, 2)
+        return _svg(figure, f"fan{fan.number}-static", "Steady speed over command")
+
+
+def error_over_speed(content: Content, fan: FanContent) -> str:
+    """Mean and spread of the error over the twin's speed: where in its range the twin is off."""
+    each = content.unit.rad_s
+    half = 2.0 * fan.sigma_rad_s / each
+    with _figure(SMALL_IN) as figure:
+        axes = figure.subplots()
+        axes.axhspan(-half, half, color=BAND, lw=0, alpha=0.6, label="± 2σ of the card")
+        axes.axhline(0.0, color="#888888", lw=0.6)
+        middle, mean, spread = (
+            [getattr(part, name) / each for part in fan.by_speed]
+            for name in ("middle_rad_s", "mean_rad_s", "std_rad_s")
+        )
+        reach = [2.0 * value for value in spread]
+        axes.errorbar(middle, mean, reach, fmt="o", ms=3, lw=0.8, capsize=2, color=MEASURED, label="mean ± 2 std")
+        axes.set_xlabel(f"speed of the free run ({content.unit.name})")
+        axes.set_ylabel(f"error ({content.unit.name})")
+        _legend_above(axes, 2)
+        return _svg(figure, f"fan{fan.number}-speed", "Mean and spread of the error over the speed")
+
+
+def _draw_over_time(content: Content, fan: FanContent, panels: tuple[Axes, Axes, Axes], columns: int) -> None:
+    speed, error, command = panels
+    line, each = content.timeline, content.unit.rad_s
+    half = 2.0 * fan.sigma_rad_s / each
+    error_drawn = np.where(np.isfinite(fan.error_rad_s), fan.error_rad_s, np.nan)
+    kept = kept_samples(line.t_s, (fan.measured_rad_s, fan.predicted_rad_s, error_drawn, fan.command), columns)
+    t_s, given = broken_at(line.starts, kept, line.t_s, fan.command)
+    speeds = (fan.measured_rad_s / each, fan.predicted_rad_s / each, error_drawn / each)
+    measured, predicted, off = broken_at(line.starts, kept, *speeds)
+    outside = np.abs(off) > half
+    speed.fill_between(t_s, predicted - half, predicted + half, color=BAND, lw=0, label="twin ± 2σ")
+    speed.plot(t_s, measured, **LINE, label="measured")
+    speed.plot(t_s, predicted, color=TWIN, lw=1.1, label="free run of the twin")
+    speed.set_ylabel(f"speed ({content.unit.name})")
+    error.axhspan(-half, half, color=BAND, lw=0, alpha=0.6)
+    error.plot(t_s, off, **LINE)
+    error.plot(*_strokes(t_s[outside], np.sign(off[outside]) * half, off[outside]), color=OUTSIDE, lw=0.8)
+    speed.plot([], [], color=OUTSIDE, label="error outside the band")
+    error.set_ylabel(f"error ({content.unit.name})")
+    command.step(t_s, given, where="post", color=COMMAND, lw=0.8)
+    unit = content.card.command_unit
+    command.set_ylabel(f"command\n({unit})" if unit else "command")
+    command.set_xlim(line.t_s[0], line.t_s[-1])
+
+
+def _strokes(x: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Vertical strokes as one line with breaks: a page of thousands of marks would be slow."""
+    broken = np.full(len(x), np.nan)
+    return np.column_stack((x, x, broken)).ravel(), np.column_stack((low, high, broken)).ravel()
+
+
+def _draw_correlation(axes: Axes, lags_s: Array, values: Array, bound: float, named: str) -> None:
+    if np.isfinite(bound):
+        axes.axhspan(-bound, bound, color=BAND, lw=0, alpha=0.6, label=named)
+    axes.axhline(0.0, color="#888888", lw=0.6)
+    axes.plot(lags_s, values, color=MEASURED, lw=0.9)
+    largest = np.nanmax(np.abs(values), initial=0.0) if np.isfinite(values).any() else 0.0
+    reach = min(1.1 * max(float(largest), bound if np.isfinite(bound) else 0.0, 0.1), 1.05)
+    axes.set_ylim(-reach, reach)
+    if np.isfinite(bound):
+        _legend_above(axes, 1)
+    if not np.isfinite(values).any():
+        axes.text(0.5, 0.6, "undefined", transform=axes.transAxes, ha="center", color="#666666")
+
+
+def _legend_above(axes: Axes, columns: int) -> None:
+    """Outside the axes, where it covers nothing."""
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.01), ncols=columns, borderaxespad=0.0, columnspacing=1.2)
+
+
+@contextmanager
+def _figure(size_in: tuple[float, float]) -> Iterator[Figure]:
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=size_in, layout="constrained")
+        FigureCanvasSVG(figure)
+        yield figure
+
+
+def _svg(figure: Figure, name: str, described: str) -> str:
+    """The figure as an svg element whose ids begin with its name, so that several can stand on one page."""
+    drawn = io.StringIO()
+    figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    svg = drawn.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}-", svg)
+    svg = re.sub(r' (?:d|x|y)="[^"]*"', lambda found: LONG_DECIMALS.sub(r"\1", found[0]), svg)
+    return svg.replace("<svg ", f'<svg role="img" aria-label="{described}" ', 1)

@@ -1,0 +1,165 @@
+"""What the figures of a report come to, in plain words."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from twin.models import Kind
+from twin.report.content import Content, FanContent, Parameter
+
+Level = Literal["as declared", "looser than declared", "not followed"]
+
+AS_DECLARED = 1.1
+LOOSER = 1.5
+"""Of the free-run rmse in healthy sigma: up to the first as declared, up to the second looser, beyond not followed."""
+WORSE: dict[Level, str] = {
+    "not followed": "does not follow {}",
+    "looser than declared": "follows {} less closely than its card says",
+}
+RANGE_TOLERANCE = 0.05
+"""Commands may leave the trained range by this share of its width, as in production (docs/deciding.md)."""
+RATE_TOLERANCE = 0.01
+UNCERTAIN = 1.0
+"""A parameter is poorly determined when half its 95 % interval is wider than this share of it."""
+OFTEN_MISSING = 0.1
+CHANCE_PEAK = 2.0
+BIASED_IN_SIGMA, BIASED_IN_ERRORS = 0.2, 3.0
+BIASED_AT_A_SPEED_IN_SIGMA = 1.0
+
+PHYSICS_USED: dict[Kind, tuple[str, ...]] = {
+    "physical": ("J", "alpha", "C_D", "lag_s"),
+    "hybrid": ("J", "alpha", "C_D", "lag_s"),
+    "neural-ode": ("lag_s",),
+    "narx": (),
+}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The whole report in a line, and what a reader should not overlook, a line each."""
+
+    level: Level
+    headline: str
+    warnings: tuple[str, ...]
+
+
+def judge(content: Content) -> Verdict:
+    """Judge by the worst fan: a tray's twin is as good as that of each fan."""
+    for level, said in WORSE.items():
+        if worse := [fan for fan in content.fans if level_of(fan) == level]:
+            did = said.format(_these(worse, content))
+            return Verdict(level, f"The twin {did}: rmse {_worst(worse)}.", warnings(content))
+    who = "this fan" if len(content.fans) == 1 else f"all {len(content.fans)} fans"
+    return Verdict("as declared", f"The twin follows {who} as closely as its card says.", warnings(content))
+
+
+def level_of(fan: FanContent) -> Level:
+    """One fan's; a diverged or undefined free run is not followed."""
+    if fan.rmse_in_sigma <= AS_DECLARED:
+        return "as declared"
+    return "looser than declared" if fan.rmse_in_sigma <= LOOSER else "not followed"
+
+
+def warnings(content: Content) -> tuple[str, ...]:
+    """A line for each thing that a reader should know before trusting the figures."""
+    return (*_about_the_data(content), *_about_the_fit(content), *_about_the_parameters(content))
+
+
+def _about_the_data(content: Content) -> Iterable[str]:
+    card = content.card
+    trained_on = {data.sha256 for data in card.training.data}
+    if seen := [data.name for data in content.recordings if data.sha256 in trained_on]:
+        yield f"{', '.join(seen)}: used in training, wholly or in part; over that part these figures flatter."
+    if card.validation.source == "training":
+        yield "The band rests on the error over the training data, so it may be too narrow: train with --validate."
+    if card.fans == 1 and len(content.fans) > 1:
+        yield f"A twin of one fan judges {len(content.fans)}: fans differ, and so may what they leave."
+    low, high = card.command_range
+    reach = RANGE_TOLERANCE * (high - low)
+    outside = np.mean([np.mean((fan.command < low - reach) | (fan.command > high + reach)) for fan in content.fans])
+    if outside > 0.0:
+        yield (
+            f"{outside:.1%} of the commands lie outside the trained range {low:.4g} to {high:.4g} {card.command_unit}"
+            .rstrip() + ": there the twin is a guess."
+        )  # fmt: skip
+    if card.kind == "narx" and abs(content.rate_hz / card.rate_hz - 1.0) > RATE_TOLERANCE:
+        yield (
+            f"A discrete twin of {card.rate_hz:.4g} Hz was run at {content.rate_hz:.4g} Hz: "
+            "its figures say nothing about the fan."
+        )
+
+    def often_missing(fan: FanContent) -> bool:
+        return bool(np.mean(np.isnan(fan.measured_rad_s)) > OFTEN_MISSING)
+
+    yield from _of_fans(content, often_missing, "more than a tenth of the speeds are missing")
+
+
+def _about_the_fit(content: Content) -> Iterable[str]:
+    yield from _of_fans(content, _unmeasured, "no speed was measured")
+    yield from _of_fans(content, _diverged, "the free run diverges")
+    yield from _of_fans(content, _biased, "on average faster or slower than the twin")
+    yield from _of_fans(
+        content, _biased_at_a_speed, "at some speeds off by more than sigma on average; see Error over speed"
+    )
+    yield from _of_fans(
+        content,
+        lambda fan: bool(abs(fan.residual.cross_over_bound) > CHANCE_PEAK),
+        "the error follows the command: the twin misses a part of what the command does",
+    )
+
+
+def _biased_at_a_speed(fan: FanContent) -> bool:
+    return any(abs(part.mean_rad_s) > BIASED_AT_A_SPEED_IN_SIGMA * fan.sigma_rad_s for part in fan.by_speed)
+
+
+def _about_the_parameters(content: Content) -> Iterable[str]:
+    for name in PHYSICS_USED[content.card.kind]:
+
+        def negative(fan: FanContent, name: str = name) -> bool:
+            return any(parameter.name == name and parameter.value < 0.0 for parameter in fan.parameters)
+
+        def uncertain(fan: FanContent, name: str = name) -> bool:
+            return any(parameter.name == name and _uncertain(parameter) for parameter in fan.parameters)
+
+        yield from _of_fans(content, negative, f"{name} is negative, so physics alone do not describe the fan")
+        yield from _of_fans(content, uncertain, f"{name} is poorly determined: record more and wider command levels")
+
+
+def _uncertain(parameter: Parameter) -> bool:
+    return 0.0 < UNCERTAIN * parameter.value < 0.5 * (parameter.high - parameter.low)
+
+
+def _unmeasured(fan: FanContent) -> bool:
+    return fan.figures.samples == 0
+
+
+def _diverged(fan: FanContent) -> bool:
+    return bool(np.any(np.isinf(fan.error_rad_s)))
+
+
+def _biased(fan: FanContent) -> bool:
+    """Whether the mean error is large beside sigma and beside its own standard error."""
+    offset = abs(fan.residual.mean_rad_s)
+    standard_error = fan.figures.rmse_rad_s / np.sqrt(fan.residual.independent_samples)
+    return bool(offset > BIASED_IN_SIGMA * fan.sigma_rad_s and offset > BIASED_IN_ERRORS * standard_error)
+
+
+def _of_fans(content: Content, concerned: Callable[[FanContent], bool], said: str) -> Iterable[str]:
+    """One line that names the fans concerned; none when there are none."""
+    if fans := [fan for fan in content.fans if concerned(fan)]:
+        yield f"{_these(fans, content).capitalize()}: {said}."
+
+
+def _these(fans: list[FanContent], content: Content) -> str:
+    if len(content.fans) == 1:
+        return "this fan"
+    return ("fan " if len(fans) == 1 else "fans ") + ", ".join(str(fan.number) for fan in fans)
+
+
+def _worst(fans: list[FanContent]) -> str:
+    ratios = [fan.rmse_in_sigma for fan in fans]
+    if not np.all(np.isfinite(ratios)):
+        return "without limit"
+    return ("" if len(fans) == 1 else "up to ") + f"{max(ratios):.2f} times the declared sigma"
