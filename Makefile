@@ -13,6 +13,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate pyproject.toml
 TORCH := torch==2.13.0
+BENCHES := published_table interval_coverage rough_table measured_table onnx_speed training_race restart
 SOURCES := schemas pipeline stages twin tests bench
 
 .PHONY: demo test check bench schema twin lock clean
@@ -30,8 +31,8 @@ check: $(VENV)/.development
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.development
-	for script in bench/*.py; do $(BIN)/python $$script || exit 1; done
+bench: $(VENV)/.benches
+	for bench in $(BENCHES); do $(BIN)/python bench/$$bench.py || exit 1; done
 
 schema: $(VENV)/.development
 	$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. schemas/fan.proto
@@ -42,6 +43,9 @@ twin: $(VENV)/.development
 lock: $(VENV)/.development
 	$(COMPILE) --extra view --output-file requirements.lock
 	$(COMPILE) --extra view --extra dev --constraint requirements.lock --output-file requirements-dev.lock
+	@echo "torch; sys_platform == 'none'" > $(VENV)/without-torch.txt
+	$(COMPILE) --extra bench --constraint requirements-dev.lock --override $(VENV)/without-torch.txt \
+		--output-file requirements-bench.lock
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
@@ -64,4 +68,9 @@ $(VENV)/.development: requirements-dev.lock pyproject.toml | $(VENV)/.runtime
 	@$(PIP) install --require-hashes -r requirements-dev.lock
 	@$(PIP) install $(TORCH)
 	@$(PIP) install --editable '.[view,train,dev]'
+	@touch $@
+
+$(VENV)/.benches: requirements-bench.lock | $(VENV)/.development
+	@echo "installing what the benches race against into $(VENV) (once)"
+	@$(PIP) install --require-hashes --no-deps -r requirements-bench.lock
 	@touch $@
