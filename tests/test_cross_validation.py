@@ -24,6 +24,12 @@ def test_a_fan_that_the_physics_describe_gets_no_network_and_a_rough_one_does() 
     assert chosen_spread(untrained(rough), rough, seed=0, physics="refined") > 0.0
 
 
+def test_a_recording_without_speeds_does_not_count() -> None:
+    run = fan_data.rough_run(1, 10.0)
+    blind = Run("blind", run.t_s, run.command, np.full_like(run.speed_rad_s, np.nan))
+    assert chosen_spread(untrained([run]), [run, blind], seed=0, physics="refined") == GRID_SPREAD
+
+
 def test_a_single_recording_gives_no_choice() -> None:
     runs = [fan_data.rough_run(1, 10.0)]
     assert chosen_spread(untrained(runs), runs, seed=0, physics="refined") == GRID_SPREAD

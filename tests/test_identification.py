@@ -38,6 +38,13 @@ def test_95_percent_intervals_hold_the_truth_in_95_percent_of_recordings() -> No
     assert np.all(np.abs(inside.mean(axis=0) - 0.95) < 0.035), inside.mean(axis=0)
 
 
+def test_short_pieces_beside_a_long_run_do_not_widen_the_intervals() -> None:
+    whole = fan_data.published_run(4, 60.0)
+    pieces = [fan_data.published_run(seed, 1.5) for seed in range(50, 80)]
+    alone, with_pieces = identify([whole]), identify([whole, *pieces])
+    assert np.all(with_pieces.standard_errors[0, :3] < 1.3 * alone.standard_errors[0, :3])
+
+
 def test_a_lag_is_found_where_there_is_one_and_none_where_there_is_none(published) -> None:
     run, without = published
     assert np.count_nonzero(without.parameters[:, 3]) == 0

@@ -56,6 +56,15 @@ def test_a_free_run_solved_at_once_is_the_one_stepped_through(guess: str) -> Non
     np.testing.assert_allclose(final, end, rtol=1e-12)
 
 
+def test_a_runaway_beside_it_does_not_spoil_a_fan() -> None:
+    parameters = np.array([PARAMETERS[0], [0.15, -3.0, 0.0, 0.0]])
+    command, step_s = np.full((150, 2), 60.0), np.full(150, 0.01)
+    speed, _ = free_run(right_hand_side(parameters), np.array([5.0, 5.0]), command, step_s)
+    alone, _ = free_run(right_hand_side(parameters[:1]), np.array([5.0]), command[:, :1], step_s)
+    assert speed[-1, 1] > 1e10
+    np.testing.assert_allclose(speed[:, 0], alone[:, 0], rtol=1e-10)
+
+
 def test_windows_join_without_a_seam(monkeypatch) -> None:
     command = np.random.default_rng(2).uniform(0.0, 90.0, (300, 1))
     whole, _ = free_run(right_hand_side(PARAMETERS), np.zeros(1), command, np.full(300, 0.01))

@@ -9,6 +9,7 @@ from twin.errors import TwinError
 from twin.hybrid import Hybrid
 from twin.identification import identify
 from twin.network import TanhNetwork
+from twin.outliers import without_outliers
 from twin.runs import Run
 from twin.torch_reference import train_adam
 from twin.training import data_scaling
@@ -93,9 +94,17 @@ def test_tacho_dropouts_and_outliers_hardly_matter(rough) -> None:
     speed[rng.random(speed.shape) < 0.1] = np.nan
     speed[rng.random(speed.shape) < 0.03] = 0.0
     speed[rng.random(speed.shape) < 0.01] *= 2.0
-    dirty = Run("dirty", rough[0].t_s, rough[0].command, speed)
+    dirty, _ = without_outliers(Run("dirty", rough[0].t_s, rough[0].command, speed))
     twin = train_twin([dirty], [], "hybrid", name="dirty", max_iterations=60)
     assert times_noise(twin, rough[2]) < 1.1
+
+
+def test_a_fan_that_was_not_measured_in_the_held_out_run_is_refused(rough) -> None:
+    run = fan_data.published_run(1, 15.0, fans=2)
+    speed = run.speed_rad_s.copy()
+    speed[:, 1] = np.nan
+    with pytest.raises(TwinError, match="fan 1: no measured speed in the held-out runs"):
+        train_twin([run], [Run("blind", run.t_s, run.command, speed)], "physical", name="x")
 
 
 def test_where_no_data_speak_the_hybrid_keeps_to_its_physics(rough) -> None:

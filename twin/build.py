@@ -32,7 +32,6 @@ from twin.network import TanhNetwork
 from twin.neural_ode import UNITS as NEURAL_ODE_UNITS
 from twin.neural_ode import NeuralOde
 from twin.onnx_twin import OnnxTwin
-from twin.outliers import without_outliers
 from twin.physical import PhysicalModel
 from twin.physics import PARAMETER_NAMES
 from twin.placement import initial_weights
@@ -88,15 +87,15 @@ def train_twin(
     validation_runs: held out of the fit; they choose the best weights and give the healthy sigma and the card's
     figures. Empty: the training runs do, and the card says so. network_inputs: of the hybrid's and neural ODE's
     network. physics: whether a hybrid's physics are refined along with its network, or stay as they were identified.
-    Outliers (twin.outliers) are left out of all runs. command_unit, data and validation_data (the files
-    that the runs are from) and created (default: now) go into the card. The same seed and runs give the same model.
+    trainer "adam" leaves them as they were, and its weights are those that did best in training.
+    command_unit, data and validation_data (the files that the runs are from) and created (default: now) go into the
+    card. The same seed and runs give the same model.
     Raises TwinError when the runs do not tell the parameters, or the result cannot serve as a twin.
     """
     _require_known(kind, trainer)
     fans = common_fans([*runs, *validation_runs])
     started_s = time.monotonic()
     identification = identify(runs)
-    runs, validation_runs = ([without_outliers(run)[0] for run in part] for part in (runs, validation_runs))
     limit = max_iterations or (NARX_ITERATIONS if kind == "narx" else DEFAULT_ITERATIONS[trainer])
     model, parameters, iterations = _train(
         kind, runs, validation_runs, identification, seed, trainer, limit, network_inputs, physics, progress
@@ -109,6 +108,13 @@ def train_twin(
     pieces = evaluation_pieces(judged)
     healthy = healthy_residual(free_run_residuals(model, parameters, pieces), pieces)
     sigma_rad_s = np.array(healthy.sigma_rad_s)
+    unmeasured = np.flatnonzero(sigma_rad_s == 0.0)
+    if unmeasured.size:
+        where = "held-out" if validation_runs else "training"
+        raise TwinError(
+            f"fan {unmeasured[0]}: no measured speed in the {where} runs, so no band; give runs in which it was "
+            "measured, or leave it out"
+        )
     if not np.all(np.isfinite(sigma_rad_s)):
         raise TwinError(
             f"the {kind} model of {name!r} diverges when run freely; record more levels, or try another kind"
@@ -116,6 +122,7 @@ def train_twin(
     validation = evaluate_model(model, parameters, sigma_rad_s, judged)
     speeds = np.concatenate([run.speed_rad_s.ravel() for run in runs])
     commands = np.concatenate([run.command.ravel() for run in runs])
+    moved: Physics = physics if kind == "hybrid" and trainer == "levenberg-marquardt" else "fixed"
     card = Card(
         kind=kind,
         name=name,
@@ -136,7 +143,7 @@ def train_twin(
         command_range=(float(commands.min()), float(commands.max())),
         rate_hz=1.0 / float(np.median(np.concatenate([np.diff(run.t_s) for run in runs]))),
         network=_network_card(model),
-        training=TrainingCard(trainer, physics, seed, iterations, round(duration_s, 3), tuple(data)),
+        training=TrainingCard(trainer, moved, seed, iterations, round(duration_s, 3), tuple(data)),
         validation=_validation_card(
             validation.pooled, "held-out" if validation_runs else "training", tuple(validation_data)
         ),

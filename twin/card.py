@@ -38,7 +38,10 @@ class DataCard:
 
 @dataclass(frozen=True, config=STRICT)
 class TrainingCard:
-    """How the twin was made. physics: whether refined along with the network. duration_s: how long training took."""
+    """How the twin was made.
+
+    physics: whether they were refined along with the network. duration_s: how long training took.
+    """
 
     trainer: str
     physics: Literal["fixed", "refined"]

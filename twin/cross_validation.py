@@ -29,6 +29,8 @@ def chosen_spread(
     model: NetworkOde, runs: Sequence[Run], *, seed: int, physics: Physics, progress: Progress | None = None
 ) -> float:
     """The spread for training.train_network. The usual one where there is a single run, or too little without one."""
+    # A recording in which some fan was never measured judges nothing.
+    runs = [run for run in runs if np.all(np.isfinite(run.speed_rad_s).any(axis=0))]
     folds = min(FOLDS, len(runs))
     if folds < 2:
         return GRID_SPREAD

@@ -33,7 +33,6 @@ from twin.filtering import filtered_regression
 from twin.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, fit_free_run
 from twin.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings
 from twin.integration import free_run
-from twin.outliers import without_outliers
 from twin.physical import PhysicalModel, fitted_unknowns, parameters_by_unknowns, physical_parameters
 from twin.physics import LAG, PARAMETER_NAMES
 from twin.right_hand_side import FanEquation
@@ -49,7 +48,6 @@ LAG_IN_STANDARD_ERRORS = 3.3
 # Data that excite a fan hold ten or more units of information about ln J per sample, a hundred times this anchor.
 ANCHOR_PER_SAMPLE = 0.1
 NEARLY_BEST = 1.25
-MANY_OUTLIERS = 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +88,10 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
     with_lag: false holds the lag at zero, which is the published model.
     """
     fans = common_fans(runs)
-    cleaned = [without_outliers(run) for run in runs]
-    pieces = [piece for run, _ in cleaned for piece in run.split_at_gaps()]
+    pieces = [piece for run in runs for piece in run.split_at_gaps()]
     for fan in range(fans):
         require_excitation(pieces, fan)
-    top_speed = np.array([np.nanquantile(np.abs(_pooled(pieces, fan)[1]), TOP_SPEED_QUANTILE) for fan in range(fans)])
+    top_speed = np.array([_top_speed_rad_s(_pooled(pieces, fan)[1]) for fan in range(fans)])
     start, lambda_per_s = _filtered_start(pieces, top_speed)
     speed = np.array([np.nanmedian(_pooled(pieces, fan)[1]) for fan in range(fans)])
     longest_s = float(np.max(_positive(physics.time_constant_s(speed, start), pieces)))
@@ -122,8 +119,7 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
         time_constant_s=_positive(physics.time_constant_s(speed, parameters), pieces),
         top_speed_rad_s=top_speed,
         iterations=iterations,
-        warnings=_outlier_warnings(np.max([share for _, share in cleaned], axis=0))
-        + identifiability_warnings([run for run, _ in cleaned], parameters, covariance),
+        warnings=identifiability_warnings(runs, parameters, covariance),
     )
 
 
@@ -239,6 +235,9 @@ def _covariance(
         # Stretches one after the other, so that a block is a piece of time.
         slopes = slopes_of_all[:, columns].transpose(1, 0, 2).reshape(-1, len(PARAMETER_NAMES))[:, known]
         weights, residual = weight[:, columns].T.ravel(), fit.point.residual[:, columns].T.ravel()
+        # Padding and missing samples tell nothing: a block is a share of what was measured.
+        told = weights > 0.0
+        slopes, weights, residual = slopes[told], weights[told], residual[told]
         scores = slopes * (weights * residual)[:, np.newaxis]
         # The second derivative of the pseudo-Huber loss, where a step of the fit makes do with its secant.
         weighted = slopes * weights[:, np.newaxis] ** 3
@@ -252,8 +251,8 @@ def _covariance(
         moves = (moves - moves.mean(axis=0)) @ chain[fan][:, known].T
         covariance[fan] = (BLOCKS - 1) / BLOCKS * moves.T @ moves
         fourth = np.sum(moves**4, axis=0)
-        told = fourth > 0.0
-        freedom[fan, told] = np.clip(3.0 * np.sum(moves**2, axis=0)[told] ** 2 / fourth[told], 2.0, BLOCKS - 1)
+        known = fourth > 0.0
+        freedom[fan, known] = np.clip(3.0 * np.sum(moves**2, axis=0)[known] ** 2 / fourth[known], 2.0, BLOCKS - 1)
     return covariance, freedom
 
 
@@ -263,16 +262,14 @@ def _rmse_rad_s(fit: FreeRunFit, trajectories: Trajectories, fans: int) -> Array
     return np.sqrt(squares / np.bincount(trajectories.fan, trajectories.measured.sum(axis=0), fans))
 
 
-def _outlier_warnings(share: Array) -> tuple[str, ...]:
-    return tuple(
-        f"fan {fan}: {value:.1%} of the speeds are outliers and were left out; check the tacho and its line"
-        for fan, value in enumerate(share)
-        if value > MANY_OUTLIERS
-    )
-
-
 def _physical_basis(speed_rad_s: Array, command: Array) -> Array:
     return np.column_stack((-speed_rad_s, -speed_rad_s * np.abs(speed_rad_s), command))
+
+
+def _top_speed_rad_s(speed_rad_s: Array) -> float:
+    """A speed that the fan reaches; the largest one where it hardly ever turns."""
+    magnitude = np.abs(speed_rad_s)
+    return float(np.nanquantile(magnitude, TOP_SPEED_QUANTILE)) or float(np.nanmax(magnitude))
 
 
 def _pooled(runs: Sequence[Run], fan: int) -> tuple[Array, Array]:

@@ -113,10 +113,10 @@ def _solve(
         correction[1:] = following - speed[1:]
         correction = linear_recursion(by_speed, correction)
         speed += correction
-        largest = np.abs(correction).max()
-        if not np.isfinite(largest):
+        largest = np.abs(correction).max(axis=0)
+        if not np.all(np.isfinite(largest)):
             return None
-        if largest <= NEWTON_TOLERANCE * (1.0 + np.abs(speed).max()):
+        if np.all(largest <= NEWTON_TOLERANCE * (1.0 + np.abs(speed).max(axis=0))):
             # Convergence is quadratic: what is left is the square of this.
             return speed[:-1], speed[-1].copy()
     return None

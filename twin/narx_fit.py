@@ -57,7 +57,12 @@ class FreeRunFit:
             downhill -= precision * (theta - self.prior_mean)
             diagonal, previous = np.diag(squares).copy(), cost
             while damping < LARGEST_DAMPING:
-                factor = cho_factor(squares + np.diag(damping * diagonal + precision), lower=True, check_finite=False)
+                try:
+                    factor = cho_factor(squares + np.diag(damping * diagonal + precision), lower=True)
+                except (np.linalg.LinAlgError, ValueError):
+                    # Sensitivities beyond all numbers, or no longer definite: only a firmer step can be taken.
+                    damping *= 4.0
+                    continue
                 trial = theta + cho_solve(factor, downhill, check_finite=False)
                 trial_speeds = self._free_run(trial)
                 trial_cost = self._cost(trial, trial_speeds, scale_rad_s, precision)

@@ -2,7 +2,7 @@
 
 The Hampel identifier (Pearson, Mining Imperfect Data, SIAM 2005, section 3.2): a sample is an outlier where it lies
 further from the median of its neighbours than several of their median absolute deviations. A transient that is sampled
-well has wide deviations around it and passes; what passes wrongly still counts only linearly in a fit
+well has wide deviations around it and passes; what is missed still counts only linearly in a fit
 (twin.free_run_fit). Bursts of up to five samples are found.
 """
 

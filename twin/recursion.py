@@ -17,7 +17,7 @@ def linear_recursion(factor: Array, forcing: Array) -> Array:
     """x (n, batch) or (n, batch, P), with x[0] = forcing[0].
 
     factor: (n - 1, batch), from each sample to the next. forcing: (n, batch) or (n, batch, P). A recursion that grows
-    beyond all numbers gives infinities or NaN, not an exception.
+    beyond all numbers gives infinities or NaN, not an exception, and NaN in the columns after it, too.
     """
     samples, batch = forcing.shape[:2]
     # All columns one after the other are one system: the factor across their seams is zero.
@@ -25,5 +25,5 @@ def linear_recursion(factor: Array, forcing: Array) -> Array:
     bands[0] = 1.0
     bands[1, :, :-1] = -factor.T
     right = forcing.reshape(samples, batch, -1).transpose(1, 0, 2).reshape(batch * samples, -1)
-    solved, _ = dtbtrs(bands.reshape(2, -1), np.asfortranarray(right), uplo="L", overwrite_b=1)
+    solved, _ = dtbtrs(bands.reshape(2, -1), np.array(right, order="F"), uplo="L", overwrite_b=1)
     return np.ascontiguousarray(solved.reshape(batch, samples, -1).transpose(1, 0, 2)).reshape(forcing.shape)

@@ -21,6 +21,7 @@ SAME_TIME_IN_STEPS = 0.01
 MIN_SHARE_MEASURED = 0.1
 MAX_SHARE_UNEVEN = 0.1
 BRIDGE_IN_STEPS = 2.5
+MOST_TIMES_FASTER = 100
 
 
 def resampled(run: Run, rate_hz: float) -> Run:
@@ -30,10 +31,13 @@ def resampled(run: Run, rate_hz: float) -> Run:
     steps are uneven (more than a tenth are no multiple of the median), or fewer than a tenth of the new times meet a
     sample, the samples met would be few or a choice of their own: then speeds are interpolated between measured
     neighbours, at most two and a half median steps apart, and their noise is lower than recorded.
-    Raises TwinError when the rate is not positive or the run is shorter than one step of it.
+    Raises TwinError when the rate is not positive or beyond 100 times that of the run, or the run is shorter than one
+    step of it.
     """
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise TwinError(f"a rate of {rate_hz} Hz; give a positive number")
+    if rate_hz * run.median_step_s > MOST_TIMES_FASTER:
+        raise TwinError(f"a rate of {rate_hz:g} Hz; give at most {MOST_TIMES_FASTER} times that of the run")
     steps = int(run.duration_s * rate_hz * (1.0 + 1e-12) + 1e-6)
     if steps < 1:
         raise TwinError(f"run {run.name!r}: {run.duration_s:.3g} s are shorter than one step at {rate_hz:g} Hz")

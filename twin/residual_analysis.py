@@ -82,7 +82,7 @@ class ResidualAnalysis:
 
     def _causal_peak(self) -> int:
         causal = len(self.cross_lags_s) // 2
-        return causal + int(np.argmax(np.abs(self.cross_correlation[causal:])))
+        return causal + int(np.argmax(np.nan_to_num(np.abs(self.cross_correlation[causal:]))))
 
 
 @dataclass(frozen=True)

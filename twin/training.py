@@ -37,7 +37,7 @@ from twin.physical import PhysicalModel, fitted_unknowns, physical_parameters
 from twin.physics import LAG, PARAMETER_NAMES
 from twin.placement import initial_weights
 from twin.runs import STARTING_SAMPLES, Array, Run
-from twin.trajectories import MAX_SAMPLES, cut_into_trajectories, stretch_samples
+from twin.trajectories import MAX_SAMPLES, cut_into_trajectories, practical_samples, stretch_samples
 
 Progress = Callable[[int, int, float], None]
 """Called with iterations done, iterations at most, and the present free-run rmse in rad/s."""
@@ -50,8 +50,7 @@ TOLERANCE = 1e-4
 PATIENCE = 10
 # Weights have a prior standard deviation of ten in scaled units: wide enough to be invisible where data speak.
 PRIOR_PRECISION = 0.01
-# Each point of the grid counts as much as one sample that tells the acceleration to a spread of its scale; a tenth
-# of a second in which the fan was really there counts a hundred times that.
+# Each point of the grid counts as much as one sample that tells the acceleration to a spread of its scale.
 GRID_POINTS, GRID_REACH, GRID_SPREAD = 15, 1.5, 0.1
 
 
@@ -120,12 +119,12 @@ def train_network(
         )
         judge.stage_done(fit.iterations)
         starts.append(fit)
-    best = min(starts, key=lambda fit: fit.rmse_rad_s).point.unknowns
+    best = min(starts, key=lambda fit: fit.rmse_rad_s if np.isfinite(fit.rmse_rad_s) else np.inf).point.unknowns
     judge.consider(best)
     tried = judge.iterations
     for data, share, estimate in (
         (stretches, SHORT_SHARE, True),
-        (cut_into_trajectories(pieces, MAX_SAMPLES), 1.0, False),
+        (cut_into_trajectories(pieces, practical_samples(pieces, MAX_SAMPLES)), 1.0, False),
     ):
         fit = fit_free_run(
             model.with_theta(best.weights),
@@ -173,7 +172,8 @@ class _Judge:
         progress: Progress | None,
     ) -> None:
         pieces = evaluation_pieces(runs)
-        self.data = cut_into_trajectories(pieces, max(piece.samples for piece in pieces))
+        whole = max(piece.samples for piece in pieces)
+        self.data = cut_into_trajectories(pieces, practical_samples(pieces, whole))
         nothing = Prior(0.0, np.zeros(len(PARAMETER_NAMES)), np.zeros((len(top_speed_rad_s), len(PARAMETER_NAMES))))
         self.problem = FreeRunProblem(model, self.data, top_speed_rad_s, NONE_FREE, nothing)
         self.held_out = held_out

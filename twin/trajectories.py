@@ -16,6 +16,7 @@ from twin.runs import Array, Run, starting_speed_rad_s
 
 MIN_SAMPLES = 200
 MAX_SAMPLES = 12_000
+MAX_PADDED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +25,7 @@ class Trajectories:
 
     fan: (batch,) which fan each stretch belongs to. command, speed_rad_s, step_s: (n, batch). Padding has a step of
     zero, which leaves the state where it is, and a speed of NaN, which counts as missing. command_before: (batch,), the
-    command in force before each stretch.
+    command in force before each stretch, which stands for the lagged one: a lag is short beside a stretch.
     """
 
     fan: NDArray[np.intp]
@@ -98,6 +99,18 @@ def cut_into_trajectories(runs: Sequence[Run], max_samples: int) -> Trajectories
 def stretch_samples(time_constant_s: float, step_s: float, time_constants: float) -> int:
     """How many samples span a number of time constants, within bounds that keep the batch efficient."""
     return int(np.clip(time_constants * time_constant_s / step_s, MIN_SAMPLES, MAX_SAMPLES))
+
+
+def practical_samples(runs: Sequence[Run], at_most: int) -> int:
+    """The longest stretches whose padding does not exceed three times the samples themselves."""
+    samples = at_most
+    while samples > MIN_SAMPLES:
+        counts = [-(-run.samples // samples) for run in runs]
+        longest = max(-(-run.samples // count) for run, count in zip(runs, counts, strict=True))
+        if sum(counts) * longest <= MAX_PADDED * sum(run.samples for run in runs):
+            break
+        samples //= 2
+    return samples
 
 
 def _equal_parts(run: Run, max_samples: int) -> list[tuple[int, int]]:

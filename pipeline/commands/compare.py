@@ -112,7 +112,7 @@ def compare(
         "judged_on": source,
         "best": winner.candidate.name,
         "models": [account(contender, material, folder) for contender in contenders],
-        "warnings": list(winner.twin.identification.warnings) if winner.twin else [],
+        "warnings": material.named(winner.twin.identification.warnings if winner.twin else []),
     }
     if folder:
         _write(folder / "comparison.json", json.dumps(told, indent=2) + "\n")

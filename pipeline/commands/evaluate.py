@@ -89,6 +89,8 @@ def evaluate(
     console.print(_fan_table(told))
     if grids:
         console.print(_grid_table(told))
+    for warning in told["warnings"]:
+        typer.echo(warning, err=True)
 
 
 def account(
@@ -101,7 +103,10 @@ def account(
     scale = material.rad_s_per_unit
 
     def figures_of(judged: Evaluation) -> dict[str, Any]:
-        return figures_in(judged.pooled, scale) | {"fans": [figures_in(fan, scale) for fan in judged.per_fan]}
+        by_fan = zip(material.fans, judged.per_fan, strict=True)
+        return figures_in(judged.pooled, scale) | {
+            "fans": [{"fan": number} | figures_in(fan, scale) for number, fan in by_fan]
+        }
 
     told = figures_of(evaluation)
     for fan, analysis in zip(told["fans"], analyses, strict=True):
@@ -109,6 +114,7 @@ def account(
     return told | {
         "speed_unit": material.speed_unit,
         "expected_coverage_2_sigma": EXPECTED_COVERAGE,
+        "warnings": material.named([]),
         "grids": [{"rate": grid} | figures_of(judged) for grid, judged in on_grids],
     }
 
@@ -161,10 +167,10 @@ def _fan_table(told: dict[str, Any]) -> Table:
         "cross\n/ bound",
     ):
         table.add_column(header, justify="right")
-    for fan, figures in enumerate(told["fans"]):
+    for figures in told["fans"]:
         residual = figures["residual"]
         tests = (_probability(residual["ljung_box_p"]), _shown(residual["cross_over_bound"], ".1f"))
-        table.add_row(str(fan), *_cells(figures), *tests)
+        table.add_row(str(figures["fan"]), *_cells(figures), *tests)
     if len(told["fans"]) > 1:
         table.add_row("all", *_cells(told), "", "")
     return table

@@ -77,6 +77,7 @@ def account(found: Identification, material: Material) -> dict[str, Any]:
 
     fans = [
         {
+            "fan": material.fans[fan],
             **dict(zip(PARAMETER_NAMES, found.parameters[fan].tolist(), strict=True)),
             **{f"{name}_95": found.interval_95[fan, k].tolist() for k, name in enumerate(PARAMETER_NAMES)},
             "covariance": found.covariance[fan].tolist(),
@@ -93,7 +94,7 @@ def account(found: Identification, material: Material) -> dict[str, Any]:
         "units": {name: UNITS[name] for name in PARAMETER_NAMES},
         "speed_unit": material.speed_unit,
         "iterations": found.iterations,
-        "warnings": list(found.warnings),
+        "warnings": material.named(found.warnings),
     }
 
 
@@ -120,10 +121,10 @@ def _table(told: dict[str, Any]) -> Table:
     table.add_column("fan", no_wrap=True)
     for header in (*mechanical, "lag\nms", "time\nconst. s", f"rmse\n{told['speed_unit']}", "lambda\n1/s"):
         table.add_column(header, justify="right", no_wrap=True)
-    for number, fan in enumerate(told["fans"]):
+    for fan in told["fans"]:
         values = [_with_interval(fan[name], fan[f"{name}_95"]) for name in mechanical]
         figures = (f"{fan['time_constant_s']:.3g}", f"{fan['rmse']:.4g}", f"{fan['lambda_per_s']:.3g}")
-        table.add_row(str(number), *values, _lag(fan), *figures)
+        table.add_row(str(fan["fan"]), *values, _lag(fan), *figures)
     return table
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -33,32 +34,46 @@ ToOption: TypeAlias = Annotated[float, typer.Option("--to", help="Use each recor
 TrayOption: TypeAlias = Annotated[str | None, typer.Option(help="Which tray, where a recording has several.")]
 FansOption: TypeAlias = Annotated[str | None, typer.Option(help="Only these fans, counted from 0, e.g. 0,2.")]
 
+MANY_OUTLIERS = 0.001
 _EXTRA_MODULES = ("jinja2", "matplotlib", "onnx", "scipy", "torch")
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Runs for the model maker, and the unit in which people are shown their speeds."""
+    """Runs for the model maker, outliers left out, and what people call their fans and units.
+
+    fans: the numbers of the runs' columns in the tray. outliers: one line for each fan and file that had some.
+    """
 
     runs: list[Run]
     recorded: list[RecordedRun]
     speed_unit: str
+    fans: list[int]
+    outliers: tuple[str, ...]
 
     @property
     def rad_s_per_unit(self) -> float:
         """One of the people's unit in rad/s."""
         return RAD_S_PER_TABLE_UNIT[self.speed_unit]
 
+    def named(self, warnings: Sequence[str]) -> list[str]:
+        """Warnings of the model maker, which counts columns, with the fans' own numbers; those of outliers first."""
+        return [
+            *self.outliers,
+            *(re.sub(r"^fan (\d+):", lambda found: f"fan {self.fans[int(found[1])]}:", line) for line in warnings),
+        ]
+
 
 def read_material(
     recordings: Sequence[Path], tray: str | None, fans: str | None, from_s: float, to_s: float
 ) -> Material:
-    """The runs of several recordings. What is damaged in them is told on stderr.
+    """The runs of several recordings, their outliers left out. What is damaged in them is told on stderr.
 
     Raises:
         UserError: a recording cannot be used, or they are not in one unit.
     """
-    from twin.runs import Run  # noqa: PLC0415  the command line loads twin only when it is needed
+    from twin.outliers import without_outliers  # noqa: PLC0415  the command line loads twin only when it is needed
+    from twin.runs import Run  # noqa: PLC0415
 
     recorded: list[RecordedRun] = []
     units: dict[str, Path] = {}
@@ -75,8 +90,15 @@ def read_material(
     if unit not in RAD_S_PER_TABLE_UNIT:
         raise UserError(f"{units[unit]}: unknown unit of speed {unit!r}; known: {', '.join(RAD_S_PER_TABLE_UNIT)}")
     with model_maker():
-        runs = [Run(run.path.stem, run.t_s, run.command, run.speed_rad_s) for run in recorded]
-    return Material(runs, recorded, unit)
+        cleaned = [without_outliers(Run(run.path.stem, run.t_s, run.command, run.speed_rad_s)) for run in recorded]
+    numbers = fan_numbers(fans) or list(range(recorded[0].command.shape[1]))
+    outliers = tuple(
+        f"{run.path}: fan {fan}: {share:.1%} of the speeds are outliers and left out; check the tacho and its line"
+        for run, (_, shares) in zip(recorded, cleaned, strict=True)
+        for fan, share in zip(numbers, shares, strict=False)
+        if share > MANY_OUTLIERS
+    )
+    return Material([run for run, _ in cleaned], recorded, unit, numbers, outliers)
 
 
 @contextmanager
@@ -114,7 +136,10 @@ def training_bars(material: Material) -> Iterator[Callable[[str], ProgressCallba
     """Gives what starts a bar on stderr for each training, by the name it is given. The bars go when all is done;
     without a terminal they stay silent."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bars:
+    console = Console(stderr=True)
+    with Progress(
+        *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
+    ) as bars:
 
         def start(name: str) -> ProgressCallback:
             said = f"{name}: " if name else ""

@@ -23,11 +23,14 @@ def fan_numbers(text: str | None) -> list[int] | None:
     """The fans of an option such as `--fans 2,5`.
 
     Raises:
-        UserError: it is not a list of fan numbers.
+        UserError: it is not a rising list of fan numbers.
     """
     if text is None:
         return None
     try:
-        return [int(part) for part in text.split(",")]
+        numbers = [int(part) for part in text.split(",")]
+        if numbers != sorted(set(numbers)):
+            raise UserError(f"--fans {text}: give each fan once, and in rising order")
+        return numbers
     except ValueError as error:
         raise UserError(f"--fans {text}: give fan numbers counted from 0, with commas: --fans 2,5") from error

@@ -61,6 +61,7 @@ def report(
         output.write_text(page, encoding="utf-8")
     except OSError as error:
         raise UserError(f"{output}: cannot be written: {error.strerror}; name another file with -o") from error
+    warnings = [*material.outliers, *judged.warnings]
     pooled = figures_in(content.evaluation.pooled, material.rad_s_per_unit)
     if json_output:
         by_fan = [
@@ -78,11 +79,9 @@ def report(
             "verdict": judged.level,
             "headline": judged.headline,
         }
-        typer.echo(
-            json.dumps({**told, **pooled, "speed_unit": unit.name, "fans": by_fan, "warnings": list(judged.warnings)})
-        )
+        typer.echo(json.dumps({**told, **pooled, "speed_unit": unit.name, "fans": by_fan, "warnings": warnings}))
         return
     typer.echo(f"{output}: {judged.headline}")
     typer.echo(f"  {sentence(pooled, unit.name)}")
-    for warning in judged.warnings:
+    for warning in warnings:
         typer.echo(warning, err=True)

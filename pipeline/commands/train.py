@@ -25,6 +25,7 @@ from pipeline.commands.model_maker import (
     training_bars,
 )
 from pipeline.commands.options import JsonOption
+from pipeline.errors import UserError
 
 if TYPE_CHECKING:
     from twin.build import TrainedTwin
@@ -73,6 +74,9 @@ def train(
     with model_maker():
         from twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
 
+        made_folder(output.parent)
+        if output.is_dir():
+            raise UserError(f"{output}: a folder; name a file with -o")
         material = read_material(recordings, tray, fans, from_s, to_s)
         held_out = read_material(validate, tray, fans, validate_from_s, validate_to_s) if validate else None
         with training_bars(material) as start_bar:
@@ -91,7 +95,6 @@ def train(
                 validation_data=data_cards(held_out) if held_out else (),
                 progress=start_bar(""),
             )
-        made_folder(output.parent)
         trained.save(output)
     told = account(trained, material, output)
     if json_output:
@@ -117,5 +120,5 @@ def account(trained: TrainedTwin, material: Material, output: Path) -> dict[str,
         "network_parameters": card.network.parameter_count,
         "iterations": card.training.iterations,
         "duration_s": card.training.duration_s,
-        "warnings": list(trained.identification.warnings),
+        "warnings": material.named(trained.identification.warnings),
     }

@@ -26,7 +26,7 @@ class SpeedUnit:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A physical parameter of one fan: as identified, its 95 % interval (normal), and in force.
+    """A physical parameter of one fan: as identified, its 95 % interval, and in force.
 
     The last differs where a hybrid has refined its physics along with its network, which has taken a share.
     """
