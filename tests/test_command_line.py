@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -134,9 +135,10 @@ def test_a_variadic_option_takes_all_words_up_to_the_next_option(words, spelt):
 
 def test_train_takes_every_recording_after_validate_as_one_to_judge_by(recording, tmp_path):
     twin = tmp_path / "twin.onnx"
-    words = ["train", recording, "--model", "physical", "--validate", recording, "none.mcap", "-o", twin]
+    other = shutil.copy(recording, tmp_path / "other.mcap")
+    words = ["train", recording, "--model", "physical", "--validate", other, "none.mcap", "-o", twin]
     assert_one_line(fantwin(*words), 1, ["none.mcap: cannot read the recording"])
-    words[6] = recording
+    words[6] = other
     done = fantwin(*words, "--json")
     assert done.returncode == 0, done.stderr
     assert '"judged_on": "held-out"' in done.stdout

@@ -309,7 +309,9 @@ def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
     assert "cannot read the recording" in said_instead("report", twin, tmp_path / "nowhere.mcap")
     (tmp_path / "file").touch()
     assert "cannot be made" in said_instead("report", twin, held_out, "-o", tmp_path / "file" / "page.html")
-    assert "cannot be written" in said_instead("report", twin, held_out, "-o", tmp_path)
+    assert "name a file that ends in .html" in said_instead("report", twin, held_out, "-o", tmp_path)
+    (tmp_path / "folder.html").mkdir()
+    assert "cannot be written" in said_instead("report", twin, held_out, "-o", tmp_path / "folder.html")
 
 
 @pytest.mark.parametrize(("command", "missing"), [("report", "jinja2"), ("report", "matplotlib"), ("compare", "onnx")])

@@ -10,7 +10,7 @@ import pytest
 from pipeline.recording_writer import RecordingWriter
 from schemas.messages import Header, Raw
 from schemas.topics import tray_key
-from tests.fan_data import PUBLISHED_PARAMETERS, published_run
+from tests.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, published_run
 from tests.fantwin_command import fantwin, said_instead
 from twin.runs import Run
 
@@ -150,6 +150,40 @@ def test_what_cannot_be_done_is_told_in_one_line(folder, twin, tmp_path):
     (tmp_path / "file").touch()
     unwritable = tmp_path / "file" / "t.onnx"
     assert "cannot be made" in said_instead("train", healthy, "--model", "physical", "-o", unwritable)
+
+
+def test_nothing_is_overwritten_or_judged_by_mistake(folder, tmp_path):
+    healthy, physical = folder / "healthy.mcap", ("--model", "physical")
+    before = healthy.read_bytes()
+    assert "ends in .onnx" in said_instead("train", healthy, *physical, "-o", healthy)
+    assert healthy.read_bytes() == before
+    twin = tmp_path / "twin.onnx"
+    same = said_instead("train", healthy, "--validate", healthy, *physical, "-o", twin)
+    assert "judged by what it was learned from" in same
+    other_unit = said_instead("train", healthy, "--validate", folder / "healthy-rpm.mcap", *physical, "-o", twin)
+    assert "speeds in rpm, those to learn from in rad/s" in other_unit
+    assert not twin.exists()
+    parts = fantwin("train", healthy, "--to", 20, "--validate", healthy, "--validate-from", 20, *physical, "-o", twin)
+    assert parts.exit_code == 0, parts.output
+
+
+def test_outliers_are_left_out_alike_wherever_a_twin_is_judged(tmp_path):
+    run = published_run(7)
+    speed = run.speed_rad_s.copy()
+    speed[50::97] = 0.0
+    for name, part in (("learn", run.between(0.0, 25.0)), ("judge", run.between(25.0, 40.0))):
+        glitched = speed[:2500] if name == "learn" else speed[2500:]
+        record(tmp_path / f"{name}.mcap", Run(name, part.t_s, part.command, glitched))
+    twin, judge = tmp_path / "twin.onnx", tmp_path / "judge.mcap"
+    trained = fantwin(
+        "train", tmp_path / "learn.mcap", "--validate", judge, "--model", "physical", "-o", twin, "--json"
+    )
+    told = json.loads(trained.stdout)
+    evaluated = json.loads(fantwin("evaluate", twin, judge, "--json").stdout)
+    assert told["rmse"] == pytest.approx(evaluated["rmse"], rel=1e-6)
+    assert told["rmse"] < 1.05 * NOISE_RAD_S
+    assert any("of the speeds are outliers" in line for line in told["warnings"])
+    assert any("of the speeds are outliers" in line for line in evaluated["warnings"])
 
 
 def test_a_command_that_never_changes_is_told_in_one_line(tmp_path):

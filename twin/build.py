@@ -102,7 +102,7 @@ def train_twin(
     )
     duration_s = time.monotonic() - started_s
     if isinstance(model, Hybrid) and not np.any(model.network.theta):
-        silent = "the network stays silent: recordings left out were predicted no better with it than by physics alone"
+        silent = "the network stays silent: free runs with it were no better than those of the physics alone"
         identification = replace(identification, warnings=(*identification.warnings, silent))
     judged = validation_runs or runs
     pieces = evaluation_pieces(judged)
@@ -163,7 +163,8 @@ def evaluate(twin: str | Path | OnnxTwin | TrainedTwin, runs: Sequence[Run]) -> 
     fans, known = common_fans(runs), loaded.card.fans
     if known not in (1, fans):
         raise TwinError(
-            f"twin {loaded.card.name!r} is of {known} fans, the runs of {fans}; select the fans, or retrain"
+            f"twin {loaded.card.name!r} is of {known} fans, the runs of {fans}; "
+            "give recordings of as many fans, or retrain"
         )
     parameters = np.broadcast_to(loaded.parameters, (fans, len(PARAMETER_NAMES)))
     sigma_rad_s = np.broadcast_to(np.array(loaded.card.sigma_rad_s), (fans,))

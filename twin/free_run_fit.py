@@ -356,7 +356,8 @@ class FreeRunProblem:
 
     def rmse_rad_s(self, point: Point) -> float:
         """Root mean square of the residual over all measured samples."""
-        return float(np.sqrt(np.sum(point.residual**2) / np.count_nonzero(self.trajectories.measured)))
+        with np.errstate(over="ignore"):
+            return float(np.sqrt(np.sum(point.residual**2) / np.count_nonzero(self.trajectories.measured)))
 
 
 def robust_scale(residual: Array, trajectories: Trajectories) -> Array:

@@ -28,6 +28,8 @@ NARROW_SPEED_RANGE = 0.35
 WELL_TOLD = 10.0
 # Of the damping at one end of the speeds to that at the other; the fit keeps both positive (twin.physical).
 EDGE = 1e-3
+# Noise estimates scatter by some percent.
+MISFIT = 1.1
 TOP_SPEED_QUANTILE = 0.99
 
 FEWEST_STEPS, FEWEST_LEVELS = 3, 3
@@ -67,6 +69,17 @@ def identifiability_warnings(runs: Sequence[Run], parameters: Array, covariance:
             *_drag(pieces, fan, parameters[fan], covariance[fan]),
             *_lag(pieces, parameters[fan], covariance[fan]),
         )
+    )
+
+
+def misfit_warnings(pieces: Sequence[Run], rmse_rad_s: Array) -> tuple[str, ...]:
+    """One line for each fan whose free run stays clear of its noise. rmse_rad_s: (fans,). pieces: without gaps."""
+    return tuple(
+        f"fan {fan}: the physical model misses the speed by {rmse:.3g} rad/s, of which noise explains {noise:.3g}: "
+        "friction, dead zone or drive bend its parameters, and their intervals, which hold for the equation as it is, "
+        "are too narrow; a hybrid learns the difference"
+        for fan, rmse in enumerate(rmse_rad_s)
+        if rmse > MISFIT * (noise := _noise(pieces, fan)) > 0.0
     )
 
 

@@ -31,7 +31,7 @@ from twin import physics
 from twin.errors import TwinError
 from twin.filtering import filtered_regression
 from twin.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, fit_free_run
-from twin.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings
+from twin.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings, misfit_warnings
 from twin.integration import free_run
 from twin.physical import PhysicalModel, fitted_unknowns, parameters_by_unknowns, physical_parameters
 from twin.physics import LAG, PARAMETER_NAMES
@@ -110,16 +110,17 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
         fit, covariance, freedom = _refine(without, free, top_speed, trajectories, start)
         iterations += fit.iterations
     parameters = physical_parameters(fit.point.unknowns.own, top_speed)
+    rmse_rad_s = _rmse_rad_s(fit, trajectories, fans)
     return Identification(
         parameters=parameters,
         covariance=covariance,
         degrees_of_freedom=freedom,
         lambda_per_s=lambda_per_s,
-        rmse_rad_s=_rmse_rad_s(fit, trajectories, fans),
+        rmse_rad_s=rmse_rad_s,
         time_constant_s=_positive(physics.time_constant_s(speed, parameters), pieces),
         top_speed_rad_s=top_speed,
         iterations=iterations,
-        warnings=identifiability_warnings(runs, parameters, covariance),
+        warnings=identifiability_warnings(runs, parameters, covariance) + misfit_warnings(pieces, rmse_rad_s),
     )
 
 

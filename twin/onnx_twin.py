@@ -25,7 +25,9 @@ class OnnxTwin:
         self._session = _session(self.path)
         metadata = self._session.get_modelmeta().custom_metadata_map
         if CARD_KEY not in metadata:
-            raise TwinError(f"{self.path}: an ONNX file without {CARD_KEY}, so not a fantwin twin; export one first")
+            raise TwinError(
+                f"{self.path}: an ONNX file without {CARD_KEY}, so not a fantwin twin; make one with fantwin train"
+            )
         try:
             self.card = Card.from_json(metadata[CARD_KEY])
         except TwinError as error:

@@ -24,6 +24,7 @@ from pipeline.commands.model_maker import (
     figures_in,
     made_folder,
     model_maker,
+    read_held_out,
     read_material,
     training_bars,
 )
@@ -67,7 +68,9 @@ def compare(
     tray: TrayOption = None,
     fans: FansOption = None,
     seed: Annotated[int, typer.Option(help="The same seed and recordings give the same twins.")] = 0,
-    iterations: Annotated[int | None, typer.Option(min=1, help="At most; without it, as fits the model.")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, help="At most, of the start that goes on; without it, as fits the model.")
+    ] = None,
     command_unit: Annotated[str, typer.Option(help="For the cards, e.g. %.")] = "",
     json_output: JsonOption = False,
 ) -> None:
@@ -82,8 +85,8 @@ def compare(
 
         chosen = _chosen(model)
         material = read_material(recordings, tray, fans, from_s, to_s)
-        held_out = read_material(validate, tray, fans, validate_from_s, validate_to_s) if validate else None
-        untouched = read_material(test, tray, fans, test_from_s, test_to_s) if test else None
+        held_out = read_held_out(material, validate, tray, fans, validate_from_s, validate_to_s) if validate else None
+        untouched = read_held_out(material, test, tray, fans, test_from_s, test_to_s) if test else None
         folder = made_folder(output) if output else None
         validation_runs, test_runs = (part.runs if part else [] for part in (held_out, untouched))
         data, validation_data = data_cards(material), data_cards(held_out) if held_out else ()

@@ -79,7 +79,7 @@ def account(found: Identification, material: Material) -> dict[str, Any]:
         {
             "fan": material.fans[fan],
             **dict(zip(PARAMETER_NAMES, found.parameters[fan].tolist(), strict=True)),
-            **{f"{name}_95": found.interval_95[fan, k].tolist() for k, name in enumerate(PARAMETER_NAMES)},
+            **{f"{name}_95": _interval(found, fan, k) for k, name in enumerate(PARAMETER_NAMES)},
             "covariance": found.covariance[fan].tolist(),
             "correlation": _correlation(found.covariance[fan]),
             "time_constant_s": float(found.time_constant_s[fan]),
@@ -96,6 +96,11 @@ def account(found: Identification, material: Material) -> dict[str, Any]:
         "iterations": found.iterations,
         "warnings": material.named(found.warnings),
     }
+
+
+def _interval(found: Identification, fan: int, index: int) -> list[float] | None:
+    """None for a parameter that was not estimated: a lag that was not seen."""
+    return found.interval_95[fan, index].tolist() if found.covariance[fan, index, index] > 0.0 else None
 
 
 def _correlation(covariance: Array) -> list[list[float | None]]:
@@ -129,8 +134,10 @@ def _table(told: dict[str, Any]) -> Table:
 
 
 def _lag(fan: dict[str, Any]) -> str:
+    if fan["lag_s_95"] is None:
+        return "none seen"
     low, high = fan["lag_s_95"]
-    return _with_interval(1e3 * fan["lag_s"], [1e3 * low, 1e3 * high]) if high > low else "none seen"
+    return _with_interval(1e3 * fan["lag_s"], [1e3 * low, 1e3 * high])
 
 
 def _with_interval(value: float, interval: list[float]) -> str:

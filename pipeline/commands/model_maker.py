@@ -154,6 +154,47 @@ def training_bars(material: Material) -> Iterator[Callable[[str], ProgressCallba
         yield start
 
 
+def read_held_out(
+    material: Material, recordings: Sequence[Path], tray: str | None, fans: str | None, from_s: float, to_s: float
+) -> Material:
+    """Recordings to judge by and not to learn from.
+
+    Raises:
+        UserError: they cannot be used, are in another unit, or hold what was learned from.
+    """
+    held_out = read_material(recordings, tray, fans, from_s, to_s)
+    if held_out.speed_unit != material.speed_unit:
+        raise UserError(
+            f"{recordings[0]}: speeds in {held_out.speed_unit}, those to learn from in {material.speed_unit}: "
+            "give recordings of one unit"
+        )
+    for own in held_out.recorded:
+        for other in material.recorded:
+            if own.path == other.path and own.t_s[0] <= other.t_s[-1] and other.t_s[0] <= own.t_s[-1]:
+                raise UserError(
+                    f"{own.path}: judged by what it was learned from; give another recording, or other seconds of it"
+                )
+    return held_out
+
+
+def check_writable(output: Path, suffix: str) -> None:
+    """Before long work: that its result can be written, and that nothing else is overwritten by mistake.
+
+    Raises:
+        UserError: it cannot, or the name does not end as it should.
+    """
+    if output.suffix != suffix:
+        raise UserError(f"{output}: name a file that ends in {suffix} with -o")
+    made_folder(output.parent)
+    existed = output.exists()
+    try:
+        output.open("ab").close()
+        if not existed:
+            output.unlink()
+    except OSError as error:
+        raise UserError(f"{output}: cannot be written: {error.strerror}; name another file with -o") from error
+
+
 def made_folder(folder: Path) -> Path:
     """The folder, made where it was missing.
 

@@ -16,9 +16,9 @@ from pipeline.commands.model_maker import (
     RecordingsArgument,
     ToOption,
     TrayOption,
+    check_writable,
     data_cards,
     figures_in,
-    made_folder,
     model_maker,
     read_material,
     sentence,
@@ -51,7 +51,7 @@ def report(
         from twin.report import SpeedUnit, judge, level_of, report_content, report_page  # noqa: PLC0415
 
         loaded = OnnxTwin(twin)
-        made_folder(output.parent)
+        check_writable(output, ".html")
         material = read_material(recordings, tray, fans, from_s, to_s)
         unit = SpeedUnit(material.speed_unit, material.rad_s_per_unit)
         content = report_content(loaded, material.runs, data_cards(material), unit, fan_numbers(fans))

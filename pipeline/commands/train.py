@@ -16,16 +16,16 @@ from pipeline.commands.model_maker import (
     RecordingsArgument,
     ToOption,
     TrayOption,
+    check_writable,
     data_cards,
     figures_in,
-    made_folder,
     model_maker,
+    read_held_out,
     read_material,
     sentence,
     training_bars,
 )
 from pipeline.commands.options import JsonOption
-from pipeline.errors import UserError
 
 if TYPE_CHECKING:
     from twin.build import TrainedTwin
@@ -54,7 +54,9 @@ def train(
     name: Annotated[str | None, typer.Option(help="Of the twin; without it, that of the file.")] = None,
     seed: Annotated[int, typer.Option(help="The same seed and recordings give the same twin.")] = 0,
     trainer: Annotated[Trainer, typer.Option(help="adam is the published recipe.")] = "levenberg-marquardt",
-    iterations: Annotated[int | None, typer.Option(min=1, help="At most; without it, as fits the trainer.")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, help="At most, of the start that goes on; without it, as fits the trainer.")
+    ] = None,
     network_inputs: Annotated[
         NetworkInputs, typer.Option(help="Of the hybrid's and the neural ODE's network.")
     ] = "speed,command",
@@ -74,11 +76,9 @@ def train(
     with model_maker():
         from twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
 
-        made_folder(output.parent)
-        if output.is_dir():
-            raise UserError(f"{output}: a folder; name a file with -o")
+        check_writable(output, ".onnx")
         material = read_material(recordings, tray, fans, from_s, to_s)
-        held_out = read_material(validate, tray, fans, validate_from_s, validate_to_s) if validate else None
+        held_out = read_held_out(material, validate, tray, fans, validate_from_s, validate_to_s) if validate else None
         with training_bars(material) as start_bar:
             trained = train_twin(
                 material.runs,
