@@ -45,6 +45,12 @@ def test_short_pieces_beside_a_long_run_do_not_widen_the_intervals() -> None:
     assert np.all(with_pieces.standard_errors[0, :3] < 1.3 * alone.standard_errors[0, :3])
 
 
+def test_a_fan_that_physics_alone_do_not_describe_is_told(published) -> None:
+    assert published[1].misfits == ()
+    found = identify([fan_data.rough_run(1, 40.0)])
+    assert "the physical model misses the speed" in found.misfits[0]
+
+
 def test_a_lag_is_found_where_there_is_one_and_none_where_there_is_none(published) -> None:
     run, without = published
     assert np.count_nonzero(without.parameters[:, 3]) == 0

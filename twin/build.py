@@ -101,6 +101,8 @@ def train_twin(
         kind, runs, validation_runs, identification, seed, trainer, limit, network_inputs, physics, progress
     )
     duration_s = time.monotonic() - started_s
+    if kind == "physical":
+        identification = replace(identification, warnings=(*identification.warnings, *identification.misfits))
     if isinstance(model, Hybrid) and not np.any(model.network.theta):
         silent = "the network stays silent: free runs with it were no better than those of the physics alone"
         identification = replace(identification, warnings=(*identification.warnings, silent))

@@ -57,7 +57,8 @@ class Identification:
     parameters, standard_errors: (fans, 4). covariance: (fans, 4, 4), degrees_of_freedom: (fans, 4) that it has.
     interval_95: (fans, 4, 2). A lag that was not found is zero, and so is its uncertainty. lambda_per_s, rmse_rad_s,
     time_constant_s, top_speed_rad_s: (fans,); the time constant is taken at the median speed. iterations: those of the
-    refinement. warnings: one line each, empty when all is well.
+    refinement. warnings: one line each, empty when all is well. misfits: one line for each fan that physics alone do
+    not describe, which is what a hybrid is for.
     """
 
     parameters: Array
@@ -69,6 +70,7 @@ class Identification:
     top_speed_rad_s: Array
     iterations: int
     warnings: tuple[str, ...]
+    misfits: tuple[str, ...]
 
     @property
     def standard_errors(self) -> Array:
@@ -120,7 +122,8 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
         time_constant_s=_positive(physics.time_constant_s(speed, parameters), pieces),
         top_speed_rad_s=top_speed,
         iterations=iterations,
-        warnings=identifiability_warnings(runs, parameters, covariance) + misfit_warnings(pieces, rmse_rad_s),
+        warnings=identifiability_warnings(runs, parameters, covariance),
+        misfits=misfit_warnings(pieces, rmse_rad_s),
     )
 
 

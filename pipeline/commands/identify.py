@@ -94,7 +94,7 @@ def account(found: Identification, material: Material) -> dict[str, Any]:
         "units": {name: UNITS[name] for name in PARAMETER_NAMES},
         "speed_unit": material.speed_unit,
         "iterations": found.iterations,
-        "warnings": material.named(found.warnings),
+        "warnings": material.named([*found.warnings, *found.misfits]),
     }
 
 
