@@ -12,15 +12,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.lapack import dtbtrs  # pyright: ignore[reportAttributeAccessIssue]  made by f2py
 
+from twin.free_run_fit import HUBER_DELTA, NORMAL_90_PERCENT
 from twin.narx import INPUTS, ORDER, UNITS, Narx, regressor_rows
 from twin.network import Scaling
 from twin.physics import PARAMETER_NAMES
+from twin.recursion import dtbtrs
 from twin.runs import Array, Run, starting_speed_rad_s
 
-HUBER_DELTA = 3.0
-NORMAL_90_PERCENT = 1.6449
 TOLERANCE = 1e-3
 FIRST_DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e9
 
@@ -28,7 +27,7 @@ IterationDone = Callable[[float], None]
 """Called after every iteration with the free-run rmse in rad/s over the samples that count."""
 
 
-class FreeRunFit:
+class OutputErrorFit:
     """Fits theta to stretches: runs of one fan each, every one started from its first measured speeds.
 
     prior_mean, prior_weight: (1151,) where the weights are held, and how firmly, relative to one another.

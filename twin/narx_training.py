@@ -25,7 +25,7 @@ import numpy as np
 from twin.errors import TwinError
 from twin.evaluation import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
 from twin.narx import Narx
-from twin.narx_fit import FreeRunFit
+from twin.narx_fit import OutputErrorFit
 from twin.narx_stability import forgets_its_start
 from twin.narx_start import lag_scale, starting_weights
 from twin.network import Scaling
@@ -69,7 +69,7 @@ def train_narx(
     parted = [(pieces, evaluation_pieces(validation_runs))] if validation_runs else leave_out(runs)
     folds = [_Fold(*parts, start, scaling, rng) for parts in parted]
     chosen = _relax_prior(folds, count, round(CHOOSING_SHARE * max_iterations))
-    whole = FreeRunFit(stretches, scaling, start, lag_scale() ** -2)
+    whole = OutputErrorFit(stretches, scaling, start, lag_scale() ** -2)
     model = Narx(start, scaling)
     for precision, theta in reversed(chosen):
         limit = min(max_iterations - count.iterations, ITERATIONS_A_PRECISION)
@@ -137,7 +137,7 @@ class _Fold:
     def __init__(
         self, fitted: Sequence[Run], judged: Sequence[Run], start: Array, scaling: Scaling, rng: np.random.Generator
     ) -> None:
-        self.fit = FreeRunFit(draw_stretches(fitted, rng), scaling, start, lag_scale() ** -2)
+        self.fit = OutputErrorFit(draw_stretches(fitted, rng), scaling, start, lag_scale() ** -2)
         self.judged = judged
         self.theta = start
 
