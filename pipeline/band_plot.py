@@ -22,7 +22,7 @@ from matplotlib.patches import Patch
 
 from pipeline.config import SpeedUnit
 from pipeline.errors import UserError
-from pipeline.recording import read_head, read_recording
+from pipeline.recordings.reading import read_head, read_recording
 from pipeline.trace import Trace, state_changes, trace_of
 from schemas.messages import Array, Score
 

@@ -96,6 +96,7 @@ class Config:
 
     path: Path
     text: str
+    overrides: tuple[str, ...]
     site: str
     run_folder: Path
     bus: BusConfig
@@ -153,6 +154,7 @@ def parse_config(text: str, path: Path, overrides: Iterable[str] = ()) -> Config
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    overrides = tuple(overrides)
     for override in overrides:
         _override(table, override)
     own = {key: value for key, value in table.items() if key not in STAGES}
@@ -168,6 +170,7 @@ def parse_config(text: str, path: Path, overrides: Iterable[str] = ()) -> Config
     return Config(
         path=path,
         text=text,
+        overrides=overrides,
         site=file.site,
         run_folder=Path(os.path.normpath(folder / file.run_folder)),
         bus=file.bus,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
-from pipeline.recording import read_recording
+from pipeline.recordings.reading import read_recording
 from schemas.messages import Alarm, Array, Grid, Raw, Score
 
 SETTLING_NS = 5_000_000_000  # after a fault has gone the fan runs back: an alarm until then is that fault's

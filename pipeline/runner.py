@@ -23,7 +23,7 @@ from pipeline.health import HealthBook, lost
 from pipeline.inlet import Inlet
 from pipeline.stage import Context, Packet, Parts, Stage
 from schemas.codec import CodecError, decode, encode, type_name
-from schemas.messages import Header, Health, Message, Output, StageStatus
+from schemas.messages import Cause, Header, Health, Message, Output, StageStatus
 from schemas.topics import BY_NAME, TOPICS, alive_key, health_key, topic_of, tray_key
 
 INBOX_SIZE = 4096
@@ -136,6 +136,7 @@ class Runner:
             run_folder=config.run_folder,
             started_t_ns=started_t_ns,
             configuration_text=config.text,
+            overrides=config.overrides,
         )
         self._parts: dict[str, Parts] = (
             {t.name: stage.build(replace(context, trays=(t,))) for t in trays}
@@ -153,6 +154,8 @@ class Runner:
         self._read_keys = {
             tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
         }
+        self._taken: dict[str, Cause] = {}
+        """of each core: what it has taken of its inputs"""
         self._crash = ""
         self._orphan_until_s = 0.0
         self._alive: set[str] = set()
@@ -181,7 +184,7 @@ class Runner:
         finally:
             self._inbox.close()
             for tray, parts in self._parts.items():
-                self._publish(tray, parts.core.close())
+                self._publish(tray, parts.core.close(), by_time=True)
             last = self._publish_health(StageStatus.DEGRADED if self._crash else StageStatus.STOPPED)
             self._bus.close()
         return last
@@ -200,7 +203,7 @@ class Runner:
             if now >= next_tick:
                 next_tick = now + TICK_S
                 for tray, parts in self._parts.items():
-                    self._publish(tray, parts.core.tick(time.time_ns()))
+                    self._publish(tray, parts.core.tick(time.time_ns()), by_time=True)
                 if now >= next_health or (now >= next_loss and self._lost() > told):
                     next_health, next_loss = now + HEALTH_PERIOD_S, now + LOSS_TOLD_S
                     told = self._publish_health(StageStatus.OK).lost
@@ -276,6 +279,10 @@ class Runner:
         if parts is None:
             self._counts["unknown_tray"] += 1
             return
+        header = packet.message.header
+        before = self._taken.get(tray)
+        taken = before.taken + 1 if before else 1
+        self._taken[tray] = Cause(packet.topic, header.producer, header.sequence, taken)
         self._publish(tray, parts.core.step(packet if self.stage.wants_packets else packet.message))
 
     def _note_alive(self, change: _Alive) -> None:
@@ -315,10 +322,13 @@ class Runner:
     def _outlet(self, key: str, topic: str) -> Outlet:
         return self._bus.outlet(key, BY_NAME[topic], type_name(BY_NAME[topic].message), self.producer)
 
-    def _publish(self, tray: str, messages: Sequence[Message]) -> None:
+    def _publish(self, tray: str, messages: Sequence[Message], *, by_time: bool = False) -> None:
+        cause = self._taken.get(tray) if messages else None
+        if cause and by_time:
+            cause = replace(cause, by_time=True)
         for message in messages:
             outlet = self._outlets[tray, _TOPIC_NAMES[type(message)]]
-            stamped = replace(message, header=Header(self.producer, outlet.published, tray))
+            stamped = replace(message, header=Header(self.producer, outlet.published, tray, cause))
             outlet.put(encode(stamped))
             self._health.note_output(stamped, time.time_ns())
 

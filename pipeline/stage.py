@@ -86,6 +86,8 @@ class Context:
     run_folder: Path
     started_t_ns: int
     configuration_text: str = field(default="", repr=False)
+    overrides: tuple[str, ...] = ()
+    """the keys set on the command line, `key=value`"""
 
     @property
     def tray(self) -> TrayConfig:

@@ -17,6 +17,7 @@ from google.protobuf.message import Message as ProtoMessage
 from schemas import fan_pb2
 from schemas.messages import (
     MESSAGE_TYPES,
+    Cause,
     Counter,
     FanState,
     Header,
@@ -88,6 +89,12 @@ def encode(message: Message) -> bytes:
     proto.header.producer = message.header.producer
     proto.header.sequence = message.header.sequence
     proto.header.tray = message.header.tray
+    if (cause := message.header.cause) is not None:
+        proto.header.cause.topic = cause.topic
+        proto.header.cause.producer = cause.producer
+        proto.header.cause.sequence = cause.sequence
+        proto.header.cause.taken = cause.taken
+        proto.header.cause.by_time = cause.by_time
     for name in _SCALARS[kind]:
         value = getattr(message, name)
         if name in _RECORDS:
@@ -119,7 +126,7 @@ def decode(message_type: type[Message], data: bytes) -> Message:
     except DecodeError as error:
         raise CodecError(f"{len(data)} bytes are not a {type_name(message_type)}: {error}") from error
     values: dict[str, Any] = {
-        "header": Header(proto.header.producer, proto.header.sequence, proto.header.tray),
+        "header": _header(proto.header),
     }
     for name in _SCALARS[message_type]:
         value = getattr(proto, name)
@@ -147,6 +154,14 @@ def decode(message_type: type[Message], data: bytes) -> Message:
     for name, (shape, _) in _COLUMNS[message_type].items():
         _check_column(message, name, values[name], shape, samples)
     return message
+
+
+def _header(proto: Any) -> Header:
+    cause = None
+    if proto.HasField("cause"):
+        made = proto.cause
+        cause = Cause(made.topic, made.producer, made.sequence, made.taken, made.by_time)
+    return Header(proto.producer, proto.sequence, proto.tray, cause)
 
 
 def _column(field: Any, name: str, dtype: np.dtype[Any], message_type: type[Message]) -> np.ndarray[Any, Any]:

@@ -60,14 +60,30 @@ STAGE_STATUS_DEGRADED: StageStatus
 STAGE_STATUS_STOPPED: StageStatus
 
 class Header(_message.Message):
-    __slots__ = ("producer", "sequence", "tray")
+    __slots__ = ("producer", "sequence", "tray", "cause")
     PRODUCER_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     TRAY_FIELD_NUMBER: _ClassVar[int]
+    CAUSE_FIELD_NUMBER: _ClassVar[int]
     producer: str
     sequence: int
     tray: str
-    def __init__(self, producer: _Optional[str] = ..., sequence: _Optional[int] = ..., tray: _Optional[str] = ...) -> None: ...
+    cause: Cause
+    def __init__(self, producer: _Optional[str] = ..., sequence: _Optional[int] = ..., tray: _Optional[str] = ..., cause: _Optional[_Union[Cause, _Mapping]] = ...) -> None: ...
+
+class Cause(_message.Message):
+    __slots__ = ("topic", "producer", "sequence", "taken", "by_time")
+    TOPIC_FIELD_NUMBER: _ClassVar[int]
+    PRODUCER_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    TAKEN_FIELD_NUMBER: _ClassVar[int]
+    BY_TIME_FIELD_NUMBER: _ClassVar[int]
+    topic: str
+    producer: str
+    sequence: int
+    taken: int
+    by_time: bool
+    def __init__(self, topic: _Optional[str] = ..., producer: _Optional[str] = ..., sequence: _Optional[int] = ..., taken: _Optional[int] = ..., by_time: _Optional[bool] = ...) -> None: ...
 
 class Raw(_message.Message):
     __slots__ = ("header", "fans", "host_receive_t_ns", "device_clock_us", "device_sequence", "command", "speed_rad_s")
@@ -222,6 +238,16 @@ class ModelCard(_message.Message):
     sigma_rad_s: _containers.RepeatedScalarFieldContainer[float]
     card_json: str
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin: _Optional[str] = ..., kind: _Optional[str] = ..., sha256: _Optional[str] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., card_json: _Optional[str] = ...) -> None: ...
+
+class Clock(_message.Message):
+    __slots__ = ("header", "t_ns", "rate")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    RATE_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    t_ns: int
+    rate: float
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., rate: _Optional[float] = ...) -> None: ...
 
 class Counter(_message.Message):
     __slots__ = ("name", "value")

@@ -57,12 +57,28 @@ class StageStatus(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Cause:
+    """What a stage had taken of its inputs, for one tray, when it made a message.
+
+    `topic`, `producer` and `sequence` name the message taken last, `taken` counts all, that one included. `by_time`:
+    made since, because time had passed or the stage ended, and not on taking it.
+    """
+
+    topic: str
+    producer: str
+    sequence: int
+    taken: int
+    by_time: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Header:
-    """Who sent a message, which one of theirs it is, and the tray it is about."""
+    """Who sent a message, which one of theirs it is, the tray it is about, and what it was made of."""
 
     producer: str = ""
     sequence: int = 0
     tray: str = ""
+    cause: Cause | None = None
 
 
 def _column(shape: str, dtype: type) -> Any:
@@ -187,6 +203,15 @@ class ModelCard:
     card_json: str = ""
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Clock:
+    """What a replay has come to, in the recording's own time; `rate` is 0 while it is paused."""
+
+    header: Header = Header()
+    t_ns: int
+    rate: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Counter:
     """One counter of a stage; grows only, within a session."""
@@ -235,8 +260,8 @@ class Health:
     process_id: int = 0
 
 
-Message: TypeAlias = Raw | Grid | Prediction | Score | Alarm | Command | ModelCard | Health
-MESSAGE_TYPES: tuple[type[Message], ...] = (Raw, Grid, Prediction, Score, Alarm, Command, ModelCard, Health)
+Message: TypeAlias = Raw | Grid | Prediction | Score | Alarm | Command | ModelCard | Clock | Health
+MESSAGE_TYPES: tuple[type[Message], ...] = (Raw, Grid, Prediction, Score, Alarm, Command, ModelCard, Clock, Health)
 
 
 def newest_t_ns(message: Message) -> int:

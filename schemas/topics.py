@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from schemas.messages import Alarm, Command, Grid, Health, Message, ModelCard, Prediction, Raw, Score
+from schemas.messages import Alarm, Clock, Command, Grid, Health, Message, ModelCard, Prediction, Raw, Score
 
 ROOT = "fantwin"
 HEALTH_CHUNK = "health"
@@ -35,6 +35,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("alarm", Alarm, "on change", True, 1024, "an alarm was raised or cleared"),
     Topic("command", Command, "on change", True, 64, "what is wanted of the fans"),
     Topic("twin", ModelCard, "on change", True, 8, "the twin in force"),
+    Topic("clock", Clock, "20 Hz", False, 1, "the time of a replay"),
     Topic("health", Health, "1 Hz for each stage", True, 8, "how a stage is"),
 )
 BY_NAME = {topic.name: topic for topic in TOPICS}

@@ -9,6 +9,7 @@ Timing  a message is safe from a crash of this process after `flush_interval_s` 
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import os
 from collections import Counter
@@ -20,8 +21,8 @@ from typing import Protocol
 
 from pydantic import Field
 
-from pipeline.recording import RecordingError
-from pipeline.recording_writer import RecordingWriter
+from pipeline.recordings.reading import RecordingError
+from pipeline.recordings.writing import RecordingWriter
 from pipeline.stage import Context, Core, Packet, Parts, Stage, StageConfig, StageError
 from schemas.messages import Message
 from schemas.topics import TOPICS
@@ -41,7 +42,7 @@ class RecorderConfig(StageConfig):
 
 
 class Writer(Protocol):
-    """What the core needs of a recording; see `pipeline.recording_writer.RecordingWriter`."""
+    """What the core needs of a recording; see `pipeline.recordings.writing.RecordingWriter`."""
 
     written: Counter[str]
     pending: Counter[str]
@@ -108,6 +109,8 @@ def head(context: Context) -> tuple[dict[str, str], dict[str, bytes]]:
         "started_t_ns": str(context.started_t_ns),
         "trays": ",".join(tray.name for tray in context.trays),
     }
+    if context.overrides:
+        metadata["overrides"] = json.dumps(context.overrides)
     attachments = {CONFIGURATION: context.configuration_text.encode()}
     for tray in context.trays:
         metadata[f"fans.{tray.name}"] = str(tray.fans)

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as st_numpy
 
 from schemas import messages
 from schemas.codec import FURTHEST_T_NS, LARGEST_STEP_NS
-from schemas.messages import Counter, FanState, Header, Input, Message, Output, WhyNot, columns
+from schemas.messages import Cause, Counter, FanState, Header, Input, Message, Output, WhyNot, columns
 
 TIME_NS = st.integers(1 - FURTHEST_T_NS, FURTHEST_T_NS - 1)
 STEP_NS = st.integers(1, LARGEST_STEP_NS)
@@ -19,6 +19,8 @@ UINT64 = st.integers(0, 2**64 - 1)
 UINT32 = st.integers(0, 2**32 - 1)
 TEXT = st.text(max_size=20)
 FLOAT = st.floats(width=64)
+CAUSE = st.builds(Cause, TEXT, TEXT, UINT64, UINT64, st.booleans())
+HEADER = st.builds(Header, TEXT, UINT64, TEXT, st.none() | CAUSE)
 ENUM_COLUMNS = {"why_not": WhyNot, "state": FanState}
 SCALARS: dict[str, st.SearchStrategy[Any]] = {
     **dict.fromkeys(("t_ns", "onset_t_ns"), INT64),
@@ -57,7 +59,7 @@ def any_message(
     shapes = {"samples": (samples,), "samples x fans": (samples, own_fans), "fans": (own_fans,)}
     own_columns = columns(message_type)
     hints = get_type_hints(message_type, dict(vars(messages)))
-    values: dict[str, Any] = {"header": Header(draw(TEXT), draw(UINT64), draw(TEXT))}
+    values: dict[str, Any] = {"header": draw(HEADER)}
     for f in fields(message_type):
         if f.name in own_columns:
             shape, dtype = own_columns[f.name]

@@ -16,7 +16,7 @@ from pipeline.band_plot import Fault, plot_bands, plot_recording, read_trace
 from pipeline.command_line import app
 from pipeline.commands.plot import plot
 from pipeline.errors import UserError
-from pipeline.recording_writer import RecordingWriter
+from pipeline.recordings.writing import RecordingWriter
 from pipeline.trace import trace_of
 from schemas.messages import Alarm, Score
 from schemas.topics import tray_key

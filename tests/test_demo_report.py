@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.demo_report import SETTLING_NS, summarise
 from pipeline.errors import UserError
-from pipeline.recording_writer import RecordingWriter
+from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Alarm, Grid, Header, Message, Raw, Score, Severity, columns
 from schemas.topics import tray_key
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recording import read_head, read_recording
-from pipeline.runs_of_recording import read_runs
+from pipeline.recordings.reading import read_head, read_recording
+from pipeline.recordings.runs import read_runs
 from schemas.messages import Array, Raw
 from tests.fantwin_command import fantwin, said_instead
 

@@ -10,7 +10,7 @@ import pytest
 from chain import SITE, TRAY, Chain, eventually, fantwin, is_running, published, received, view_of
 from mcap.reader import make_reader
 
-from pipeline.recording import read_recording
+from pipeline.recordings.reading import read_recording
 from pipeline.watcher import Watcher
 from schemas.topics import tray_key
 

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from pipeline.config import load_config
 from pipeline.launcher import Launcher, Outcome
 from pipeline.processes import process_list
-from pipeline.recording import read_recording
+from pipeline.recordings.reading import read_recording
 from schemas.messages import Grid, Prediction, Raw, Score
 from schemas.topics import tray_key
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recording import read_recording
+from pipeline.recordings.reading import read_recording
 from schemas.messages import ModelCard, Raw, Score
 from tests.chain import Running, fantwin
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.runs_of_recording import read_runs
+from pipeline.recordings.runs import read_runs
 from tests.fantwin_command import fantwin
 
 pytestmark = pytest.mark.data

@@ -1,7 +1,9 @@
 """The recorder stage: everything of the table is kept, and a disk that refuses is told and counted."""
 
+import json
 import logging
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.config import TrayConfig
-from pipeline.recording import RecordingError, read_head, read_recording
-from pipeline.recording_writer import RecordingWriter
+from pipeline.recordings.reading import RecordingError, read_head, read_recording
+from pipeline.recordings.writing import RecordingWriter
 from pipeline.stage import Context, Packet, StageError
 from schemas.codec import encode
 from schemas.messages import Header, Message, Raw
@@ -93,6 +95,12 @@ def test_every_topic_of_the_table_is_recorded_as_it_came(tmp_path_factory, messa
     for entry, item in zip(entries, packets, strict=True):
         assert same(encode(entry.message), item.payload)
     assert core.counters() == {f"recorded_{topic.name}": 1 for topic in TOPICS} | {"lost_unwritten": 0}
+
+
+def test_it_keeps_what_was_set_on_the_command_line(tmp_path):
+    STAGE.build(replace(context(tmp_path), overrides=("scorer.on_delay_s=1",))).core.close()
+    head = read_head(tmp_path / "runs" / "recording.mcap")
+    assert json.loads(head.metadata["overrides"]) == ["scorer.on_delay_s=1"]
 
 
 def test_it_keeps_the_configuration_and_the_twin(tmp_path):

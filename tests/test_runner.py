@@ -16,8 +16,9 @@ from pipeline.config import BusConfig, Config, LauncherConfig, TrayConfig
 from pipeline.runner import INBOX_SIZE, Runner
 from pipeline.stage import Context, Core, Parts, Stage, StageConfig
 from schemas.codec import decode, encode, type_name
-from schemas.messages import Command, Grid, Header, Health, Message, Output, Raw, StageStatus
+from schemas.messages import Cause, Command, Grid, Header, Health, Message, Output, Raw, StageStatus
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from tests.chain import eventually
 
 TRAY_A, TRAY_B = "a", "b"
 
@@ -76,6 +77,7 @@ def config(endpoint, tmp_path) -> Config:
     return Config(
         path=tmp_path / "fan.toml",
         text="",
+        overrides=(),
         site="s",
         run_folder=tmp_path,
         bus=BusConfig(endpoint=endpoint),
@@ -153,6 +155,38 @@ def test_outputs_are_stamped_with_producer_sequence_and_tray(config):
     assert first.t_ns.tolist() == [10]
 
 
+def test_an_output_says_what_had_been_taken_when_it_was_made(config):
+    bench = Bench(toy(), config)
+    for t_ns in (10, 11):
+        bench.feed(TRAY_A, t_ns)
+    bench.feed(TRAY_B, 12)
+    causes = [bench.next(Grid).header.cause for _ in range(3)]
+    bench.end()
+    assert causes == [Cause("raw", "feeder", 0, 1), Cause("raw", "feeder", 1, 2), Cause("raw", "feeder", 0, 1)]
+
+
+def test_what_is_made_because_time_has_passed_says_so(config):
+    class Waits(Core):
+        def __init__(self) -> None:
+            self.held: list[Grid] = []
+
+        def step(self, item: Raw) -> list[Grid]:
+            passer = Passer()
+            passer.fans = item.fans
+            self.held.append(passer.grid(item.host_receive_t_ns))
+            return []
+
+        def tick(self, now_ns: int) -> list[Grid]:
+            held, self.held = self.held, []
+            return held
+
+    bench = Bench(toy(lambda _context: Parts(Waits())), config)
+    bench.feed(TRAY_A, 10)
+    cause = bench.next(Grid).header.cause
+    bench.end()
+    assert cause == Cause("raw", "feeder", 0, 1, by_time=True)
+
+
 def test_each_tray_has_a_core_and_a_sequence_of_its_own(config):
     bench = Bench(toy(), config)
     bench.feed(TRAY_A, 1)
@@ -222,6 +256,7 @@ def test_a_stage_that_may_drop_throws_its_oldest_away_and_counts(config):
     bench = Bench(toy(lambda _context: Parts(Slow()), may_drop=True), config)
     for t_ns in range(count):
         bench.feed(TRAY_A, t_ns)
+    eventually(lambda: bench.runner._inbox.dropped, "the inbox has overflowed")
     release.set()
     assert newest.wait(20)
     last = bench.end()

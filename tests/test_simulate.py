@@ -17,7 +17,7 @@ from pipeline import simulated_line
 from pipeline.commands.simulate import simulate
 from pipeline.errors import UserError
 from pipeline.played_table import PlayedTable, TableSample
-from pipeline.recording import read_recording
+from pipeline.recordings.reading import read_recording
 from pipeline.simulated_line import PseudoTerminal, play, wait_for_reader
 from pipeline.table import read_table
 from schemas import wire

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recording_writer import RecordingWriter
+from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Raw
 from schemas.topics import tray_key
 from tests.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, published_run

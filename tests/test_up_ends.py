@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.recording import read_recording
+from pipeline.recordings.reading import read_recording
 from schemas.messages import Raw
 from tests.chain import Chain, Running, eventually, fantwin, published, view_of
 

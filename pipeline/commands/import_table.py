@@ -14,7 +14,7 @@ import typer
 from pipeline.commands.options import JsonOption
 from pipeline.config import NAME_PATTERN
 from pipeline.errors import UserError
-from pipeline.recording_writer import RecordingWriter
+from pipeline.recordings.writing import RecordingWriter
 from pipeline.table import Table, read_table
 from schemas.messages import Header, Raw
 from schemas.topics import RESERVED_TRAY_NAMES, tray_key

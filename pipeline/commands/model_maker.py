@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pipeline.commands.options import fan_numbers
 from pipeline.errors import UserError
-from pipeline.runs_of_recording import RecordedRun, read_runs
+from pipeline.recordings.runs import RecordedRun, read_runs
 from pipeline.table import RAD_S_PER_TABLE_UNIT
 
 if TYPE_CHECKING:

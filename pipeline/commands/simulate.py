@@ -18,9 +18,9 @@ from pipeline.commands.options import JsonOption
 from pipeline.config import RAD_S_PER_UNIT, SpeedUnit
 from pipeline.errors import UserError
 from pipeline.played_table import PlayedTable
+from pipeline.recordings.simulated import record
 from pipeline.signals import stop_on_signals
 from pipeline.simulated_line import Played, PseudoTerminal, play, wait_for_reader
-from pipeline.simulated_recording import record
 from pipeline.table import read_table
 from schemas import wire
 

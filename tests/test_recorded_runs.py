@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recording import RecordingError
-from pipeline.recording_writer import RecordingWriter
-from pipeline.runs_of_recording import read_runs
+from pipeline.recordings.reading import RecordingError
+from pipeline.recordings.runs import read_runs
+from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Raw
 from schemas.topics import tray_key
 

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from pipeline.recording_writer import RecordingWriter
+from pipeline.recordings.writing import RecordingWriter
 from pipeline.simulated_line import Device, DeviceSample, Played
 from schemas.messages import Header, Raw
 from schemas.topics import tray_key

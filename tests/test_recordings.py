@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from pipeline.recording import RecordingError, read_head, read_recording
-from pipeline.recording_writer import ACTIVE_SUFFIX, CHUNK_BYTES, RecordingWriter
+from pipeline.recordings.reading import RecordingError, read_head, read_recording
+from pipeline.recordings.writing import ACTIVE_SUFFIX, CHUNK_BYTES, RecordingWriter
 from schemas.messages import Alarm, Array, Command, Header, Message, Raw, Severity
 from schemas.topics import tray_key
 
@@ -189,8 +189,8 @@ def kill_a_recorder(path: Path, flushed: int) -> None:
     program = f"""
 import os, signal, sys
 from pathlib import Path
-from test_recording import RAW_KEY, raw
-from pipeline.recording_writer import RecordingWriter
+from test_recordings import RAW_KEY, raw
+from pipeline.recordings.writing import RecordingWriter
 writer = RecordingWriter(Path(sys.argv[1]), {{}})
 for sequence in range({flushed}):
     writer.write_message(RAW_KEY, raw(sequence), sequence)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.device_time import DeviceClock
-from pipeline.recording import RecordingError, read_head, read_recording
+from pipeline.recordings.reading import RecordingError, read_head, read_recording
 from pipeline.table import held
 from schemas.messages import Array, Raw
 

@@ -25,7 +25,7 @@ from mcap.writer import MCAP0_MAGIC
 from mcap.writer import Writer as McapWriter
 from mcap_protobuf.schema import register_schema
 
-from pipeline.recording import METADATA_NAME, RecordingError, read_recording
+from pipeline.recordings.reading import METADATA_NAME, RecordingError, read_recording
 from schemas.codec import encode, proto_type
 from schemas.messages import Message, newest_t_ns
 from schemas.topics import topic_of

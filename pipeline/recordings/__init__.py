@@ -1,0 +1,1 @@
+"""Recordings: what went over the bus, in MCAP files."""
