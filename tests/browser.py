@@ -30,8 +30,9 @@ document.getElementById("page").onload = event => {{
     }})),
   }}));
   const scrolls = [...inside.document.querySelectorAll("table")].map(table => box(table.parentElement));
+  const needed = [...inside.document.querySelectorAll("table")].map(table => table.parentElement.scrollWidth);
   document.getElementById("measured").textContent = JSON.stringify({{
-    width: root.clientWidth, needs: root.scrollWidth, figures, tables: scrolls,
+    width: root.clientWidth, needs: root.scrollWidth, figures, tables: scrolls, needed,
     fetched: inside.performance.getEntriesByType("resource").map(entry => entry.name),
     background: inside.getComputedStyle(inside.document.body).backgroundColor,
   }});

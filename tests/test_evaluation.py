@@ -1,20 +1,25 @@
 """The figures, against residuals that are known, and the command that prints them."""
 
 import json
+import re
 from pathlib import Path
 
 import fan_data
 import numpy as np
 import pytest
+from rich.console import Console
 
+from pipeline.commands.evaluate import _fan_table
 from tests.fantwin_command import fantwin, said_instead
 from tests.test_train_commands import record
+from tests.twin_files import write_twin
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
 from twin.evaluation import evaluate_model, free_run_residuals, healthy_sigma_rad_s, one_step_residuals
 from twin.models import TwinModel
 from twin.narx import PARAMETER_COUNT, Narx
 from twin.network import Scaling
+from twin.onnx_twin import OnnxTwin
 from twin.physical import PhysicalModel
 from twin.physics import PARAMETER_NAMES
 from twin.runs import Array, Run
@@ -95,7 +100,7 @@ def lossy_and_irregular(samples: int = 400) -> Run:
     t_s = np.cumsum(rng.choice([0.008, 0.01, 0.013], samples))
     speed = rng.normal(80.0, 5.0, (samples, 2))
     speed[rng.random((samples, 2)) < 0.1] = np.nan
-    return Run("lossy and irregular", t_s, fan_data.random_stairs(rng, samples, 2), speed)
+    return Run("lossy and irregular", t_s, fan_data.stairs(rng, samples, 2), speed)
 
 
 def random_narx() -> Narx:
@@ -147,7 +152,7 @@ def test_a_twin_of_one_fan_serves_many_and_a_twin_of_two_does_not_serve_three() 
     three = fan_data.published_run(2, 15.0, fans=3)
     assert len(evaluate(one, [three]).per_fan) == 3
     two = train_twin([fan_data.published_run(1, 15.0, fans=2)], [], "physical", name="two")
-    with pytest.raises(TwinError, match="twin 'two' is of 2 fans, the runs of 3"):
+    with pytest.raises(TwinError, match="twin 'two' is of fans 0, 1, the runs of 0, 1, 2"):
         evaluate(two, [three])
 
 
@@ -182,10 +187,82 @@ def test_evaluate_tells_machines_of_other_grids_and_of_what_is_left(recorded: tu
 
 def test_evaluate_shows_a_row_for_each_fan_and_each_grid(recorded: tuple[Path, Path]) -> None:
     shown = fantwin("evaluate", *recorded, "--rate", "12.5", "--rate", "irregular").stdout
-    rows = [line.split("│")[1].strip() for line in shown.splitlines() if line.startswith("│")]
+    rows = re.findall(r"^ ([\d.]+ Hz|\d+|all|own|irregular) ", shown, re.MULTILINE)
     assert rows == ["0", "1", "all", "own", "12.5 Hz", "irregular"]
-    assert "free run: rmse" in shown.splitlines()[0]
+    assert "free run: rmse" in shown.splitlines()[1]
     assert "Hz" not in fantwin("evaluate", *recorded).stdout
+
+
+def test_evaluate_warns_as_the_report_does(recorded: tuple[Path, Path]) -> None:
+    evaluated = json.loads(fantwin("evaluate", *recorded, "--json").stdout)
+    reported = json.loads(fantwin("report", *recorded, "-o", recorded[0].parent / "page.html", "--json").stdout)
+    for said in ("warnings", "verdict", "headline"):
+        assert evaluated[said] == reported[said]
+    assert "two.mcap: used in training" in evaluated["warnings"][0]
+    assert fantwin("evaluate", *recorded).stderr.splitlines() == evaluated["warnings"]
+
+
+def test_numbers_beyond_reason_are_shown_whole_in_the_table_and_with_an_exponent() -> None:
+    wild = {"rmse": 3.21e14, "max_error": 123456.7, "r2": -4.56e18, "one_step_rmse": 8.7e300, "coverage_2_sigma": 0.0}
+    residual = {"ljung_box_p": 0.0, "cross_over_bound": -1.2e9}
+    told = {"speed_unit": "rpm", "fans": [{"fan": 63, **wild, "residual": residual}]}
+    console = Console(width=80)
+    with console.capture() as captured:
+        console.print(_fan_table(told))
+    shown = captured.get()
+    assert shown.split()[-8:] == ["63", "3.21e+14", "123457", "-4.56e+18", "8.7e+300", "0.0%", "<0.001", "-1.2e+09"]
+    assert "…" not in shown
+
+
+@pytest.fixture(scope="module")
+def tray(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recording of three fans that differ, and a twin of the first and the last."""
+    folder = tmp_path_factory.mktemp("tray")
+    recording = record(folder / "three.mcap", fan_data.rough_run(5, 15.0, fans=3))
+    record(folder / "two.mcap", fan_data.rough_run(5, 15.0, fans=2))
+    made = fantwin("train", recording, "--fans", "0,2", "--model", "physical", "-o", folder / "twin.onnx")
+    assert made.exit_code == 0, made.output
+    return folder
+
+
+def test_a_card_names_the_fans_it_is_of_and_a_fan_is_judged_by_its_own_parameters(tray: Path) -> None:
+    twin, recording = tray / "twin.onnx", tray / "three.mcap"
+    assert OnnxTwin(twin).card.training.fans == (0, 2)
+    both = json.loads(fantwin("evaluate", twin, recording, "--fans", "0,2", "--rate", "50", "--json").stdout)
+    last = json.loads(fantwin("evaluate", twin, recording, "--fans", "2", "--rate", "50", "--json").stdout)
+    assert last["fans"] == [both["fans"][1]]
+    assert last["grids"][0]["fans"] == [both["grids"][0]["fans"][1]]
+    page = tray / "page.html"
+    reported = json.loads(fantwin("report", twin, recording, "--fans", "2", "-o", page, "--json").stdout)
+    assert [fan["fan"] for fan in reported["fans"]] == [2]
+    assert reported["fans"][0]["rmse"] == last["rmse"]
+    parameters = OnnxTwin(twin).parameters
+    assert f'<data value="{parameters[1, 0]}">' in page.read_text()
+    assert f'<data value="{parameters[0, 0]}">' not in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("three.mcap",), "is of fans 0, 2, the runs of 0, 1, 2; choose its fans with --fans"),
+        (("three.mcap", "--fans", "0,1"), "is of fans 0, 2, the runs of 0, 1;"),
+        (("two.mcap",), "is of fans 0, 2, the runs of 0, 1;"),
+    ],
+)
+def test_where_the_fans_are_not_those_of_the_twin_one_line_says_so(tray: Path, arguments: tuple, words: str) -> None:
+    file, *options = arguments
+    assert words in said_instead("evaluate", tray / "twin.onnx", tray / file, *options)
+    assert words in said_instead("report", tray / "twin.onnx", tray / file, *options, "-o", tray / "none.html")
+
+
+def test_a_twin_made_before_cards_named_fans_is_still_read_and_serves_as_many(tray: Path) -> None:
+    training = {"trainer": "none", "physics": "fixed", "seed": 0, "iterations": 0, "duration_s": 0.0, "data": []}
+    old = write_twin(tray / "old.onnx", fans=2, training=training)
+    assert OnnxTwin(old).card.training.fans == ()
+    for options in (("two.mcap",), ("three.mcap", "--fans", "0,2")):
+        told = json.loads(fantwin("evaluate", old, tray / options[0], *options[1:], "--json").stdout)
+        assert len(told["fans"]) == 2
+    assert "is of 2 fans and does not say which" in said_instead("evaluate", old, tray / "two.mcap", "--fans", "1")
 
 
 @pytest.mark.parametrize("rate", ["0", "-50", "fast", "nan", "inf"])

@@ -64,7 +64,7 @@ def minute_of_commands() -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(9)
     step_s = rng.uniform(0.008, 0.012, MINUTE)
     step_s[100:110], step_s[2000] = 1e-7, 0.0
-    return fan_data.random_stairs(rng, MINUTE, FANS), step_s
+    return fan_data.stairs(rng, MINUTE, FANS), step_s
 
 
 def state_of(model: Model, command: np.ndarray) -> np.ndarray:

@@ -89,7 +89,7 @@ def controlled(
 def open_loop_commands(samples: int, fans: int) -> dict[str, Array]:
     """(samples, fans) commands given from outside, each kind predictable from its past in another way."""
     rng = np.random.default_rng(12)
-    stairs = fan_data.random_stairs(rng, samples, fans)
+    stairs = fan_data.stairs(rng, samples, fans)
     t_s = np.arange(samples)[:, None] * STEP_S
     frequency_hz, phase = rng.uniform(0.05, 0.5, (2, 1, fans)), rng.uniform(0.0, 2.0 * np.pi, (2, 1, fans))
     waves = np.sin(2.0 * np.pi * frequency_hz * t_s + phase)
@@ -170,13 +170,13 @@ def test_every_loop_at_one_set_point_is_noticed(controller) -> None:
     ids=named,
 )
 def test_every_proportional_loop_is_noticed_behind_steps_of_its_set_point(controller) -> None:
-    stairs = fan_data.random_stairs(np.random.default_rng(6), 3000, 20, 60.0, 180.0)
+    stairs = fan_data.stairs(np.random.default_rng(6), 3000, 20, 60.0, 180.0)
     run = controlled(stairs, seed=3, **controller)
     assert all(feedback_share([run], fan) > 0.0 for fan in range(run.fans))
 
 
 def test_feedback_far_weaker_than_the_excitation_is_passed_over_and_does_no_harm() -> None:
-    stairs = fan_data.random_stairs(np.random.default_rng(6), 4000, 8, 60.0, 180.0)
+    stairs = fan_data.stairs(np.random.default_rng(6), 4000, 8, 60.0, 180.0)
     run = controlled(stairs, seed=3, proportional=0.0)
     assert warnings_of(run) == ()
     np.testing.assert_allclose(identify([run]).parameters[:, 0].mean(), INERTIA, rtol=0.02)
@@ -200,7 +200,7 @@ def test_a_loop_at_one_set_point_is_told_with_what_is_biased_and_what_is_not_tol
 
 
 def test_a_narrow_range_of_speed_tells_only_the_sum_of_alpha_and_drag() -> None:
-    stairs = fan_data.random_stairs(np.random.default_rng(9), 4500, 4, 50.0, 70.0)
+    stairs = fan_data.stairs(np.random.default_rng(9), 4500, 4, 50.0, 70.0)
     apart = [line for line in warnings_of(commanded(stairs, seed=1, warm_up_s=5.0)) if "cannot be told apart" in line]
     assert len(apart) == 4
     for line in apart:

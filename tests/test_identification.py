@@ -7,7 +7,7 @@ import pytest
 from twin.errors import TwinError
 from twin.filtering import filter_between_samples
 from twin.identification import Identification, filtering_operator, identify
-from twin.lag import effective_command
+from twin.published_fan import published_fan
 from twin.runs import Run
 
 
@@ -54,15 +54,12 @@ def test_a_fan_that_physics_alone_do_not_describe_is_told(published) -> None:
 def test_a_lag_is_found_where_there_is_one_and_none_where_there_is_none(published) -> None:
     run, without = published
     assert np.count_nonzero(without.parameters[:, 3]) == 0
-    lagging, _ = effective_command(run.command, run.step_s[:, None], np.full(8, 0.03), run.command[0])
-    parameters = np.tile(fan_data.PUBLISHED, (8, 1))
-    rng = np.random.default_rng(0)
-    measured = fan_data.simulate(lambda w, u: fan_data.physics.acceleration(w, u, parameters), lagging, rng)
-    found = identify([Run("lagging", run.t_s, run.command, measured.speed_rad_s)])
+    lagging = published_fan(run.command, 0, "lagging", lag_s=0.03).run
+    found = identify([lagging])
     np.testing.assert_allclose(found.parameters[:, 3], 0.03, atol=0.004)
     assert np.all(np.abs(found.parameters[:, 3] - 0.03) < 4.0 * found.standard_errors[:, 3])
     np.testing.assert_allclose(found.parameters[:, 0], 0.15, rtol=0.02)
-    published_model = identify([Run("lagging", run.t_s, run.command, measured.speed_rad_s)], with_lag=False)
+    published_model = identify([lagging], with_lag=False)
     assert np.all(published_model.parameters[:, 3] == 0.0)
     assert np.all(published_model.rmse_rad_s > found.rmse_rad_s)
 
@@ -81,13 +78,9 @@ def test_standard_errors_predict_the_scatter_over_repeated_recordings() -> None:
 
 
 def test_the_filtering_operator_is_exact_without_noise() -> None:
-    command = fan_data.random_stairs(np.random.default_rng(3), 2000, 1)
-    run = fan_data.simulate(
-        lambda speed, u: fan_data.physics.acceleration(speed, u, fan_data.PUBLISHED),
-        command,
-        np.random.default_rng(0),
-        noise_rad_s=0.0,
-    )
+    command = fan_data.stairs(np.random.default_rng(3), 2000, 1)
+    simulated = published_fan(command, 0, "noisy")
+    run = Run("without noise", simulated.run.t_s, command, simulated.true_speed_rad_s)
     np.testing.assert_allclose(filtering_operator([run], 0, 2.0)[:3], fan_data.PUBLISHED_PARAMETERS, rtol=5e-3)
 
 
@@ -131,7 +124,7 @@ def test_a_command_that_never_changes_is_refused() -> None:
 
 
 def test_swapped_columns_of_a_dead_sensor_are_refused() -> None:
-    command = fan_data.random_stairs(np.random.default_rng(3), 500, 1)
+    command = fan_data.stairs(np.random.default_rng(3), 500, 1)
     t_s = np.arange(500) / 100.0
     with pytest.raises(TwinError, match="speed never changes"):
         identify([Run("stuck", t_s, command, np.full_like(command, 3.0))])
@@ -141,8 +134,7 @@ def test_swapped_columns_of_a_dead_sensor_are_refused() -> None:
 
 def test_two_nearby_levels_are_warned_about() -> None:
     rng = np.random.default_rng(4)
-    parameters = fan_data.PUBLISHED
     command = np.where(rng.random(10) < 0.5, 50.0, 51.0).repeat(100)[:, None]
-    run = fan_data.simulate(lambda speed, u: fan_data.physics.acceleration(speed, u, parameters), command, rng)
+    run = published_fan(command, 4, "two levels").run
     found = identify([run.between(2.0, 10.0)])
     assert any("poorly determined" in line or "negative" in line for line in found.warnings)

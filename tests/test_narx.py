@@ -39,7 +39,7 @@ def trained(run: Run, seed: int = 0, max_iterations: int = 25) -> Narx:
 
 def filter_start(time_constant: float, rng: np.random.Generator) -> tuple[Array, float]:
     """Starting weights on the noisy response of a low-pass filter to stairs, and their time constant."""
-    command = fan_data.random_stairs(rng, 4000, 1, -1.0, 1.0)[:, 0]
+    command = fan_data.stairs(rng, 4000, 1, -1.0, 1.0)[:, 0]
     clean = np.empty(4000)
     clean[0], kept = command[0], np.exp(-1.0 / time_constant)
     for k in range(3999):
@@ -89,7 +89,7 @@ def test_one_sample_at_a_time_gives_the_same_bits_as_one_block() -> None:
 
 def test_the_free_run_is_differentiated_exactly_by_every_weight() -> None:
     model = random_narx(0.3)
-    command = fan_data.random_stairs(np.random.default_rng(4), 120, 1)
+    command = fan_data.stairs(np.random.default_rng(4), 120, 1)
 
     def run(theta: Array) -> Array:
         state = model.state_layout.initial_state(np.array([20.0]), command[0])

@@ -7,6 +7,8 @@ import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -18,15 +20,21 @@ from tests.fan_data import PUBLISHED_PARAMETERS, published_run
 from tests.fantwin_command import fantwin, said_instead
 from tests.test_train_commands import record
 from twin.card import DataCard
+from twin.excitation import Staircase
+from twin.identification import identify
 from twin.onnx_twin import OnnxTwin
 from twin.physical import PhysicalModel
 from twin.physics import PARAMETER_NAMES
-from twin.report import Content, SpeedUnit, judge, report_content, report_page
-from twin.report.page import MOST_FANS_DRAWN, drawn_fans
+from twin.published_fan import published_fan
+from twin.report.content import Content, SpeedUnit, report_content
+from twin.report.figures import error_over_speed, histogram
+from twin.report.page import MOST_FANS_DRAWN, drawn_fans, report_page, shown
 from twin.report.speed_bins import speed_bins
 from twin.report.steady_states import static_curve
 from twin.report.timeline import broken_at, kept_samples, timeline
+from twin.report.verdict import judge
 from twin.runs import Run
+from twin.simulated_plant import FanParameters, Tacho, advance, at_rest
 
 SECTIONS = ["verdict", "figures", "parameters", "fan-0", "meaning", "card"]
 TITLES = [
@@ -287,6 +295,72 @@ def test_the_static_curve_is_where_torque_and_load_meet():
     assert len(static_curve(model, parameters, [shaken], 0, 100.0, 180.0).measured) == 0
 
 
+def test_a_staircase_of_two_and_a_half_seconds_a_step_tells_the_static_curve_of_the_simulated_tray():
+    profile, rng = Staircase(1, 1, 0.1, 0.95, hold_s=2.5), np.random.default_rng(1)
+    plant, tacho, state = FanParameters(), Tacho(), at_rest(1)
+    command = np.stack([profile.command(k / 100.0) for k in range(6000)])
+    speed = np.empty_like(command)
+    for k, duty in enumerate(command):
+        speed[k] = tacho.read(state.speed_rad_s, rng)
+        state = advance(state, duty, 0.01, plant)
+    run, top_rad_s = Run("staircase", np.arange(6000) / 100.0, command, speed), float(speed.max())
+    curve = static_curve(PhysicalModel(), identify([run]).parameters[0], [run], 0, 100.0, top_rad_s)
+    assert len(curve.holds) == 24
+    assert len(curve.measured) > 8
+    for duty, measured in curve.measured:
+        settled = at_rest(1)
+        for _ in range(2000):
+            settled = advance(settled, np.array([duty]), 0.01, plant)
+        assert measured == pytest.approx(settled.speed_rad_s[0], abs=0.02 * top_rad_s)
+
+
+def test_the_page_says_why_no_measured_point_is_on_the_static_curve(twin):
+    run = published_run(1, 10.0)
+    hasty = published_fan(np.where(np.arange(1000) // 10 % 2, 20.0, 80.0)[:, np.newaxis], 1, "hasty").run
+    never = report_page(content_of(twin, hasty))
+    assert re.search(r"the one that came nearest lasted 0\.\d+ s and needed \d", Page(never).text)
+    moving = Run("ramp", run.t_s, 10.0 * run.t_s, run.speed_rad_s)
+    assert "The command never held still" in Page(report_page(content_of(twin, moving))).text
+
+
+def test_a_band_that_is_too_wide_and_figures_of_few_errors_are_told(twin):
+    run = published_run(5, 30.0)
+    assert judge(content_of(twin, run)).warnings == ()
+    content = content_of(twin, run)
+    wide = replace(content, fans=(replace(content.fans[0], sigma_rad_s=2.0 * content.fans[0].sigma_rad_s),))
+    (line,) = judge(wide).warnings
+    assert line.startswith("This fan: the card's sigma is over 1.5 times what the errors scatter by")
+    assert judge(wide).level == "as declared"
+    (line,) = judge(content_of(twin, run.between(0.0, 0.9))).warnings
+    assert re.search(r"errors worth \d+ independent ones tell their rmse to 1\d% only", line)
+    healthy = replace(twin.card.healthy, independent_samples=(8.0,))
+    of_few = SimpleNamespace(card=replace(twin.card, healthy=healthy), path=twin.path)
+    (line,) = judge(replace(content, twin=cast("OnnxTwin", of_few))).warnings
+    assert "worth 8 independent ones: its sigma may be off by 25%" in line
+
+
+@pytest.mark.parametrize(
+    ("value", "form", "said"),
+    [
+        (38.449, ".4g", "38.45"),
+        (123456.7, ".4g", "123457"),
+        (3.2e9, ".4g", "3.2e+09"),
+        (-4.56e12, ".5f", "-4.56e+12"),
+        (120_000_000, ",d", "120,000,000"),
+        (np.inf, ".4g", "infinite"),
+        (None, ".1%", "undefined"),
+    ],
+)
+def test_numbers_are_whole_and_have_an_exponent_only_beyond_reason(value, form, said):
+    assert shown(value, form) == said
+
+
+def test_ticks_of_small_figures_leave_room_for_large_speeds(twin):
+    content = content_of(twin, published_run(2, 10.0), unit=SpeedUnit("rpm", np.pi / 30.0 / 50.0))
+    for drawn in (error_over_speed(content, content.fans[0]), histogram(content, content.fans[0])):
+        assert 2 <= len(re.findall(r'id="[^"]*-xtick_\d+"', drawn)) <= 6
+
+
 def test_errors_are_gathered_by_speed_and_few_samples_make_no_point():
     rng = np.random.default_rng(1)
     speed = rng.uniform(0.0, 100.0, 20_000)
@@ -303,7 +377,7 @@ def test_errors_are_gathered_by_speed_and_few_samples_make_no_point():
 
 def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
     twin, held_out = folder / "healthy.onnx", folder / "held-out.mcap"
-    assert "is of 2 fans, the runs of 3" in said_instead("report", folder / "two.onnx", folder / "three.mcap")
+    assert "is of fans 0, 1, the runs of 0, 1, 2" in said_instead("report", folder / "two.onnx", folder / "three.mcap")
     assert "no such file" in said_instead("report", tmp_path / "nowhere.onnx", held_out)
     assert "not an ONNX file" in said_instead("report", held_out, held_out)
     assert "cannot read the recording" in said_instead("report", twin, tmp_path / "nowhere.mcap")
@@ -345,3 +419,13 @@ def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(page, tm
         assert SMALLEST_TEXT_UNITS * figure["svgs"][0]["px_per_unit"] > 8.5, figure["title"]
     for left, _, width, _ in seen["tables"]:
         assert left + width <= seen["width"]
+
+
+@pytest.mark.parametrize("width_px", [900, 1280])
+def test_on_a_desk_no_table_has_to_be_scrolled(twin, tmp_path, width_px):
+    content = content_of(twin, published_run(2, 10.0), unit=SpeedUnit("rpm", np.pi / 30.0))
+    refined = tuple(replace(parameter, in_force=1.1 * parameter.value) for parameter in content.fans[0].parameters)
+    page = report_page(replace(content, fans=(replace(content.fans[0], parameters=refined),)))
+    seen = seen_in_browser(page, width_px, tmp_path)
+    for (_, _, width, _), needed in zip(seen["tables"], seen["needed"], strict=True):
+        assert needed <= np.ceil(width)

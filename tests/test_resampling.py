@@ -121,7 +121,7 @@ LINEAR = {"J": 0.15, "alpha": 0.3}
 def simulated(model: TwinModel, parameters: Array, seed: int = 8) -> Run:
     """40 s at 100 Hz of a fan that is as the model says, integrated in steps of 1 ms, with noise."""
     rng = np.random.default_rng(seed)
-    command = fan_data.random_stairs(rng, 4000, 1)
+    command = fan_data.stairs(rng, 4000, 1)
     start = model.state_layout.initial_state(np.zeros(1), command[0])
     speed, _ = model.advance(start, np.repeat(command, 10, axis=0), np.full(40_000, 0.001), parameters)
     noisy = speed[::10] + rng.normal(0.0, NOISE, command.shape)

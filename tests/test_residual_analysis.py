@@ -50,7 +50,7 @@ def oscillating(rng: np.random.Generator) -> Array:
 
 
 def stairs(rng: np.random.Generator) -> Array:
-    return fan_data.random_stairs(rng, SAMPLES, 1)[:, 0]
+    return fan_data.stairs(rng, SAMPLES, 1)[:, 0]
 
 
 def binary(rng: np.random.Generator) -> Array:

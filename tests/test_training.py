@@ -17,7 +17,7 @@ from twin.training import data_scaling
 
 @pytest.fixture(scope="module")
 def rough() -> tuple[Run, Run, Run]:
-    return fan_data.rough_run(1, 80.0), fan_data.rough_run(2, 20.0), fan_data.rough_run(3, 30.0)
+    return fan_data.rough_run(1, 160.0), fan_data.rough_run(2, 20.0), fan_data.rough_run(3, 30.0)
 
 
 @pytest.fixture(scope="module")

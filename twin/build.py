@@ -77,6 +77,7 @@ def train_twin(
     network_inputs: tuple[str, ...] = ("speed", "command"),
     physics: Physics = "refined",
     command_unit: str = "",
+    fan_numbers: Sequence[int] | None = None,
     data: Sequence[DataCard] = (),
     validation_data: Sequence[DataCard] = (),
     created: datetime | None = None,
@@ -88,12 +89,14 @@ def train_twin(
     figures. Empty: the training runs do, and the card says so. network_inputs: of the hybrid's and neural ODE's
     network. physics: whether a hybrid's physics are refined along with its network, or stay as they were identified.
     trainer "adam" leaves them as they were, and its weights are those that did best in training.
-    command_unit, data and validation_data (the files that the runs are from) and created (default: now) go into the
-    card. The same seed and runs give the same model.
+    fan_numbers (what the recordings call the runs' fans; default: counted from 0), command_unit, data and
+    validation_data (the files that the runs are from) and created (default: now) go into the card. The same seed and
+    runs give the same model.
     Raises TwinError when the runs do not tell the parameters, or the result cannot serve as a twin.
     """
     _require_known(kind, trainer)
     fans = common_fans([*runs, *validation_runs])
+    numbers = tuple(range(fans) if fan_numbers is None else fan_numbers)
     started_s = time.monotonic()
     identification = identify(runs)
     limit = max_iterations or (NARX_ITERATIONS if kind == "narx" else DEFAULT_ITERATIONS[trainer])
@@ -145,7 +148,7 @@ def train_twin(
         command_range=(float(commands.min()), float(commands.max())),
         rate_hz=1.0 / float(np.median(np.concatenate([np.diff(run.t_s) for run in runs]))),
         network=_network_card(model),
-        training=TrainingCard(trainer, moved, seed, iterations, round(duration_s, 3), tuple(data)),
+        training=TrainingCard(trainer, moved, seed, iterations, round(duration_s, 3), tuple(data), numbers),
         validation=_validation_card(
             validation.pooled, "held-out" if validation_runs else "training", tuple(validation_data)
         ),
@@ -155,22 +158,18 @@ def train_twin(
     return TrainedTwin(model, parameters, card, identification, validation)
 
 
-def evaluate(twin: str | Path | OnnxTwin | TrainedTwin, runs: Sequence[Run]) -> Evaluation:
+def evaluate(
+    twin: str | Path | OnnxTwin | TrainedTwin, runs: Sequence[Run], fan_numbers: Sequence[int] | None = None
+) -> Evaluation:
     """Figures of a twin, or of its file, on runs.
 
-    A twin of one fan serves any number of fans. Raises TwinError when the fan counts differ otherwise.
+    fan_numbers: what the recordings call the runs' fans, as card.Card.rows wants them. A twin of one fan serves any.
+    Raises TwinError when the fans do not fit.
     """
     loaded = OnnxTwin(twin) if isinstance(twin, str | Path) else twin
     model = loaded if isinstance(loaded, OnnxTwin) else loaded.model
-    fans, known = common_fans(runs), loaded.card.fans
-    if known not in (1, fans):
-        raise TwinError(
-            f"twin {loaded.card.name!r} is of {known} fans, the runs of {fans}; "
-            "give recordings of as many fans, or retrain"
-        )
-    parameters = np.broadcast_to(loaded.parameters, (fans, len(PARAMETER_NAMES)))
-    sigma_rad_s = np.broadcast_to(np.array(loaded.card.sigma_rad_s), (fans,))
-    return evaluate_model(model, parameters, sigma_rad_s, runs)
+    rows = loaded.card.rows(common_fans(runs), fan_numbers)
+    return evaluate_model(model, loaded.parameters[rows], np.array(loaded.card.sigma_rad_s)[rows], runs)
 
 
 def _require_known(kind: str, trainer: str) -> None:

@@ -1,6 +1,7 @@
 """The model card: what a twin is and how good it is, as JSON inside its ONNX file (metadata `fantwin.card`)."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, Literal
 
@@ -40,7 +41,8 @@ class DataCard:
 class TrainingCard:
     """How the twin was made.
 
-    physics: whether they were refined along with the network. duration_s: how long training took.
+    physics: whether they were refined along with the network. duration_s: how long training took. fans: the numbers
+    that the recordings give to the fans, in order; empty in files made before they were written down.
     """
 
     trainer: str
@@ -49,6 +51,7 @@ class TrainingCard:
     iterations: int
     duration_s: float
     data: tuple[DataCard, ...]
+    fans: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -116,6 +119,36 @@ class Card:
     command_unit: str
     speed_unit: Literal["rad/s"] = "rad/s"
     format_version: int = FORMAT_VERSION
+
+    @property
+    def fan_numbers(self) -> tuple[int, ...]:
+        """What the recordings call the fans; counted from 0 where the card does not say."""
+        return self.training.fans or tuple(range(self.fans))
+
+    def rows(self, fans: int, fan_numbers: Sequence[int] | None = None) -> list[int]:
+        """Which entries of the lists per fan are those of the fans of some runs.
+
+        fan_numbers: of the fans chosen from the recordings; without a choice it is all of them, counted from 0. A twin
+        of one fan serves any. Raises TwinError where it cannot be told which fan is which.
+        """
+        if self.fans == 1:
+            return [0] * fans
+        named, numbers = self.training.fans, tuple(fan_numbers or range(fans))
+        if not named and fans == self.fans:
+            return list(range(fans))
+        if numbers == named or (fan_numbers and set(numbers) <= set(named)):
+            return [named.index(number) for number in numbers]
+        of_runs = ", ".join(map(str, numbers))
+        if named:
+            of_twin = ", ".join(map(str, named))
+            raise TwinError(
+                f"twin {self.name!r} is of fans {of_twin}, the runs of {of_runs}; "
+                "choose its fans with --fans, or retrain"
+            )
+        raise TwinError(
+            f"twin {self.name!r} is of {self.fans} fans and does not say which, the runs of {of_runs}; "
+            "give recordings of as many fans, or retrain"
+        )
 
     def to_json(self) -> str:
         """One line of JSON."""

@@ -82,6 +82,7 @@ def contend(
     seed: int = 0,
     max_iterations: int | None = None,
     command_unit: str = "",
+    fan_numbers: Sequence[int] | None = None,
     data: Sequence[DataCard] = (),
     validation_data: Sequence[DataCard] = (),
     progress: Progress | None = None,
@@ -100,6 +101,7 @@ def contend(
             max_iterations=max_iterations,
             network_inputs=candidate.network_inputs,
             command_unit=command_unit,
+            fan_numbers=fan_numbers,
             data=data,
             validation_data=validation_data,
             progress=progress,
@@ -113,7 +115,7 @@ def contend(
         training_rmse_rad_s=pooled_rmse_rad_s(residual),
         training=None if validation_runs else trained.validation,
         held_out=trained.validation if validation_runs else None,
-        test=evaluate(trained, test_runs) if test_runs else None,
+        test=evaluate(trained, test_runs, fan_numbers) if test_runs else None,
     )
 
 

@@ -18,7 +18,6 @@ A fit costs by the sample: of long recordings, stretches of MAX_SAMPLES in all a
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -86,7 +85,8 @@ def draw_stretches(pieces: Sequence[Run], rng: np.random.Generator) -> list[Run]
     """
     single = [piece.fan(index) for piece in pieces for index in range(piece.fans)]
     if sum(run.samples for run in single) > MAX_SAMPLES:
-        single = [part for run in single for part in _equal_parts(run, MAX_SAMPLES // DRAWN_STRETCHES)]
+        samples = MAX_SAMPLES // DRAWN_STRETCHES
+        single = [run.rows(first, last) for run in single for first, last in run.equal_parts(samples)]
         single = [single[index] for index in rng.permutation(len(single))]
     usable = [run for run in single if np.isfinite(run.speed_rad_s).sum() >= 2]
     if not usable:
@@ -123,12 +123,6 @@ def leave_out_blocks(pieces: Sequence[Run]) -> tuple[list[Run], list[Run]]:
         judged = out | (count <= STARTING_SAMPLES)
         left_out.append(replace(piece, speed_rad_s=np.where(judged, piece.speed_rad_s, np.nan)))
     return kept, left_out
-
-
-def _equal_parts(run: Run, max_samples: int) -> list[Run]:
-    parts = -(-run.samples // max_samples)
-    cuts = np.linspace(0, run.samples, parts + 1).round().astype(int).tolist()
-    return [run.rows(first, last) for first, last in pairwise(cuts) if last - first >= 2]
 
 
 class _Fold:

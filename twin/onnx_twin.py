@@ -62,6 +62,10 @@ def _require_fit(path: Path, session: Any, card: Card) -> None:
             raise TwinError(f"{path}: {name} is {shape}, the card says (fans, {width}); export the twin again")
     if card.n_state != widths["state"] or [len(row) for row in card.parameters] != [widths["parameters"]] * card.fans:
         raise TwinError(f"{path}: n_state or parameters of the model card do not fit the rest; export the twin again")
+    if len(card.fan_numbers) != card.fans:
+        raise TwinError(
+            f"{path}: training.fans of the model card does not name {card.fans} fans; export the twin again"
+        )
 
 
 def _session(path: Path) -> Any:

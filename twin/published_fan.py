@@ -66,24 +66,33 @@ def published_test(seed: int, duration_s: float = 40.0) -> SimulatedRun:
     return published_fan(sum_of_sines(seed, duration_s, 1, *TEST_RANGE), seed, f"published test {seed}")
 
 
-def published_fan(command: Array, seed: int, name: str) -> SimulatedRun:
+def published_fan(command: Array, seed: int, name: str, *, lag_s: float = 0.0) -> SimulatedRun:
     """Fans alike under commands (n, fans) at 100 Hz, from standstill. The seed is that of the noise."""
-    return _measured(command, [(_published_torque, INERTIA, VISCOUS, DRAG)] * command.shape[1], 0.0, seed, name)
+    return _measured(command, [(_published_torque, INERTIA, VISCOUS, DRAG)] * command.shape[1], lag_s, seed, name)
 
 
 def rough_run(
-    seed: int, duration_s: float = 40.0, fans: int = 1, *, spread: float = 0.1, lag_s: float = 0.0
+    seed: int,
+    duration_s: float = 40.0,
+    fans: int = 1,
+    *,
+    spread: float = 0.1,
+    lag_s: float = 0.0,
+    low: float = ROUGH_RANGE[0],
 ) -> SimulatedRun:
-    """Rough fans under random stairs. spread: J, alpha and C_D go from -spread to +spread along several fans."""
+    """Rough fans under random stairs from low on. spread: J, alpha and C_D go from -spread to +spread along several."""
     scatter = 1.0 + spread * np.linspace(-1.0, 1.0, fans) if fans > 1 else np.ones(1)
     parts = [(_rough_torque, INERTIA * s, VISCOUS * s, DRAG * s) for s in scatter.tolist()]
-    return _measured(random_stairs(seed, duration_s, fans, *ROUGH_RANGE), parts, lag_s, seed, f"rough {seed}")
+    return _measured(random_stairs(seed, duration_s, fans, low, ROUGH_RANGE[1]), parts, lag_s, seed, f"rough {seed}")
 
 
 def random_stairs(seed: int, duration_s: float, fans: int, low: float, high: float) -> Array:
     """(n, fans) commands at 100 Hz that jump to a random level every 0.5 to 2 s, each fan on its own."""
-    rng = np.random.default_rng([seed, 0])
-    samples = round(duration_s * RATE_HZ)
+    return stairs(np.random.default_rng([seed, 0]), round(duration_s * RATE_HZ), fans, low, high)
+
+
+def stairs(rng: np.random.Generator, samples: int, fans: int, low: float, high: float) -> Array:
+    """(samples, fans): random_stairs, drawn from rng."""
     shortest, longest = (round(hold_s * RATE_HZ) for hold_s in STAIR_S)
     command = np.empty((samples, fans))
     for fan in range(fans):

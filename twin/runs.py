@@ -101,6 +101,12 @@ class Run:
         part = slice(first, last)
         return Run(self.name, self.t_s[part], self.command[part], self.speed_rad_s[part])
 
+    def equal_parts(self, max_samples: int) -> list[tuple[int, int]]:
+        """First and last row, for rows(), of about equal parts of at most max_samples; a lone sample is left out."""
+        count = -(-self.samples // max_samples)
+        cuts = np.linspace(0, self.samples, count + 1).astype(int).tolist()
+        return [(first, last) for first, last in pairwise(cuts) if last - first >= 2]
+
     def split_at_gaps(self, max_gap_s: float | None = None) -> list["Run"]:
         """The stretches between steps longer than max_gap_s (default: five median steps).
 

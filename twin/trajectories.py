@@ -6,7 +6,6 @@ treats stretches and fans alike as one batch. Each stretch has its own initial s
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +70,7 @@ def cut_into_trajectories(runs: Sequence[Run], max_samples: int) -> Trajectories
 
     The runs must not hold gaps (Run.split_at_gaps). Raises TwinError when nothing is left.
     """
-    parts = [(run, first, last) for run in runs for first, last in _equal_parts(run, max_samples)]
+    parts = [(run, first, last) for run in runs for first, last in run.equal_parts(max_samples)]
     length = max((last - first for _, first, last in parts), default=0)
     fans = runs[0].fans if runs else 0
     shape = (length, len(parts), fans)
@@ -111,9 +110,3 @@ def practical_samples(runs: Sequence[Run], at_most: int) -> int:
             break
         samples //= 2
     return samples
-
-
-def _equal_parts(run: Run, max_samples: int) -> list[tuple[int, int]]:
-    count = -(-run.samples // max_samples)
-    bounds = np.linspace(0, run.samples, count + 1).astype(int).tolist()
-    return [(a, b) for a, b in pairwise(bounds) if b - a >= 2]

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pipeline.commands.figures import figures_in, shown
 from pipeline.commands.model_maker import (
     FansOption,
     FromOption,
@@ -21,14 +22,13 @@ from pipeline.commands.model_maker import (
     ToOption,
     TrayOption,
     data_cards,
-    figures_in,
     made_folder,
     model_maker,
     read_held_out,
     read_material,
-    training_bars,
 )
 from pipeline.commands.options import JsonOption
+from pipeline.commands.progress import training_progress
 from pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def compare(
         validation_runs, test_runs = (part.runs if part else [] for part in (held_out, untouched))
         data, validation_data = data_cards(material), data_cards(held_out) if held_out else ()
         contenders = []
-        with training_bars(material) as start_bar:
+        with training_progress(material) as start:
             for candidate in chosen:
                 contender = contend(
                     candidate,
@@ -101,9 +101,10 @@ def compare(
                     seed=seed,
                     max_iterations=iterations,
                     command_unit=command_unit,
+                    fan_numbers=material.fans,
                     data=data,
                     validation_data=validation_data,
-                    progress=start_bar(candidate.said),
+                    progress=start(candidate.said),
                 )
                 if folder and contender.twin:
                     contender.twin.save(_file(folder, candidate))
@@ -156,29 +157,29 @@ def table(told: dict[str, Any]) -> Table:
     """The models side by side. Only the rmse is given for the data that they are not judged by."""
     source, unit = told["judged_on"], told["speed_unit"]
     sources = [name for name in ("held-out", "test") if any(name in m.get("figures", {}) for m in told["models"])]
-    shown = Table(box=box.SIMPLE_HEAD, padding=0, caption=f"rmse and error in {unit}", caption_justify="left")
-    shown.add_column("model", no_wrap=True)
+    rows = Table(box=box.SIMPLE_HEAD, padding=0, caption=f"rmse and error in {unit}", caption_justify="left")
+    rows.add_column("model", no_wrap=True)
     rmse = (SOURCE_HEADER[name] for name in sources)
     for header in ("para-\nmeters", "train\nrmse", *rmse, "max\nerror", "R2", "in\n±2σ", "1-step\nrmse", "train\ns"):
-        shown.add_column(header, justify="right", no_wrap=True)
+        rows.add_column(header, justify="right", no_wrap=True)
     for its in told["models"]:
         if its["why_not"]:
-            shown.add_row(escape(its["said"]), *("-" for _ in shown.columns[1:]))
+            rows.add_row(escape(its["said"]), *("-" for _ in rows.columns[1:]))
             continue
         figures, is_best = its["figures"][source], its["model"] == told["best"]
-        shown.add_row(
+        rows.add_row(
             escape(its["said"] + (" *" if is_best else "")),
             " + ".join(str(its[part]) for part in ("physical_parameters", "network_parameters") if its[part]),
-            _number(its["training_rmse"]),
-            *(_number(its["figures"][name]["rmse"]) for name in sources),
-            _number(figures["max_error"]),
-            _number(figures["r2"], ".4f"),
-            _number(figures["coverage_2_sigma"], ".1%"),
-            _number(figures["one_step_rmse"]),
+            shown(its["training_rmse"]),
+            *(shown(its["figures"][name]["rmse"]) for name in sources),
+            shown(figures["max_error"]),
+            shown(figures["r2"], ".4f"),
+            shown(figures["coverage_2_sigma"], ".1%"),
+            shown(figures["one_step_rmse"]),
             f"{its['training_s']:.1f}",
             style="bold" if is_best else "",
         )
-    return shown
+    return rows
 
 
 def _chosen(names: str | None) -> list[Candidate]:
@@ -201,9 +202,3 @@ def _write(path: Path, text: str) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}; name another folder with -o") from error
-
-
-def _number(value: float | None, form: str = ".4g") -> str:
-    if value is None:
-        return "undefined"
-    return f"{value:.0f}" if form == ".4g" and abs(value) >= 1e3 else format(value, form)

@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from pipeline.commands.figures import figures_in, sentence, shown
 from pipeline.commands.model_maker import (
     FansOption,
     FromOption,
@@ -19,12 +21,11 @@ from pipeline.commands.model_maker import (
     RecordingsArgument,
     ToOption,
     TrayOption,
-    figures_in,
+    data_cards,
     model_maker,
     read_material,
-    sentence,
 )
-from pipeline.commands.options import JsonOption
+from pipeline.commands.options import JsonOption, fan_numbers
 from pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from twin.evaluation import Evaluation
+    from twin.report.content import Content
+    from twin.report.verdict import Verdict
     from twin.resampling import Grid
     from twin.residual_analysis import ResidualAnalysis
 
@@ -63,28 +66,25 @@ def evaluate(
     grids: list[Grid] = [_grid(text) for text in rate or []]
     with model_maker():
         # The command line loads twin only when it is needed.
-        import numpy as np  # noqa: PLC0415
-
         from twin.build import evaluate as evaluate_twin  # noqa: PLC0415
-        from twin.evaluation import evaluation_pieces, free_run_residuals  # noqa: PLC0415
         from twin.onnx_twin import OnnxTwin  # noqa: PLC0415
+        from twin.report.content import SpeedUnit, report_content  # noqa: PLC0415
+        from twin.report.verdict import judge  # noqa: PLC0415
         from twin.resampling import on_grid  # noqa: PLC0415
-        from twin.residual_analysis import analyse_residual  # noqa: PLC0415
 
         loaded = OnnxTwin(twin)
         material = read_material(recordings, tray, fans, from_s, to_s)
-        evaluation = evaluate_twin(loaded, material.runs)
-        pieces = evaluation_pieces(material.runs)
-        parameters = np.broadcast_to(loaded.parameters, (pieces[0].fans, loaded.parameters.shape[1]))
-        analyses = analyse_residual(free_run_residuals(loaded, parameters, pieces), pieces)
+        unit = SpeedUnit(material.speed_unit, material.rad_s_per_unit)
+        content = report_content(loaded, material.runs, data_cards(material), unit, fan_numbers(fans))
+        judged = judge(content)
         on_grids: list[tuple[Grid, Evaluation]] = [
-            (grid, evaluate_twin(loaded, on_grid(material.runs, grid))) for grid in grids
+            (grid, evaluate_twin(loaded, on_grid(material.runs, grid), fan_numbers(fans))) for grid in grids
         ]
-    told = account(evaluation, analyses, on_grids, material)
+    told = account(content, judged, on_grids, material)
     if json_output:
         typer.echo(json.dumps(told))
         return
-    typer.echo(sentence(told, material.speed_unit))
+    typer.echo(f"{told['headline']}\n{sentence(told, material.speed_unit)}")
     console = Console()
     console.print(_fan_table(told))
     if grids:
@@ -94,28 +94,30 @@ def evaluate(
 
 
 def account(
-    evaluation: Evaluation,
-    analyses: tuple[ResidualAnalysis, ...],
+    content: Content,
+    judged: Verdict,
     on_grids: Sequence[tuple[Grid, Evaluation]],
     material: Material,
 ) -> dict[str, Any]:
     """What a machine is told of an evaluation; speeds in the recordings' own unit, None where a figure is undefined."""
     scale = material.rad_s_per_unit
 
-    def figures_of(judged: Evaluation) -> dict[str, Any]:
-        by_fan = zip(material.fans, judged.per_fan, strict=True)
-        return figures_in(judged.pooled, scale) | {
+    def figures_of(evaluation: Evaluation) -> dict[str, Any]:
+        by_fan = zip(material.fans, evaluation.per_fan, strict=True)
+        return figures_in(evaluation.pooled, scale) | {
             "fans": [{"fan": number} | figures_in(fan, scale) for number, fan in by_fan]
         }
 
-    told = figures_of(evaluation)
-    for fan, analysis in zip(told["fans"], analyses, strict=True):
-        fan["residual"] = residual_account(analysis, scale)
+    told = figures_of(content.evaluation)
+    for its, fan in zip(told["fans"], content.fans, strict=True):
+        its["residual"] = residual_account(fan.residual, scale)
     return told | {
         "speed_unit": material.speed_unit,
         "expected_coverage_2_sigma": EXPECTED_COVERAGE,
-        "warnings": material.named([]),
-        "grids": [{"rate": grid} | figures_of(judged) for grid, judged in on_grids],
+        "verdict": judged.level,
+        "headline": judged.headline,
+        "warnings": [*material.outliers, *judged.warnings],
+        "grids": [{"rate": grid} | figures_of(evaluation) for grid, evaluation in on_grids],
     }
 
 
@@ -155,7 +157,7 @@ def _grid(text: str) -> Grid:
 
 def _fan_table(told: dict[str, Any]) -> Table:
     unit = told["speed_unit"]
-    table = Table("fan")
+    table = _empty_table("fan")
     expected = f"in ±2σ\n({EXPECTED_COVERAGE:.1%})"
     for header in (
         f"rmse\n{unit}",
@@ -166,10 +168,10 @@ def _fan_table(told: dict[str, Any]) -> Table:
         "white p",
         "cross\n/ bound",
     ):
-        table.add_column(header, justify="right")
+        table.add_column(header, justify="right", no_wrap=True)
     for figures in told["fans"]:
         residual = figures["residual"]
-        tests = (_probability(residual["ljung_box_p"]), _shown(residual["cross_over_bound"], ".1f"))
+        tests = (_probability(residual["ljung_box_p"]), shown(residual["cross_over_bound"], ".1f", "-"))
         table.add_row(str(figures["fan"]), *_cells(figures), *tests)
     if len(told["fans"]) > 1:
         table.add_row("all", *_cells(told), "", "")
@@ -179,9 +181,9 @@ def _fan_table(told: dict[str, Any]) -> Table:
 def _grid_table(told: dict[str, Any]) -> Table:
     """Figures of all fans together on the recordings' own grid and on the others."""
     unit = told["speed_unit"]
-    table = Table("grid")
+    table = _empty_table("grid")
     for header in ("samples", f"rmse\n{unit}", f"max error\n{unit}", "R2", f"one step\n{unit}", "in ±2σ"):
-        table.add_column(header, justify="right")
+        table.add_column(header, justify="right", no_wrap=True)
     for grid in ({"rate": None} | told, *told["grids"]):
         rate = grid["rate"]
         name = "own" if rate is None else rate if rate == "irregular" else f"{rate:g} Hz"
@@ -191,15 +193,18 @@ def _grid_table(told: dict[str, Any]) -> Table:
 
 def _cells(figures: dict[str, Any]) -> tuple[str, ...]:
     formats = {"rmse": ".4g", "max_error": ".4g", "r2": ".4f", "one_step_rmse": ".4g", "coverage_2_sigma": ".1%"}
-    return tuple(_shown(figures[name], digits) for name, digits in formats.items())
+    return tuple(shown(figures[name], form, "-") for name, form in formats.items())
 
 
-def _shown(value: float | None, digits: str) -> str:
-    return "-" if value is None else format(value, digits)
+def _empty_table(first: str) -> Table:
+    """Narrow, so that numbers are whole on a terminal of 80 columns."""
+    table = Table(box=SIMPLE_HEAD, padding=0)
+    table.add_column(first, no_wrap=True)
+    return table
 
 
 def _probability(value: float | None) -> str:
-    return "<0.001" if value is not None and value < 0.001 else _shown(value, ".3f")
+    return "<0.001" if value is not None and value < 0.001 else shown(value, ".3f", "-")
 
 
 def _finite(value: float) -> float | None:

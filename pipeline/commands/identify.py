@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -24,6 +22,7 @@ from pipeline.commands.model_maker import (
     read_material,
 )
 from pipeline.commands.options import JsonOption
+from pipeline.commands.progress import working
 
 if TYPE_CHECKING:
     from twin.identification import Identification
@@ -56,7 +55,8 @@ def identify(
         from twin.identification import identify as identify_fans  # noqa: PLC0415  loads twin only when it is needed
 
         material = read_material(recordings, tray, fans, from_s, to_s)
-        with _spinner(material):
+        samples = sum(run.samples for run in material.runs)
+        with working(f"identifying {material.runs[0].fans} fan(s) from {samples:,} samples each"):
             found = identify_fans(material.runs)
     told = account(found, material)
     if json_output:
@@ -142,11 +142,3 @@ def _lag(fan: dict[str, Any]) -> str:
 
 def _with_interval(value: float, interval: list[float]) -> str:
     return f"{value:.4g}\n± {(interval[1] - interval[0]) / 2:.1g}"
-
-
-@contextmanager
-def _spinner(material: Material) -> Iterator[None]:
-    """Something that moves on stderr meanwhile; without a terminal it stays silent."""
-    samples = sum(run.samples for run in material.runs)
-    with Console(stderr=True).status(f"identifying {material.runs[0].fans} fan(s) from {samples:,} samples each"):
-        yield

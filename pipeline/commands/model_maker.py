@@ -1,19 +1,16 @@
-"""What the commands that build and judge twins share: recordings as runs, errors in one line, people's own units."""
+"""What the commands that build and judge twins share: recordings as runs, errors in one line."""
 
 from __future__ import annotations
 
 import hashlib
-import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pipeline.commands.options import fan_numbers
 from pipeline.errors import UserError
@@ -22,9 +19,7 @@ from pipeline.table import RAD_S_PER_TABLE_UNIT
 
 if TYPE_CHECKING:
     from twin.card import DataCard
-    from twin.evaluation import Figures
     from twin.runs import Run
-    from twin.training import Progress as ProgressCallback
 
 RecordingsArgument: TypeAlias = Annotated[
     list[Path], typer.Argument(metavar="REC.mcap...", help="Recordings; each counts its seconds from its own start.")
@@ -131,29 +126,6 @@ def data_cards(material: Material) -> list[DataCard]:
     ]
 
 
-@contextmanager
-def training_bars(material: Material) -> Iterator[Callable[[str], ProgressCallback]]:
-    """Gives what starts a bar on stderr for each training, by the name it is given. The bars go when all is done;
-    without a terminal they stay silent."""
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    console = Console(stderr=True)
-    with Progress(
-        *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
-    ) as bars:
-
-        def start(name: str) -> ProgressCallback:
-            said = f"{name}: " if name else ""
-            task = bars.add_task(f"{said}identifying", total=None)
-
-            def show(done: int, at_most: int, rmse_rad_s: float) -> None:
-                error = f"free-run rmse {rmse_rad_s / material.rad_s_per_unit:.4g} {material.speed_unit}"
-                bars.update(task, completed=done, total=at_most, description=said + error)
-
-            return show
-
-        yield start
-
-
 def read_held_out(
     material: Material, recordings: Sequence[Path], tray: str | None, fans: str | None, from_s: float, to_s: float
 ) -> Material:
@@ -206,30 +178,3 @@ def made_folder(folder: Path) -> Path:
     except OSError as error:
         raise UserError(f"{folder}: cannot be made: {error.strerror}; name another folder with -o") from error
     return folder
-
-
-def figures_in(figures: Figures, rad_s_per_unit: float) -> dict[str, float | int | None]:
-    """Figures for people and machines: speeds in a unit of theirs, None where a figure is undefined or infinite."""
-    values = {
-        "rmse": figures.rmse_rad_s / rad_s_per_unit,
-        "max_error": figures.max_error_rad_s / rad_s_per_unit,
-        "r2": figures.r2,
-        "one_step_rmse": figures.one_step_rmse_rad_s / rad_s_per_unit,
-        "coverage_2_sigma": figures.coverage_2_sigma,
-    }
-    return {name: value if math.isfinite(value) else None for name, value in values.items()} | {
-        "samples": figures.samples
-    }
-
-
-def sentence(figures: dict[str, Any], unit: str) -> str:
-    """Figures in a line."""
-
-    def shown(name: str, digits: str) -> str:
-        return "undefined" if figures[name] is None else format(figures[name], digits)
-
-    return (
-        f"free run: rmse {shown('rmse', '.4g')} {unit}, max error {shown('max_error', '.4g')} {unit}, "
-        f"R2 {shown('r2', '.4f')}, {shown('coverage_2_sigma', '.1%')} within 2 sigma; "
-        f"one step: rmse {shown('one_step_rmse', '.4g')} {unit}; {figures['samples']} samples"
-    )

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
+from pipeline.commands.figures import figures_in, sentence
 from pipeline.commands.model_maker import (
     FansOption,
     FromOption,
@@ -18,12 +18,11 @@ from pipeline.commands.model_maker import (
     TrayOption,
     check_writable,
     data_cards,
-    figures_in,
     model_maker,
     read_material,
-    sentence,
 )
 from pipeline.commands.options import JsonOption, fan_numbers
+from pipeline.commands.progress import working
 from pipeline.errors import UserError
 
 
@@ -46,17 +45,20 @@ def report(
 
     Example: fantwin report TWIN.onnx held-out.mcap -o report.html
     """
-    with model_maker(), Console(stderr=True).status(f"drawing {output}"):
+    with model_maker():
         from twin.onnx_twin import OnnxTwin  # noqa: PLC0415  the command line loads twin only when it is needed
-        from twin.report import SpeedUnit, judge, level_of, report_content, report_page  # noqa: PLC0415
+        from twin.report.content import SpeedUnit, report_content  # noqa: PLC0415
+        from twin.report.page import report_page  # noqa: PLC0415
+        from twin.report.verdict import judge, level_of  # noqa: PLC0415
 
         loaded = OnnxTwin(twin)
         check_writable(output, ".html")
         material = read_material(recordings, tray, fans, from_s, to_s)
         unit = SpeedUnit(material.speed_unit, material.rad_s_per_unit)
-        content = report_content(loaded, material.runs, data_cards(material), unit, fan_numbers(fans))
-        judged = judge(content)
-        page = report_page(content, judged)
+        with working(f"drawing {output}"):
+            content = report_content(loaded, material.runs, data_cards(material), unit, fan_numbers(fans))
+            judged = judge(content)
+            page = report_page(content, judged)
     try:
         output.write_text(page, encoding="utf-8")
     except OSError as error:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
+from pipeline.commands.figures import figures_in, sentence
 from pipeline.commands.model_maker import (
     FansOption,
     FromOption,
@@ -18,14 +19,12 @@ from pipeline.commands.model_maker import (
     TrayOption,
     check_writable,
     data_cards,
-    figures_in,
     model_maker,
     read_held_out,
     read_material,
-    sentence,
-    training_bars,
 )
 from pipeline.commands.options import JsonOption
+from pipeline.commands.progress import training_progress
 
 if TYPE_CHECKING:
     from twin.build import TrainedTwin
@@ -79,7 +78,7 @@ def train(
         check_writable(output, ".onnx")
         material = read_material(recordings, tray, fans, from_s, to_s)
         held_out = read_held_out(material, validate, tray, fans, validate_from_s, validate_to_s) if validate else None
-        with training_bars(material) as start_bar:
+        with training_progress(material) as start:
             trained = train_twin(
                 material.runs,
                 held_out.runs if held_out else [],
@@ -91,9 +90,10 @@ def train(
                 network_inputs=tuple(network_inputs.split(",")),
                 physics=physics,
                 command_unit=command_unit,
+                fan_numbers=material.fans,
                 data=data_cards(material),
                 validation_data=data_cards(held_out) if held_out else (),
-                progress=start_bar(""),
+                progress=start(""),
             )
         trained.save(output)
     told = account(trained, material, output)

@@ -10,7 +10,6 @@ from twin.card import Card, DataCard
 from twin.evaluation import Evaluation, Figures, evaluation_pieces, free_run_speeds
 from twin.onnx_twin import OnnxTwin
 from twin.report.speed_bins import SpeedBin, speed_bins
-from twin.report.steady_states import StaticCurve, static_curve
 from twin.report.timeline import Timeline, timeline
 from twin.residual_analysis import ResidualAnalysis, analyse_residual
 from twin.runs import Array, Run
@@ -42,10 +41,11 @@ class Parameter:
 class FanContent:
     """One fan. Arrays (n,) are in rad/s or command units, over all pieces one after the other.
 
-    number: as the recording counts fans. predicted_rad_s: NaN where the free run diverged. error_rad_s: measured minus
-    free run, NaN where nothing was measured, infinite where the free run diverged.
+    column: of the runs. number: as the recording counts fans. predicted_rad_s: NaN where the free run diverged.
+    error_rad_s: measured minus free run, NaN where nothing was measured, infinite where the free run diverged.
     """
 
+    column: int
     number: int
     figures: Figures
     sigma_rad_s: float
@@ -56,7 +56,6 @@ class FanContent:
     parameters: tuple[Parameter, ...]
     residual: ResidualAnalysis
     by_speed: tuple[SpeedBin, ...]
-    curve: StaticCurve
 
     @property
     def rmse_in_sigma(self) -> float:
@@ -68,14 +67,19 @@ class FanContent:
 class Content:
     """All that a page shows. recordings: the files judged, the name of one appearing in Timeline without its ending."""
 
-    file: str
-    card: Card
+    twin: OnnxTwin
+    pieces: tuple[Run, ...]
     unit: SpeedUnit
     recordings: tuple[DataCard, ...]
     evaluation: Evaluation
     timeline: Timeline
     rate_hz: float
     fans: tuple[FanContent, ...]
+
+    @property
+    def card(self) -> Card:
+        """The twin's."""
+        return self.twin.card
 
 
 def report_content(
@@ -85,18 +89,18 @@ def report_content(
     unit: SpeedUnit,
     fan_numbers: Sequence[int] | None = None,
 ) -> Content:
-    """Run the twin over the runs. recordings: the files that the runs came from. fan_numbers: of the runs' fans, where
-    they are not all of the recording's.
+    """Run the twin over the runs. recordings: the files that the runs came from. fan_numbers: see build.evaluate.
 
     Raises TwinError when the twin does not fit the runs, or there is nothing to evaluate.
     """
-    evaluation = evaluate(twin, runs)
+    evaluation = evaluate(twin, runs, fan_numbers)
     pieces = evaluation_pieces(runs)
     fans = pieces[0].fans
-    parameters = np.broadcast_to(twin.parameters, (fans, twin.parameters.shape[1]))
-    sigma_rad_s = np.broadcast_to(np.array(twin.card.sigma_rad_s), (fans,))
-    identified = np.broadcast_to(np.array(twin.card.identified_parameters), parameters.shape)
-    intervals_95 = np.broadcast_to(np.array(twin.card.parameter_interval_95), (*parameters.shape, 2))
+    rows = twin.card.rows(fans, fan_numbers)
+    parameters, sigma_rad_s = twin.parameters[rows], np.array(twin.card.sigma_rad_s)[rows]
+    identified, intervals_95 = (
+        np.array(of_card)[rows] for of_card in (twin.card.identified_parameters, twin.card.parameter_interval_95)
+    )
     command, measured = (
         np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("command", "speed_rad_s")
     )
@@ -105,8 +109,8 @@ def report_content(
     error = np.where(np.isfinite(measured) & ~np.isfinite(predicted), np.inf, measured - predicted)
     residuals = analyse_residual(error, pieces)
     return Content(
-        file=twin.path.name,
-        card=twin.card,
+        twin=twin,
+        pieces=tuple(pieces),
         unit=unit,
         recordings=tuple(recordings),
         evaluation=evaluation,
@@ -114,6 +118,7 @@ def report_content(
         rate_hz=1.0 / float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces]))),
         fans=tuple(
             FanContent(
+                column=fan,
                 number=fan_numbers[fan] if fan_numbers is not None else fan,
                 figures=evaluation.per_fan[fan],
                 sigma_rad_s=float(sigma_rad_s[fan]),
@@ -124,9 +129,6 @@ def report_content(
                 parameters=_parameters(twin.card, identified[fan], intervals_95[fan], parameters[fan]),
                 residual=residuals[fan],
                 by_speed=speed_bins(predicted[:, fan], error[:, fan]),
-                curve=static_curve(
-                    twin, parameters[fan], pieces, fan, twin.card.rate_hz, twin.card.speed_range_rad_s[1]
-                ),
             )
             for fan in range(fans)
         ),

@@ -13,6 +13,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from twin.report.content import Content, FanContent
+from twin.report.steady_states import StaticCurve
 from twin.report.timeline import broken_at, kept_samples
 from twin.runs import Array
 
@@ -34,6 +35,7 @@ STYLE: dict[Any, Any] = {
 }
 WIDE_IN, NARROW_IN, SMALL_IN = (11.5, 5.4), (4.2, 6.0), (4.0, 2.9)
 WIDE_COLUMNS, NARROW_COLUMNS = 500, 200
+MOST_TICKS = 5
 AROUND_PEAK_SAMPLES = 300
 HISTOGRAM_SIGMAS = 5.0
 HISTOGRAM_BINS = 50
@@ -74,8 +76,7 @@ def around_the_largest_error(content: Content, fan: FanContent) -> str:
     end = int(line.starts[piece + 1]) if piece + 1 < len(line.starts) else len(line.t_s)
     part = slice(first, min(end, peak + AROUND_PEAK_SAMPLES))
     t_s, twin, half = line.t_s[part], fan.predicted_rad_s[part] / each, 2.0 * fan.sigma_rad_s / each
-    with _figure(SMALL_IN) as figure:
-        axes = figure.subplots()
+    with _small_figure() as (figure, axes):
         axes.fill_between(t_s, twin - half, twin + half, color=BAND, lw=0, label="twin ± 2σ")
         axes.plot(t_s, fan.measured_rad_s[part] / each, **{**LINE, "lw": 0.8}, label="measured")
         axes.plot(t_s, twin, color=TWIN, lw=1.4, label="free run")
@@ -91,8 +92,7 @@ def histogram(content: Content, fan: FanContent) -> str:
     sigma = fan.sigma_rad_s / content.unit.rad_s
     error = fan.error_rad_s[np.isfinite(fan.error_rad_s)] / content.unit.rad_s
     reach = HISTOGRAM_SIGMAS * max(sigma, float(np.sqrt(np.mean(error**2))) if error.size else 0.0)
-    with _figure(SMALL_IN) as figure:
-        axes = figure.subplots()
+    with _small_figure() as (figure, axes):
         axes.axvspan(-2.0 * sigma, 2.0 * sigma, color=BAND, lw=0, alpha=0.6, label="± 2σ of the card")
         if error.size and reach > 0.0:
             inside = np.clip(error, -reach, reach)
@@ -117,8 +117,7 @@ def histogram(content: Content, fan: FanContent) -> str:
 def autocorrelation(fan: FanContent) -> str:
     """Of the error, with the bound that white noise keeps at 95 % of the lags."""
     its = fan.residual
-    with _figure(SMALL_IN) as figure:
-        axes = figure.subplots()
+    with _small_figure() as (figure, axes):
         _draw_correlation(axes, its.lags_s, its.autocorrelation, its.bound_95, "bound of white noise, 95 %")
         axes.set_xlim(0.0, its.lags_s[-1])
         axes.set_xlabel("lag (s)")
@@ -129,8 +128,7 @@ def autocorrelation(fan: FanContent) -> str:
 def cross_correlation(fan: FanContent) -> str:
     """Of the error with the command, with the bound that unrelated signals keep at 95 % of the lags."""
     its = fan.residual
-    with _figure(SMALL_IN) as figure:
-        axes = figure.subplots()
+    with _small_figure() as (figure, axes):
         bound = "bound of unrelated signals, 95 %"
         _draw_correlation(axes, its.cross_lags_s, its.cross_correlation, its.cross_bound_95, bound)
         axes.axvline(0.0, color="#888888", lw=0.6)
@@ -140,14 +138,13 @@ def cross_correlation(fan: FanContent) -> str:
         return _svg(figure, f"fan{fan.number}-cross", "Cross-correlation of the error with the command, with its bound")
 
 
-def static_curve(content: Content, fan: FanContent) -> str:
+def static_curve(content: Content, fan: FanContent, curve: StaticCurve) -> str:
     """Steady speeds over the command: the twin's, and the measured ones."""
     each, unit = content.unit.rad_s, content.card.command_unit
-    with _figure(SMALL_IN) as figure:
-        axes = figure.subplots()
-        axes.plot(fan.curve.twin[:, 0], fan.curve.twin[:, 1] / each, color=TWIN, lw=1.4, label="twin, settled")
-        if len(fan.curve.measured):
-            command, speed = fan.curve.measured.T
+    with _small_figure() as (figure, axes):
+        axes.plot(curve.twin[:, 0], curve.twin[:, 1] / each, color=TWIN, lw=1.4, label="twin, settled")
+        if len(curve.measured):
+            command, speed = curve.measured.T
             axes.plot(command, speed / each, "o", ms=3.5, mfc="none", color=MEASURED, label="measured, settled")
         axes.set_xlabel(f"command ({unit})" if unit else "command")
         axes.set_ylabel(f"speed ({content.unit.name})")
@@ -159,8 +156,7 @@ def error_over_speed(content: Content, fan: FanContent) -> str:
     """Mean and spread of the error over the twin's speed: where in its range the twin is off."""
     each = content.unit.rad_s
     half = 2.0 * fan.sigma_rad_s / each
-    with _figure(SMALL_IN) as figure:
-        axes = figure.subplots()
+    with _small_figure() as (figure, axes):
         axes.axhspan(-half, half, color=BAND, lw=0, alpha=0.6, label="± 2σ of the card")
         axes.axhline(0.0, color="#888888", lw=0.6)
         middle, mean, spread = (
@@ -231,6 +227,15 @@ def _figure(size_in: tuple[float, float]) -> Iterator[Figure]:
         figure = Figure(figsize=size_in, layout="constrained")
         FigureCanvasSVG(figure)
         yield figure
+
+
+@contextmanager
+def _small_figure() -> Iterator[tuple[Figure, Axes]]:
+    """With so few ticks along x that labels of five digits and a sign stay apart."""
+    with _figure(SMALL_IN) as figure:
+        axes = figure.subplots()
+        axes.locator_params(axis="x", nbins=MOST_TICKS)
+        yield figure, axes
 
 
 def _svg(figure: Figure, name: str, described: str) -> str:

@@ -5,16 +5,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
+import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from twin.report import figures
 from twin.report.content import Content, FanContent
+from twin.report.steady_states import StaticCurve, static_curve
 from twin.report.verdict import AS_DECLARED, LOOSER, PHYSICS_USED, Verdict, judge, level_of
 from twin.residual_analysis import SIGNIFICANCE
 
 MOST_FANS_DRAWN = 12
 FOUR_DIGITS = ".4g"
+BEYOND_REASON = 1e7
 
 KIND_SAID = {"physical": "physical", "narx": "NARX", "neural-ode": "neural ODE", "hybrid": "hybrid"}
 PARAMETER_SAID = {
@@ -71,7 +74,14 @@ def drawn_fans(fans: Sequence[FanContent]) -> list[FanContent]:
 
 def fan_figures(content: Content, fan: FanContent) -> list[Figure]:
     """The figures of one fan, the one over time first."""
-    holds = len(fan.curve.measured)
+    curve = static_curve(
+        content.twin,
+        np.array([parameter.in_force for parameter in fan.parameters]),
+        content.pieces,
+        fan.column,
+        content.card.rate_hz,
+        content.card.speed_range_rad_s[1],
+    )
     return [
         Figure(
             "Fit and error over time",
@@ -105,13 +115,8 @@ def fan_figures(content: Content, fan: FanContent) -> list[Figure]:
         ),
         Figure(
             "Static curve",
-            "The speed at which twin and fan settle. "
-            + (
-                f"{holds} holds of the command were long enough to settle."
-                if holds
-                else "No hold of the command was long enough for the fan to settle."
-            ),
-            figures.static_curve(content, fan),
+            f"The speed at which twin and fan settle. {_holds(curve)}",
+            figures.static_curve(content, fan, curve),
         ),
         Figure(
             "Error over speed",
@@ -133,6 +138,18 @@ def _how_time_is_drawn(content: Content) -> str:
     return " ".join(said)
 
 
+def _holds(curve: StaticCurve) -> str:
+    if settled := len(curve.measured):
+        return f"{settled} of {len(curve.holds)} holds of the command were long enough to settle."
+    if not curve.holds:
+        return "The command never held still, so nothing measured can be shown."
+    nearest = min(curve.holds, key=lambda hold: hold.needed_s - hold.lasted_s)
+    return (
+        "No hold of the command was long enough for the fan to settle: the one that came nearest lasted "
+        f"{nearest.lasted_s:.2g} s and needed {nearest.needed_s:.2g} s."
+    )
+
+
 def _whiteness(fan: FanContent) -> str:
     p = fan.residual.ljung_box_p
     if math.isnan(p):
@@ -143,9 +160,11 @@ def _whiteness(fan: FanContent) -> str:
 
 
 def shown(value: float | None, form: str = FOUR_DIGITS) -> str:
-    """A number for people, large ones without an exponent; what is undefined or infinite is said in words."""
+    """A number for people, with an exponent only beyond reason; what is undefined or infinite is said in words."""
     if value is None or math.isnan(value):
         return "undefined"
     if math.isinf(value):
         return "infinite"
-    return f"{value:.0f}" if form == FOUR_DIGITS and 1e3 <= abs(value) < 1e7 else format(value, form)
+    if abs(value) >= BEYOND_REASON and not form.endswith("d"):
+        return f"{value:.3g}"
+    return f"{value:.0f}" if form == FOUR_DIGITS and abs(value) >= 1e3 else format(value, form)

@@ -27,6 +27,10 @@ OFTEN_MISSING = 0.1
 CHANCE_PEAK = 2.0
 BIASED_IN_SIGMA, BIASED_IN_ERRORS = 0.2, 3.0
 BIASED_AT_A_SPEED_IN_SIGMA = 1.0
+WIDE_BAND = 1.5
+"""A card's sigma is wide when it exceeds the standard deviation of the errors by this factor."""
+FEW_INDEPENDENT = 0.5 / (AS_DECLARED - 1.0) ** 2
+"""Fewer independent errors than these tell their rmse, to 1 / sqrt(2 n), worse than the margin of as declared."""
 
 PHYSICS_USED: dict[Kind, tuple[str, ...]] = {
     "physical": ("J", "alpha", "C_D", "lag_s"),
@@ -74,6 +78,11 @@ def _about_the_data(content: Content) -> Iterable[str]:
         yield f"{', '.join(seen)}: used in training, wholly or in part; over that part these figures flatter."
     if card.validation.source == "training":
         yield "The band rests on the error over the training data, so it may be too narrow: train with --validate."
+    if few := [n for n in card.healthy.independent_samples if n is not None and n < FEW_INDEPENDENT]:
+        yield (
+            f"The band rests on errors worth {min(few):.0f} independent ones: its sigma may be off by "
+            f"{_uncertainty(min(few)):.0%}; validate on longer recordings."
+        )
     if card.fans == 1 and len(content.fans) > 1:
         yield f"A twin of one fan judges {len(content.fans)}: fans differ, and so may what they leave."
     low, high = card.command_range
@@ -99,6 +108,16 @@ def _about_the_data(content: Content) -> Iterable[str]:
 def _about_the_fit(content: Content) -> Iterable[str]:
     yield from _of_fans(content, _unmeasured, "no speed was measured")
     yield from _of_fans(content, _diverged, "the free run diverges")
+    yield from _of_fans(
+        content, _wide_band, f"the card's sigma is over {WIDE_BAND:g} times what the errors scatter by, so the verdict "
+        "is generous"
+    )  # fmt: skip
+    if few := [fan for fan in content.fans if _few(fan)]:
+        fewest = min(_independent(fan) for fan in few)
+        yield (
+            f"{_these(few, content).capitalize()}: errors worth {fewest:.0f} independent ones tell their rmse to "
+            f"{_uncertainty(fewest):.0%} only; judge by longer recordings."
+        )
     yield from _of_fans(content, _biased, "on average faster or slower than the twin")
     yield from _of_fans(
         content, _biased_at_a_speed, "at some speeds off by more than sigma on average; see Error over speed"
@@ -137,6 +156,25 @@ def _unmeasured(fan: FanContent) -> bool:
 
 def _diverged(fan: FanContent) -> bool:
     return bool(np.any(np.isinf(fan.error_rad_s)))
+
+
+def _wide_band(fan: FanContent) -> bool:
+    errors = fan.error_rad_s[np.isfinite(fan.error_rad_s)]
+    return bool(errors.size and fan.sigma_rad_s > WIDE_BAND * errors.std())
+
+
+def _few(fan: FanContent) -> bool:
+    return not (_unmeasured(fan) or _diverged(fan)) and _independent(fan) < FEW_INDEPENDENT
+
+
+def _independent(fan: FanContent) -> float:
+    """How many independent errors the fan's are worth; one, where they are too few to tell."""
+    return float(np.nan_to_num(fan.residual.independent_samples, nan=1.0))
+
+
+def _uncertainty(independent: float) -> float:
+    """Relative, one standard deviation, of a root mean square of so many independent normal errors."""
+    return float(1.0 / np.sqrt(2.0 * independent))
 
 
 def _biased(fan: FanContent) -> bool:
