@@ -1,4 +1,4 @@
-"""How a view is laid out in Rerun: a tab for each tray, a plot for each fan, state lanes, logs.
+"""How a view is laid out in Rerun: a tab for each tray, a plot for each fan, state lanes, alarms; and the stages.
 
 Measured with Rerun 0.41; see docs/viewing.md. The only modules that import rerun are this, `rerun_sink` and
 `rerun_picture`.
@@ -18,6 +18,7 @@ from pipeline.config import SpeedUnit
 from pipeline.trace import state_names
 
 TIMELINE = "time"
+STAGES_PATH = "stages"
 FANS_ON_A_PAGE = 8  # a page of a hundred plots is drawn seven times a second only
 MARGIN_FOR_LEGEND = {1: 0.12, 2: 0.25, 4: 0.45}  # columns of plots -> share of the window kept free at its right
 
@@ -49,9 +50,9 @@ def state_path(tray: str, fan: int) -> str:
     return f"{tray}/state/fan_{fan}"
 
 
-def log_path(where: str) -> str:
-    """Entity of a log: of a tray, or of the `stages`."""
-    return f"{where}/log"
+def log_path(tray: str) -> str:
+    """Entity of a tray's log."""
+    return f"{tray}/log"
 
 
 def speed_style(unit: SpeedUnit, width: float) -> rr.Measurements:
@@ -92,7 +93,7 @@ def blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_picture: bool
     and nothing in it is later than the cursor."""
     tabs: list[rrb.Container | rrb.View] = [_tray_tab(tray, window_s, for_picture) for tray in trays]
     if not for_picture:
-        tabs.append(_log_view("stages", "stages"))
+        tabs.append(rrb.TextDocumentView(origin=f"/{STAGES_PATH}", name="stages"))
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else tabs[0],
         rrb.TopPanel(state="hidden" if for_picture else "expanded"),
@@ -123,7 +124,7 @@ def _page(tray: TrayLayout, fans: Sequence[int], window_s: float, for_picture: b
     lane_share = (1.7 + len(fans)) / 24
     return rrb.Vertical(
         rrb.Grid(*(_fan_view(tray, fan, axis, past) for fan in fans), grid_columns=columns),
-        rrb.Horizontal(lanes, _log_view(tray.name, f"{tray.name} / alarm log"), column_shares=[3, 2]),
+        rrb.Horizontal(lanes, _log_view(tray.name), column_shares=[3, 2]),
         row_shares=[1 - lane_share, lane_share],
         name=name,
     )
@@ -144,10 +145,10 @@ def _fan_view(tray: TrayLayout, fan: int, axis: rrb.TimeAxis, past: rrb.VisibleT
     )
 
 
-def _log_view(where: str, name: str) -> rrb.TextLogView:
+def _log_view(tray: str) -> rrb.TextLogView:
     return rrb.TextLogView(
-        origin=f"/{log_path(where)}",
-        name=name,
+        origin=f"/{log_path(tray)}",
+        name=f"{tray} / alarm log",
         columns=TextLogColumns(
             timeline_columns=[TimelineColumn(TIMELINE, visible=False)],  # too narrow to read: lines bear their time
             text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],

@@ -22,7 +22,16 @@ import rerun as rr
 
 from pipeline.config import TrayConfig
 from pipeline.loopback import LOOPBACK, check_free
-from pipeline.rerun_layout import TIMELINE, TrayLayout, blueprint, fan_path, log_path, log_styles, state_path
+from pipeline.rerun_layout import (
+    STAGES_PATH,
+    TIMELINE,
+    TrayLayout,
+    blueprint,
+    fan_path,
+    log_path,
+    log_styles,
+    state_path,
+)
 from pipeline.stage import StageError
 from pipeline.trace import Trace
 from schemas.messages import Array
@@ -108,11 +117,15 @@ class RerunSink:
         """Colour a fan's lane from each time on."""
         self._send(state_path(tray, fan), t_ns, rr.StateChange.columns(state=list(names)))
 
-    def log(self, where: str, t_ns: int, level: str, text: str) -> None:
-        """Add a line to the log of a tray or of the `stages`, with its time of day (UTC)."""
+    def log(self, tray: str, t_ns: int, level: str, text: str) -> None:
+        """Add a line to the log of a tray, with its time of day (UTC)."""
         times = np.array([t_ns])
         clock = np.datetime_as_string(times.astype("datetime64[ns]"), unit="ms")[0].split("T")[1]
-        self._send(log_path(where), times, rr.TextLog.columns(text=[f"{clock}  {text}"], level=[level]))
+        self._send(log_path(tray), times, rr.TextLog.columns(text=[f"{clock}  {text}"], level=[level]))
+
+    def show_stages(self, page: str) -> None:
+        """Replace the page on the stages. It has no time, so it moves no cursor that follows the newest time."""
+        self._recording.log(STAGES_PATH, rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN), static=True)
 
     def flush(self) -> None:
         """Hand everything to the system: it outlives this process, however that ends."""

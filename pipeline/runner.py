@@ -17,13 +17,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from pipeline.bus import Bus, Outlet
+from pipeline.clock import REPLAY, StageClock, is_of_replay
 from pipeline.config import Config
 from pipeline.errors import UserError
 from pipeline.health import HealthBook, lost
 from pipeline.inlet import Inlet
 from pipeline.stage import Context, Packet, Parts, Stage
 from schemas.codec import CodecError, decode, encode, type_name
-from schemas.messages import Cause, Header, Health, Message, Output, StageStatus
+from schemas.messages import Cause, Clock, Header, Health, Message, Output, StageStatus
 from schemas.topics import BY_NAME, TOPICS, alive_key, health_key, topic_of, tray_key
 
 INBOX_SIZE = 4096
@@ -143,6 +144,8 @@ class Runner:
             if stage.core_per_tray
             else {"": stage.build(context)}
         )
+        self._has_source = any(parts.source for parts in self._parts.values())
+        self._clock = StageClock()
         self._bus = Bus(config.bus, stop)
         self._inlet = Inlet(None if stage.may_drop else self._recover)
         self._outlets: dict[tuple[str, str], Outlet] = {
@@ -166,6 +169,9 @@ class Runner:
         """Run to the end and give the last health. Whatever happens, the cores are closed and it is published."""
         for key in sorted(self._read_keys):
             self._bus.subscribe(key, self._on_bus)
+        if self.stage.core_per_tray and not self._has_source:  # a core of all trays has no one tray's time
+            for tray in self._parts:
+                self._bus.subscribe(tray_key(self._site, tray, "clock"), self._on_bus)
         self._bus.subscribe(health_key(self._site, "*", "*"), self._on_bus)
         self._bus.watch_alive(alive_key(self._site, "*", "*"), lambda key, alive: self._inbox.put(_Alive(key, alive)))
         try:
@@ -203,7 +209,7 @@ class Runner:
             if now >= next_tick:
                 next_tick = now + TICK_S
                 for tray, parts in self._parts.items():
-                    self._publish(tray, parts.core.tick(time.time_ns()), by_time=True)
+                    self._publish(tray, parts.core.tick(self._clock.tick_ns(tray)), by_time=True)
                 if now >= next_health or (now >= next_loss and self._lost() > told):
                     next_health, next_loss = now + HEALTH_PERIOD_S, now + LOSS_TOLD_S
                     told = self._publish_health(StageStatus.OK).lost
@@ -261,6 +267,8 @@ class Runner:
                 return
             if isinstance(packet.message, Health):
                 self._note_health(packet)
+            elif isinstance(packet.message, Clock):
+                self._clock.note(packet.message, packet.received_t_ns)
             else:
                 for due in self._inlet.accept(packet):
                     self._step(due)
@@ -280,9 +288,10 @@ class Runner:
             self._counts["unknown_tray"] += 1
             return
         header = packet.message.header
-        before = self._taken.get(tray)
-        taken = before.taken + 1 if before else 1
-        self._taken[tray] = Cause(packet.topic, header.producer, header.sequence, taken)
+        if self._has_source and is_of_replay(header.producer):  # a recorded command must not drive a fan of today
+            self._counts["refused_of_replay"] += 1
+            return
+        self._taken[tray] = Cause.after(self._taken.get(tray), packet.topic, header)
         self._publish(tray, parts.core.step(packet if self.stage.wants_packets else packet.message))
 
     def _note_alive(self, change: _Alive) -> None:
@@ -291,12 +300,16 @@ class Runner:
             self._left.pop(change.key, None)
         else:
             self._alive.discard(change.key)
+            if change.key == alive_key(self._site, REPLAY, "all"):
+                self._clock.forget()
             self._left[change.key] = time.monotonic()
 
     def _note_health(self, packet: Packet) -> None:
         health = packet.message
         assert isinstance(health, Health)
         self._last_health[alive_key(self._site, health.stage, health.instance)] = health
+        if health.stage == REPLAY and health.status == StageStatus.STOPPED:
+            self._clock.forget()
         for due in self._inlet.reconcile(health, self._read_keys):
             self._step(due)
         if "health" in self.stage.reads:
@@ -323,14 +336,16 @@ class Runner:
         return self._bus.outlet(key, BY_NAME[topic], type_name(BY_NAME[topic].message), self.producer)
 
     def _publish(self, tray: str, messages: Sequence[Message], *, by_time: bool = False) -> None:
-        cause = self._taken.get(tray) if messages else None
+        # what comes of a device is made of nothing that came over the bus
+        cause = self._taken.get(tray) if messages and not self._has_source else None
         if cause and by_time:
             cause = replace(cause, by_time=True)
         for message in messages:
             outlet = self._outlets[tray, _TOPIC_NAMES[type(message)]]
             stamped = replace(message, header=Header(self.producer, outlet.published, tray, cause))
             outlet.put(encode(stamped))
-            self._health.note_output(stamped, time.time_ns())
+            if (now_ns := self._clock.now_ns(tray)) is not None:
+                self._health.note_output(stamped, now_ns)
 
     def _counters(self) -> Counter[str]:
         counters: Counter[str] = Counter(self._counts)

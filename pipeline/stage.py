@@ -47,7 +47,7 @@ class Core(Protocol):
         ...
 
     def tick(self, now_ns: int) -> Sequence[Message]:
-        """Called about every 50 ms of host time."""
+        """Called about every 50 ms; `now_ns` is the host's time, or a replay's while one feeds the stage."""
         return ()
 
     def close(self) -> Sequence[Message]:

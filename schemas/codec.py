@@ -7,7 +7,7 @@ out is standard protobuf that any reader decodes with `fan.proto`.
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any, get_args
 
 import numpy as np
@@ -17,6 +17,7 @@ from google.protobuf.message import Message as ProtoMessage
 from schemas import fan_pb2
 from schemas.messages import (
     MESSAGE_TYPES,
+    Array,
     Cause,
     Counter,
     FanState,
@@ -39,10 +40,21 @@ _OF_SOME_DEVICES = {"device_clock_us", "device_sequence"}  # the only columns of
 LARGEST_STEP_NS = 86_400_000_000_000  # a day
 FURTHEST_T_NS = (1 << 62) - LARGEST_STEP_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits
 _FURTHEST = {"host_receive_t_ns": FURTHEST_T_NS, "t_ns": 1 << 62}  # the grid may go a little beyond what was received
-_COLUMNS = {t: columns(t) for t in MESSAGE_TYPES}
+_FEW = 48  # up to so many values a list is a quicker way into an array than the protobuf field itself
 _SCALARS = {
     t: tuple(f.name for f in fields(t) if "shape" not in f.metadata and f.name != "header") for t in MESSAGE_TYPES
 }
+
+
+@dataclass(frozen=True, slots=True)
+class _Column:
+    """What is known of a column before any message is there."""
+
+    name: str
+    shape: str
+    dtype: np.dtype[Any]
+    key: bytes  # of its packed field
+    limits: tuple[int, int] | None  # of its values, for times and enums
 
 
 class CodecError(ValueError):
@@ -68,13 +80,21 @@ def _varint(value: int) -> bytes:
     return bytes(out)
 
 
-_KEYS = {
-    t: {
-        name: _varint(proto_type(t).DESCRIPTOR.fields_by_name[name].number << 3 | _LENGTH_DELIMITED)
-        for name in _COLUMNS[t]
-    }
-    for t in MESSAGE_TYPES
-}
+def _limits(name: str) -> tuple[int, int] | None:
+    if name in _FURTHEST:
+        return 1 - _FURTHEST[name], _FURTHEST[name] - 1
+    return (0, _ENUM_COLUMNS[name]) if name in _ENUM_COLUMNS else None
+
+
+def _columns(message_type: type[Message]) -> tuple[_Column, ...]:
+    numbers = {f.name: f.number for f in proto_type(message_type).DESCRIPTOR.fields}
+    return tuple(
+        _Column(name, shape, dtype, _varint(numbers[name] << 3 | _LENGTH_DELIMITED), _limits(name))
+        for name, (shape, dtype) in columns(message_type).items()
+    )
+
+
+_COLUMNS = {t: _columns(t) for t in MESSAGE_TYPES}
 
 
 def encode(message: Message) -> bytes:
@@ -94,6 +114,7 @@ def encode(message: Message) -> bytes:
         proto.header.cause.producer = cause.producer
         proto.header.cause.sequence = cause.sequence
         proto.header.cause.taken = cause.taken
+        proto.header.cause.since = cause.since
         proto.header.cause.by_time = cause.by_time
     for name in _SCALARS[kind]:
         value = getattr(message, name)
@@ -104,13 +125,15 @@ def encode(message: Message) -> bytes:
             setattr(proto, name, value)
     parts = [proto.SerializeToString()]
     samples = _sample_count(message)
-    for name, (shape, dtype) in _COLUMNS[kind].items():
-        column = np.asarray(getattr(message, name), dtype=dtype.newbyteorder("<"))
-        _check_column(message, name, column, shape, samples)
-        if column.size == 0:
+    for column in _COLUMNS[kind]:
+        values = np.asarray(getattr(message, column.name), dtype=column.dtype.newbyteorder("<"))
+        if values.size and column.name in _FURTHEST:
+            _check_limits(kind, column, values)
+        _check_shape(message, column, values, samples, getattr(message, "fans", values.size))
+        if values.size == 0:
             continue
-        data = column.tobytes()
-        parts += (_KEYS[kind][name], _varint(len(data)), data)
+        data = values.tobytes()
+        parts += (column.key, _varint(len(data)), data)
     return b"".join(parts)
 
 
@@ -120,14 +143,11 @@ def decode(message_type: type[Message], data: bytes) -> Message:
     Raises:
         CodecError: the bytes are not such a message.
     """
-    proto: Any = proto_type(message_type)()
     try:
-        proto.ParseFromString(data)
+        proto: Any = proto_type(message_type).FromString(data)
     except DecodeError as error:
         raise CodecError(f"{len(data)} bytes are not a {type_name(message_type)}: {error}") from error
-    values: dict[str, Any] = {
-        "header": _header(proto.header),
-    }
+    values: dict[str, Any] = {"header": _header(proto.header)}
     for name in _SCALARS[message_type]:
         value = getattr(proto, name)
         if name in _RECORDS:
@@ -137,22 +157,20 @@ def decode(message_type: type[Message], data: bytes) -> Message:
             value = _enum(name, value, message_type)
         values[name] = value
     fans = values.get("fans", 0)
-    for name, (shape, dtype) in _COLUMNS[message_type].items():
-        column = _column(getattr(proto, name), name, dtype, message_type)
-        if shape == "samples x fans":
-            if fans == 0 or column.size % fans:
-                if column.size:
-                    raise CodecError(f"{type_name(message_type)}.{name} has {column.size} values for {fans} fans")
-                column = column.reshape(0, fans)
-            else:
-                column = column.reshape(-1, fans)
-        column.setflags(write=False)
-        values[name] = column
+    for column in _COLUMNS[message_type]:
+        array = _array(message_type, column, getattr(proto, column.name))
+        if column.shape == "samples x fans":
+            if array.size and (fans == 0 or array.size % fans):
+                raise CodecError(f"{type_name(message_type)}.{column.name} has {array.size} values for {fans} fans")
+            array = array.reshape(-1 if array.size else 0, fans)
+        array.setflags(write=False)
+        values[column.name] = array
     message = message_type(**values)
     _check_step(message)
     samples = _sample_count(message)
-    for name, (shape, _) in _COLUMNS[message_type].items():
-        _check_column(message, name, values[name], shape, samples)
+    for column in _COLUMNS[message_type]:
+        array = values[column.name]
+        _check_shape(message, column, array, samples, values.get("fans", array.size))
     return message
 
 
@@ -160,17 +178,20 @@ def _header(proto: Any) -> Header:
     cause = None
     if proto.HasField("cause"):
         made = proto.cause
-        cause = Cause(made.topic, made.producer, made.sequence, made.taken, made.by_time)
+        cause = Cause(made.topic, made.producer, made.sequence, made.taken, made.since, made.by_time)
     return Header(proto.producer, proto.sequence, proto.tray, cause)
 
 
-def _column(field: Any, name: str, dtype: np.dtype[Any], message_type: type[Message]) -> np.ndarray[Any, Any]:
-    if name not in _ENUM_COLUMNS:
-        return np.asarray(field, dtype=dtype)
-    values = np.asarray(field, dtype=np.int64)
-    if values.size and not (values.min() >= 0 and values.max() <= _ENUM_COLUMNS[name]):
-        raise CodecError(f"{type_name(message_type)}.{name} holds values that are not known here: a newer producer?")
-    return values.astype(dtype)
+def _array(message_type: type[Message], column: _Column, field: Any) -> Array:
+    """The values of a packed field, (n,)."""
+    if len(field) <= _FEW:
+        values = field[:]
+        if values:
+            _check_limits(message_type, column, values)
+        return np.array(values, column.dtype)
+    values = np.asarray(field)
+    _check_limits(message_type, column, values)
+    return values.astype(column.dtype, copy=False)
 
 
 def _enum(name: str, value: int, message_type: type[Message]) -> Any:
@@ -182,9 +203,9 @@ def _enum(name: str, value: int, message_type: type[Message]) -> Any:
 
 def _sample_count(message: Message) -> int:
     """Samples in a message, by its time column; -1 for messages without one."""
-    for name, (shape, _) in _COLUMNS[type(message)].items():
-        if shape == "samples":
-            return len(getattr(message, name))
+    for column in _COLUMNS[type(message)]:
+        if column.shape == "samples":
+            return len(getattr(message, column.name))
     return -1
 
 
@@ -194,21 +215,37 @@ def _check_step(message: Message) -> None:
         raise CodecError(f"{type_name(type(message))}.step_ns = {step_ns}: a step is 1 ns to a day")
 
 
-def _check_column(message: Message, name: str, column: np.ndarray[Any, Any], shape: str, samples: int) -> None:
-    if column.size == 0 and _may_be_empty(message, name, shape, samples):
+def _check_limits(message_type: type[Message], column: _Column, values: list[int] | Array) -> None:
+    """values: at least one."""
+    if column.limits is None:
         return
-    if name in _FURTHEST and not (-_FURTHEST[name] < column.min() and column.max() < _FURTHEST[name]):
-        raise CodecError(f"{type_name(type(message))}.{name} has times that are no ns since 1970: beyond the year 2116")
-    fans = getattr(message, "fans", column.size)
-    expected = {"samples": (samples,), "samples x fans": (samples, fans), "fans": (fans,)}[shape]
-    if column.shape != expected:
-        raise CodecError(f"{type_name(type(message))}.{name} has shape {column.shape}, not {shape} = {expected}")
+    lowest, highest = column.limits
+    if isinstance(values, list):
+        fits = lowest <= min(values) and max(values) <= highest
+    else:
+        fits = lowest <= values.min() and values.max() <= highest
+    if fits:
+        return
+    where = f"{type_name(message_type)}.{column.name}"
+    if column.name in _FURTHEST:
+        raise CodecError(f"{where} has times that are no ns since 1970: beyond the year 2116")
+    raise CodecError(f"{where} holds values that are not known here: a newer producer?")
 
 
-def _may_be_empty(message: Message, name: str, shape: str, samples: int) -> bool:
-    if shape == "fans":
+def _check_shape(message: Message, column: _Column, values: Array, samples: int, fans: int) -> None:
+    if column.shape == "samples x fans":
+        expected = (samples, fans)
+    else:
+        expected = (samples,) if column.shape == "samples" else (fans,)
+    if values.shape != expected and not (values.size == 0 and _may_be_empty(message, column, samples)):
+        where = f"{type_name(type(message))}.{column.name}"
+        raise CodecError(f"{where} has shape {values.shape}, not {column.shape} = {expected}")
+
+
+def _may_be_empty(message: Message, column: _Column, samples: int) -> bool:
+    if column.shape == "fans":
         return samples <= 0 or not isinstance(message, Prediction)  # without sigma nothing can be judged
-    return samples == 0 or name in _OF_SOME_DEVICES
+    return samples == 0 or column.name in _OF_SOME_DEVICES
 
 
 assert set(get_args(Message)) == set(MESSAGE_TYPES)

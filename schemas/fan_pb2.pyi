@@ -72,18 +72,20 @@ class Header(_message.Message):
     def __init__(self, producer: _Optional[str] = ..., sequence: _Optional[int] = ..., tray: _Optional[str] = ..., cause: _Optional[_Union[Cause, _Mapping]] = ...) -> None: ...
 
 class Cause(_message.Message):
-    __slots__ = ("topic", "producer", "sequence", "taken", "by_time")
+    __slots__ = ("topic", "producer", "sequence", "taken", "since", "by_time")
     TOPIC_FIELD_NUMBER: _ClassVar[int]
     PRODUCER_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     TAKEN_FIELD_NUMBER: _ClassVar[int]
+    SINCE_FIELD_NUMBER: _ClassVar[int]
     BY_TIME_FIELD_NUMBER: _ClassVar[int]
     topic: str
     producer: str
     sequence: int
     taken: int
+    since: int
     by_time: bool
-    def __init__(self, topic: _Optional[str] = ..., producer: _Optional[str] = ..., sequence: _Optional[int] = ..., taken: _Optional[int] = ..., by_time: _Optional[bool] = ...) -> None: ...
+    def __init__(self, topic: _Optional[str] = ..., producer: _Optional[str] = ..., sequence: _Optional[int] = ..., taken: _Optional[int] = ..., since: _Optional[int] = ..., by_time: _Optional[bool] = ...) -> None: ...
 
 class Raw(_message.Message):
     __slots__ = ("header", "fans", "host_receive_t_ns", "device_clock_us", "device_sequence", "command", "speed_rad_s")

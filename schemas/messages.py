@@ -60,15 +60,29 @@ class StageStatus(IntEnum):
 class Cause:
     """What a stage had taken of its inputs, for one tray, when it made a message.
 
-    `topic`, `producer` and `sequence` name the message taken last, `taken` counts all, that one included. `by_time`:
-    made since, because time had passed or the stage ended, and not on taking it.
+    `topic`, `producer` and `sequence` name the message taken last, `taken` counts all, that one included. From `since`
+    on up to `sequence` none is missing. `by_time`: made since, because time had passed or the stage ended, and not on
+    taking it.
     """
 
     topic: str
     producer: str
     sequence: int
     taken: int
+    since: int
     by_time: bool = False
+
+    @classmethod
+    def after(cls, before: Cause | None, topic: str, header: Header) -> Cause:
+        """What has been taken once a message with this header has, too."""
+        follows = before is not None and (before.producer, before.sequence + 1) == (header.producer, header.sequence)
+        return cls(
+            topic=topic,
+            producer=header.producer,
+            sequence=header.sequence,
+            taken=before.taken + 1 if before else 1,
+            since=before.since if before and follows else header.sequence,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,7 @@ from schemas.messages import Alarm, Array, FanState, Prediction, Score, Severity
 
 NS_PER_S = 1_000_000_000
 BAND_SIGMAS = 2.0
+UNKNOWN, NORMAL, SUSPECT, ALARM, RETURNING = map(int, FanState)
 FIRST_WARM_UP_NS = 60 * NS_PER_S  # a fan that was never judged may warm up for so long before that is told
 IN_WORDS = {
     WhyNot.NONE: "no reason given",
@@ -67,11 +68,22 @@ class Smoother:
         """(fans,) rad/s, NaN before a fan's first valid sample"""
 
     def update(self, residual: Array, valid: Array, step_s: float) -> Array:
-        """Take a residual (fans,); fans that are not valid keep their value. Returns the smoothed residual (fans,)."""
+        """Take a block of residuals. Fans that are not valid keep their value. All (n, fans), as is what returns."""
         keep = math.exp(-step_s / self._time_constant_s) if self._time_constant_s > 0 else 0.0
-        before = np.where(np.isnan(self.smoothed), residual, self.smoothed)
-        self.smoothed = np.where(valid, residual + keep * (before - residual), self.smoothed)
-        return self.smoothed
+        smoothed = np.empty_like(residual)
+        before = self.smoothed
+        some_begin = keep == 0.0 or bool(np.isnan(before).any())  # without smoothing what overflows is no number either
+        some_stay = not valid.all()
+        for new, stays, now in zip(residual, ~valid, smoothed, strict=True):
+            start = np.where(np.isnan(before), new, before) if some_begin else before
+            np.subtract(start, new, out=now)  # now = new + keep * (start - new)
+            np.multiply(keep, now, out=now)
+            np.add(new, now, out=now)
+            if some_stay:
+                np.copyto(now, before, where=stays)
+            before = now
+        self.smoothed = before.copy()
+        return smoothed
 
 
 @dataclass(frozen=True)
@@ -90,49 +102,81 @@ class Threshold:
         return (self.alarm_sigmas - self.deadband_sigmas) * sigma
 
 
-@dataclass(frozen=True)
-class Changes:
-    """What one sample changed. All (fans,) of bool."""
+@dataclass(frozen=True, order=True)
+class Change:
+    """An alarm raised (or cleared) at a row of a block."""
 
-    raised: Array
-    cleared: Array
-    too_short: Array
+    row: int
+    fan: int
+    raised: bool
+    onset_t_ns: int
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a block did to the states. state: (n, fans) of FanState after each sample, UNKNOWN where it is not valid."""
+
+    state: Array
+    changes: list[Change]
+    too_short: int
+
+
+class AlarmState:
+    """One fan's state: NORMAL, SUSPECT (on-delay runs), ALARM, RETURNING (off-delay runs)."""
+
+    def __init__(self, on_delay_ns: int, off_delay_ns: int) -> None:
+        self._on_delay_ns = on_delay_ns
+        self._off_delay_ns = off_delay_ns
+        self.state = NORMAL
+        self.onset_t_ns = 0
+        """First sample of the present excursion; meaningless when NORMAL."""
+        self._lasted_ns = 0  # how long the condition of SUSPECT or RETURNING has held
+
+    @property
+    def is_active(self) -> bool:
+        """Whether an alarm was raised and not cleared."""
+        return self.state in (ALARM, RETURNING)
+
+    def update(self, t_ns: int, step_ns: int, exceeds: bool, returns: bool) -> None:
+        """Take a valid sample: whether the score is beyond the limit, or below the limit of return."""
+        if self.is_active and not returns:
+            self.state = ALARM
+        elif self.is_active:
+            self._lasted_ns = 0 if self.state == ALARM else self._lasted_ns + step_ns
+            self.state = NORMAL if self._lasted_ns >= self._off_delay_ns else RETURNING
+        elif not exceeds:
+            self.state = NORMAL
+        else:
+            if self.state == NORMAL:
+                self.onset_t_ns = t_ns
+            self._lasted_ns = 0 if self.state == NORMAL else self._lasted_ns + step_ns
+            self.state = ALARM if self._lasted_ns >= self._on_delay_ns else SUSPECT
 
 
 class AlarmStates:
-    """The state of each fan: NORMAL, SUSPECT (on-delay runs), ALARM, RETURNING (off-delay runs). All arrays by fan."""
+    """The states of a tray's fans over blocks. Samples that are not valid leave state and timers alone."""
 
     def __init__(self, fans: int, on_delay_ns: int, off_delay_ns: int) -> None:
-        self._on_delay_ns = on_delay_ns
-        self._off_delay_ns = off_delay_ns
-        self.state = np.full(fans, FanState.NORMAL, np.uint8)
-        self.onset_t_ns = np.zeros(fans, np.int64)
-        """First sample of the present excursion; meaningless when NORMAL."""
-        self._lasted_ns = np.zeros(fans, np.int64)  # how long the condition of SUSPECT or RETURNING has held
+        self._fans = [AlarmState(on_delay_ns, off_delay_ns) for _ in range(fans)]
+        self._not_normal = np.zeros(fans, np.bool_)
 
-    def update(self, t_ns: int, step_ns: int, exceeds: Array, returns: Array, valid: Array) -> Changes:
-        """Take one sample. Fans that are not valid keep state and timers.
-
-        exceeds, returns: whether the score is beyond the limit, or below the limit of return.
-        """
-        was = self.state
-        normal, suspect = valid & (was == FanState.NORMAL), valid & (was == FanState.SUSPECT)
-        alarm, returning = valid & (was == FanState.ALARM), valid & (was == FanState.RETURNING)
-        begins = (normal & exceeds) | (alarm & returns)
-        goes_on = (suspect & exceeds) | (returning & returns)
-        self.onset_t_ns[normal & exceeds] = t_ns
-        self._lasted_ns[begins] = 0
-        self._lasted_ns[goes_on] += step_ns
-        active = alarm | returning
-        raised = (normal | suspect) & exceeds & (self._lasted_ns >= self._on_delay_ns)
-        cleared = active & returns & (self._lasted_ns >= self._off_delay_ns)
-        too_short = suspect & ~exceeds
-        self.state = np.select(
-            [raised, cleared, too_short, normal & exceeds, active & returns, active],
-            [FanState.ALARM, FanState.NORMAL, FanState.NORMAL, FanState.SUSPECT, FanState.RETURNING, FanState.ALARM],
-            default=was,
-        ).astype(np.uint8)
-        return Changes(raised, cleared, too_short)
+    def update(self, t_ns: Array, step_ns: int, exceeds: Array, returns: Array, valid: Array) -> Course:
+        """Take a block. t_ns: (n,). The others, (n, fans): see AlarmState."""
+        state = np.where(valid, NORMAL, UNKNOWN).astype(np.uint8)
+        changes: list[Change] = []
+        too_short = 0
+        for fan in np.flatnonzero(self._not_normal | (exceeds & valid).any(axis=0)).tolist():
+            one, rows = self._fans[fan], np.flatnonzero(valid[:, fan])
+            samples = (rows, t_ns[rows], exceeds[rows, fan], returns[rows, fan])
+            for row, time_ns, beyond, back in zip(*(column.tolist() for column in samples), strict=True):
+                was, was_active = one.state, one.is_active
+                one.update(time_ns, step_ns, beyond, back)
+                state[row, fan] = one.state
+                too_short += was == SUSPECT and one.state == NORMAL
+                if one.is_active != was_active:
+                    changes.append(Change(row, fan, one.is_active, one.onset_t_ns))
+            self._not_normal[fan] = one.state != NORMAL
+        return Course(state, sorted(changes), too_short)
 
 
 class NotJudged:
@@ -202,13 +246,15 @@ class ScorerCore(Core):
         residual = measured - predicted
         finite = np.isfinite(residual)
         valid = item.valid[new] & finite
-        smoothed = np.empty_like(residual)
-        state = np.empty(residual.shape, np.uint8)
-        alarms: list[Alarm] = []
-        for k, time_ns in enumerate(t_ns.tolist()):
-            smoothed[k] = self._smoother.update(residual[k], valid[k], item.step_ns / NS_PER_S)
-            alarms += self._judge(time_ns, item.step_ns, smoothed[k], valid[k], item.sigma_rad_s)
-            state[k] = np.where(valid[k], self._states.state, FanState.UNKNOWN)
+        smoothed = self._smoother.update(residual, valid, item.step_ns / NS_PER_S)
+        limit, return_limit = self._threshold.limit(item.sigma_rad_s), self._threshold.return_limit(item.sigma_rad_s)
+        size = np.abs(smoothed)
+        course = self._states.update(t_ns, item.step_ns, size > limit, size < return_limit, valid)
+        self._counts["excursions_too_short"] += course.too_short
+        alarms = [
+            self._alarm(change, int(t_ns[change.row]), float(smoothed[change.row, change.fan]), limit, return_limit)
+            for change in course.changes
+        ]
         why_not = np.where(item.valid[new] & ~finite, WhyNot.OUT_OF_RANGE, item.why_not[new]).astype(np.uint8)
         self._not_judged.update(item.step_ns, valid, why_not)
         band = BAND_SIGMAS * item.sigma_rad_s
@@ -225,7 +271,7 @@ class ScorerCore(Core):
             residual_rad_s=residual,
             smoothed_residual_rad_s=smoothed,
             outside=np.abs(residual) > band,
-            state=state,
+            state=course.state,
             valid=valid,
             why_not=why_not,
         )
@@ -241,29 +287,20 @@ class ScorerCore(Core):
             return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
         return self._not_judged.problem()
 
-    def _judge(self, t_ns: int, step_ns: int, smoothed: Array, valid: Array, sigma: Array) -> list[Alarm]:
-        limit, return_limit = self._threshold.limit(sigma), self._threshold.return_limit(sigma)
-        size = np.abs(smoothed)
-        changes = self._states.update(t_ns, step_ns, size > limit, size < return_limit, valid)
-        self._counts["excursions_too_short"] += int(changes.too_short.sum())
-        alarms = []
-        for fan in np.flatnonzero(changes.raised | changes.cleared).tolist():
-            raised = bool(changes.raised[fan])
-            self._counts["alarms_raised" if raised else "alarms_cleared"] += 1
-            residual, crossed = float(smoothed[fan]), float((limit if raised else return_limit)[fan])
-            alarms.append(
-                Alarm(
-                    fan=fan,
-                    active=raised,
-                    severity=Severity.ALARM,
-                    t_ns=t_ns,
-                    onset_t_ns=int(self._states.onset_t_ns[fan]),
-                    residual_rad_s=residual,
-                    limit_rad_s=crossed,
-                    message=self._raised(fan, residual, crossed) if raised else self._cleared(fan, crossed),
-                )
-            )
-        return alarms
+    def _alarm(self, change: Change, t_ns: int, residual_rad_s: float, limit: Array, return_limit: Array) -> Alarm:
+        fan, raised = change.fan, change.raised
+        crossed = float((limit if raised else return_limit)[fan])
+        self._counts["alarms_raised" if raised else "alarms_cleared"] += 1
+        return Alarm(
+            fan=fan,
+            active=raised,
+            severity=Severity.ALARM,
+            t_ns=t_ns,
+            onset_t_ns=change.onset_t_ns,
+            residual_rad_s=residual_rad_s,
+            limit_rad_s=crossed,
+            message=self._raised(fan, residual_rad_s, crossed) if raised else self._cleared(fan, crossed),
+        )
 
     def _raised(self, fan: int, residual_rad_s: float, limit_rad_s: float) -> str:
         side = "below" if residual_rad_s < 0 else "above"

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
@@ -36,13 +37,37 @@ class TwinIntegratorConfig(StageConfig):
     hold_limit_s: float = Field(default=0.5, ge=0, description="how long the last command is held on a silent line")
 
 
+@dataclass(frozen=True)
+class Inputs:
+    """What free runs are given over a block. All (n, fans) but `missing`, (n,)."""
+
+    command: Array
+    """the last known one"""
+    unknown: Array
+    """whether the command of this sample is not known"""
+    overdue: Array
+    """whether a command has been held for longer than allowed"""
+    reads: Array
+    """whether the sample counts towards a start"""
+    missing: Array
+    """how many grid samples are missing before this one"""
+
+    def next_event(self, after: int, running: Array) -> int:
+        """The first row after one at which a free run may start or stop, or samples are missing; n if there is none."""
+        if after + 1 == len(self.missing):
+            return after + 1
+        rest = slice(after + 1, None)
+        may_change = (self.overdue[rest] & running) | (self.reads[rest] & ~running)
+        rows = np.flatnonzero(may_change.any(axis=1) | (self.missing[rest] > 0))
+        return after + 1 + int(rows[0]) if len(rows) else len(self.missing)
+
+
 class FreeRun:
     """The free run of each fan: when it starts and stops, and the state it carries. All arrays by fan."""
 
     def __init__(self, twin: TwinFile, config: TwinIntegratorConfig) -> None:
         self._twin = twin
         self._start_samples = config.start_samples
-        self._hold_limit_ns = round(config.hold_limit_s * NS_PER_S)
         fans = twin.fans
         self.running = np.zeros(fans, np.bool_)
         self.started_t_ns = np.zeros(fans, np.int64)
@@ -52,48 +77,66 @@ class FreeRun:
         self._sum_rad_s = np.zeros(fans)
         self._state = twin.initial_state(np.zeros(fans), self.held_command)
 
-    def cut(self, t_ns: int, step_ns: int) -> Array:
-        """Whose command, at this sample, has been held in place of an unknown one for longer than allowed."""
-        return self.running & (t_ns - self._known_t_ns - step_ns > self._hold_limit_ns)
+    def hold(self, t_ns: Array, command: Array, known: Array) -> tuple[Array, Array]:
+        """Hold the last known command where one is unknown. t_ns: (n,); command, known: (n, fans).
+
+        Returns the commands (n, fans), and when the one before each was known (n, fans).
+        """
+        known_t_ns = np.broadcast_to(t_ns[:, np.newaxis], command.shape)
+        if not known.all():
+            rows = np.maximum.accumulate(np.where(known, np.arange(len(t_ns))[:, np.newaxis], -1))
+            known_t_ns = np.where(rows < 0, self._known_t_ns, t_ns[rows])
+            command = np.where(rows < 0, self.held_command, np.take_along_axis(command, rows, axis=0))
+        before_t_ns = np.concatenate((self._known_t_ns[np.newaxis], known_t_ns[:-1]))
+        self.held_command, self._known_t_ns = command[-1], known_t_ns[-1]
+        return command, before_t_ns
 
     def stop(self, fans: Array) -> None:
         """End the free run of some fans; the next one starts anew from measured speeds."""
         self.running &= ~fans
-        self._forget_readings(fans)
+        self.forget_readings(fans)
 
-    def note(self, t_ns: int, command: Array, known: Array, speed_rad_s: Array) -> Array:
-        """Take a sample. Returns which fans have now the readings that a start needs."""
-        self._known_t_ns[known] = t_ns
-        self.held_command = np.where(known, command, self.held_command)
-        self._forget_readings(~known)
-        reads = known & ~self.running & np.isfinite(speed_rad_s)
+    def note(self, reads: Array, speed_rad_s: Array) -> Array:
+        """Take the readings of one sample. Returns which fans have now those that a start needs."""
+        reads = reads & ~self.running
         self._readings[reads] += 1
         self._sum_rad_s[reads] += speed_rad_s[reads]
         return reads & (self._readings >= self._start_samples)
 
-    def start(self, fans: Array, t_ns: int) -> None:
+    def forget_readings(self, fans: Array) -> None:
+        """Some fans need all the readings again."""
+        self._readings[fans] = 0
+        self._sum_rad_s[fans] = 0.0
+
+    def start(self, fans: Array, t_ns: int, command: Array) -> None:
         """Begin the free run of some fans at this sample."""
         speed = np.where(fans, self._sum_rad_s / np.maximum(self._readings, 1), 0.0)
-        initial = self._twin.initial_state(speed, self.held_command)
+        initial = self._twin.initial_state(speed, command)
         self._state = np.where(fans[:, np.newaxis], initial, self._state)
         self.started_t_ns[fans] = t_ns
         self.running |= fans
-        self._forget_readings(fans)
+        self.forget_readings(fans)
 
-    def advance(self, command: Array, step_s: Array) -> tuple[Array, Array]:
-        """Run over a block. command: (n, fans). Returns speeds (n, fans), NaN where none runs, and who diverged."""
-        if not len(command) or not self.running.any():
+    def advance(self, command: Array, step_s: float) -> tuple[Array, Array]:
+        """Run over a block, or a first part of it. command: (n, fans), of at least one sample.
+
+        Returns speeds (m, fans), NaN where none runs, and who diverged at the last of them: for what a fan does then
+        must not depend on what else is in the block.
+        """
+        rows = len(command)
+        if not self.running.any():
             return np.full(command.shape, np.nan), np.zeros_like(self.running)
-        speed_rad_s, state = self._twin.advance(self._state, command, step_s)
-        diverged = self.running & ~(np.isfinite(speed_rad_s).all(axis=0) & np.isfinite(state).all(axis=1))
+        while True:
+            speed_rad_s, state = self._twin.advance(self._state, command[:rows], np.full(rows, step_s))
+            finite = np.isfinite(speed_rad_s)
+            diverged = self.running & ~(finite.all(axis=0) & np.isfinite(state).all(axis=1))
+            if rows == 1 or not diverged.any():
+                break
+            rows //= 2
         self._state = np.where((self.running & ~diverged)[:, np.newaxis], state, self._state)
-        predicted = np.where(self.running & np.isfinite(speed_rad_s), speed_rad_s, np.nan)
+        predicted = np.where(self.running & finite, speed_rad_s, np.nan)
         self.stop(diverged)
         return predicted, diverged
-
-    def _forget_readings(self, fans: Array) -> None:
-        self._readings[fans] = 0
-        self._sum_rad_s[fans] = 0.0
 
 
 class TwinIntegratorCore(Core):
@@ -102,6 +145,7 @@ class TwinIntegratorCore(Core):
     def __init__(self, twin: TwinFile, config: TwinIntegratorConfig, started_t_ns: int) -> None:
         self._twin = twin
         self._warm_up_ns = round(config.warm_up_s * NS_PER_S)
+        self._hold_limit_ns = round(config.hold_limit_s * NS_PER_S)
         low, high = twin.command_range
         margin = RANGE_MARGIN * (high - low)
         self._lowest_command, self._highest_command = low - margin, high + margin
@@ -179,33 +223,21 @@ class TwinIntegratorCore(Core):
 
     def _predict(self, grid: Grid) -> Prediction:
         run = self._run
-        shape = grid.command.shape
-        silent = np.isin(grid.why_not, (WhyNot.GAP, WhyNot.STALE))
-        known = ~silent & np.isfinite(grid.command)
-        speed = np.where(grid.valid, grid.speed_rad_s, np.nan)
-        used, predicted = np.empty(shape), np.empty(shape)
-        running, started_t_ns = np.empty(shape, np.bool_), np.empty(shape, np.int64)
-        done = 0
-        for k, t_ns in enumerate(grid.t_ns.tolist()):
-            missing = self._missing_before(t_ns)
-            cut = run.cut(t_ns, grid.step_ns)
-            if missing or cut.any():
-                predicted[done:k] = self._advance(used[done:k])
-                done = k
-                run.stop(cut | (missing > LONGEST_BRIDGE))
-                self._advance(np.tile(run.held_command, (missing if run.running.any() else 0, 1)))
-            starting = run.note(t_ns, grid.command[k], known[k], speed[k])
-            if starting.any():
-                predicted[done:k] = self._advance(used[done:k])
-                done = k
-                run.start(starting, t_ns)
-                self._counts["free_runs"] += int(starting.sum())
-            used[k] = run.held_command
-            running[k] = run.running
-            started_t_ns[k] = run.started_t_ns
-            self._last_t_ns = t_ns
-            self._line_is_silent = bool(silent[k].all())
-        predicted[done:] = self._advance(used[done:])
+        held_before = run.held_command
+        inputs = self._inputs(grid)
+        predicted = np.empty(grid.command.shape)
+        running, started_t_ns = np.empty(predicted.shape, np.bool_), np.empty(predicted.shape, np.int64)
+        row = 0
+        while row < len(predicted):
+            self._meet(row, grid, inputs, held_before if row == 0 else inputs.command[row - 1])
+            end = inputs.next_event(row, run.running)
+            running[row:end], started_t_ns[row:end] = run.running, run.started_t_ns
+            speed_rad_s = self._advance(inputs.command[row:end])
+            end = row + len(speed_rad_s)
+            predicted[row:end] = speed_rad_s
+            if end > row + 1:
+                run.forget_readings(np.any(inputs.unknown[row + 1 : end], axis=0))
+            row = end
         settled = running & (grid.t_ns[:, np.newaxis] - started_t_ns >= self._warm_up_ns)
         in_range = (grid.command >= self._lowest_command) & (grid.command <= self._highest_command)
         in_range &= np.isfinite(predicted) | ~running
@@ -215,17 +247,47 @@ class TwinIntegratorCore(Core):
         why_not = np.where(grid.valid, why_not, grid.why_not).astype(np.uint8)
         return self._prediction(grid, predicted, why_not)
 
-    def _missing_before(self, t_ns: int) -> int:
-        """How many grid samples are missing before this one; counts those that no gap of the line explains."""
-        if self._last_t_ns is None:
-            return 0
-        missing = round((t_ns - self._last_t_ns) / self._step_ns) - 1
-        if missing > 0 and not self._line_is_silent:
-            self._counts["lost_grid_samples"] += missing
-        return max(missing, 0)
+    def _inputs(self, grid: Grid) -> Inputs:
+        silent = (grid.why_not == int(WhyNot.GAP)) | (grid.why_not == int(WhyNot.STALE))
+        known = ~silent & np.isfinite(grid.command)
+        command, known_before_t_ns = self._run.hold(grid.t_ns, grid.command, known)
+        return Inputs(
+            command=command,
+            unknown=~known,
+            overdue=grid.t_ns[:, np.newaxis] - known_before_t_ns - grid.step_ns > self._hold_limit_ns,
+            reads=known & grid.valid & np.isfinite(grid.speed_rad_s),
+            missing=self._missing(grid.t_ns, np.all(silent, axis=1)),
+        )
+
+    def _missing(self, t_ns: Array, line_is_silent: Array) -> Array:
+        """How many grid samples are missing before each, (n,); counts those that no gap of the line explains."""
+        step_ns = self._step_ns
+        last_t_ns = t_ns[0] - step_ns if self._last_t_ns is None else self._last_t_ns
+        since_ns = t_ns - np.concatenate(([last_t_ns], t_ns[:-1]))
+        missing = np.zeros(len(t_ns), np.int64)
+        for row in np.flatnonzero(since_ns > step_ns + (step_ns - 1) // 2).tolist():  # from one and a half steps on
+            missing[row] = round(int(since_ns[row]) / step_ns) - 1
+            if not (line_is_silent[row - 1] if row else self._line_is_silent):
+                self._counts["lost_grid_samples"] += int(missing[row])
+        self._line_is_silent = bool(line_is_silent[-1])
+        return missing
+
+    def _meet(self, row: int, grid: Grid, inputs: Inputs, held_command: Array) -> None:
+        """Stop and start free runs where this sample asks for it. held_command: (fans,), before it."""
+        run, missing = self._run, int(inputs.missing[row])
+        cut = run.running & inputs.overdue[row]
+        if missing or cut.any():
+            run.stop(cut | (missing > LONGEST_BRIDGE))
+            while missing > 0 and run.running.any():
+                missing -= len(self._advance(np.tile(held_command, (missing, 1))))
+        run.forget_readings(inputs.unknown[row])
+        starting = run.note(inputs.reads[row], grid.speed_rad_s[row])
+        if starting.any():
+            run.start(starting, int(grid.t_ns[row]), inputs.command[row])
+            self._counts["free_runs"] += int(starting.sum())
 
     def _advance(self, command: Array) -> Array:
-        speed_rad_s, diverged = self._run.advance(command, np.full(len(command), self._step_ns / NS_PER_S))
+        speed_rad_s, diverged = self._run.advance(command, self._step_ns / NS_PER_S)
         self._counts["diverged"] += int(diverged.sum())
         return speed_rad_s
 

@@ -2,7 +2,9 @@
 
 Reads `score`, `alarm`, `twin` and `health`; writes nothing. One core serves all trays. Speeds are shown in the
 tray's own unit. Samples are collected and drawn twice a second, because a call into Rerun costs much and a row in
-it costs nothing. This stage alone may drop: the runner holds a bounded queue before it and counts what it lets go.
+it costs nothing. In time there are samples and alarms only, at the samples' own times: what is told in the host's time
+goes to a page without time, else a replay of yesterday would lie far from the newest time that a viewer follows.
+This stage alone may drop: the runner holds a bounded queue before it and counts what it lets go.
 """
 
 from __future__ import annotations
@@ -19,12 +21,14 @@ from pydantic import Field
 from pipeline.config import TrayConfig
 from pipeline.loopback import check_free
 from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.stages_page import StagesPage
 from pipeline.trace import Trace, state_changes, state_name, trace_of
-from schemas.messages import Alarm, Array, Health, Message, ModelCard, Score, StageStatus
+from schemas.messages import Alarm, Array, Health, Message, ModelCard, Score
 
 NO_RERUN = "the viewer needs the `view` extra: pip install 'fantwin[view]', or take viewer out of launcher.stages"
 FLUSH_PERIOD_NS = 500_000_000
 REPEAT_STATES_NS = 5_000_000_000  # a viewer that joins late gets no state older than this
+PAGE_PERIOD_NS = 5_000_000_000  # at least, between two pages: what has no time is never dropped for being old
 SAMPLES_HELD = 4096  # of a tray, when a replay outruns the ticks
 
 
@@ -55,8 +59,12 @@ class ViewSink(Protocol):
         """Colour a fan's lane from each time on."""
         ...
 
-    def log(self, where: str, t_ns: int, level: str, text: str) -> None:
-        """Add a line to a log: `where` is a tray's name or `stages`, `level` is INFO, WARN or ERROR."""
+    def log(self, tray: str, t_ns: int, level: str, text: str) -> None:
+        """Add a line to a tray's log; `level` is INFO or ERROR."""
+        ...
+
+    def show_stages(self, page: str) -> None:
+        """Show this page (Markdown) on the stages in place of the one before."""
         ...
 
     def flush(self) -> None:
@@ -71,16 +79,6 @@ class ViewSink(Protocol):
 def alarm_line(alarm: Alarm) -> tuple[str, str]:
     """Level and text of an alarm for people."""
     return ("ERROR", f"alarm raised: {alarm.message}") if alarm.active else ("INFO", f"alarm cleared: {alarm.message}")
-
-
-def health_line(health: Health) -> tuple[str, str]:
-    """Level and text of a stage's health for people."""
-    text = f"{health.stage} ({health.instance}) {health.status.name.lower()}"
-    if health.lost:
-        text += f", {health.lost} lost"
-    if health.problem:
-        text += f": {health.problem}"
-    return ("INFO" if health.status != StageStatus.DEGRADED and not health.lost else "WARN"), text
 
 
 @dataclass(slots=True)
@@ -101,15 +99,18 @@ class ViewerCore(Core):
     def __init__(self, trays: Sequence[TrayConfig], sink: ViewSink) -> None:
         self._views = {tray.name: _TrayView(tray) for tray in trays}
         self._sink = sink
+        self._now_ns = 0
         self._flushed_t_ns = 0
-        self._stages: dict[str, str] = {}
+        self._page = StagesPage()
+        self._shown_page = ""
+        self._page_t_ns = 0
         self._samples_drawn = 0
         self._counts: Counter[str] = Counter()
 
     def step(self, item: Message) -> Sequence[Message]:
-        """Remember a score, write an alarm, a change of twin or a change of health into the log."""
+        """Remember a score, write an alarm into the log, note a twin or the health of a stage for the page."""
         if isinstance(item, Health):
-            self._note_health(item)
+            self._page.note_health(item)
             return ()
         view = self._views.get(item.header.tray)
         if view is None:
@@ -120,18 +121,22 @@ class ViewerCore(Core):
         elif isinstance(item, Alarm):
             self._sink.log(view.config.name, item.t_ns, *alarm_line(item))
         elif isinstance(item, ModelCard):
-            self._sink.log(view.config.name, item.t_ns, "INFO", f"twin in force: {item.twin} ({item.kind})")
+            self._page.note_twin(view.config.name, item)
         return ()
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Draw what has come since the last flush, twice a second."""
+        self._now_ns = now_ns
         if now_ns - self._flushed_t_ns >= FLUSH_PERIOD_NS:
             self._flushed_t_ns = now_ns
+            if now_ns - self._page_t_ns >= PAGE_PERIOD_NS:
+                self._show_stages()
             self._flush_all()
         return ()
 
     def close(self) -> Sequence[Message]:
         """Draw the rest and finish the file."""
+        self._show_stages()
         self._flush_all()
         self._sink.close()
         return ()
@@ -160,12 +165,12 @@ class ViewerCore(Core):
         if view.samples >= SAMPLES_HELD:
             self._flush(view)
 
-    def _note_health(self, health: Health) -> None:
-        level, text = health_line(health)
-        name = f"{health.stage}/{health.instance}"
-        if self._stages.get(name) != text:
-            self._stages[name] = text
-            self._sink.log("stages", health.t_ns, level, text)
+    def _show_stages(self) -> None:
+        page = self._page.text(self._now_ns)
+        if page != self._shown_page:
+            self._shown_page = page
+            self._page_t_ns = self._now_ns
+            self._sink.show_stages(page)
 
     def _flush_all(self) -> None:
         for view in self._views.values():

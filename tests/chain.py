@@ -113,8 +113,16 @@ class Running:
 class Chain:
     """A tray that sends until told to stop, all stages judging it, and a watcher on their bus."""
 
-    def __init__(self, folder: Path, endpoint: str, *settings: str, viewer: bool = True) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        endpoint: str,
+        *settings: str,
+        viewer: bool = True,
+        configuration: Path = DEMO / "demo.toml",
+    ) -> None:
         self.folder = folder
+        self.configuration = configuration
         self.endpoint = endpoint
         self.port = folder / "tray"
         stages = ["acquisition", "resampler", "twin_integrator", "scorer", "recorder", *(["viewer"] if viewer else [])]
@@ -127,7 +135,7 @@ class Chain:
         self.up: Running | None = None
 
     def words(self, command: str) -> list[str]:
-        return [command, "-c", str(DEMO / "demo.toml"), *(w for s in self.settings for w in ("--set", s))]
+        return [command, "-c", str(self.configuration), *(w for s in self.settings for w in ("--set", s))]
 
     def start_tray(self, *words: str) -> Running:
         truth = self.folder / "truth.json"
@@ -137,7 +145,7 @@ class Chain:
                 *("--wait-for-reader", "--json", *words),
             ]
         )
-        self.tray.line_with("8 fans on")
+        self.tray.line_with("fans on")
         return self.tray
 
     def start_up(self) -> Running:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from small_disk import mount, unmount
 
 # The same examples on every run, and no judgement of how long one takes: machines differ.
 settings.register_profile("house", derandomize=True, deadline=None)
@@ -20,6 +22,19 @@ def endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """The folder of a disk of its own of a few MB; skips where none can be mounted."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    if not mount(place):
+        pytest.skip("no file system can be mounted here")
+    try:
+        yield place
+    finally:
+        unmount(place)
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ UINT64 = st.integers(0, 2**64 - 1)
 UINT32 = st.integers(0, 2**32 - 1)
 TEXT = st.text(max_size=20)
 FLOAT = st.floats(width=64)
-CAUSE = st.builds(Cause, TEXT, TEXT, UINT64, UINT64, st.booleans())
+CAUSE = st.builds(Cause, TEXT, TEXT, UINT64, UINT64, UINT64, st.booleans())
 HEADER = st.builds(Header, TEXT, UINT64, TEXT, st.none() | CAUSE)
 ENUM_COLUMNS = {"why_not": WhyNot, "state": FanState}
 SCALARS: dict[str, st.SearchStrategy[Any]] = {

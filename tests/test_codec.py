@@ -168,6 +168,35 @@ def grid_with(step_ns: int, t_ns: int) -> Grid:
     )
 
 
+LENGTHS = pytest.mark.parametrize("samples", [1, 47, 48, 49, 600])
+"""short and long blocks are decoded on different ways"""
+
+
+def grid_of(samples: int) -> Grid:
+    rng = np.random.default_rng(samples)
+    speed = rng.normal(size=(samples, 2))
+    speed[rng.random(speed.shape) < 0.1] = np.nan
+    why_not = rng.integers(0, 8, speed.shape).astype(np.uint8)
+    t_ns = np.arange(samples) + 10**18
+    return Grid(fans=2, step_ns=1, t_ns=t_ns, command=-speed, speed_rad_s=speed, valid=why_not == 0, why_not=why_not)
+
+
+@LENGTHS
+def test_blocks_of_any_length_come_back(samples):
+    message = grid_of(samples)
+    back = decode(Grid, encode(message))
+    assert all(same(getattr(message, name), getattr(back, name)) for name in columns(Grid))
+
+
+@LENGTHS
+@pytest.mark.parametrize(("column", "value"), [("why_not", 8), ("why_not", -1), ("t_ns", 2**62), ("t_ns", -(2**62))])
+def test_a_value_out_of_its_limits_is_refused_in_blocks_of_any_length(samples, column, value):
+    proto = fan_pb2.Grid.FromString(encode(grid_of(samples)))
+    getattr(proto, column)[samples // 2] = value
+    with pytest.raises(CodecError, match=rf"Grid\.{column}"):
+        decode(Grid, proto.SerializeToString())
+
+
 @pytest.mark.parametrize("step_ns", [0, -1, 2**62])
 @pytest.mark.parametrize("kind", [Grid, Prediction, Score])
 def test_a_step_that_is_none_is_refused_on_both_ways(kind, step_ns):

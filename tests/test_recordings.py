@@ -1,5 +1,7 @@
 """Recordings: what is written is read back, by us and by others, also after crashes, full disks and damage."""
 
+import errno
+import os
 import resource
 import signal
 import subprocess
@@ -14,8 +16,11 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.decoder import DecoderFactory
 
+from pipeline.recordings.disk import DiskError, WholeFile
+from pipeline.recordings.ledger import Account, accounts_of
 from pipeline.recordings.reading import RecordingError, read_head, read_recording
 from pipeline.recordings.writing import ACTIVE_SUFFIX, CHUNK_BYTES, RecordingWriter
 from schemas.messages import Alarm, Array, Command, Header, Message, Raw, Severity
@@ -120,7 +125,7 @@ def test_other_readers_need_nothing_of_ours(tmp_path):
         assert {schema.name for schema in summary.schemas.values()} == {"fantwin.Raw", "fantwin.Alarm"}
         assert {channel.topic for channel in summary.channels.values()} == {RAW_KEY, ALARM_KEY}
         assert [a.name for a in reader.iter_attachments()] == ["configuration.toml"]
-        assert [m.metadata for m in reader.iter_metadata()] == [{"site": "plant"}]
+        assert {m.name: m.metadata for m in reader.iter_metadata()}["fantwin"] == {"site": "plant"}
         decoded = list(reader.iter_decoded_messages())
     _, channel, message, proto = decoded[2]
     assert (channel.message_encoding, message.log_time, message.sequence) == ("protobuf", 1002, 2)
@@ -163,25 +168,6 @@ def test_a_finished_recording_is_never_overwritten_unasked(tmp_path):
     assert sequences(path) == [0]
     assert write(path, 5, overwrite=True) == path
     assert len(sequences(path)) == 5
-
-
-def test_what_a_killed_recorder_left_is_kept_under_a_name_of_its_own(tmp_path):
-    path = tmp_path / "r.mcap"
-    kill_a_recorder(path, flushed=40)
-    writer = RecordingWriter(path, {})
-    assert writer.left_over == path
-    writer.close()
-    assert writer.path.name == "r-2.mcap"
-    assert sequences(path) == list(range(40))
-
-
-def test_a_left_over_without_any_message_is_not_kept(tmp_path):
-    path = tmp_path / "r.mcap"
-    kill_a_recorder(path, flushed=0)
-    writer = RecordingWriter(path, {})
-    assert writer.left_over is None
-    writer.close()
-    assert [p.name for p in tmp_path.iterdir()] == ["r.mcap"]
 
 
 def kill_a_recorder(path: Path, flushed: int) -> None:
@@ -236,10 +222,57 @@ def test_what_is_counted_as_written_is_in_the_file(tmp_path):
         writer.write_message(RAW_KEY, raw(sequence), sequence)
         if sequence % 50 == 0:
             assert len(sequences(active)) == writer.written["raw"]
-            assert writer.written["raw"] + writer.pending["raw"] == sequence + 1
+            assert writer.written["raw"] + len(writer.pending) == sequence + 1
     writer.flush()
-    assert (writer.written["raw"], writer.pending.total()) == (600, 0)
+    assert (writer.written["raw"], len(writer.pending)) == (600, 0)
     writer.close()
+
+
+def test_what_is_flushed_is_through_to_the_disk_and_so_is_the_name(tmp_path, monkeypatch):
+    synced = []
+    monkeypatch.setattr(os, "fdatasync", lambda descriptor: synced.append(os.fstat(descriptor).st_size))
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(Path(f"/proc/self/fd/{descriptor}").readlink()))
+    writer = RecordingWriter(tmp_path / "r.mcap", {})
+    assert synced == [tmp_path]
+    writer.write_message(RAW_KEY, raw(0), 0)
+    writer.flush()
+    writer.flush()
+    assert synced == [tmp_path, writer.size], "once, as long as there is nothing new"
+    writer.close()
+    assert synced[2:] == [(tmp_path / "r.mcap").stat().st_size, tmp_path]
+
+
+@pytest.mark.parametrize("for_ever", [False, True])
+def test_a_disk_that_fails_to_sync_is_told_and_the_file_ends_readable(tmp_path, monkeypatch, for_ever):
+    writer = RecordingWriter(tmp_path / "r.mcap", {})
+    sync, failures = os.fdatasync, count()
+
+    def fail(descriptor: int) -> None:
+        if for_ever or next(failures) == 0:
+            raise OSError(errno.EIO, "Input/output error")
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fdatasync", fail)
+    writer.write_message(RAW_KEY, raw(0), 0)
+    with pytest.raises(DiskError, match="r.mcap: cannot be written any more: Input/output error; it ends here"):
+        writer.flush()
+    reading = read_recording(tmp_path / "r.mcap")
+    assert [entry.message.header.sequence for entry in reading] == [0]
+    assert reading.damage == ""
+    with (tmp_path / "r.mcap").open("rb") as file:
+        assert (make_reader(file).get_summary() is None) == for_ever
+    assert (tmp_path / "r.mcap").read_bytes().count(MCAP0_MAGIC) == 2, "one beginning, one end"
+
+
+def test_a_write_that_the_disk_refuses_leaves_the_file_as_it_was(tmp_path):
+    file = WholeFile(tmp_path / "file")
+    with disk_of(1000):
+        file.write(b"a" * 900)
+        with pytest.raises(OSError, match="File too large"):
+            file.write(b"b" * 900)
+        file.write(b"c" * 50)
+    file.close()
+    assert (tmp_path / "file").read_bytes() == b"a" * 900 + b"c" * 50
 
 
 @contextmanager
@@ -261,14 +294,43 @@ def test_a_full_disk_ends_the_file_where_it_was_whole(tmp_path, size):
     with disk_of(size), pytest.raises(RecordingError, match="File too large; it ends here and is readable"):
         for written in count():
             writer.write_message(RAW_KEY, raw(written), written)
-    assert writer.written["raw"] + writer.pending["raw"] == written + 1
     assert writer.written["raw"] > 0
+    unwritten = [pending.message.header.sequence for pending in writer.pending]
+    assert unwritten == list(range(writer.written["raw"], written + 1))
     reading = read_recording(path)
     assert [e.message.header.sequence for e in reading] == list(range(writer.written["raw"]))
     assert reading.damage == ""
     with path.open("rb") as file:
         messages = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
     assert len(messages) == writer.written["raw"]
+
+
+def test_a_full_disk_leaves_room_for_no_index_and_the_file_is_readable_all_the_same(tmp_path):
+    path = tmp_path / "r.mcap"
+    writer = RecordingWriter(path, {})
+    with pytest.raises(RecordingError, match="it ends here and is readable"):
+        for sequence in count():
+            writer.write_message(RAW_KEY, raw(sequence), sequence)
+            if writer.written["raw"] > 500:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (writer.size + 100, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    reading = read_recording(path)
+    assert [e.message.header.sequence for e in reading] == list(range(writer.written["raw"]))
+    assert reading.damage == ""
+    with path.open("rb") as file:
+        assert make_reader(file).get_summary() is None
+
+
+def test_the_ledger_stands_in_the_file(tmp_path):
+    path = tmp_path / "r.mcap"
+    with RecordingWriter(path, {}) as writer:
+        for sequence in (3, 4, 7):
+            writer.write_message(RAW_KEY, raw(sequence), 1000 + sequence)
+    with path.open("rb") as file:
+        records = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+    assert accounts_of(records["fantwin.ledger"]) == {
+        (RAW_KEY, "acquisition-1"): Account(3, 2, 0, first_sequence=3, last_sequence=7, first_ns=1003, last_ns=1007)
+    }
 
 
 def test_a_disk_that_is_full_from_the_start_is_told_in_one_line(tmp_path):

@@ -110,31 +110,6 @@ def test_a_grid_sample_leaves_with_the_first_raw_sample_at_or_after_it() -> None
     assert [[seconds_of(g.t_ns).round(3).tolist() for g in grids] for grids in steps] == [[], [], [[0.01]], [[0.02]]]
 
 
-@settings(max_examples=60, deadline=None)
-@given(
-    steps=st.lists(st.floats(0.0005, 0.3).map(lambda s: s if s > 0.25 else s / 8), min_size=2, max_size=60),
-    missing=st.lists(st.booleans(), min_size=120, max_size=120),
-    block=st.integers(1, 20),
-    out_block=st.integers(1, 20),
-    with_clock=st.booleans(),
-)
-def test_block_sizes_do_not_change_the_grid(
-    steps: list[float], missing: list[bool], block: int, out_block: int, with_clock: bool
-) -> None:
-    t_ns = at(*np.cumsum(steps))
-    speed = np.where(np.array(missing[: 2 * len(steps)]).reshape(-1, 2), NAN, np.outer(np.cumsum(steps), [3.0, 5.0]))
-    message = raw(t_ns, speed, np.arange(0.0, len(steps)), fans=2)
-    if with_clock:
-        clock_us = ((t_ns - EPOCH_NS) // 1000).astype(np.uint32)
-        message = replace(message, device_clock_us=clock_us)
-    whole = ResamplerCore(2, ResamplerConfig(block_size=4096))
-    expected = [*whole.step(message), *whole.close()]
-    if not expected:
-        return
-    grid, _ = run(split(message, block), fans=2, block_size=out_block)
-    assert_same(grid, joined(expected))
-
-
 def test_blocks_have_the_size_asked_for() -> None:
     core = ResamplerCore(1, ResamplerConfig(block_size=7))
     grids = core.step(raw(at(*np.arange(0.0, 0.2, 0.01)), np.zeros(20)))

@@ -35,7 +35,7 @@ class Passer(Core):
 
     def step(self, item: Any) -> Sequence[Message]:
         self.fans = item.fans
-        return [self.grid(item.host_receive_t_ns)]
+        return [self.grid(item.host_receive_t_ns)] if isinstance(item, Raw) else []
 
     def close(self) -> Sequence[Message]:
         return [self.grid(np.array([-1]))] if self.fans else []
@@ -162,7 +162,7 @@ def test_an_output_says_what_had_been_taken_when_it_was_made(config):
     bench.feed(TRAY_B, 12)
     causes = [bench.next(Grid).header.cause for _ in range(3)]
     bench.end()
-    assert causes == [Cause("raw", "feeder", 0, 1), Cause("raw", "feeder", 1, 2), Cause("raw", "feeder", 0, 1)]
+    assert causes == [Cause("raw", "feeder", 0, 1, 0), Cause("raw", "feeder", 1, 2, 0), Cause("raw", "feeder", 0, 1, 0)]
 
 
 def test_what_is_made_because_time_has_passed_says_so(config):
@@ -184,7 +184,7 @@ def test_what_is_made_because_time_has_passed_says_so(config):
     bench.feed(TRAY_A, 10)
     cause = bench.next(Grid).header.cause
     bench.end()
-    assert cause == Cause("raw", "feeder", 0, 1, by_time=True)
+    assert cause == Cause("raw", "feeder", 0, 1, 0, by_time=True)
 
 
 def test_each_tray_has_a_core_and_a_sequence_of_its_own(config):

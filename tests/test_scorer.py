@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import replace
+from itertools import accumulate, cycle, pairwise, takewhile
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pipeline.config import SpeedUnit
-from schemas.messages import Alarm, FanState, Prediction, Score, Severity, WhyNot
+from schemas.blocks import cut
+from schemas.messages import Alarm, FanState, Prediction, Score, Severity, WhyNot, columns
 from stages.scorer import ScorerConfig, ScorerCore
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -190,18 +195,63 @@ def test_a_step_of_three_sigma_raises_within_a_second() -> None:
         assert alarm.t_ns - alarm.onset_t_ns == 500_000_000
 
 
-@pytest.mark.parametrize("size", [1, 7, 50])
-def test_the_block_size_changes_nothing(size: int) -> None:
-    rng = np.random.default_rng(8)
-    residual = rng.normal(0, SIGMA, (600, 3)) + 12 * (np.arange(600) // 150 % 2)[:, np.newaxis]
-    valid = rng.random((600, 3)) > 0.1
-    whole, expected = feed(core_of(fans=3), [prediction_of(residual, valid)])
-    parts = [prediction_of(residual[k : k + size], valid[k : k + size], first=k) for k in range(0, 600, size)]
-    scores, alarms = feed(core_of(fans=3), parts)
-    for name in ("smoothed_residual_rad_s", "state", "outside", "valid", "lower_bound_rad_s"):
-        np.testing.assert_array_equal(np.concatenate([getattr(s, name) for s in scores]), getattr(whole[0], name))
-    assert len(expected) >= 9
-    assert [asdict(alarm) for alarm in alarms] == [asdict(alarm) for alarm in expected]
+def eventful_prediction(seed: int, samples: int, change_s: float) -> Prediction:
+    """Three fans: residuals that cross the limits, values that are no number, invalid stretches, repeats, jumps."""
+    rng = np.random.default_rng(seed)
+    shape = (samples, 3)
+    k = np.arange(samples)
+    level = rng.choice([0.0, 0.0, 5.0, 7.0, 9.0, -12.0], (samples // 5 + 1, 3)).repeat(5, axis=0)[:samples]
+    prediction = prediction_of(level + rng.normal(0, 1, shape))
+    measured = np.where(rng.random(shape) < 0.02, np.nan, prediction.measured_speed_rad_s)
+    predicted = np.where(rng.random(shape) < 0.01, rng.choice([np.nan, np.inf, 1e308, -1e308]), 300.0)
+    valid = (rng.random((samples // 7 + 1, 3)) > 0.2).repeat(7, axis=0)[:samples] & (rng.random(shape) > 0.02)
+    steps = rng.choice([1, 1, 1, 1, 1, 0, -2, 40], samples) if change_s else np.ones(samples, int)
+    return replace(
+        prediction,
+        t_ns=EPOCH_NS + (steps.cumsum() + k // 50 * round(change_s * 100)) * STEP_NS,
+        measured_speed_rad_s=measured,
+        predicted_speed_rad_s=predicted,
+        valid=valid,
+        why_not=np.where(valid, WhyNot.NONE, WhyNot.GAP).astype(np.uint8),
+    )
+
+
+def judged(core: ScorerCore, predictions: Iterable[Prediction]) -> tuple[Any, ...]:
+    """All columns, to the bit, and what else the core says; each alarm as it reads."""
+    with np.errstate(all="ignore"):
+        scores, alarms = feed(core, predictions)
+    bits = {name: np.concatenate([getattr(s, name) for s in scores]).tobytes() for name in columns(Score) if scores}
+    return bits, [repr(alarm) for alarm in alarms], core.counters(), core.problem()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    samples=st.integers(1, 300),
+    sizes=st.lists(st.integers(1, 100), min_size=1, max_size=3),
+    smoothing_s=st.sampled_from([0.0, 0.02, 0.2]),
+    delays_s=st.sampled_from([(0.0, 0.0), (0.03, 0.05), (0.5, 1.0)]),
+    change_s=st.sampled_from([0.0, 0.1]),
+)
+def test_blocks_of_any_size_are_judged_the_same_to_the_bit(
+    seed: int, samples: int, sizes: list[int], smoothing_s: float, delays_s: tuple[float, float], change_s: float
+) -> None:
+    whole = eventful_prediction(seed, samples, change_s)
+    ends = [0, *takewhile(lambda end: end < samples, accumulate(cycle(sizes))), samples]
+    single, blocks = (
+        judged(
+            core_of(3, smoothing_s=smoothing_s, on_delay_s=delays_s[0], off_delay_s=delays_s[1], not_judged_s=0.1),
+            [cut(whole, *part) for part in pairwise(marks)],
+        )
+        for marks in (range(samples + 1), ends)
+    )
+    assert single == blocks
+
+
+def test_the_made_up_predictions_raise_and_clear_alarms() -> None:
+    core = core_of(3, smoothing_s=0.02, on_delay_s=0.03, off_delay_s=0.05)
+    judged(core, [eventful_prediction(seed=1, samples=2000, change_s=0.0)])
+    assert min(core.counters()[name] for name in ("alarms_raised", "alarms_cleared", "excursions_too_short")) > 10
 
 
 def test_a_score_carries_all_that_a_viewer_draws() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from pipeline.config import TrayConfig
 from pipeline.stage import Context, StageError
 from pipeline.twin_file import StateLayout, TwinFile
+from schemas.blocks import cut, join
 from schemas.messages import Grid, ModelCard, Prediction, WhyNot
 from stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
 from tests.twin_files import PARAMETERS, SIGMA_RAD_S, small_hybrid, write_twin
@@ -83,34 +83,15 @@ def silent(samples: int, first: int, command: float, why: WhyNot = WhyNot.GAP) -
     return grid
 
 
-def part(grid: Grid, k: slice) -> Grid:
-    return Grid(
-        fans=grid.fans,
-        step_ns=grid.step_ns,
-        t_ns=grid.t_ns[k],
-        command=grid.command[k],
-        speed_rad_s=grid.speed_rad_s[k],
-        valid=grid.valid[k],
-        why_not=grid.why_not[k],
-    )
-
-
 def split(grid: Grid, size: int) -> list[Grid]:
-    return [part(grid, slice(k, k + size)) for k in range(0, len(grid.t_ns), size)]
+    samples = len(grid.t_ns)
+    return [cut(grid, k, min(k + size, samples)) for k in range(0, samples, size)]
 
 
 def feed(core: TwinIntegratorCore, grids: Iterable[Grid]) -> Prediction:
     """All predictions of the grids, as one."""
     found = [m for grid in grids for m in core.step(grid) if isinstance(m, Prediction)]
-    names = ("t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "valid", "why_not")
-    columns: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in found]) for name in names}
-    return Prediction(
-        fans=found[0].fans,
-        step_ns=found[0].step_ns,
-        sigma_rad_s=found[0].sigma_rad_s,
-        twin=found[0].twin,
-        **columns,
-    )
+    return join(found)
 
 
 def stairs(samples: int, fans: int = 1, seed: int = 2) -> Floats:
@@ -230,7 +211,7 @@ def test_lost_grid_samples_are_counted_and_run_through() -> None:
     grid = grid_of(np.full(300, 40.0))
     whole = feed(core_of(), [grid])
     core = core_of()
-    holed = feed(core, [part(grid, slice(0, 100)), part(grid, slice(120, 300))])
+    holed = feed(core, [cut(grid, 0, 100), cut(grid, 120, 300)])
     assert core.counters()["lost_grid_samples"] == 20
     np.testing.assert_allclose(holed.predicted_speed_rad_s[100:], whole.predicted_speed_rad_s[120:], rtol=1e-12)
 
@@ -254,7 +235,7 @@ def test_samples_that_were_seen_are_dropped_and_counted() -> None:
     grid = grid_of(stairs(300))
     whole = feed(core_of(), [grid])
     core = core_of()
-    again = feed(core, [part(grid, slice(0, 200)), part(grid, slice(50, 150)), part(grid, slice(150, 300))])
+    again = feed(core, [cut(grid, 0, 200), cut(grid, 50, 150), cut(grid, 150, 300)])
     assert core.counters()["repeated"] == 150
     np.testing.assert_array_equal(again.t_ns, whole.t_ns)
     np.testing.assert_allclose(again.predicted_speed_rad_s, whole.predicted_speed_rad_s, rtol=1e-12)

@@ -19,8 +19,18 @@ from pipeline.config import RAD_S_PER_UNIT, TrayConfig
 from pipeline.stage import Context, Core, StageError
 from pipeline.trace import Trace
 from schemas.messages import FanState, Header, Health, ModelCard, Score, StageStatus, WhyNot
-from stages.viewer import FLUSH_PERIOD_NS, REPEAT_STATES_NS, SAMPLES_HELD, ViewerConfig, ViewerCore, build
+from stages.viewer import (
+    FLUSH_PERIOD_NS,
+    PAGE_PERIOD_NS,
+    REPEAT_STATES_NS,
+    SAMPLES_HELD,
+    ViewerConfig,
+    ViewerCore,
+    build,
+)
 from tests.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
+
+LATER_NS = START_NS + 400 * 86_400 * 1_000_000_000  # the host's time while what was recorded at START_NS is replayed
 
 
 @dataclass
@@ -29,7 +39,8 @@ class FakeSink:
 
     traces: list[Trace] = field(default_factory=list)
     states: list[tuple[str, int, list[int], list[str]]] = field(default_factory=list)
-    lines: list[tuple[str, str, str]] = field(default_factory=list)
+    lines: list[tuple[str, int, str, str]] = field(default_factory=list)
+    pages: list[str] = field(default_factory=list)
     flushed: int = 0
     closed: bool = False
 
@@ -39,8 +50,11 @@ class FakeSink:
     def change_states(self, tray: str, fan: int, t_ns: Any, names: Sequence[str]) -> None:
         self.states.append((tray, fan, t_ns.tolist(), list(names)))
 
-    def log(self, where: str, t_ns: int, level: str, text: str) -> None:
-        self.lines.append((where, level, text))
+    def log(self, tray: str, t_ns: int, level: str, text: str) -> None:
+        self.lines.append((tray, t_ns, level, text))
+
+    def show_stages(self, page: str) -> None:
+        self.pages.append(page)
 
     def flush(self) -> None:
         self.flushed = len(self.traces)
@@ -146,29 +160,46 @@ def test_speeds_are_shown_in_the_unit_of_the_tray() -> None:
     rpm = 60 / (2 * np.pi)
     np.testing.assert_allclose(sink.traces[0].measured, scores[0].measured_speed_rad_s * rpm)
     np.testing.assert_allclose(sink.traces[0].half_width, 2 * SIGMA * rpm)
-    assert alarms[0].message in sink.lines[0][2]
+    assert alarms[0].message in sink.lines[0][3]
 
 
-def test_alarms_the_twin_in_force_and_changes_of_health_go_to_the_logs() -> None:
+def test_alarms_go_to_the_log_of_their_tray_at_the_samples_time() -> None:
     sink = FakeSink()
     _, alarms = made_up_tray()
     core = core_of(sink)
-    core.step(ModelCard(header=Header("x", 0, "tray1"), t_ns=START_NS, twin="f40", kind="hybrid", sha256=""))
     for alarm in alarms:
         core.step(alarm)
-    healths = [health(), health(), health(lost=3), health(lost=3), health(problem="the port is gone")]
-    for one in healths:
-        core.step(one)
-    assert [(where, level) for where, level, _ in sink.lines] == [
-        ("tray1", "INFO"),
-        ("tray1", "ERROR"),
-        ("tray1", "INFO"),
-        ("stages", "INFO"),
-        ("stages", "WARN"),
-        ("stages", "WARN"),
+    assert [line[:3] for line in sink.lines] == [
+        ("tray1", alarms[0].t_ns, "ERROR"),
+        ("tray1", alarms[1].t_ns, "INFO"),
     ]
-    assert "f40" in sink.lines[0][2] and "alarm raised" in sink.lines[1][2] and "cleared" in sink.lines[2][2]
-    assert "3 lost" in sink.lines[4][2] and "the port is gone" in sink.lines[5][2]
+    assert "alarm raised" in sink.lines[0][3] and "cleared" in sink.lines[1][3]
+
+
+def test_what_the_stages_and_the_twin_say_is_a_page_that_is_replaced_when_it_changes() -> None:
+    sink = FakeSink()
+    core = core_of(sink)
+    core.step(health())
+    core.tick(LATER_NS)
+    core.step(health())
+    core.tick(LATER_NS + PAGE_PERIOD_NS)
+    assert len(sink.pages) == 1
+    core.step(card())
+    core.step(health(problem="the port is gone"))
+    core.tick(LATER_NS + 2 * PAGE_PERIOD_NS)
+    assert len(sink.pages) == 2 and sink.lines == []
+    assert "f40" not in sink.pages[0] and "f40" in sink.pages[1] and "the port is gone" in sink.pages[1]
+
+
+def test_pages_that_change_all_the_time_are_shown_now_and_then_and_the_last_one_always() -> None:
+    sink = FakeSink()
+    core = core_of(sink)
+    for tenth in range(200):
+        core.step(health(problem=f"problem {tenth}"))
+        core.tick(LATER_NS + tenth * 100_000_000)
+    assert PAGE_PERIOD_NS == 5_000_000_000 and len(sink.pages) == 4
+    core.close()
+    assert len(sink.pages) == 5 and "problem 199" in sink.pages[-1]
 
 
 def test_scores_that_do_not_fit_the_configuration_are_counted_and_told() -> None:
@@ -222,6 +253,22 @@ def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp
     states = [row["StateChange:state"][0] for _, row in rows["/tray1/state/fan_2"]]
     assert [name for name, _ in groupby(states)] == ["normal", "suspect", "alarm", "returning", "normal"]
     assert [row["TextLog:level"][0] for _, row in rows["/tray1/log"]] == ["ERROR", "INFO"]
+
+
+def test_a_recording_of_long_ago_is_all_there_is_in_time_whatever_the_stages_say_today(tmp_path: Path) -> None:
+    scores, alarms = made_up_tray(seconds=2)
+    core = build(context(tmp_path)).core
+    for number, item in enumerate((health(), card(), *scores, *alarms, health(lost=3, problem="two | *lines*"))):
+        core.step(item)
+        core.tick(LATER_NS + number * FLUSH_PERIOD_NS)
+    core.close()
+    rows = rows_of(tmp_path / "view.rrd")
+    times = [t_ns for entity in rows.values() for t_ns, _ in entity]
+    assert min(times) == int(scores[0].t_ns[0])
+    assert max(times) == max(int(scores[-1].t_ns[-1]), *(alarm.t_ns for alarm in alarms))
+    page = pages_of(tmp_path / "view.rrd")[-1]
+    assert "| scorer | **degraded** | **3** |" in page
+    assert r"- **scorer**: two \| \*lines\*" in page and "f40" in page
 
 
 def test_an_alarm_zone_lies_beyond_the_band_on_both_sides_and_ends_with_the_alarm(tmp_path: Path) -> None:
@@ -353,6 +400,10 @@ def changed(score: Score, **columns: Any) -> Score:
     return Score(**{**vars(score), **columns})
 
 
+def card() -> ModelCard:
+    return ModelCard(header=Header("x", 0, "tray1"), t_ns=LATER_NS, twin="f40", kind="hybrid", sha256="")
+
+
 def health(lost: int = 0, problem: str = "") -> Health:
     status = StageStatus.DEGRADED if problem else StageStatus.OK
     return Health(
@@ -386,6 +437,13 @@ def rows_of(path: Path) -> dict[str, list[tuple[int, dict[str, Any]]]]:
             row = {name: table.column(name)[index].as_py() for name in names}
             rows.setdefault(chunk.entity_path, []).append((t_ns, row))
     return {path: sorted(of, key=lambda row: row[0]) for path, of in rows.items()}
+
+
+def pages_of(path: Path) -> list[str]:
+    """The pages on the stages in the order in which they were shown."""
+    chunks = [chunk for chunk in chunks_of(path) if chunk.entity_path == "/stages"]
+    assert all(chunk.is_static for chunk in chunks)
+    return [text[0] for chunk in chunks for text in chunk.to_record_batch().column("TextDocument:text").to_pylist()]
 
 
 def styles_of(path: Path, entity: str, component: str) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from PIL import Image
 
 from pipeline.commands.picture import picture
 from pipeline.errors import UserError
-from stages.viewer import build
+from stages.viewer import PAGE_PERIOD_NS, build
+from tests.chain import eventually
 from tests.score_data import made_up_tray
-from tests.test_viewer import context, play
+from tests.test_viewer import LATER_NS, card, context, free_port, health, play
 
 rerun_picture = pytest.importorskip("pipeline.rerun_picture", exc_type=ModuleNotFoundError)
 needs_a_driver = pytest.mark.skipif(
@@ -86,6 +88,25 @@ def test_the_command_writes_the_picture_and_says_what_it_shows(
     assert Image.open(output).width == 1920
 
 
+@pytest.mark.slow
+@needs_a_driver
+def test_a_live_viewer_follows_a_recording_of_long_ago_though_the_stages_speak_today(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(seconds=5)
+    port = free_port()
+    core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core
+    with rerun_picture._headless_viewer() as viewer:
+        viewer.open(f"rerun+http://127.0.0.1:{port}/proxy")
+        for number, item in enumerate((card(), health(), *scores, health(problem="something is wrong"))):
+            core.step(item)
+            core.tick(LATER_NS + number * PAGE_PERIOD_NS)
+        last_ns = int(scores[-1].t_ns[-1])
+        eventually(lambda: abs(shown_ns(viewer) - last_ns) < 1000, "the last sample is under the cursor")
+        assert {str(report) for view in viewer.get_state().views for report in view.reports} == set()
+        measured = next(view for view in viewer.get_state().views if "fan 0" in view.name)
+        assert colors(viewer.take_screenshot(measured.view_id))["band"] > 0.01
+    core.close()
+
+
 def test_without_a_driver_one_line_says_what_to_install(view_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rerun_picture.sys, "platform", "linux")
     monkeypatch.setenv("VK_DRIVER_FILES", "/nowhere/icd.json")
@@ -114,6 +135,11 @@ def test_a_file_that_is_no_view_is_told_in_one_line(tmp_path: Path) -> None:
             path.write_bytes(b"not a view, and long enough to be read as a header")
         with pytest.raises(UserError, match=said):
             rerun_picture.draw_picture(path)
+
+
+def shown_ns(viewer: Any) -> int:
+    """Where the cursor of a viewer's one recording is; 0 if it shows nothing in time yet."""
+    return next((entry.current_time or 0 for entry in viewer.get_state().recordings), 0)
 
 
 def colors(png: bytes) -> dict[str, float]:

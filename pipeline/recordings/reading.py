@@ -88,17 +88,17 @@ class Reading:
 
     def _records(self) -> Iterator[McapRecord]:
         try:
-            for record in _records_of(self.path):
+            for record in records_of(self.path):
                 if not isinstance(record, Chunk):
                     yield record
                     continue
                 try:
                     inside = breakup_chunk(record, validate_crc=True)
-                except _BROKEN:
+                except BROKEN:
                     self.damaged_chunks += 1
                 else:
                     yield from inside
-        except _BROKEN:
+        except BROKEN:
             self.torn = True
 
 
@@ -108,8 +108,8 @@ def read_recording(path: Path, topics: Collection[str] | None = None) -> Reading
     Raises:
         RecordingError: there is no such file, or it is no recording.
     """
-    with suppress(*_BROKEN):
-        next(_records_of(path))
+    with suppress(*BROKEN):
+        next(records_of(path))
     return Reading(path, topics)
 
 
@@ -133,8 +133,8 @@ def read_head(path: Path) -> Head:
     """
     metadata: dict[str, str] = {}
     attachments: dict[str, bytes] = {}
-    with suppress(*_BROKEN):
-        for record in _records_of(path):
+    with suppress(*BROKEN):
+        for record in records_of(path):
             if isinstance(record, Metadata) and record.name == METADATA_NAME:
                 metadata.update(record.metadata)
             elif isinstance(record, Attachment):
@@ -144,12 +144,12 @@ def read_head(path: Path) -> Head:
     return Head(metadata, attachments)
 
 
-_BROKEN = (McapError, ZstdError, ValueError, struct.error, OverflowError, MemoryError)
+BROKEN = (McapError, ZstdError, ValueError, struct.error, OverflowError, MemoryError)
 """What reading bytes that are not what they should be raises; the last two where a damaged length asks for too much."""
 
 
-def _records_of(path: Path) -> Iterator[McapRecord]:
-    """The records of a file, chunks as they are. Raises RecordingError at its beginning, or one of `_BROKEN` later."""
+def records_of(path: Path) -> Iterator[McapRecord]:
+    """The records of a file, chunks as they are. Raises RecordingError at its beginning, or one of `BROKEN` later."""
     try:
         with path.open("rb") as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:

@@ -1,33 +1,37 @@
 """Writing recordings: MCAP files, whole at every moment as far as they go.
 
-Metadata and attachments stand before the first message, so that a file that was torn off still says what it is. While
-it is written a file is called NAME.mcap.active. See docs/recordings.md.
+Metadata and attachments stand before the first message, so that a file that was torn off still says what it is; the
+ledger stands behind the last. While it is written a file is called NAME.mcap.active. See docs/recordings.md.
 """
 
 from __future__ import annotations
 
-import fcntl
 import mimetypes
-import os
+import struct
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from functools import partial
+from functools import cache
 from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
+from zlib import crc32
 
-from mcap.data_stream import RecordBuilder
-from mcap.records import DataEnd, Footer
-from mcap.well_known import MessageEncoding
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Header, Metadata, Schema
+from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import MCAP0_MAGIC
-from mcap.writer import Writer as McapWriter
-from mcap_protobuf.schema import register_schema
+from mcap_protobuf.schema import build_file_descriptor_set
+from zstandard import ZstdCompressor
 
-from pipeline.recordings.reading import METADATA_NAME, RecordingError, read_recording
-from schemas.codec import encode, proto_type
-from schemas.messages import Message, newest_t_ns
+from pipeline.recordings.disk import WholeFile, refused, sync_folder
+from pipeline.recordings.index import SHORT_ENDING, Index, message_indexes
+from pipeline.recordings.ledger import BEFORE_NAME, ENDED, LEDGER_NAME, Account, Ledger, Line, as_metadata
+from pipeline.recordings.reading import METADATA_NAME, RecordingError
+from pipeline.recordings.records import MESSAGE, RECORD, record_bytes
+from schemas.codec import encode, proto_type, type_name
+from schemas.messages import Health, Message, newest_t_ns
 from schemas.topics import topic_of
 
 ACTIVE_SUFFIX = ".active"
@@ -36,39 +40,16 @@ CHUNK_BYTES = (
 )  # what is not yet in a finished chunk is lost in a crash, and a reader holds one chunk in memory
 
 
-class _File:
-    """A file in which every write is whole or has not been: on a full disk it keeps what it had."""
+_MESSAGE_RECORD = struct.Struct(RECORD.format + MESSAGE.format.removeprefix("<"))
 
-    def __init__(self, path: Path) -> None:
-        """Open for writing; refuses a file that another process is writing. OSError if that cannot be done."""
-        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # let go of by the system, even after kill -9
-            os.ftruncate(self._descriptor, 0)
-        except OSError:
-            os.close(self._descriptor)
-            raise
-        self.size = 0
 
-    def write(self, data: bytes) -> None:
-        rest = memoryview(data)
-        try:
-            while rest:
-                rest = rest[os.write(self._descriptor, rest) :]
-        except OSError:
-            os.ftruncate(self._descriptor, self.size)
-            os.lseek(self._descriptor, self.size, os.SEEK_SET)
-            raise
-        self.size += len(data)
+class Pending(NamedTuple):
+    """A message that is to be in a recording: the key it came on, its bytes, when it was received."""
 
-    def tell(self) -> int:
-        return self.size
-
-    def flush(self) -> None:
-        """Nothing is held back: the system has it, and a killed process loses none of it."""
-
-    def close(self) -> None:
-        os.close(self._descriptor)
+    key: str
+    payload: bytes
+    message: Message
+    log_time_ns: int
 
 
 class RecordingWriter:
@@ -85,11 +66,12 @@ class RecordingWriter:
         *,
         t_ns: int = 0,
         overwrite: bool = False,
+        ledger: Ledger | None = None,
     ) -> None:
-        """Begin `path`, under its active name.
+        """Begin `path`, under its active name. What a killed process has left under that name is lost: see
+        `pipeline.recordings.parts` for what keeps it.
 
         Without `overwrite`, a finished file of that name is left alone and this one becomes NAME-2.mcap, and so on.
-        What a killed recorder has left under the active name is kept in the same way: see `left_over`.
 
         Args:
             path: NAME.mcap.
@@ -97,83 +79,95 @@ class RecordingWriter:
             attachments: name -> content.
             t_ns: when it begins, ns since 1970.
             overwrite: replace a finished file.
+            ledger: that goes on from the parts before.
 
         Raises:
+            DiskError: the disk is full, or has gone.
             RecordingError: it cannot be written there, or another process is writing it.
         """
         self.path = path
-        self.left_over: Path | None = None
-        """the name now borne by what a killed recorder had left"""
+        self.ledger = ledger or Ledger()
         self.written: Counter[str] = Counter()
         """messages of each topic that are in the file for good"""
-        self.pending: Counter[str] = Counter()
-        """messages of each topic in the chunk that is not written yet"""
+        self.pending: list[Pending] = []
+        """the messages that are not: those of the chunk that is not written yet"""
         self._overwrite = overwrite
         self._ended = False
+        self._index = Index()
         self._channels: dict[str, tuple[int, str]] = {}
-        self._schemas: dict[type[Message], int] = {}
+        self._chunk = _Chunk()
         self._active = path.with_name(path.name + ACTIVE_SUFFIX)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self.left_over = _keep_left_over(self._active, path)
-            self._file = _File(self._active)
+            self._file = WholeFile(self._active)
         except BlockingIOError as error:
             raise RecordingError(
                 f"{self._active}: another recorder is writing it; stop it, or name another file"
             ) from error
         except OSError as error:
-            raise RecordingError(f"{path}: cannot be written: {error.strerror}; name another file or folder") from error
-        self._mcap = McapWriter(self._file, chunk_size=CHUNK_BYTES)  # type: ignore[arg-type]  it wants a stream of any kind
+            raise refused(f"{path}: cannot be written", error, "name another file or folder") from error
         try:
-            self._mcap.start(profile="", library="fantwin")
-            self._mcap.add_metadata(METADATA_NAME, dict(metadata))
+            self._file.write(MCAP0_MAGIC + record_bytes(Header(profile="", library="fantwin")))
+            self._write_metadata(METADATA_NAME, metadata)
+            if self.ledger.next:
+                self._write_metadata(BEFORE_NAME, self.ledger.before_as_metadata())
             for name, content in (attachments or {}).items():
-                self._mcap.add_attachment(t_ns, t_ns, name, _media_type(name), content)
+                self._write_attachment(Attachment(t_ns, t_ns, name, _media_type(name), content))
+            sync_folder(path.parent)
         except OSError as error:
             self.discard()
-            raise RecordingError(f"{path}: cannot be written: {error.strerror}; name another file or folder") from error
+            raise refused(f"{path}: cannot be written", error, "name another file or folder") from error
+
+    @property
+    def size(self) -> int:
+        """Of the file, in bytes."""
+        return self._file.size
 
     def write(self, key: str, payload: bytes, message: Message, log_time_ns: int) -> None:
         """Add a message: the key it came on, its bytes, and when it was received.
 
         Raises:
-            RecordingError: the disk refuses; `pending` then counts what did not get into the file.
+            RecordingError: the disk refuses; `pending` then has what did not get into the file.
         """
-        channel, topic = self._channels.get(key) or self._register(key, type(message))
-        self.pending[topic] += 1
-        self._put(
-            partial(
-                self._mcap.add_message,
-                channel,
-                max(0, log_time_ns),  # MCAP has no time before 1970; the message itself keeps it
-                payload,
-                max(0, newest_t_ns(message)),
-                message.header.sequence % 2**32,  # a field of 32 bits in MCAP
-            )
-        )
+        channel, _ = self._channels.get(key) or self._register(key, type(message))
+        self.pending.append(Pending(key, payload, message, log_time_ns))
+        self._chunk.add(channel, message.header.sequence, log_time_ns, newest_t_ns(message), payload)
+        if self._chunk.size > CHUNK_BYTES:
+            self._close_chunk()
 
     def write_message(self, key: str, message: Message, log_time_ns: int) -> None:
         """The same for a message that has not been on the bus."""
         self.write(key, encode(message), message, log_time_ns)
 
     def flush(self) -> None:
-        """Close the chunk: what has been written until now survives a crash of this process.
+        """Through to the disk: what has been written until now survives a crash, of the machine too.
 
         Raises:
             RecordingError: as in `write`.
         """
-        if self.pending:
-            self._put(self._mcap.flush)
+        self._close_chunk()
+        try:
+            self._file.sync()
+        except OSError as error:
+            raise self._end_early(error) from error
 
-    def close(self) -> None:
+    def close(self, *, has_ended: bool = False) -> None:
         """Finish the file and give it its name, `path`. Does nothing to a file that has already been ended.
+
+        has_ended: the recorder comes to its end with it; what was published and has not come is then missing.
 
         Raises:
             RecordingError: as in `write`.
         """
         if self._ended:
             return
-        self._put(self._mcap.finish)
+        self._close_chunk()
+        if has_ended:
+            self.ledger.settle()
+        try:
+            write_ending(self._file, self._index, self.ledger.accounts, has_ended=has_ended)
+        except OSError as error:
+            raise self._end_early(error) from error
         self._hand_over()
 
     def discard(self) -> None:
@@ -193,39 +187,65 @@ class RecordingWriter:
             self.discard()
 
     def _register(self, key: str, message_type: type[Message]) -> tuple[int, str]:
-        if message_type not in self._schemas:
-            self._schemas[message_type] = register_schema(self._mcap, proto_type(message_type))
-        channel = self._mcap.register_channel(key, MessageEncoding.Protobuf, self._schemas[message_type])
-        self._channels[key] = (channel, topic_of(key).name)
+        name = type_name(message_type)
+        known = next((schema for schema in self._index.schemas.values() if schema.name == name), None)
+        schema = known or Schema(
+            id=len(self._index.schemas) + 1, name=name, encoding=SchemaEncoding.Protobuf, data=_schema(message_type)
+        )
+        channel = Channel(
+            id=len(self._channels) + 1,
+            topic=key,
+            message_encoding=MessageEncoding.Protobuf,
+            metadata={},
+            schema_id=schema.id,
+        )
+        self._index.schemas[schema.id] = schema
+        self._index.channels[channel.id] = channel
+        self._chunk.append(record_bytes(channel) if known else record_bytes(schema, channel))
+        self._channels[key] = (channel.id, topic_of(key).name)
         return self._channels[key]
 
-    def _put(self, write: Callable[[], None]) -> None:
-        """Let MCAP write, and note whether it has closed a chunk."""
-        before = self._file.size
+    def _close_chunk(self) -> None:
+        if not self.pending:
+            return
+        offset = self._file.size
+        record, index = self._chunk.made(offset)
         try:
-            write()
+            self._file.write(record)
         except OSError as error:
-            self._note_written(before)
-            self._end_short()
-            raise RecordingError(
-                f"{self.path}: cannot be written any more: {error.strerror}; it ends here and is readable: make room "
-                "and start the recorder again"
-            ) from error
-        self._note_written(before)
+            raise self._end_early(error) from error
+        self._index.note_chunk(index, {channel: len(flat) // 2 for channel, flat in self._chunk.entries.items()})
+        self._chunk = _Chunk()
+        for key, _, message, log_time_ns in self.pending:
+            header = message.header
+            self.ledger.note(key, header.producer, header.sequence, log_time_ns)
+            self.written[self._channels[key][1]] += 1
+            if isinstance(message, Health):
+                self.ledger.note_health(message)
+        self.pending = []
 
-    def _note_written(self, before: int) -> None:
-        if self._file.size != before:
-            self.written += self.pending
-            self.pending.clear()
+    def _write_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        metadata = Metadata(name=name, metadata=dict(values))
+        record = record_bytes(metadata)
+        self._index.note_metadata(metadata, self._file.size, len(record))
+        self._file.write(record)
 
-    def _end_short(self) -> None:
-        """End the file at its last whole record, without a summary: forty bytes, where a summary may need thousands."""
-        ending = RecordBuilder()
-        DataEnd(0).write(ending)
-        Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(ending)
-        with suppress(OSError):  # without them the file is readable all the same, by readers that bear a torn file
-            self._file.write(ending.end() + MCAP0_MAGIC)
+    def _write_attachment(self, attachment: Attachment) -> None:
+        record = record_bytes(attachment)
+        self._index.note_attachment(attachment, self._file.size, len(record))
+        self._file.write(record)
+
+    def _end_early(self, error: OSError) -> RecordingError:
+        """End the file at its last whole chunk, with an index if there is room for one; what to raise."""
+        try:
+            write_ending(self._file, self._index, self.ledger.accounts)
+        except OSError:
+            with suppress(OSError):  # without it the file is readable all the same, by readers that bear a torn file
+                self._file.write(SHORT_ENDING)
         self._hand_over()
+        return refused(
+            f"{self.path}: cannot be written any more", error, "it ends here and is readable: make room on the disk"
+        )
 
     def _hand_over(self) -> None:
         self._ended = True
@@ -233,35 +253,105 @@ class RecordingWriter:
             self.path = free_name(self.path)
         try:
             self._active.replace(self.path)
+            sync_folder(self.path.parent)
         except OSError as error:
-            raise RecordingError(
-                f"{self.path}: the recording cannot be given its name: {error.strerror}; it stays {self._active.name}"
+            raise refused(
+                f"{self.path}: the recording cannot be given its name", error, f"it stays {self._active.name}"
             ) from error
         finally:
             self._file.close()
+
+
+class _Chunk:
+    """The chunk that is being filled."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        self.entries: dict[int, list[int]] = {}
+        """by channel: log time and place of each message, in turns"""
+        self._parts: list[bytes] = []
+
+    def append(self, record: bytes) -> None:
+        """Add a record that is no message."""
+        self._parts.append(record)
+        self.size += len(record)
+
+    def add(self, channel: int, sequence: int, log_time_ns: int, publish_time_ns: int, payload: bytes) -> None:
+        """Add a message. MCAP has no time before 1970 (the message itself keeps it), and 32 bits for the sequence."""
+        log_time_ns = max(0, log_time_ns)
+        publish_time_ns = max(0, publish_time_ns)
+        length = MESSAGE.size + len(payload)
+        head = _MESSAGE_RECORD.pack(
+            Opcode.MESSAGE, length, channel, sequence & 0xFFFFFFFF, log_time_ns, publish_time_ns
+        )
+        self._parts += (head, payload)
+        entries = self.entries.get(channel)
+        if entries is None:
+            entries = self.entries[channel] = []
+        entries += (log_time_ns, self.size)
+        self.size += RECORD.size + length
+
+    def made(self, offset: int) -> tuple[bytes, ChunkIndex]:
+        """The chunk's record and those of its index behind it, which are to stand at `offset`."""
+        data = b"".join(self._parts)
+        packed = ZstdCompressor().compress(data)
+        first_ns = min(min(flat[::2]) for flat in self.entries.values())
+        last_ns = max(max(flat[::2]) for flat in self.entries.values())
+        record = record_bytes(
+            Chunk(
+                compression="zstd",
+                data=packed,
+                message_start_time=first_ns,
+                message_end_time=last_ns,
+                uncompressed_crc=crc32(data),
+                uncompressed_size=len(data),
+            )
+        )
+        indexes, offsets = message_indexes(self.entries, offset + len(record))
+        index = ChunkIndex(
+            message_start_time=first_ns,
+            message_end_time=last_ns,
+            chunk_start_offset=offset,
+            chunk_length=len(record),
+            message_index_offsets=offsets,
+            message_index_length=len(indexes),
+            compression="zstd",
+            compressed_size=len(packed),
+            uncompressed_size=len(data),
+        )
+        return record + indexes, index
+
+
+@cache
+def _schema(message_type: type[Message]) -> bytes:
+    return build_file_descriptor_set(proto_type(message_type)).SerializeToString()
+
+
+def write_ending(
+    file: WholeFile, index: Index, accounts: Mapping[Line, Account], *, before: bytes = b"", has_ended: bool = False
+) -> None:
+    """End a file with `before`, the ledger and the index: all of it, or nothing.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    ledger = Metadata(name=LEDGER_NAME, metadata=as_metadata(accounts) | ({ENDED: "in order"} if has_ended else {}))
+    record = record_bytes(ledger)
+    offset = file.size + len(before)
+    index.note_metadata(ledger, offset, len(record))
+    without = file.size
+    try:
+        file.write(before + record + index.ending(offset + len(record)))
+        file.sync()
+    except OSError:
+        file.cut(without)
+        raise
 
 
 def free_name(path: Path) -> Path:
     """`path` if there is no such file, or else the first of NAME-2, NAME-3 ... that is free."""
     names = chain([path], (path.with_stem(f"{path.stem}-{number}") for number in count(2)))
     return next(name for name in names if not name.exists())
-
-
-def _keep_left_over(active: Path, path: Path) -> Path | None:
-    """Give what a killed recorder has left the name of a recording; one without any message is not worth it."""
-    try:
-        descriptor = os.open(active, os.O_RDWR | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        try:
-            worth = any(True for _ in read_recording(active))
-        except RecordingError:
-            worth = False
-        return active.rename(free_name(path)) if worth else None
-    finally:
-        os.close(descriptor)
 
 
 def _media_type(name: str) -> str:

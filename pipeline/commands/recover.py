@@ -1,0 +1,117 @@
+"""`fantwin recover`: a torn recording becomes whole again."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pipeline.commands.options import JsonOption
+from pipeline.commands.progress import working
+from pipeline.recordings.contents import BREAKS_OFF, NO_LOSS, damage_of
+from pipeline.recordings.ledger import Account, add_up
+from pipeline.recordings.recovery import Recovery
+from pipeline.recordings.recovery import recover as recover_file
+from pipeline.recordings.scan import Scan
+
+
+def recover(
+    file: Annotated[Path, typer.Argument(metavar="TORN.mcap", help="What a killed recorder or a bad disk has left.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="WHOLE.mcap", help="Recording to write; without it, in place."),
+    ] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Make a torn recording whole again (end, index, statistics, ledger), and say what is in it and what is missing.
+
+    Without -o the whole recording takes the name of the torn one, which is kept beside it as TORN.mcap.torn. Exit code
+    0: nothing was lost; 3: something was; 1: nothing could be recovered.
+
+    Example: fantwin recover runs/recording.mcap.active
+    """
+    with working(f"reading {file}"):
+        recovery = recover_file(file, output)
+    if json_output:
+        typer.echo(json.dumps(as_json(file, recovery)))
+    else:
+        for line in _lines(file, recovery):
+            typer.echo(line)
+    if losses(recovery.found):
+        raise typer.Exit(3)
+
+
+def losses(found: Scan) -> list[str]:
+    """What is missing, or may be, one line each; nothing where nothing is."""
+    lines = [line for line in damage_of(found) if line not in NO_LOSS | {BREAKS_OFF}]
+    if not found.is_ended:
+        flush_s = found.metadata.get("flush_interval_s")
+        may = f"what came in the last {flush_s} s" if flush_s else "what was in the unfinished chunk"
+        lines.insert(0, f"{BREAKS_OFF}: {may} may be missing")
+    for (key, producer), account in found.accounts.items():
+        if account.missing:
+            lines.append(f"{key}: {_messages(account.missing)} of {producer} missing in between")
+    for (key, producer), count in found.census.ledger.unrecorded().items() if not found.is_ended else ():
+        lines.append(f"{key}: {_messages(count)} of {producer} published, by its health, after the last one here")
+    return lines
+
+
+def _lines(file: Path, recovery: Recovery) -> list[str]:
+    found = recovery.found
+    if found.is_whole:
+        copied = f"; copied to {recovery.path}" if recovery.path != file else ""
+        lines = [f"{file}: is whole already, with {_messages(found.messages)}; nothing to recover{copied}"]
+    else:
+        kept = f"; the torn file is {recovery.torn}" if recovery.torn else ""
+        lines = [f"{file}: {_messages(found.messages)} are whole again in {recovery.path}{kept}"]
+    for topic, account in _by_topic(found).items():
+        last = f", the last at {_time(account.last_ns)}" if account.last_ns is not None else ""
+        missing = f", {account.missing} missing" if account.missing else ""
+        lines.append(f"  {topic}: {_messages(account.messages)}{missing}{last}")
+    lost = losses(found)
+    return lines + (["lost:", *(f"  {line}" for line in lost)] if lost else ["nothing was lost"])
+
+
+def as_json(file: Path, recovery: Recovery) -> dict[str, Any]:
+    """What a machine is told."""
+    found = recovery.found
+    unrecorded = {} if found.is_ended else found.census.ledger.unrecorded()
+    return {
+        "file": str(file),
+        "whole": str(recovery.path),
+        "torn": str(recovery.torn) if recovery.torn else None,
+        "was_whole": found.is_whole,
+        "had_ended": found.is_ended,
+        "messages": found.messages,
+        "topics": {
+            topic: {
+                "messages": account.messages,
+                "missing": account.missing,
+                "duplicated": account.duplicated,
+                "first_ns": account.first_ns,
+                "last_ns": account.last_ns,
+            }
+            for topic, account in _by_topic(found).items()
+        },
+        "published_after_the_last": {f"{key} {producer}": count for (key, producer), count in unrecorded.items()},
+        "thrown_away_bytes": found.thrown_away_bytes,
+        "damaged_chunks": found.damaged_chunks,
+        "damaged_attachments": found.damaged_attachments,
+        "damaged_records": found.damaged_records,
+        "lost": losses(found),
+    }
+
+
+def _by_topic(found: Scan) -> dict[str, Account]:
+    return add_up(found.accounts.items()) | found.census.others
+
+
+def _messages(count: int) -> str:
+    return "1 message" if count == 1 else f"{count} messages"
+
+
+def _time(t_ns: int) -> str:
+    return datetime.fromtimestamp(t_ns / 1e9).isoformat(sep=" ", timespec="milliseconds")

@@ -1,0 +1,157 @@
+"""The account of a recording: of every key and producer, what was recorded, what is missing, what came twice.
+
+A producer numbers its messages on a key without gaps, so every hole between the first and the last is a loss.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import TypeAlias
+
+from schemas.messages import Health
+
+LEDGER_NAME = "fantwin.ledger"
+"""the metadata record that holds a finished ledger"""
+ENDED = "ended"
+"""its entry that says that the recorder ended in order with this part"""
+BEFORE_NAME = "fantwin.before"
+"""the one, before the first message, that says with which number each producer should go on"""
+
+Line: TypeAlias = tuple[str, str]
+"""Key and producer."""
+
+
+@dataclass(slots=True)
+class Account:
+    """Of one key and producer. `missing` counts holes, that before the first message included where it is known what
+    had been recorded before. Sequence numbers and times, of receipt, are of the messages here; None without any."""
+
+    messages: int = 0
+    missing: int = 0
+    duplicated: int = 0
+    first_sequence: int | None = None
+    last_sequence: int | None = None
+    first_ns: int | None = None
+    last_ns: int | None = None
+
+
+_FIGURES = {field.name for field in fields(Account)}
+
+
+class Ledger:
+    """Kept message by message, in the order in which they are recorded."""
+
+    def __init__(self, before: Mapping[Line, int] | None = None) -> None:
+        """before: with which sequence number each producer should go on, where parts have gone before."""
+        self.accounts: dict[Line, Account] = {}
+        self.next: dict[Line, int] = dict(before or {})
+        """the sequence number each producer should go on with"""
+        self._published: dict[Line, int] = {}
+
+    def note(self, key: str, producer: str, sequence: int, log_time_ns: int) -> None:
+        """A message was recorded. A twin's card is written again at the start of each part, and counts once."""
+        line = (key, producer)
+        due = self.next.get(line)
+        if due is not None and sequence < due and key.endswith("/twin"):
+            return
+        account = self.accounts.get(line)
+        if account is None:
+            account = self.accounts[line] = Account()
+        if account.messages == 0:
+            account.first_sequence, account.first_ns = sequence, log_time_ns
+        account.messages += 1
+        account.last_ns = log_time_ns
+        if due is not None and sequence < due:
+            account.duplicated += 1
+            return
+        if due is not None:
+            account.missing += sequence - due
+        account.last_sequence = sequence
+        self.next[line] = sequence + 1
+
+    def note_health(self, health: Health) -> None:
+        """A health was recorded: it says how much its stage had published by then."""
+        for output in health.outputs:
+            self._published[output.key, health.header.producer] = output.published
+
+    def lose(self, key: str, producer: str, sequence: int) -> None:
+        """A message came that is not going to be recorded: a hole, as soon as a later one is, or else at the end."""
+        line = (key, producer)
+        self.next.setdefault(line, sequence)
+        self._published[line] = max(sequence + 1, self._published.get(line, 0))
+
+    def note_duplicated(self, key: str, producer: str, count: int = 1) -> None:
+        """Messages came again and were not recorded again."""
+        self.accounts.setdefault((key, producer), Account()).duplicated += count
+
+    def unrecorded(self) -> dict[Line, int]:
+        """How many messages are known to have been published after the last one recorded, above all by healths."""
+        behind = {line: published - self.next.get(line, published) for line, published in self._published.items()}
+        return {line: count for line, count in behind.items() if count > 0}
+
+    def settle(self) -> None:
+        """The session is over: what was published and has not come is missing."""
+        for line, count in self.unrecorded().items():
+            self.accounts.setdefault(line, Account()).missing += count
+            self.next[line] += count
+
+    def following(self) -> Ledger:
+        """An empty one for the part after this."""
+        ledger = Ledger(self.next)
+        ledger._published = self._published
+        return ledger
+
+    def before_as_metadata(self) -> dict[str, str]:
+        """`next` as text for a metadata record; only sensible before the first message."""
+        return {" ".join(line): str(sequence) for line, sequence in self.next.items()}
+
+
+def as_metadata(accounts: Mapping[Line, Account]) -> dict[str, str]:
+    """Text for a metadata record: key and producer to the account as JSON."""
+    return {" ".join(line): json.dumps(asdict(account)) for line, account in accounts.items()}
+
+
+def accounts_of(metadata: Mapping[str, str]) -> dict[Line, Account]:
+    """What `as_metadata` has written. Raises ValueError if it is not that."""
+    accounts = {}
+    for name, text in metadata.items():
+        if name != ENDED:
+            values = json.loads(text)
+            if not isinstance(values, dict) or values.keys() != _FIGURES:
+                raise ValueError(f"{name}: no account")
+            if not all(value is None or type(value) is int for value in values.values()):
+                raise ValueError(f"{name}: an account of something else than numbers")
+            accounts[_line(name)] = Account(**values)
+    return accounts
+
+
+def next_of(before: Mapping[Line, int], accounts: Mapping[Line, Account]) -> dict[Line, int]:
+    """With which number each producer should go on after a part."""
+    last = {line: account.last_sequence for line, account in accounts.items()}
+    return dict(before) | {line: sequence + 1 for line, sequence in last.items() if sequence is not None}
+
+
+def before_of(metadata: Mapping[str, str]) -> dict[Line, int]:
+    """What `before_as_metadata` has written. Raises ValueError if it is not that."""
+    return {_line(name): int(text) for name, text in metadata.items()}
+
+
+def add_up(accounts: Iterable[tuple[Line, Account]]) -> dict[str, Account]:
+    """The accounts of each key together, by key; sequence numbers, which are each producer's own, left out."""
+    found: dict[str, Account] = {}
+    for (key, _), account in accounts:
+        total = found.setdefault(key, Account())
+        total.messages += account.messages
+        total.missing += account.missing
+        total.duplicated += account.duplicated
+        if account.first_ns is not None and account.last_ns is not None:
+            total.first_ns = min(account.first_ns, total.first_ns if total.first_ns is not None else account.first_ns)
+            total.last_ns = max(account.last_ns, total.last_ns or 0)
+    return dict(sorted(found.items()))
+
+
+def _line(name: str) -> Line:
+    key, _, producer = name.partition(" ")
+    return key, producer

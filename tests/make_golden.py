@@ -1,0 +1,85 @@
+"""Makes tests/data/golden.mcap anew: python tests/make_golden.py
+
+A real site watches a simulated tray of two fans for some ten seconds; one inlet is covered and set free, and the twin
+integrator and the scorer are killed on the way. Its twin is a physical one: it needs no function whose last bit depends
+on the machine. Make it anew only when what the stages decide is meant to change, and say why in the commit.
+"""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import sys
+import tempfile
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
+
+from chain import TRAY, Chain, eventually, fantwin, published, view_of  # noqa: E402
+
+GOLDEN = Path(__file__).parent / "data" / "golden.mcap"
+FANS = 2
+CONFIGURATION = f"""
+site = "demo"
+[[tray]]
+name = "{TRAY}"
+fans = {FANS}
+speed_unit = "rpm"
+speed_max = 20000
+twin = "twin.onnx"
+[resampler]
+rate_hz = 50
+[twin_integrator]
+warm_up_s = 1.0
+[scorer]
+on_delay_s = 0.3
+off_delay_s = 0.5
+"""
+
+
+def main() -> None:
+    """Train, run, kill, keep."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        healthy = folder / "healthy.mcap"
+        run(
+            "simulate", "--fans", FANS, "--rate", 50, "--profile", "multisine", "--duration", 60, "--recording", healthy
+        )
+        run("train", healthy, "--model", "physical", "--name", "golden", "-o", folder / "twin.onnx")
+        (folder / "golden.toml").write_text(CONFIGURATION)
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        chain = Chain(folder, endpoint, viewer=False, configuration=folder / "golden.toml")
+        try:
+            record(chain)
+        finally:
+            chain.close()
+        (recording,) = chain.recordings()
+        GOLDEN.parent.mkdir(exist_ok=True)
+        shutil.copy(recording, GOLDEN)
+    print(f"{GOLDEN}: {GOLDEN.stat().st_size} bytes")
+
+
+def record(chain: Chain) -> None:
+    """Some ten seconds with a fault and two deaths."""
+    tray = chain.start_tray("--fans", str(FANS), "--rate", "50", "--fault", "inlet:fan=1,start=3,stop=6,size=2.0")
+    up = chain.start_up()
+    with chain.watcher() as watcher:
+        for scored, label in ((100, "twin_integrator"), (350, "scorer")):
+            eventually(lambda: published(view_of(watcher, "scorer")) > scored, "scores flow")  # noqa: B023
+            chain.kill(watcher, label)
+        before = published(view_of(watcher, "scorer"))
+        eventually(lambda: published(view_of(watcher, "scorer")) > before + 100, "scores flow again")
+    assert tray.end() == 0
+    assert up.end() == 0, up.output()
+
+
+def run(*words: object) -> None:
+    """A command that must succeed."""
+    told = fantwin(*words, timeout_s=600)
+    assert told.returncode == 0, told.stderr
+
+
+if __name__ == "__main__":
+    main()

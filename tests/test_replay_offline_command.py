@@ -1,0 +1,181 @@
+"""`fantwin replay --offline` as a user sees it: what it prints, and its exit codes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from pipeline.recordings.reading import read_head, read_recording
+from pipeline.recordings.writing import RecordingWriter
+from tests.chain import fantwin
+from tests.killed_site import Site
+from tests.test_offline import changed
+
+GOLDEN = Path(__file__).parent / "data" / "golden.mcap"
+
+
+def replay(*words: object):
+    return fantwin("replay", "--offline", *words)
+
+
+def test_equal_is_exit_code_0():
+    told = replay("--verify", GOLDEN)
+    assert told.returncode == 0, told.stderr
+    assert "equal:" in told.stdout and "to the bit" in told.stdout
+    assert "2 restarts of stages" in told.stdout
+
+
+def test_a_difference_is_exit_code_1_and_named(tmp_path):
+    def doubled(entry):
+        if entry.topic == "score":
+            entry.message.residual_rad_s.setflags(write=True)
+            entry.message.residual_rad_s[:] *= 2
+        return entry.message
+
+    told = replay("--verify", changed(GOLDEN, tmp_path / "doubled.mcap", doubled))
+    assert told.returncode == 1
+    assert "DIFFERS" in told.stdout and "residual_rad_s" in told.stdout
+
+
+@pytest.mark.parametrize("words", [("--twin",), ("--set", "scorer.on_delay_s=1"), ("--start", "2")])
+def test_what_is_not_as_recorded_cannot_be_compared_exit_code_2(tmp_path, words):
+    if words == ("--twin",):
+        (tmp_path / "twin.onnx").write_bytes(read_head(GOLDEN).attachments["tray1.onnx"])
+        words = ("--twin", tmp_path / "twin.onnx")
+    told = replay("--verify", GOLDEN, *words)
+    assert told.returncode == 2
+    assert "leave out" in told.stderr and len(told.stderr.strip().splitlines()) == 1
+
+
+def test_no_scores_cannot_be_compared_exit_code_2(tmp_path):
+    raw = changed(GOLDEN, tmp_path / "raw.mcap", lambda entry: entry.message if entry.topic == "raw" else None)
+    told = replay("--verify", "--json", raw)
+    assert told.returncode == 2
+    assert json.loads(told.stdout)["verified"] is None
+    assert "nothing to compare with" in told.stderr
+
+
+def test_the_decision_as_json():
+    told = json.loads(replay("--json", GOLDEN).stdout)
+    (alarm,) = told["alarms"]
+    assert alarm["fan"] == 1 and alarm["raised_ns"] < alarm["cleared_ns"]
+    assert alarm["severity"] == "alarm" and alarm["residual"] < 0
+    assert told["samples"] > 500 and told["lost"] == 0
+    warming_up = told["not_judged"]["tray1"]["warming_up"] / 2
+    assert told["hours"] == pytest.approx((told["samples"] - warming_up) * 0.02 / 3600, abs=1e-4)
+
+
+def test_another_threshold_says_what_is_gained_and_lost():
+    told = json.loads(replay("--json", GOLDEN, "--set", "scorer.alarm_sigmas=1000").stdout)
+    assert told["alarms"] == [] and told["what_if"]["gained"] == []
+    assert [alarm["fan"] for alarm in told["what_if"]["lost"]] == [1]
+    assert "1 alarms lost" in replay(GOLDEN, "--set", "scorer.alarm_sigmas=1000").stdout
+
+
+def test_another_configuration_file_is_taken(tmp_path):
+    text = read_head(GOLDEN).attachments["configuration.toml"].decode().replace("on_delay_s = 0.3", "on_delay_s = 2.5")
+    config = tmp_path / "other.toml"
+    config.write_text(text.replace('twin = "twin.onnx"\n', ""))
+    before, now = (json.loads(replay("--json", GOLDEN, *words).stdout)["alarms"] for words in ((), ("-c", config)))
+    assert now[0]["raised_ns"] - before[0]["raised_ns"] == pytest.approx(2.2e9, abs=0.2e9)
+
+
+def test_the_output_is_a_whole_recording(tmp_path):
+    out = tmp_path / "out.mcap"
+    told = replay(GOLDEN, "-o", out)
+    assert told.returncode == 0 and str(out) in told.stdout
+    samples = [t_ns for entry in read_recording(out, ("score",)) for t_ns in entry.message.t_ns.tolist()]  # type: ignore[union-attr]
+    assert len(samples) == len(set(samples)) == json.loads(replay("--json", GOLDEN).stdout)["samples"]
+    assert read_head(out).attachments.keys() == read_head(GOLDEN).attachments.keys()
+
+
+def test_an_imported_table_is_judged_at_the_twins_own_rate(tmp_path):
+    site = Site(tmp_path, seed=1)
+    site.run(600)
+    path = site.finished()
+    table = changed(path, tmp_path / "table.mcap", lambda entry: entry.message if entry.topic == "raw" else None)
+    bare = tmp_path / "bare.mcap"
+    with RecordingWriter(bare, {"source": "a table"}) as writer:
+        for entry in read_recording(table):
+            writer.write_message(entry.key, entry.message, entry.log_time_ns)
+    told = replay("--json", bare)
+    assert told.returncode == 1 and "--twin" in told.stderr
+    told = replay("--json", bare, "--twin", tmp_path / "twin.onnx")
+    assert told.returncode == 0, told.stderr
+    assert json.loads(told.stdout)["samples"] > 550
+    told = json.loads(
+        replay("--json", bare, "--twin", tmp_path / "twin.onnx", "--set", "scorer.alarm_sigmas=1000").stdout
+    )
+    assert told["alarms"] == [], "keys are set on top of the defaults"
+    told = replay("--json", bare, "--twin", tmp_path / "twin.onnx", "--set", "no.such_key=1")
+    assert told.returncode == 1 and "no.such_key" in told.stderr.replace("'no'", "no.such_key")
+    out = tmp_path / "out.mcap"
+    assert replay(bare, "--twin", tmp_path / "twin.onnx", "-o", out).returncode == 0
+    assert json.loads(replay("--json", out).stdout)["samples"] > 550, "what was made of a table can be judged again"
+
+
+def test_no_file_is_ever_written_over(tmp_path):
+    copy = tmp_path / "copy.mcap"
+    shutil.copy(GOLDEN, copy)
+    active = tmp_path / "other.mcap.active"
+    active.write_bytes(b"what a recorder is writing")
+    for words in ((copy, "-o", copy), (copy, "-o", tmp_path / "other.mcap"), (copy, "-o", tmp_path)):
+        told = replay(*words)
+        assert told.returncode == 1 and "exists already" in told.stderr
+    assert copy.read_bytes() == GOLDEN.read_bytes() and active.read_bytes() == b"what a recorder is writing"
+
+
+def test_a_part_of_time_is_judged_and_compared_with_what_was_recorded_in_it():
+    told = json.loads(replay("--json", GOLDEN, "--end", "3", "--set", "scorer.on_delay_s=0.2").stdout)
+    assert told["what_if"] == {"gained": [], "lost": [], "kept": []}, "the alarm comes later"
+    assert 120 < told["samples"] < 160
+    told = replay("--json", GOLDEN, "--start", "1000")
+    assert told.returncode == 1 and "--start" in told.stderr
+
+
+def test_parts_of_two_runs_are_refused(tmp_path):
+    site = Site(tmp_path, seed=1)
+    site.run(100)
+    told = replay(GOLDEN, site.finished())
+    assert told.returncode == 1 and "two runs" in told.stderr
+
+
+def test_an_attachment_is_written_nowhere_else(tmp_path):
+    head = read_head(GOLDEN)
+    evil = tmp_path / "evil.mcap"
+    attachments = {**head.attachments, str(tmp_path / "planted.onnx"): b"x", "sub/dir.onnx": b"x"}
+    with RecordingWriter(evil, head.metadata, attachments) as writer:
+        for entry in read_recording(GOLDEN):
+            writer.write_message(entry.key, entry.message, entry.log_time_ns)
+    assert replay("--verify", evil).returncode == 0
+    assert not (tmp_path / "planted.onnx").exists()
+
+
+@pytest.mark.parametrize("metadata", [{"overrides": "{broken"}, {"started_t_ns": "yesterday"}])
+def test_damaged_metadata_are_one_line(tmp_path, metadata):
+    head = read_head(GOLDEN)
+    path = tmp_path / "[odd].mcap"
+    with RecordingWriter(path, {**head.metadata, **metadata}, head.attachments) as writer:
+        for entry in read_recording(GOLDEN, ("raw",)):
+            writer.write_message(entry.key, entry.message, entry.log_time_ns)
+    told = replay(path)
+    assert told.returncode == 1 and "[odd].mcap: its metadata are damaged" in told.stderr
+    assert len(told.stderr.strip().splitlines()) == 1
+
+
+def test_a_torn_recording_is_judged_as_far_as_it_goes_exit_code_3(tmp_path):
+    torn = tmp_path / "torn.mcap"
+    shutil.copy(GOLDEN, torn)
+    with torn.open("r+b") as file:
+        file.truncate(GOLDEN.stat().st_size // 2)
+    told = replay("--json", torn)
+    assert told.returncode == 3
+    assert "breaks off" in json.loads(told.stdout)["damage"][0]
+
+
+def test_a_file_that_is_not_there_is_one_line():
+    told = replay("nothing.mcap")
+    assert told.returncode == 1 and len(told.stderr.strip().splitlines()) == 1
