@@ -36,8 +36,9 @@ def main(
     """Print a row for each load and history; exit code 1 where something is unreadable, uncounted or too old."""
     rows = [_row(load, history, kills, seed, folder) for load in LOADS for history in HISTORIES]
     notes = [
-        f"oldest s: age, at its kill, of the oldest message that a kill has cost; it flushes every {FLUSH_S:g} s",
-        "newest s: longest time, at a kill, since the receipt of the newest message in the file",
+        "while recording: kills of a recorder that had started and caught up with what the bus held; of these",
+        f"  oldest s: age, at its kill, of the oldest message that a kill has cost; it flushes every {FLUSH_S:g} s",
+        "  newest s: longest time, at a kill, since the receipt of the newest message in the file",
         "recorded again: messages that are in the parts more than once",
     ]
     show({f"{kills} kills at random within 4 s of the start before": rows}, notes, as_json=json_output)
@@ -69,6 +70,7 @@ def _row(load: str, history: int, number: int, seed: int, folder: Path | None) -
         "recorded again": found.repeated,
         "missing": found.missing,
         "counted": found.counted_missing,
+        "while recording": found.kills_of_recording,
         "oldest s": found.oldest_s,
         "newest s": found.newest_s,
     }

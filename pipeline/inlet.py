@@ -26,8 +26,8 @@ class _Line:
 class Inlet:
     """Puts the arrivals of all producers and keys in sequence.
 
-    `recover(key, producer, first, last)` asks a producer for what it still keeps. Stages that may drop have none,
-    and what they missed is simply counted.
+    `recover(key, producer, first, last)` asks a producer for what it still keeps. Without it, what was missed is simply
+    counted.
 
     The first message of an unknown producer need not be its first: what it still keeps from before is asked for,
     and what it no longer keeps is history, not a loss. From then on every gap is either recovered or counted.
@@ -81,6 +81,7 @@ class Inlet:
         known = line.next_sequence is not None
         first = line.next_sequence if line.next_sequence is not None else max(0, until - topic_of(key).history)
         if first >= until:
+            line.next_sequence = first if line.next_sequence is None else line.next_sequence
             return
         line.next_sequence = until
         recovered = self._recover(key, producer, first, until - 1) if self._recover else ()

@@ -147,7 +147,7 @@ class Runner:
         self._has_source = any(parts.source for parts in self._parts.values())
         self._clock = StageClock()
         self._bus = Bus(config.bus, stop)
-        self._inlet = Inlet(None if stage.may_drop else self._recover)
+        self._inlet = Inlet(self._recover_rare if stage.may_drop else self._recover)
         self._outlets: dict[tuple[str, str], Outlet] = {
             (t.name, name): self._outlet(tray_key(config.site, t.name, name), name)
             for t in trays
@@ -320,6 +320,10 @@ class Runner:
         found = self._bus.recover(key, producer, first, last, self._inbox.set_aside)
         packets = (self._decode(its_key, payload, time.time_ns()) for its_key, payload in found)
         return (packet for packet in packets if packet is not None)
+
+    def _recover_rare(self, key: str, producer: str, first: int, last: int) -> Iterator[Packet]:
+        """What a stage that may drop asks for again: no data, but what is said once, such as the twin in force."""
+        return self._recover(key, producer, first, last) if topic_of(key).is_rare else iter(())
 
     def _catch_up(self) -> None:
         """Take what producers still keep from before this stage came: only then is it ready."""

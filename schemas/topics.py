@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from schemas.messages import Alarm, Clock, Command, Grid, Health, Message, ModelCard, Prediction, Raw, Score
 
+ON_CHANGE = "on change"
 ROOT = "fantwin"
 HEALTH_CHUNK = "health"
 ALIVE_CHUNK = "alive"
@@ -26,15 +27,20 @@ class Topic:
     history: int
     about: str
 
+    @property
+    def is_rare(self) -> bool:
+        """Said once, when it changes: nobody can do without, and asking for it again costs nothing."""
+        return self.rate == ON_CHANGE
+
 
 TOPICS: tuple[Topic, ...] = (
     Topic("raw", Raw, "as the device sends, often 100 Hz", True, 1024, "samples as the device sent them"),
     Topic("grid", Grid, "the grid's rate over the block size", True, 1024, "samples on a uniform grid"),
     Topic("prediction", Prediction, "as grid", True, 1024, "the healthy twin beside the measurement"),
     Topic("score", Score, "as prediction", True, 1024, "judged samples, ready to draw"),
-    Topic("alarm", Alarm, "on change", True, 1024, "an alarm was raised or cleared"),
-    Topic("command", Command, "on change", True, 64, "what is wanted of the fans"),
-    Topic("twin", ModelCard, "on change", True, 8, "the twin in force"),
+    Topic("alarm", Alarm, ON_CHANGE, True, 1024, "an alarm was raised or cleared"),
+    Topic("command", Command, ON_CHANGE, True, 64, "what is wanted of the fans"),
+    Topic("twin", ModelCard, ON_CHANGE, True, 8, "the twin in force"),
     Topic("clock", Clock, "20 Hz", False, 1, "the time of a replay"),
     Topic("health", Health, "1 Hz for each stage", True, 8, "how a stage is"),
 )

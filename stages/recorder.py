@@ -76,8 +76,9 @@ class OpenPart(Protocol):
 
     path: Path
     written: Counter[str]
-    pending: list[Pending]
 
+    @property
+    def pending(self) -> Sequence[Pending]: ...  # noqa: D102
     @property
     def size(self) -> int: ...  # noqa: D102
     def write(self, key: str, payload: bytes, message: Message, log_time_ns: int) -> None: ...  # noqa: D102
@@ -152,6 +153,11 @@ class Recorder(Core):
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Flush, begin a new part and look after the disk when it is time."""
+        if now_ns < self._now_ns - LOOK_NS:  # the host's clock was set back: what was due by the old one never would be
+            self._looked_ns = self._began_ns = now_ns
+            self._paused_ns = min(self._paused_ns, now_ns)
+            self._flushed_ns = now_ns - int(self._config.flush_interval_s * 1e9)
+            self._unflushed_ns = None if self._unflushed_ns is None else self._flushed_ns  # due at once
         self._now_ns = now_ns
         if self._part and self._is_flush_due():
             self._unflushed_ns, self._flushed_ns = None, now_ns
@@ -193,7 +199,7 @@ class Recorder(Core):
             self._hold([pending])
             return
         if self._unflushed_ns is None:
-            self._unflushed_ns = pending.log_time_ns
+            self._unflushed_ns = min(pending.log_time_ns, self._now_ns)
         try:
             self._part.write(*pending)
         except RecordingError as error:
@@ -207,7 +213,7 @@ class Recorder(Core):
             self._pause(str(error))
 
     def _begin(self, about: Mapping[str, str]) -> None:
-        self._began_ns = self._held[0].log_time_ns if self._held else self._now_ns
+        self._began_ns = min(self._held[0].log_time_ns, self._now_ns) if self._held else self._now_ns
         self._part = self._place.begin(self._began_ns, self._ledger, about)
         self._counts["parts"] += 1
         self._problem = ""
@@ -354,6 +360,12 @@ def build(context: Context) -> Parts:
             )
         for path in shelf.unreadable:
             _LOG.warning("a recorder had been killed; what it has left cannot be mended, and is put aside as %s", path)
+        for path in shelf.unmended:
+            _LOG.warning(
+                "a recorder had been killed; the disk refuses to mend what it has left, which stays %s: start again "
+                "when it no longer does, or use `fantwin recover`",
+                path,
+            )
         return Parts(Recorder(shelf, config, context.started_t_ns))
     except RecordingError as error:
         raise StageError(f"{error} (recorder.file)") from error

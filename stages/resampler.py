@@ -225,7 +225,7 @@ class ResamplerCore(Core):
             return f"no raw samples for {self._watermark_ns / NS_PER_S:g} s and more: look at acquisition"
         if self._set_back_ns:
             return (
-                f"the host's clock was set back by {self._set_back_ns / NS_PER_S:.0f} s: "
+                f"the host's clock was set back by {self._set_back_ns / NS_PER_S:.0f} s, or a replay began anew: "
                 "samples are refused until it has caught up; restart the stages"
             )
         return ""

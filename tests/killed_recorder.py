@@ -20,6 +20,8 @@ from recorder_feed import PRODUCER, SITE
 from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.reading import RecordingError, read_recording
 from pipeline.recordings.scan import scan
+from schemas.messages import StageStatus
+from schemas.topics import health_key
 
 FLUSH_S = 1.0
 
@@ -41,15 +43,17 @@ class Outcome:
     """sent after the first that was recorded, and in no part"""
     counted_missing: int = 0
     """the same by the ledgers"""
+    kills_of_recording: int = 0
+    """kills of a recorder that had started and caught up with what the bus held"""
     oldest_s: float = 0.0
-    """of those missing that a kill has cost: the age of the oldest at the kill"""
+    """of those missing that such a kill has cost: the age of the oldest at the kill"""
     newest_s: float = 0.0
-    """at a kill: how long ago the newest message in the file had been received"""
+    """at such a kill: how long ago the newest message in the file had been received"""
 
 
 @dataclass(frozen=True)
 class _Killed:
-    """A recorder that had recorded something: from when to when, ns, and what was due in the file, by key."""
+    """A recorder that had caught up with the bus: what it recorded from when to when, ns, and what was due, by key."""
 
     first_ns: int
     at_ns: int
@@ -135,7 +139,9 @@ class Kills:
             found = scan(active)
             ledger = found.census.ledger
             due = {key: ledger.next[key, producer] for key, producer in ledger.accounts if producer == PRODUCER}
-            if due and found.index.first_ns is not None:
+            own = found.census.healths.get(health_key(SITE, "recorder", "all"))
+            has_caught_up = own is not None and own.status == StageStatus.OK
+            if has_caught_up and found.index.first_ns is not None:
                 self._killed.append(_Killed(found.index.first_ns, at_ns, due, found.index.last_ns))
 
     def _has_caught_up(self) -> bool:
@@ -179,6 +185,7 @@ class Kills:
         outcome.counted_missing = sum(
             account.missing for part in contents for (key, _), account in part.accounts.items() if key in sent_ns
         )
+        outcome.kills_of_recording = len(self._killed)
         outcome.newest_s = max(((killed.at_ns - killed.newest_ns) / 1e9 for killed in self._killed), default=0.0)
         return outcome
 

@@ -7,7 +7,6 @@ on the machine. Make it anew only when what the stages decide is meant to change
 
 from __future__ import annotations
 
-import shutil
 import socket
 import sys
 import tempfile
@@ -16,6 +15,9 @@ from pathlib import Path
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
 from chain import TRAY, Chain, eventually, fantwin, published, view_of  # noqa: E402
+
+from pipeline.recordings.reading import read_head, read_recording  # noqa: E402
+from pipeline.recordings.writing import RecordingWriter  # noqa: E402
 
 GOLDEN = Path(__file__).parent / "data" / "golden.mcap"
 FANS = 2
@@ -56,8 +58,7 @@ def main() -> None:
         finally:
             chain.close()
         (recording,) = chain.recordings()
-        GOLDEN.parent.mkdir(exist_ok=True)
-        shutil.copy(recording, GOLDEN)
+        keep(recording)
     print(f"{GOLDEN}: {GOLDEN.stat().st_size} bytes")
 
 
@@ -73,6 +74,17 @@ def record(chain: Chain) -> None:
         eventually(lambda: published(view_of(watcher, "scorer")) > before + 100, "scores flow again")
     assert tray.end() == 0
     assert up.end() == 0, up.output()
+
+
+def keep(recording: Path) -> None:
+    """What is decided and of what, without what tells of the machine: health, ports and folders."""
+    head = read_head(recording)
+    metadata = {key: value for key, value in head.metadata.items() if key != "overrides"}
+    GOLDEN.parent.mkdir(exist_ok=True)
+    with RecordingWriter(GOLDEN, metadata, head.attachments, overwrite=True) as writer:
+        for entry in read_recording(recording):
+            if entry.topic != "health":
+                writer.write_message(entry.key, entry.message, entry.log_time_ns)
 
 
 def run(*words: object) -> None:

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.recordings import read_arrays
-from pipeline.recordings.arrays import WORDS, Arrays, Block, _Seen, block_columns, read_topics
+from pipeline.recordings.arrays import WORDS, Arrays, Block, block_columns, read_topics
+from pipeline.recordings.order import Seen
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import (
@@ -216,7 +217,7 @@ def test_producers_and_keys_count_their_messages_apart(tmp_path):
 
 @given(st.lists(st.integers(0, 30)))
 def test_a_sequence_number_is_new_once_in_any_order(sequences):
-    seen, known = _Seen(), set()
+    seen, known = Seen(), set()
     for sequence in sequences:
         assert seen.is_new(sequence) == (sequence not in known)
         known.add(sequence)

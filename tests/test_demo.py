@@ -48,6 +48,11 @@ def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
         assert picture.width > 1000
     assert (out / "view.rrd").stat().st_size > 100_000
 
+    told = fantwin("replay", "--offline", "--verify", out / "recording.mcap", "--json")
+    assert told.returncode == 0, told.stdout + told.stderr
+    verified = json.loads(told.stdout)["verified"]
+    assert verified["samples_equal"] > 3100 and verified["alarms_equal"] == 4
+
 
 def test_a_wheel_brings_what_the_demo_reads(tmp_path):
     root = Path(__file__).parents[1]

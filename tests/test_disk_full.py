@@ -178,6 +178,7 @@ def test_a_recorder_killed_on_a_full_disk_is_followed_by_one_that_waits_and_lose
         run.second()
     part = run.core._part
     assert part is not None
+    part.flush()
     part._file.close()  # type: ignore[attr-defined]  as kill -9 does
     recorded = part.written["raw"]
     with (small_disk / "ballast").open("wb", buffering=0) as ballast, pytest.raises(OSError, match="No space"):

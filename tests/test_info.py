@@ -151,6 +151,29 @@ def test_parts_are_added_up_and_checked_to_go_on_from_one_another(tmp_path):
     assert found["continuity"] == []
 
 
+def test_what_is_left_of_a_ring_of_parts_is_well(tmp_path):
+    place, ledger = shelf(tmp_path), Ledger()
+    for first in (0, 10, 20):
+        part(place, range(first, first + 10), ledger).close()
+        ledger = ledger.following()
+    assert place.delete_oldest() == "r.mcap"
+    assert told(tmp_path / "r-2.mcap", tmp_path / "r-3.mcap")["continuity"] == []
+    assert "continues r.mcap" in fantwin("info", tmp_path / "r-2.mcap", tmp_path / "r-3.mcap").stdout
+
+
+def test_a_file_that_is_named_twice_counts_once(tmp_path):
+    with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
+        writer.write_message(RAW_KEY, raw(0), 1)
+    assert told(tmp_path / "r.mcap", tmp_path / "r.mcap")["topics"][RAW_KEY]["messages"] == 1
+
+
+def test_metadata_of_others_under_our_names_are_passed_over(tmp_path):
+    with RecordingWriter(tmp_path / "r.mcap", {"paused_t_ns": "yesterday", "resumed_t_ns": "1"}):
+        pass
+    done = fantwin("info", tmp_path / "r.mcap")
+    assert (done.exit_code, "nothing was recorded" in done.stdout) == (0, False)
+
+
 def test_a_part_that_is_not_among_them_is_missed(tmp_path):
     place, ledger = shelf(tmp_path), Ledger()
     for first in (0, 10, 20):

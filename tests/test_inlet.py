@@ -116,6 +116,14 @@ def test_health_shows_a_first_message_that_never_came():
     assert sequences(inlet.reconcile(health(1), [KEY])) == [0]
 
 
+def test_of_a_producer_that_was_there_before_its_first_message_all_are_accounted_for():
+    inlet = Inlet(Producer([]).recover)
+    assert sequences(inlet.reconcile(health(0), [KEY])) == []
+    assert sequences(inlet.accept(packet(3))) == [3]
+    (line,) = inlet.inputs()
+    assert (line.received, line.missing, line.next_sequence) == (1, 3, 4)
+
+
 def test_health_about_keys_that_are_not_read_is_ignored():
     producer = Producer(range(3))
     assert list(Inlet(producer.recover).reconcile(health(3), ["another/key"])) == []

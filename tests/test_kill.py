@@ -100,6 +100,10 @@ def test_every_stage_is_brought_back_the_others_go_on_and_the_account_is_complet
     assert times == list(range(times[0], times[-1] + 1, 10_000_000))
     assert grid_times(chain, "prediction") == grid_times(chain, "score") == set(times)
 
+    # and a replay that is given what each session was given decides the same, to the bit
+    told = fantwin("replay", "--offline", "--verify", *chain.recordings())
+    assert told.returncode == 0, told.stdout + told.stderr
+
 
 def test_a_killed_recorder_loses_nothing(chain):
     chain.start_tray()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.recordings.ledger import Account, Ledger, accounts_of, add_up, as_metadata, before_of, next_of
+from pipeline.recordings.ledger import Account, Ledger, accounts_of, add_up, as_metadata, before_of, corrected, next_of
 from schemas.messages import Header, Health, Output, StageStatus
 
 KEY, TWIN_KEY = "fantwin/plant/tray1/raw", "fantwin/plant/tray1/twin"
@@ -18,8 +18,8 @@ def noted(sequences, before=None, key=KEY, producer="a") -> Ledger:
     return ledger
 
 
-def health(producer: str, published: int) -> Health:
-    output = Output(key=KEY, published=published)
+def health(producer: str, published: int, key: str = KEY) -> Health:
+    output = Output(key=key, published=published)
     return Health(
         header=Header(producer, 0, ""),
         stage="acquisition",
@@ -103,6 +103,44 @@ def test_of_a_producer_of_which_nothing_was_recorded_nothing_is_missing():
     ledger.note_health(health("a", 500))
     ledger.settle()
     assert ledger.accounts == {}
+
+
+def test_of_a_producer_that_was_there_before_its_first_message_all_are_accounted_for():
+    ledger = Ledger()
+    ledger.note_health(health("a", 0))
+    ledger.note(KEY, "a", 3, 1)
+    assert ledger.accounts[KEY, "a"].missing == 3
+    ledger = Ledger()
+    ledger.note_health(health("a", 0))
+    ledger.note_health(health("a", 5))
+    ledger.settle()
+    assert ledger.accounts[KEY, "a"] == Account(missing=5)
+
+
+def test_what_is_never_recorded_is_never_missing():
+    ledger = Ledger()
+    for published in (0, 5):
+        ledger.note_health(health("a", published, "fantwin/plant/tray1/clock"))
+        ledger.note_health(health("a", published, "fantwin/something/else"))
+    ledger.settle()
+    assert ledger.accounts == {}
+
+
+def test_times_are_the_first_and_the_last_also_where_the_clock_was_set_back():
+    ledger = Ledger()
+    for sequence, t_ns in enumerate((50, 90, 10, 20)):
+        ledger.note(KEY, "a", sequence, t_ns)
+    account = ledger.accounts[KEY, "a"]
+    assert (account.first_ns, account.last_ns) == (10, 90)
+
+
+def test_of_a_file_that_was_damaged_later_what_was_recorded_and_is_not_found_is_missing():
+    recorded = noted([0, 1, 5, 6]).accounts | noted([7, 8], producer="b").accounts
+    found = noted([5]).accounts
+    assert corrected(recorded, found) == {
+        (KEY, "a"): Account(1, 3 + 3, 0, 5, 6, 1005, 1005),
+        (KEY, "b"): Account(missing=2, last_sequence=8),
+    }
 
 
 @given(st.lists(st.integers(0, 30), min_size=1), st.integers(0, 30))

@@ -5,14 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 from small_disk import unmount
-from test_recordings import RAW_KEY, kill_a_recorder, raw, sequences, write
+from test_recordings import RAW_KEY, disk_of, kill_a_recorder, raw, sequences, write
 
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.disk import Disk, DiskError
 from pipeline.recordings.ledger import Ledger
 from pipeline.recordings.parts import Shelf
 from pipeline.recordings.reading import RecordingError, read_head, read_recording
+from pipeline.recordings.records import Walk
 from pipeline.recordings.writing import RecordingWriter
 
 LINE = (RAW_KEY, "acquisition-1")
@@ -133,12 +135,51 @@ def test_a_recorder_killed_while_it_had_no_part_open_is_gone_on_from_too(tmp_pat
     assert shelf(tmp_path, "s2").before == {LINE: 40}
 
 
-def test_after_a_recorder_that_ended_in_order_a_new_one_begins_anew(tmp_path):
+def test_a_recorder_that_ended_in_order_is_gone_on_from_as_well(tmp_path):
     part(shelf(tmp_path), range(40)).close(has_ended=True)
     place = shelf(tmp_path, "s2")
-    assert place.before == {}
+    assert place.before == {LINE: 40}
+    part(place, [45]).close()
+    assert read_head(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
+    assert contents_of(tmp_path / "r-2.mcap").accounts[LINE].missing == 5
+
+
+def test_a_file_of_others_with_a_higher_number_does_not_hide_the_last_part(tmp_path):
+    part(shelf(tmp_path), range(40)).close()
+    write(tmp_path / "r-9.mcap", 3)
+    place = shelf(tmp_path, "s2")
+    assert place.before == {LINE: 40}
     part(place).close()
-    assert "continues" not in read_head(tmp_path / "r-2.mcap").metadata
+    assert read_head(tmp_path / "r-10.mcap").metadata["continues"] == "r.mcap"
+
+
+def damage_a_chunk(path: Path, number: int) -> None:
+    chunk = [record for record in Walk(path) if record.opcode == Opcode.CHUNK][number]
+    content = bytearray(path.read_bytes())
+    content[chunk.offset + chunk.length // 2] ^= 0xFF
+    path.write_bytes(content)
+
+
+def test_a_left_over_whose_only_chunk_is_damaged_is_put_aside_and_not_deleted(tmp_path):
+    kill_a_recorder(tmp_path / "r.mcap", flushed=5)
+    damage_a_chunk(tmp_path / "r.mcap.active", 0)
+    content = (tmp_path / "r.mcap.active").read_bytes()
+    assert shelf(tmp_path).unreadable == [tmp_path / "r.mcap.torn"]
+    assert (tmp_path / "r.mcap.torn").read_bytes() == content
+
+
+def test_a_damaged_left_over_that_a_full_disk_keeps_from_being_mended_is_gone_on_from(tmp_path):
+    writer = part(shelf(tmp_path), range(3000))
+    writer.flush()
+    killed(writer)
+    damage_a_chunk(tmp_path / "r.mcap.active", 1)
+    with disk_of(100):
+        place = shelf(tmp_path, "s2")
+    assert (place.unmended, place.unreadable, place.mended) == ([tmp_path / "r.mcap.active"], [], [])
+    assert place.before == {LINE: 3000}
+    part(place, [3000]).close()
+    assert read_head(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
+    assert shelf(tmp_path, "s3").mended[0].path == tmp_path / "r.mcap"
 
 
 def test_a_left_over_without_any_message_is_not_kept(tmp_path):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
+import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -248,6 +250,62 @@ def test_behind_a_backlog_it_flushes_more_often_but_not_at_every_tick():
         core.step(packet(raw(tick), "raw", NOW_NS - 5 * SECOND_NS))
         core.tick(NOW_NS + tick * TICK_NS)
     assert disk.parts[0].flushes == 8
+
+
+def test_a_clock_that_is_set_back_stops_neither_flushing_nor_looking_nor_parts():
+    disk = Disk()
+    core = recorder(disk, part_s=60.0)
+    core.step(packet(raw(0), "raw", NOW_NS))
+    core.tick(NOW_NS)
+    back_ns = NOW_NS - 3600 * SECOND_NS
+    core.tick(back_ns)
+    assert sequences(disk.parts[0]) == [0]
+    core.step(packet(raw(1), "raw", back_ns))
+    core.tick(back_ns + SECOND_NS)
+    assert sequences(disk.parts[0]) == [0, 1]
+    disk.free = 0
+    core.tick(back_ns + 2 * SECOND_NS)
+    assert core.problem()
+    disk.free = 1 << 40
+    core.tick(back_ns + 3 * SECOND_NS)
+    assert core.problem() == ""
+    core.tick(back_ns + 63 * SECOND_NS)
+    assert len(disk.parts) == 3
+
+
+def test_what_was_held_while_the_clock_was_set_back_is_flushed_in_time_too():
+    disk = Disk()
+    disk.free = 0
+    core = recorder(disk)
+    record(core, [0])
+    disk.free = 1 << 40
+    back_ns = NOW_NS - 3600 * SECOND_NS
+    for second in range(4):
+        core.tick(back_ns + second * SECOND_NS)
+    assert sequences(disk.parts[0]) == [0]
+
+
+def test_what_a_failed_flush_may_have_lost_is_recorded_again_in_the_next_part(tmp_path, monkeypatch):
+    run = context(tmp_path, min_free_bytes=0)
+    core, start_ns = STAGE.build(run).core, context(tmp_path).started_t_ns
+    sync, failures = os.fdatasync, iter([OSError(errno.EIO, "Input/output error")])
+
+    def fail_once(descriptor: int) -> None:
+        for error in failures:
+            raise error
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fdatasync", fail_once)
+    for second in range(4):
+        core.step(packet(raw(second), "raw", start_ns + second * SECOND_NS))
+        core.tick(start_ns + second * SECOND_NS)
+    core.close()
+    found = [
+        [entry.message.header.sequence for entry in read_recording(run.run_folder / name)]
+        for name in ("recording.mcap", "recording-2.mcap")
+    ]
+    assert found == [[], [0, 1, 2, 3]]
+    assert core.counters() == {"recorded_raw": 4, "lost_unwritten": 0, "parts": 2, "pauses": 1}
 
 
 def test_without_messages_there_is_nothing_to_flush():

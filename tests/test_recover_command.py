@@ -7,9 +7,13 @@ from pathlib import Path
 
 import pytest
 from fantwin_command import fantwin, said_instead
+from mcap.opcode import Opcode
 from test_recordings import RAW_KEY, raw
 from test_recovery import chunk_ends, read_by_others, small
 
+from pipeline.recordings.contents import BREAKS_OFF, contents_of
+from pipeline.recordings.records import Walk
+from pipeline.recordings.recovery import mend
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Health, Output, StageStatus
 from schemas.topics import health_key
@@ -80,6 +84,60 @@ def test_a_damaged_chunk_is_told(whole):
     assert done.exit_code == 3
     assert "damaged chunks: 1" in done.stdout
     assert f"{RAW_KEY}: 5 messages of acquisition-1 missing in between" in done.stdout
+
+
+def healths_of(producer: str) -> Health:
+    return Health(
+        header=Header(producer, 0, ""),
+        stage="scorer",
+        instance="all",
+        status=StageStatus.OK,
+        t_ns=2,
+        uptime_s=1.0,
+    )
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_what_a_recovered_file_has_lost_info_says_ever_after(tmp_path, number):
+    """Whichever chunk it was: the ledger of the damaged file still knows what there had been."""
+    path, keys = tmp_path / "r.mcap", health_key("plant", "scorer", "all")
+    with RecordingWriter(path, {}) as writer:
+        for chunk in range(3):
+            for sequence in range(5):
+                writer.write_message(RAW_KEY, raw(5 * chunk + sequence), 1000)
+            writer.write_message(keys, healths_of(f"scorer-{chunk}"), 1000)
+            writer.flush()
+    chunks = [record for record in Walk(path) if record.opcode == Opcode.CHUNK]
+    content = bytearray(path.read_bytes())
+    content[chunks[number].offset + chunks[number].length // 2] ^= 0xFF
+    path.write_bytes(content)
+    assert fantwin("recover", path, "-o", tmp_path / "out.mcap").exit_code == 3
+    done = fantwin("info", tmp_path / "out.mcap", "--json")
+    assert done.exit_code == 3
+    told = json.loads(done.stdout)
+    assert told["topics"][RAW_KEY]["missing"] == 5
+    assert told["topics"][keys]["missing"] == 1
+    (file,) = told["files"]
+    assert (file["recovered"][1:], file["damage"]) == (["damaged chunks: 1"], [])
+    assert contents_of(tmp_path / "out.mcap").next[RAW_KEY, "acquisition-1"] == 15
+    assert "was mended: damaged chunks: 1" in fantwin("info", tmp_path / "out.mcap").stdout
+    assert fantwin("recover", tmp_path / "out.mcap").exit_code == 3, "it still is what it is"
+
+
+def test_what_a_torn_file_may_have_lost_info_says_ever_after(tmp_path, torn):
+    assert fantwin("recover", torn, "-o", tmp_path / "out.mcap").exit_code == 3
+    mended = mend(torn)
+    assert mended is not None
+    for path in (tmp_path / "out.mcap", mended.path):
+        done = fantwin("info", path, "--json")
+        assert done.exit_code == 3
+        (file,) = json.loads(done.stdout)["files"]
+        assert file["recovered"] == [f"{BREAKS_OFF}: what was in the unfinished chunk may be missing"]
+
+
+def test_where_the_output_cannot_be_it_says_to_name_another(tmp_path, whole):
+    said = said_instead("recover", whole, "-o", tmp_path / "nowhere" / "out.mcap")
+    assert "No such file or directory; whole.mcap is left as it was; name another file with -o" in said
 
 
 def test_what_a_health_says_was_published_and_is_not_there_is_told(tmp_path):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
@@ -18,6 +20,7 @@ from test_recordings import ALARM_KEY, RAW_KEY, alarm, disk_of, raw, write
 from pipeline.recordings.contents import contents_of, damage_of
 from pipeline.recordings.ledger import Account
 from pipeline.recordings.reading import RecordingError, read_head, read_recording
+from pipeline.recordings.records import RECORD, Walk
 from pipeline.recordings.recovery import mend, recover
 from pipeline.recordings.scan import scan
 from pipeline.recordings.writing import RecordingWriter
@@ -151,6 +154,35 @@ def test_what_is_still_called_active_gets_the_name_of_a_recording(tmp_path, whol
     assert sorted(p.name for p in tmp_path.iterdir()) == ["r-2.mcap", "r-2.mcap.torn", "r.mcap"]
 
 
+@pytest.mark.parametrize("less", [0, 300])
+@pytest.mark.parametrize("moment", range(6))
+def test_a_kill_at_any_moment_leaves_the_recording_under_a_name_that_is_looked_for(
+    tmp_path, whole, monkeypatch, less, moment
+):
+    active = tmp_path / "r.mcap.active"
+    active.write_bytes(whole.read_bytes()[: whole.stat().st_size - less])
+    done = 0
+
+    def or_killed(action):
+        def act(*args, **kwargs):
+            nonlocal done
+            if done == moment:
+                raise KeyboardInterrupt
+            done += 1
+            return action(*args, **kwargs)
+
+        return act
+
+    for owner, name in ((os, "link"), (Path, "rename"), (Path, "replace"), (Path, "unlink")):
+        monkeypatch.setattr(owner, name, or_killed(getattr(owner, name)))
+    with suppress(KeyboardInterrupt):
+        recover(active)
+    monkeypatch.undo()
+    found = [path for path in (tmp_path / "r.mcap", active) if path.exists()]
+    assert found
+    assert all(len(list(read_recording(path))) == 41 for path in found)
+
+
 def test_a_file_that_is_whole_is_left_alone_or_copied(tmp_path, whole):
     path = tmp_path / "r.mcap"
     path.write_bytes(whole.read_bytes())
@@ -198,6 +230,25 @@ def test_a_changed_byte_anywhere_costs_its_record_only(tmp_path, whole, at, valu
     assert len(messages) >= 41 - 6, "at most one chunk"
     assert scan(output).is_whole or scan(output).nameless
     assert {name for name, _ in messages} <= {RAW_KEY, ALARM_KEY, "lost/1"}
+
+
+@pytest.mark.parametrize("opcode", [Opcode.CHUNK, Opcode.MESSAGE_INDEX])
+@pytest.mark.parametrize("more", [1, 256, -256, 1024, 4096, 1 << 16])
+def test_a_damaged_length_costs_one_chunk_though_it_fits_into_the_file(tmp_path, opcode, more):
+    path = write(tmp_path / "r.mcap", 3000)
+    records = [record for record in Walk(path) if record.opcode == opcode]
+    content = bytearray(path.read_bytes())
+    before = scan(path).messages
+    place = records[2].offset
+    code, length = RECORD.unpack_from(content, place)
+    RECORD.pack_into(content, place, code, max(0, length + more))
+    path.write_bytes(content)
+    chunks = len(records)
+    found = recover(path).found
+    lost = before - found.messages
+    assert found.walk.damaged
+    assert (0 < lost < 2 * before / chunks) if opcode == Opcode.CHUNK else lost == 0
+    assert contents_of(path).accounts[LINE].missing == lost
 
 
 def test_after_a_damaged_length_the_next_whole_chunk_is_found(tmp_path, whole):

@@ -20,8 +20,8 @@ from tests.replay_data import START_NS, STEP_NS, raw_of, write_raw
 RAW = tray_key("demo", "tray1", "raw")
 
 
-def part(path: Path, sequences: range, log_s: float = 0.0) -> Path:
-    with RecordingWriter(path, {"trays": "tray1"}) as writer:
+def part(path: Path, sequences: range, log_s: float = 0.0, **metadata: str) -> Path:
+    with RecordingWriter(path, {"trays": "tray1", **metadata}) as writer:
         for sequence in sequences:
             writer.write_message(RAW, raw_of(sequence, 1), START_NS + round(log_s * 1e9) + sequence * STEP_NS)
     return path
@@ -39,6 +39,21 @@ def test_parts_are_played_in_the_order_of_their_times_and_what_two_parts_hold_is
     assert [file.name for file in reel.files] == ["z.mcap", "b.mcap", "a.mcap"]
     assert sequences(reel) == list(range(50))
     assert sequences(reel) == list(range(50)), "a second time it is the same"
+
+
+def test_parts_of_a_session_keep_their_order_where_the_hosts_clock_was_set_back(tmp_path):
+    first = part(tmp_path / "r.mcap", range(50), 100.0, session="s", part="1")
+    second = part(tmp_path / "r-2.mcap", range(50, 100), 0.0, session="s", part="2")
+    reel = Reel([second, first], ("raw",))
+    assert sequences(reel) == list(range(100))
+
+
+def test_a_message_that_was_fetched_later_does_not_end_a_stretch(tmp_path):
+    path = tmp_path / "r.mcap"
+    with RecordingWriter(path, {"trays": "tray1"}) as writer:
+        for sequence, log_s in enumerate((0, 1, 2, 9, 9, 9, 3, 4, 5, 30)):
+            writer.write_message(RAW, raw_of(sequence, 1), START_NS + log_s * 10**9)
+    assert sequences(Reel([path], ("raw",), 0.0, 6.0)) == [0, 1, 2, 6, 7, 8]
 
 
 def test_a_stretch_begins_and_ends_in_seconds_since_the_first_message(tmp_path):

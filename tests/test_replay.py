@@ -24,7 +24,10 @@ def recording(tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--rate 0", "'0': give a number above 0, or max"),
+        ("--rate 0", "'0': give a number above 0, to 1e+06, or max"),
+        ("--rate 1e308", "give a number above 0"),
+        ("--start 1e300", "--start"),
+        ("--end 1e300", "--start"),
         ("--rate -1", "give a number above 0"),
         ("--rate inf", "give a number above 0"),
         ("--rate nan", "give a number above 0"),

@@ -13,6 +13,7 @@ from pipeline.recordings.writing import RecordingWriter
 from tests.chain import fantwin
 from tests.killed_site import Site
 from tests.test_offline import changed
+from tests.twin_files import write_twin
 
 GOLDEN = Path(__file__).parent / "data" / "golden.mcap"
 
@@ -179,3 +180,21 @@ def test_a_torn_recording_is_judged_as_far_as_it_goes_exit_code_3(tmp_path):
 def test_a_file_that_is_not_there_is_one_line():
     told = replay("nothing.mcap")
     assert told.returncode == 1 and len(told.stderr.strip().splitlines()) == 1
+
+
+def test_a_twin_that_is_set_by_a_key_is_the_one_that_judges(tmp_path):
+    other = write_twin(tmp_path / "other.onnx", fans=1)
+    by_option, by_key = (
+        json.loads(replay("--json", GOLDEN, *words).stdout)
+        for words in (("--twin", other), ("--set", f"tray.0.twin='{other}'"))
+    )
+    assert by_key["alarms"] == by_option["alarms"] and by_key["what_if"]["gained"]
+    told = replay(GOLDEN, "--twin", tmp_path / "none.onnx")
+    assert told.returncode == 1 and "correct --twin" in told.stderr
+
+
+def test_the_output_goes_from_second_to_second(tmp_path):
+    out = tmp_path / "out.mcap"
+    replay(GOLDEN, "-o", out)
+    sizes = [len(entry.message.t_ns) for entry in read_recording(out, ("grid", "prediction", "score"))]  # type: ignore[union-attr]
+    assert max(sizes) == 100

@@ -53,6 +53,13 @@ class Passer(Core):
         return Grid(fans=self.fans, step_ns=1, t_ns=t_ns, command=column, speed_rad_s=column, **states)
 
 
+class Deaf(Passer):
+    """Makes nothing of anything."""
+
+    def step(self, item: Any) -> Sequence[Message]:
+        return []
+
+
 class Burst:
     """A source that delivers its items when it is told to stop: the hardest moment."""
 
@@ -238,6 +245,24 @@ def test_messages_of_trays_that_are_not_configured_are_not_read(config):
     outlet.put(encode(Command(header=Header("x", 0, "stranger"), fans=1, t_ns=0)))
     last = bench.end()
     assert last.inputs == ()
+
+
+def test_a_stage_that_may_drop_asks_again_for_what_is_said_once(config):
+    stage = toy(lambda _context: Parts(Deaf()), reads=("command", "raw"), may_drop=True)
+    bench = Bench(stage, config)
+    for topic, kind in (("command", Command), ("raw", Raw)):
+        outlet = bench.bus.outlet(tray_key("s", TRAY_A, topic), BY_NAME[topic], type_name(kind), "x")
+        for sequence in (0, 1):
+            header = Header("x", sequence, TRAY_A)
+            message = Command(header=header, fans=1, t_ns=0) if kind is Command else replace(raw(1), header=header)
+            if sequence == 0:  # sent before this stage was there
+                outlet._kept.append((0, encode(message)))
+                outlet.published = 1
+            else:
+                outlet.put(encode(message))
+    inputs = bench.health_with(lambda health: len(health.inputs) == 2).inputs
+    bench.end()
+    assert {line.key.split("/")[-1]: line.received for line in inputs} == {"command": 2, "raw": 1}
 
 
 def test_a_stage_that_may_drop_throws_its_oldest_away_and_counts(config):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -35,7 +36,7 @@ def info(
     Example: fantwin info runs/recording.mcap
     """
     with working(f"reading {', '.join(str(file) for file in files)}"):
-        parts = sorted((contents_of(file) for file in files), key=lambda part: part.first_ns or 0)
+        parts = sorted((contents_of(file) for file in dict.fromkeys(files)), key=lambda part: part.first_ns or 0)
     breaks = continuity(parts)
     if json_output:
         typer.echo(json.dumps(as_json(parts, breaks)))
@@ -79,6 +80,7 @@ def _part_as_json(part: Contents) -> dict[str, Any]:
             }
             for health in part.healths.values()
         },
+        "recovered": list(part.recovered),
         "damage": list(part.damage),
     }
 
@@ -105,6 +107,8 @@ def _show(parts: Iterable[Contents], breaks: Iterable[str]) -> None:
             if health.problem or health.lost:
                 lost = f"; {health.lost} lost" if health.lost else ""
                 console.print(f"[red]{escape(_stage(health))}: {escape(health.problem or 'well')}{lost}[/red]")
+        for line in part.recovered:
+            console.print(f"[red]was mended: {escape(line)}[/red]")
         for line in part.damage:
             advice = "" if line == STILL_WRITTEN else "; `fantwin recover` mends it"
             console.print(f"[red]{escape(line)}{advice}[/red]")
@@ -123,10 +127,11 @@ def _about(part: Contents) -> list[str]:
     if "part" in said:
         after = f", continues {said['continues']}" if "continues" in said else ""
         lines.append(f"part {said['part']} of session {said.get('session', '?')}{after}, site {said.get('site', '?')}")
-    if "paused_t_ns" in said:
+    with suppress(KeyError, ValueError):  # others may have metadata of these names
         gap_s = (int(said["resumed_t_ns"]) - int(said["paused_t_ns"])) / 1e9
-        lines.append(f"before it nothing was recorded for {gap_s:,.1f} s; messages lost: {said['lost_in_pause']}")
-        lines.append(f"  because {said['paused_because']}")
+        lost, why = said["lost_in_pause"], said["paused_because"]
+        lines.append(f"before it nothing was recorded for {gap_s:,.1f} s; messages lost: {lost}")
+        lines.append(f"  because {why}")
     for tray in filter(None, said.get("trays", "").split(",")):
         fans = f", {said[f'fans.{tray}']} fans" if f"fans.{tray}" in said else ""
         lines.append(
@@ -164,7 +169,8 @@ def _table(part: Contents) -> Table:
 
 
 def _has_lost(part: Contents) -> bool:
-    return any(account.missing for account in part.accounts.values()) or not NO_LOSS.issuperset(part.damage)
+    has_missing = any(account.missing for account in part.accounts.values())
+    return has_missing or bool(part.recovered) or not NO_LOSS.issuperset(part.damage)
 
 
 def _duration_s(part: Contents) -> float:

@@ -11,7 +11,7 @@ import typer
 
 from pipeline.commands.options import JsonOption
 from pipeline.commands.progress import working
-from pipeline.recordings.contents import BREAKS_OFF, NO_LOSS, damage_of
+from pipeline.recordings.contents import losses, messages_as_text
 from pipeline.recordings.ledger import Account, add_up
 from pipeline.recordings.recovery import Recovery
 from pipeline.recordings.recovery import recover as recover_file
@@ -44,33 +44,18 @@ def recover(
         raise typer.Exit(3)
 
 
-def losses(found: Scan) -> list[str]:
-    """What is missing, or may be, one line each; nothing where nothing is."""
-    lines = [line for line in damage_of(found) if line not in NO_LOSS | {BREAKS_OFF}]
-    if not found.is_ended:
-        flush_s = found.metadata.get("flush_interval_s")
-        may = f"what came in the last {flush_s} s" if flush_s else "what was in the unfinished chunk"
-        lines.insert(0, f"{BREAKS_OFF}: {may} may be missing")
-    for (key, producer), account in found.accounts.items():
-        if account.missing:
-            lines.append(f"{key}: {_messages(account.missing)} of {producer} missing in between")
-    for (key, producer), count in found.census.ledger.unrecorded().items() if not found.is_ended else ():
-        lines.append(f"{key}: {_messages(count)} of {producer} published, by its health, after the last one here")
-    return lines
-
-
 def _lines(file: Path, recovery: Recovery) -> list[str]:
     found = recovery.found
     if found.is_whole:
         copied = f"; copied to {recovery.path}" if recovery.path != file else ""
-        lines = [f"{file}: is whole already, with {_messages(found.messages)}; nothing to recover{copied}"]
+        lines = [f"{file}: is whole already, with {messages_as_text(found.messages)}; nothing to recover{copied}"]
     else:
         kept = f"; the torn file is {recovery.torn}" if recovery.torn else ""
-        lines = [f"{file}: {_messages(found.messages)} are whole again in {recovery.path}{kept}"]
+        lines = [f"{file}: {messages_as_text(found.messages)} are whole again in {recovery.path}{kept}"]
     for topic, account in _by_topic(found).items():
         last = f", the last at {_time(account.last_ns)}" if account.last_ns is not None else ""
         missing = f", {account.missing} missing" if account.missing else ""
-        lines.append(f"  {topic}: {_messages(account.messages)}{missing}{last}")
+        lines.append(f"  {topic}: {messages_as_text(account.messages)}{missing}{last}")
     lost = losses(found)
     return lines + (["lost:", *(f"  {line}" for line in lost)] if lost else ["nothing was lost"])
 
@@ -107,10 +92,6 @@ def as_json(file: Path, recovery: Recovery) -> dict[str, Any]:
 
 def _by_topic(found: Scan) -> dict[str, Account]:
     return add_up(found.accounts.items()) | found.census.others
-
-
-def _messages(count: int) -> str:
-    return "1 message" if count == 1 else f"{count} messages"
 
 
 def _time(t_ns: int) -> str:

@@ -33,6 +33,9 @@ REPLAYED = tuple(topic.name for topic in TOPICS if topic.recorded and topic.name
 """What is replayed where nothing else is said; the health of stages that are gone is told to nobody."""
 _KEYS_HELP = "space pause, → step, ↑↓ rate, q quit"
 _SHOWN_EVERY_S = 0.1
+LARGEST_RATE = 1e6
+LONGEST_S = 1e10
+"""three centuries, and still a time in ns"""
 _Show: TypeAlias = Callable[[Progress], None]
 _VIEWING = "Viewing"
 _DECIDING = "Deciding again, without a bus"
@@ -48,8 +51,8 @@ def replay(
             rich_help_panel=_VIEWING,
         ),
     ] = None,
-    start: Annotated[float, typer.Option(help="Where to begin, s since the recording's first message.")] = 0.0,
-    end: Annotated[float, typer.Option(help="Where to end, s since the recording's first message.")] = math.inf,
+    start: Annotated[float, typer.Option(help="Where to begin, s since the recording began.")] = 0.0,
+    end: Annotated[float, typer.Option(help="Where to end, s since the recording began.")] = math.inf,
     pause: Annotated[
         bool, typer.Option("--pause", help="Begin paused: space goes on.", rich_help_panel=_VIEWING)
     ] = False,
@@ -107,7 +110,7 @@ def replay(
     deciding = {"--twin": twin, "--output": output, "--verify": verify}
     for name in (name for name, value in (viewing if offline else deciding).items() if value):
         raise typer.BadParameter(f"{name} {'cannot go' if offline else 'goes only'} with --offline")
-    if not 0.0 <= start < end:
+    if not 0.0 <= start < min(end, LONGEST_S) or (end > LONGEST_S and not math.isinf(end)):
         raise typer.BadParameter("0 <= --start < --end, in seconds", param_hint="--start, --end")
     if offline:
         from pipeline.commands.replay_offline import run_offline  # noqa: PLC0415  with all that decides
@@ -179,8 +182,8 @@ def _rate(text: str) -> float:
         rate = math.inf if text == "max" else float(text)
     except ValueError:
         rate = math.nan
-    if not rate > 0.0 or (math.isinf(rate) and text != "max"):
-        raise typer.BadParameter(f"{text!r}: give a number above 0, or max", param_hint="--rate")
+    if text != "max" and not 0.0 < rate <= LARGEST_RATE:
+        raise typer.BadParameter(f"{text!r}: give a number above 0, to {LARGEST_RATE:g}, or max", param_hint="--rate")
     return rate
 
 

@@ -137,7 +137,8 @@ def _tell(trays: Sequence[JudgedTray], result: dict[str, Any], output: Path | No
     if len(now) > _SHOWN:
         console.print(f"and {len(now) - _SHOWN} more; all with --json")
     console.print(
-        f"{len(now)} alarms in {result['hours']:.3g} h, {result['samples']} samples, {result['lost']} lost; "
+        f"{len(now)} alarm{'s' * (len(now) != 1)} in {_duration(result['hours'])}, {result['samples']} samples, "
+        f"{result['lost']} lost; "
         f"{result['times_real_time']:.0f} times real time"
     )
     for tray in trays:
@@ -158,6 +159,12 @@ def _tell(trays: Sequence[JudgedTray], result: dict[str, Any], output: Path | No
         _tell_verified(result["verified"], console)
     if output:
         console.print(f"written to {output}", markup=False)
+
+
+def _duration(hours: float) -> str:
+    return (
+        f"{hours:.3g} h" if hours >= 1.0 else f"{hours * 60:.3g} min" if hours * 60 >= 1.0 else f"{hours * 3600:.3g} s"
+    )
 
 
 def _tell_verified(found: dict[str, Any], console: Console) -> None:

@@ -5,7 +5,6 @@ A recording may lie in several files, the parts of one. See docs/reading.md.
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
@@ -14,7 +13,7 @@ from typing import Any, get_type_hints
 
 import numpy as np
 
-from pipeline.recordings.order import in_order
+from pipeline.recordings.order import Seen, in_order
 from pipeline.recordings.reading import Entry, RecordingError, read_recording
 from schemas.messages import MESSAGE_TYPES, Array, FanState, Message, Severity, StageStatus, WhyNot, columns
 from schemas.topics import BY_NAME, HEALTH_CHUNK, TOPICS
@@ -92,14 +91,14 @@ class Arrays:
 
     def _entries(self) -> Iterator[Entry]:
         """The messages of all parts, each once."""
-        seen: dict[tuple[str, str], _Seen] = {}
+        seen: dict[tuple[str, str], Seen] = {}
         for path in self.paths:
             reading = read_recording(path, self.topics)
             for entry in reading:
                 if self.tray is not None and _site_and_tray(entry.key)[1] not in ("", self.tray):
                     continue
                 header = entry.message.header
-                if seen.setdefault((entry.key, header.producer), _Seen()).is_new(header.sequence):
+                if seen.setdefault((entry.key, header.producer), Seen()).is_new(header.sequence):
                     yield entry
                 else:
                     self.duplicated += 1
@@ -218,28 +217,3 @@ def _form(message: Message) -> tuple[int, ...]:
 def _site_and_tray(key: str) -> tuple[str, str]:
     _, site, tray, *_ = key.split("/")
     return site, "" if tray == HEALTH_CHUNK else tray
-
-
-class _Seen:
-    """Which sequence numbers of a producer have come: as stretches, for there are as many as there are gaps."""
-
-    def __init__(self) -> None:
-        self._first: list[int] = []
-        self._next: list[int] = []
-
-    def is_new(self, sequence: int) -> bool:
-        """Whether it comes for the first time; from now on it has come."""
-        at = bisect_right(self._first, sequence)  # the stretch that may hold or touch it is the one before
-        if at and sequence < self._next[at - 1]:
-            return False
-        joins_next = at < len(self._first) and sequence + 1 == self._first[at]
-        if at and sequence == self._next[at - 1]:
-            self._next[at - 1] = self._next.pop(at) if joins_next else sequence + 1
-            if joins_next:
-                del self._first[at]
-        elif joins_next:
-            self._first[at] = sequence
-        else:
-            self._first.insert(at, sequence)
-            self._next.insert(at, sequence + 1)
-        return True

@@ -70,7 +70,7 @@ class Census:
         elif lane.topic is None:
             account = self.others.setdefault(lane.key, Account(first_ns=log_time_ns))
             account.messages += 1
-            account.last_ns = log_time_ns
+            account.last_ns = max(log_time_ns, account.last_ns or 0)
         else:
             self._decode(lane, lane.topic, log_time_ns, data[start:end])
 

@@ -11,7 +11,17 @@ from mcap.reader import make_reader
 from mcap.summary import Summary
 
 from pipeline.recordings.disk import unwritten
-from pipeline.recordings.ledger import BEFORE_NAME, ENDED, LEDGER_NAME, Account, Line, accounts_of, before_of, next_of
+from pipeline.recordings.ledger import (
+    BEFORE_NAME,
+    ENDED,
+    LEDGER_NAME,
+    Account,
+    Line,
+    accounts_of,
+    before_of,
+    next_of,
+    recovered_of,
+)
 from pipeline.recordings.reading import BROKEN, METADATA_NAME
 from pipeline.recordings.records import RECORD, open_chunk, payloads_of
 from pipeline.recordings.scan import Scan, scan
@@ -20,6 +30,7 @@ from schemas.messages import Health, Message, ModelCard
 from schemas.topics import topic_of
 
 BREAKS_OFF = "it breaks off, as after a crash"
+NOTHING_WHOLE = "bytes that are nothing whole"
 NO_INDEX = "it has no index"
 STILL_WRITTEN = "it is still being written"
 NO_LOSS = frozenset((NO_INDEX, STILL_WRITTEN))
@@ -46,6 +57,8 @@ class Contents:
     cards: Mapping[str, ModelCard]
     has_ended: bool
     """its recorder ended in order with this file"""
+    recovered: tuple[str, ...] = ()
+    """what was lost, or may have been, when it was mended, one line each"""
     damage: tuple[str, ...] = ()
     """what is wrong with the file, one line each"""
 
@@ -64,7 +77,7 @@ def contents_of(path: Path) -> Contents:
     try:
         with path.open("rb") as file:
             found = _by_index(path, file)
-    except (OSError, *BROKEN, KeyError):
+    except (OSError, *BROKEN, LookupError):
         found = None
     if found:
         return found
@@ -90,7 +103,7 @@ def continuity(parts: Sequence[Contents]) -> list[str]:
     for part in parts:
         name = part.metadata.get("continues", "")
         earlier = by_name.get(name)
-        if name and earlier is None and len(parts) > 1:
+        if name and earlier is None and part is not parts[0]:  # those before the first were not asked for, or deleted
             lines.append(f"{part.path.name} continues {name}, which is not among these files")
         ends_at = earlier.next if earlier else {}
         for line, due in part.before.items():
@@ -105,7 +118,7 @@ def damage_of(found: Scan) -> tuple[str, ...]:
     lines = (
         (not found.is_ended, BREAKS_OFF),
         (found.is_ended and not found.has_index, NO_INDEX),
-        (found.thrown_away_bytes, f"bytes that are nothing whole: {found.thrown_away_bytes}"),
+        (found.thrown_away_bytes, f"{NOTHING_WHOLE}: {found.thrown_away_bytes}"),
         (found.damaged_chunks, f"damaged chunks: {found.damaged_chunks}"),
         (found.damaged_records, f"damaged records: {found.damaged_records}"),
         (found.damaged_attachments, f"damaged attachments: {found.damaged_attachments}"),
@@ -113,6 +126,35 @@ def damage_of(found: Scan) -> tuple[str, ...]:
         (found.census.undecodable, f"messages that are not what their channel says: {found.census.undecodable}"),
     )
     return tuple(line for is_so, line in lines if is_so)
+
+
+def losses(found: Scan) -> list[str]:
+    """What is missing, or may be, one line each; nothing where nothing is."""
+    missing = [
+        f"{key}: {messages_as_text(account.missing)} of {producer} missing in between"
+        for (key, producer), account in found.accounts.items()
+        if account.missing
+    ]
+    return [*unaccounted(found), *missing]
+
+
+def unaccounted(found: Scan) -> list[str]:
+    """Those of the losses that do not stand in its accounts."""
+    lines = [line for line in damage_of(found) if line not in NO_LOSS | {BREAKS_OFF}]
+    if not found.is_ended:
+        flush_s = found.metadata.get("flush_interval_s")
+        may = f"what came in the last {flush_s} s" if flush_s else "what was in the unfinished chunk"
+        lines.insert(0, f"{BREAKS_OFF}: {may} may be missing")
+    for (key, producer), count in found.census.ledger.unrecorded().items() if not found.is_ended else ():
+        lines.append(
+            f"{key}: {messages_as_text(count)} of {producer} published, by its health, after the last one here"
+        )
+    return [*found.recovered, *lines]
+
+
+def messages_as_text(count: int) -> str:
+    """The number with its noun."""
+    return "1 message" if count == 1 else f"{count} messages"
 
 
 def _by_scan(found: Scan) -> Contents:
@@ -130,6 +172,7 @@ def _by_scan(found: Scan) -> Contents:
         healths=found.census.healths,
         cards=found.census.cards,
         has_ended=found.has_ended,
+        recovered=found.recovered,
         damage=damage_of(found),
     )
 
@@ -163,6 +206,7 @@ def _by_index(path: Path, file: BinaryIO) -> Contents | None:
         healths={key: message for key, message in news if isinstance(message, Health)},
         cards={key: message for key, message in news if isinstance(message, ModelCard)},
         has_ended=ENDED in records[LEDGER_NAME],
+        recovered=recovered_of(records[LEDGER_NAME]),
     )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pipeline.recordings.reading import RecordingError
 
-_PASSING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENODEV, errno.ENXIO, errno.ESTALE)
+_PASSING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENODEV, errno.ENXIO, errno.EROFS, errno.ESTALE)
 
 
 class DiskError(RecordingError):

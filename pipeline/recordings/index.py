@@ -67,6 +67,10 @@ class Index:
         """The same of metadata."""
         self._metadata.append(MetadataIndex(offset=offset, length=length, name=metadata.name))
 
+    def forget_metadata(self) -> None:
+        """The last metadata could not be written."""
+        self._metadata.pop()
+
     def note_chunk(self, chunk: ChunkIndex, messages: Mapping[int, int]) -> None:
         """A chunk with so many messages of each channel."""
         self._chunks.append(chunk)

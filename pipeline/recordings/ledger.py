@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import TypeAlias
 
 from schemas.messages import Health
+from schemas.topics import topic_of
 
 LEDGER_NAME = "fantwin.ledger"
 """the metadata record that holds a finished ledger"""
 ENDED = "ended"
 """its entry that says that the recorder ended in order with this part"""
+RECOVERED = "recovered"
+"""its entry that says what was lost, or may have been, in a file that was mended"""
 BEFORE_NAME = "fantwin.before"
 """the one, before the first message, that says with which number each producer should go on"""
 
@@ -26,7 +29,8 @@ Line: TypeAlias = tuple[str, str]
 @dataclass(slots=True)
 class Account:
     """Of one key and producer. `missing` counts holes, that before the first message included where it is known what
-    had been recorded before. Sequence numbers and times, of receipt, are of the messages here; None without any."""
+    had been recorded before. Sequence numbers and times, of receipt, are of the messages here; None without any.
+    Of a damaged file `last_sequence` is that of the last message that was recorded."""
 
     messages: int = 0
     missing: int = 0
@@ -60,9 +64,12 @@ class Ledger:
         if account is None:
             account = self.accounts[line] = Account()
         if account.messages == 0:
-            account.first_sequence, account.first_ns = sequence, log_time_ns
+            account.first_sequence = sequence
         account.messages += 1
-        account.last_ns = log_time_ns
+        if account.first_ns is None or log_time_ns < account.first_ns:  # the host's clock may be set back
+            account.first_ns = log_time_ns
+        if account.last_ns is None or log_time_ns > account.last_ns:
+            account.last_ns = log_time_ns
         if due is not None and sequence < due:
             account.duplicated += 1
             return
@@ -74,7 +81,10 @@ class Ledger:
     def note_health(self, health: Health) -> None:
         """A health was recorded: it says how much its stage had published by then."""
         for output in health.outputs:
-            self._published[output.key, health.header.producer] = output.published
+            line = (output.key, health.header.producer)
+            self._published[line] = output.published
+            if output.published == 0 and _is_recorded(output.key):
+                self.next.setdefault(line, 0)  # from its first message on, each is recorded or missing
 
     def lose(self, key: str, producer: str, sequence: int) -> None:
         """A message came that is not going to be recorded: a hole, as soon as a later one is, or else at the end."""
@@ -117,13 +127,37 @@ def accounts_of(metadata: Mapping[str, str]) -> dict[Line, Account]:
     """What `as_metadata` has written. Raises ValueError if it is not that."""
     accounts = {}
     for name, text in metadata.items():
-        if name != ENDED:
+        if name not in (ENDED, RECOVERED):
             values = json.loads(text)
             if not isinstance(values, dict) or values.keys() != _FIGURES:
                 raise ValueError(f"{name}: no account")
             if not all(value is None or type(value) is int for value in values.values()):
                 raise ValueError(f"{name}: an account of something else than numbers")
             accounts[_line(name)] = Account(**values)
+    return accounts
+
+
+def recovered_of(metadata: Mapping[str, str]) -> tuple[str, ...]:
+    """What the ledger of a mended file says of it, one line each. Raises ValueError if it is not that."""
+    lines = json.loads(metadata.get(RECOVERED, "[]"))
+    if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
+        raise ValueError(f"{RECOVERED}: no lines")
+    return tuple(lines)
+
+
+def corrected(recorded: Mapping[Line, Account], found: Mapping[Line, Account]) -> dict[Line, Account]:
+    """The ledger of a file that has been damaged since: what it says was recorded and is not found is missing."""
+    accounts = dict(found)
+    for line, said in recorded.items():
+        here = found.get(line, Account())
+        accounts[line] = replace(
+            said,
+            messages=here.messages,
+            missing=said.missing + max(0, said.messages - here.messages),
+            first_sequence=here.first_sequence,
+            first_ns=here.first_ns,
+            last_ns=here.last_ns,
+        )
     return accounts
 
 
@@ -150,6 +184,13 @@ def add_up(accounts: Iterable[tuple[Line, Account]]) -> dict[str, Account]:
             total.first_ns = min(account.first_ns, total.first_ns if total.first_ns is not None else account.first_ns)
             total.last_ns = max(account.last_ns, total.last_ns or 0)
     return dict(sorted(found.items()))
+
+
+def _is_recorded(key: str) -> bool:
+    try:
+        return topic_of(key).recorded
+    except KeyError:
+        return False
 
 
 def _line(name: str) -> Line:

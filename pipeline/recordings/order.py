@@ -1,7 +1,8 @@
-"""The parts of a recording in the order of time."""
+"""The parts of a recording in order, and each of their messages once."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -21,12 +22,49 @@ def in_order(parts: Iterable[Path]) -> list[Path]:
                 raise RecordingError(
                     f"{path}: made by import or simulate or an offline replay, so no part of another: read it by itself"
                 )
-        paths.sort(key=_start_ns)
+        paths = _sessions_in_order(paths)
     elif paths:
         read_recording(paths[0])
     return paths
 
 
+def _sessions_in_order(paths: Iterable[Path]) -> list[Path]:
+    """By the time each session of a recorder began, and in it by part: the host's clock may be set back between two."""
+    sessions: dict[str, list[tuple[int, int, Path]]] = {}
+    for path in paths:
+        metadata = read_head(path).metadata
+        part = metadata.get("part", "")
+        entry = (int(part) if part.isdecimal() else 0, _start_ns(path), path)
+        sessions.setdefault(metadata.get("session") or str(path), []).append(entry)
+    ordered = [sorted(parts) for parts in sessions.values()]
+    return [path for parts in sorted(ordered, key=lambda parts: parts[0][1]) for _, _, path in parts]
+
+
 def _start_ns(path: Path) -> int:
     """When its first message was received; a file without any may stand anywhere."""
     return next((entry.log_time_ns for entry in read_recording(path)), 0)
+
+
+class Seen:
+    """Which sequence numbers of a producer have come: as stretches, for there are as many as there are gaps."""
+
+    def __init__(self) -> None:
+        self._first: list[int] = []
+        self._next: list[int] = []
+
+    def is_new(self, sequence: int) -> bool:
+        """Whether it comes for the first time; from now on it has come."""
+        at = bisect_right(self._first, sequence)  # the stretch that may hold or touch it is the one before
+        if at and sequence < self._next[at - 1]:
+            return False
+        joins_next = at < len(self._first) and sequence + 1 == self._first[at]
+        if at and sequence == self._next[at - 1]:
+            self._next[at - 1] = self._next.pop(at) if joins_next else sequence + 1
+            if joins_next:
+                del self._first[at]
+        elif joins_next:
+            self._first[at] = sequence
+        else:
+            self._first.insert(at, sequence)
+            self._next.insert(at, sequence + 1)
+        return True

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from pipeline.recordings.contents import Contents, contents_of
-from pipeline.recordings.disk import Disk, refused
+from pipeline.recordings.disk import Disk, DiskError, refused, sync_folder
 from pipeline.recordings.ledger import Ledger
 from pipeline.recordings.reading import RecordingError, read_head
 from pipeline.recordings.recovery import TORN_SUFFIX, Recovery, free_torn_name, mend
@@ -43,6 +43,8 @@ class Shelf:
         """what killed recorders had left"""
         self.unreadable: list[Path] = []
         """what they had left and cannot be mended: put aside"""
+        self.unmended: list[Path] = []
+        """what they had left and the disk refuses to mend for now: left as it is"""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._disk = Disk(path.parent)
@@ -51,9 +53,9 @@ class Shelf:
         except OSError as error:
             raise refused(f"{path}: cannot be written", error, "name another file or folder") from error
         last = self._last_part()
-        self._continues = last.path.name if last else ""
+        self._continues = last.path.name.removesuffix(ACTIVE_SUFFIX) if last else ""
         self.before = last.next if last else {}
-        """of each key and producer, the sequence number that is due after the last part of a killed recorder"""
+        """of each key and producer, the sequence number that is due after the last part there is"""
 
     def begin(self, t_ns: int, ledger: Ledger, about: Mapping[str, str]) -> RecordingWriter:
         """Begin the next part, at `t_ns`. about: what is special about it, for its metadata.
@@ -123,17 +125,20 @@ class Shelf:
                 raise RecordingError(
                     f"{path}: another recorder is writing it; stop it, or name another file"
                 ) from error
+            except DiskError:
+                self.unmended.append(path)
+                continue
             except RecordingError:
                 aside = free_torn_name(path.with_name(path.name.removesuffix(ACTIVE_SUFFIX)))
                 self.unreadable.append(path.rename(aside))
+                sync_folder(aside.parent)
                 continue
             if recovery:
                 self.mended.append(recovery)
 
     def _last_part(self) -> Contents | None:
-        """The last part, unless its recorder ended in order."""
-        finished = [path for _, path in sorted(self._files()) if path.suffix == self._path.suffix]
-        if not finished or not self._is_ours(finished[-1]):
-            return None
-        contents = contents_of(finished[-1])
-        return None if contents.has_ended else contents
+        """The last part of ours."""
+        for _, path in sorted(self._files(), reverse=True):
+            if (path.suffix == self._path.suffix or path in self.unmended) and self._is_ours(path):
+                return contents_of(path)
+        return None

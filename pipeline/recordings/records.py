@@ -14,7 +14,7 @@ from zlib import crc32
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Chunk, McapRecord
+from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdDecompressor
@@ -29,6 +29,13 @@ _CHUNK = struct.Struct("<QQQI")
 _BEFORE_COMPRESSION = RECORD.size + _CHUNK.size
 _ZSTD = b"\x04\x00\x00\x00zstd"
 _KNOWN = frozenset(int(opcode) for opcode in Opcode)
+_DESCRIBING: dict[int, type[McapRecord]] = {
+    Opcode.HEADER: Header,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.METADATA: Metadata,
+    Opcode.ATTACHMENT: Attachment,
+}
 _FOOTER_BYTES = 20
 _BLOCK_BYTES = 1 << 20
 
@@ -130,12 +137,13 @@ class Walk:
         if len(content) < length:
             return None
         found = Found(self.end, opcode, content)
-        if opcode not in _KNOWN:  # its length is not trusted unless it leads to another record
-            following = file.read(RECORD.size)
-            file.seek(found.end)
-            if not self._is_plausible(following, found.end) or following[0] not in _KNOWN:
-                return None
-        return found
+        if opcode in _KNOWN and _is_of_its_length(opcode, content):
+            return found
+        if opcode in (Opcode.CHUNK, Opcode.MESSAGE_INDEX):
+            return None  # a damaged length would cost all that it spans, and the next chunk is easily found
+        following = file.read(RECORD.size)  # the length is not trusted unless it leads to another record
+        file.seek(found.end)
+        return found if self._is_plausible(following, found.end) and following[0] in _KNOWN else None
 
     def _is_plausible(self, head: bytes, offset: int) -> bool:
         return len(head) == RECORD.size and head[0] != 0 and RECORD.unpack(head)[1] <= self.size - offset - RECORD.size
@@ -168,6 +176,21 @@ class Walk:
         except BROKEN:
             return False
         return True
+
+
+def _is_of_its_length(opcode: int, content: bytes) -> bool:
+    """Whether the lengths inside a record agree with its own, where it has any inside."""
+    try:
+        if opcode == Opcode.CHUNK:
+            _, at = _text(content, _CHUNK.size)
+            return struct.unpack_from("<Q", content, at)[0] == len(content) - at - 8
+        if opcode == Opcode.MESSAGE_INDEX:
+            return struct.unpack_from("<I", content, 2)[0] == len(content) - 6
+        if opcode in _DESCRIBING:
+            parse(_DESCRIBING[opcode], content)
+    except BROKEN:
+        return False
+    return True
 
 
 def open_chunk(content: bytes) -> ChunkContent:

@@ -5,6 +5,8 @@ Nothing is taken away before its replacement is on the disk. See docs/recordings
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,6 +15,7 @@ from pathlib import Path
 
 from mcap.writer import MCAP0_MAGIC
 
+from pipeline.recordings.contents import NOTHING_WHOLE, unaccounted
 from pipeline.recordings.disk import WholeFile, refused, sync_folder, unwritten
 from pipeline.recordings.index import SHORT_ENDING
 from pipeline.recordings.reading import RecordingError
@@ -68,7 +71,7 @@ def mend(active: Path) -> Recovery | None:
     file = WholeFile(active, keep=True)
     try:
         found = _scan_of_left_over(active)
-        if found is None or not found.messages:
+        if found is None or not (found.messages or found.is_damaged):
             active.unlink()
             return None
         if not found.is_whole and (found.is_damaged or not found.fits):
@@ -76,10 +79,11 @@ def mend(active: Path) -> Recovery | None:
         if not found.is_whole:
             file.cut(found.solid_end)
             try:
-                write_ending(file, found.index, found.accounts, before=found.tail, has_ended=found.has_ended)
+                _end(file, found, before=found.tail)
             except OSError:
                 with suppress(OSError):
                     file.write(SHORT_ENDING)
+                    file.sync()
         name = _finished_name(active)
         active.rename(name)
         sync_folder(name.parent)
@@ -102,19 +106,34 @@ def _recover(path: Path, output: Path | None) -> Recovery:
         raise RecordingError(f"{path}: there is no whole message in it: nothing can be recovered")
     target = output or _finished_name(path)
     unfinished = target.with_name(target.name + _UNFINISHED_SUFFIX)
+    torn = None
     try:
+        if found.is_whole and output is None:
+            path.rename(target)
+            sync_folder(target.parent)
+            return Recovery(found, target)
         _write(unfinished, lambda file: _copy(found, file))
-        torn = None
-        if output is None and not found.is_whole:
+        if output is None:
             torn = free_torn_name(target)
-            path.rename(torn)
-        elif output is None:
-            path.unlink()
-        unfinished.rename(target)
+            _give_second_name(path, torn)
+        unfinished.replace(target)
         sync_folder(target.parent)
+        if output is None and path != target:
+            path.unlink(missing_ok=True)
     except OSError as error:
-        raise refused(f"{target}: cannot be written", error, f"{path.name} is left as it was; make room") from error
+        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        advice = "make room" if is_full else "name another file with -o"
+        raise refused(f"{target}: cannot be written", error, f"{path.name} is left as it was; {advice}") from error
     return Recovery(found, target, torn)
+
+
+def _give_second_name(path: Path, name: Path) -> None:
+    """So that a kill at any moment leaves it under one of them."""
+    try:
+        os.link(path, name)
+        sync_folder(path.parent)
+    except OSError:  # a disk without links
+        path.rename(name)
 
 
 def _write(path: Path, fill: Callable[[WholeFile], None]) -> None:
@@ -139,7 +158,7 @@ def _copy(found: Scan, file: WholeFile) -> None:
                 file.write(block)
                 left -= len(block)
         if not found.is_whole:
-            write_ending(file, found.index, found.accounts, before=found.tail, has_ended=found.has_ended)
+            _end(file, found, before=found.tail)
         return
 
     def keep(data: bytes) -> int:
@@ -149,7 +168,18 @@ def _copy(found: Scan, file: WholeFile) -> None:
 
     file.write(MCAP0_MAGIC)
     again = scan(found.path, keep)
-    write_ending(file, again.index, again.accounts, has_ended=again.has_ended)
+    _end(file, again)
+
+
+def _end(file: WholeFile, found: Scan, before: bytes = b"") -> None:
+    """Write an ending that tells what was lost. OSError if the disk refuses."""
+    write_ending(file, found.index, found.accounts, before=before, has_ended=found.has_ended, recovered=_said_of(found))
+
+
+def _said_of(found: Scan) -> list[str]:
+    """The losses that its accounts do not show. An unfinished chunk at the end is told as the end that is lacking."""
+    tail = not found.is_ended and not found.is_damaged
+    return [line for line in unaccounted(found) if not (tail and line.startswith(NOTHING_WHOLE))]
 
 
 def _finished_name(path: Path) -> Path:

@@ -16,7 +16,18 @@ from mcap.writer import MCAP0_MAGIC
 
 from pipeline.recordings.census import Census
 from pipeline.recordings.index import Index, message_indexes
-from pipeline.recordings.ledger import BEFORE_NAME, ENDED, LEDGER_NAME, Account, Ledger, Line, accounts_of, before_of
+from pipeline.recordings.ledger import (
+    BEFORE_NAME,
+    ENDED,
+    LEDGER_NAME,
+    Account,
+    Ledger,
+    Line,
+    accounts_of,
+    before_of,
+    corrected,
+    recovered_of,
+)
 from pipeline.recordings.reading import BROKEN, METADATA_NAME
 from pipeline.recordings.records import (
     MESSAGE,
@@ -50,6 +61,8 @@ class Scan:
     """with which number each producer should go on, by the parts before"""
     has_ended: bool = False
     """its recorder ended in order with this file, and not because something was in its way"""
+    recovered: tuple[str, ...] = ()
+    """what was said to be lost when it was mended before, one line each"""
     metadata: dict[str, str] = field(default_factory=dict)
     attachments: list[str] = field(default_factory=list)
     is_ended: bool = False
@@ -86,8 +99,11 @@ class Scan:
 
     @property
     def accounts(self) -> dict[Line, Account]:
-        """The ledger that was kept while it was written, if it is there and still true, or else the one found."""
-        return self.recorded if self.recorded is not None and not self.is_damaged else self.census.ledger.accounts
+        """The ledger that was kept while it was written, if it is there, less what is damaged; or the one found."""
+        found = self.census.ledger.accounts
+        if self.recorded is None:
+            return found
+        return corrected(self.recorded, found) if self.is_damaged else self.recorded
 
 
 def scan(path: Path, keep: Keep | None = None) -> Scan:
@@ -184,6 +200,7 @@ class _Scanner:
         if metadata.name == LEDGER_NAME:
             found.recorded = accounts_of(metadata.metadata)
             found.has_ended = ENDED in metadata.metadata
+            found.recovered = recovered_of(metadata.metadata)
             found.is_ended = self._past_data = True
             return
         if metadata.name == METADATA_NAME:

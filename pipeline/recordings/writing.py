@@ -6,10 +6,11 @@ ledger stands behind the last. While it is written a file is called NAME.mcap.ac
 
 from __future__ import annotations
 
+import json
 import mimetypes
 import struct
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from itertools import chain, count
@@ -27,7 +28,16 @@ from zstandard import ZstdCompressor
 
 from pipeline.recordings.disk import WholeFile, refused, sync_folder
 from pipeline.recordings.index import SHORT_ENDING, Index, message_indexes
-from pipeline.recordings.ledger import BEFORE_NAME, ENDED, LEDGER_NAME, Account, Ledger, Line, as_metadata
+from pipeline.recordings.ledger import (
+    BEFORE_NAME,
+    ENDED,
+    LEDGER_NAME,
+    RECOVERED,
+    Account,
+    Ledger,
+    Line,
+    as_metadata,
+)
 from pipeline.recordings.reading import METADATA_NAME, RecordingError
 from pipeline.recordings.records import MESSAGE, RECORD, record_bytes
 from schemas.codec import encode, proto_type, type_name
@@ -35,11 +45,10 @@ from schemas.messages import Health, Message, newest_t_ns
 from schemas.topics import topic_of
 
 ACTIVE_SUFFIX = ".active"
-CHUNK_BYTES = (
-    64 * 1024
-)  # what is not yet in a finished chunk is lost in a crash, and a reader holds one chunk in memory
-
-
+CHUNK_BYTES = 64 * 1024
+"""What is not yet in a finished chunk is lost in a crash, and a reader holds one chunk in memory."""
+UNSYNCED_BYTES = 4 << 20
+"""About so much is held in memory at most until it is through to the disk."""
 _MESSAGE_RECORD = struct.Struct(RECORD.format + MESSAGE.format.removeprefix("<"))
 
 
@@ -88,9 +97,12 @@ class RecordingWriter:
         self.path = path
         self.ledger = ledger or Ledger()
         self.written: Counter[str] = Counter()
-        """messages of each topic that are in the file for good"""
-        self.pending: list[Pending] = []
-        """the messages that are not: those of the chunk that is not written yet"""
+        """messages of each topic that are in the file for good: through to the disk"""
+        self._filling: list[Pending] = []
+        """those of the chunk that is not written yet"""
+        self._unsynced: list[_WrittenChunk] = []
+        """what is written and may not be on the disk yet"""
+        self._unsynced_bytes = 0
         self._overwrite = overwrite
         self._ended = False
         self._index = Index()
@@ -114,14 +126,21 @@ class RecordingWriter:
             for name, content in (attachments or {}).items():
                 self._write_attachment(Attachment(t_ns, t_ns, name, _media_type(name), content))
             sync_folder(path.parent)
+            self._synced_size = self._file.size
         except OSError as error:
-            self.discard()
+            with suppress(OSError):  # the disk may refuse that as well
+                self.discard()
             raise refused(f"{path}: cannot be written", error, "name another file or folder") from error
 
     @property
     def size(self) -> int:
         """Of the file, in bytes."""
         return self._file.size
+
+    @property
+    def pending(self) -> list[Pending]:
+        """The messages that are not in the file for good, in their order."""
+        return [*chain.from_iterable(chunk.messages for chunk in self._unsynced), *self._filling]
 
     def write(self, key: str, payload: bytes, message: Message, log_time_ns: int) -> None:
         """Add a message: the key it came on, its bytes, and when it was received.
@@ -130,10 +149,12 @@ class RecordingWriter:
             RecordingError: the disk refuses; `pending` then has what did not get into the file.
         """
         channel, _ = self._channels.get(key) or self._register(key, type(message))
-        self.pending.append(Pending(key, payload, message, log_time_ns))
+        self._filling.append(Pending(key, payload, message, log_time_ns))
         self._chunk.add(channel, message.header.sequence, log_time_ns, newest_t_ns(message), payload)
         if self._chunk.size > CHUNK_BYTES:
             self._close_chunk()
+            if self._unsynced_bytes > UNSYNCED_BYTES:
+                self._sync()
 
     def write_message(self, key: str, message: Message, log_time_ns: int) -> None:
         """The same for a message that has not been on the bus."""
@@ -146,10 +167,7 @@ class RecordingWriter:
             RecordingError: as in `write`.
         """
         self._close_chunk()
-        try:
-            self._file.sync()
-        except OSError as error:
-            raise self._end_early(error) from error
+        self._sync()
 
     def close(self, *, has_ended: bool = False) -> None:
         """Finish the file and give it its name, `path`. Does nothing to a file that has already been ended.
@@ -161,7 +179,7 @@ class RecordingWriter:
         """
         if self._ended:
             return
-        self._close_chunk()
+        self.flush()
         if has_ended:
             self.ledger.settle()
         try:
@@ -174,8 +192,10 @@ class RecordingWriter:
         """Remove the unfinished file."""
         if not self._ended:
             self._ended = True
-            self._active.unlink()
-            self._file.close()
+            try:
+                self._active.unlink()
+            finally:
+                self._file.close()
 
     def __enter__(self) -> Self:
         return self
@@ -206,23 +226,45 @@ class RecordingWriter:
         return self._channels[key]
 
     def _close_chunk(self) -> None:
-        if not self.pending:
+        if not self._filling:
             return
         offset = self._file.size
         record, index = self._chunk.made(offset)
         try:
             self._file.write(record)
         except OSError as error:
+            self._sync()  # the chunks before can be saved all the same
             raise self._end_early(error) from error
-        self._index.note_chunk(index, {channel: len(flat) // 2 for channel, flat in self._chunk.entries.items()})
-        self._chunk = _Chunk()
-        for key, _, message, log_time_ns in self.pending:
+        counts = {channel: len(flat) // 2 for channel, flat in self._chunk.entries.items()}
+        self._unsynced.append(_WrittenChunk(index, counts, self._filling))
+        self._unsynced_bytes += self._chunk.size
+        self._chunk, self._filling = _Chunk(), []
+
+    def _sync(self) -> None:
+        """What is written goes through to the disk, and counts from then on."""
+        try:
+            self._file.sync()
+        except OSError as error:  # the system forgets what it could not write: another attempt would prove nothing
+            self._take_back()
+            raise self._end_early(error) from error
+        for chunk in self._unsynced:
+            self._note(chunk)
+        self._unsynced, self._unsynced_bytes, self._synced_size = [], 0, self._file.size
+
+    def _note(self, chunk: _WrittenChunk) -> None:
+        self._index.note_chunk(chunk.place, chunk.counts)
+        for key, _, message, log_time_ns in chunk.messages:
             header = message.header
             self.ledger.note(key, header.producer, header.sequence, log_time_ns)
             self.written[self._channels[key][1]] += 1
             if isinstance(message, Health):
                 self.ledger.note_health(message)
-        self.pending = []
+
+    def _take_back(self) -> None:
+        """What may not be on the disk is pending again, and no longer in the file."""
+        self._filling, self._unsynced = self.pending, []
+        with suppress(OSError):
+            self._file.cut(self._synced_size)
 
     def _write_metadata(self, name: str, values: Mapping[str, str]) -> None:
         metadata = Metadata(name=name, metadata=dict(values))
@@ -236,7 +278,7 @@ class RecordingWriter:
         self._file.write(record)
 
     def _end_early(self, error: OSError) -> RecordingError:
-        """End the file at its last whole chunk, with an index if there is room for one; what to raise."""
+        """End the file behind what is on the disk, with an index if there is room for one; what to raise."""
         try:
             write_ending(self._file, self._index, self.ledger.accounts)
         except OSError:
@@ -260,6 +302,15 @@ class RecordingWriter:
             ) from error
         finally:
             self._file.close()
+
+
+class _WrittenChunk(NamedTuple):
+    """What is to be noted of a chunk once it is on the disk."""
+
+    place: ChunkIndex
+    counts: dict[int, int]
+    """messages by channel"""
+    messages: list[Pending]
 
 
 class _Chunk:
@@ -328,14 +379,27 @@ def _schema(message_type: type[Message]) -> bytes:
 
 
 def write_ending(
-    file: WholeFile, index: Index, accounts: Mapping[Line, Account], *, before: bytes = b"", has_ended: bool = False
+    file: WholeFile,
+    index: Index,
+    accounts: Mapping[Line, Account],
+    *,
+    before: bytes = b"",
+    has_ended: bool = False,
+    recovered: Sequence[str] = (),
 ) -> None:
     """End a file with `before`, the ledger and the index: all of it, or nothing.
+
+    recovered: of a mended file, what was lost or may have been, one line each.
 
     Raises:
         OSError: the disk refuses.
     """
-    ledger = Metadata(name=LEDGER_NAME, metadata=as_metadata(accounts) | ({ENDED: "in order"} if has_ended else {}))
+    entries = as_metadata(accounts)
+    if has_ended:
+        entries[ENDED] = "in order"
+    if recovered:
+        entries[RECOVERED] = json.dumps(list(recovered))
+    ledger = Metadata(name=LEDGER_NAME, metadata=entries)
     record = record_bytes(ledger)
     offset = file.size + len(before)
     index.note_metadata(ledger, offset, len(record))
@@ -344,6 +408,7 @@ def write_ending(
         file.write(before + record + index.ending(offset + len(record)))
         file.sync()
     except OSError:
+        index.forget_metadata()
         file.cut(without)
         raise
 

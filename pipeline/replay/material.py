@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from pipeline.replay.place import attached_config
 from pipeline.replay.plan import CHAIN, Planner, TrayPlan, UnplannedError
 from pipeline.stage import Context
 from schemas.codec import CodecError, decode
-from schemas.messages import Alarm
+from schemas.messages import Alarm, Raw
 
 
 @dataclass
@@ -34,6 +34,8 @@ class Material:
     """configuration and twins are those of the recording"""
     is_same_grid: bool
     """at least the grid of time is"""
+    started_t_ns: int
+    """when its recording began"""
     from_s: float = 0.0
     to_s: float = math.inf
     """the part of the recording that is judged, since its first raw sample"""
@@ -94,7 +96,7 @@ class Material:
                 config=self.config.sections[stage],
                 folder=self.config.folder,
                 run_folder=self.config.run_folder,
-                started_t_ns=_started_t_ns(self.paths[0], self.head),
+                started_t_ns=self.started_t_ns,
                 configuration_text=self.config.text,
                 overrides=self.config.overrides,
             )
@@ -120,6 +122,8 @@ def open_material(
         ConfigError: the configuration cannot be used, or does not know a tray of the recording.
         StageError: a twin cannot be used.
     """
+    if twin is not None and not twin.is_file():
+        raise RecordingError(f"{twin}: there is no such twin; correct --twin")
     ordered = tuple(in_order(paths))
     head = read_head(ordered[0])
     for path in ordered[1:]:
@@ -142,7 +146,8 @@ def open_material(
             paths=ordered,
             head=head,
             config=replace(base, trays=trays),
-            twins={tray.name: _twin_of(tray, base, config, recorded, twin, ordered[0]) for tray in trays},
+            twins={tray.name: _twin_of(tray, base, own, recorded, twin, ordered[0]) for tray in trays},
+            started_t_ns=_started_t_ns(ordered[0], head, first),
             is_as_recorded=own is not None and config is None and not overrides and twin is None,
             is_same_grid=own is not None and base.sections["resampler"] == own.sections["resampler"],
             from_s=from_s,
@@ -174,20 +179,24 @@ def _recorded_twins(head: Head, folder: Path, trays: Iterable[str]) -> dict[str,
 
 
 def _twin_of(
-    tray: TrayConfig, base: Config, config: Path | None, recorded: dict[str, Path], twin: Path | None, path: Path
+    tray: TrayConfig, base: Config, own: Config | None, recorded: dict[str, Path], twin: Path | None, path: Path
 ) -> Path:
-    """The twin that was named, else that of the configuration that was named, else the recording's own."""
+    """The twin that was named, else that of another configuration or a key, else the recording's own."""
     if twin is not None:
         return twin
-    if config is not None and tray.twin is not None:
+    as_recorded = own is not None and base.path == own.path and tray.twin == own.tray(tray.name).twin
+    if not as_recorded and tray.twin is not None:
         return tray.twin if tray.twin.is_absolute() else base.folder / tray.twin
     if tray.name in recorded:
         return recorded[tray.name]
     raise RecordingError(f"{path}: no twin of {tray.name} in this recording: name one with --twin FILE.onnx")
 
 
-def _started_t_ns(path: Path, head: Head) -> int:
+def _started_t_ns(path: Path, head: Head, first: Mapping[str, Sequence[Raw]]) -> int:
+    started = head.metadata.get("started_t_ns")
+    if started is None:
+        return min(int(message.host_receive_t_ns[0]) for messages in first.values() for message in messages[:1])
     try:
-        return int(head.metadata.get("started_t_ns", "0"))
+        return int(started)
     except ValueError as error:
         raise RecordingError(f"{path}: its metadata are damaged: started_t_ns is no number") from error

@@ -28,11 +28,13 @@ from pipeline.replay.verify import (
 )
 from schemas.blocks import cut
 from schemas.codec import CodecError
-from schemas.messages import Alarm, Grid, Header, Message, Prediction, Score, newest_t_ns
+from schemas.messages import Alarm, Grid, Header, Message, Prediction, Raw, Score, newest_t_ns
 from schemas.topics import TOPICS, tray_key
 
 Progress = Callable[[str, int], None]
 """Is told the tray, and the time of the newest sample that was judged, ns since the epoch."""
+_ROWS_WRITTEN = 100
+"""samples a message: who plays the file goes from one to the next, and a torn file loses few"""
 _TOPIC_NAMES = {topic.message: topic.name for topic in TOPICS}
 
 
@@ -254,6 +256,13 @@ class _Outputs:
                 return
             message = cut(message, first, len(message.t_ns))
             self._written_t_ns[type(message)] = int(message.t_ns[-1])
+        if isinstance(message, Raw | Grid | Prediction | Score):
+            for first in range(0, len(message.command), _ROWS_WRITTEN):
+                self._write(cut(message, first, min(first + _ROWS_WRITTEN, len(message.command))))
+        else:
+            self._write(message)
+
+    def _write(self, message: Message) -> None:
         topic = _TOPIC_NAMES[type(message)]
         header = Header(f"offline-{topic}", self._sequences[topic], self._tray)
         self._sequences[topic] += 1

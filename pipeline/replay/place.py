@@ -24,9 +24,10 @@ def place_of(file: Path, first: Entry, config: Path | None, overrides: Iterable[
     if config is not None:
         return load_config(config, overrides)
     head = read_head(file)
-    attached = attached_config(file, head, overrides)
-    if attached is not None:
-        return attached
+    if ATTACHED in head.attachments:
+        # where its own processes met is over; those who listen now are where the file says, or at the default
+        recorded = [override for override in _recorded_overrides(file, head) if not override.startswith("bus.")]
+        return _parsed(file, head, [*recorded, *overrides])
     trays = head.metadata.get("trays") or tray_of(first.key)
     sections = [f"[[tray]]\nname = {json.dumps(tray)}\nfans = 1\n" for tray in trays.split(",")]  # fans do not matter
     return parse_config(f"site = {json.dumps(first.key.split('/')[1])}\n{''.join(sections)}", file, overrides)
@@ -41,12 +42,19 @@ def attached_config(file: Path, head: Head, overrides: Iterable[str] = ()) -> Co
     """
     if ATTACHED not in head.attachments:
         return None
+    return _parsed(file, head, [*_recorded_overrides(file, head), *overrides])
+
+
+def _parsed(file: Path, head: Head, overrides: Iterable[str]) -> Config:
+    text = head.attachments[ATTACHED].decode(errors="replace")
+    return parse_config(text, Path(f"{file}:{ATTACHED}"), overrides)
+
+
+def _recorded_overrides(file: Path, head: Head) -> list[str]:
     try:
-        recorded = [str(override) for override in json.loads(head.metadata.get("overrides", "[]"))]
+        return [str(override) for override in json.loads(head.metadata.get("overrides", "[]"))]
     except (ValueError, TypeError) as error:
         raise RecordingError(f"{file}: its metadata are damaged: overrides are no list") from error
-    text = head.attachments[ATTACHED].decode(errors="replace")
-    return parse_config(text, Path(f"{file}:{ATTACHED}"), [*recorded, *overrides])
 
 
 def trays_of(files: Iterable[Path]) -> set[str]:

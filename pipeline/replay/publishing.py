@@ -87,7 +87,8 @@ def publish(
         refuse_conflicts()
         outcome.listeners = listeners.readers(topics)
         if not outcome.listeners:
-            say(f"nobody listens on site {place.site!r} at {place.bus.endpoint}; publishing all the same")
+            where = f"site {place.site!r} at {place.bus.endpoint}"
+            say(f"nobody on {where} reads {', '.join(topics)}; publishing all the same")
         sender = Sender(bus, place.site, trays)
         player = Player(sender, pace, RealTime(stop), keys=keys, look=look)
         outcome.stopped = True

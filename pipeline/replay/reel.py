@@ -13,12 +13,14 @@ import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from pipeline.recordings.order import in_order
+from pipeline.recordings.order import Seen, in_order
 from pipeline.recordings.reading import Entry, RecordingError, read_recording
 from schemas.messages import Array, Grid, Message, Prediction, Raw, Score
 
 NS_PER_S = 1_000_000_000
 LOOP_GAP_NS = 10_000_000  # between two rounds where no grid says how far samples are apart
+OUT_OF_ORDER_NS = 10 * NS_PER_S
+"""a message that was fetched from the bus later is recorded at a later time than some that follow it"""
 CARRIED = "twin"
 """the topic whose last message before the start is in force at the start"""
 
@@ -40,7 +42,9 @@ class Reel:
         self.files = list(firsts)
         self._topics = topics
         first = self.first = firsts[self.files[0]]
-        self._start_ns = first.log_time_ns + round(start_s * NS_PER_S)
+        self._start_ns = (
+            first.log_time_ns + round(start_s * NS_PER_S) if start_s else 0
+        )  # all of it, whatever its times
         self._end_ns = first.log_time_ns + round(end_s * NS_PER_S) if math.isfinite(end_s) else None
         self.damage: tuple[str, ...] = ()
         """what could not be read, a line for each file, once the messages are through"""
@@ -58,19 +62,19 @@ class Reel:
 
     def __iter__(self) -> Iterator[Entry]:
         """One round."""
-        newest: dict[tuple[str, str], int] = {}
+        seen: dict[tuple[str, str], Seen] = {}
         carried: dict[str, Entry] = {}
         damage: list[str] = []
         for file in self.files:
             reading = read_recording(file, self._topics)
             for entry in reading:
                 header = entry.message.header
-                line = entry.key, header.producer
-                if header.sequence <= newest.get(line, -1):
+                if not seen.setdefault((entry.key, header.producer), Seen()).is_new(header.sequence):
                     continue  # the part before this one had it, too
-                newest[line] = header.sequence
                 if self._end_ns is not None and entry.log_time_ns > self._end_ns:
-                    return
+                    if entry.log_time_ns > self._end_ns + OUT_OF_ORDER_NS:
+                        return
+                    continue
                 if entry.log_time_ns >= self._start_ns:
                     yield from carried.values()
                     carried.clear()
