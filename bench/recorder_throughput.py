@@ -29,7 +29,7 @@ from stages.recorder import Recorder, RecorderConfig
 
 FANS = 8
 STEP_NS = 10_000_000
-EPOCH_NS = 1_800_000_000_000_000_000
+EPOCH_NS = time.time_ns() - 1_000_000_000_000  # what is received now, not in a future that looks like a clock set back
 ASKED = 0.7
 TICK_EVERY = 100
 """The runner calls `tick` every 50 ms; looking at the clock that often is enough."""
