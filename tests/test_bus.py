@@ -14,6 +14,7 @@ from pipeline.bus import KEPT_BYTES, Bus, BusError
 from pipeline.config import BusConfig
 from schemas.topics import alive_key
 from tests.bus_peer import KEY, TOPIC
+from tests.chain import eventually
 
 COUNT = 400
 
@@ -118,6 +119,8 @@ def test_an_outlet_keeps_the_newest_messages_that_fit_its_memory(endpoint):
         outlet = publisher.outlet(KEY, TOPIC, "", "big")
         for number in range(count):
             outlet.put(bytes([number]) * size)
+        # the asker has to have heard who answers for them
+        eventually(lambda: list(asker.recover(KEY, "big", count - 1, count - 1, wait)), "somebody answers")
         kept = [payload[0] for _, payload in asker.recover(KEY, "big", 0, count, wait)]
         assert kept == [2, 3, 4, 5]
         for _ in range(TOPIC.history + 1):
