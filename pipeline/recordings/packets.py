@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from google.protobuf.message import DecodeError
 from mcap.opcode import Opcode
 from mcap.records import Channel
 
@@ -114,7 +115,7 @@ def header_of(packet: Packet) -> Any:
             if length < 1 << 14:
                 return fan_pb2.Header.FromString(payload[start : start + length])
         message: Any = proto_type(packet.topic.message).FromString(payload)
-    except Exception as error:
+    except DecodeError as error:
         raise CodecError(f"{packet.key}: {error}") from error
     return message.header
 

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.health import LOSS_PREFIX
+from pipeline.recordings.head import head_of
 from pipeline.recordings.writing import ACTIVE_SUFFIX, RecordingWriter
 from pipeline.replay.chain import Chain, Made
 from pipeline.replay.material import Material
-from pipeline.replay.place import ATTACHED
 from pipeline.replay.plan import TrayPlan, undisturbed
 from pipeline.replay.verify import (
     Comparison,
@@ -220,22 +217,9 @@ def _writer(material: Material, output: Path) -> RecordingWriter:
     for there in (output, output.with_name(output.name + ACTIVE_SUFFIX)):
         if there.exists():
             raise UserError(f"{there}: exists already; name another file with -o, or remove it")
-    config = material.config
-    metadata = {
-        "made_by": f"fantwin {version('fantwin')}",
-        "source": ",".join(path.name for path in material.paths),
-        "site": config.site,
-        "trays": ",".join(tray.name for tray in config.trays),
-    }
-    if config.overrides:
-        metadata["overrides"] = json.dumps(config.overrides)
-    attachments = {ATTACHED: config.text.encode()}
-    for tray in config.trays:
-        twin = material.twins[tray.name].read_bytes()
-        metadata[f"fans.{tray.name}"] = str(tray.fans)
-        metadata[f"speed_unit.{tray.name}"] = tray.speed_unit
-        metadata[f"twin_sha256.{tray.name}"] = hashlib.sha256(twin).hexdigest()
-        attachments[f"{tray.name}.onnx"] = twin
+    contexts = [material.contexts(tray)["scorer"] for tray in material.trays]
+    metadata, attachments = head_of(replace(contexts[0], trays=tuple(context.tray for context in contexts)))
+    metadata["source"] = ",".join(path.name for path in material.paths)
     return RecordingWriter(output, metadata, attachments)
 
 

@@ -7,10 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from pipeline.config import Config, load_config, parse_config
+from pipeline.recordings.head import CONFIGURATION
 from pipeline.recordings.reading import Entry, Head, RecordingError, read_head
 from pipeline.replay.sender import tray_of
-
-ATTACHED = "configuration.toml"
 
 
 def place_of(file: Path, first: Entry, config: Path | None, overrides: Iterable[str]) -> Config:
@@ -24,7 +23,7 @@ def place_of(file: Path, first: Entry, config: Path | None, overrides: Iterable[
     if config is not None:
         return load_config(config, overrides)
     head = read_head(file)
-    if ATTACHED in head.attachments:
+    if CONFIGURATION in head.attachments:
         # where its own processes met is over; those who listen now are where the file says, or at the default
         recorded = [override for override in _recorded_overrides(file, head) if not override.startswith("bus.")]
         return _parsed(file, head, [*recorded, *overrides])
@@ -40,14 +39,14 @@ def attached_config(file: Path, head: Head, overrides: Iterable[str] = ()) -> Co
         ConfigError: it cannot be used any more.
         RecordingError: what was set on top of it cannot be read.
     """
-    if ATTACHED not in head.attachments:
+    if CONFIGURATION not in head.attachments:
         return None
     return _parsed(file, head, [*_recorded_overrides(file, head), *overrides])
 
 
 def _parsed(file: Path, head: Head, overrides: Iterable[str]) -> Config:
-    text = head.attachments[ATTACHED].decode(errors="replace")
-    return parse_config(text, Path(f"{file}:{ATTACHED}"), overrides)
+    text = head.attachments[CONFIGURATION].decode(errors="replace")
+    return parse_config(text, Path(f"{file}:{CONFIGURATION}"), overrides)
 
 
 def _recorded_overrides(file: Path, head: Head) -> list[str]:
