@@ -5,6 +5,7 @@ COPY requirements.lock ./
 RUN pip install --no-cache-dir --require-hashes -r requirements.lock
 COPY pyproject.toml README.md LICENSE ./
 COPY schemas schemas
+COPY scoring scoring
 COPY pipeline pipeline
 COPY stages stages
 COPY twin twin

@@ -31,7 +31,13 @@ PANEL_HEIGHT_IN, LANE_HEIGHT_IN, WIDTH_IN = 2.3, 0.2, 12.0
 BETWEEN_IN, HEAD_IN, FOOT_IN = 0.5, 1.25, 0.6
 
 MEASURED, TWIN, BAND, ZONE, OUTSIDE, FAULT = "#454545", "#006e30", "#8fd9a8", "#f4a3a3", "#d62020", "#4a4a8a"
-STATE_COLORS = {"normal": "#57b97a", "suspect": "#f2b400", "alarm": "#d62020", "returning": "#ee8a4a"}
+STATE_COLORS = {
+    "normal": "#57b97a",
+    "suspect": "#f2b400",
+    "alarm": "#d62020",
+    "returning": "#ee8a4a",
+    "commissioning": "#7aa7d8",
+}
 UNKNOWN_COLOR = "#a9a9a9"
 
 

@@ -17,6 +17,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "up": ("up", "Watch"),
     "run": ("run", "Watch"),
     "status": ("status", "Watch"),
+    "alarms": ("alarms", "Watch"),
+    "wear": ("wear", "Watch"),
     "command": ("command", "Watch"),
     "doctor": ("doctor", "Watch"),
     "router": ("router", "Watch"),
@@ -29,13 +31,18 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "picture": ("picture", "Recordings"),
     "identify": ("identify", "Twins"),
     "train": ("train", "Twins"),
+    "calibrate": ("calibrate", "Twins"),
     "evaluate": ("evaluate", "Twins"),
     "compare": ("compare", "Twins"),
     "report": ("report", "Twins"),
     "simulate": ("simulate", "Simulated tray"),
 }
 
-VARIADIC: dict[str, tuple[str, ...]] = {"train": ("--validate",), "compare": ("--validate", "--test")}
+VARIADIC: dict[str, tuple[str, ...]] = {
+    "train": ("--validate",),
+    "compare": ("--validate", "--test"),
+    "calibrate": ("--verify",),
+}
 """Options that take all words up to the next option, by command."""
 
 app = typer.Typer(

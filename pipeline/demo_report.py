@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.recordings.reading import read_recording
-from schemas.messages import Alarm, Array, Grid, Raw, Score
+from schemas.messages import Alarm, Array, Grid, Raw, Score, Transition
 
 SETTLING_NS = 5_000_000_000  # after a fault has gone the fan runs back: an alarm until then is that fault's
 
@@ -27,6 +27,9 @@ class FaultSeen:
     stop_ns: int
     alarm_ns: int | None
     cleared_ns: int | None
+    cause: str = ""
+    """the most probable one, as it was known last"""
+    probability: float = 0.0
 
     @property
     def delay_s(self) -> float | None:
@@ -74,7 +77,8 @@ def summarise(truth_path: Path, recordings: Iterable[Path], lost_by_stage: dict[
     truth = _read_truth(truth_path)
     recorded = _read(recordings)
     faults = [_match(fault, recorded.alarms) for fault in truth["faults"]]
-    false_alarms = sum(alarm.active and not _explained(alarm, truth["faults"]) for alarm in recorded.alarms)
+    raised = [alarm for alarm in recorded.alarms if alarm.transition == Transition.RAISED]
+    false_alarms = sum(not _explained(alarm, truth["faults"]) for alarm in raised)
     unrecorded = max(0, truth["samples_sent"] - len(recorded.samples))
     lost = unrecorded + len(recorded.grid - recorded.scored) + sum(lost_by_stage.values())
     latency_ms: dict[str, float | None] = {"p50": None, "p99": None}
@@ -127,9 +131,21 @@ def _named(message: Raw | Grid | Score, names: Array) -> set[tuple[str, int]]:
 
 def _match(fault: dict[str, Any], alarms: list[Alarm]) -> FaultSeen:
     mine = [alarm for alarm in alarms if alarm.fan == fault["fan"] and alarm.t_ns >= fault["start_ns"]]
-    raised = next((a.t_ns for a in mine if a.active and a.t_ns <= fault["stop_ns"]), None)
-    cleared = next((a.t_ns for a in mine if not a.active and raised is not None and a.t_ns > raised), None)
-    return FaultSeen(fault["fan"], fault["kind"], fault["start_ns"], fault["stop_ns"], raised, cleared)
+    started = [a for a in mine if a.transition == Transition.RAISED and a.t_ns <= fault["stop_ns"]]
+    seen = FaultSeen(fault["fan"], fault["kind"], fault["start_ns"], fault["stop_ns"], None, None)
+    if not started:
+        return seen
+    raised_ns = started[0].t_ns
+    cleared_ns = next((a.t_ns for a in mine if a.transition == Transition.CLEARED and a.t_ns > raised_ns), None)
+    told = [a.causes[0] for a in mine if a.causes and raised_ns <= a.t_ns <= (cleared_ns or a.t_ns)]
+    first = told[-1] if told else None
+    return replace(
+        seen,
+        alarm_ns=raised_ns,
+        cleared_ns=cleared_ns,
+        cause=first.cause if first else "",
+        probability=round(first.probability, 4) if first else 0.0,
+    )
 
 
 def _explained(alarm: Alarm, faults: Iterable[dict[str, Any]]) -> bool:

@@ -27,7 +27,13 @@ WHITE = (235, 235, 235)
 GREEN = (60, 220, 110)
 RED = (255, 60, 60)
 GREY = (150, 150, 150)
-STATE_COLORS = {"normal": (38, 150, 76), "suspect": (250, 178, 0), "alarm": (224, 36, 36), "returning": (232, 120, 60)}
+STATE_COLORS = {
+    "normal": (38, 150, 76),
+    "suspect": (250, 178, 0),
+    "alarm": (224, 36, 36),
+    "returning": (232, 120, 60),
+    "commissioning": (90, 140, 200),
+}
 UNKNOWN_COLOR = (110, 110, 110)
 
 

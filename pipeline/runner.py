@@ -136,6 +136,7 @@ class Runner:
             folder=config.folder,
             run_folder=config.run_folder,
             started_t_ns=started_t_ns,
+            memory_folder=config.run_folder,
             configuration_text=config.text,
             overrides=config.overrides,
         )
@@ -158,7 +159,7 @@ class Runner:
             tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
         }
         self._taken: dict[str, Cause] = {}
-        """of each core: what it has taken of its inputs"""
+        """of each core: what it has taken of its main input, the first it reads; the others move no output's place"""
         self._crash = ""
         self._orphan_until_s = 0.0
         self._alive: set[str] = set()
@@ -291,7 +292,8 @@ class Runner:
         if self._has_source and is_of_replay(header.producer):  # a recorded command must not drive a fan of today
             self._counts["refused_of_replay"] += 1
             return
-        self._taken[tray] = Cause.after(self._taken.get(tray), packet.topic, header)
+        if packet.topic == self.stage.reads[0]:
+            self._taken[tray] = Cause.after(self._taken.get(tray), packet.topic, header)
         self._publish(tray, parts.core.step(packet if self.stage.wants_packets else packet.message))
 
     def _note_alive(self, change: _Alive) -> None:

@@ -85,6 +85,8 @@ class Context:
     folder: Path
     run_folder: Path
     started_t_ns: int
+    memory_folder: Path | None = None
+    """where a stage keeps what a restart must not forget; None: nothing is kept, as in a replay"""
     configuration_text: str = field(default="", repr=False)
     overrides: tuple[str, ...] = ()
     """the keys set on the command line, `key=value`"""
@@ -117,6 +119,7 @@ def no_problems(_context: Context) -> Sequence[str]:
 class Stage:
     """The declaration of a stage: what the runner and the launcher need to know, and nothing of how it works.
 
+    The first topic of `reads` is the main input: outputs say how far it had been taken (`Cause`); others come aside.
     `check` looks, without side effects, for what would keep the stage from working (a missing port, a twin that
     does not fit) and gives one line each; `fantwin doctor` prints them.
     """

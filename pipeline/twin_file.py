@@ -10,6 +10,7 @@ card as JSON. docs/deciding.md tells how the card's healthy residual is used.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,11 +20,11 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from pipeline.stage import StageError
+from pipeline.stage import Context, StageError
 from schemas.messages import Array
 
 CARD_PROPERTY = "fantwin.card"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 INPUTS = ("state", "command", "step_s", "parameters")
 OUTPUTS = ("speed_rad_s", "state_out")
 
@@ -43,6 +44,26 @@ class StateLayout(_OfCard):
     command: int = Field(ge=0)
 
 
+class BalanceCard(_OfCard):
+    """The torque balance, one entry a fan; see Balance."""
+
+    inertia: tuple[Annotated[float, Field(ge=0)], ...]
+    viscous: tuple[float, ...]
+    drag: tuple[float, ...]
+    friction: tuple[float, ...]
+    std_errors: tuple[tuple[float, float, float, float], ...]
+    lag_s: tuple[Annotated[float, Field(ge=0)], ...]
+    sigma_command: tuple[Annotated[float, Field(gt=0)], ...]
+    autocorrelation_time_s: tuple[Annotated[float, Field(gt=0)], ...]
+    lowest_speed_rad_s: tuple[Annotated[float, Field(ge=0)], ...]
+    filter_rate_per_s: float = Field(gt=0)
+
+    @property
+    def of_fans(self) -> dict[str, tuple[Any, ...]]:
+        """What has one entry a fan, by its name."""
+        return {name: getattr(self, name) for name in BalanceCard.model_fields if name != "filter_rate_per_s"}
+
+
 class TwinCard(_OfCard):
     """What the stages need of the card; it holds more, for people."""
 
@@ -54,6 +75,8 @@ class TwinCard(_OfCard):
     state_layout: StateLayout
     parameters: tuple[tuple[float, ...], ...]
     sigma_rad_s: tuple[Annotated[float, Field(gt=0)], ...]
+    balance: BalanceCard
+    calibration: dict[str, Any] | None = None
     command_range: Range
     rate_hz: float = Field(gt=0)
 
@@ -65,9 +88,38 @@ class TwinCard(_OfCard):
             raise ValueError("parameters must have one row of equal length for each fan")
         if len(self.sigma_rad_s) != self.fans:
             raise ValueError("sigma_rad_s must have one value for each fan")
+        for name, values in self.balance.of_fans.items():
+            if len(values) != self.fans:
+                raise ValueError(f"balance.{name} must have one value for each fan")
         if not self.command_range[0] < self.command_range[1]:
             raise ValueError("command_range must rise")
         return self
+
+
+@dataclass(frozen=True)
+class Balance:
+    """The torque balance of each fan: what it needs, and how far a healthy one strays from it within a run.
+
+    needed command = inertia w' + viscous w + drag w|w| + friction, with a constant friction, and both sides through
+    lambda / (s + lambda). Units are those of the command with rad/s and s. std_errors: (fans, 4), of these four. The
+    others are (fans,), but for lambda.
+    """
+
+    inertia: Array
+    viscous: Array
+    drag: Array
+    friction: Array
+    std_errors: Array
+    lag_s: Array
+    """of the command before it acts"""
+    sigma_command: Array
+    """healthy standard deviation of the balance within a run"""
+    autocorrelation_time_s: Array
+    """of the healthy balance"""
+    lowest_speed_rad_s: Array
+    """below it the balance means nothing"""
+    filter_rate_per_s: float
+    """lambda"""
 
 
 @dataclass(frozen=True)
@@ -81,6 +133,9 @@ class TwinFile:
     layout: StateLayout
     sigma_rad_s: Array
     """(fans,) standard deviation of the healthy residual"""
+    balance: Balance
+    calibration: dict[str, Any] | None
+    """of the alarms, as the card has it; None where they were never calibrated"""
     command_range: Range
     rate_hz: float
     """rate of the data it was made from"""
@@ -96,13 +151,23 @@ class TwinFile:
         """Whether it steps from sample to sample and so holds at its own rate only."""
         return self.kind == "narx"
 
+    @property
+    def top_speed_rad_s(self) -> float:
+        """The highest it was made from; infinite where its card does not say."""
+        return max(map(abs, json.loads(self.card_json).get("speed_range_rad_s", (np.inf,))))
+
+    @property
+    def command_unit(self) -> str:
+        """Of the balance; empty where the card does not say."""
+        return str(json.loads(self.card_json).get("command_unit", ""))
+
     def initial_state(self, speed_rad_s: Array, command: Array) -> Array:
         """(fans, n_state) of fans that have long run at speed_rad_s (fans,) under command (fans,)."""
         return np.column_stack([speed_rad_s] * self.layout.speed + [command] * self.layout.command)
 
     @classmethod
-    def load(cls, path: Path, fans: int) -> TwinFile:
-        """Load a twin for a tray of `fans` fans. A twin of one fan serves every fan of the tray.
+    def load(cls, path: Path, fans: int | None = None) -> TwinFile:
+        """Load a twin for a tray of `fans` fans; without it, of as many as it has. One fan's twin serves every fan.
 
         Raises:
             StageError: the file is missing, not ONNX, not a twin, from another fantwin, or for other fans.
@@ -118,25 +183,37 @@ class TwinFile:
                 f"{path}: an ONNX file, but not a twin: it has no {CARD_PROPERTY}; make one: fantwin train"
             )
         card = _card(path, card_json)
+        fans = fans or card.fans
         if card.fans not in (1, fans):
             raise StageError(
                 f"{path}: a twin of {card.fans} fans, [[tray]] says fans = {fans}: choose a twin that fits"
             )
         _check_graph(path, session, card)
-        parameters = np.broadcast_to(np.array(card.parameters), (fans, len(card.parameters[0]))).copy()
+        parameters = _for_fans(card.parameters, fans)
         twin = cls(
             name=card.name,
             kind=card.kind,
             sha256=hashlib.sha256(content).hexdigest(),
             card_json=card_json,
             layout=card.state_layout,
-            sigma_rad_s=np.broadcast_to(np.array(card.sigma_rad_s), fans).copy(),
+            sigma_rad_s=_for_fans(card.sigma_rad_s, fans),
+            balance=Balance(
+                **{name: _for_fans(values, fans) for name, values in card.balance.of_fans.items()},
+                filter_rate_per_s=card.balance.filter_rate_per_s,
+            ),
+            calibration=card.calibration,
             command_range=card.command_range,
             rate_hz=card.rate_hz,
             advance=_advance(session, parameters),
         )
         _check_run(path, twin)
         return twin
+
+
+def _for_fans(values: tuple[Any, ...], fans: int) -> Array:
+    """(fans, ...) values of each fan; those of a twin of one fan hold for all."""
+    of_card = np.array(values, dtype=np.float64)
+    return np.broadcast_to(of_card, (fans, *of_card.shape[1:])).copy()
 
 
 def _session(path: Path, content: bytes) -> Any:
@@ -218,3 +295,15 @@ def _advance(session: Any, parameters: Array) -> Advance:
         return speed_rad_s, state_out
 
     return advance
+
+
+def twin_of(context: Context) -> TwinFile:
+    """The twin of a context's one tray.
+
+    Raises:
+        StageError: the tray names none, or one that cannot be used.
+    """
+    tray = context.tray
+    if tray.twin is None:
+        raise StageError(f'tray {tray.name} has no twin: set [[tray]] twin = "FILE.onnx"')
+    return TwinFile.load(context.resolve(tray.twin), tray.fans)

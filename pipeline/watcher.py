@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from pipeline.account import losses
 from pipeline.bus import Bus
+from pipeline.standing_alarms import StandingAlarm, standing_alarms
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Health
 from schemas.topics import alive_key, health_key, tray_key
@@ -39,7 +40,9 @@ class StageView:
 
 
 class Watcher:
-    """Keeps the last health of every session and the last alarm of every fan. Safe to read from any thread."""
+    """Keeps the last health of every session, and what was said of the last alarm of every fan. Safe to read from any
+    thread.
+    """
 
     def __init__(self, bus: Bus, site: str) -> None:
         self._bus = bus
@@ -47,7 +50,8 @@ class Watcher:
         self._lock = threading.Lock()
         self._healths: dict[str, tuple[Health, Health | None]] = {}
         self._alive: set[str] = set()
-        self._alarms: dict[tuple[str, int], Alarm] = {}
+        self._alarms: dict[tuple[str, int], dict[tuple[str, int], Alarm]] = {}
+        """of each fan the messages about its last occurrence, by who sent them"""
         bus.watch_alive(alive_key(site, "*", "*"), self._note_alive)
         bus.subscribe(health_key(site, "*", "*"), self._note_health)
         bus.subscribe(tray_key(site, "*", "alarm"), self._note_alarm)
@@ -74,8 +78,12 @@ class Watcher:
 
     def alarms(self) -> list[Alarm]:
         """The last alarm message of every fan that had one, oldest first."""
+        return sorted((standing.newest for standing in self.standing()), key=lambda alarm: alarm.t_ns)
+
+    def standing(self) -> list[StandingAlarm]:
+        """How the alarm of every fan that had one stands, by tray and fan."""
         with self._lock:
-            return sorted(self._alarms.values(), key=lambda alarm: alarm.t_ns)
+            return standing_alarms(alarm for told in self._alarms.values() for alarm in told.values())
 
     def losses(self) -> dict[str, int]:
         """What every stage has lost, over all its sessions; see `pipeline.account`."""
@@ -97,9 +105,11 @@ class Watcher:
         alarm = _decoded(Alarm, payload)
         if isinstance(alarm, Alarm):
             with self._lock:
-                fan = (alarm.header.tray, alarm.fan)
-                if fan not in self._alarms or self._alarms[fan].t_ns <= alarm.t_ns:
-                    self._alarms[fan] = alarm
+                told = self._alarms.setdefault((alarm.header.tray, alarm.fan), {})
+                told[alarm.header.producer, alarm.header.sequence] = alarm
+                newest = max(told.values(), key=lambda each: (each.t_ns, each.header.sequence))
+                for name in [name for name, each in told.items() if each.onset_t_ns != newest.onset_t_ns]:
+                    del told[name]
 
 
 def _decoded(kind: type[Health] | type[Alarm], payload: bytes) -> object | None:

@@ -17,9 +17,11 @@ from google.protobuf.message import Message as ProtoMessage
 from schemas import fan_pb2
 from schemas.messages import (
     MESSAGE_TYPES,
+    Action,
     Array,
     Cause,
     Counter,
+    Diagnosis,
     FanState,
     Header,
     Input,
@@ -28,14 +30,22 @@ from schemas.messages import (
     Prediction,
     Severity,
     StageStatus,
+    Statistic,
+    Transition,
     WhyNot,
     columns,
 )
 
 _LENGTH_DELIMITED = 2
-_RECORDS = {"inputs": Input, "outputs": Output, "counters": Counter}
-_ENUMS = {"severity": Severity, "status": StageStatus}
-_ENUM_COLUMNS = {"why_not": max(WhyNot), "state": max(FanState)}
+_RECORDS = {"inputs": Input, "outputs": Output, "counters": Counter, "causes": Diagnosis}
+_ENUMS = {
+    "severity": Severity,
+    "status": StageStatus,
+    "transition": Transition,
+    "statistic": Statistic,
+    "action": Action,
+}
+_ENUM_COLUMNS = {"why_not": max(WhyNot), "state": max(FanState), "statistic": max(Statistic)}
 _OF_SOME_DEVICES = {"device_clock_us", "device_sequence"}  # the only columns of samples that may be empty
 LARGEST_STEP_NS = 86_400_000_000_000  # a day
 FURTHEST_T_NS = (1 << 62) - LARGEST_STEP_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits

@@ -25,6 +25,52 @@ class FanState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     FAN_STATE_SUSPECT: _ClassVar[FanState]
     FAN_STATE_ALARM: _ClassVar[FanState]
     FAN_STATE_RETURNING: _ClassVar[FanState]
+    FAN_STATE_COMMISSIONING: _ClassVar[FanState]
+
+class Statistic(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    STATISTIC_NONE: _ClassVar[Statistic]
+    STATISTIC_SPEED_STEP: _ClassVar[Statistic]
+    STATISTIC_SPEED_DRIFT: _ClassVar[Statistic]
+    STATISTIC_SPEED_SPREAD: _ClassVar[Statistic]
+    STATISTIC_BALANCE_STEP: _ClassVar[Statistic]
+    STATISTIC_BALANCE_DRIFT: _ClassVar[Statistic]
+    STATISTIC_BALANCE_SPREAD: _ClassVar[Statistic]
+    STATISTIC_SENSOR: _ClassVar[Statistic]
+
+class Transition(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    TRANSITION_NONE: _ClassVar[Transition]
+    TRANSITION_RAISED: _ClassVar[Transition]
+    TRANSITION_SEVERITY: _ClassVar[Transition]
+    TRANSITION_DIAGNOSED: _ClassVar[Transition]
+    TRANSITION_CLEARED: _ClassVar[Transition]
+    TRANSITION_ACKNOWLEDGED: _ClassVar[Transition]
+    TRANSITION_CONFIRMED: _ClassVar[Transition]
+    TRANSITION_RESET: _ClassVar[Transition]
+    TRANSITION_SHELVED: _ClassVar[Transition]
+    TRANSITION_UNSHELVED: _ClassVar[Transition]
+    TRANSITION_SUPPRESSED: _ClassVar[Transition]
+    TRANSITION_UNSUPPRESSED: _ClassVar[Transition]
+    TRANSITION_OUT_OF_SERVICE: _ClassVar[Transition]
+    TRANSITION_IN_SERVICE: _ClassVar[Transition]
+    TRANSITION_COMMISSIONING: _ClassVar[Transition]
+    TRANSITION_RESTATED: _ClassVar[Transition]
+    TRANSITION_REFUSED: _ClassVar[Transition]
+
+class Action(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    ACTION_NONE: _ClassVar[Action]
+    ACTION_ACKNOWLEDGE: _ClassVar[Action]
+    ACTION_CONFIRM: _ClassVar[Action]
+    ACTION_RESET: _ClassVar[Action]
+    ACTION_SHELVE: _ClassVar[Action]
+    ACTION_UNSHELVE: _ClassVar[Action]
+    ACTION_SUPPRESS: _ClassVar[Action]
+    ACTION_UNSUPPRESS: _ClassVar[Action]
+    ACTION_OUT_OF_SERVICE: _ClassVar[Action]
+    ACTION_IN_SERVICE: _ClassVar[Action]
+    ACTION_COMMISSION: _ClassVar[Action]
 
 class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -51,6 +97,43 @@ FAN_STATE_NORMAL: FanState
 FAN_STATE_SUSPECT: FanState
 FAN_STATE_ALARM: FanState
 FAN_STATE_RETURNING: FanState
+FAN_STATE_COMMISSIONING: FanState
+STATISTIC_NONE: Statistic
+STATISTIC_SPEED_STEP: Statistic
+STATISTIC_SPEED_DRIFT: Statistic
+STATISTIC_SPEED_SPREAD: Statistic
+STATISTIC_BALANCE_STEP: Statistic
+STATISTIC_BALANCE_DRIFT: Statistic
+STATISTIC_BALANCE_SPREAD: Statistic
+STATISTIC_SENSOR: Statistic
+TRANSITION_NONE: Transition
+TRANSITION_RAISED: Transition
+TRANSITION_SEVERITY: Transition
+TRANSITION_DIAGNOSED: Transition
+TRANSITION_CLEARED: Transition
+TRANSITION_ACKNOWLEDGED: Transition
+TRANSITION_CONFIRMED: Transition
+TRANSITION_RESET: Transition
+TRANSITION_SHELVED: Transition
+TRANSITION_UNSHELVED: Transition
+TRANSITION_SUPPRESSED: Transition
+TRANSITION_UNSUPPRESSED: Transition
+TRANSITION_OUT_OF_SERVICE: Transition
+TRANSITION_IN_SERVICE: Transition
+TRANSITION_COMMISSIONING: Transition
+TRANSITION_RESTATED: Transition
+TRANSITION_REFUSED: Transition
+ACTION_NONE: Action
+ACTION_ACKNOWLEDGE: Action
+ACTION_CONFIRM: Action
+ACTION_RESET: Action
+ACTION_SHELVE: Action
+ACTION_UNSHELVE: Action
+ACTION_SUPPRESS: Action
+ACTION_UNSUPPRESS: Action
+ACTION_OUT_OF_SERVICE: Action
+ACTION_IN_SERVICE: Action
+ACTION_COMMISSION: Action
 SEVERITY_NONE: Severity
 SEVERITY_WARNING: Severity
 SEVERITY_ALARM: Severity
@@ -126,7 +209,7 @@ class Grid(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., step_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., why_not: _Optional[_Iterable[_Union[WhyNot, str]]] = ...) -> None: ...
 
 class Prediction(_message.Message):
-    __slots__ = ("header", "fans", "step_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "why_not", "twin")
+    __slots__ = ("header", "fans", "step_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "why_not", "twin", "torque_balance_command", "torque_balance_sigma_command")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     STEP_NS_FIELD_NUMBER: _ClassVar[int]
@@ -138,6 +221,8 @@ class Prediction(_message.Message):
     VALID_FIELD_NUMBER: _ClassVar[int]
     WHY_NOT_FIELD_NUMBER: _ClassVar[int]
     TWIN_FIELD_NUMBER: _ClassVar[int]
+    TORQUE_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
+    TORQUE_BALANCE_SIGMA_COMMAND_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     step_ns: int
@@ -149,10 +234,12 @@ class Prediction(_message.Message):
     valid: _containers.RepeatedScalarFieldContainer[bool]
     why_not: _containers.RepeatedScalarFieldContainer[WhyNot]
     twin: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., step_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., why_not: _Optional[_Iterable[_Union[WhyNot, str]]] = ..., twin: _Optional[str] = ...) -> None: ...
+    torque_balance_command: _containers.RepeatedScalarFieldContainer[float]
+    torque_balance_sigma_command: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., step_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., why_not: _Optional[_Iterable[_Union[WhyNot, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Score(_message.Message):
-    __slots__ = ("header", "fans", "step_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "lower_bound_rad_s", "upper_bound_rad_s", "band_variance", "residual_rad_s", "smoothed_residual_rad_s", "outside", "state", "valid", "why_not")
+    __slots__ = ("header", "fans", "step_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "lower_bound_rad_s", "upper_bound_rad_s", "band_variance", "residual_rad_s", "smoothed_residual_rad_s", "outside", "state", "valid", "why_not", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     STEP_NS_FIELD_NUMBER: _ClassVar[int]
@@ -169,6 +256,11 @@ class Score(_message.Message):
     STATE_FIELD_NUMBER: _ClassVar[int]
     VALID_FIELD_NUMBER: _ClassVar[int]
     WHY_NOT_FIELD_NUMBER: _ClassVar[int]
+    TORQUE_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
+    SPEED_BASELINE_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    BALANCE_BASELINE_COMMAND_FIELD_NUMBER: _ClassVar[int]
+    SCORE_FIELD_NUMBER: _ClassVar[int]
+    STATISTIC_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     step_ns: int
@@ -185,10 +277,35 @@ class Score(_message.Message):
     state: _containers.RepeatedScalarFieldContainer[FanState]
     valid: _containers.RepeatedScalarFieldContainer[bool]
     why_not: _containers.RepeatedScalarFieldContainer[WhyNot]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., step_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., lower_bound_rad_s: _Optional[_Iterable[float]] = ..., upper_bound_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., residual_rad_s: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., outside: _Optional[_Iterable[bool]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., why_not: _Optional[_Iterable[_Union[WhyNot, str]]] = ...) -> None: ...
+    torque_balance_command: _containers.RepeatedScalarFieldContainer[float]
+    speed_baseline_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    balance_baseline_command: _containers.RepeatedScalarFieldContainer[float]
+    score: _containers.RepeatedScalarFieldContainer[float]
+    statistic: _containers.RepeatedScalarFieldContainer[Statistic]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., step_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., lower_bound_rad_s: _Optional[_Iterable[float]] = ..., upper_bound_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., residual_rad_s: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., outside: _Optional[_Iterable[bool]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., why_not: _Optional[_Iterable[_Union[WhyNot, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ...) -> None: ...
+
+class Diagnosis(_message.Message):
+    __slots__ = ("cause", "probability", "parameter", "change", "change_low", "change_high", "unit", "evidence")
+    CAUSE_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_FIELD_NUMBER: _ClassVar[int]
+    PARAMETER_FIELD_NUMBER: _ClassVar[int]
+    CHANGE_FIELD_NUMBER: _ClassVar[int]
+    CHANGE_LOW_FIELD_NUMBER: _ClassVar[int]
+    CHANGE_HIGH_FIELD_NUMBER: _ClassVar[int]
+    UNIT_FIELD_NUMBER: _ClassVar[int]
+    EVIDENCE_FIELD_NUMBER: _ClassVar[int]
+    cause: str
+    probability: float
+    parameter: str
+    change: float
+    change_low: float
+    change_high: float
+    unit: str
+    evidence: str
+    def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ..., parameter: _Optional[str] = ..., change: _Optional[float] = ..., change_low: _Optional[float] = ..., change_high: _Optional[float] = ..., unit: _Optional[str] = ..., evidence: _Optional[str] = ...) -> None: ...
 
 class Alarm(_message.Message):
-    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "limit_rad_s", "message")
+    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "limit_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_limit_command", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed", "out_of_service", "causes", "request", "operator_name", "comment")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FAN_FIELD_NUMBER: _ClassVar[int]
     ACTIVE_FIELD_NUMBER: _ClassVar[int]
@@ -198,6 +315,21 @@ class Alarm(_message.Message):
     RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
     LIMIT_RAD_S_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    TRANSITION_FIELD_NUMBER: _ClassVar[int]
+    STATISTIC_FIELD_NUMBER: _ClassVar[int]
+    SCORE_FIELD_NUMBER: _ClassVar[int]
+    TORQUE_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
+    TORQUE_BALANCE_LIMIT_COMMAND_FIELD_NUMBER: _ClassVar[int]
+    ACKNOWLEDGED_FIELD_NUMBER: _ClassVar[int]
+    CONFIRMED_FIELD_NUMBER: _ClassVar[int]
+    LATCHED_FIELD_NUMBER: _ClassVar[int]
+    SHELVED_UNTIL_T_NS_FIELD_NUMBER: _ClassVar[int]
+    SUPPRESSED_FIELD_NUMBER: _ClassVar[int]
+    OUT_OF_SERVICE_FIELD_NUMBER: _ClassVar[int]
+    CAUSES_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_FIELD_NUMBER: _ClassVar[int]
+    OPERATOR_NAME_FIELD_NUMBER: _ClassVar[int]
+    COMMENT_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fan: int
     active: bool
@@ -207,7 +339,54 @@ class Alarm(_message.Message):
     residual_rad_s: float
     limit_rad_s: float
     message: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., limit_rad_s: _Optional[float] = ..., message: _Optional[str] = ...) -> None: ...
+    transition: Transition
+    statistic: Statistic
+    score: float
+    torque_balance_command: float
+    torque_balance_limit_command: float
+    acknowledged: bool
+    confirmed: bool
+    latched: bool
+    shelved_until_t_ns: int
+    suppressed: bool
+    out_of_service: bool
+    causes: _containers.RepeatedCompositeFieldContainer[Diagnosis]
+    request: str
+    operator_name: str
+    comment: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., limit_rad_s: _Optional[float] = ..., message: _Optional[str] = ..., transition: _Optional[_Union[Transition, str]] = ..., statistic: _Optional[_Union[Statistic, str]] = ..., score: _Optional[float] = ..., torque_balance_command: _Optional[float] = ..., torque_balance_limit_command: _Optional[float] = ..., acknowledged: _Optional[bool] = ..., confirmed: _Optional[bool] = ..., latched: _Optional[bool] = ..., shelved_until_t_ns: _Optional[int] = ..., suppressed: _Optional[bool] = ..., out_of_service: _Optional[bool] = ..., causes: _Optional[_Iterable[_Union[Diagnosis, _Mapping]]] = ..., request: _Optional[str] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ...) -> None: ...
+
+class Request(_message.Message):
+    __slots__ = ("header", "t_ns", "action", "fan", "duration_s", "operator_name", "comment")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    ACTION_FIELD_NUMBER: _ClassVar[int]
+    FAN_FIELD_NUMBER: _ClassVar[int]
+    DURATION_S_FIELD_NUMBER: _ClassVar[int]
+    OPERATOR_NAME_FIELD_NUMBER: _ClassVar[int]
+    COMMENT_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    t_ns: int
+    action: Action
+    fan: int
+    duration_s: float
+    operator_name: str
+    comment: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., action: _Optional[_Union[Action, str]] = ..., fan: _Optional[int] = ..., duration_s: _Optional[float] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ...) -> None: ...
+
+class Memory(_message.Message):
+    __slots__ = ("header", "t_ns", "twin_sha256", "restored", "state_json")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    TWIN_SHA256_FIELD_NUMBER: _ClassVar[int]
+    RESTORED_FIELD_NUMBER: _ClassVar[int]
+    STATE_JSON_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    t_ns: int
+    twin_sha256: str
+    restored: bool
+    state_json: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin_sha256: _Optional[str] = ..., restored: _Optional[bool] = ..., state_json: _Optional[str] = ...) -> None: ...
 
 class Command(_message.Message):
     __slots__ = ("header", "fans", "t_ns", "command", "set_point_rad_s")

@@ -37,6 +37,58 @@ class FanState(IntEnum):
     SUSPECT = 2
     ALARM = 3
     RETURNING = 4
+    COMMISSIONING = 5
+
+
+class Statistic(IntEnum):
+    """Which statistic is the furthest towards its limit."""
+
+    NONE = 0
+    SPEED_STEP = 1
+    SPEED_DRIFT = 2
+    SPEED_SPREAD = 3
+    BALANCE_STEP = 4
+    BALANCE_DRIFT = 5
+    BALANCE_SPREAD = 6
+    SENSOR = 7
+
+
+class Transition(IntEnum):
+    """What happened to an alarm, in the words of OPC UA Part 9."""
+
+    NONE = 0
+    RAISED = 1
+    SEVERITY = 2
+    DIAGNOSED = 3
+    CLEARED = 4
+    ACKNOWLEDGED = 5
+    CONFIRMED = 6
+    RESET = 7
+    SHELVED = 8
+    UNSHELVED = 9
+    SUPPRESSED = 10
+    UNSUPPRESSED = 11
+    OUT_OF_SERVICE = 12
+    IN_SERVICE = 13
+    COMMISSIONING = 14
+    RESTATED = 15
+    REFUSED = 16
+
+
+class Action(IntEnum):
+    """What an operator may ask for."""
+
+    NONE = 0
+    ACKNOWLEDGE = 1
+    CONFIRM = 2
+    RESET = 3
+    SHELVE = 4
+    UNSHELVE = 5
+    SUPPRESS = 6
+    UNSUPPRESS = 7
+    OUT_OF_SERVICE = 8
+    IN_SERVICE = 9
+    COMMISSION = 10
 
 
 class Severity(IntEnum):
@@ -154,6 +206,8 @@ class Prediction:
     valid: Array = _samples_fans(np.bool_)
     why_not: Array = _samples_fans(np.uint8)
     twin: str = ""
+    torque_balance_command: Array = _samples_fans(np.float64)
+    torque_balance_sigma_command: Array = _fans(np.float64)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -176,11 +230,30 @@ class Score:
     state: Array = _samples_fans(np.uint8)
     valid: Array = _samples_fans(np.bool_)
     why_not: Array = _samples_fans(np.uint8)
+    torque_balance_command: Array = _samples_fans(np.float64)
+    speed_baseline_rad_s: Array = _samples_fans(np.float64)
+    balance_baseline_command: Array = _samples_fans(np.float64)
+    score: Array = _samples_fans(np.float64)
+    statistic: Array = _samples_fans(np.uint8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """One possible cause of an alarm, with what speaks for it."""
+
+    cause: str
+    probability: float
+    parameter: str = ""
+    change: float = 0.0
+    change_low: float = 0.0
+    change_high: float = 0.0
+    unit: str = ""
+    evidence: str = ""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Alarm:
-    """An alarm was raised or cleared; tray, fan and `onset_t_ns` name it."""
+    """What happened to the alarm of a fan, and how it stands since; tray, fan and `onset_t_ns` name it."""
 
     header: Header = Header()
     fan: int
@@ -191,6 +264,45 @@ class Alarm:
     residual_rad_s: float
     limit_rad_s: float
     message: str
+    transition: Transition = Transition.NONE
+    statistic: Statistic = Statistic.NONE
+    score: float = 0.0
+    torque_balance_command: float = 0.0
+    torque_balance_limit_command: float = 0.0
+    acknowledged: bool = False
+    confirmed: bool = False
+    latched: bool = False
+    shelved_until_t_ns: int = 0
+    suppressed: bool = False
+    out_of_service: bool = False
+    causes: tuple[Diagnosis, ...] = ()
+    request: str = ""
+    operator_name: str = ""
+    comment: str = ""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Request:
+    """What an operator wants of the alarms of a tray; fan -1 means all of them."""
+
+    header: Header = Header()
+    t_ns: int
+    action: Action
+    fan: int = -1
+    duration_s: float = 0.0
+    operator_name: str = ""
+    comment: str = ""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Memory:
+    """What a scorer must not forget when it is restarted."""
+
+    header: Header = Header()
+    t_ns: int
+    twin_sha256: str
+    restored: bool = False
+    state_json: str = ""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -274,8 +386,10 @@ class Health:
     process_id: int = 0
 
 
-Message: TypeAlias = Raw | Grid | Prediction | Score | Alarm | Command | ModelCard | Clock | Health
-MESSAGE_TYPES: tuple[type[Message], ...] = (Raw, Grid, Prediction, Score, Alarm, Command, ModelCard, Clock, Health)
+Message: TypeAlias = Raw | Grid | Prediction | Score | Alarm | Request | Memory | Command | ModelCard | Clock | Health
+MESSAGE_TYPES: tuple[type[Message], ...] = (
+    Raw, Grid, Prediction, Score, Alarm, Request, Memory, Command, ModelCard, Clock, Health,
+)  # fmt: skip
 
 
 def newest_t_ns(message: Message) -> int:

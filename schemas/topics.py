@@ -7,7 +7,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from schemas.messages import Alarm, Clock, Command, Grid, Health, Message, ModelCard, Prediction, Raw, Score
+from schemas.messages import (
+    Alarm,
+    Clock,
+    Command,
+    Grid,
+    Health,
+    Memory,
+    Message,
+    ModelCard,
+    Prediction,
+    Raw,
+    Request,
+    Score,
+)
 
 ON_CHANGE = "on change"
 ROOT = "fantwin"
@@ -38,7 +51,9 @@ TOPICS: tuple[Topic, ...] = (
     Topic("grid", Grid, "the grid's rate over the block size", True, 1024, "samples on a uniform grid"),
     Topic("prediction", Prediction, "as grid", True, 1024, "the healthy twin beside the measurement"),
     Topic("score", Score, "as prediction", True, 1024, "judged samples, ready to draw"),
-    Topic("alarm", Alarm, ON_CHANGE, True, 1024, "an alarm was raised or cleared"),
+    Topic("alarm", Alarm, ON_CHANGE, True, 1024, "what happened to an alarm"),
+    Topic("request", Request, ON_CHANGE, True, 64, "what an operator wants of the alarms"),
+    Topic("memory", Memory, "on change, and each minute", True, 4, "what a scorer must not forget"),
     Topic("command", Command, ON_CHANGE, True, 64, "what is wanted of the fans"),
     Topic("twin", ModelCard, ON_CHANGE, True, 8, "the twin in force"),
     Topic("clock", Clock, "20 Hz", False, 1, "the time of a replay"),

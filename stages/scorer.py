@@ -1,331 +1,409 @@
-"""Scorer: measured against predicted; the band, and an alarm that needs a lasting excursion.
+"""Scorer: judges what was measured against the twin, and keeps each fan's alarm.
 
-Reads: topic `prediction` (measured and predicted speed rad/s, sigma rad/s).
-Writes: topic `score` (residual, smoothed residual, band rad/s, state), and `alarm` when one is raised or cleared.
+Reads: topic `prediction` (measured and predicted speed rad/s, torque balance in command units), and `request` (what
+operators want of alarms).
+Writes: topic `score` (residuals, baselines, the statistic furthest towards its limit, state), `alarm` (every transition
+of a fan's alarm), `memory` (what a restart must not forget).
 Timing: a score for every prediction, at once, block for block; delays count the valid samples' own time.
 
-Three things, kept apart. The *score* is the residual, smoothed by a first-order low-pass. The *threshold* is in healthy
-standard deviations, with a deadband for the way back. The *state* follows the alarms of OPC UA Part 9: on-delay,
-active, off-delay. The +-2 sigma band is shown beside them and is no alarm. See docs/deciding.md.
+Four things, kept apart: the *statistics* on the two residuals (scoring.judge), their *limits* (scoring.limits, from the
+twin's card), the *state* of each alarm after OPC UA Part 9 (scoring.conditions), its *diagnosis* (scoring.diagnosis).
+The +-2 sigma band is shown beside them and is no alarm. See docs/deciding.md.
 """
 
 from __future__ import annotations
 
-import math
+import json
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError
 
-from pipeline.config import RAD_S_PER_UNIT, SpeedUnit
-from pipeline.stage import Context, Core, Parts, Stage, StageConfig
-from schemas.messages import Alarm, Array, FanState, Prediction, Score, Severity, WhyNot
+from pipeline.config import SpeedUnit
+from pipeline.memory_file import MemoryFile
+from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.twin_file import TwinFile, twin_of
+from schemas.messages import (
+    Alarm,
+    Array,
+    FanState,
+    Memory,
+    Prediction,
+    Request,
+    Score,
+    Transition,
+    WhyNot,
+    columns,
+)
+from scoring.alarm_desk import AlarmDesk, Distance
+from scoring.condition import ConditionSettings
+from scoring.diagnoser import Diagnoser
+from scoring.judge import QUIET, Judge, Verdict, samples_of
+from scoring.limits import Limits, Timing, uncalibrated
+from scoring.not_judged import NotJudged
+from scoring.regression_window import HealthyBalance
+from scoring.wear_watch import WearWatch
+from scoring.wording import Wording
 
 NS_PER_S = 1_000_000_000
 BAND_SIGMAS = 2.0
-UNKNOWN, NORMAL, SUSPECT, ALARM, RETURNING = map(int, FanState)
-FIRST_WARM_UP_NS = 60 * NS_PER_S  # a fan that was never judged may warm up for so long before that is told
-IN_WORDS = {
-    WhyNot.NONE: "no reason given",
-    WhyNot.STALE: "the line is silent",
-    WhyNot.GAP: "samples are missing",
-    WhyNot.WARMING_UP: "the twin is warming up",
-    WhyNot.OUT_OF_RANGE: "the command is out of the twin's range, or a value is no number",
-    WhyNot.SATURATED: "saturated",
-    WhyNot.NO_SPEED: "no speed",
-    WhyNot.NO_TWIN: "the twin does not fit the grid's rate",
-}
+MEMORY_NS = 60 * NS_PER_S  # how often it is noted when nothing happens
+BACK_IN_TIME_NS = 120 * NS_PER_S  # who is restarted catches up with less; samples still older are another story
 
 
 class ScorerConfig(StageConfig):
-    """Section `[scorer]`."""
+    """Section `[scorer]`. Times that are not given are those that the twin was calibrated with."""
 
-    smoothing_s: float = Field(default=0.2, ge=0, description="time constant of the residual's low-pass; 0 for none")
-    alarm_sigmas: float = Field(default=2.0, gt=0, description="alarm limit on the smoothed residual, in sigma")
-    deadband_sigmas: float = Field(default=0.5, ge=0, description="so much below the limit an alarm begins to return")
-    on_delay_s: float = Field(default=0.5, ge=0, description="how long the limit must be exceeded to raise")
+    alarm_sigmas: float = Field(
+        default=2.0,
+        gt=0,
+        description="limit on the smoothed speed residual of a twin that was not calibrated, in sigma",
+    )
+    limit_factor: float = Field(default=1.0, gt=0, description="on all limits; above 1: fewer alarms than declared")
+    smoothing_s: float | None = Field(default=None, ge=0, description="time constant of the residuals' low-pass")
+    baseline_s: float | None = Field(default=None, gt=0, description="how long commissioning takes at least")
+    adaptation_s: float | None = Field(default=None, gt=0, description="time constant of the baseline in the long run")
+    on_delay_s: float | None = Field(default=None, ge=0, description="how long a limit must be exceeded to raise")
     off_delay_s: float = Field(default=1.0, ge=0, description="how long a return must last to clear")
+    deadband: float = Field(default=0.25, ge=0, lt=1, description="share of its limit below which a return begins")
+    alarm_ratio: float = Field(default=1.5, ge=1, description="from so many limits on a warning is an alarm")
+    latching: bool = Field(default=False, description="whether a cleared alarm stays until it is reset")
+    confirming: bool = Field(default=False, description="whether an acknowledged alarm must be confirmed, too")
+    wear_every_s: float = Field(default=600.0, gt=0, description="how often a fan's wear is looked at")
     not_judged_s: float = Field(
         default=10.0, gt=0, description="a fan that is not judged for so long is told; above twin_integrator.warm_up_s"
     )
 
-    @model_validator(mode="after")
-    def _can_return(self) -> Self:
-        if self.deadband_sigmas >= self.alarm_sigmas:
-            raise ValueError("deadband_sigmas must be below alarm_sigmas, or no alarm could ever clear")
-        return self
+    def timing(self, calibrated: Timing) -> Timing:
+        """The times in force."""
+        own = {name: getattr(self, name) for name in Timing.model_fields}
+        return calibrated.model_copy(update={name: value for name, value in own.items() if value is not None})
 
 
-class Smoother:
-    """The score: a first-order low-pass of the residual, discretised exactly. Starts at each fan's first sample."""
+@dataclass(frozen=True, eq=False)
+class Healthy:
+    """What the scorer knows of the twin. sha256: which one it is."""
 
-    def __init__(self, fans: int, time_constant_s: float) -> None:
-        self._time_constant_s = time_constant_s
-        self.smoothed = np.full(fans, np.nan)
-        """(fans,) rad/s, NaN before a fan's first valid sample"""
-
-    def update(self, residual: Array, valid: Array, step_s: float) -> Array:
-        """Take a block of residuals. Fans that are not valid keep their value. All (n, fans), as is what returns."""
-        keep = math.exp(-step_s / self._time_constant_s) if self._time_constant_s > 0 else 0.0
-        smoothed = np.empty_like(residual)
-        before = self.smoothed
-        some_begin = keep == 0.0 or bool(np.isnan(before).any())  # without smoothing what overflows is no number either
-        some_stay = not valid.all()
-        for new, stays, now in zip(residual, ~valid, smoothed, strict=True):
-            start = np.where(np.isnan(before), new, before) if some_begin else before
-            np.subtract(start, new, out=now)  # now = new + keep * (start - new)
-            np.multiply(keep, now, out=now)
-            np.add(new, now, out=now)
-            if some_stay:
-                np.copyto(now, before, where=stays)
-            before = now
-        self.smoothed = before.copy()
-        return smoothed
-
-
-@dataclass(frozen=True)
-class Threshold:
-    """When an excursion begins, and when it is over; multiples of sigma."""
-
-    alarm_sigmas: float
-    deadband_sigmas: float
-
-    def limit(self, sigma: Array) -> Array:
-        """What the smoothed residual must exceed."""
-        return self.alarm_sigmas * sigma
-
-    def return_limit(self, sigma: Array) -> Array:
-        """What it must fall below to return."""
-        return (self.alarm_sigmas - self.deadband_sigmas) * sigma
-
-
-@dataclass(frozen=True, order=True)
-class Change:
-    """An alarm raised (or cleared) at a row of a block."""
-
-    row: int
-    fan: int
-    raised: bool
-    onset_t_ns: int
-
-
-@dataclass(frozen=True)
-class Course:
-    """What a block did to the states. state: (n, fans) of FanState after each sample, UNKNOWN where it is not valid."""
-
-    state: Array
-    changes: list[Change]
-    too_short: int
-
-
-class AlarmState:
-    """One fan's state: NORMAL, SUSPECT (on-delay runs), ALARM, RETURNING (off-delay runs)."""
-
-    def __init__(self, on_delay_ns: int, off_delay_ns: int) -> None:
-        self._on_delay_ns = on_delay_ns
-        self._off_delay_ns = off_delay_ns
-        self.state = NORMAL
-        self.onset_t_ns = 0
-        """First sample of the present excursion; meaningless when NORMAL."""
-        self._lasted_ns = 0  # how long the condition of SUSPECT or RETURNING has held
-
-    @property
-    def is_active(self) -> bool:
-        """Whether an alarm was raised and not cleared."""
-        return self.state in (ALARM, RETURNING)
-
-    def update(self, t_ns: int, step_ns: int, exceeds: bool, returns: bool) -> None:
-        """Take a valid sample: whether the score is beyond the limit, or below the limit of return."""
-        if self.is_active and not returns:
-            self.state = ALARM
-        elif self.is_active:
-            self._lasted_ns = 0 if self.state == ALARM else self._lasted_ns + step_ns
-            self.state = NORMAL if self._lasted_ns >= self._off_delay_ns else RETURNING
-        elif not exceeds:
-            self.state = NORMAL
-        else:
-            if self.state == NORMAL:
-                self.onset_t_ns = t_ns
-            self._lasted_ns = 0 if self.state == NORMAL else self._lasted_ns + step_ns
-            self.state = ALARM if self._lasted_ns >= self._on_delay_ns else SUSPECT
-
-
-class AlarmStates:
-    """The states of a tray's fans over blocks. Samples that are not valid leave state and timers alone."""
-
-    def __init__(self, fans: int, on_delay_ns: int, off_delay_ns: int) -> None:
-        self._fans = [AlarmState(on_delay_ns, off_delay_ns) for _ in range(fans)]
-        self._not_normal = np.zeros(fans, np.bool_)
-
-    def update(self, t_ns: Array, step_ns: int, exceeds: Array, returns: Array, valid: Array) -> Course:
-        """Take a block. t_ns: (n,). The others, (n, fans): see AlarmState."""
-        state = np.where(valid, NORMAL, UNKNOWN).astype(np.uint8)
-        changes: list[Change] = []
-        too_short = 0
-        for fan in np.flatnonzero(self._not_normal | (exceeds & valid).any(axis=0)).tolist():
-            one, rows = self._fans[fan], np.flatnonzero(valid[:, fan])
-            samples = (rows, t_ns[rows], exceeds[rows, fan], returns[rows, fan])
-            for row, time_ns, beyond, back in zip(*(column.tolist() for column in samples), strict=True):
-                was, was_active = one.state, one.is_active
-                one.update(time_ns, step_ns, beyond, back)
-                state[row, fan] = one.state
-                too_short += was == SUSPECT and one.state == NORMAL
-                if one.is_active != was_active:
-                    changes.append(Change(row, fan, one.is_active, one.onset_t_ns))
-            self._not_normal[fan] = one.state != NORMAL
-        return Course(state, sorted(changes), too_short)
-
-
-class NotJudged:
-    """For how long each fan has not been judged, in the time of its samples, and why."""
-
-    def __init__(self, fans: int, limit_ns: int) -> None:
-        self._limit_ns = limit_ns
-        self._lasted_ns = np.zeros(fans, np.int64)
-        self._why_not = np.zeros(fans, np.uint8)
-        self._was_judged = np.zeros(fans, np.bool_)
-
-    def update(self, step_ns: int, valid: Array, why_not: Array) -> None:
-        """Take a block, (n, fans) each."""
-        judged = valid.any(axis=0)
-        since = np.where(judged, np.argmax(valid[::-1], axis=0), len(valid))
-        self._lasted_ns = np.where(judged, 0, self._lasted_ns) + since * step_ns
-        self._why_not = why_not[-1]
-        self._was_judged |= judged
-
-    def problem(self) -> str:
-        """Which fans are not judged; times only as multiples, so that the line does not change all the time."""
-        first_warm_up = ~self._was_judged & (self._why_not == WhyNot.WARMING_UP)
-        limit_ns = np.where(first_warm_up, max(self._limit_ns, FIRST_WARM_UP_NS), self._limit_ns)
-        late = self._lasted_ns >= limit_ns
-        parts = []
-        for why in np.unique(self._why_not[late]).tolist():
-            fans = np.flatnonzero(late & (self._why_not == why))
-            doubled = int(self._lasted_ns[fans].min() // self._limit_ns).bit_length() - 1
-            names = ", ".join(map(str, fans.tolist()))
-            who = f"fan {names} is" if len(fans) == 1 else f"fans {names} are"
-            lasted_s = self._limit_ns * 2**doubled / NS_PER_S
-            parts.append(f"{who} not judged: {IN_WORDS[WhyNot(why)]} for {lasted_s:g} s and more")
-        return "; ".join(parts)
+    sha256: str
+    limits: Limits
+    balances: Sequence[HealthyBalance]
+    command_unit: str = ""
 
 
 class ScorerCore(Core):
     """One tray's fans, each judged for itself."""
 
-    def __init__(self, fans: int, speed_unit: SpeedUnit, config: ScorerConfig) -> None:
+    def __init__(
+        self,
+        fans: int,
+        speed_unit: SpeedUnit,
+        config: ScorerConfig,
+        healthy: Healthy,
+        keeper: MemoryFile | None = None,
+    ) -> None:
+        """keeper: where to keep what must not be forgotten; None: nowhere, as in a replay."""
         self._fans = fans
-        self._unit = speed_unit
-        self._on_delay_s = config.on_delay_s
-        self._off_delay_s = config.off_delay_s
-        self._smoother = Smoother(fans, config.smoothing_s)
-        self._threshold = Threshold(config.alarm_sigmas, config.deadband_sigmas)
-        on_delay_ns, off_delay_ns = round(config.on_delay_s * NS_PER_S), round(config.off_delay_s * NS_PER_S)
-        self._states = AlarmStates(fans, on_delay_ns, off_delay_ns)
+        self._healthy = healthy
+        self._config = config
+        self._wording = Wording(speed_unit, healthy.command_unit)
+        self._settings = ConditionSettings(
+            on_delay_ns=round(healthy.limits.timing.on_delay_s * NS_PER_S),
+            off_delay_ns=round(config.off_delay_s * NS_PER_S),
+            return_ratio=1.0 - config.deadband,
+            alarm_ratio=config.alarm_ratio,
+            latching=config.latching,
+            confirming=config.confirming,
+        )
         self._not_judged = NotJudged(fans, max(1, round(config.not_judged_s * NS_PER_S)))
-        self._last_t_ns = np.iinfo(np.int64).min
+        self._keeper = keeper
         self._wrong_fans = 0
         self._counts: Counter[str] = Counter()
+        self._begin()
+        self._first: list[Alarm | Memory] = []
+        memory = keeper.load() if keeper else None
+        if memory is not None:
+            self._first = [*self.restore(memory)]
 
-    def step(self, item: Prediction) -> list[Score | Alarm]:
-        """Judge a block: its score, and then the alarms it raised or cleared."""
+    def _begin(self) -> None:
+        self._judge = Judge(self._fans, self._healthy.limits)
+        self._diagnoser = Diagnoser(self._healthy.balances)
+        self._wear = WearWatch(
+            self._healthy.balances, self._diagnoser, self._config.wear_every_s, self._healthy.command_unit
+        )
+        self._desk = AlarmDesk(self._fans, self._settings, self._diagnoser, self._wording)
+        self._last_t_ns = np.iinfo(np.int64).min
+        self._noted_t_ns = np.iinfo(np.int64).min
+        self._fed_by = ""  # who made the last prediction
+        self._may_be_of_other_times = False
+
+    def restore(self, memory: Memory) -> list[Alarm | Memory]:
+        """Go on from what another session has kept, if it is of this twin. Gives what is to be told of it."""
+        if memory.twin_sha256 != self._healthy.sha256:
+            self._counts["memories_of_another_twin"] += 1
+            return []
+        try:
+            state = json.loads(memory.state_json)
+            self._judge.restore(state["judge"])
+            self._desk.restore(state["desk"])
+            if "wear" in state:
+                self._wear.restore(state["wear"])
+            self._fed_by = str(state["fed_by"])
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
+            self._begin()
+            self._counts["memories_not_understood"] += 1
+            return []
+        self._last_t_ns = self._noted_t_ns = memory.t_ns
+        self._may_be_of_other_times = True
+        return [replace(memory, restored=True), *self._desk.restate()]
+
+    def tick(self, now_ns: int) -> list[Alarm | Memory]:
+        """Say once what was remembered."""
+        first, self._first = self._first, []
+        return first
+
+    def step(self, item: Prediction | Request) -> list[Score | Alarm | Memory]:
+        """Judge a block: its score, and then what happened to alarms; or answer a request."""
+        if isinstance(item, Request):
+            return [*self.tick(0), *self._answer(item)]
         if item.fans != self._fans:
             self._wrong_fans = item.fans
             self._counts["lost_wrong_fan_count"] += len(item.t_ns)
             return []
         self._wrong_fans = 0
+        self._look_back(item)
         before = np.maximum.accumulate(np.concatenate(([self._last_t_ns], item.t_ns)))[:-1]
         new = item.t_ns > before
         self._counts["repeated"] += int((~new).sum())
         if not new.any():
-            return []
-        self._last_t_ns = int(item.t_ns[new][-1])
-        t_ns, measured, predicted = item.t_ns[new], item.measured_speed_rad_s[new], item.predicted_speed_rad_s[new]
+            return [*self.tick(0)]
+        self._last_t_ns, self._fed_by = int(item.t_ns[new][-1]), item.header.producer
+        score, alarms = self._judge_block(item if new.all() else _rows(item, new))
+        return [*self.tick(0), score, *alarms, *self._note(bool(alarms))]
+
+    def counters(self) -> Mapping[str, int]:
+        """docs/deciding.md says what each counts."""
+        desk = self._desk
+        of_alarms = {
+            "alarms_raised": desk.raised,
+            "alarms_cleared": desk.cleared,
+            "excursions_too_short": desk.too_short,
+        }
+        return {**self._counts, **of_alarms}
+
+    def problem(self) -> str:
+        """Predictions of another number of fans, fans that have not been judged for long, or that drift."""
+        if self._wrong_fans:
+            return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
+        problems = [self._not_judged.problem(), self._keeper.problem if self._keeper else ""]
+        judged = [residual for residual in (self._judge.speed, self._judge.balance) if residual.is_judged]
+        adrift = np.flatnonzero(np.any([residual.baseline.is_at_limit for residual in judged], axis=0))
+        if len(adrift):
+            names = ", ".join(map(str, adrift.tolist()))
+            problems.append(f"the baseline of fan {names} may drift no further: look at the fan, or commission it anew")
+        problems.append(self._wear.problem(self._last_t_ns))
+        return "; ".join(filter(None, problems))
+
+    def close(self) -> list[Memory]:
+        """Note what is known for the next session."""
+        return self._note(True) if self._last_t_ns > np.iinfo(np.int64).min else []
+
+    def _look_back(self, item: Prediction) -> None:
+        """What is remembered of later times is of another recording, or of the same one played again: begin anew."""
+        if not self._may_be_of_other_times or not len(item.t_ns):
+            return
+        self._may_be_of_other_times = False
+        if item.header.producer == self._fed_by:
+            return  # who made the last one still keeps it, and some before it
+        first_t_ns, began_t_ns = int(item.t_ns[0]), self._judge.origin_t_ns
+        again = began_t_ns is not None and first_t_ns <= began_t_ns
+        if again or first_t_ns < self._last_t_ns - BACK_IN_TIME_NS:
+            self._begin()
+            self._first = []
+            self._counts["memories_of_other_times"] += 1
+
+    def _judge_block(self, item: Prediction) -> tuple[Score, list[Alarm]]:
+        t_ns, why_not, command = item.t_ns, item.why_not, item.command
+        measured, predicted = item.measured_speed_rad_s, item.predicted_speed_rad_s
+        sigma, sigma_command = item.sigma_rad_s, item.torque_balance_sigma_command
         residual = measured - predicted
-        finite = np.isfinite(residual)
-        valid = item.valid[new] & finite
-        smoothed = self._smoother.update(residual, valid, item.step_ns / NS_PER_S)
-        limit, return_limit = self._threshold.limit(item.sigma_rad_s), self._threshold.return_limit(item.sigma_rad_s)
-        size = np.abs(smoothed)
-        course = self._states.update(t_ns, item.step_ns, size > limit, size < return_limit, valid)
-        self._counts["excursions_too_short"] += course.too_short
-        alarms = [
-            self._alarm(change, int(t_ns[change.row]), float(smoothed[change.row, change.fan]), limit, return_limit)
-            for change in course.changes
-        ]
-        why_not = np.where(item.valid[new] & ~finite, WhyNot.OUT_OF_RANGE, item.why_not[new]).astype(np.uint8)
-        self._not_judged.update(item.step_ns, valid, why_not)
-        band = BAND_SIGMAS * item.sigma_rad_s
+        verdict = self._judge.update(samples_of(item))
+        valid = np.isfinite(verdict.score)
+        balance_baseline = verdict.balance_baseline * sigma_command
+        told = np.where(np.isin(why_not, (WhyNot.GAP, WhyNot.STALE)), np.nan, command)
+        self._diagnoser.take(t_ns, item.step_ns, told, measured, balance_baseline, verdict.balance_baseline_s)
+        state, changes = self._desk.states(t_ns, item.step_ns, verdict.score, valid)
+        why_not = np.where(valid, WhyNot.NONE, np.where(why_not == WhyNot.NONE, WhyNot.WARMING_UP, why_not))
+        self._not_judged.update(item.step_ns, valid, why_not.astype(np.uint8))
+        self._watch_wear(item, verdict, state)
+        band = BAND_SIGMAS * sigma
         score = Score(
             fans=self._fans,
             step_ns=item.step_ns,
             t_ns=t_ns,
-            command=item.command[new],
+            command=command,
             measured_speed_rad_s=measured,
             predicted_speed_rad_s=predicted,
             lower_bound_rad_s=predicted - band,
             upper_bound_rad_s=predicted + band,
             band_variance=np.broadcast_to(band**2, residual.shape),
             residual_rad_s=residual,
-            smoothed_residual_rad_s=smoothed,
+            smoothed_residual_rad_s=verdict.speed_smoothed * sigma,
             outside=np.abs(residual) > band,
-            state=course.state,
+            state=np.where(verdict.commissioning & ~valid, int(FanState.COMMISSIONING), state).astype(np.uint8),
             valid=valid,
-            why_not=why_not,
+            why_not=why_not.astype(np.uint8),
+            torque_balance_command=item.torque_balance_command,
+            speed_baseline_rad_s=verdict.speed_baseline * sigma,
+            balance_baseline_command=balance_baseline,
+            score=verdict.score,
+            statistic=verdict.statistic,
         )
-        return [score, *alarms]
-
-    def counters(self) -> Mapping[str, int]:
-        """docs/deciding.md says what each counts."""
-        return dict(self._counts)
-
-    def problem(self) -> str:
-        """Predictions of another number of fans, or fans that have not been judged for long."""
-        if self._wrong_fans:
-            return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
-        return self._not_judged.problem()
-
-    def _alarm(self, change: Change, t_ns: int, residual_rad_s: float, limit: Array, return_limit: Array) -> Alarm:
-        fan, raised = change.fan, change.raised
-        crossed = float((limit if raised else return_limit)[fan])
-        self._counts["alarms_raised" if raised else "alarms_cleared"] += 1
-        return Alarm(
-            fan=fan,
-            active=raised,
-            severity=Severity.ALARM,
-            t_ns=t_ns,
-            onset_t_ns=change.onset_t_ns,
-            residual_rad_s=residual_rad_s,
-            limit_rad_s=crossed,
-            message=self._raised(fan, residual_rad_s, crossed) if raised else self._cleared(fan, crossed),
+        return score, self._desk.tell(
+            changes, score, self._distance(verdict, item.step_ns / NS_PER_S, sigma, sigma_command)
         )
 
-    def _raised(self, fan: int, residual_rad_s: float, limit_rad_s: float) -> str:
-        side = "below" if residual_rad_s < 0 else "above"
-        size, limit = self._shown(abs(residual_rad_s)), self._shown(limit_rad_s)
-        return f"fan {fan}: {size} {self._unit} {side} the twin for {self._on_delay_s:g} s (limit {limit})"
+    def _watch_wear(self, item: Prediction, verdict: Verdict, state: Array) -> None:
+        assert self._judge.origin_t_ns is not None
+        sigma_command, known = item.torque_balance_sigma_command, np.isfinite(item.torque_balance_command)
+        self._wear.update(
+            item.t_ns,
+            self._judge.origin_t_ns,
+            quiet=(verdict.score < QUIET) & (state == FanState.NORMAL) & known,
+            commissioned_command=verdict.balance_commissioned * sigma_command,
+            held=verdict.balance_held,
+            limit_command=self._judge.balance.lasting_limit_sigmas(item.step_ns / NS_PER_S) * sigma_command,
+        )
 
-    def _cleared(self, fan: int, limit_rad_s: float) -> str:
-        limit = self._shown(limit_rad_s)
-        return f"fan {fan}: back within {limit} {self._unit} of the twin for {self._off_delay_s:g} s"
+    def _distance(self, verdict: Verdict, step_s: float, sigma: Array, sigma_command: Array) -> Distance:
+        return Distance(
+            balance_command=verdict.balance_smoothed * sigma_command,
+            limit_rad_s=_if_any(self._judge.speed.limit_sigmas(step_s) * sigma),
+            balance_limit_command=_if_any(self._judge.balance.limit_sigmas(step_s) * sigma_command),
+        )
 
-    def _shown(self, speed_rad_s: float) -> str:
-        speed = speed_rad_s / RAD_S_PER_UNIT[self._unit]
-        return f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
+    def _answer(self, request: Request) -> list[Alarm | Memory]:
+        told = self._desk.answer(request, max(self._last_t_ns, 0))
+        if not told:
+            self._counts["requests_repeated"] += 1
+            return []
+        again = np.zeros(self._fans, np.bool_)
+        again[[alarm.fan for alarm in told if alarm.transition == Transition.COMMISSIONING]] = True
+        self._judge.forget(again)
+        self._wear.forget(again)
+        self._counts["requests"] += 1
+        return [*told, *self._note(True)]
+
+    def _note(self, at_once: bool) -> list[Memory]:
+        """What must not be forgotten: when something happened, and now and then."""
+        if not at_once and self._last_t_ns - self._noted_t_ns < MEMORY_NS:
+            return []
+        self._noted_t_ns = self._last_t_ns
+        state = {
+            "judge": self._judge.snapshot(),
+            "desk": self._desk.snapshot(),
+            "wear": self._wear.snapshot(),
+            "fed_by": self._fed_by,
+        }
+        memory = Memory(
+            t_ns=max(self._last_t_ns, 0),
+            twin_sha256=self._healthy.sha256,
+            state_json=json.dumps(state, allow_nan=False),
+        )
+        if self._keeper:
+            self._keeper.keep(memory)
+        return [memory]
+
+
+def _rows(item: Prediction, rows: Array) -> Prediction:
+    """Some samples of a block, (n,) of bool."""
+    names = [name for name, (shape, _) in columns(Prediction).items() if shape != "fans"]
+    return replace(item, **{name: getattr(item, name)[rows] for name in names})
+
+
+def _if_any(limit: Array) -> Array:
+    return np.where(np.isfinite(limit), limit, 0.0)
 
 
 def build(context: Context) -> Parts:
-    """The core of one tray."""
-    return Parts(ScorerCore(context.tray.fans, context.tray.speed_unit, context.config))
+    """The core of one tray.
+
+    Raises:
+        StageError: the tray names no twin, or one that cannot be used; what an earlier session kept cannot be read.
+    """
+    tray = context.tray
+    keeper = MemoryFile(context.memory_folder / f"scorer-{tray.name}.memory") if context.memory_folder else None
+    healthy = _healthy(context, twin_of(context))
+    return Parts(ScorerCore(tray.fans, tray.speed_unit, context.config, healthy, keeper))
+
+
+def limits_in_force(config: ScorerConfig, calibration: Mapping[str, Any] | None) -> Limits:
+    """The limits of a twin's card, or those of a twin that was not calibrated, as the settings change them.
+
+    Raises:
+        ValidationError: the calibration is none.
+    """
+    if calibration is None:
+        return uncalibrated(config.alarm_sigmas, config.timing(Timing())).times(config.limit_factor)
+    limits = Limits.model_validate(calibration)
+    timing = config.timing(limits.timing)
+    promise = limits.promise if timing == limits.timing else None  # it was for the other times
+    return limits.model_copy(update={"timing": timing, "promise": promise}).times(config.limit_factor)
+
+
+def _healthy(context: Context, twin: TwinFile) -> Healthy:
+    try:
+        limits = limits_in_force(context.config, twin.calibration)
+    except ValidationError as error:
+        where = ".".join(map(str, error.errors()[0]["loc"]))
+        raise StageError(
+            f"{context.tray.twin}: its calibration cannot be used: {where}: {error.errors()[0]['msg']}; "
+            "calibrate it anew: fantwin calibrate"
+        ) from error
+    balance = twin.balance
+    return Healthy(
+        sha256=twin.sha256,
+        limits=limits,
+        command_unit=twin.command_unit,
+        balances=[
+            HealthyBalance(
+                inertia=float(balance.inertia[fan]),
+                viscous=float(balance.viscous[fan]),
+                drag=float(balance.drag[fan]),
+                friction=float(balance.friction[fan]),
+                lag_s=float(balance.lag_s[fan]),
+                std_errors=balance.std_errors[fan],
+                filter_rate_per_s=balance.filter_rate_per_s,
+                sigma_command=float(balance.sigma_command[fan]),
+                autocorrelation_time_s=float(balance.autocorrelation_time_s[fan]),
+                lowest_speed_rad_s=float(balance.lowest_speed_rad_s[fan]),
+            )
+            for fan in range(twin.fans)
+        ],
+    )
+
+
+def check(context: Context) -> list[str]:
+    """What keeps the scorer from judging; of a twin that cannot be loaded the twin integrator tells."""
+    try:
+        twin = twin_of(context)
+    except StageError:
+        return []
+    try:
+        _healthy(context, twin)
+    except StageError as error:
+        return [str(error)]
+    return []
 
 
 STAGE = Stage(
     name="scorer",
-    about="the band, and alarms on lasting excursions",
-    reads=("prediction",),
-    writes=("score", "alarm"),
+    about="two residuals, their statistics, and the fans' alarms",
+    reads=("prediction", "request"),
+    writes=("score", "alarm", "memory"),
     config=ScorerConfig,
     build=build,
+    check=check,
 )

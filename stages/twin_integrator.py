@@ -7,7 +7,11 @@ Timing: a prediction for every grid message, at once, block for block; one run o
 The prediction is a *free run*: it starts from the mean of the first measured speeds and is never corrected by a
 measurement again. It needs commands only, so a fan without a reading does not disturb it. While the line is silent the
 last command is held for `hold_limit_s`; then the commands are unknown, the free run ends, and a new one begins when
-the line returns. Samples in the first `warm_up_s` of a free run are not valid (WARMING_UP).
+the line returns. Samples in the first `warm_up_s` of a free run are not valid (WARMING_UP), nor are those in the first
+`warm_up_s` after a command that was out of the twin's range or too small to turn the rotor (OUT_OF_RANGE).
+
+Beside it goes the *torque balance*: the command given, less the command that a healthy fan needs for what was measured.
+It needs no free run, and so is there a third of a second after the first sample (scoring.torque_balance).
 """
 
 from __future__ import annotations
@@ -15,17 +19,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from pydantic import Field
 
 from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
-from pipeline.twin_file import TwinFile
+from pipeline.twin_file import TwinFile, twin_of
 from schemas.messages import Array, Grid, ModelCard, Prediction, WhyNot
+from scoring.torque_balance import BalanceModel, TorqueBalance
 
 NS_PER_S = 1_000_000_000
 RANGE_MARGIN = 0.05  # of the range's width: so far beyond the commands it was made from a twin is still believed
 LONGEST_BRIDGE = 1 << 16  # grid samples; more than half a second at 100 kHz takes longer to run than to start anew
+DEAD_ZONE = 0.25  # of the range's width: a friction above so much of the commands is none
+HIGHEST_SPEED = 1.5  # of the top speed it was made from: the balance is believed up to there
 RATE_TOLERANCE = 0.01  # a card gives the rate as it was measured
 
 
@@ -73,6 +81,7 @@ class FreeRun:
         self.started_t_ns = np.zeros(fans, np.int64)
         self.held_command = np.full(fans, twin.command_range[0])
         self._known_t_ns = np.zeros(fans, np.int64)  # when the command was last known
+        self._out_of_range_t_ns = np.full(fans, np.iinfo(np.int64).min // 2)
         self._readings = np.zeros(fans, np.int64)  # towards a start
         self._sum_rad_s = np.zeros(fans)
         self._state = twin.initial_state(np.zeros(fans), self.held_command)
@@ -90,6 +99,13 @@ class FreeRun:
         before_t_ns = np.concatenate((self._known_t_ns[np.newaxis], known_t_ns[:-1]))
         self.held_command, self._known_t_ns = command[-1], known_t_ns[-1]
         return command, before_t_ns
+
+    def last_out_of_range(self, t_ns: Array, beyond: Array) -> Array:
+        """When the command of each sample's fan was last out of range, (n, fans) ns: the free run must settle since."""
+        last = np.where(beyond, t_ns[:, np.newaxis], np.iinfo(np.int64).min // 2)
+        last = np.maximum(np.maximum.accumulate(last, axis=0), self._out_of_range_t_ns)
+        self._out_of_range_t_ns = last[-1].copy()
+        return last
 
     def stop(self, fans: Array) -> None:
         """End the free run of some fans; the next one starts anew from measured speeds."""
@@ -149,7 +165,9 @@ class TwinIntegratorCore(Core):
         low, high = twin.command_range
         margin = RANGE_MARGIN * (high - low)
         self._lowest_command, self._highest_command = low - margin, high + margin
+        self._off_below = _off_below(twin)
         self._run = FreeRun(twin, config)
+        self._balance = _balance_of(twin)
         self._card = [
             ModelCard(
                 t_ns=started_t_ns,
@@ -179,6 +197,7 @@ class TwinIntegratorCore(Core):
             return messages
         if grid.step_ns != self._step_ns:
             self._run.stop(np.ones_like(self._run.running))
+            self._balance.reset()
             self._step_ns = grid.step_ns
         if self._twin.is_discrete and abs(grid.step_ns * self._twin.rate_hz / NS_PER_S - 1) > RATE_TOLERANCE:
             self._problem = (
@@ -238,8 +257,11 @@ class TwinIntegratorCore(Core):
             if end > row + 1:
                 run.forget_readings(np.any(inputs.unknown[row + 1 : end], axis=0))
             row = end
-        settled = running & (grid.t_ns[:, np.newaxis] - started_t_ns >= self._warm_up_ns)
         in_range = (grid.command >= self._lowest_command) & (grid.command <= self._highest_command)
+        in_range &= grid.command >= self._off_below
+        beyond = np.isfinite(grid.command) & ~in_range  # where it is unknown the free run has the last known
+        since_t_ns = np.maximum(started_t_ns, self._run.last_out_of_range(grid.t_ns, beyond))
+        settled = running & ((grid.t_ns[:, np.newaxis] - since_t_ns >= self._warm_up_ns) | ~in_range)
         in_range &= np.isfinite(predicted) | ~running
         self._counts["out_of_range"] += int((settled & ~in_range).sum())
         why_not = np.where(settled, WhyNot.OUT_OF_RANGE, WhyNot.WARMING_UP)
@@ -265,7 +287,7 @@ class TwinIntegratorCore(Core):
         last_t_ns = t_ns[0] - step_ns if self._last_t_ns is None else self._last_t_ns
         since_ns = t_ns - np.concatenate(([last_t_ns], t_ns[:-1]))
         missing = np.zeros(len(t_ns), np.int64)
-        for row in np.flatnonzero(since_ns > step_ns + (step_ns - 1) // 2).tolist():  # from one and a half steps on
+        for row in np.flatnonzero(since_ns > self._longest_step_ns).tolist():
             missing[row] = round(int(since_ns[row]) / step_ns) - 1
             if not (line_is_silent[row - 1] if row else self._line_is_silent):
                 self._counts["lost_grid_samples"] += int(missing[row])
@@ -295,6 +317,26 @@ class TwinIntegratorCore(Core):
         why_not = np.where(grid.valid, WhyNot.NO_TWIN, grid.why_not).astype(np.uint8)
         return self._prediction(grid, np.full(grid.command.shape, np.nan), why_not)
 
+    def _torque_balance(self, grid: Grid) -> Array:
+        """(n, fans) in command units. Where samples are missing it begins anew."""
+        known = grid.valid & np.isfinite(grid.speed_rad_s) & np.isfinite(grid.command)
+        if self._last_t_ns is not None and grid.t_ns[0] - self._last_t_ns > self._longest_step_ns:
+            self._balance.reset()
+        cuts = (np.flatnonzero(np.diff(grid.t_ns) > self._longest_step_ns) + 1).tolist()
+        parts = []
+        for first, last in pairwise((0, *cuts, len(grid.t_ns))):
+            if first:
+                self._balance.reset()
+            rows = slice(first, last)
+            parts.append(
+                self._balance.update(self._step_ns / NS_PER_S, grid.command[rows], grid.speed_rad_s[rows], known[rows])
+            )
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    @property
+    def _longest_step_ns(self) -> int:
+        return self._step_ns + (self._step_ns - 1) // 2  # from one and a half steps on samples are missing
+
     def _prediction(self, grid: Grid, predicted_speed_rad_s: Array, why_not: Array) -> Prediction:
         return Prediction(
             fans=grid.fans,
@@ -307,7 +349,35 @@ class TwinIntegratorCore(Core):
             valid=why_not == WhyNot.NONE,
             why_not=why_not,
             twin=self._twin.name,
+            torque_balance_command=self._torque_balance(grid),
+            torque_balance_sigma_command=self._twin.balance.sigma_command,
         )
+
+
+def _balance_of(twin: TwinFile) -> TorqueBalance:
+    balance = twin.balance
+    return TorqueBalance(
+        BalanceModel(
+            inertia=balance.inertia,
+            viscous=balance.viscous,
+            drag=balance.drag,
+            friction=balance.friction,
+            lag_s=balance.lag_s,
+            filter_rate_per_s=balance.filter_rate_per_s,
+            lowest_speed_rad_s=balance.lowest_speed_rad_s,
+            highest_speed_rad_s=HIGHEST_SPEED * twin.top_speed_rad_s,
+            off_below=_off_below(twin),
+        )
+    )
+
+
+def _off_below(twin: TwinFile) -> Array:
+    """(fans,) the smallest command that turns the rotor: the friction, unless that lies amidst the healthy commands.
+    Then the fan was held at one speed, where friction takes the place of a drag that could not be told.
+    """
+    low, high = twin.command_range
+    friction = twin.balance.friction
+    return np.where((friction > 0.0) & (friction < low + DEAD_ZONE * (high - low)), friction, -np.inf)
 
 
 def build(context: Context) -> Parts:
@@ -316,23 +386,16 @@ def build(context: Context) -> Parts:
     Raises:
         StageError: the tray names no twin, or one that cannot be used.
     """
-    return Parts(TwinIntegratorCore(_twin(context), context.config, context.started_t_ns))
+    return Parts(TwinIntegratorCore(twin_of(context), context.config, context.started_t_ns))
 
 
 def check(context: Context) -> list[str]:
     """What keeps the twin from being loaded."""
     try:
-        _twin(context)
+        twin_of(context)
     except StageError as error:
         return [str(error)]
     return []
-
-
-def _twin(context: Context) -> TwinFile:
-    tray = context.tray
-    if tray.twin is None:
-        raise StageError(f'tray {tray.name} has no twin: set [[tray]] twin = "FILE.onnx"')
-    return TwinFile.load(context.resolve(tray.twin), tray.fans)
 
 
 STAGE = Stage(

@@ -23,7 +23,7 @@ from pipeline.loopback import check_free
 from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from pipeline.stages_page import StagesPage
 from pipeline.trace import Trace, state_changes, state_name, trace_of
-from schemas.messages import Alarm, Array, Health, Message, ModelCard, Score
+from schemas.messages import Alarm, Array, Health, Message, ModelCard, Score, Severity, Transition
 
 NO_RERUN = "the viewer needs the `view` extra: pip install 'fantwin[view]', or take viewer out of launcher.stages"
 FLUSH_PERIOD_NS = 500_000_000
@@ -60,7 +60,7 @@ class ViewSink(Protocol):
         ...
 
     def log(self, tray: str, t_ns: int, level: str, text: str) -> None:
-        """Add a line to a tray's log; `level` is INFO or ERROR."""
+        """Add a line to a tray's log; `level` is INFO, WARN or ERROR."""
         ...
 
     def show_stages(self, page: str) -> None:
@@ -77,8 +77,12 @@ class ViewSink(Protocol):
 
 
 def alarm_line(alarm: Alarm) -> tuple[str, str]:
-    """Level and text of an alarm for people."""
-    return ("ERROR", f"alarm raised: {alarm.message}") if alarm.active else ("INFO", f"alarm cleared: {alarm.message}")
+    """Level and text of what happened to an alarm, for people."""
+    happened = alarm.transition.name.lower().replace("_", " ")
+    if alarm.transition not in (Transition.RAISED, Transition.SEVERITY, Transition.RESTATED):
+        return "INFO", f"{happened}: {alarm.message}"
+    level = "ERROR" if alarm.severity == Severity.ALARM else "WARN"
+    return level, f"{alarm.severity.name.lower()} {happened}: {alarm.message}"
 
 
 @dataclass(slots=True)

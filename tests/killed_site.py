@@ -18,12 +18,19 @@ from pipeline.recordings.writing import RecordingWriter
 from pipeline.stage import Context, Core
 from pipeline.table_of_stages import load_stage
 from pipeline.twin_file import TwinFile
-from schemas.messages import Cause, Header, Message, Raw
+from schemas.messages import Action, Cause, Header, Message, Raw, Request
 from schemas.topics import TOPICS, tray_key
 from tests.twin_files import small_hybrid, write_twin
 
 SITE, TRAY, FANS = "plant", "tray1", 3
 CHAIN = ("resampler", "twin_integrator", "scorer")
+CALIBRATION = {
+    "speed": {"step": 2.0, "drift": 8.0, "growth": 4.0},
+    "balance": {"step": 4.0, "drift": 20.0, "growth": 6.0},
+    "missing_share": 0.5,
+    "timing": {"smoothing_s": 0.2, "baseline_s": 0.2, "adaptation_s": 5.0, "on_delay_s": 0.1},
+}
+"""limits of no particular fan, such that alarms come and go"""
 EPOCH_NS = 1_800_000_000_000_000_000
 TICK_NS = 50_000_000
 TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
@@ -40,6 +47,7 @@ block_size = %d
 [twin_integrator]
 warm_up_s = 0.5
 [scorer]
+baseline_s = 0.2
 alarm_sigmas = 1.0
 on_delay_s = 0.1
 off_delay_s = 0.2
@@ -60,10 +68,11 @@ class Session:
 class Stages:
     """Three stages of one tray, and a recording of all that goes between them."""
 
-    def __init__(self, config: Config, path: Path, started_t_ns: int) -> None:
+    def __init__(self, config: Config, path: Path, started_t_ns: int, *, remembers: bool = True) -> None:
         (tray,) = config.trays
         assert tray.twin
         self.config = config
+        self.remembers = remembers
         self.tray = tray.name
         self.now_ns = started_t_ns
         metadata = {
@@ -81,11 +90,21 @@ class Stages:
         self._lives = 0
         self._ticked_ns = started_t_ns
         self.source = Session("acquisition-0", None)
+        self.operator = Session("operator-0", None)
         self.stages = {stage: self._begin(stage) for stage in CHAIN}
 
     def take(self, raw: Raw) -> None:
         """What acquisition would publish next."""
         self._publish(self.source, raw, None)
+
+    def ask(self, action: Action, fan: int = -1, duration_s: float = 0.0) -> None:
+        """What an operator asks for."""
+        name = f"{action.name.lower()} by Ann"
+        self._publish(
+            self.operator,
+            Request(t_ns=self.now_ns, action=action, fan=fan, duration_s=duration_s, operator_name=name),
+            None,
+        )
 
     def tick(self) -> None:
         """Let time pass for the stages, up to `now_ns`."""
@@ -95,12 +114,14 @@ class Stages:
                 self._put_out(stage, self._core(stage).tick(self._ticked_ns), by_time=True)
 
     def kill(self, stage: str) -> None:
-        """kill -9: what the core held is gone; its successor takes again what is still kept."""
+        """kill -9: what the core held is gone; its successor takes again what is still kept, topic after topic."""
         self.stages[stage] = self._begin(stage)
         feeding = self.source if stage == "resampler" else self.stages[CHAIN[CHAIN.index(stage) - 1]]
-        for topic, message in tuple(feeding.kept):
-            if topic in load_stage(stage).reads:
-                self._step(stage, topic, message)
+        kept = (*feeding.kept, *self.operator.kept)
+        for read in sorted(load_stage(stage).reads):
+            for topic, message in kept:
+                if topic == read:
+                    self._step(stage, topic, message)
 
     def loses(self, messages: int) -> None:
         """The next raw messages never come to the resampler."""
@@ -126,6 +147,7 @@ class Stages:
             folder=self.config.folder,
             run_folder=self.config.folder,
             started_t_ns=self.now_ns,
+            memory_folder=self.config.folder if self.remembers else None,
         )
         return Session(f"{stage}-{self._lives}", load_stage(stage).build(context).core)
 
@@ -136,7 +158,8 @@ class Stages:
 
     def _step(self, stage: str, topic: str, message: Message) -> None:
         session = self.stages[stage]
-        session.cause = Cause.after(session.cause, topic, message.header)
+        if topic == load_stage(stage).reads[0]:
+            session.cause = Cause.after(session.cause, topic, message.header)
         self._put_out(stage, self._core(stage).step(message), by_time=False)
 
     def _put_out(self, stage: str, messages: Sequence[Message], by_time: bool) -> None:
@@ -164,11 +187,15 @@ class Stages:
 class Site(Stages):
     """A tray of three fans and its stages."""
 
-    def __init__(self, folder: Path, seed: int, block_size: int = 1) -> None:
-        write_twin(folder / "twin.onnx", small_hybrid(), fans=FANS)
+    def __init__(
+        self, folder: Path, seed: int, block_size: int = 1, *, calibrated: bool = False, remembers: bool = True
+    ) -> None:
+        """remembers: whether a scorer that begins anew finds what the one before has kept."""
+        card = {"calibration": CALIBRATION} if calibrated else {}
+        write_twin(folder / "twin.onnx", small_hybrid(), fans=FANS, **card)
         (folder / "site.toml").write_text(CONFIGURATION % block_size)
         self.path = folder / "recording.mcap"
-        super().__init__(load_config(folder / "site.toml"), self.path, EPOCH_NS)
+        super().__init__(load_config(folder / "site.toml"), self.path, EPOCH_NS, remembers=remembers)
         self.rng = np.random.default_rng(seed)
         self._device_us = 0
         self._device_sequence = 0

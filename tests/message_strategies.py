@@ -10,7 +10,19 @@ from hypothesis.extra import numpy as st_numpy
 
 from schemas import messages
 from schemas.codec import FURTHEST_T_NS, LARGEST_STEP_NS
-from schemas.messages import Cause, Counter, FanState, Header, Input, Message, Output, WhyNot, columns
+from schemas.messages import (
+    Cause,
+    Counter,
+    Diagnosis,
+    FanState,
+    Header,
+    Input,
+    Message,
+    Output,
+    Statistic,
+    WhyNot,
+    columns,
+)
 
 TIME_NS = st.integers(1 - FURTHEST_T_NS, FURTHEST_T_NS - 1)
 STEP_NS = st.integers(1, LARGEST_STEP_NS)
@@ -21,12 +33,13 @@ TEXT = st.text(max_size=20)
 FLOAT = st.floats(width=64)
 CAUSE = st.builds(Cause, TEXT, TEXT, UINT64, UINT64, UINT64, st.booleans())
 HEADER = st.builds(Header, TEXT, UINT64, TEXT, st.none() | CAUSE)
-ENUM_COLUMNS = {"why_not": WhyNot, "state": FanState}
+ENUM_COLUMNS = {"why_not": WhyNot, "state": FanState, "statistic": Statistic}
 SCALARS: dict[str, st.SearchStrategy[Any]] = {
-    **dict.fromkeys(("t_ns", "onset_t_ns"), INT64),
+    **dict.fromkeys(("t_ns", "onset_t_ns", "shelved_until_t_ns"), INT64),
     "step_ns": STEP_NS,
-    **dict.fromkeys(("fan", "process_id"), UINT32),
+    "process_id": UINT32,
     "lost": UINT64,
+    "fan": st.integers(0, 2**31 - 1),
 }
 OF_TYPE: dict[Any, st.SearchStrategy[Any]] = {str: TEXT, float: FLOAT, bool: st.booleans(), int: UINT64}
 
@@ -36,7 +49,7 @@ def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
         return SCALARS[name]
     if isinstance(hint, type) and issubclass(hint, IntEnum):
         return st.sampled_from(hint)
-    for record in (Counter, Input, Output):
+    for record in (Counter, Input, Output, Diagnosis):
         if hint == tuple[record, ...]:
             types = get_type_hints(record)
             values = {f.name: OF_TYPE[types[f.name]] for f in fields(record)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.messages import Alarm, FanState, Header, Score, Severity, WhyNot
+from schemas.messages import Alarm, FanState, Header, Score, Severity, Statistic, Transition, WhyNot
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -59,6 +59,11 @@ def made_up_tray(
         "state": state,
         "valid": valid,
         "why_not": why_not,
+        "torque_balance_command": np.where(np.isfinite(measured), -residual / 100, np.nan),
+        "speed_baseline_rad_s": np.zeros(predicted.shape),
+        "balance_baseline_command": np.zeros(predicted.shape),
+        "score": np.abs(residual) / (2 * SIGMA),
+        "statistic": np.where(valid, Statistic.SPEED_STEP, Statistic.NONE).astype(np.uint8),
     }
     t_ns = START_NS + np.arange(len(t_s)) * STEP_NS
     scores = [
@@ -85,4 +90,9 @@ def _alarm(tray: str, fan: int, at_s: float, onset_s: float, active: bool) -> Al
         residual_rad_s=-30.0 if active else -1.0,
         limit_rad_s=2 * SIGMA,
         message="slower than its twin" if active else "back in the band",
+        transition=Transition.RAISED if active else Transition.CLEARED,
+        statistic=Statistic.SPEED_STEP,
+        score=3.75 if active else 0.1,
+        torque_balance_command=0.3 if active else 0.01,
+        confirmed=True,
     )

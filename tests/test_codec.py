@@ -218,8 +218,9 @@ def test_a_time_beyond_2116_is_refused_on_both_ways(t_ns):
 
 def test_a_prediction_with_samples_but_no_sigma_is_refused_on_both_ways():
     one = np.zeros((1, 1))
-    speeds = dict.fromkeys(("command", "measured_speed_rad_s", "predicted_speed_rad_s", "valid", "why_not"), one)
-    good = Prediction(fans=1, step_ns=1, t_ns=np.array([5]), sigma_rad_s=np.ones(1), **speeds)
+    names = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "valid", "why_not", "torque_balance_command")
+    sigmas = {"sigma_rad_s": np.ones(1), "torque_balance_sigma_command": np.ones(1)}
+    good = Prediction(fans=1, step_ns=1, t_ns=np.array([5]), **sigmas, **dict.fromkeys(names, one))
     with pytest.raises(CodecError, match="sigma_rad_s"):
         encode(replace(good, sigma_rad_s=np.zeros(0)))
     proto = proto_type(Prediction).FromString(encode(good))

@@ -15,12 +15,12 @@ from pipeline.config import TrayConfig
 from pipeline.stage import Core
 from pipeline.twin_file import TwinFile
 from schemas.codec import decode, encode
-from schemas.messages import Alarm, Grid, Header, Health, Message, ModelCard, Prediction, Raw, Score
+from schemas.messages import Alarm, Grid, Header, Health, Memory, Message, ModelCard, Prediction, Raw, Request, Score
 from stages.resampler import ResamplerConfig, ResamplerCore
-from stages.scorer import ScorerConfig, ScorerCore
 from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from stages.viewer import ViewerCore
 from tests.message_strategies import any_message
+from tests.scored import CALIBRATION, core_of, prediction_of
 from tests.test_viewer import FakeSink
 from tests.twin_files import write_twin
 
@@ -67,10 +67,52 @@ def test_the_twin_integrator_takes_anything(twin: TwinFile, session: list[Messag
     survives(TwinIntegratorCore(twin, config, 0), session)
 
 
+LOW_LIMITS = CALIBRATION | {
+    "speed": {"step": 0.1, "drift": 0.1, "growth": 0.1, "spread": [1.0, 2.0], "speeds_rad_s": [0.0, 100.0],
+              "offset_sigmas": [0.0, 1.0], "baseline_sigmas": 0.0},
+    "balance": {"step": 0.1, "baseline_sigmas": 0.0},
+    "timing": {"baseline_s": 0.01, "on_delay_s": 0.0},
+}  # fmt: skip
+
+
+def judged_prediction(message: Message) -> Message:
+    """The same, in a row of samples that are taken at least: most of what may be wrong is refused by its flags."""
+    if not isinstance(message, Prediction):
+        return message
+    t_ns = np.sort(message.t_ns)
+    return replace(message, t_ns=t_ns, valid=np.ones_like(message.valid), why_not=np.zeros_like(message.why_not))
+
+
 @NO_SLOW_CHECK
-@given(sessions(Prediction))
-def test_the_scorer_takes_anything(session: list[Message]) -> None:
-    survives(ScorerCore(FANS, "rpm", ScorerConfig()), session)
+@given(sessions(Prediction, Request), st.sampled_from([None, CALIBRATION, LOW_LIMITS]), st.booleans())
+def test_the_scorer_takes_anything(session: list[Message], calibration: Any, all_valid: bool) -> None:
+    core = core_of(FANS, "rpm", calibration=calibration, off_delay_s=0.0)
+    survives(core, [judged_prediction(message) for message in session] if all_valid else session)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.sampled_from([1, 1000, 10_000_000, 1_000_000_000]),
+    st.lists(st.tuples(st.floats(allow_nan=True), st.floats(allow_nan=True)), min_size=1, max_size=40),
+    st.integers(1, 40),
+)
+def test_a_fan_of_any_speed_and_command_is_diagnosed(step_ns: int, values: list, repeats: int) -> None:
+    core = core_of(1, calibration=LOW_LIMITS, off_delay_s=0.0)
+    samples = np.repeat(np.array(values), repeats, axis=0)
+    made = prediction_of(np.zeros(len(samples)), step_ns=step_ns)
+    wild = replace(
+        made, measured_speed_rad_s=samples[:, :1], command=samples[:, 1:], torque_balance_command=samples[:, 1:]
+    )
+    survives(core, [prediction_of(np.zeros(3), first=-9, step_ns=step_ns), wild])
+
+
+@settings(max_examples=60, deadline=None)
+@given(any_message(Memory))
+def test_the_scorer_begins_with_any_memory(memory: Memory) -> None:
+    core = core_of(FANS)
+    for kept in (memory, replace(memory, twin_sha256="twin")):
+        core.restore(kept)
+    survives(core, [prediction_of(np.zeros((3, FANS)))])
 
 
 @NO_SLOW_CHECK

@@ -31,7 +31,7 @@ def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
     assert [(fault["fan"], fault["kind"]) for fault in summary["faults"]] == [(2, "inlet"), (5, "rotor")]
     for fault in summary["faults"]:
         assert fault["start_ns"] < fault["alarm_ns"] < fault["stop_ns"] < fault["cleared_ns"]
-    assert summary["samples_sent"] == summary["samples_recorded"] == 3200
+    assert summary["samples_sent"] == summary["samples_recorded"] == 3400
     assert (summary["false_alarms"], summary["lost"], summary["problems"]) == (0, 0, [])
     assert 0 < summary["latency_ms"]["p50"] <= summary["latency_ms"]["p99"]
 
@@ -58,7 +58,7 @@ def test_a_wheel_brings_what_the_demo_reads(tmp_path):
     root = Path(__file__).parents[1]
     for part in ("pyproject.toml", "README.md", "LICENSE"):  # a copy: a build leaves its traces in the source
         shutil.copy(root / part, tmp_path)
-    for part in ("schemas", "pipeline", "stages", "twin"):
+    for part in ("schemas", "scoring", "pipeline", "stages", "twin"):
         shutil.copytree(root / part, tmp_path / part, ignore=shutil.ignore_patterns("__pycache__"))
     build = "import sys, setuptools.build_meta as backend; print(backend.build_wheel(sys.argv[1]))"
     done = subprocess.run(

@@ -13,7 +13,7 @@ import pytest
 from pipeline.demo_report import SETTLING_NS, summarise
 from pipeline.errors import UserError
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Alarm, Grid, Header, Message, Raw, Score, Severity, columns
+from schemas.messages import Alarm, Grid, Header, Message, Raw, Score, Severity, Transition, columns
 from schemas.topics import tray_key
 
 START_NS = 1_700_000_000_000_000_000
@@ -97,6 +97,7 @@ def alarm(number: int, fan: int, active: bool, t_ns: int) -> Alarm:
         residual_rad_s=0.0,
         limit_rad_s=0.0,
         message="",
+        transition=Transition.RAISED if active else Transition.CLEARED,
     )
 
 

@@ -1,6 +1,7 @@
 """The exported file against the model in numpy and in torch, and files that are not one."""
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -183,6 +184,9 @@ def test_the_card_travels_in_the_file(trained: TrainedTwin, tmp_path: Path) -> N
     assert card.command_unit == "%"
     assert card.training.data[0].sha256 == "ab" * 32
     assert card.rate_hz == pytest.approx(100.0)
+    assert card.calibration is None
+    calibrated = replace(card, calibration={"false_alarms_per_day": 1.0, "limits": [3.0, None]})
+    assert Card.from_json(calibrated.to_json()) == calibrated
     np.testing.assert_array_equal(card.parameters, trained.parameters)
 
 
@@ -225,7 +229,7 @@ def test_a_file_that_is_not_a_twin_is_refused_in_one_line(tmp_path: Path) -> Non
     ("changes", "words"),
     [
         ({"format_version": 99}, "format_version 99"),
-        ({"format_version": 1}, "format_version 1, this program reads 2"),
+        ({"format_version": 1}, "format_version 1, this program reads 3"),
         ({"state_layout": {"speed": 1, "command": 0}, "n_state": 1}, r"the card says (fans, 1)"),
         ({"n_state": 3}, "n_state or parameters"),
         ({"parameters": [[0.1, 0.1, 0.1, 0.0]]}, "n_state or parameters"),

@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 
 from pipeline.recordings.reading import RecordingError, read_head, read_recording
 from pipeline.recordings.writing import RecordingWriter
+from pipeline.replay.decisions import episodes
 from pipeline.replay.material import open_material
 from pipeline.replay.offline import CannotCompareError, JudgedTray, judge
-from schemas.messages import Alarm, Score
+from schemas import fan_pb2
+from schemas.messages import Action, Alarm, Score, Transition
 from tests.killed_site import CHAIN, Site
 from tests.twin_files import write_twin
 
@@ -70,21 +72,30 @@ def test_samples_that_time_had_given_up_are_given_up_again(tmp_path):
     assert made_equal(tray) > 400
 
 
-@settings(deadline=None, max_examples=30)
+ASKED = (Action.ACKNOWLEDGE, Action.SHELVE, Action.COMMISSION, Action.OUT_OF_SERVICE)
+
+
+@settings(deadline=None, max_examples=40)
 @given(
     seed=st.integers(0, 1000),
     block_size=st.sampled_from([1, 1, 4]),
+    calibrated=st.booleans(),
+    remembers=st.sampled_from([True, True, False]),
     events=st.lists(
-        st.tuples(st.integers(5, 250), st.sampled_from([*CHAIN, "acquisition", "silence", "loss"])),
+        st.tuples(st.integers(5, 250), st.sampled_from([*CHAIN, "scorer", "acquisition", "silence", "loss", *ASKED])),
         min_size=1,
         max_size=8,
     ),
 )
-def test_whatever_was_killed_and_when_the_same_is_decided(tmp_path_factory, seed, block_size, events):
-    site = Site(tmp_path_factory.mktemp("site"), seed, block_size)
+def test_whatever_was_killed_and_asked_for_and_when_the_same_is_decided(
+    tmp_path_factory, seed, block_size, calibrated, remembers, events
+):
+    site = Site(tmp_path_factory.mktemp("site"), seed, block_size, calibrated=calibrated, remembers=remembers)
     for samples, event in events:
         site.run(samples)
-        if event == "acquisition":
+        if isinstance(event, Action):
+            site.ask(event, fan=samples % 4 - 1, duration_s=float(samples % 2))
+        elif event == "acquisition":
             site.restart_source()
         elif event == "silence":
             site.fall_silent(0.8)
@@ -95,6 +106,130 @@ def test_whatever_was_killed_and_when_the_same_is_decided(tmp_path_factory, seed
     site.run(50)
     path = site.finished()
     assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
+
+
+def alarms_of(path: Path) -> list[Alarm]:
+    return recorded(path, "alarm")
+
+
+@pytest.mark.parametrize("block_size", [1, 4])
+def test_what_operators_asked_for_is_asked_for_again_at_the_same_samples(tmp_path, block_size):
+    site = Site(tmp_path, 1, block_size, calibrated=True)
+    site.run(210)
+    site.ask(Action.ACKNOWLEDGE, 0)
+    site.ask(Action.SHELVE, 0, duration_s=1.0)
+    site.run(30)
+    site.ask(Action.COMMISSION, 1)
+    site.run(400)
+    path = site.finished()
+    told = {alarm.transition for alarm in alarms_of(path)}
+    wanted = {Transition.RAISED, Transition.ACKNOWLEDGED, Transition.SHELVED, Transition.UNSHELVED, Transition.CLEARED}
+    assert {*wanted, Transition.COMMISSIONING} <= told
+    tray = verified(path)
+    assert made_equal(tray) > 550
+    assert tray.comparison and tray.comparison.alarms_equal == len(alarms_of(path))
+
+    def unasked(entry):
+        return None if entry.topic == "request" else entry.message
+
+    without = verified(changed(path, tmp_path / "unasked.mcap", unasked)).comparison
+    assert without and not without.is_equal, "the requests are what made the difference"
+
+
+def test_a_restarted_scorer_goes_on_from_what_it_remembers_and_so_does_a_replay(tmp_path):
+    site = Site(tmp_path, 1, calibrated=True)
+    site.run(210)
+    site.ask(Action.ACKNOWLEDGE, 0)
+    site.ask(Action.OUT_OF_SERVICE, 2)
+    site.run(5)
+    site.kill("scorer")
+    site.run(400)
+    path = site.finished()
+    alarms = alarms_of(path)
+    successor = next(alarm.header.producer for alarm in alarms if alarm.transition == Transition.RESTATED)
+    restated = [alarm for alarm in alarms if alarm.transition == Transition.RESTATED]
+    stood = {alarm.fan: (alarm.active, alarm.acknowledged, alarm.out_of_service) for alarm in restated}
+    assert stood[0] == (True, True, False)
+    assert stood[2][2]
+    assert len([alarm for alarm in alarms if alarm.request]) == 2, "what was answered is not answered again"
+    tray = verified(path)
+    assert made_equal(tray) > 550
+    assert tray.plan.memories.keys() == {successor}
+    assert tray.comparison and tray.comparison.alarms_equal == len(alarms)
+    found = episodes(tray.alarms)
+    assert found == episodes(alarms)
+    first = next(episode for episode in found if episode.fan == 0 and episode.onset_ns == restated[0].onset_t_ns)
+    raised = [a for a in alarms if a.transition == Transition.RAISED and a.fan == 0 and a.onset_t_ns == first.onset_ns]
+    assert len(raised) == 1 and raised[0].t_ns == first.raised_ns, "one alarm, over the restart"
+
+
+def test_without_the_memory_it_began_with_a_session_cannot_be_made_the_same(tmp_path):
+    site = Site(tmp_path, 1, calibrated=True)
+    site.run(210)
+    site.kill("scorer")
+    site.run(100)
+
+    def forgotten(entry):
+        return None if entry.topic == "memory" else entry.message
+
+    path = changed(site.finished(), tmp_path / "forgotten.mcap", forgotten)
+    with pytest.raises(CannotCompareError, match="begins in the middle of scorer"):
+        verified(path)
+
+
+def test_a_part_that_begins_with_a_restarted_scorer_still_needs_what_it_was_fed(tmp_path):
+    site = Site(tmp_path, 1, calibrated=True)
+    site.run(210)
+    site.records = False
+    site.run(20)
+    site.records = True
+    site.kill("scorer")
+    site.run(100)
+    with pytest.raises(CannotCompareError, match="lacks .* raw messages"):
+        verified(site.finished())
+
+
+def test_with_other_limits_a_session_goes_on_from_what_the_one_before_finds_now(tmp_path):
+    site = Site(tmp_path, 1, calibrated=True)
+    site.run(215)
+    site.kill("scorer")
+    site.run(100)
+    with open_material([site.finished()], None, ("scorer.limit_factor=1000",), None) as material:
+        (tray,) = judge(material, None, verify=False)
+    assert any(alarm.transition == Transition.RESTATED for alarm in tray.recorded_alarms)
+    assert tray.alarms == []
+    assert tray.counts["memories_of_another_twin"] == 0
+
+
+def test_with_another_twin_a_restart_costs_no_commissioning(tmp_path):
+    site = Site(tmp_path, 1, calibrated=True)
+    site.run(215)
+    site.kill("scorer")
+    site.run(100)
+    other = write_twin(tmp_path / "other.onnx", fans=1)
+    with open_material([site.finished()], None, (), other) as material:
+        (tray,) = judge(material, None, verify=False)
+    assert tray.plan.restarts == 1
+    assert tray.counts["memories_of_another_twin"] == 0
+
+
+def test_a_recording_of_another_version_is_judged_from_its_raw_samples(tmp_path):
+    site = Site(tmp_path, 1)
+    site.run(300)
+    with open_material([site.finished()], None, (), None) as material:
+        packets = list(material.packets("tray1", ("grid", "prediction", "score", "raw")))
+        old = [p if p.topic.name != "prediction" else p._replace(payload=_without_balance(p.payload)) for p in packets]
+        material.packets = lambda tray, topics: (p for p in old if p.topic.name in topics)  # type: ignore[method-assign]
+        plan, _ = material.survey("tray1")
+        (tray,) = judge(material, None, verify=False)
+    assert plan is None
+    assert tray.judged > 200
+
+
+def _without_balance(payload: bytes) -> bytes:
+    prediction = fan_pb2.Prediction.FromString(payload)
+    prediction.ClearField("torque_balance_command")
+    return prediction.SerializeToString()
 
 
 def test_raw_messages_that_the_recorder_never_got_are_missed(tmp_path):

@@ -15,6 +15,7 @@ from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.reel import Extent, Reel, shifted
 from schemas.messages import MESSAGE_TYPES, Alarm, Grid, Header, ModelCard, Severity, WhyNot, columns
 from schemas.topics import tray_key
+from scoring.condition import UNTIL_IT_CLEARS_T_NS
 from tests.replay_data import START_NS, STEP_NS, raw_of, write_raw
 
 RAW = tray_key("demo", "tray1", "raw")
@@ -113,6 +114,9 @@ def test_all_times_of_a_message_are_shifted_and_nothing_else():
     later = shifted(Entry("k", "alarm", alarm, 60), 1000)
     assert later.log_time_ns == 1060
     assert vars(later.message) == vars(replace(alarm, t_ns=1050, onset_t_ns=1040))
+    for until, moved in ((70, 1070), (UNTIL_IT_CLEARS_T_NS, UNTIL_IT_CLEARS_T_NS)):
+        shelved = shifted(Entry("k", "alarm", replace(alarm, shelved_until_t_ns=until), 60), 1000).message
+        assert isinstance(shelved, Alarm) and shelved.shelved_until_t_ns == moved
     raw = raw_of(3, 2)
     moved = shifted(Entry("k", "raw", raw, 60), 1000).message
     assert (moved.host_receive_t_ns == raw.host_receive_t_ns + 1000).all()  # type: ignore[union-attr]

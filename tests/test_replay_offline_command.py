@@ -70,10 +70,10 @@ def test_the_decision_as_json():
 
 
 def test_another_threshold_says_what_is_gained_and_lost():
-    told = json.loads(replay("--json", GOLDEN, "--set", "scorer.alarm_sigmas=1000").stdout)
+    told = json.loads(replay("--json", GOLDEN, "--set", "scorer.limit_factor=1000").stdout)
     assert told["alarms"] == [] and told["what_if"]["gained"] == []
     assert [alarm["fan"] for alarm in told["what_if"]["lost"]] == [1]
-    assert "1 alarms lost" in replay(GOLDEN, "--set", "scorer.alarm_sigmas=1000").stdout
+    assert "1 alarms lost" in replay(GOLDEN, "--set", "scorer.limit_factor=1000").stdout
 
 
 def test_another_configuration_file_is_taken(tmp_path):
@@ -108,7 +108,7 @@ def test_an_imported_table_is_judged_at_the_twins_own_rate(tmp_path):
     assert told.returncode == 0, told.stderr
     assert json.loads(told.stdout)["samples"] > 550
     told = json.loads(
-        replay("--json", bare, "--twin", tmp_path / "twin.onnx", "--set", "scorer.alarm_sigmas=1000").stdout
+        replay("--json", bare, "--twin", tmp_path / "twin.onnx", "--set", "scorer.limit_factor=1000").stdout
     )
     assert told["alarms"] == [], "keys are set on top of the defaults"
     told = replay("--json", bare, "--twin", tmp_path / "twin.onnx", "--set", "no.such_key=1")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.account import losses
 from pipeline.bus import Bus
 from pipeline.config import BusConfig, Config, LauncherConfig, TrayConfig
 from pipeline.runner import INBOX_SIZE, Runner
@@ -192,6 +193,53 @@ def test_what_is_made_because_time_has_passed_says_so(config):
     cause = bench.next(Grid).header.cause
     bench.end()
     assert cause == Cause("raw", "feeder", 0, 1, 0, by_time=True)
+
+
+class Answers(Passer):
+    """Reads commands beside its raw samples, and makes a grid of each of them, too."""
+
+    def step(self, item: Any) -> Sequence[Message]:
+        self.fans = item.fans
+        return [self.grid([item.t_ns])] if isinstance(item, Command) else super().step(item)
+
+
+def send_once(bus: Bus, producer: str, t_ns: int) -> None:
+    outlet = bus.outlet(tray_key("s", TRAY_A, "command"), BY_NAME["command"], type_name(Command), producer)
+    outlet.put(encode(Command(header=Header(producer, 0, TRAY_A), fans=1, t_ns=t_ns)))
+
+
+def test_a_side_input_becomes_no_cause_and_does_not_count_as_taken(config):
+    bench = Bench(toy(lambda _context: Parts(Answers()), reads=("raw", "command")), config)
+    send_once(bench.bus, "operator", 5)
+    bench.feed(TRAY_A, 10)
+    send_once(bench.bus, "another", 6)
+    bench.feed(TRAY_A, 11)
+    grids = [bench.next(Grid) for _ in range(4)]
+    bench.end()
+    first = Cause("raw", "feeder", 0, 1, 0)
+    assert [grid.t_ns.tolist() for grid in grids] == [[5], [10], [6], [11]]
+    assert [grid.header.cause for grid in grids] == [None, first, first, Cause("raw", "feeder", 1, 2, 0)]
+
+
+def test_a_producer_that_says_one_thing_and_leaves_is_heard_and_no_loss(config):
+    class Careful(Answers):
+        def counters(self):
+            return {}
+
+    bench = Bench(toy(lambda _context: Parts(Careful()), reads=("raw", "command")), config)
+    for number in range(3):  # sessions that nobody has a word of health from
+        with Bus(config.bus) as visitor:
+            met = threading.Event()
+            visitor.subscribe(health_key("s", "*", "*"), lambda _key, _payload, met=met: met.set())
+            assert met.wait(20)
+            send_once(visitor, f"visitor-{number}", number)
+            assert bench.next(Grid).t_ns.tolist() == [number]
+    health = bench.health_with(lambda health: len(health.inputs) == 3)
+    last = bench.end()
+    for said, status in ((health, StageStatus.OK), (last, StageStatus.STOPPED)):
+        assert (said.status, said.problem, said.lost) == (status, "", 0)
+        assert [(line.received, line.missing, line.duplicated) for line in said.inputs] == [(1, 0, 0)] * 3
+    assert losses([health, last]) == {"resampler": 0}
 
 
 def test_each_tray_has_a_core_and_a_sequence_of_its_own(config):

@@ -7,6 +7,7 @@ import json
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from chain import DEMO, SITE, TRAY, Running, eventually, fantwin
@@ -17,7 +18,18 @@ from pipeline.commands.status import as_json, stage_table
 from pipeline.config import BusConfig, load_config
 from pipeline.watcher import StageView, Watcher
 from schemas.codec import encode, type_name
-from schemas.messages import Alarm, Counter, Header, Health, Input, Output, Severity, StageStatus
+from schemas.messages import (
+    Alarm,
+    Counter,
+    Diagnosis,
+    Header,
+    Health,
+    Input,
+    Output,
+    Severity,
+    StageStatus,
+    Transition,
+)
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
 NS_PER_S = 1_000_000_000
@@ -141,6 +153,33 @@ def test_machines_are_told_stages_rates_losses_and_alarms(site):
     assert stage["counters"] == {"lost_on_purpose": 4}
     assert stage["latency_ms"] == {"p50": 1.5, "p99": 2.5}
     assert (alarm["tray"], alarm["fan"], alarm["active"]) == (TRAY, 2, True)
+
+
+def test_people_are_told_how_alarms_stand_and_what_is_probably_wrong(site):
+    def tell(number: int, transition: Transition, **more: Any) -> None:
+        header, t_ns = Header("scorer-all-1", number, TRAY), ALARM.t_ns + number
+        site.alarm.put(
+            encode(replace(ALARM, header=header, t_ns=t_ns, transition=transition, **{"confirmed": True} | more))
+        )
+
+    over = {"active": False, "acknowledged": True}
+    cause = Diagnosis(cause="drag_up", probability=0.87)
+    tell(0, Transition.RAISED)
+    tell(1, Transition.DIAGNOSED, causes=(cause,), message="fan 2: more drag")
+    tell(2, Transition.ACKNOWLEDGED, causes=(cause,), acknowledged=True, message="fan 2: acknowledged")
+    tell(3, Transition.RAISED, fan=3, onset_t_ns=7)
+    tell(4, Transition.CLEARED, fan=3, onset_t_ns=7, **over)
+    tell(5, Transition.SHELVED, fan=4, onset_t_ns=0, severity=Severity.NONE, shelved_until_t_ns=2**63 - 1, **over)
+    watcher = Watcher(site.outside, SITE)
+    view(site, watcher, HEALTH)
+    watcher.ask_for_past_alarms()
+    text = shown(watcher)
+    assert "fan 2: active, acknowledged, drag_up 87 %; more drag" in " ".join(text.split())
+    assert "fan 3" not in text, "it is over, and everybody knows"
+    assert "fan 4: never raised, shelved until it clears" in text
+    told = {alarm["fan"]: alarm for alarm in as_json(watcher)["alarms"]}  # type: ignore[attr-defined]
+    assert (told[2]["acknowledged"], told[2]["causes"][0]["cause"]) == (True, "drag_up")
+    assert (told[3]["retained"], told[4]["presented"]) == (False, False)
 
 
 @pytest.mark.parametrize(

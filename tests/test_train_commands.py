@@ -112,6 +112,17 @@ def test_without_held_out_recordings_it_says_so(folder, tmp_path):
     assert "  training data, free run: rmse" in result.stdout
 
 
+def test_the_healthy_torque_balance_is_told(folder, tmp_path):
+    command = ("train", folder / "two.mcap", "--model", "physical", "--command-unit", "%", "-o", tmp_path / "t.onnx")
+    told = json.loads(fantwin(*command, "--json").stdout)
+    assert told["balance_source"] == ["physics"] * 2
+    low, high = sorted(told["balance_sigma"])
+    implied = PUBLISHED_PARAMETERS[0] * 3.0 * NOISE_RAD_S
+    assert (low, high) == (pytest.approx(implied, rel=0.1), pytest.approx(implied, rel=0.1))
+    line = f"  torque balance: healthy sigma {low:.4g} to {high:.4g} %; coefficients of 2 fan(s) by physics"
+    assert line in fantwin(*command).stdout.splitlines()
+
+
 def test_the_same_seed_gives_the_same_figures(folder, tmp_path):
     def train(seed: int) -> dict:
         arguments = ("--model", "neural-ode", "--iterations", 2, "--to", 15, "--seed", seed, "--json")

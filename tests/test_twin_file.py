@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from onnx import TensorProto, helper
 from pipeline.stage import StageError
 from pipeline.twin_file import CARD_PROPERTY, TwinFile
 from tests.test_models import random_narx
-from tests.twin_files import PARAMETERS, SIGMA_RAD_S, small_hybrid, write_twin
+from tests.twin_files import PARAMETERS, SIGMA_COMMAND, SIGMA_RAD_S, made_up_balance, small_hybrid, write_twin
 from twin.neural_ode import NeuralOde
 from twin.physical import PhysicalModel
 
@@ -59,6 +60,38 @@ def test_a_twin_of_one_fan_serves_every_fan_of_the_tray(tmp_path: Path) -> None:
     speeds, _ = five.advance(five.initial_state(np.zeros(5), commands[0]), commands, step_s)
     assert five.sigma_rad_s.shape == (5,)
     np.testing.assert_allclose(speeds, np.repeat(speed, 5, axis=1), rtol=1e-12)
+
+
+def test_the_balance_of_each_fan_is_read_and_that_of_one_fan_holds_for_all(tmp_path: Path) -> None:
+    two = TwinFile.load(write_twin(tmp_path / "two.onnx", fans=2), 2).balance
+    inertia, viscous, drag, lag_s = np.array(PARAMETERS)[:, np.newaxis] * [1.0, 1.05]
+    for value, expected in ((two.inertia, inertia), (two.viscous, viscous), (two.drag, drag), (two.lag_s, lag_s)):
+        np.testing.assert_allclose(value, expected)
+    assert two.filter_rate_per_s == 3.0
+    five = TwinFile.load(write_twin(tmp_path / "one.onnx"), 5).balance
+    assert five.std_errors.shape == (5, 4)
+    for array in (five.inertia, five.friction, five.sigma_command, five.autocorrelation_time_s):
+        assert array.shape == (5,)
+        assert np.ptp(array) == 0.0
+    np.testing.assert_allclose(five.sigma_command, SIGMA_COMMAND)
+
+
+def test_a_calibration_is_carried_as_it_stands(tmp_path: Path) -> None:
+    assert TwinFile.load(write_twin(tmp_path / "never.onnx"), 1).calibration is None
+    told = {"limits": [1.5, {"kind": "fast"}]}
+    assert TwinFile.load(write_twin(tmp_path / "twin.onnx", calibration=told), 1).calibration == told
+
+
+def test_a_balance_that_makes_no_sense_is_refused_by_name(tmp_path: Path) -> None:
+    whole = asdict(made_up_balance((PARAMETERS,)))
+    for changes, named in (
+        ({"sigma_command": [0.0]}, "balance.sigma_command"),
+        ({"inertia": [0.1, 0.1]}, "balance.inertia must have one value for each fan"),
+        ({"std_errors": [[1.0, 1.0, 1.0]]}, "balance.std_errors"),
+        ({"filter_rate_per_s": 0.0}, "balance.filter_rate_per_s"),
+    ):
+        assert named in _refusal(write_twin(tmp_path / "twin.onnx", balance=whole | changes))
+    assert "balance" in _refusal(write_twin(tmp_path / "twin.onnx", balance=None))
 
 
 def test_a_continuous_twin_starts_with_its_lagged_command_settled(tmp_path: Path) -> None:
@@ -114,13 +147,13 @@ def test_a_card_on_another_graph_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_newer_format_is_refused_even_if_its_card_looks_different(tmp_path: Path) -> None:
-    assert "update fantwin" in _refusal(write_twin(tmp_path / "a.onnx", format_version=3))
-    assert "update fantwin" in _refusal(write_twin(tmp_path / "b.onnx", format_version=3, sigma_rad_s=None))
+    assert "update fantwin" in _refusal(write_twin(tmp_path / "a.onnx", format_version=4))
+    assert "update fantwin" in _refusal(write_twin(tmp_path / "b.onnx", format_version=4, sigma_rad_s=None))
 
 
 def test_an_older_format_is_to_be_trained_anew(tmp_path: Path) -> None:
     line = _refusal(write_twin(tmp_path / "a.onnx", format_version=1, parameters=[[0.15, 0.12, 0.0005]], n_state=1))
-    assert "twin format 1, this fantwin knows 2: train it anew" in line
+    assert "twin format 1, this fantwin knows 3: train it anew" in line
 
 
 def test_a_card_without_a_format_is_refused(tmp_path: Path) -> None:

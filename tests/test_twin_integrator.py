@@ -16,7 +16,7 @@ from pipeline.twin_file import StateLayout, TwinFile
 from schemas.blocks import cut, join
 from schemas.messages import Grid, ModelCard, Prediction, WhyNot
 from stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
-from tests.twin_files import PARAMETERS, SIGMA_RAD_S, small_hybrid, write_twin
+from tests.twin_files import PARAMETERS, SIGMA_RAD_S, small_hybrid, still_balance, write_twin
 from twin import physics
 from twin.integration import step_through
 from twin.lag import effective_command
@@ -49,10 +49,19 @@ def physical_twin(fans: int = 1, kind: str = "physical") -> TwinFile:
         card_json="{}",
         layout=StateLayout(speed=1, command=1),
         sigma_rad_s=np.full(fans, 3.0),
+        balance=still_balance(fans),
+        calibration=None,
         command_range=(0.0, 100.0),
         rate_hz=100.0,
         advance=advance,
     )
+
+
+def twin_with_friction(friction: float, fans: int = 1) -> TwinFile:
+    """Commands below it do not turn the rotor; the balance has no lag."""
+    twin = physical_twin(fans)
+    balance = replace(twin.balance, friction=np.full(fans, friction), lag_s=np.zeros(fans))
+    return replace(twin, balance=balance)
 
 
 def core_of(twin: TwinFile | None = None, **config: float) -> TwinIntegratorCore:
@@ -247,6 +256,39 @@ def test_a_command_outside_what_the_twin_was_made_from_is_not_judged() -> None:
     out = WhyNot.OUT_OF_RANGE
     assert prediction.why_not[:, 0].tolist() == [WhyNot.NONE, WhyNot.NONE, out, out, WhyNot.NONE]
     assert core.counters()["out_of_range"] == 2
+
+
+def why_not_of(command: list[float], **config: float) -> list[int]:
+    core = core_of(twin_with_friction(10.0), warm_up_s=0.03, **config)
+    return feed(core, [grid_of(np.array([40.0] * 5 + command))]).why_not[5:, 0].tolist()
+
+
+@pytest.mark.parametrize("out", [9.9, 0.0, -50.0, 105.1, 1e6])
+def test_after_a_command_out_of_range_or_too_small_to_turn_the_rotor_the_twin_must_settle(out: float) -> None:
+    beyond, young, good = WhyNot.OUT_OF_RANGE, WhyNot.WARMING_UP, WhyNot.NONE
+    assert why_not_of([out, out, 40.0, 10.0, 40.0, 40.0]) == [beyond, beyond, young, young, good, good]
+
+
+def test_after_a_command_that_is_not_known_it_need_not() -> None:
+    assert why_not_of([NAN, 40.0, np.inf, 40.0]) == [WhyNot.OUT_OF_RANGE, WhyNot.NONE] * 2
+
+
+def test_it_must_settle_over_the_end_of_a_block_as_well() -> None:
+    core = core_of(twin_with_friction(10.0), warm_up_s=0.03)
+    grid = grid_of(np.array([40.0] * 5 + [0.0] + [40.0] * 4))
+    assert feed(core, split(grid, 6)).valid[:, 0].tolist() == [False] * 3 + [True] * 2 + [False] * 3 + [True] * 2
+
+
+def test_a_friction_amidst_the_commands_of_a_fan_that_was_held_at_one_speed_is_no_dead_zone() -> None:
+    held = replace(twin_with_friction(25.6), command_range=(24.5, 27.3))
+    prediction = feed(core_of(held), [grid_of(np.full(100, 25.0), np.full(100, 31.0))])
+    assert prediction.valid.all()
+    assert np.isfinite(prediction.torque_balance_command[40:]).all()
+
+
+def test_without_friction_a_small_or_reversed_command_is_as_good_as_any() -> None:
+    reversing = replace(physical_twin(), command_range=(-100.0, 100.0))
+    assert feed(core_of(reversing), [grid_of(np.array([40.0, 0.0, -50.0, -104.0]))]).valid.all()
 
 
 def test_an_unknown_command_of_one_fan_never_reaches_the_graph_and_leaves_the_other_alone() -> None:

@@ -26,6 +26,7 @@ from tests.test_twin_integrator import (
     grid_of,
     physical_twin,
     split,
+    twin_with_friction,
 )
 from tests.twin_files import small_hybrid, write_twin
 
@@ -53,12 +54,14 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> dict[str, TwinFile]:
         "physical": TwinFile.load(write_twin(folder / "physical.onnx"), FANS),
         "hybrid": TwinFile.load(write_twin(folder / "hybrid.onnx", small_hybrid()), FANS),
         "unstable": unstable_twin(),
+        "stiff": twin_with_friction(30.0, FANS),
     }
 
 
 WHAT_HAPPENS = (
     *("regular", "commands move", "no readings", "one reads at times", "one command unknown", "one far out"),
-    *("short gap", "long gap", "stale", "some lost", "many lost", "off the grid", "again", "earlier"),
+    *("off", "on and off", "short gap", "long gap", "stale"),
+    *("some lost", "many lost", "off the grid", "again", "earlier"),
 )
 
 
@@ -81,6 +84,8 @@ def grid_where(happenings: Iterable[tuple[str, int]], seed: int) -> Grid:
                 why[:] = WhyNot.STALE if what == "stale" else WhyNot.GAP
             if what == "one command unknown":
                 command[-1][1] = NAN
+            if what == "off" or (what == "on and off" and rng.random() < 0.5):
+                command[-1][:4] = 10.0
             if what == "one far out":
                 command[-1][2] = 150.0
             speed[-1][why > 0] = NAN
@@ -105,7 +110,7 @@ def predicted(core: TwinIntegratorCore, grids: Iterable[Grid]) -> tuple[Any, ...
 
 @settings(max_examples=80, deadline=None)
 @given(
-    name=st.sampled_from(["demo", "physical", "hybrid", "unstable"]),
+    name=st.sampled_from(["demo", "physical", "hybrid", "unstable", "stiff"]),
     happenings=st.lists(st.tuples(st.sampled_from(WHAT_HAPPENS), st.integers(1, 30)), min_size=1, max_size=10),
     seed=st.integers(0, 1000),
     size=st.integers(2, 400),

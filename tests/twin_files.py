@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
 
-from twin.card import CARD_KEY, Card, HealthyCard, NetworkCard, TrainingCard, ValidationCard
+from pipeline.twin_file import Balance
+from pipeline.twin_file import BalanceCard as BalanceOfCard
+from twin.balance import FILTER_RATE_PER_S
+from twin.card import CARD_KEY, BalanceCard, Card, HealthyCard, NetworkCard, TrainingCard, ValidationCard
 from twin.export import export_onnx
 from twin.hybrid import Hybrid
 from twin.models import Model
@@ -20,6 +24,7 @@ from twin.physics import PARAMETER_NAMES
 PARAMETERS = (0.15, 0.12, 0.0005, 0.02)
 """J, alpha, C_D, lag_s of a fan that settles within about a second."""
 SIGMA_RAD_S = 3.0
+SIGMA_COMMAND = 1.0
 COMMAND_RANGE = (0.0, 100.0)
 
 
@@ -52,6 +57,7 @@ def made_up_card(model: Model, fans: int) -> Card:
         parameter_interval_95=tuple(tuple((value, value) for value in fan) for fan in parameters),
         sigma_rad_s=tuple((SIGMA_RAD_S * scale).tolist()),
         healthy=HealthyCard(unknown, unknown, (), ((),) * fans, unknown),
+        balance=made_up_balance(parameters),
         speed_range_rad_s=(0.0, 500.0),
         command_range=COMMAND_RANGE,
         rate_hz=100.0,
@@ -61,6 +67,32 @@ def made_up_card(model: Model, fans: int) -> Card:
         versions={},
         command_unit="1",
     )
+
+
+def made_up_balance(parameters: tuple[tuple[float, ...], ...]) -> BalanceCard:
+    """The torque balance of fans with these parameters, (fans, 4), and no friction."""
+    inertia, viscous, drag, lag_s = zip(*parameters, strict=True)
+    each = np.ones(len(parameters))
+    return BalanceCard(
+        inertia=inertia,
+        viscous=viscous,
+        drag=drag,
+        friction=tuple((0.0 * each).tolist()),
+        std_errors=((0.001, 0.001, 1e-5, 0.1),) * len(parameters),
+        lag_s=lag_s,
+        source=("physics",) * len(parameters),
+        sigma_command=tuple((SIGMA_COMMAND * each).tolist()),
+        autocorrelation_time_s=tuple((0.02 * each).tolist()),
+        lowest_speed_rad_s=tuple((20.0 * each).tolist()),
+        filter_rate_per_s=FILTER_RATE_PER_S,
+    )
+
+
+def still_balance(fans: int) -> Balance:
+    """made_up_balance as a stage has it."""
+    card = BalanceOfCard.model_validate(asdict(made_up_balance((PARAMETERS,) * fans)))
+    arrays = {name: np.array(values) for name, values in card.of_fans.items()}
+    return Balance(**arrays, filter_rate_per_s=card.filter_rate_per_s)
 
 
 def write_twin(path: Path, model: Model | None = None, fans: int = 1, **changes: Any) -> Path:

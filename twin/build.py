@@ -10,7 +10,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from twin.card import Card, DataCard, HealthyCard, NetworkCard, TrainingCard, ValidationCard
+from twin.balance import FILTER_RATE_PER_S
+from twin.balance_fit import BalanceFit, fit_balance
+from twin.card import BalanceCard, Card, DataCard, HealthyCard, NetworkCard, TrainingCard, ValidationCard
 from twin.cross_validation import chosen_spread
 from twin.errors import TwinError
 from twin.evaluation import (
@@ -85,7 +87,7 @@ def train_twin(
 ) -> TrainedTwin:
     """Build a twin of healthy runs.
 
-    validation_runs: held out of the fit; they choose the best weights and give the healthy sigma and the card's
+    validation_runs: held out of the fit; they choose the best weights and give the healthy sigmas and the card's
     figures. Empty: the training runs do, and the card says so. network_inputs: of the hybrid's and neural ODE's
     network. physics: whether a hybrid's physics are refined along with its network, or stay as they were identified.
     trainer "adam" leaves them as they were, and its weights are those that did best in training.
@@ -125,6 +127,7 @@ def train_twin(
             f"the {kind} model of {name!r} diverges when run freely; record more levels, or try another kind"
         )
     validation = evaluate_model(model, parameters, sigma_rad_s, judged)
+    balance = fit_balance(runs, validation_runs, identification)
     speeds = np.concatenate([run.speed_rad_s.ravel() for run in runs])
     commands = np.concatenate([run.command.ravel() for run in runs])
     moved: Physics = physics if kind == "hybrid" and trainer == "levenberg-marquardt" else "fixed"
@@ -144,6 +147,7 @@ def train_twin(
         ),
         sigma_rad_s=healthy.sigma_rad_s,
         healthy=_healthy_card(healthy),
+        balance=_balance_card(balance),
         speed_range_rad_s=(float(np.nanmin(speeds)), float(np.nanmax(speeds))),
         command_range=(float(commands.min()), float(commands.max())),
         rate_hz=1.0 / float(np.median(np.concatenate([np.diff(run.t_s) for run in runs]))),
@@ -244,6 +248,23 @@ def _healthy_card(healthy: HealthyResidual) -> HealthyCard:
         probabilities=QUANTILES,
         quantiles_sigma=tuple(tuple(map(_finite, fan)) for fan in healthy.quantiles_sigma),
         max_sigma=tuple(map(_finite, healthy.max_sigma)),
+    )
+
+
+def _balance_card(balance: BalanceFit) -> BalanceCard:
+    inertia, viscous, drag, friction = (tuple(column) for column in balance.coefficients.T.tolist())
+    return BalanceCard(
+        inertia=inertia,
+        viscous=viscous,
+        drag=drag,
+        friction=friction,
+        std_errors=tuple((row[0], row[1], row[2], row[3]) for row in balance.std_errors.tolist()),
+        lag_s=tuple(balance.lag_s.tolist()),
+        source=balance.sources,
+        sigma_command=tuple(balance.sigma_command.tolist()),
+        autocorrelation_time_s=tuple(balance.autocorrelation_time_s.tolist()),
+        lowest_speed_rad_s=tuple(balance.lowest_speed_rad_s.tolist()),
+        filter_rate_per_s=FILTER_RATE_PER_S,
     )
 
 

@@ -8,11 +8,12 @@ from typing import Any, Literal
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
+from twin.balance import Source
 from twin.errors import TwinError
 from twin.models import Kind
 from twin.state import StateLayout
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 CARD_KEY = "fantwin.card"
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -87,13 +88,35 @@ class HealthyCard:
 
 
 @dataclass(frozen=True, config=STRICT)
+class BalanceCard:
+    """The torque balance (twin.balance), one entry a fan, in command units with rad/s and s.
+
+    std_errors: of inertia, viscous, drag and friction. source: which candidate they are, see twin.balance_fit.
+    sigma_command: the healthy standard deviation of the balance within a run. lowest_speed_rad_s: below it the balance
+    means nothing.
+    """
+
+    inertia: tuple[float, ...]
+    viscous: tuple[float, ...]
+    drag: tuple[float, ...]
+    friction: tuple[float, ...]
+    std_errors: tuple[tuple[float, float, float, float], ...]
+    lag_s: tuple[float, ...]
+    source: tuple[Source, ...]
+    sigma_command: tuple[float, ...]
+    autocorrelation_time_s: tuple[float, ...]
+    lowest_speed_rad_s: tuple[float, ...]
+    filter_rate_per_s: float
+
+
+@dataclass(frozen=True, config=STRICT)
 class Card:
     """Everything a reader of the file needs to know. Lists per fan come in the order of the fans.
 
     parameters: those in force, per fan, in the order of parameter_names. identified_parameters, parameter_std_errors:
     those of the physical model alone, with their standard errors; a refined twin's own differ, because its network
     has taken a share. sigma_rad_s: per fan, the healthy root mean square free-run error. The ranges are those seen in
-    training: outside them the twin is a guess.
+    training: outside them the twin is a guess. calibration: of the alarms, once they have been calibrated.
     """
 
     kind: Kind
@@ -109,6 +132,7 @@ class Card:
     parameter_interval_95: tuple[tuple[tuple[float, float], ...], ...]
     sigma_rad_s: tuple[float, ...]
     healthy: HealthyCard
+    balance: BalanceCard
     speed_range_rad_s: tuple[float, float]
     command_range: tuple[float, float]
     rate_hz: float
@@ -118,6 +142,7 @@ class Card:
     versions: dict[str, str]
     command_unit: str
     speed_unit: Literal["rad/s"] = "rad/s"
+    calibration: dict[str, Any] | None = None
     format_version: int = FORMAT_VERSION
 
     @property

@@ -30,12 +30,12 @@ from pipeline.errors import UserError
 from pipeline.signals import stop_on_signals
 
 DEMO_FOLDER = Path(__file__).parents[1] / "demo"
-DURATION_S = 32.0
+DURATION_S = 34.0
 FAULTS = (
     ("inlet", "fan=2,start=8,stop=14,size=1.8"),
     ("rotor", "fan=5,start=18,stop=24,size=0.8"),
 )
-OUTPUTS = ("recording*.mcap*", "view*.rrd", "bands.png", "summary.json", "truth.json", "up.log", "tray")
+OUTPUTS = ("recording*.mcap*", "view*.rrd", "bands.png", "summary.json", "truth.json", "up.log", "tray", "*.memory")
 _START_TIMEOUT_S = 60.0
 _STOP_TIMEOUT_S = 60.0
 
@@ -192,11 +192,13 @@ def _tell(summary: Summary, out: Path, took_s: float, console: Console) -> None:
     table = Table("fault", title="what happened, seconds since the first sample", title_justify="left", box=SIMPLE_HEAD)
     for column in ("fan", "start", "alarm", "delay", "removed", "cleared"):
         table.add_column(column, justify="right")
+    table.add_column("probable cause")
     for fault in summary.faults:
         times = (fault.start_ns, fault.alarm_ns, None, fault.stop_ns, fault.cleared_ns)
         cells = ["missed" if t is None else f"{(t - summary.start_ns) / 1e9:.2f}" for t in times]
         cells[2] = "" if fault.delay_s is None else f"{fault.delay_s:.2f}"
-        table.add_row(fault.kind, str(fault.fan), *cells)
+        cause = f"{fault.cause.replace('_', ' ')}, {fault.probability:.0%}" if fault.cause else ""
+        table.add_row(fault.kind, str(fault.fan), *cells, cause)
     console.print(table)
     p50, p99 = ("unknown" if t is None else f"{t:.1f} ms" for t in summary.latency_ms.values())
     console.print(

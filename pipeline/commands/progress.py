@@ -19,15 +19,15 @@ A_LINE_EVERY_S = 5.0
 
 
 @contextmanager
-def working(said: str) -> Iterator[None]:
-    """Around work that cannot tell how far it is."""
+def working(said: str) -> Iterator[Callable[[str], None]]:
+    """Around work that cannot tell how far it is; gives what says which part of it is being done."""
     console = Console(stderr=True)
     if not console.is_terminal:
         typer.echo(said, err=True)
-        yield
+        yield lambda part: typer.echo(part, err=True)
         return
-    with console.status(said):
-        yield
+    with console.status(said) as status:
+        yield status.update
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 import time
-from datetime import datetime
 from typing import Annotated
 
 import typer
@@ -20,9 +19,11 @@ from pipeline.commands.options import DEFAULT_CONFIG, ConfigOption, JsonOption, 
 from pipeline.config import Config, load_config
 from pipeline.errors import UserError
 from pipeline.signals import stop_on_signals
+from pipeline.standing_alarms import StandingAlarm, clock
 from pipeline.watcher import StageView, Watcher
-from schemas.messages import Alarm, StageStatus
+from schemas.messages import Severity, StageStatus
 
+_STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 _LISTEN_S = 2.5  # two healths of every stage, so that there are rates
 
 
@@ -87,7 +88,7 @@ def stage_table(watcher: Watcher, config: Config) -> Group:
         table.add_row(name, _state(view), f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}", *latency, lost)
         if health.problem and view.alive:
             problems.append(Text(f"{name}: {health.problem}", style="red"))
-    alarms = [_alarm_line(alarm) for alarm in watcher.alarms()]
+    alarms = [_alarm_line(each) for each in watcher.standing() if each.is_retained or each.is_quiet]
     if not any(view.alive and view.health.stage == "scorer" for view in views):
         alarms.append(Text("alarms unknown: no scorer is alive", style="red"))
     return Group(*([table] if views else []), *problems, *(alarms or [Text("no alarms", style="green")]))
@@ -103,10 +104,18 @@ def _state(view: StageView) -> Text:
     return Text(view.health.status.name.lower(), style=styles.get(view.health.status, "yellow"))
 
 
-def _alarm_line(alarm: Alarm) -> Text:
-    at = datetime.fromtimestamp(alarm.t_ns / 1e9).strftime("%H:%M:%S.%f")[:-3]
-    word, style = ("ALARM  ", "bold red") if alarm.active else ("cleared", "green")
-    return Text.assemble((f"{at}  {word}", style), f"  {alarm.header.tray}  {alarm.message}")
+def _alarm_line(standing: StandingAlarm) -> Text:
+    alarm = standing.newest
+    style = _STYLES[alarm.severity] if alarm.active else "green"
+    text = Text.assemble(
+        (f"{clock(alarm.t_ns)}  {alarm.severity.name:7}", style if standing.is_presented else "dim"),
+        f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(standing.words())}",
+    )
+    about = standing.message.removeprefix(f"fan {alarm.fan}: ")
+    if standing.causes:
+        first = standing.causes[0]
+        text.append(f", {first.cause} {100 * first.probability:.0f} %")
+    return text.append(f"; {about}") if about else text
 
 
 def as_json(watcher: Watcher) -> dict[str, object]:
@@ -128,15 +137,5 @@ def as_json(watcher: Watcher) -> dict[str, object]:
             }
             for view in watcher.stages()
         ],
-        "alarms": [
-            {
-                "tray": alarm.header.tray,
-                "fan": alarm.fan,
-                "active": alarm.active,
-                "t_ns": alarm.t_ns,
-                "onset_t_ns": alarm.onset_t_ns,
-                "message": alarm.message,
-            }
-            for alarm in watcher.alarms()
-        ],
+        "alarms": [standing.as_json() for standing in watcher.standing()],
     }

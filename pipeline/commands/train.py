@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
-from pipeline.commands.figures import figures_in, sentence
+from pipeline.commands.figures import figures_in, sentence, shown
 from pipeline.commands.model_maker import (
     FansOption,
     FromOption,
@@ -102,8 +102,19 @@ def train(
         return
     typer.echo(f"{output}: {model} of {told['fans']} fan(s), {told['network_parameters']} network parameters")
     typer.echo(f"  {told['judged_on']} data, {sentence(told, material.speed_unit)}")
+    typer.echo(f"  {balance_sentence(told)}")
     for warning in told["warnings"]:
         typer.echo(warning, err=True)
+
+
+def balance_sentence(told: dict[str, Any]) -> str:
+    """How still the torque balance of healthy fans is, in a line."""
+    lowest, highest = (shown(sigma(told["balance_sigma"])) for sigma in (min, max))
+    spread = lowest if lowest == highest else f"{lowest} to {highest}"
+    chosen: list[str] = told["balance_source"]
+    sources = ", ".join(f"{chosen.count(source)} fan(s) by {source}" for source in dict.fromkeys(chosen))
+    unit = told["command_unit"] or "of the command"
+    return f"torque balance: healthy sigma {spread} {unit}; coefficients of {sources}"
 
 
 def account(trained: TrainedTwin, material: Material, output: Path) -> dict[str, Any]:
@@ -116,6 +127,9 @@ def account(trained: TrainedTwin, material: Material, output: Path) -> dict[str,
         "judged_on": card.validation.source,
         "speed_unit": material.speed_unit,
         "sigma": [sigma / material.rad_s_per_unit for sigma in card.sigma_rad_s],
+        "balance_sigma": list(card.balance.sigma_command),
+        "balance_source": list(card.balance.source),
+        "command_unit": card.command_unit,
         "fans": card.fans,
         "network_parameters": card.network.parameter_count,
         "iterations": card.training.iterations,

@@ -1,6 +1,7 @@
 #!/bin/sh
-# Trains twin.onnx, the twin of the demo's tray, on recordings of that tray that hold no fault. The demo runs the
-# same fans on commands that none of these recordings has.   sh train_twin.sh [FANTWIN] [OUT.onnx]
+# Trains twin.onnx, the twin of the demo's tray, on recordings of that tray that hold no fault, and calibrates its
+# alarms on two hours more. The demo runs the same fans on commands that none of these recordings has.
+#   sh train_twin.sh [FANTWIN] [OUT.onnx]
 set -eu
 fantwin=${1:-fantwin}
 out=${2:-$(dirname "$0")/twin.onnx}
@@ -14,7 +15,12 @@ record multisine multisine 101 80
 record manual manual 102 80
 record staircase staircase 103 60
 record held-out manual 104 120
+record healthy-1 manual 105 3600
+record healthy-2 manual 106 3600
+record healthy-3 manual 107 1200
 
 "$fantwin" train "$work/multisine.mcap" "$work/manual.mcap" "$work/staircase.mcap" --model hybrid \
     --validate "$work/held-out.mcap" --name "demo tray" --seed 1 -o "$out"
 "$fantwin" evaluate "$out" "$work/held-out.mcap"
+"$fantwin" calibrate "$out" "$work/healthy-1.mcap" "$work/healthy-2.mcap" --false-alarms-per-day 5 \
+    --verify "$work/healthy-3.mcap"

@@ -10,6 +10,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -19,7 +20,7 @@ from pipeline.replay.plan import RawSpan, ResamplerSession, RowSession, RowSpan,
 from pipeline.stage import Context, Core
 from pipeline.table_of_stages import load_stage
 from schemas.blocks import cut
-from schemas.messages import Grid, Message, Prediction, Raw, Score, WhyNot
+from schemas.messages import Grid, Memory, Message, Prediction, Raw, Score, WhyNot
 
 BLOCK = 512
 """messages and rows that are handed over at once"""
@@ -127,15 +128,45 @@ class Chain:
             StageError: a stage cannot be built as configured.
             CodecError: a raw packet cannot be decoded.
         """
+        own: Memory | None = None
         for session in self._plan.scorer:
-            core = self._core("scorer")
-            for prediction in self._rows(self._predictions, session.spans):
-                for message in core.step(prediction):
-                    if isinstance(message, Score):
-                        self._count(message)
-                    self._observe(message)
-                    yield Made(session.producer, message)
-            self._end(core)
+            core: Any = self._core("scorer")
+            memory = self._plan.memories.get(session.producer)
+            if memory and not self._plan.is_as_recorded:
+                memory = own  # what the one before has found here, which may be something else
+            remembered = core.restore(memory) if memory else ()
+            for message in chain(remembered, self._score(core, session)):
+                if isinstance(message, Score):
+                    self._count(message)
+                self._observe(message)
+                yield Made(session.producer, message)
+            own = next((message for message in self._end(core) if isinstance(message, Memory)), None)
+
+    def predictions(self) -> Iterator[Prediction]:
+        """What the scorer would be fed, and no scorer.
+
+        Raises:
+            StageError, CodecError: see `run`.
+        """
+        for session in self._plan.scorer:
+            yield from self._rows(self._predictions, session.spans)
+
+    def _score(self, core: Core, session: RowSession) -> Iterator[Message]:
+        """What the scorer makes of its predictions, and of the requests that it was given between them."""
+        requests = deque(self._plan.requests.get(session.producer, ()))
+        for block in self._rows(self._predictions, session.spans):
+            done = 0
+            while requests and requests[0][0] <= block.t_ns[-1]:
+                after_t_ns, request = requests.popleft()
+                row = max(done, int(np.searchsorted(block.t_ns, after_t_ns, side="right")))
+                if row > done:
+                    yield from core.step(cut(block, done, row))
+                    done = row
+                yield from core.step(request)
+            if done < len(block.t_ns):
+                yield from core.step(cut(block, done, len(block.t_ns)) if done else block)
+        for _, request in requests:
+            yield from core.step(request)
 
     @property
     def raw_missing(self) -> int:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from schemas.messages import Alarm
+from schemas.messages import Alarm, Diagnosis
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,12 @@ class Episode:
     cleared_ns: int | None
     onset_ns: int
     severity: str
+    """the highest"""
     residual_rad_s: float
+    torque_balance_command: float
     message: str
+    causes: tuple[Diagnosis, ...]
+    """as they were known last"""
 
     def as_json(self) -> dict[str, Any]:
         """For machines; times in the recording's own clock, ns."""
@@ -32,7 +36,9 @@ class Episode:
             "onset_ns": self.onset_ns,
             "severity": self.severity,
             "residual": self.residual_rad_s,
+            "torque_balance": self.torque_balance_command,
             "message": self.message,
+            "causes": [asdict(cause) for cause in self.causes],
         }
 
 
@@ -42,14 +48,14 @@ def episodes(alarms: Iterable[Alarm]) -> list[Episode]:
     A session of the scorer that raises what an earlier one had raised and never cleared goes on with that alarm.
     """
     found: list[Episode] = []
-    standing: dict[tuple[str, int], Alarm] = {}
+    standing: dict[tuple[str, int], list[Alarm]] = {}
     for alarm in sorted(alarms, key=lambda alarm: alarm.t_ns):
         fan = (alarm.header.tray, alarm.fan)
         if alarm.active:
-            standing.setdefault(fan, alarm)
+            standing.setdefault(fan, []).append(alarm)
         elif fan in standing:
-            found.append(_episode(standing.pop(fan), alarm.t_ns))
-    found += [_episode(alarm, None) for alarm in standing.values()]
+            found.append(_episode([*standing.pop(fan), alarm], alarm.t_ns))
+    found += [_episode(told, None) for told in standing.values()]
     return sorted(found, key=lambda episode: (episode.raised_ns, episode.tray, episode.fan))
 
 
@@ -87,14 +93,18 @@ def _to(episode: Episode) -> int:
     return 2**63 if episode.cleared_ns is None else episode.cleared_ns
 
 
-def _episode(alarm: Alarm, cleared_ns: int | None) -> Episode:
+def _episode(told: list[Alarm], cleared_ns: int | None) -> Episode:
+    """told: all that was said of it, in order."""
+    first = told[0]
     return Episode(
-        tray=alarm.header.tray,
-        fan=alarm.fan,
-        raised_ns=alarm.t_ns,
+        tray=first.header.tray,
+        fan=first.fan,
+        raised_ns=first.t_ns,
         cleared_ns=cleared_ns,
-        onset_ns=alarm.onset_t_ns,
-        severity=alarm.severity.name.lower(),
-        residual_rad_s=alarm.residual_rad_s,
-        message=alarm.message,
+        onset_ns=first.onset_t_ns,
+        severity=max(alarm.severity for alarm in told).name.lower(),
+        residual_rad_s=first.residual_rad_s,
+        torque_balance_command=first.torque_balance_command,
+        message=first.message,
+        causes=next((alarm.causes for alarm in reversed(told) if alarm.causes), ()),
     )

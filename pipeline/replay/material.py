@@ -15,7 +15,7 @@ from pipeline.recordings.packets import Packet, PacketReading
 from pipeline.recordings.reading import Head, RecordingError, read_head
 from pipeline.replay.made_up import first_raw, made_up_config
 from pipeline.replay.place import attached_config
-from pipeline.replay.plan import CHAIN, Planner, TrayPlan, UnplannedError
+from pipeline.replay.plan import CHAIN, SIDE_TOPICS, Planner, SideInputs, TrayPlan, UnplannedError
 from pipeline.stage import Context
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Raw
@@ -69,12 +69,14 @@ class Material:
         alarms: dict[tuple[str, int], Alarm] = {}
         undecodable = 0
         planner: Planner | None = Planner()
-        for packet in self.packets(tray, (*CHAIN.values(), "alarm")):
+        side = SideInputs()
+        for packet in self.packets(tray, (*CHAIN.values(), *SIDE_TOPICS)):
             try:
-                if packet.topic.name == "alarm":
-                    alarm = decode(Alarm, packet.payload)
-                    assert isinstance(alarm, Alarm)
-                    alarms.setdefault((alarm.header.producer, alarm.header.sequence), alarm)
+                if packet.topic.name in SIDE_TOPICS:
+                    message = decode(packet.topic.message, packet.payload)
+                    side.note(message)
+                    if isinstance(message, Alarm):
+                        alarms.setdefault((message.header.producer, message.header.sequence), message)
                 elif planner:
                     planner.note(packet)
             except UnplannedError:
@@ -84,7 +86,10 @@ class Material:
         if undecodable:
             self.damage[self.paths[0]] = f"{self.paths[0]}: messages left out that cannot be decoded: {undecodable}"
         usable = planner is not None and self.is_same_grid and not self.is_part
-        return planner.plan() if planner and usable else None, list(alarms.values())
+        plan = planner.plan() if planner and usable else None
+        if plan:
+            side.add_to(plan, is_as_recorded=self.is_as_recorded)
+        return plan, list(alarms.values())
 
     def contexts(self, tray: TrayConfig) -> dict[str, Context]:
         """What the stages of a tray are built from."""

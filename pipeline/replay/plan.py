@@ -12,10 +12,12 @@ from dataclasses import dataclass, field
 from pipeline.recordings.packets import Packet, header_of
 from schemas import fan_pb2
 from schemas.codec import decode
-from schemas.messages import Grid, Prediction, Score
+from schemas.messages import Alarm, Grid, Memory, Message, Prediction, Request, Score
 
 CHAIN = {"resampler": "grid", "twin_integrator": "prediction", "scorer": "score"}
 """The stages that decide, in the order of the data, and the topic whose rows tell what each was fed."""
+
+SIDE_TOPICS = ("alarm", "memory", "request")
 
 
 @dataclass
@@ -68,6 +70,12 @@ class TrayPlan:
     """sessions that had taken something before the recording begins: they cannot be made the same again"""
     last_scored_t_ns: dict[str, int]
     """of each session of the scorer, the newest sample whose score is recorded"""
+    memories: dict[str, Memory] = field(default_factory=dict)
+    """what sessions of the scorer began with"""
+    is_as_recorded: bool = True
+    """what is judged by is the recording's own; else a session goes on from what the one before finds now"""
+    requests: dict[str, list[tuple[int, Request]]] = field(default_factory=dict)
+    """of each session of the scorer: what operators asked for, and after which sample, in order"""
 
     @property
     def restarts(self) -> int:
@@ -103,6 +111,8 @@ class Planner:
     def plan(self) -> TrayPlan | None:
         """The sessions; None where what is recorded does not tell all of them."""
         grids, predictions, scores = (list(book.sessions.values()) for book in self._books.values())
+        if not all(session.spans for session in (*predictions, *scores)):
+            return None  # of another version: their rows cannot be read
         for made, fed in ((predictions, grids), (scores, predictions)):
             known = {session.producer for session in fed}
             if not made or not all(span.producer in known for session in made for span in session.spans):
@@ -116,6 +126,34 @@ class Planner:
         )
         _open_the_ends(plan)
         return plan
+
+
+class SideInputs:
+    """What the scorer was given besides predictions; its own answers tell when."""
+
+    def __init__(self) -> None:
+        self.memories: dict[str, Memory] = {}
+        self._requests: dict[str, Request] = {}
+        self._answers: dict[tuple[str, str], tuple[int, int]] = {}
+
+    def note(self, message: Message) -> None:
+        """Take the next message of the topics `memory`, `request` and `alarm`."""
+        producer, sequence = message.header.producer, message.header.sequence
+        if isinstance(message, Memory) and message.restored:
+            self.memories.setdefault(producer, message)
+        elif isinstance(message, Request):
+            self._requests[f"{producer}/{sequence}"] = message
+        elif isinstance(message, Alarm) and message.request:
+            self._answers.setdefault((producer, message.request), (sequence, message.t_ns))
+
+    def add_to(self, plan: TrayPlan, *, is_as_recorded: bool) -> None:
+        """Tell a plan of them. A session that began with a memory needs nothing of what came before it."""
+        plan.memories = self.memories
+        plan.is_as_recorded = is_as_recorded
+        plan.began_before -= set(self.memories)
+        for (producer, name), (_, t_ns) in sorted(self._answers.items(), key=lambda answer: answer[1]):
+            if name in self._requests:
+                plan.requests.setdefault(producer, []).append((t_ns, self._requests[name]))
 
 
 @dataclass

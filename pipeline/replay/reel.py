@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import fields, replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -139,8 +140,14 @@ def shifted(entry: Entry, by_ns: int) -> Entry:
     if not by_ns:
         return entry
     message = entry.message
-    times = {f.name: getattr(message, f.name) + by_ns for f in fields(message) if f.name.endswith("t_ns")}
+    times = {f.name: _later(getattr(message, f.name), by_ns) for f in fields(message) if f.name.endswith("t_ns")}
     return replace(entry, message=replace(message, **times), log_time_ns=entry.log_time_ns + by_ns)
+
+
+def _later(t_ns: Any, by_ns: int) -> Any:
+    """A time of a message, or an array of them. What is no time of an alarm (never, until it clears) stays so."""
+    is_none = isinstance(t_ns, int) and not 0 < t_ns < 2**63 - 1
+    return t_ns if is_none else t_ns + by_ns
 
 
 def _last_log_time_ns(file: Path) -> int:

@@ -101,13 +101,13 @@ def note_not_made(t_ns: Array, found: Comparison) -> None:
 
 
 def compare_alarms(made: Iterable[Alarm], recorded: Iterable[Alarm], last_scored_t_ns: int, found: Comparison) -> None:
-    """Hold the alarms of one session against those recorded: each is named by fan, time and being raised or cleared.
+    """Hold the alarms of one session against those recorded: each is named by fan, time, transition and request.
 
     An alarm leaves right after its score: of the last score that was recorded it may be missing, and after that it is.
     """
-    left = {(alarm.fan, alarm.t_ns, alarm.active): alarm for alarm in recorded}
+    left = {(alarm.fan, alarm.t_ns, alarm.transition, alarm.request): alarm for alarm in recorded}
     for alarm in made:
-        other = left.pop((alarm.fan, alarm.t_ns, alarm.active), None)
+        other = left.pop((alarm.fan, alarm.t_ns, alarm.transition, alarm.request), None)
         if other is not None and _without_header(alarm) == _without_header(other):
             found.alarms_equal += 1
         elif other is not None:
@@ -167,4 +167,4 @@ def _without_header(message: Message) -> tuple[Any, ...]:
 
 
 def _said(alarm: Alarm) -> str:
-    return f"{'raised' if alarm.active else 'cleared'} at {when(alarm.t_ns)}, {alarm.message!r},"
+    return f"{alarm.transition.name.lower()} at {when(alarm.t_ns)}, {alarm.message!r},"

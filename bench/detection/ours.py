@@ -1,0 +1,115 @@
+"""The scorer itself as a detector, and its calibration on simulated running that is too long for a recording.
+
+`fantwin calibrate` does the same with recordings. Here the healthy samples of all trays lie in plain files of a
+temporary folder, in single precision, and one set of limits is found for the whole fleet.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from bench.detection.methods import Change, Verdict
+from bench.detection.plant import BLOCK, STEP_NS
+from pipeline.stage import Core
+from pipeline.twin_file import TwinFile
+from schemas.messages import Alarm, Array, Prediction, Score
+from scoring.calibration import calibrate
+from scoring.judge import Samples, samples_of
+from scoring.limits import Limits, Timing
+from twin.calibrated import with_calibration
+
+NAME = "fantwin"
+COLUMNS = ("speed_rad_s", "speed_residual", "balance")
+FLAGS = ("speed_valid", "balance_valid", "missing", "alive")
+
+
+class Scorer:
+    """The stage's core. Its score is the furthest of its statistics, in multiples of that one's limit."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+
+    def take(self, block: Prediction) -> Verdict:
+        """See methods.Detector."""
+        scores: list[Array] = []
+        changes: list[Change] = []
+        for message in self._core.step(block):
+            if isinstance(message, Score):
+                scores.append(message.score)
+            elif isinstance(message, Alarm):
+                causes = sorted(message.causes, key=lambda one: -one.probability)
+                told = tuple(one.cause for one in causes)
+                changes.append(Change(message.fan, message.t_ns, message.active, told))
+        return Verdict(np.concatenate(scores), changes)
+
+
+class HealthySamples:
+    """Samples of healthy runs, kept in files, to be gone through several times."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._fans: dict[str, int] = {}
+        self._rows: dict[str, int] = {}
+
+    def take(self, run: str, block: Prediction) -> None:
+        """Keep a block of a run."""
+        samples = samples_of(block)
+        self._fans[run] = block.fans
+        self._rows[run] = self._rows.get(run, 0) + len(block.t_ns)
+        for name in (*COLUMNS, *FLAGS):
+            column: Array = getattr(samples, name)
+            with self._file(run, name).open("ab") as file:
+                column.astype(np.float32 if name in COLUMNS else np.bool_).tofile(file)
+
+    def __call__(self) -> Iterator[tuple[int, Iterable[Samples]]]:
+        """All runs from the beginning, as scoring.calibration wants them."""
+        for run, fans in self._fans.items():
+            yield fans, self._blocks(run, fans)
+
+    def clear(self) -> None:
+        """Remove the files."""
+        for run in self._fans:
+            for name in (*COLUMNS, *FLAGS):
+                self._file(run, name).unlink()
+        self._fans.clear()
+
+    def _blocks(self, run: str, fans: int) -> Iterator[Samples]:
+        shape = (self._rows[run], fans)
+        columns = {
+            name: np.memmap(self._file(run, name), np.float32 if name in COLUMNS else np.bool_, "r", shape=shape)
+            for name in (*COLUMNS, *FLAGS)
+        }
+        for first in range(0, shape[0], BLOCK):
+            rows = slice(first, min(first + BLOCK, shape[0]))
+            yield Samples(
+                t_ns=STEP_NS * np.arange(rows.start, rows.stop),
+                step_ns=STEP_NS,
+                **{name: np.array(column[rows], np.float64) for name, column in columns.items() if name in COLUMNS},
+                **{name: np.array(column[rows]) for name, column in columns.items() if name in FLAGS},
+            )
+
+    def _file(self, run: str, name: str) -> Path:
+        return self._folder / f"{run.replace('/', '-')}.{name}"
+
+
+def calibrated_twins(
+    twins: Iterable[Path], healthy: HealthySamples, alarms_per_day: float, *, extrapolate: bool
+) -> tuple[list[Path], Limits]:
+    """Twins with limits in their cards, beside the ones given; and the limits.
+
+    Raises:
+        TooLittleError: the healthy running cannot support so low a rate.
+    """
+    given = list(twins)
+    top_speed_rad_s = max(max(json.loads(TwinFile.load(path).card_json)["speed_range_rad_s"]) for path in given)
+    limits = calibrate(healthy, top_speed_rad_s, Timing(), alarms_per_day, extrapolate=extrapolate)
+    calibration = json.loads(limits.model_dump_json())
+    made = []
+    for path in given:
+        made.append(path.with_name(f"calibrated-{path.name}"))
+        made[-1].write_bytes(with_calibration(path.read_bytes(), calibration))
+    return made, limits

@@ -1,0 +1,102 @@
+"""The whole decision beside other ways to decide: false alarms, delays, misses and causes where the truth is known.
+
+Simulated: 200 fans that differ, days that differ, twins learned from data; limits for one false alarm of a fan in 30
+days, all set on the same healthy runs; then other healthy days, and five strengths of each kind of fault, in open loop
+and under a speed loop. Measured: the rosa rig, by the public commands, limits and twins from healthy runs alone. Every
+figure is of runs that nothing was learned from.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from bench.detection.measured import measured_tables
+from bench.detection.simulated_tables import (
+    Sizes,
+    cause_rows,
+    healthy_rows,
+    judged_faults,
+    kind_rows,
+    method_rows,
+    prepared,
+)
+from bench.printing import JsonOption, progress, show
+from scoring.calibration import TooLittleError
+
+
+def main(
+    only: Annotated[str, typer.Option(help="simulated or measured; without it, both.")] = "",
+    fans: Annotated[int, typer.Option(help="Simulated fans, in trays of 50.")] = 200,
+    declared_days: Annotated[float, typer.Option(help="One false alarm of a fan in so many days is declared.")] = 30.0,
+    calibration_days: Annotated[float, typer.Option(help="Healthy fan-days to calibrate on.")] = 25.0,
+    healthy_days: Annotated[float, typer.Option(help="Other healthy fan-days, to count false alarms in.")] = 50.0,
+    runs: Annotated[int, typer.Option(help="Healthy runs, of a day each, that they are parted into.")] = 8,
+    fault_runs: Annotated[int, typer.Option(help="Runs with a fault of every fan.")] = 20,
+    commissioned_s: Annotated[
+        float, typer.Option(help="Faults begin so long after the run, or half a minute later.")
+    ] = 60.0,
+    extrapolate: Annotated[bool, typer.Option(help="Set limits beyond what the healthy fan-days can show.")] = True,
+    libraries: Annotated[bool, typer.Option(help="PyOD and river as well.")] = True,
+    seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 1,
+    json_output: JsonOption = False,
+) -> None:
+    """Print the tables of the simulated and of the measured part."""
+    began_s = time.monotonic()
+    tables: dict[str, list[dict[str, Any]]] = {}
+    notes: list[str] = []
+    if only != "measured":
+        sizes = Sizes(fans, declared_days, calibration_days, healthy_days, runs, fault_runs, commissioned_s, seed)
+        with tempfile.TemporaryDirectory() as folder:
+            _simulated(Path(folder), sizes, extrapolate, libraries, tables, notes)
+    if only != "simulated":
+        measured, told = measured_tables(progress, libraries=libraries)
+        tables |= measured
+        notes += told
+    notes.append(f"all of it took {(time.monotonic() - began_s) / 60:.1f} min")
+    show(tables, notes, as_json=json_output)
+
+
+def _simulated(
+    folder: Path,
+    sizes: Sizes,
+    extrapolate: bool,
+    libraries: bool,
+    tables: dict[str, list[dict[str, Any]]],
+    notes: list[str],
+) -> None:
+    try:
+        bench = prepared(folder, sizes, extrapolate=extrapolate, libraries=libraries, tell=progress)
+    except TooLittleError as error:
+        raise SystemExit(
+            f"{sizes.calibration_days:g} healthy fan-days cannot support one alarm of a fan in "
+            f"{sizes.declared_days:g} days: give --calibration-days {error.needed_fan_hours / 24:.3g}, or --extrapolate"
+        ) from error
+    tables["simulated, healthy running of other days"] = healthy_rows(bench, sizes, progress)
+    faulty = judged_faults(bench, sizes, progress)
+    tables["simulated faults, by method"] = method_rows(faulty, bench)
+    tables["simulated faults, fantwin, by kind and strength"] = kind_rows(faulty)
+    tables["causes told first by fantwin, command moving"] = cause_rows(faulty, is_moved=True)
+    tables["causes told first by fantwin, command held"] = cause_rows(faulty, is_moved=False)
+    promise = bench.limits.promise
+    assert promise
+    low, high = (sizes.declared_days * figure for figure in promise.interval_95)
+    notes += [
+        f"declared: one false alarm of a fan in {sizes.declared_days:g} days; by the calibration's own interval "
+        f"{low:.2g} to {high:.2g}, from {promise.fan_hours / 24:.3g} fan-days"
+        + (", extrapolated" if promise.extrapolated else ""),
+        f"all other limits: no more than {bench.calibration.allowed} excursions on the same fan-days; '+-2 sigma, as "
+        "published' and 'CUSUM, textbook limit' have their own",
+        "PyOD judges one fan in 3, river one in 13; delays: median and quartiles of what was found",
+    ]
+
+
+if __name__ == "__main__":
+    typer.run(main)

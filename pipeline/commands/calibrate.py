@@ -1,0 +1,171 @@
+"""`fantwin calibrate`: alarm limits from healthy running, with a declared number of false alarms."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.commands.calibration_check import check_promise
+from pipeline.commands.model_maker import model_maker
+from pipeline.commands.options import JsonOption, SetOption
+from pipeline.commands.progress import working
+from pipeline.errors import UserError
+from pipeline.replay.healthy import HealthyRuns
+from pipeline.twin_file import TwinFile
+from scoring.calibration import TooLittleError
+from scoring.calibration import calibrate as find_limits
+from scoring.limits import Limits, ResidualLimits, Timing
+
+EXIT_BROKEN = 3
+
+
+def calibrate(
+    twin: Annotated[Path, typer.Argument(metavar="TWIN.onnx", help="Twin whose alarms are calibrated.")],
+    healthy: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="HEALTHY.mcap...", help="Healthy recordings, best such as the twin was not trained on."),
+    ] = None,
+    false_alarms_per_day: Annotated[
+        float | None, typer.Option(help="What is declared: false alarms per fan and day.", min=1e-6, max=8640)
+    ] = None,
+    verify: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="OTHER.mcap...", help="Other healthy recordings, to test what was declared."),
+    ] = None,
+    extrapolate: Annotated[
+        bool, typer.Option("--extrapolate", help="Set limits beyond what so little data can show; promises nothing.")
+    ] = False,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="OUT.onnx", help="Write there, not into TWIN.onnx.")
+    ] = None,
+    overrides: SetOption = None,
+    seed: Annotated[int, typer.Option(help="Of the bootstrap.")] = 0,
+    json_output: JsonOption = False,
+) -> None:
+    """Set the alarm limits of a twin by healthy recordings, and write them into its card.
+
+    Every recording is judged as a live fan is, from its own start. Limits are set where false alarms come as often as
+    declared; what the data cannot support is refused, with how much would be needed. Alarms of a twin that was never
+    calibrated rest on its speed band alone.
+
+    Exit codes: 0 well; 1 could not be done; 3 --verify found more false alarms than declared.
+
+    Example: fantwin calibrate TWIN.onnx healthy-1.mcap healthy-2.mcap --false-alarms-per-day 1 --verify healthy-3.mcap
+    """
+    if not healthy and not verify:
+        raise UserError("nothing to calibrate on: name healthy recordings, or --verify OTHER.mcap to test what is set")
+    result: dict[str, Any] = {}
+    if healthy:
+        if false_alarms_per_day is None:
+            raise UserError("say what is declared: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
+        limits = _calibrated(twin, healthy, false_alarms_per_day, extrapolate, overrides or [], seed)
+        output = output or twin
+        _write(twin, output, limits)
+        result = {"twin": str(output), "calibration": json.loads(limits.model_dump_json())}
+        if not json_output:
+            _tell(output, limits)
+    check = check_promise(output or twin, verify, overrides or []) if verify else None
+    if check:
+        result["verify"] = check.as_json()
+    if json_output:
+        typer.echo(json.dumps(result))
+    elif check:
+        typer.echo(check.said)
+    if check and check.is_broken:
+        raise typer.Exit(EXIT_BROKEN)
+
+
+def _calibrated(
+    twin: Path, healthy: list[Path], per_day: float, extrapolate: bool, overrides: list[str], seed: int
+) -> Limits:
+    card = json.loads(TwinFile.load(twin).card_json)
+    top_speed_rad_s = max(abs(speed) for speed in card["speed_range_rad_s"])
+    with working("judging healthy recordings") as tell:
+        runs = HealthyRuns(healthy, twin, overrides, tell)
+        try:
+            limits = find_limits(runs, top_speed_rad_s, Timing(), per_day, seed, extrapolate)
+        except TooLittleError as error:
+            raise UserError(_too_little(error, per_day)) from error
+    assert limits.promise
+    promise = limits.promise.model_copy(
+        update={
+            "data": tuple({"name": path.name, "sha256": _sha256(path)} for path in healthy),
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+    )
+    return limits.model_copy(update={"promise": promise})
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _too_little(error: TooLittleError, per_day: float) -> str:
+    if error.fan_hours < error.needed_fan_hours:
+        return (
+            f"{error.fan_hours:.2g} fan-hours of healthy running cannot support {_rate(per_day)}: that takes "
+            f"{error.needed_fan_hours:.3g}; record more, declare {_round_up(error.least_per_day):g} or more, or set "
+            "limits that promise nothing: --extrapolate"
+        )
+    return f"{error.fan_hours * 3600:.0f} s of healthy running is too little for any limit: give a minute at least"
+
+
+def _rate(per_day: float) -> str:
+    return f"{per_day:g} false alarm{'s' * (per_day != 1)} per fan and day"
+
+
+def _runs(count: int) -> str:
+    return f"{count} run{'s' * (count != 1)}"
+
+
+def _round_up(rate: float) -> float:
+    """To two digits, so that it is enough when it is typed."""
+    unit = 10.0 ** (math.floor(math.log10(rate)) - 1)
+    return math.ceil(rate / unit) * unit
+
+
+def _write(twin: Path, output: Path, limits: Limits) -> None:
+    with model_maker():
+        from twin.calibrated import with_calibration  # noqa: PLC0415  the command line loads twin only when needed
+
+        content = with_calibration(twin.read_bytes(), json.loads(limits.model_dump_json()))
+    beside = output.with_name(output.name + ".new")
+    try:
+        beside.write_bytes(content)
+        beside.replace(output)
+    except OSError as error:
+        raise UserError(f"{output}: cannot write the twin: {error.strerror}") from error
+
+
+def _tell(output: Path, limits: Limits) -> None:
+    promise = limits.promise
+    assert promise
+    console = Console(highlight=False, soft_wrap=True)
+    table = Table("residual", box=None, pad_edge=False)
+    for column in ("step", "drift", "growth", "memory of the healthy residual"):
+        table.add_column(column, justify="right")
+    for name in ("speed", "balance"):
+        of: ResidualLimits = getattr(limits, name)
+        figures = ["-" if limit is None else f"{limit:.3g}" for limit in (of.step, of.drift, of.growth)]
+        table.add_row(name, *figures, f"{of.autocorrelation_time_s:.2g} s")
+    low, high = promise.interval_95
+    console.print(
+        f"{output}: alarms calibrated on {promise.fan_hours:.3g} fan-hours in {_runs(promise.runs)}", markup=False
+    )
+    console.print("limits, in standard deviations of each healthy statistic:")
+    console.print(table)
+    declared = _rate(promise.false_alarms_per_day)
+    if promise.extrapolated:
+        console.print(f"[yellow]aimed at {declared}, beyond what so little data can show: nothing is promised[/yellow]")
+    else:
+        console.print(f"declared: {declared} (95 % by these data: {low:.3g} to {high:.3g})")
+    console.print("test it on other healthy recordings: fantwin calibrate TWIN.onnx --verify OTHER.mcap")

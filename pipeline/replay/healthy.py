@@ -1,0 +1,94 @@
+"""Healthy recordings as the scorer would be fed them: what alarms are calibrated on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import UserError
+from pipeline.replay.chain import Chain
+from pipeline.replay.material import open_material
+from pipeline.replay.plan import undisturbed
+from schemas.codec import CodecError
+from scoring.judge import Samples, samples_of
+
+KEPT_SAMPLES = 10_000_000
+"""of fans, about 80 bytes each: so many are kept between passes, what is beyond is made anew"""
+
+
+@dataclass(frozen=True)
+class HealthyRun:
+    """One tray of one recording."""
+
+    path: Path
+    tray: str
+    fans: int
+
+
+class HealthyRuns:
+    """Recordings, each judged from its start as a live tray is; to be gone through several times."""
+
+    def __init__(
+        self, paths: Sequence[Path], twin: Path, overrides: Sequence[str], progress: Callable[[str], None]
+    ) -> None:
+        self._paths = paths
+        self._twin = twin
+        self._overrides = overrides
+        self._progress = progress
+        self._pass = 0
+        self._kept: list[tuple[int, list[Samples]]] | None = None
+        self.runs: list[HealthyRun] = []
+
+    def __call__(self) -> Iterator[tuple[int, Iterable[Samples]]]:
+        """All runs from the beginning: how many fans, and the blocks.
+
+        Raises:
+            UserError: a recording cannot be used.
+        """
+        self._pass += 1
+        if self._kept is not None:
+            yield from self._kept
+            return
+        self.runs = []
+        kept = _Kept()
+        for path in self._paths:
+            self._progress(f"pass {self._pass}: {path}")
+            try:
+                for run, blocks in self._of(path):
+                    self.runs.append(run)
+                    yield run.fans, kept.noting(run.fans, blocks)
+            except CodecError as error:
+                raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
+        self._kept = kept.runs
+
+    def _of(self, path: Path) -> Iterator[tuple[HealthyRun, Iterator[Samples]]]:
+        with open_material([path], None, self._overrides, self._twin) as material:
+            for tray in material.trays:
+                name = tray.name
+                chain = Chain(
+                    material.contexts(tray), lambda name=name: material.raw(name), undisturbed(), lambda _message: None
+                )
+                yield HealthyRun(path, name, tray.fans), map(samples_of, chain.predictions())
+
+
+class _Kept:
+    """The blocks of all runs, as long as there is room for them. runs: None once there was none."""
+
+    def __init__(self) -> None:
+        self.runs: list[tuple[int, list[Samples]]] | None = []
+        self._room = KEPT_SAMPLES
+
+    def noting(self, fans: int, blocks: Iterable[Samples]) -> Iterator[Samples]:
+        """The blocks of the next run."""
+        mine: list[Samples] = []
+        if self.runs is not None:
+            self.runs.append((fans, mine))
+        for block in blocks:
+            self._room -= block.speed_rad_s.size
+            if self._room < 0:
+                self.runs = None
+                mine.clear()
+            else:
+                mine.append(block)
+            yield block

@@ -1,0 +1,42 @@
+"""The interval of a rate of alarms that were counted in blocks of running: runs, fans, or stretches of time.
+
+Alarms of one block go together: a day, or a fan, has many or none. So the count is worth as many independent ones as
+its variance over bootstrapped blocks says (quasi-Poisson: Wedderburn, Biometrika 61 (1974) 439; the bootstrap of
+blocks: Kuensch, Annals of Statistics 17 (1989) 1217), and the interval is Garwood's (Biometrika 28 (1936) 437) of that
+count.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from schemas.messages import Array
+
+BOOTSTRAPS = 1000
+COVERAGE = 0.95
+
+
+def rate_interval(counts: Array, exposures: Array, seed: int) -> tuple[float, float]:
+    """95 % of the rate per unit of exposure. counts, exposures: (blocks,)."""
+    total = float(exposures.sum())
+    worth = 1.0 / dispersion(counts, exposures, seed)
+    low, high = poisson_interval(float(counts.sum()) * worth)
+    return low / worth / total, high / worth / total
+
+
+def poisson_interval(count: float) -> tuple[float, float]:
+    """95 % of what was expected where so many were counted."""
+    outside = (1.0 - COVERAGE) / 2
+    low = float(chi2.ppf(outside, 2 * count)) / 2 if count > 0 else 0.0
+    return low, float(chi2.ppf(1.0 - outside, 2 * count + 2)) / 2
+
+
+def dispersion(counts: Array, exposures: Array, seed: int) -> float:
+    """Variance of the count over bootstrapped blocks, in that of independent alarms; not below one."""
+    if not counts.sum():
+        return 1.0
+    random = np.random.default_rng(seed)
+    drawn = random.integers(0, len(counts), (BOOTSTRAPS, len(counts)))
+    rates = counts[drawn].sum(axis=1) / exposures[drawn].sum(axis=1)
+    return max(1.0, float(rates.var() * exposures.sum() ** 2 / counts.sum()))

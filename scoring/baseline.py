@@ -1,0 +1,131 @@
+"""Commissioning: what of a residual is this fan's, or this day's, own.
+
+The time since a session's first sample is cut into intervals. The mean residual of the first one in which the residual
+stays where it is becomes the baseline: a fan that starts from rest is not itself at first. But it is not waited for
+longer than some intervals. While the fan is commissioned the baseline is the median of the means of its intervals;
+afterwards good ones refine it, as a running mean and with a fixed time constant in the long run. Nothing is learnt from
+an anomaly: while commissioning, from an interval with anything beyond its limit, and afterwards, from one that was not
+far from every limit. While commissioning the baseline may not lie further from none than those of healthy fans do, and
+afterwards not further from the commissioned one than the adaptation limit: what wears slowly gets there, and alarms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.messages import Array
+
+COMMISSIONING_INTERVALS = 10  # the baseline after so many is the commissioned one
+GOOD_SHARE = 0.5  # of an interval's samples must be valid
+ONE = 1 << 20  # of fixed point: one sigma
+ONE_SQUARED = 1 << 20  # of fixed point: one sigma squared
+WILD = 1e3  # sigma; a larger residual counts as this
+STEADY = 2.0  # standard deviations of a healthy residual: more within an interval, and the fan is on its way somewhere
+PATIENCE = 10  # intervals that may go by before an unsteady one will do
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class BaselineSettings:
+    """limits and spread in sigma; adaptation in intervals: the time constant in the long run."""
+
+    farthest: float
+    adaptation_limit: float
+    adaptation_intervals: float
+    spread: float = 1.0
+    """standard deviation of the healthy residual"""
+
+
+class Baseline:
+    """The baselines of one residual of a tray's fans, in sigma of each fan."""
+
+    def __init__(self, fans: int, settings: BaselineSettings) -> None:
+        self._settings = settings
+        self.value = np.zeros(fans)
+        """(fans,) sigma; zero before the first good interval"""
+        self.commissioned = np.zeros(fans)
+        """(fans,) sigma: the value of commissioning, at its end or so far"""
+        self.intervals = np.zeros(fans, np.int64)
+        """(fans,) good intervals so far"""
+        self.waited = np.zeros(fans, np.int64)
+        """(fans,) unsteady intervals before the first good one"""
+        self.means = np.full((COMMISSIONING_INTERVALS, fans), np.nan)
+        """sigma, of the good intervals while commissioning"""
+        self.sums = np.zeros(fans, np.int64)
+        self.squares = np.zeros(fans, np.int64)
+        self.counts = np.zeros(fans, np.int64)
+
+    @property
+    def is_set(self) -> Array:
+        """(fans,) whether a fan can be judged."""
+        return self.intervals > 0
+
+    @property
+    def is_commissioning(self) -> Array:
+        """(fans,) whether the baseline has yet to settle."""
+        return self.intervals < COMMISSIONING_INTERVALS
+
+    @property
+    def is_at_limit(self) -> Array:
+        """(fans,) whether the baseline would have gone further if it might."""
+        limit = self._settings.adaptation_limit
+        went = np.abs(self.value - self.commissioned)
+        return self.is_set & (went >= limit * (1.0 - ROUNDING)) & (limit > 0)
+
+    @property
+    def weight(self) -> Array:
+        """(fans,) of how many independent intervals the baseline varies as the mean."""
+        in_the_long_run = 2.0 * self._settings.adaptation_intervals - 1.0
+        return np.minimum(self.intervals, in_the_long_run)
+
+    def restart(self, fans: Array) -> None:
+        """Commission some fans anew, (fans,) of bool."""
+        for column in (
+            self.value,
+            self.commissioned,
+            self.intervals,
+            self.waited,
+            self.sums,
+            self.squares,
+            self.counts,
+        ):
+            column[fans] = 0
+        self.means[:, fans] = np.nan
+
+    def add(self, residual: Array, valid: Array) -> None:
+        """Note samples of the present interval, (n, fans) each, in sigma."""
+        known = np.clip(np.where(valid, residual, 0.0), -WILD, WILD)
+        self.sums += np.rint(known * ONE).astype(np.int64).sum(axis=0)
+        self.squares += np.rint(known * known * ONE_SQUARED).astype(np.int64).sum(axis=0)
+        self.counts += valid.sum(axis=0)
+
+    def end_interval(self, samples: int, normal: Array, quiet: Array) -> Array:
+        """End the present interval of so many samples. Returns which fans have just got a baseline.
+
+        normal, quiet: (fans,) whether nothing was beyond its limit, and all far from it.
+        """
+        counts = np.maximum(self.counts, 1)
+        mean = self.sums / counts / ONE
+        deviation = np.sqrt(np.maximum(self.squares / counts / ONE_SQUARED - mean**2, 0.0))
+        seen = (self.counts >= GOOD_SHARE * samples) & (self.counts > 0)
+        unsteady = seen & ~self.is_set & (deviation > STEADY * self._settings.spread) & (self.waited < PATIENCE)
+        self.waited += unsteady
+        good = seen & ~unsteady & np.where(self.is_commissioning, normal, quiet)
+        first = good & (self.intervals == 0)
+        gain = np.maximum(1.0 / (self.intervals + 1), 1.0 / self._settings.adaptation_intervals)
+        value = np.where(good, self.value + gain * (mean - self.value), self.value)
+        young = good & self.is_commissioning
+        if young.any():
+            self.means[self.intervals[young], young] = mean[young]
+            median = np.nanmedian(self.means[:, young], axis=0)
+            value[young] = np.clip(median, -self._settings.farthest, self._settings.farthest)
+        limit = self._settings.adaptation_limit
+        held = np.clip(value, self.commissioned - limit, self.commissioned + limit)
+        self.value = np.where(young, value, held)
+        self.commissioned = np.where(young, self.value, self.commissioned)
+        self.intervals += good
+        for column in (self.sums, self.squares, self.counts):
+            column[:] = 0
+        return first

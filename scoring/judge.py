@@ -1,0 +1,246 @@
+"""The judge of a tray: both residuals and the tachos, and which statistic is the furthest towards its limit.
+
+What it finds is the score: that statistic in its own limit. Above one the fan is not what it was. When an alarm comes
+of it is for scoring.conditions to say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from schemas.messages import Array, Prediction, Statistic, WhyNot
+from scoring.limits import Limits
+from scoring.residual import Residual
+from scoring.sensor import Sensor
+
+QUIET = 0.5  # once a fan is commissioned, nothing is learnt from it with a score above
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Samples:
+    """A block to be judged; residuals in sigma of each fan. All (n, fans) but t_ns, (n,)."""
+
+    t_ns: Array
+    step_ns: int
+    speed_rad_s: Array
+    speed_residual: Array
+    speed_valid: Array
+    balance: Array
+    balance_valid: Array
+    missing: Array
+    """the tacho gave no reading"""
+    alive: Array
+    """the line gave something"""
+
+
+def samples_of(prediction: Prediction) -> Samples:
+    """The samples of a block of predictions. The torque balance is judged where the free run is too
+    young, and where a controller asks for more than any healthy fan needed: it holds there.
+    """
+    why_not, residual = prediction.why_not, prediction.measured_speed_rad_s - prediction.predicted_speed_rad_s
+    balance = prediction.torque_balance_command
+    with np.errstate(all="ignore"):
+        speed_residual = residual / prediction.sigma_rad_s
+        balance = balance / prediction.torque_balance_sigma_command
+    speaks = np.isin(why_not, (WhyNot.NONE, WhyNot.WARMING_UP, WhyNot.OUT_OF_RANGE))
+    return Samples(
+        t_ns=prediction.t_ns,
+        step_ns=prediction.step_ns,
+        speed_rad_s=prediction.measured_speed_rad_s,
+        speed_residual=speed_residual,
+        speed_valid=prediction.valid & np.isfinite(speed_residual),
+        balance=balance,
+        balance_valid=speaks & np.isfinite(balance),
+        missing=why_not == WhyNot.NO_SPEED,
+        alive=~np.isin(why_not, (WhyNot.GAP, WhyNot.STALE)),
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Verdict:
+    """What the judge found, (n, fans) each; smoothed residuals and baselines in sigma."""
+
+    score: Array
+    """NaN where nothing could be judged"""
+    statistic: Array
+    commissioning: Array
+    """valid, and no baseline yet"""
+    speed_smoothed: Array
+    speed_baseline: Array
+    balance_smoothed: Array
+    balance_baseline: Array
+    balance_baseline_s: Array
+    """seconds of healthy running that this baseline varies as the mean of; 0: there is none yet"""
+    balance_commissioned: Array
+    """what the baseline was at the end of commissioning; NaN before"""
+    balance_held: Array
+    """the baseline may go no further from that"""
+
+
+class Judge:
+    """Of one tray's fans. What it gives does not depend on how samples are cut into blocks."""
+
+    def __init__(self, fans: int, limits: Limits) -> None:
+        self.limits = limits
+        self.speed = Residual(fans, limits.speed, limits.timing)
+        self.balance = Residual(fans, limits.balance, limits.timing)
+        self.sensor = Sensor(fans, limits.stuck_s, limits.missing_share)
+        self.quiet = np.ones(fans, np.bool_)
+        """(fans,) whether all was far from its limit in the present interval so far"""
+        self.normal = np.ones(fans, np.bool_)
+        """(fans,) whether nothing was beyond its limit"""
+        self.origin_t_ns: int | None = None
+        self.interval = 0
+        self._interval_ns = max(1, round(limits.timing.baseline_s * NS_PER_S))
+        self._ratios: list[Array] | None = None
+
+    def update(self, block: Samples) -> Verdict:
+        """Judge a block of at least one sample."""
+        if self.origin_t_ns is None:
+            self.origin_t_ns = int(block.t_ns[0])
+        intervals = (block.t_ns - self.origin_t_ns) // self._interval_ns
+        cuts = np.flatnonzero(np.diff(intervals)) + 1
+        edges = [0, *cuts.tolist(), len(intervals)]
+        verdicts = []
+        for first, last in pairwise(edges):
+            number = int(intervals[first])
+            if number != self.interval:
+                self._end_interval(block.step_ns)
+                self.interval = number
+            verdicts.append(self._stretch(block, slice(first, last)))
+        if len(verdicts) == 1:
+            return verdicts[0]
+        return Verdict(**{name: np.concatenate([getattr(v, name) for v in verdicts]) for name in vars(verdicts[0])})
+
+    def watch(self) -> None:
+        """Keep the ratios of all statistics from now on, for `watched`."""
+        self._ratios = []
+
+    def watched(self) -> Array:
+        """(7, n, fans) the ratios since the last call, in the order of Statistic from 1 on."""
+        assert self._ratios is not None
+        ratios, self._ratios = np.concatenate(self._ratios, axis=1), []
+        return ratios
+
+    def forget(self, fans: Array) -> None:
+        """Take new baselines of some fans, (fans,) of bool."""
+        for residual in (self.speed, self.balance):
+            residual.baseline.restart(fans)
+            residual.forget(fans)
+        self.sensor.reset(fans)
+        self.quiet[fans] = self.normal[fans] = True
+
+    def _end_interval(self, step_ns: int) -> None:
+        expected = self._interval_ns // step_ns
+        for residual in (self.speed, self.balance):
+            residual.forget(residual.baseline.end_interval(expected, self.normal, self.quiet))
+        self.quiet[:] = self.normal[:] = True
+
+    def _stretch(self, block: Samples, rows: slice) -> Verdict:
+        speed_rad_s, step_s = block.speed_rad_s[rows], block.step_ns / NS_PER_S
+        parts: list[Array] = []
+        smoothed: list[Array] = []
+        baselines: list[Array] = []
+        judged = np.zeros(speed_rad_s.shape, np.bool_)
+        known = np.zeros(speed_rad_s.shape, np.bool_)
+        for residual, values, valid in (
+            (self.speed, block.speed_residual[rows], block.speed_valid[rows]),
+            (self.balance, block.balance[rows], block.balance_valid[rows]),
+        ):
+            standard = residual.standardise(values, speed_rad_s)
+            residual.learn(standard, speed_rad_s, valid, step_s)
+            may = valid & residual.baseline.is_set
+            found = residual.judge(standard, speed_rad_s, may, step_s)
+            parts.append(np.where(may, found.ratios, 0.0))
+            smoothed.append(np.where(may, found.smoothed, np.nan))
+            baselines.append(np.broadcast_to(residual.baseline.value, valid.shape))
+            if residual.is_judged:
+                judged |= may
+                known |= valid
+        alive = block.alive[rows]
+        sensor = self.sensor.update(speed_rad_s, block.missing[rows], alive, block.step_ns)
+        ratios = np.concatenate((*parts, np.where(alive, sensor, 0.0)[np.newaxis]))
+        if self._ratios is not None:
+            self._ratios.append(ratios)
+        largest = ratios.argmax(axis=0)
+        score = np.take_along_axis(ratios, largest[np.newaxis], axis=0)[0]
+        highest = score.max(axis=0)
+        own = self.balance.baseline
+        self.quiet &= highest <= QUIET
+        self.normal &= highest <= 1.0
+        seen = judged | (alive & (score > 1.0))
+        return Verdict(
+            score=np.where(seen, score, np.nan),
+            statistic=np.where(seen, largest + 1, Statistic.NONE).astype(np.uint8),
+            commissioning=known & ~judged,
+            speed_smoothed=smoothed[0],
+            speed_baseline=baselines[0],
+            balance_smoothed=smoothed[1],
+            balance_baseline=baselines[1],
+            balance_baseline_s=np.broadcast_to(own.weight * self.limits.timing.baseline_s, known.shape),
+            balance_commissioned=np.broadcast_to(np.where(own.is_commissioning, np.nan, own.commissioned), known.shape),
+            balance_held=np.broadcast_to(own.is_at_limit, known.shape),
+        )
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that it knows, as JSON can hold it."""
+        return {
+            "origin_t_ns": self.origin_t_ns,
+            "interval": self.interval,
+            **{name: _plain(column) for name, column in self._columns().items()},
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a snapshot of a judge of as many fans; without it nothing has changed when this raises.
+
+        Raises:
+            ValueError, KeyError, TypeError: it is not one.
+        """
+        columns = self._columns()
+        kept = {name: np.array(state[name], column.dtype) for name, column in columns.items()}
+        origin_t_ns, interval = state["origin_t_ns"], int(state["interval"])
+        for name, column in columns.items():
+            if kept[name].shape != column.shape:
+                raise ValueError(f"{name} of a judge of another number of fans")
+        for name, column in columns.items():
+            column[...] = kept[name]
+        self.origin_t_ns = None if origin_t_ns is None else int(origin_t_ns)
+        self.interval = interval
+
+    def _columns(self) -> dict[str, Array]:
+        columns: dict[str, Array] = {"quiet": self.quiet, "normal": self.normal}
+        for name, residual in (("speed", self.speed), ("balance", self.balance)):
+            baseline = residual.baseline
+            columns |= {
+                f"{name}_baseline": baseline.value,
+                f"{name}_commissioned": baseline.commissioned,
+                f"{name}_intervals": baseline.intervals,
+                f"{name}_waited": baseline.waited,
+                f"{name}_squares": baseline.squares,
+                f"{name}_means": baseline.means,
+                f"{name}_sums": baseline.sums,
+                f"{name}_counts": baseline.counts,
+                f"{name}_shown": residual.shown.value,
+                f"{name}_smoothed": residual.low_pass.value,
+                f"{name}_cusum": residual.cusum.sums,
+                f"{name}_square": residual.spread.square.value,
+            }
+        return columns | {
+            "sensor_last": self.sensor.last,
+            "sensor_since_ns": self.sensor.since_ns,
+            "sensor_missing": self.sensor.missing.value,
+        }
+
+
+def _plain(column: Array) -> Any:
+    """As JSON can hold it, which has no NaN."""
+    if column.dtype.kind != "f":
+        return column.tolist()
+    values = column.astype(object)
+    values[np.isnan(column)] = None
+    return values.tolist()

@@ -1,0 +1,192 @@
+"""The last seconds of one fan as a filtered regression, in which every fault is a line or a curve.
+
+The torque balance is linear in its coefficients. Both sides go through lambda / (s + lambda), the filtering operator
+(Peng and Chen, equations (13) to (18)), so that no speed is differentiated. On the grid, with a = exp(-lambda h), v the
+command that acts after its lag, m_k = (w_k + w_k+1) / 2 and the healthy coefficients,
+
+    x_k = v_k - inertia (w_k+1 - w_k) / h - viscous m_k - drag m_k|m_k| - friction - offset
+    f_k+1 = a f_k + (1 - a) x_k
+
+A fault changes one term from some time on. With a course p, 0 before and up to 1 after, the same filter over p times
+that term gives its column, and the residual of the fault is f - size * column. One pass of a first-order recursion
+over the samples; whatever is asked of the window later needs only the products of these columns.
+
+Healthy coefficients and the offset of commissioning are known up to their standard errors. Each error has a column,
+too, with the weight that it may have at most.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+Array: TypeAlias = NDArray[np.float64]
+
+BRIDGE_S = 0.1
+"""missing speeds are bridged within the filter; over longer than this, it has to settle again"""
+LACK_OF_FIT = np.array([0.03, 0.01, 0.01, 0.05])
+"""errors of the healthy coefficients, relative, beside those from noise: the balance is not the whole truth. Noisy
+speeds bias the inertia by some percent; friction depends a little on speed"""
+GAP_MEMORIES = 4.0
+"""time constants of the filter: by as much a command that was not known can be wrong"""
+TOLD = 2.0
+"""standard errors from zero at which a coefficient is told from it"""
+MEAN_OVER_S = 0.2
+"""rows are means over so long; the filter is slower than that, the noise of a tacho is not"""
+RESIDUAL, COMMAND, DRAG, SQUARE, CONSTANT, JUMP = range(6)
+"""columns of the residual and of what a fault can work on; those of the errors come after them"""
+FIRST_ERROR = 6
+
+
+@dataclass(frozen=True, eq=False)
+class HealthyBalance:
+    """Torque balance of one healthy fan, from the twin's card; everything in units of its command."""
+
+    inertia: float
+    viscous: float
+    drag: float
+    friction: float
+    lag_s: float
+    std_errors: Array
+    """(4,) of inertia, viscous, drag and friction"""
+    filter_rate_per_s: float
+    sigma_command: float
+    """standard deviation of the healthy balance"""
+    autocorrelation_time_s: float
+    lowest_speed_rad_s: float = 0.0
+    """below it the balance does not hold: breakaway, standstill, a tacho's floor"""
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """The last grid samples of one fan. command, speed_rad_s: (n,), NaN where unknown or where the sensor gave none.
+
+    onset: index of the first anomalous sample, as the detector has it. offset: balance of this fan when healthy, from
+    commissioning, and its standard error; both in units of the command.
+    """
+
+    step_s: float
+    command: Array
+    speed_rad_s: Array
+    onset: int
+    offset: float = 0.0
+    offset_std_error: float = 0.0
+
+
+class RegressionWindow:
+    """Filtered columns of a window, as rows of means over MEAN_OVER_S."""
+
+    def __init__(self, window: Window, healthy: HealthyBalance) -> None:
+        h = window.step_s
+        self.step_s, self.onset, self.samples = h, window.onset, len(window.command)
+        self._decay = float(np.exp(-healthy.filter_rate_per_s * h))
+        speed = _bridged(window.speed_rad_s)
+        middle = (speed[:-1] + speed[1:]) / 2.0
+        acting = acting_command(_held(window.command), h, healthy.lag_s)[:-1]
+        motion = np.stack((np.diff(speed) / h, middle, middle * np.abs(middle), np.ones_like(middle)))
+        coefficients = np.array((healthy.inertia, healthy.viscous, healthy.drag, healthy.friction))
+        errors = np.hypot(healthy.std_errors, LACK_OF_FIT * coefficients)
+        errors[3] = np.hypot(errors[3], window.offset_std_error)
+        square = healthy.drag * motion[2]
+        # A rotor without blades has no drag by the square of its speed; then all that rises with speed is its drag.
+        told = healthy.drag > TOLD * healthy.std_errors[2]
+        drag = square if told else square + healthy.viscous * middle
+        self._terms = np.stack((acting, drag, square, motion[3]))
+        self._momentum = healthy.inertia * speed[:-1] / h
+        counts = _counts(window, healthy, speed)
+        self._after = counts & (np.arange(1, len(speed)) > window.onset)
+        self.per_row = max(1, round(MEAN_OVER_S / h))
+        """samples in a row"""
+        self._starts = np.arange(0, len(middle), self.per_row)
+        valid = np.add.reduceat(counts.astype(float), self._starts)
+        self._enough = valid >= self.per_row / 2.0
+        self._weight = counts / np.repeat(np.maximum(valid, 1.0), self.per_row)[: len(counts)]
+        self._fixed = self._rows(
+            np.vstack((acting - coefficients @ motion - window.offset, motion * errors[:, np.newaxis]))
+        )
+        self.rows = self._fixed.shape[-1]
+        self.typical_command = float(np.abs(acting).mean())
+        self.constant_need = healthy.friction + window.offset
+        self.speeds_after = np.abs(middle[self._after])
+        """of the samples that count since the onset, rad/s"""
+
+    def columns(self, course: Array) -> Array:
+        """(..., FIRST_ERROR + 4, rows) of faults whose sizes follow these courses. course: (..., samples)."""
+        faulty = course[..., np.newaxis, :-1] * self._terms
+        jump = (np.diff(course) * self._momentum)[..., np.newaxis, :]
+        changed = self._rows(np.concatenate((faulty, jump), axis=-2))
+        fixed = np.broadcast_to(self._fixed, (*course.shape[:-1], *self._fixed.shape))
+        return np.concatenate((fixed[..., :1, :], changed, fixed[..., 1:, :]), axis=-2)
+
+    def torque(self, course: Array) -> Array:
+        """(..., rows) the column of a torque that follows these courses (..., samples)."""
+        return self._rows(course[..., :-1])
+
+    def _rows(self, terms: Array) -> Array:
+        """Filtered, and averaged over the samples of each row that count."""
+        filtered: Any = lfilter([1.0 - self._decay], [1.0, -self._decay], terms, axis=-1)
+        return np.add.reduceat(filtered * self._weight, self._starts, axis=-1)[..., self._enough]
+
+
+def acting_command(command: Array, step_s: float, lag_s: float) -> Array:
+    """(n,) mean over each step of the command after its lag, lag i' + i = command; settled at the first."""
+    if lag_s <= 0.0:
+        return command
+    decay = np.exp(-step_s / lag_s)
+    before: Any = lfilter([0.0, 1.0 - decay], [1.0, -decay], command - command[0]) + command[0]
+    return command + (before - command) * (1.0 - decay) * lag_s / step_s
+
+
+def mean_of_correlated(correlation_samples: float, samples: int) -> tuple[float, float]:
+    """Variance of the mean of so many samples of unit variance, and by how much the variance of many such means is
+    larger than if they were independent; for a first-order autoregression with this correlation time in samples.
+    """
+    phi = np.exp(-1.0 / correlation_samples) if correlation_samples > 0.0 else 0.0
+    whole = (1.0 - phi**samples) / (1.0 - phi)
+    variance = ((1.0 + phi) / (1.0 - phi) - 2.0 * phi * whole / (samples * (1.0 - phi))) / samples
+    next_to_it = phi * whole**2 / samples**2 / variance
+    return float(variance), float((1.0 + next_to_it) / (1.0 - next_to_it))
+
+
+def _bridged(speed_rad_s: Array) -> Array:
+    """Missing speeds on the line between their neighbours; the nearest at the ends."""
+    known = np.isfinite(speed_rad_s)
+    if not known.any():
+        return np.zeros(len(speed_rad_s))
+    at = np.arange(len(speed_rad_s))
+    return np.interp(at, at[known], speed_rad_s[known])
+
+
+def _held(command: Array) -> Array:
+    """An unknown command is the last known one; before the first, the first."""
+    known = np.isfinite(command)
+    if not known.any():
+        return np.zeros(len(command))
+    last = np.maximum.accumulate(np.where(known, np.arange(len(command)), np.argmax(known)))
+    return command[last]
+
+
+def _counts(window: Window, healthy: HealthyBalance, speed_rad_s: Array) -> NDArray[np.bool_]:
+    """(n - 1,) which samples count, from the second on: measured, and the filter has forgotten its start, long gaps and
+    speeds that are too low.
+    """
+    memory = 1.0 / (healthy.filter_rate_per_s * window.step_s)
+    missing = ~np.isfinite(window.speed_rad_s + window.command)
+    bridge = max(1, round(BRIDGE_S / window.step_s))
+    whole_gaps = np.lib.stride_tricks.sliding_window_view(np.pad(missing, (bridge, 0)), bridge + 1)
+    gap = np.asarray(whole_gaps.all(axis=1))
+    slow = np.abs(speed_rad_s) < healthy.lowest_speed_rad_s
+    slow[0] = True
+    forgotten = (_since(slow) >= memory) & (_since(gap) >= GAP_MEMORIES * memory)
+    return (forgotten & ~missing)[1:]
+
+
+def _since(flags: NDArray[np.bool_]) -> Array:
+    """(n,) samples since the last flag (n,), infinite before the first."""
+    at = np.arange(len(flags))
+    last = np.maximum.accumulate(np.where(flags, at, -1))
+    return np.where(last < 0, np.inf, at - last)

@@ -1,0 +1,121 @@
+"""One residual of a tray: standardised, less its baseline, and the statistics on it, each in its own limit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.messages import Array
+from scoring.baseline import Baseline, BaselineSettings
+from scoring.cusum import Cusum
+from scoring.limits import ResidualLimits, Timing, smoothed_deviation, summed_deviation
+from scoring.low_pass import LowPass
+from scoring.spread import Spread
+
+CAP = 2.0  # the residual counts no further than so many limits
+CUSUM_CAP = 1.05  # nor a CUSUM: what is forgotten late clears late, and a shift that only lasts is a warning
+LEAST_CLIP = 5.0  # healthy deviations
+LARGEST = 1e6  # of them, so that what follows stays finite
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What became of a stretch. ratios: (3, n, fans), step, drift and spread in their limits."""
+
+    smoothed: Array
+    """(n, fans) the low-passed residual, sigma"""
+    ratios: Array
+
+
+class Residual:
+    """Of one kind; baselines and statistics of every fan."""
+
+    def __init__(self, fans: int, limits: ResidualLimits, timing: Timing) -> None:
+        self._limits = limits
+        self._timing = timing
+        adaptation = max(timing.adaptation_s / timing.baseline_s, 1.0)
+        self.baseline = Baseline(
+            fans, BaselineSettings(limits.baseline_sigmas, limits.adaptation_sigmas, adaptation, limits.mean_spread)
+        )
+        self.shown = LowPass(fans, timing.smoothing_s)
+        self.low_pass = LowPass(fans, timing.smoothing_s)
+        self._drift_s = summed_deviation(limits.autocorrelation_time_s, 0.01)
+        cap = math.inf if limits.drift is None else CUSUM_CAP * limits.drift * self._drift_s
+        self.cusum = Cusum(fans, limits.reference_sigmas, cap)
+        self.spread = Spread(fans)
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether any statistic of it has a limit."""
+        limits = self._limits
+        return any(limit is not None for limit in (limits.step, limits.drift, limits.growth))
+
+    def standardise(self, residual_sigmas: Array, speed_rad_s: Array) -> Array:
+        """(n, fans) the residual less what it is at this speed. Both (n, fans); the residual in sigma of each fan."""
+        limits = self._limits
+        if len(limits.speeds_rad_s) == 1:
+            return residual_sigmas - limits.offset_sigmas[0]
+        return residual_sigmas - np.interp(np.abs(speed_rad_s), limits.speeds_rad_s, limits.offset_sigmas)
+
+    def learn(self, standard: Array, speed_rad_s: Array, valid: Array, step_s: float) -> None:
+        """Note for the baseline. Arguments as of judge; one wild reading must not move it."""
+        reach = self._limits.baseline_sigmas + self._clip(step_s) * self._spread(speed_rad_s, valid)
+        centre = self.baseline.value
+        self.baseline.add(np.clip(np.where(valid, standard, centre), centre - reach, centre + reach), valid)
+
+    def judge(self, standard: Array, speed_rad_s: Array, valid: Array, step_s: float) -> Judged:
+        """Take a stretch in which the baseline stays. standard: as standardise gives it; valid: to be judged."""
+        limits = self._limits
+        shift = np.clip(np.where(valid, standard - self.baseline.value, 0.0), -LARGEST, LARGEST)
+        shown = self.shown.update(shift, valid, step_s)
+        clip = self._clip(step_s)
+        z = np.clip(shift / self._spread(speed_rad_s, valid), -clip, clip)  # one wild reading must not raise an alarm
+        smoothed = self.low_pass.update(z, valid, step_s)
+        drift = self.cusum.update(z, valid, step_s)
+        spread = self.spread.update(z, smoothed, valid, step_s)
+        ratios = np.stack(
+            (
+                np.abs(smoothed) / (self._deviation(step_s) * (limits.step or math.inf)),
+                drift / (self._drift_s * (limits.drift or math.inf)),
+                np.maximum(spread - limits.usual_growth, 0.0) / ((limits.growth or math.inf) - limits.usual_growth),
+            )
+        )
+        return Judged(shown, ratios)
+
+    def limit_sigmas(self, step_s: float) -> float:
+        """How far the smoothed residual may be from its baseline, sigma; infinite where that is not judged.
+
+        It is a little more or less at speeds where healthy residuals vary more or less than on average.
+        """
+        limits = self._limits
+        return self._deviation(step_s) * limits.step * limits.mean_spread if limits.step else math.inf
+
+    def lasting_limit_sigmas(self, step_s: float) -> float:
+        """How far a shift that lasts may be from the commissioned baseline, sigma; infinite where that is not judged.
+
+        The baseline follows up to its own limit, and what is then left is found by the drift, where that is judged.
+        """
+        limits = self._limits
+        left = math.inf if limits.drift is None else limits.reference_sigmas * limits.mean_spread
+        return limits.adaptation_sigmas + min(left, self.limit_sigmas(step_s))
+
+    def _clip(self, step_s: float) -> float:
+        return max(LEAST_CLIP, CAP * self._deviation(step_s) * (self._limits.step or 0.0))
+
+    def _deviation(self, step_s: float) -> float:
+        return smoothed_deviation(self._timing.smoothing_s, self._limits.autocorrelation_time_s, step_s)
+
+    def _spread(self, speed_rad_s: Array, valid: Array) -> Array | float:
+        limits = self._limits
+        if len(limits.speeds_rad_s) == 1:
+            return limits.spread[0]
+        return np.where(valid, np.interp(np.abs(speed_rad_s), limits.speeds_rad_s, limits.spread), 1.0)
+
+    def forget(self, fans: Array) -> None:
+        """Begin the statistics of some fans anew, (fans,) of bool; baselines stay."""
+        self.shown.reset(fans)
+        self.low_pass.reset(fans)
+        self.cusum.reset(fans)
+        self.spread.reset(fans)

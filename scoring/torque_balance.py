@@ -1,0 +1,162 @@
+"""Torque balance: the command that was given, less the command that a healthy fan needs for the motion measured.
+
+A healthy fan needs J w' + alpha w + C_D w|w| + friction. The difference goes through 1 / (1 + s / lambda), and so no
+speed is differentiated: over a step the filter gives J w' the weight of J lambda (w - filtered w), as the filtering
+operator of Peng and Chen does (their equations 13 to 18). A speed loop cannot hide a fault from it: what it adds to
+the command to hold the speed is just what appears here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+from schemas.messages import Array
+
+
+@dataclass(frozen=True, eq=False)
+class BalanceModel:
+    """A healthy fan's balance, (fans,) each, in the tray's command unit."""
+
+    inertia: Array
+    viscous: Array
+    drag: Array
+    friction: Array
+    lag_s: Array
+    filter_rate_per_s: float
+    lowest_speed_rad_s: Array
+    """below it friction is whatever holds the rotor, and nothing is said"""
+    highest_speed_rad_s: float
+    """above it nobody knows what a healthy fan needs"""
+    off_below: Array | None = None
+    """(fans,) with a smaller command the drive is off; None: where friction is not overcome"""
+
+
+class TorqueBalance:
+    """The balance of a tray's fans, block by block; what it gives does not depend on how blocks are cut.
+
+    It begins with a fan's first known pair of samples, and anew after what is not known, when the drive was off, and
+    when the fan was too slow.
+    """
+
+    def __init__(self, model: BalanceModel) -> None:
+        self._model = model
+        of_friction = np.where(model.friction > 0.0, model.friction, -np.inf)
+        self._off_below = of_friction if model.off_below is None else model.off_below
+        fans = len(model.inertia)
+        self._speed = np.full(fans, np.nan)
+        self._command = np.full(fans, np.nan)
+        self._lagged = np.full(fans, np.nan)
+        self._lag_step_s = np.nan
+        self._lag_shares = (np.zeros(fans), np.zeros(fans))
+        self._filtered = np.zeros(fans)
+        self._weight = np.zeros(fans)
+
+    def reset(self) -> None:
+        """Forget what was measured: samples are missing."""
+        self._speed[:] = self._command[:] = self._lagged[:] = np.nan
+
+    def update(self, step_s: float, command: Array, speed_rad_s: Array, known: Array) -> Array:
+        """The balance at each sample, NaN where it is not settled. All (n, fans); command: held to the next sample."""
+        model = self._model
+        drives = command >= self._off_below  # one that is off may brake or coast: that is another machine
+        turns = np.abs(speed_rad_s) >= model.lowest_speed_rad_s
+        speed = np.where(known & drives & turns, speed_rad_s, np.nan)
+        before, given = np.vstack((self._speed, speed))[:-1], np.vstack((self._command, command))[:-1]
+        self._speed, self._command = speed[-1].copy(), command[-1].copy()
+        linked = np.isfinite(before) & np.isfinite(speed) & np.isfinite(given)
+        acting = self._acting(step_s, given, linked)
+        mean = 0.5 * (before + speed)
+        drag = (model.viscous + model.drag * np.abs(mean)) * mean
+        excess = acting - model.inertia * (speed - before) / step_s - drag - model.friction
+        keep = float(np.exp(-model.filter_rate_per_s * step_s))
+        if linked.all():
+            filtered, weight = self._all(excess, keep)
+        else:
+            filtered, weight = self._some(excess, linked, keep)
+        self._filtered, self._weight = filtered[-1].copy(), weight[-1].copy()
+        settled = linked & (weight >= SETTLED) & (np.abs(speed) <= model.highest_speed_rad_s)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(settled, filtered / weight, np.nan)
+
+    def _all(self, excess: Array, keep: float) -> tuple[Array, Array]:
+        both = np.hstack((excess, np.ones_like(excess)))
+        state = keep * np.concatenate((self._filtered, self._weight))[np.newaxis]
+        filtered, _ = filter_rows(keep, both, state)
+        return filtered[:, : excess.shape[1]], filtered[:, excess.shape[1] :]
+
+    def _some(self, excess: Array, linked: Array, keep: float) -> tuple[Array, Array]:
+        if len(excess) == 1:
+            filtered = np.where(linked, (1.0 - keep) * excess + keep * self._filtered, 0.0)
+            return filtered, np.where(linked, (1.0 - keep) + keep * self._weight, 0.0)
+        filtered, weight = np.zeros_like(excess), np.zeros_like(excess)
+        for fan in np.flatnonzero(linked.any(axis=0)).tolist():
+            state = np.array([[self._filtered[fan], self._weight[fan]]])
+            for rows in stretches(linked[:, fan]):
+                if rows.start > 0:
+                    state = np.zeros((1, 2))
+                pair = np.column_stack((excess[rows, fan], np.ones(rows.stop - rows.start)))
+                made, _ = filter_rows(keep, pair, keep * state)
+                filtered[rows, fan], weight[rows, fan] = made.T
+        return filtered, weight
+
+    def _acting(self, step_s: float, given: Array, linked: Array) -> Array:
+        """The command that acts over the step before each sample, after the electrical lag: lag i' + i = command."""
+        lag_s = self._model.lag_s
+        if not lag_s.any():
+            return given
+        if len(given) == 1:
+            return self._acting_once(step_s, given[0])[np.newaxis]
+        acting = given.copy()
+        keeps, shares = self._lagging(step_s)
+        for fan in np.flatnonzero(lag_s).tolist():
+            keep, share = float(keeps[fan]), float(shares[fan])
+            lagged = self._lagged[fan : fan + 1]
+            for rows in stretches(np.isfinite(given[:, fan])):
+                held = given[rows, fan]
+                # a lag that has long settled, where nothing is known from before
+                start = held[:1] if np.isnan(lagged[0]) or rows.start > 0 else lagged
+                after, _ = filter_rows(keep, held[:, np.newaxis], keep * start[np.newaxis])
+                before = np.concatenate((start, after[:-1, 0]))
+                acting[rows, fan] = held + (before - held) * share
+                lagged = after[-1:, 0]
+            self._lagged[fan] = lagged[0] if np.isfinite(given[-1, fan]) else np.nan
+        return acting
+
+    def _acting_once(self, step_s: float, given: Array) -> Array:
+        """The same for one sample, (fans,): all fans at once."""
+        keep, share = self._lagging(step_s)
+        start = np.where(np.isnan(self._lagged), given, self._lagged)
+        after = (1.0 - keep) * given + keep * start
+        self._lagged = np.where(np.isfinite(given), after, np.nan)
+        return np.where(self._model.lag_s > 0.0, given + (start - given) * share, given)
+
+    def _lagging(self, step_s: float) -> tuple[Array, Array]:
+        """What is left of a distance after a step, and its mean over the step, (fans,) each."""
+        if step_s != self._lag_step_s:
+            steps = step_s / np.where(self._model.lag_s > 0.0, self._model.lag_s, 1.0)
+            self._lag_step_s, self._lag_shares = step_s, (np.exp(-steps), -np.expm1(-steps) / steps)
+        return self._lag_shares
+
+
+SETTLED = 0.6
+"""share of the filter's memory that must be filled: one time constant"""
+
+
+def filter_rows(keep: float, rows: Array, state: Array) -> tuple[Array, Array]:
+    """y[k] = (1 - keep) x[k] + keep y[k-1] along the first axis, sample by sample, so cuts change nothing.
+
+    rows: (n, m). state: (1, m), keep times the y before the first. Returns y (n, m) and the state after.
+    """
+    made: Any = lfilter([1.0 - keep], [1.0, -keep], rows, axis=0, zi=state)
+    return made[0], made[1]
+
+
+def stretches(flags: Array) -> Sequence[slice]:
+    """Where flags (n,) are set without interruption."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(np.int8), [0]))))
+    return [slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
