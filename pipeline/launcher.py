@@ -148,9 +148,10 @@ class Launcher:
             if view.alive and problem != self._told.get(name, ""):
                 self._told[name] = problem
                 self._say(f"{name}: {problem or 'all well again'}")
-        for alarm in self._watcher.alarms():
+        for standing in self._watcher.standing():
+            alarm = standing.newest
             fan = f"{alarm.header.tray} fan {alarm.fan}"
-            now = f"{'ALARM' if alarm.active else 'cleared'}  {alarm.header.tray}  {alarm.message}"
+            now = standing.line()
             if now != self._told.get(fan):
                 self._told[fan] = now
                 self._say(now)

@@ -50,6 +50,14 @@ class StandingAlarm:
         """Whether it is to be put before an operator."""
         return self.is_retained and not self.is_quiet
 
+    def line(self) -> str:
+        """What happened last, for a log: nobody is called for what an operator keeps quiet."""
+        alarm = self.newest
+        word = alarm.severity.name if alarm.active else alarm.transition.name.lower().replace("_", " ")
+        return (
+            f"{word}{' (kept quiet)' if alarm.active and self.is_quiet else ''}  {alarm.header.tray}  {alarm.message}"
+        )
+
     def words(self) -> list[str]:
         """The states that it is in."""
         alarm, raised = self.newest, self.newest.severity != Severity.NONE

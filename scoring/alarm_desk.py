@@ -154,6 +154,8 @@ class AlarmDesk:
         self._conditions.restore(state["conditions"])
         self._diagnoser.restore(state["diagnoser"])
         self._told = {int(fan): _alarm_of(told) for fan, told in state["told"].items()}
+        if not all(0 <= fan < self._fans and alarm.fan == fan for fan, alarm in self._told.items()):
+            raise ValueError("an alarm of a fan that is not there")
         self._answered = {str(producer): int(following) for producer, following in state["answered"].items()}
 
     def _is_new(self, header: Header) -> bool:

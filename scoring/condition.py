@@ -122,7 +122,8 @@ class Condition:
         why_not = self._why_not(action, now_t_ns, duration_ns)
         if why_not:
             return Transition.REFUSED, why_not
-        until_t_ns = now_t_ns + round(duration_ns) if duration_ns else UNTIL_IT_CLEARS_T_NS
+        timed = action == Action.SHELVE and duration_ns  # of others it is whatever somebody sent, NaN even
+        until_t_ns = now_t_ns + round(duration_ns) if timed else UNTIL_IT_CLEARS_T_NS
         confirmed = not self._settings.confirming
         granted: dict[Action, tuple[Transition, dict[str, Any]]] = {
             Action.ACKNOWLEDGE: (

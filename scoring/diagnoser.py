@@ -119,6 +119,8 @@ class Diagnoser:
         """
         self._due = {int(fan): [int(t) for t in times] for fan, times in state["due"].items()}
         self._onset_t_ns = {int(fan): int(onset) for fan, onset in state["onset_t_ns"].items()}
+        if not all(0 <= fan < len(self._healthy) for fan in (*self._due, *self._onset_t_ns)):
+            raise ValueError("a fan that is not there")
 
     def window(self, fan: int, t_ns: int, onset_t_ns: int) -> Window | None:
         """The last seconds of a fan up to t_ns; None where there are none."""

@@ -151,7 +151,7 @@ class ScorerCore(Core):
             if "wear" in state:
                 self._wear.restore(state["wear"])
             self._fed_by = str(state["fed_by"])
-        except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
+        except (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError):
             self._begin()
             self._counts["memories_not_understood"] += 1
             return []

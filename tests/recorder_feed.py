@@ -37,7 +37,13 @@ def messages(fans: int, number: int) -> dict[str, Message]:
     return {
         "raw": Raw(fans=fans, host_receive_t_ns=t_ns, command=common["command"], speed_rad_s=speed),
         "grid": Grid(**common, speed_rad_s=speed, valid=ones, why_not=zeros),
-        "prediction": Prediction(**judged, predicted_speed_rad_s=speed * 1.01, sigma_rad_s=np.full(fans, 3.0)),
+        "prediction": Prediction(
+            **judged,
+            predicted_speed_rad_s=speed * 1.01,
+            sigma_rad_s=np.full(fans, 3.0),
+            torque_balance_command=speed * 1e-4,
+            torque_balance_sigma_command=np.full(fans, 0.01),
+        ),
         "score": Score(
             **judged,
             predicted_speed_rad_s=speed * 1.01,
@@ -48,6 +54,11 @@ def messages(fans: int, number: int) -> dict[str, Message]:
             smoothed_residual_rad_s=speed * 0.007,
             outside=~ones,
             state=zeros + 1,
+            torque_balance_command=speed * 1e-4,
+            speed_baseline_rad_s=speed * 0.0,
+            balance_baseline_command=speed * 0.0,
+            score=speed * 1e-3,
+            statistic=zeros + 1,
         ),
     }
 

@@ -167,7 +167,7 @@ def test_the_list_has_what_stands_and_with_all_what_is_over(site):
     assert [a["fan"] for a in site.listed("--all")] == [3, 5]
     first, cause, message = site.ask().splitlines()
     assert first.startswith(f"{TRAY} fan 3  ALARM    active, unacknowledged  since ")
-    assert (cause.strip(), message.strip()) == ("drag_up 83%, friction_up 10%: drag +50 %", "too slow")
+    assert (cause.strip(), message.strip()) == ("drag_up 83 %, friction_up 10 %: drag +50 %", "too slow")
 
 
 def test_an_acknowledgement_names_who_and_a_shelved_alarm_is_listed_and_not_presented(site):

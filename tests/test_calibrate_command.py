@@ -190,6 +190,21 @@ def test_an_output_that_cannot_be_written_is_said_in_one_line(folder: Path) -> N
     assert "cannot write the twin" in said
 
 
+def test_a_folder_as_output_is_said_before_anything_is_judged(folder: Path) -> None:
+    said = said_instead(
+        "calibrate", folder / "twin.onnx", folder / "missing.mcap", "--false-alarms-per-day", PER_DAY, "-o", folder
+    )
+    assert "cannot write the twin" in said
+    assert not folder.with_name(folder.name + ".new").exists()
+
+
+def test_a_recording_counts_once(folder: Path) -> None:
+    healthy, verify = folder / "healthy.mcap", ("--verify", folder / "healthy.mcap")
+    twin, rate = folder / "twin.onnx", ("--false-alarms-per-day", PER_DAY)
+    assert "named twice" in said_instead("calibrate", twin, healthy, healthy, *rate)
+    assert "named twice" in said_instead("calibrate", twin, healthy, *rate, *verify)
+
+
 def test_a_rate_is_broken_only_by_more_alarms_than_chance_explains() -> None:
     assert not Check(0, 100.0, 1.0).is_broken
     assert not Check(7, 100.0, 1.0).is_broken  # 4.2 expected

@@ -201,6 +201,12 @@ def test_a_time_that_no_shelving_can_have_is_refused(duration_ns):
     assert asked(at_once(), Action.SHELVE, now_t_ns=5, duration_ns=duration_ns) == refused
 
 
+@pytest.mark.parametrize("duration_ns", [math.nan, math.inf])
+def test_the_time_of_what_is_no_shelving_does_not_matter(duration_ns):
+    granted = (Transition.SUPPRESSED, "")
+    assert asked(at_once(), Action.SUPPRESS, now_t_ns=5, duration_ns=duration_ns) == granted
+
+
 def test_every_fan_asked_about_gets_exactly_one_answer():
     conditions = conditions_of(fans=2)
     answers = conditions.request(Action.SUPPRESS, [1, 0, 2, -3], 0)

@@ -51,7 +51,7 @@ def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
     told = fantwin("replay", "--offline", "--verify", out / "recording.mcap", "--json")
     assert told.returncode == 0, told.stdout + told.stderr
     verified = json.loads(told.stdout)["verified"]
-    assert verified["samples_equal"] > 3100 and verified["alarms_equal"] == 4
+    assert verified["samples_equal"] > 3100 and verified["alarms_equal"] >= 4
 
 
 def test_a_wheel_brings_what_the_demo_reads(tmp_path):

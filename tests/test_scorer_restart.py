@@ -175,13 +175,32 @@ def test_what_is_remembered_of_another_twin_is_set_aside_and_counted() -> None:
 
 @pytest.mark.parametrize(
     "state",
-    ["", "[]", "{}", '{"judge": 1}', '{"judge": {}, "desk": {}}', '{"judge": null, "desk": 3, "fed_by": ""}'],
+    [
+        "",
+        "[]",
+        "{}",
+        '{"judge": 1}',
+        '{"judge": {}, "desk": {}}',
+        '{"judge": null, "desk": 3, "fed_by": ""}',
+        "[" * 100_000,
+    ],
 )
 def test_a_memory_that_is_not_understood_is_set_aside_and_counted(state: str) -> None:
     successor = core_of(3)
     assert successor.restore(replace(note_of(raised()), state_json=state)) == []
     assert successor.counters()["memories_not_understood"] == 1
     feed(successor, [prediction_of(np.zeros((200, 3)))])
+
+
+@pytest.mark.parametrize("where", ["told", "due", "onset_t_ns"])
+def test_a_memory_of_a_fan_that_is_not_there_is_not_understood(where: str) -> None:
+    memory = note_of(raised())
+    state = json.loads(memory.state_json)
+    fans = state["desk"]["told"] if where == "told" else state["desk"]["diagnoser"][where]
+    fans["99"] = next(iter(fans.values())) if where == "told" else {"due": [0], "onset_t_ns": 0}[where]
+    successor = core_of(3)
+    assert successor.restore(replace(memory, state_json=json.dumps(state))) == []
+    assert successor.counters()["memories_not_understood"] == 1
 
 
 def test_a_memory_of_another_number_of_fans_is_not_understood() -> None:

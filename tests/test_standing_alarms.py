@@ -34,6 +34,24 @@ def test_the_newest_message_of_each_fan_says_how_it_stands_whatever_the_order():
         assert found == [("a", 0, False), ("a", 1, True), ("b", 0, True)]
 
 
+@pytest.mark.parametrize(
+    ("transition", "more", "line"),
+    [
+        (Transition.RAISED, {}, "WARNING  a  RAISED at 1"),
+        (Transition.SEVERITY, {"severity": Severity.ALARM}, "ALARM  a  SEVERITY at 1"),
+        (Transition.RAISED, {"out_of_service": True}, "WARNING (kept quiet)  a  RAISED at 1"),
+        (Transition.CLEARED, {"active": False}, "cleared  a  CLEARED at 1"),
+        (
+            Transition.OUT_OF_SERVICE,
+            {"active": False, "out_of_service": True},
+            "out of service  a  OUT_OF_SERVICE at 1",
+        ),
+    ],
+)
+def test_a_log_says_what_happened_and_how_bad_it_is(transition, more, line):
+    assert one(alarm(transition, **more)).line() == line
+
+
 def test_of_messages_at_the_same_sample_the_one_sent_later_counts():
     first, second = alarm(), alarm(Transition.ACKNOWLEDGED, acknowledged=True)
     assert one(second, first).newest is second

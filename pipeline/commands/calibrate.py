@@ -62,6 +62,9 @@ def calibrate(
     """
     if not healthy and not verify:
         raise UserError("nothing to calibrate on: name healthy recordings, or --verify OTHER.mcap to test what is set")
+    _named_once([*(healthy or ()), *(verify or ())])
+    if output and (output.is_dir() or not output.parent.is_dir()):  # told now, and not after an hour of judging
+        raise UserError(f"{output}: cannot write the twin: name a file in a folder that is there")
     result: dict[str, Any] = {}
     if healthy:
         if false_alarms_per_day is None:
@@ -86,8 +89,11 @@ def calibrate(
 def _calibrated(
     twin: Path, healthy: list[Path], per_day: float, extrapolate: bool, overrides: list[str], seed: int
 ) -> Limits:
-    card = json.loads(TwinFile.load(twin).card_json)
-    top_speed_rad_s = max(abs(speed) for speed in card["speed_range_rad_s"])
+    top_speed_rad_s = TwinFile.load(twin).top_speed_rad_s
+    if not 0.0 < top_speed_rad_s < math.inf:
+        raise UserError(
+            f"{twin}: its card does not say up to which speed it was made (speed_range_rad_s): train it anew"
+        )
     with working("judging healthy recordings") as tell:
         runs = HealthyRuns(healthy, twin, overrides, tell)
         try:
@@ -102,6 +108,15 @@ def _calibrated(
         }
     )
     return limits.model_copy(update={"promise": promise})
+
+
+def _named_once(recordings: list[Path]) -> None:
+    """A recording that counted twice would promise more than is known, and verifies nothing it was calibrated on."""
+    seen: set[Path] = set()
+    for path in recordings:
+        if path.resolve() in seen:
+            raise UserError(f"{path}: named twice: every recording counts once, and --verify takes others")
+        seen.add(path.resolve())
 
 
 def _sha256(path: Path) -> str:
