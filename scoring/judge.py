@@ -14,6 +14,7 @@ import numpy as np
 
 from schemas.messages import Array, Prediction, Statistic, WhyNot
 from scoring.limits import Limits
+from scoring.motion import Motion
 from scoring.residual import Residual
 from scoring.sensor import Sensor
 
@@ -80,6 +81,8 @@ class Verdict:
     """what the baseline was at the end of commissioning; NaN before"""
     balance_held: Array
     """the baseline may go no further from that"""
+    motion_rad_s: Array
+    """see scoring.motion"""
 
 
 class Judge:
@@ -90,6 +93,7 @@ class Judge:
         self.speed = Residual(fans, limits.speed, limits.timing)
         self.balance = Residual(fans, limits.balance, limits.timing)
         self.sensor = Sensor(fans, limits.stuck_s, limits.missing_share)
+        self.motion = Motion(fans)
         self.quiet = np.ones(fans, np.bool_)
         """(fans,) whether all was far from its limit in the present interval so far"""
         self.normal = np.ones(fans, np.bool_)
@@ -97,7 +101,7 @@ class Judge:
         self.origin_t_ns: int | None = None
         self.interval = 0
         self._interval_ns = max(1, round(limits.timing.baseline_s * NS_PER_S))
-        self._ratios: list[Array] | None = None
+        self._watched: list[tuple[Array, Array]] | None = None
 
     def update(self, block: Samples) -> Verdict:
         """Judge a block of at least one sample."""
@@ -118,14 +122,16 @@ class Judge:
         return Verdict(**{name: np.concatenate([getattr(v, name) for v in verdicts]) for name in vars(verdicts[0])})
 
     def watch(self) -> None:
-        """Keep the ratios of all statistics from now on, for `watched`."""
-        self._ratios = []
+        """Keep the ratios of all statistics, and what they are of, from now on, for `watched`."""
+        self._watched = []
 
-    def watched(self) -> Array:
-        """(7, n, fans) the ratios since the last call, in the order of Statistic from 1 on."""
-        assert self._ratios is not None
-        ratios, self._ratios = np.concatenate(self._ratios, axis=1), []
-        return ratios
+    def watched(self) -> tuple[Array, Array]:
+        """(7, n, fans) the ratios since the last call, in the order of Statistic from 1 on, and (2, n, fans) both
+        standardised residuals.
+        """
+        assert self._watched is not None
+        (ratios, standard), self._watched = zip(*self._watched, strict=True), []
+        return np.concatenate(ratios, axis=1), np.concatenate(standard, axis=1)
 
     def forget(self, fans: Array) -> None:
         """Take new baselines of some fans, (fans,) of bool."""
@@ -144,33 +150,40 @@ class Judge:
     def _stretch(self, block: Samples, rows: slice) -> Verdict:
         speed_rad_s, step_s = block.speed_rad_s[rows], block.step_ns / NS_PER_S
         parts: list[Array] = []
+        standardised: list[Array] = []
         smoothed: list[Array] = []
         baselines: list[Array] = []
+        commissioned: list[Array] = []
         judged = np.zeros(speed_rad_s.shape, np.bool_)
         known = np.zeros(speed_rad_s.shape, np.bool_)
+        motion_rad_s = self.motion.update(speed_rad_s, step_s)
         for residual, values, valid in (
             (self.speed, block.speed_residual[rows], block.speed_valid[rows]),
             (self.balance, block.balance[rows], block.balance_valid[rows]),
         ):
             standard = residual.standardise(values, speed_rad_s)
-            residual.learn(standard, speed_rad_s, valid, step_s)
+            shape = residual.shape(speed_rad_s, valid)
+            own = residual.baseline.value * shape
+            residual.learn(standard, shape, speed_rad_s, valid, step_s)
             may = valid & residual.baseline.is_set
-            found = residual.judge(standard, speed_rad_s, may, step_s)
+            found = residual.judge(standard - own, shape, speed_rad_s, motion_rad_s, may, step_s)
             parts.append(np.where(may, found.ratios, 0.0))
+            standardised.append(found.standard)
             smoothed.append(np.where(may, found.smoothed, np.nan))
-            baselines.append(np.broadcast_to(residual.baseline.value, valid.shape))
+            baselines.append(own)
+            commissioned.append(residual.baseline.commissioned * shape)
             if residual.is_judged:
                 judged |= may
                 known |= valid
         alive = block.alive[rows]
         sensor = self.sensor.update(speed_rad_s, block.missing[rows], alive, block.step_ns)
         ratios = np.concatenate((*parts, np.where(alive, sensor, 0.0)[np.newaxis]))
-        if self._ratios is not None:
-            self._ratios.append(ratios)
+        if self._watched is not None:
+            self._watched.append((ratios, np.stack(standardised)))
         largest = ratios.argmax(axis=0)
         score = np.take_along_axis(ratios, largest[np.newaxis], axis=0)[0]
         highest = score.max(axis=0)
-        own = self.balance.baseline
+        balance = self.balance.baseline
         self.quiet &= highest <= QUIET
         self.normal &= highest <= 1.0
         seen = judged | (alive & (score > 1.0))
@@ -182,9 +195,10 @@ class Judge:
             speed_baseline=baselines[0],
             balance_smoothed=smoothed[1],
             balance_baseline=baselines[1],
-            balance_baseline_s=np.broadcast_to(own.weight * self.limits.timing.baseline_s, known.shape),
-            balance_commissioned=np.broadcast_to(np.where(own.is_commissioning, np.nan, own.commissioned), known.shape),
-            balance_held=np.broadcast_to(own.is_at_limit, known.shape),
+            balance_baseline_s=np.broadcast_to(balance.weight * self.limits.timing.baseline_s, known.shape),
+            balance_commissioned=np.where(balance.is_commissioning, np.nan, commissioned[-1]),
+            motion_rad_s=motion_rad_s,
+            balance_held=np.broadcast_to(balance.is_at_limit, known.shape),
         )
 
     def snapshot(self) -> dict[str, Any]:
@@ -223,7 +237,10 @@ class Judge:
                 f"{name}_waited": baseline.waited,
                 f"{name}_squares": baseline.squares,
                 f"{name}_means": baseline.means,
+                f"{name}_told": baseline.told,
+                f"{name}_worth": baseline.worth,
                 f"{name}_sums": baseline.sums,
+                f"{name}_shapes": baseline.shapes,
                 f"{name}_counts": baseline.counts,
                 f"{name}_shown": residual.shown.value,
                 f"{name}_smoothed": residual.low_pass.value,
@@ -231,6 +248,7 @@ class Judge:
                 f"{name}_square": residual.spread.square.value,
             }
         return columns | {
+            "motion_past": self.motion.past.value,
             "sensor_last": self.sensor.last,
             "sensor_since_ns": self.sensor.since_ns,
             "sensor_missing": self.sensor.missing.value,

@@ -27,11 +27,20 @@ class ResidualLimits(_Part):
     of the low-passed residual in its own standard deviations. drift: of the CUSUM in standard deviations of a second's
     sum, with reference_sigmas. growth: of the spread, that is usual_growth on average. baseline_sigmas: how far a fan's
     own offset may be from none. adaptation_sigmas: how far the baseline may follow afterwards.
+
+    lasting: how much more than usual, at these speeds or at all, what lasts of the healthy residual varies;
+    motion_rad_s: and where a fan moves by so much (scoring.motion), root two times as much as where its speed holds,
+    None for no more. baseline_power: a fan's own offset goes with this power of the speed, and baselines are those at
+    baseline_speed_rad_s: 0 where friction is what differs from day to day; where it is the density of the air, 1 of
+    the speed and 2 of the balance. Then baseline_ridge is the variance of what baselines cannot follow in that of
+    healthy ones, and baseline_usual_sigmas the root mean square of these.
     """
 
     speeds_rad_s: tuple[float, ...] = (0.0,)
     offset_sigmas: tuple[float, ...] = (0.0,)
     spread: tuple[float, ...] = (1.0,)
+    lasting: tuple[float, ...] = (1.0,)
+    motion_rad_s: float | None = Field(default=None, gt=0)
     autocorrelation_time_s: float = Field(default=0.0, ge=0)
     step: float | None = Field(default=None, gt=0)
     drift: float | None = Field(default=None, gt=0)
@@ -40,6 +49,10 @@ class ResidualLimits(_Part):
     usual_growth: float = Field(default=0.0, ge=0)
     baseline_sigmas: float = Field(default=1.0, ge=0)
     adaptation_sigmas: float = Field(default=1.0, ge=0)
+    baseline_power: int = Field(default=0, ge=0, le=2)
+    baseline_speed_rad_s: float = Field(default=1.0, gt=0)
+    baseline_ridge: float = Field(default=0.0, ge=0)
+    baseline_usual_sigmas: float = Field(default=0.0, ge=0)
 
     @property
     def mean_spread(self) -> float:
@@ -63,12 +76,13 @@ class ResidualLimits(_Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> ResidualLimits:
-        if not len(self.speeds_rad_s) == len(self.offset_sigmas) == len(self.spread) > 0:
-            raise ValueError("speeds_rad_s, offset_sigmas and spread must be of one length")
+        knots = len(self.speeds_rad_s)
+        if not knots == len(self.offset_sigmas) == len(self.spread) > 0 or len(self.lasting) not in (1, knots):
+            raise ValueError("speeds_rad_s, offset_sigmas and spread must be of one length, and lasting too, or of one")
         if list(self.speeds_rad_s) != sorted(set(self.speeds_rad_s)):
             raise ValueError("speeds_rad_s must rise")
-        if min(self.spread) <= 0:
-            raise ValueError("spread must be above zero")
+        if min(*self.spread, *self.lasting) <= 0:
+            raise ValueError("spread and lasting must be above zero")
         if self.growth is not None and self.growth <= self.usual_growth:
             raise ValueError("growth must be above usual_growth")
         return self

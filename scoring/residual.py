@@ -18,6 +18,7 @@ CAP = 2.0  # the residual counts no further than so many limits
 CUSUM_CAP = 1.05  # nor a CUSUM: what is forgotten late clears late, and a shift that only lasts is a warning
 LEAST_CLIP = 5.0  # healthy deviations
 LARGEST = 1e6  # of them, so that what follows stays finite
+FASTEST = 3.0  # of the baseline's speed: offsets grow no further
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +27,8 @@ class Judged:
 
     smoothed: Array
     """(n, fans) the low-passed residual, sigma"""
+    standard: Array
+    """(n, fans) the residual in how much it varies there"""
     ratios: Array
 
 
@@ -37,7 +40,15 @@ class Residual:
         self._timing = timing
         adaptation = max(timing.adaptation_s / timing.baseline_s, 1.0)
         self.baseline = Baseline(
-            fans, BaselineSettings(limits.baseline_sigmas, limits.adaptation_sigmas, adaptation, limits.mean_spread)
+            fans,
+            BaselineSettings(
+                limits.baseline_sigmas,
+                limits.adaptation_sigmas,
+                adaptation,
+                limits.mean_spread,
+                limits.baseline_ridge,
+                limits.baseline_usual_sigmas,
+            ),
         )
         self.shown = LowPass(fans, timing.smoothing_s)
         self.low_pass = LowPass(fans, timing.smoothing_s)
@@ -59,30 +70,42 @@ class Residual:
             return residual_sigmas - limits.offset_sigmas[0]
         return residual_sigmas - np.interp(np.abs(speed_rad_s), limits.speeds_rad_s, limits.offset_sigmas)
 
-    def learn(self, standard: Array, speed_rad_s: Array, valid: Array, step_s: float) -> None:
-        """Note for the baseline. Arguments as of judge; one wild reading must not move it."""
-        reach = self._limits.baseline_sigmas + self._clip(step_s) * self._spread(speed_rad_s, valid)
-        centre = self.baseline.value
-        self.baseline.add(np.clip(np.where(valid, standard, centre), centre - reach, centre + reach), valid)
+    def learn(self, standard: Array, shape: Array, speed_rad_s: Array, valid: Array, step_s: float) -> None:
+        """Note for the baseline what standardise gives; one wild reading must not move it. All (n, fans)."""
+        reach = self._limits.baseline_sigmas * shape + self._clip(step_s) * self._spread(speed_rad_s, valid)
+        centre = self.baseline.value * shape
+        self.baseline.add(np.clip(np.where(valid, standard, centre), centre - reach, centre + reach), valid, shape)
 
-    def judge(self, standard: Array, speed_rad_s: Array, valid: Array, step_s: float) -> Judged:
-        """Take a stretch in which the baseline stays. standard: as standardise gives it; valid: to be judged."""
+    def shape(self, speed_rad_s: Array, valid: Array) -> Array:
+        """(n, fans) how large a fan's own offset is at these speeds, that at the baseline's speed being one."""
         limits = self._limits
-        shift = np.clip(np.where(valid, standard - self.baseline.value, 0.0), -LARGEST, LARGEST)
+        if limits.baseline_power == 0:
+            return np.ones(speed_rad_s.shape)
+        speed = np.where(valid, np.abs(speed_rad_s), 0.0) / limits.baseline_speed_rad_s
+        return np.minimum(speed, FASTEST) ** limits.baseline_power
+
+    def judge(
+        self, less_own: Array, shape: Array, speed_rad_s: Array, motion_rad_s: Array, valid: Array, step_s: float
+    ) -> Judged:
+        """Take a stretch. less_own: what standardise gives less what is the fan's own. valid: to be judged."""
+        limits, clip = self._limits, self._clip(step_s)
+        shift = np.clip(np.where(valid, less_own, 0.0), -LARGEST, LARGEST)
         shown = self.shown.update(shift, valid, step_s)
-        clip = self._clip(step_s)
-        z = np.clip(shift / self._spread(speed_rad_s, valid), -clip, clip)  # one wild reading must not raise an alarm
+        spread = self._spread(speed_rad_s, valid)
+        raw = np.clip(shift / spread, -clip, clip)  # one wild reading must not raise an alarm
+        lasting = self._lasting(shape, speed_rad_s, motion_rad_s, valid, step_s)
+        z = raw / lasting
         smoothed = self.low_pass.update(z, valid, step_s)
         drift = self.cusum.update(z, valid, step_s)
-        spread = self.spread.update(z, smoothed, valid, step_s)
+        growth = self.spread.update(raw, lasting * smoothed, valid, step_s)
         ratios = np.stack(
             (
                 np.abs(smoothed) / (self._deviation(step_s) * (limits.step or math.inf)),
                 drift / (self._drift_s * (limits.drift or math.inf)),
-                np.maximum(spread - limits.usual_growth, 0.0) / ((limits.growth or math.inf) - limits.usual_growth),
+                np.maximum(growth - limits.usual_growth, 0.0) / ((limits.growth or math.inf) - limits.usual_growth),
             )
         )
-        return Judged(shown, ratios)
+        return Judged(shown, z, ratios)
 
     def limit_sigmas(self, step_s: float) -> float:
         """How far the smoothed residual may be from its baseline, sigma; infinite where that is not judged.
@@ -112,6 +135,21 @@ class Residual:
         if len(limits.speeds_rad_s) == 1:
             return limits.spread[0]
         return np.where(valid, np.interp(np.abs(speed_rad_s), limits.speeds_rad_s, limits.spread), 1.0)
+
+    def _lasting(
+        self, shape: Array, speed_rad_s: Array, motion_rad_s: Array, valid: Array, step_s: float
+    ) -> Array | float:
+        """How much more what lasts varies here than where it varies least, and where a fan's own offset is known."""
+        limits = self._limits
+        more: Array | float = limits.lasting[0]
+        if len(limits.lasting) > 1:
+            more = np.where(valid, np.interp(np.abs(speed_rad_s), limits.speeds_rad_s, limits.lasting), 1.0)
+        if limits.motion_rad_s is not None:
+            more = more * np.sqrt(1.0 + np.square(motion_rad_s / limits.motion_rad_s))
+        if limits.baseline_usual_sigmas > 0.0:
+            unknown = np.where(valid, self.baseline.unknown(shape), 0.0) / self._deviation(step_s)
+            more = np.sqrt(np.square(more) + np.square(unknown))
+        return more
 
     def forget(self, fans: Array) -> None:
         """Begin the statistics of some fans anew, (fans,) of bool; baselines stay."""

@@ -145,3 +145,58 @@ def test_once_commissioned_it_learns_only_from_what_is_far_from_every_limit() ->
     baseline.end_interval(SAMPLES, GOOD, np.array([False, True]))
     assert baseline.value[0] == 0.0
     assert baseline.value[1] > 0.0
+
+
+# An offset that goes with the speed
+
+SHAPED = BaselineSettings(farthest=5.0, adaptation_limit=0.5, adaptation_intervals=60.0, ridge=0.25, usual=0.5)
+EVERY = np.ones((SAMPLES, 2), np.bool_)
+
+
+def shaped(levels: np.ndarray, seed: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of an offset of two where the shape is one, and the shapes; (samples, 2) each, from (samples,)."""
+    shape = levels[:, np.newaxis] * np.ones(2)
+    return 2.0 * shape + np.random.default_rng(seed).normal(0.0, noise, shape.shape), shape
+
+
+def test_an_offset_that_goes_with_the_speed_is_found_while_the_speed_moves() -> None:
+    baseline = Baseline(2, BaselineSettings(5.0, 0.5, 60.0))
+    for seed in range(COMMISSIONING_INTERVALS):
+        baseline.add(*_with(EVERY, shaped(np.linspace(0.3, 1.5, SAMPLES), seed, 0.2)))
+        baseline.end_interval(SAMPLES, GOOD, GOOD)
+    np.testing.assert_allclose(baseline.value, 2.0, atol=0.05)
+
+
+def test_a_fan_too_slow_to_tell_its_offset_is_judged_and_not_led_astray() -> None:
+    baseline = Baseline(2, SHAPED)
+    for seed in range(5 * COMMISSIONING_INTERVALS):
+        baseline.add(*_with(EVERY, shaped(np.full(SAMPLES, 0.02), seed, 1.0)))
+        baseline.end_interval(SAMPLES, GOOD, GOOD)
+        assert baseline.is_set.all()
+        assert np.abs(baseline.value).max() < 0.5
+
+
+def test_how_far_an_offset_may_be_is_known_where_it_was_learnt() -> None:
+    baseline = Baseline(2, SHAPED)
+    for level, unknown in ((0.2, 3.0 * 0.5 * 0.8), (1.0, 0.0)):
+        for seed in range(COMMISSIONING_INTERVALS):
+            baseline.add(*_with(EVERY, shaped(np.full(SAMPLES, level), seed, 0.2)))
+            baseline.end_interval(SAMPLES, GOOD, GOOD)
+        np.testing.assert_allclose(baseline.unknown(np.ones((1, 2))), unknown, atol=1e-6)
+        assert (baseline.unknown(np.full((1, 2), 0.1)) == 0.0).all()
+
+
+def test_intervals_that_tell_more_take_the_place_of_those_that_told_little() -> None:
+    baseline = Baseline(2, SHAPED)
+    for seed in range(COMMISSIONING_INTERVALS):
+        baseline.add(*_with(EVERY, shaped(np.full(SAMPLES, 0.02), seed, 1.0)))
+        baseline.end_interval(SAMPLES, GOOD, GOOD)
+    for seed in range(2):
+        baseline.add(*_with(EVERY, shaped(np.full(SAMPLES, 1.0), seed, 0.2)))
+        baseline.end_interval(SAMPLES, GOOD, GOOD)
+    assert not baseline.is_commissioning.any()
+    np.testing.assert_allclose(baseline.value, 2.0 * 1.0 / 1.25, rtol=0.05)
+
+
+def _with(valid: np.ndarray, made: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return made[0], valid, made[1]

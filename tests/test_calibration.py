@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from scoring.alarm_rate import dispersion, poisson_interval, rate_interval
-from scoring.calibration import Runs, TooLittleError, calibrate, survey
+from scoring.calibration import TooLittleError, calibrate
 from scoring.judge import Judge, Samples
 from scoring.limits import Limits, Timing
+from scoring.survey import Runs, survey
 from scoring.tail import Tail
 from scoring.windows import Windows, peaks
 from tests.healthy_residuals import Raised, alarms_of, autoregressive, in_blocks, samples_of
