@@ -3,7 +3,8 @@
 Processes are peers that need no router. The first to start on a host listens on the configured endpoint, the
 others connect there and learn of each other. When that process dies, the rest stay connected to one another, and
 the next to start takes the endpoint over. (Trying again and again to listen would take it over at once, but a
-session that still tries cannot be closed in less than ten seconds: measured with Zenoh 1.10.)
+session that still tries cannot be closed in less than ten seconds: measured with Zenoh 1.10.) A command that looks in
+and goes again does not listen there: once it had gone, a newcomer would find nobody, and meet the others late.
 
 Data is published with congestion control BLOCK, and each publisher keeps its last messages and answers
 questions for them, so that a consumer that was not yet connected, or was restarted, asks for what it missed.
@@ -88,8 +89,10 @@ def recovery_key(key: str, producer: str) -> str:
 class Bus:
     """One session on the bus."""
 
-    def __init__(self, config: BusConfig, stop: threading.Event | None = None) -> None:
+    def __init__(self, config: BusConfig, stop: threading.Event | None = None, *, listens: bool = True) -> None:
         """Open a session. Peers need nobody; a client needs its router, and with `stop` waits for it until that is set.
+
+        listens: where nobody is there yet, at the endpoint; not for one that only looks in.
 
         Raises:
             BusError: the endpoint cannot be used, or a client's router is not there.
@@ -97,7 +100,7 @@ class Bus:
         self._config = config
         self.came_second = _somebody_listens(config.endpoint)
         """Whether others were there before: it takes a moment until they are met."""
-        self._session = _open(config, stop)
+        self._session = _open(config, stop, listens)
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
 
     def __enter__(self) -> Self:
@@ -217,9 +220,9 @@ def _somebody_listens(endpoint: str) -> bool:
     return False
 
 
-def _open(config: BusConfig, stop: threading.Event | None) -> zenoh.Session:
+def _open(config: BusConfig, stop: threading.Event | None, listens: bool) -> zenoh.Session:
     try:
-        conf = _zenoh_config(config)
+        conf = _zenoh_config(config, listens)
         if config.mode == "peer":
             return zenoh.open(conf)
     except zenoh.ZError as error:
@@ -234,7 +237,7 @@ def _open(config: BusConfig, stop: threading.Event | None) -> zenoh.Session:
                 ) from error
 
 
-def _zenoh_config(config: BusConfig) -> zenoh.Config:
+def _zenoh_config(config: BusConfig, listens: bool) -> zenoh.Config:
     conf = zenoh.Config()
     conf.insert_json5("mode", json.dumps(config.mode))
     conf.insert_json5("connect/endpoints", json.dumps([config.endpoint]))
@@ -244,7 +247,8 @@ def _zenoh_config(config: BusConfig) -> zenoh.Config:
     conf.insert_json5("scouting/multicast/enabled", "false")
     if config.mode == "peer":
         host = config.endpoint.rsplit(":", 1)[0]
-        conf.insert_json5("listen/endpoints", json.dumps([config.endpoint, f"{host}:0"]))
+        endpoints = [*([config.endpoint] if listens else []), f"{host}:0"]
+        conf.insert_json5("listen/endpoints", json.dumps(endpoints))
         conf.insert_json5("listen/timeout_ms", "0")
         conf.insert_json5("listen/exit_on_failure", "false")
         conf.insert_json5("scouting/gossip/enabled", "true")

@@ -10,6 +10,7 @@ from pipeline.stage import Packet
 from schemas.messages import Health, Input
 from schemas.topics import topic_of
 
+MOST_PRODUCERS = 64  # of a key: so many are known by name, the latest; every `fantwin alarms ack` is a new one
 Recover: TypeAlias = Callable[[str, str, int, int], Iterable[Packet]]
 
 
@@ -21,6 +22,12 @@ class _Line:
     received: int = 0
     missing: int = 0
     duplicated: int = 0
+
+    def add(self, other: _Line) -> None:
+        """Count another one's messages as well."""
+        self.received += other.received
+        self.missing += other.missing
+        self.duplicated += other.duplicated
 
 
 class Inlet:
@@ -35,7 +42,10 @@ class Inlet:
 
     def __init__(self, recover: Recover | None) -> None:
         self._recover = recover
-        self._lines: dict[tuple[str, str], _Line] = {}
+        self._lines: dict[str, dict[str, _Line]] = {}
+        """of each key, by producer; who spoke last is at the end"""
+        self._silent: dict[str, _Line] = {}
+        """of each key, all that are no longer known by name"""
 
     def accept(self, packet: Packet) -> Iterator[Packet]:
         """The packets that are due now that this one has come: recovered ones first, nothing if it came before."""
@@ -59,7 +69,8 @@ class Inlet:
                 yield from self._fill(output.key, health.header.producer, line, output.published)
 
     def inputs(self) -> tuple[Input, ...]:
-        """The account, for health."""
+        """The account, for health; of those that are not known by name, under an empty one."""
+        named = [(key, *of) for key, lines in self._lines.items() for of in lines.items()]
         return tuple(
             Input(
                 key=key,
@@ -69,12 +80,16 @@ class Inlet:
                 duplicated=line.duplicated,
                 next_sequence=line.next_sequence or 0,
             )
-            for (key, producer), line in self._lines.items()
+            for key, producer, line in (*named, *((key, "", line) for key, line in self._silent.items()))
             if line.next_sequence is not None
         )
 
     def _line(self, key: str, producer: str) -> _Line:
-        return self._lines.setdefault((key, producer), _Line())
+        lines = self._lines.setdefault(key, {})
+        line = lines[producer] = lines.pop(producer, None) or _Line()
+        if len(lines) > MOST_PRODUCERS:
+            self._silent.setdefault(key, _Line(next_sequence=0)).add(lines.pop(next(iter(lines))))
+        return line
 
     def _fill(self, key: str, producer: str, line: _Line, until: int) -> Iterator[Packet]:
         """Bring a line up to sequence `until` (exclusive)."""

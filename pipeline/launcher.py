@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -18,7 +19,8 @@ from pipeline.watcher import Watcher
 from schemas.topics import alive_key
 
 _LOOK_S = 0.05
-_MEETING_S = 2.0  # within which those who were there before are met
+_MEETING_S = 10.0  # within which those who were there before are met, however busy the machine
+_OTHERS_S = 2.0  # within which all of them are, once one is
 _ORDERLY = (0, 3)  # how a stage ends in order: all well, or something was lost
 _READY_TIMEOUT_S = 30.0
 _STABLE_S = 10.0  # a stage that ran this long starts again at the shortest delay
@@ -87,17 +89,22 @@ class Launcher:
         return self.outcome
 
     def _refuse_a_second(self, bus: Bus) -> None:
-        key = alive_key(self._config.site, "*", "*")
-        until_s = time.monotonic() + (_MEETING_S if bus.came_second else 0.0)
-        while not (alive := bus.alive(key)) and time.monotonic() < until_s:
-            time.sleep(_LOOK_S)
+        """Somebody at the endpoint is of this site, or of another that shares it, or no stage at all. A busy machine
+        takes seconds until the first is met; a router is met already."""
         ours = {alive_key(self._config.site, slot.row.stage, slot.row.instance): slot.row.label for slot in self._slots}
-        running = [label for key, label in ours.items() if key in alive]
-        if running:
-            raise UserError(
-                f"site {self._config.site!r} already runs at {self._config.bus.endpoint} ({', '.join(running)}): "
-                "stop that, or give this one another site or bus.endpoint"
-            )
+        began_s, met_s = time.monotonic(), math.inf if self._config.bus.mode == "peer" else time.monotonic()
+        while True:
+            alive = bus.alive(alive_key("*", "*", "*"))
+            if running := [label for key, label in ours.items() if key in alive]:
+                raise UserError(
+                    f"site {self._config.site!r} already runs at {self._config.bus.endpoint} ({', '.join(running)}): "
+                    "stop that, or give this one another site or bus.endpoint"
+                )
+            now_s = time.monotonic()
+            met_s = min(met_s, now_s if alive else math.inf)
+            if not bus.came_second or now_s >= min(began_s + _MEETING_S, met_s + _OTHERS_S):
+                return
+            time.sleep(_LOOK_S)
 
     def _start_all(self, stop: threading.Event) -> None:
         """Whoever listens first: sources start when all others are ready, so that no first sample is missed."""

@@ -103,11 +103,23 @@ class StandingAlarm:
 
 
 def standing_alarms(messages: Iterable[Alarm]) -> list[StandingAlarm]:
-    """One for each fan that was ever told of, by tray and fan; the messages in any order."""
+    """One for each fan that was ever told of, by tray and fan; the messages in the order in which they came."""
     by_fan: dict[tuple[str, int], list[Alarm]] = {}
-    for alarm in sorted(messages, key=lambda alarm: (alarm.t_ns, alarm.header.sequence)):
+    for alarm in messages:
         by_fan.setdefault((alarm.header.tray, alarm.fan), []).append(alarm)
-    return [_standing(by_fan[fan]) for fan in sorted(by_fan)]
+    return [_standing(in_sequence(by_fan[fan])) for fan in sorted(by_fan)]
+
+
+def in_sequence(messages: Iterable[Alarm]) -> list[Alarm]:
+    """Messages as they came, but those of each producer by sequence: some may have been asked for again.
+
+    Not by their times: those of a scorer go back when it is fed a recording of long ago.
+    """
+    came = list(messages)
+    of: dict[str, list[Alarm]] = {}
+    for alarm in sorted(came, key=lambda alarm: alarm.header.sequence, reverse=True):
+        of.setdefault(alarm.header.producer, []).append(alarm)
+    return [of[alarm.header.producer].pop() for alarm in came]
 
 
 def _standing(told: list[Alarm]) -> StandingAlarm:

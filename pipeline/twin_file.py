@@ -22,11 +22,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from pipeline.stage import Context, StageError
 from schemas.messages import Array
+from scoring.regression_window import HealthyBalance
 
 CARD_PROPERTY = "fantwin.card"
 FORMAT_VERSION = 3
 INPUTS = ("state", "command", "step_s", "parameters")
 OUTPUTS = ("speed_rad_s", "state_out")
+DEAD_ZONE = 0.25  # of the range of commands: a friction above so much of it is none
 
 Range: TypeAlias = tuple[float, float]
 Advance: TypeAlias = Callable[[Array, Array, Array], tuple[Array, Array]]
@@ -160,6 +162,35 @@ class TwinFile:
     def command_unit(self) -> str:
         """Of the balance; empty where the card does not say."""
         return str(json.loads(self.card_json).get("command_unit", ""))
+
+    @property
+    def off_below(self) -> Array:
+        """(fans,) the smallest command that turns the rotor: the friction, unless it lies amidst the healthy commands.
+
+        Then the fan was held at one speed, where friction takes the place of a drag that could not be told.
+        """
+        low, high = self.command_range
+        friction = self.balance.friction
+        return np.where((friction > 0.0) & (friction < low + DEAD_ZONE * (high - low)), friction, -np.inf)
+
+    def healthy_balances(self) -> list[HealthyBalance]:
+        """The balance fan by fan, as those that judge want it."""
+        of, rate_per_s = self.balance, self.balance.filter_rate_per_s
+        return [
+            HealthyBalance(
+                inertia=float(of.inertia[fan]),
+                viscous=float(of.viscous[fan]),
+                drag=float(of.drag[fan]),
+                friction=float(of.friction[fan]),
+                lag_s=float(of.lag_s[fan]),
+                std_errors=of.std_errors[fan],
+                filter_rate_per_s=rate_per_s,
+                sigma_command=float(of.sigma_command[fan]),
+                autocorrelation_time_s=float(of.autocorrelation_time_s[fan]),
+                lowest_speed_rad_s=float(of.lowest_speed_rad_s[fan]),
+            )
+            for fan in range(self.fans)
+        ]
 
     def initial_state(self, speed_rad_s: Array, command: Array) -> Array:
         """(fans, n_state) of fans that have long run at speed_rad_s (fans,) under command (fans,)."""

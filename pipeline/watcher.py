@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from pipeline.account import losses
 from pipeline.bus import Bus
-from pipeline.standing_alarms import StandingAlarm, standing_alarms
+from pipeline.standing_alarms import StandingAlarm, in_sequence, standing_alarms
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Health
 from schemas.topics import alive_key, health_key, tray_key
@@ -58,9 +58,8 @@ class Watcher:
 
     def ask_for_past_alarms(self) -> None:
         """Fetch the alarms that were raised before this watcher came."""
-        for _, payload in self._bus.recover(
-            tray_key(self._site, "*", "alarm"), "*", 0, 2**63, lambda: time.sleep(0.005)
-        ):
+        key = tray_key(self._site, "*", "alarm")
+        for _, payload in self._bus.recover(key, "*", 0, 2**63, lambda: time.sleep(0.005)):
             self._note_alarm("", payload)
 
     def stages(self) -> list[StageView]:
@@ -107,7 +106,7 @@ class Watcher:
             with self._lock:
                 told = self._alarms.setdefault((alarm.header.tray, alarm.fan), {})
                 told[alarm.header.producer, alarm.header.sequence] = alarm
-                newest = max(told.values(), key=lambda each: (each.t_ns, each.header.sequence))
+                newest = in_sequence(told.values())[-1]
                 for name in [name for name, each in told.items() if each.onset_t_ns != newest.onset_t_ns]:
                     del told[name]
 

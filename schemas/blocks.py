@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from schemas.messages import MESSAGE_TYPES, Message, columns
+from schemas.messages import MESSAGE_TYPES, Array, Message, columns
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
 
@@ -87,6 +87,12 @@ def cut(message: AnyMessage, first: int, end: int) -> AnyMessage:
     if not of_samples or not 0 <= first <= end <= len(getattr(message, of_samples[0])):
         raise ValueError(f"a {type(message).__name__} without samples {first} to {end}")
     return replace(message, **{name: getattr(message, name)[first:end] for name in of_samples})
+
+
+def chosen(message: AnyMessage, rows: Array) -> AnyMessage:
+    """Some of the samples, (n,) of bool, and the header."""
+    of_samples = {name: getattr(message, name) for name in _FORMS[type(message)].of_samples}
+    return replace(message, **{name: values[rows] if len(values) else values for name, values in of_samples.items()})
 
 
 def _has_columns(message: Message, form: _Form) -> list[bool]:

@@ -28,6 +28,7 @@ from schemas.messages import (
     Message,
     Output,
     Prediction,
+    Score,
     Severity,
     StageStatus,
     Statistic,
@@ -47,6 +48,11 @@ _ENUMS = {
 }
 _ENUM_COLUMNS = {"why_not": max(WhyNot), "state": max(FanState), "statistic": max(Statistic)}
 _OF_SOME_DEVICES = {"device_clock_us", "device_sequence"}  # the only columns of samples that may be empty
+_ADDED_LATER: dict[type[Message], set[str]] = {
+    Prediction: {"torque_balance_command", "torque_balance_sigma_command"},
+    Score: {"torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic"},
+}
+"""columns that older recordings do not have: they read as NaN, or 0"""
 LARGEST_STEP_NS = 86_400_000_000_000  # a day
 FURTHEST_T_NS = (1 << 62) - LARGEST_STEP_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits
 _FURTHEST = {"host_receive_t_ns": FURTHEST_T_NS, "t_ns": 1 << 62}  # the grid may go a little beyond what was received
@@ -150,6 +156,8 @@ def encode(message: Message) -> bytes:
 def decode(message_type: type[Message], data: bytes) -> Message:
     """Parse bytes into a message; columns come back read-only in their declared shape.
 
+    What was added to a message since it was recorded is NaN, or 0.
+
     Raises:
         CodecError: the bytes are not such a message.
     """
@@ -169,7 +177,11 @@ def decode(message_type: type[Message], data: bytes) -> Message:
     fans = values.get("fans", 0)
     for column in _COLUMNS[message_type]:
         array = _array(message_type, column, getattr(proto, column.name))
-        if column.shape == "samples x fans":
+        if not array.size and column.name in _ADDED_LATER.get(message_type, ()) and len(values["t_ns"]):
+            shape = (fans,) if column.shape == "fans" else (len(values["t_ns"]), fans)
+            nothing = np.array(np.nan if column.dtype.kind == "f" else 0, column.dtype)
+            array = np.broadcast_to(nothing, shape)  # takes no room: nothing has said yet that `fans` is true
+        elif column.shape == "samples x fans":
             if array.size and (fans == 0 or array.size % fans):
                 raise CodecError(f"{type_name(message_type)}.{column.name} has {array.size} values for {fans} fans")
             array = array.reshape(-1 if array.size else 0, fans)

@@ -30,7 +30,7 @@ MOST_PRODUCERS = 64  # of requests: so many are known by name, the latest
 
 @dataclass(frozen=True, eq=False)
 class Distance:
-    """How far fans are from their twins. balance_command: (n, fans), less baseline; limits: (fans,), 0 for none."""
+    """How far fans are from their twins. balance_command: (n, fans), less baseline; limits: (fans,), inf for none."""
 
     balance_command: Array
     limit_rad_s: Array
@@ -76,7 +76,7 @@ class AlarmDesk:
             if change.transition == Transition.RAISED:
                 self.raised += 1
                 t_ns = int(score.t_ns[change.row])
-                self._diagnoser.raised(fan, t_ns, change.onset_t_ns)
+                self._diagnoser.raised(fan, t_ns, change.standing.onset_t_ns)
                 more["causes"] = self._diagnoser.diagnose(fan, t_ns)
             elif change.transition == Transition.CLEARED:
                 self.cleared += 1
@@ -122,19 +122,29 @@ class AlarmDesk:
 
     def restate(self) -> list[Alarm]:
         """What still concerns somebody, or is kept quiet, told again after a restart; and who acknowledged it."""
+        return [self._restated(fan) for fan in self._concerning()]
+
+    def disown(self, t_ns: int, *, stays_quiet: bool) -> list[Alarm]:
+        """Forget all alarms, and say so of each that concerned somebody; what operators want quiet may stay so."""
+        fans = self._concerning()
+        self._conditions.forget(stays_quiet=stays_quiet)
+        self._told = {}
+        told: list[Alarm] = []
+        for fan in fans:
+            self._diagnoser.cleared(fan)
+            self._told[fan] = replace(self._alarm(fan), t_ns=t_ns, **_of_standing(self._conditions.standing(fan)))
+            told.append(self._restated(fan))
+        return told
+
+    def _concerning(self) -> list[int]:
+        """Fans whose alarm is retained, or kept quiet."""
         standing = {fan: self._conditions.standing(fan) for fan in sorted(self._told)}
-        return [
-            self._tell(
-                replace(
-                    self._alarm(fan),
-                    transition=Transition.RESTATED,
-                    operator_name=now.acknowledged_by,
-                    comment=now.comment,
-                )
-            )
-            for fan, now in standing.items()
-            if now.retained or now.quiet
-        ]
+        return [fan for fan, now in standing.items() if now.retained or now.quiet]
+
+    def _restated(self, fan: int) -> Alarm:
+        now = self._conditions.standing(fan)
+        restated = replace(self._alarm(fan), transition=Transition.RESTATED)
+        return self._tell(replace(restated, operator_name=now.acknowledged_by, comment=now.comment))
 
     def snapshot(self) -> dict[str, Any]:
         """All that must not be forgotten, as JSON can hold it."""
@@ -196,12 +206,16 @@ def _at(row: int, fan: int, score: Score, distance: Distance) -> dict[str, Any]:
     return {
         "t_ns": int(score.t_ns[row]),
         "residual_rad_s": float(np.nan_to_num(score.smoothed_residual_rad_s[row, fan])),
-        "limit_rad_s": float(distance.limit_rad_s[fan]),
+        "limit_rad_s": _if_any(distance.limit_rad_s[fan]),
         "torque_balance_command": float(np.nan_to_num(distance.balance_command[row, fan])),
-        "torque_balance_limit_command": float(distance.balance_limit_command[fan]),
+        "torque_balance_limit_command": _if_any(distance.balance_limit_command[fan]),
         "statistic": Statistic(int(score.statistic[row, fan])),
         "score": float(np.nan_to_num(score.score[row, fan])),
     }
+
+
+def _if_any(limit: float) -> float:
+    return float(limit) if np.isfinite(limit) else 0.0
 
 
 def _of_standing(standing: Standing) -> dict[str, Any]:

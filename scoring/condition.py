@@ -68,11 +68,6 @@ class Standing:
         """Whether somebody has asked for silence (SuppressedOrShelved, 5.8.2)."""
         return bool(self.shelved_until_t_ns) or self.suppressed or self.out_of_service
 
-    @property
-    def presented(self) -> bool:
-        """Whether it is to be put before an operator."""
-        return self.retained and not self.quiet
-
 
 class Condition:
     """One fan's alarm. `state`: NORMAL, SUSPECT (on-delay runs), ALARM, RETURNING (off-delay runs)."""
@@ -109,6 +104,17 @@ class Condition:
             acknowledged_by="",
         )
         return ((Transition.RAISED, self.standing),)
+
+    def forget(self, *, stays_quiet: bool) -> None:
+        """No alarm was ever raised; what operators want quiet may stay so."""
+        was, self.state, self.standing = self.standing, NORMAL, Standing()
+        if stays_quiet:
+            self.standing = Standing(
+                shelved_until_t_ns=was.shelved_until_t_ns,
+                suppressed=was.suppressed,
+                out_of_service=was.out_of_service,
+                comment=was.comment,
+            )
 
     def expire(self) -> tuple[Transition, Standing]:
         """The time of shelving is over."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas.messages import Action, Array, FanState, Severity, Transition
+from schemas.messages import Action, Array, FanState, Transition
 from scoring.condition import NORMAL, SUSPECT, UNTIL_IT_CLEARS_T_NS, Condition, ConditionSettings, Standing
 
 UNKNOWN = int(FanState.UNKNOWN)
@@ -26,16 +26,6 @@ class Change:
     fan: int
     transition: Transition
     standing: Standing
-
-    @property
-    def onset_t_ns(self) -> int:
-        """First sample of the excursion."""
-        return self.standing.onset_t_ns
-
-    @property
-    def severity(self) -> Severity:
-        """The highest since it was raised."""
-        return self.standing.severity
 
 
 @dataclass(frozen=True)
@@ -110,9 +100,11 @@ class Conditions:
         """How a fan's alarm stands now."""
         return self._conditions[fan].standing
 
-    def is_presented(self, fan: int) -> bool:
-        """Whether a fan's alarm is to be put before an operator."""
-        return self.standing(fan).presented
+    def forget(self, *, stays_quiet: bool) -> None:
+        """No alarm was ever raised; what operators want quiet may stay so."""
+        for condition in self._conditions:
+            condition.forget(stays_quiet=stays_quiet)
+        self._note_all()
 
     def snapshot(self) -> dict[str, Any]:
         """All that must not be forgotten, as JSON takes it."""

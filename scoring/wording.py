@@ -30,7 +30,6 @@ PLAIN = {
     Transition.OUT_OF_SERVICE: "out of service",
     Transition.IN_SERVICE: "in service",
     Transition.COMMISSIONING: "a new baseline is being taken",
-    Transition.RESTATED: "still stands",
 }
 
 
@@ -50,6 +49,8 @@ class Wording:
             return f"{fan}: {self._cause(alarm)}"
         if alarm.transition in (Transition.RAISED, Transition.SEVERITY):
             return f"{fan}: {self._departure(alarm)}{self._cause_if_known(alarm)}"
+        if alarm.transition == Transition.RESTATED:
+            return f"{fan}: {'still stands' if _stands(alarm) else 'stands no longer'}"
         return f"{fan}: {PLAIN[alarm.transition]}"
 
     def _departure(self, alarm: Alarm) -> str:
@@ -80,6 +81,12 @@ class Wording:
     def _speed(self, speed_rad_s: float) -> str:
         speed = speed_rad_s / RAD_S_PER_RPM if self._speed_unit == "rpm" else speed_rad_s
         return f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
+
+
+def _stands(alarm: Alarm) -> bool:
+    """Whether there is an alarm, or one that is to come is kept quiet."""
+    retained = alarm.active or alarm.latched or not (alarm.acknowledged and alarm.confirmed)
+    return retained or bool(alarm.shelved_until_t_ns) or alarm.suppressed or alarm.out_of_service
 
 
 def _drifts(alarm: Alarm) -> str:

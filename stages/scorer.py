@@ -26,6 +26,7 @@ from pipeline.config import SpeedUnit
 from pipeline.memory_file import MemoryFile
 from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from pipeline.twin_file import TwinFile, twin_of
+from schemas.blocks import chosen
 from schemas.messages import (
     Alarm,
     Array,
@@ -36,7 +37,6 @@ from schemas.messages import (
     Score,
     Transition,
     WhyNot,
-    columns,
 )
 from scoring.alarm_desk import AlarmDesk, Distance
 from scoring.condition import ConditionSettings
@@ -51,6 +51,9 @@ from scoring.wording import Wording
 NS_PER_S = 1_000_000_000
 BAND_SIGMAS = 2.0
 MEMORY_NS = 60 * NS_PER_S  # how often it is noted when nothing happens
+SET_ASIDE_NS = 60 * NS_PER_S  # so long it is told that something was
+ANOTHER_TWIN = "the twin is another one: baselines, alarms and wear begin anew; what operators keep quiet stays so"
+NOT_UNDERSTOOD = "what was remembered is not understood: baselines, alarms and wear begin anew, nothing is kept quiet"
 BACK_IN_TIME_NS = 120 * NS_PER_S  # who is restarted catches up with less; samples still older are another story
 
 
@@ -121,6 +124,8 @@ class ScorerCore(Core):
         self._keeper = keeper
         self._wrong_fans = 0
         self._counts: Counter[str] = Counter()
+        self._set_aside = ""
+        """what was not gone on from"""
         self._begin()
         self._first: list[Alarm | Memory] = []
         memory = keeper.load() if keeper else None
@@ -140,24 +145,31 @@ class ScorerCore(Core):
         self._may_be_of_other_times = False
 
     def restore(self, memory: Memory) -> list[Alarm | Memory]:
-        """Go on from what another session has kept, if it is of this twin. Gives what is to be told of it."""
-        if memory.twin_sha256 != self._healthy.sha256:
-            self._counts["memories_of_another_twin"] += 1
-            return []
+        """Go on from what another session has kept. Gives what is to be told of it.
+
+        Of another twin only what belongs to operators is taken: what they want quiet, and that they were answered.
+        """
+        is_of_this_twin = memory.twin_sha256 == self._healthy.sha256
         try:
             state = json.loads(memory.state_json)
-            self._judge.restore(state["judge"])
             self._desk.restore(state["desk"])
-            if "wear" in state:
-                self._wear.restore(state["wear"])
+            if is_of_this_twin:
+                self._judge.restore(state["judge"])
+                if "wear" in state:
+                    self._wear.restore(state["wear"])
             self._fed_by = str(state["fed_by"])
         except (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError):
             self._begin()
             self._counts["memories_not_understood"] += 1
+            self._set_aside = NOT_UNDERSTOOD
             return []
         self._last_t_ns = self._noted_t_ns = memory.t_ns
         self._may_be_of_other_times = True
-        return [replace(memory, restored=True), *self._desk.restate()]
+        if is_of_this_twin:
+            return [replace(memory, restored=True), *self._desk.restate()]
+        self._counts["memories_of_another_twin"] += 1
+        self._set_aside = ANOTHER_TWIN
+        return [replace(memory, restored=True), *self._desk.disown(memory.t_ns, stays_quiet=True)]
 
     def tick(self, now_ns: int) -> list[Alarm | Memory]:
         """Say once what was remembered."""
@@ -173,15 +185,15 @@ class ScorerCore(Core):
             self._counts["lost_wrong_fan_count"] += len(item.t_ns)
             return []
         self._wrong_fans = 0
-        self._look_back(item)
+        disowned = self._look_back(item)
         before = np.maximum.accumulate(np.concatenate(([self._last_t_ns], item.t_ns)))[:-1]
         new = item.t_ns > before
         self._counts["repeated"] += int((~new).sum())
         if not new.any():
-            return [*self.tick(0)]
+            return [*self.tick(0), *disowned]
         self._last_t_ns, self._fed_by = int(item.t_ns[new][-1]), item.header.producer
-        score, alarms = self._judge_block(item if new.all() else _rows(item, new))
-        return [*self.tick(0), score, *alarms, *self._note(bool(alarms))]
+        score, alarms = self._judge_block(item if new.all() else chosen(item, new))
+        return [*self.tick(0), *disowned, score, *alarms, *self._note(bool(alarms))]
 
     def counters(self) -> Mapping[str, int]:
         """docs/deciding.md says what each counts."""
@@ -197,7 +209,10 @@ class ScorerCore(Core):
         """Predictions of another number of fans, fans that have not been judged for long, or that drift."""
         if self._wrong_fans:
             return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
-        problems = [self._not_judged.problem(), self._keeper.problem if self._keeper else ""]
+        began_t_ns = self._judge.origin_t_ns
+        is_new = began_t_ns is None or self._last_t_ns < began_t_ns + SET_ASIDE_NS
+        problems = [self._set_aside if is_new else "", self._not_judged.problem()]
+        problems += [self._keeper.problem] if self._keeper else []
         judged = [residual for residual in (self._judge.speed, self._judge.balance) if residual.is_judged]
         adrift = np.flatnonzero(np.any([residual.baseline.is_at_limit for residual in judged], axis=0))
         if len(adrift):
@@ -210,19 +225,23 @@ class ScorerCore(Core):
         """Note what is known for the next session."""
         return self._note(True) if self._last_t_ns > np.iinfo(np.int64).min else []
 
-    def _look_back(self, item: Prediction) -> None:
-        """What is remembered of later times is of another recording, or of the same one played again: begin anew."""
+    def _look_back(self, item: Prediction) -> list[Alarm]:
+        """What is remembered of later times is of another recording, or of the same one played again: begin anew, and
+        say so of the alarms that stood."""
         if not self._may_be_of_other_times or not len(item.t_ns):
-            return
+            return []
         self._may_be_of_other_times = False
         if item.header.producer == self._fed_by:
-            return  # who made the last one still keeps it, and some before it
+            return []  # who made the last one still keeps it, and some before it
         first_t_ns, began_t_ns = int(item.t_ns[0]), self._judge.origin_t_ns
         again = began_t_ns is not None and first_t_ns <= began_t_ns
-        if again or first_t_ns < self._last_t_ns - BACK_IN_TIME_NS:
-            self._begin()
-            self._first = []
-            self._counts["memories_of_other_times"] += 1
+        if not again and first_t_ns >= self._last_t_ns - BACK_IN_TIME_NS:
+            return []
+        disowned = self._desk.disown(first_t_ns, stays_quiet=False)
+        self._begin()
+        self._first = []
+        self._counts["memories_of_other_times"] += 1
+        return disowned
 
     def _judge_block(self, item: Prediction) -> tuple[Score, list[Alarm]]:
         t_ns, why_not, command = item.t_ns, item.why_not, item.command
@@ -280,8 +299,8 @@ class ScorerCore(Core):
     def _distance(self, verdict: Verdict, step_s: float, sigma: Array, sigma_command: Array) -> Distance:
         return Distance(
             balance_command=verdict.balance_smoothed * sigma_command,
-            limit_rad_s=_if_any(self._judge.speed.limit_sigmas(step_s) * sigma),
-            balance_limit_command=_if_any(self._judge.balance.limit_sigmas(step_s) * sigma_command),
+            limit_rad_s=self._judge.speed.limit_sigmas(step_s) * sigma,
+            balance_limit_command=self._judge.balance.limit_sigmas(step_s) * sigma_command,
         )
 
     def _answer(self, request: Request) -> list[Alarm | Memory]:
@@ -315,16 +334,6 @@ class ScorerCore(Core):
         if self._keeper:
             self._keeper.keep(memory)
         return [memory]
-
-
-def _rows(item: Prediction, rows: Array) -> Prediction:
-    """Some samples of a block, (n,) of bool."""
-    names = [name for name, (shape, _) in columns(Prediction).items() if shape != "fans"]
-    return replace(item, **{name: getattr(item, name)[rows] for name in names})
-
-
-def _if_any(limit: Array) -> Array:
-    return np.where(np.isfinite(limit), limit, 0.0)
 
 
 def build(context: Context) -> Parts:
@@ -362,27 +371,7 @@ def _healthy(context: Context, twin: TwinFile) -> Healthy:
             f"{context.tray.twin}: its calibration cannot be used: {where}: {error.errors()[0]['msg']}; "
             "calibrate it anew: fantwin calibrate"
         ) from error
-    balance = twin.balance
-    return Healthy(
-        sha256=twin.sha256,
-        limits=limits,
-        command_unit=twin.command_unit,
-        balances=[
-            HealthyBalance(
-                inertia=float(balance.inertia[fan]),
-                viscous=float(balance.viscous[fan]),
-                drag=float(balance.drag[fan]),
-                friction=float(balance.friction[fan]),
-                lag_s=float(balance.lag_s[fan]),
-                std_errors=balance.std_errors[fan],
-                filter_rate_per_s=balance.filter_rate_per_s,
-                sigma_command=float(balance.sigma_command[fan]),
-                autocorrelation_time_s=float(balance.autocorrelation_time_s[fan]),
-                lowest_speed_rad_s=float(balance.lowest_speed_rad_s[fan]),
-            )
-            for fan in range(twin.fans)
-        ],
-    )
+    return Healthy(twin.sha256, limits, twin.healthy_balances(), twin.command_unit)
 
 
 def check(context: Context) -> list[str]:

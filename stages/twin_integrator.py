@@ -26,13 +26,13 @@ from pydantic import Field
 
 from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from pipeline.twin_file import TwinFile, twin_of
+from schemas.blocks import chosen
 from schemas.messages import Array, Grid, ModelCard, Prediction, WhyNot
 from scoring.torque_balance import BalanceModel, TorqueBalance
 
 NS_PER_S = 1_000_000_000
 RANGE_MARGIN = 0.05  # of the range's width: so far beyond the commands it was made from a twin is still believed
 LONGEST_BRIDGE = 1 << 16  # grid samples; more than half a second at 100 kHz takes longer to run than to start anew
-DEAD_ZONE = 0.25  # of the range's width: a friction above so much of the commands is none
 HIGHEST_SPEED = 1.5  # of the top speed it was made from: the balance is believed up to there
 RATE_TOLERANCE = 0.01  # a card gives the rate as it was measured
 
@@ -165,7 +165,7 @@ class TwinIntegratorCore(Core):
         low, high = twin.command_range
         margin = RANGE_MARGIN * (high - low)
         self._lowest_command, self._highest_command = low - margin, high + margin
-        self._off_below = _off_below(twin)
+        self._off_below = twin.off_below
         self._run = FreeRun(twin, config)
         self._balance = _balance_of(twin)
         self._card = [
@@ -230,15 +230,7 @@ class TwinIntegratorCore(Core):
         if new.all():
             return grid
         self._counts["repeated"] += int((~new).sum())
-        return Grid(
-            fans=grid.fans,
-            step_ns=grid.step_ns,
-            t_ns=grid.t_ns[new],
-            command=grid.command[new],
-            speed_rad_s=grid.speed_rad_s[new],
-            valid=grid.valid[new],
-            why_not=grid.why_not[new],
-        )
+        return chosen(grid, new)
 
     def _predict(self, grid: Grid) -> Prediction:
         run = self._run
@@ -366,18 +358,9 @@ def _balance_of(twin: TwinFile) -> TorqueBalance:
             filter_rate_per_s=balance.filter_rate_per_s,
             lowest_speed_rad_s=balance.lowest_speed_rad_s,
             highest_speed_rad_s=HIGHEST_SPEED * twin.top_speed_rad_s,
-            off_below=_off_below(twin),
+            off_below=twin.off_below,
         )
     )
-
-
-def _off_below(twin: TwinFile) -> Array:
-    """(fans,) the smallest command that turns the rotor: the friction, unless that lies amidst the healthy commands.
-    Then the fan was held at one speed, where friction takes the place of a drag that could not be told.
-    """
-    low, high = twin.command_range
-    friction = twin.balance.friction
-    return np.where((friction > 0.0) & (friction < low + DEAD_ZONE * (high - low)), friction, -np.inf)
 
 
 def build(context: Context) -> Parts:

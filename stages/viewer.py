@@ -22,6 +22,7 @@ from pipeline.config import TrayConfig
 from pipeline.loopback import check_free
 from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from pipeline.stages_page import StagesPage
+from pipeline.standing_alarms import StandingAlarm
 from pipeline.trace import Trace, state_changes, state_name, trace_of
 from schemas.messages import Alarm, Array, Health, Message, ModelCard, Score, Severity, Transition
 
@@ -79,6 +80,9 @@ class ViewSink(Protocol):
 def alarm_line(alarm: Alarm) -> tuple[str, str]:
     """Level and text of what happened to an alarm, for people."""
     happened = alarm.transition.name.lower().replace("_", " ")
+    if alarm.severity == Severity.NONE and alarm.transition == Transition.RESTATED:
+        states = StandingAlarm(alarm, alarm.message, (), "").words()
+        return "INFO", f"{happened} ({', '.join(states)}): {alarm.message}"
     if alarm.transition not in (Transition.RAISED, Transition.SEVERITY, Transition.RESTATED):
         return "INFO", f"{happened}: {alarm.message}"
     level = "ERROR" if alarm.severity == Severity.ALARM else "WARN"

@@ -154,7 +154,7 @@ class Chain:
 
     @contextmanager
     def watcher(self) -> Iterator[Watcher]:
-        with Bus(BusConfig(endpoint=self.endpoint)) as bus:
+        with Bus(BusConfig(endpoint=self.endpoint), listens=False) as bus:
             yield Watcher(bus, SITE)
 
     def process_ids(self) -> dict[str, int]:

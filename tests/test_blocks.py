@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.blocks import can_join, cut, join
+from schemas.blocks import can_join, chosen, cut, join
 from schemas.codec import decode, encode
 from schemas.messages import Command, Grid, Header, Message, Prediction, Raw, Score, columns
 from tests.message_strategies import any_message, same
@@ -109,6 +109,12 @@ def test_messages_that_differ_in_more_than_their_samples_are_not_joined(one: Any
 
 def test_predictions_of_one_twin_are_joined_although_each_brings_its_own_sigma() -> None:
     assert join([prediction(), prediction()]).sigma_rad_s.tolist() == [1.0]
+
+
+def test_some_samples_of_a_message_are_chosen() -> None:
+    some = chosen(raw(3, clock=False), np.array([True, False, True]))
+    assert (some.host_receive_t_ns.tolist(), some.device_sequence.tolist()) == ([0, 2], [0, 2])
+    assert (some.command.shape, some.device_clock_us.tolist()) == ((2, 1), [])
 
 
 def test_nothing_is_no_message() -> None:

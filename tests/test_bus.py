@@ -103,6 +103,16 @@ def test_a_token_tells_when_a_process_comes_and_when_it_is_gone(endpoint):
     assert seen == [True, False]
 
 
+def test_who_only_looks_in_leaves_the_endpoint_to_those_who_stay(endpoint):
+    config = BusConfig(endpoint=endpoint)
+    with Bus(config, listens=False) as first, Bus(config) as staying:
+        assert not staying.came_second
+        staying.declare_alive(alive_key("site", "scorer", "all"))
+        eventually(lambda: first.alive(alive_key("site", "*", "*")), "they meet all the same")
+        with Bus(config, listens=False) as late:
+            assert late.came_second
+
+
 def test_an_outlet_keeps_the_newest_messages_that_fit_its_memory(endpoint):
     size, count = KEPT_BYTES // 4, 6
     patient = BusConfig(endpoint=endpoint, recovery_timeout_s=30)

@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.commands.calibration_check import Check
 from pipeline.twin_file import TwinFile
-from scoring.limits import Limits
+from scoring.limits import Limits, Timing
 from tests.fantwin_command import fantwin, said_instead
 
 FANS = 2
@@ -203,6 +203,44 @@ def test_a_recording_counts_once(folder: Path) -> None:
     twin, rate = folder / "twin.onnx", ("--false-alarms-per-day", PER_DAY)
     assert "named twice" in said_instead("calibrate", twin, healthy, healthy, *rate)
     assert "named twice" in said_instead("calibrate", twin, healthy, *rate, *verify)
+
+
+def test_what_the_twin_was_made_of_verifies_nothing_under_any_name(folder: Path, calibrated: Path) -> None:
+    copy = folder / "copy.mcap"
+    copy.write_bytes((folder / "healthy.mcap").read_bytes())
+    said = said_instead("calibrate", calibrated, "--verify", folder / "other.mcap", "--verify", copy)
+    assert f"{copy}: {calibrated} was calibrated on it, so that it proves nothing" in said
+    said = said_instead("calibrate", calibrated, "--verify", folder / "training.mcap")
+    assert f"{calibrated} was trained on it" in said
+
+
+def test_limits_are_found_for_the_times_that_the_scorer_is_set_to(folder: Path, calibrated: Path) -> None:
+    output = folder / "slow.onnx"
+    result = calibrate(folder, "-o", output, "--set", "scorer.smoothing_s=1.0")
+    assert result.exit_code == 0, result.output
+    slow, usual = (Limits.model_validate(TwinFile.load(twin).calibration) for twin in (output, calibrated))
+    assert (usual.timing, slow.timing) == (Timing(), Timing(smoothing_s=1.0))
+    assert slow.speed.step != usual.speed.step
+
+
+def test_recordings_of_scorers_with_other_times_are_refused(folder: Path) -> None:
+    slow, twin = folder / "slow.mcap", folder / "twin.onnx"
+    result = fantwin(
+        "replay", folder / "other.mcap", "--offline", "--twin", twin, "--set", "scorer.on_delay_s=1.0", "-o", slow
+    )
+    assert result.exit_code == 0, result.output
+    said = said_instead("calibrate", twin, folder / "healthy.mcap", slow, "--false-alarms-per-day", PER_DAY)
+    assert f"healthy.mcap and {slow} differ in scorer.on_delay_s, for which limits are found: say which" in said
+
+
+def test_what_has_no_part_in_finding_limits_is_refused(folder: Path, calibrated: Path) -> None:
+    said = said_instead(
+        "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY,
+        "--set", "scorer.limit_factor=2",
+    )  # fmt: skip
+    assert "--set scorer.limit_factor: does not change which limits are found" in said
+    result = fantwin("calibrate", calibrated, "--verify", folder / "other.mcap", "--set", "scorer.off_delay_s=2.0")
+    assert result.exit_code == 0, result.output
 
 
 def test_a_rate_is_broken_only_by_more_alarms_than_chance_explains() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf.descriptor import FieldDescriptor
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from mcap.records import Schema
 from mcap.well_known import MessageEncoding
@@ -179,6 +179,43 @@ def grid_of(samples: int) -> Grid:
     why_not = rng.integers(0, 8, speed.shape).astype(np.uint8)
     t_ns = np.arange(samples) + 10**18
     return Grid(fans=2, step_ns=1, t_ns=t_ns, command=-speed, speed_rad_s=speed, valid=why_not == 0, why_not=why_not)
+
+
+def older(message: Message, *lacks: str) -> bytes:
+    """As it was recorded before these columns were added."""
+    proto = proto_type(type(message)).FromString(encode(message))
+    for name in lacks:
+        proto.ClearField(name)
+    return proto.SerializeToString()
+
+
+BEFORE_BALANCE = {
+    Prediction: ("torque_balance_command", "torque_balance_sigma_command"),
+    Score: ("torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic"),
+}
+
+
+@pytest.mark.parametrize("kind", BEFORE_BALANCE)
+@given(data=st.data())
+def test_what_was_recorded_before_a_column_was_added_reads_as_not_known(kind, data):
+    message: Any = data.draw(any_message(kind))
+    assume(len(message.t_ns) > 0)
+    back: Any = decode(kind, older(message, *BEFORE_BALANCE[kind]))
+    for name, (shape, dtype) in columns(kind).items():
+        values, there = getattr(back, name), getattr(message, name)
+        if name not in BEFORE_BALANCE[kind]:
+            assert same(there, values), name
+            continue
+        assert (values.shape, values.dtype) == (there.shape, dtype), shape
+        assert np.isnan(values).all() if dtype.kind == "f" else (values == 0).all()
+    again = decode(kind, encode(back))
+    assert all(same(getattr(back, name), getattr(again, name)) for name in columns(kind))
+
+
+def test_a_column_that_was_always_there_is_still_asked_for_and_nobody_is_believed_about_fans():
+    score = fan_pb2.Score(step_ns=1, fans=1 << 31, t_ns=[0])
+    with pytest.raises(CodecError, match="command has shape"):
+        decode(Score, score.SerializeToString())
 
 
 @LENGTHS

@@ -57,7 +57,7 @@ def test_an_alarm_is_raised_exactly_when_the_on_delay_has_run_out():
     course = take(conditions_of(), [LOW, LOW] + [UP] * 7)
     assert course.state[:, 0].tolist() == [NORMAL] * 2 + [SUSPECT] * 5 + [ALARM] * 2
     (change,) = course.changes
-    assert (change.row, change.fan, change.transition, change.onset_t_ns) == (7, 0, RAISED, 2 * STEP_NS)
+    assert (change.row, change.fan, change.transition, change.standing.onset_t_ns) == (7, 0, RAISED, 2 * STEP_NS)
 
 
 def test_an_excursion_one_sample_too_short_raises_nothing_and_is_counted():
@@ -74,7 +74,7 @@ def test_an_alarm_is_cleared_exactly_when_the_off_delay_has_run_out():
     course = take(conditions_of(), [UP] * 6 + [MID] * 20 + [LOW] * 12)
     assert course.state[5:, 0].tolist() == [ALARM] * 21 + [RETURNING] * 10 + [NORMAL] * 2
     assert happened(course) == [(5, RAISED), (36, CLEARED)]
-    assert [change.onset_t_ns for change in course.changes] == [0, 0]
+    assert [change.standing.onset_t_ns for change in course.changes] == [0, 0]
 
 
 def test_a_return_that_is_interrupted_begins_again():
@@ -94,7 +94,7 @@ def test_samples_that_are_not_valid_stop_the_timers_and_end_nothing():
 
 def test_severity_rises_at_its_ratio_and_does_not_fall_before_the_next_alarm():
     course = take(at_once(), [UP, 1.5, UP, LOW, UP])
-    told = [(change.row, change.transition, change.severity) for change in course.changes]
+    told = [(change.row, change.transition, change.standing.severity) for change in course.changes]
     assert told == [
         (0, RAISED, Severity.WARNING),
         (1, Transition.SEVERITY, Severity.ALARM),
@@ -227,7 +227,7 @@ def test_a_shelved_alarm_is_evaluated_and_told_as_ever_and_not_presented():
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=4 * STEP_NS)
     course = take(conditions, [LOW, LOW, UP, UP, UP])
     assert happened(course) == [(2, RAISED), (4, UNSHELVED)]
-    assert [change.standing.presented for change in course.changes] == [False, True]
+    assert [change.standing.quiet for change in course.changes] == [True, False]
 
 
 def test_an_alarm_raised_at_the_very_sample_at_which_a_shelving_ends_is_presented():
@@ -235,7 +235,7 @@ def test_an_alarm_raised_at_the_very_sample_at_which_a_shelving_ends_is_presente
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=2 * STEP_NS)
     course = take(conditions, [LOW, LOW, UP])
     assert happened(course) == [(2, UNSHELVED), (2, RAISED)]
-    assert course.changes[1].standing.presented
+    assert not course.changes[1].standing.quiet
 
 
 def test_shelving_again_sets_a_new_time():
@@ -257,10 +257,10 @@ def test_suppressed_or_out_of_service_hides_no_transition_and_presents_nothing(a
     conditions = at_once()
     asked(conditions, action)
     assert happened(take(conditions, [UP])) == [(0, RAISED)]
-    assert not conditions.is_presented(0)
+    assert conditions.standing(0).retained and conditions.standing(0).quiet
     back = Action.UNSUPPRESS if action == Action.SUPPRESS else Action.IN_SERVICE
     asked(conditions, back)
-    assert conditions.is_presented(0)
+    assert conditions.standing(0).retained and not conditions.standing(0).quiet
 
 
 def test_commissioning_is_granted_and_leaves_the_alarm_as_it_is():

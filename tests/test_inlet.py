@@ -103,6 +103,19 @@ def test_a_new_session_of_a_producer_starts_its_own_sequence():
     assert all(line.duplicated == 0 for line in inlet.inputs())
 
 
+def test_of_many_producers_the_latest_are_known_by_name_and_the_others_counted_together():
+    inlet = Inlet(Producer([]).recover)
+    list(inlet.accept(packet(0, "controller")))
+    for number in range(100):
+        list(inlet.accept(packet(0, f"operator-{number}")))
+        list(inlet.accept(packet(3, f"operator-{number}")))
+        assert sequences(inlet.accept(packet(number + 1, "controller"))) == [number + 1], "who speaks stays known"
+    *named, others = inlet.inputs()
+    assert {line.producer for line in named} == {"controller", *(f"operator-{number}" for number in range(37, 100))}
+    assert (others.producer, others.received, others.missing) == ("", 2 * 37, 2 * 37)
+    assert sum(line.received for line in inlet.inputs()) == 301
+
+
 def test_health_shows_a_last_message_that_never_came():
     producer = Producer(range(3))
     inlet = Inlet(producer.recover)

@@ -13,11 +13,12 @@ from chain import DEMO, SITE, TRAY, Chain, eventually, fantwin, is_running, publ
 from mcap.reader import make_reader
 
 from pipeline.config import load_config
+from pipeline.errors import UserError
 from pipeline.launcher import Launcher, Outcome
 from pipeline.processes import process_list
 from pipeline.recordings.reading import read_recording
 from schemas.messages import Grid, Prediction, Raw, Score
-from schemas.topics import tray_key
+from schemas.topics import alive_key, tray_key
 
 
 @pytest.fixture
@@ -127,6 +128,48 @@ def test_told_to_stop_before_all_is_ready_it_starts_no_source(chain):
         "twin_integrator",
         "resampler",
     ]
+
+
+class LateBus:
+    """Who comes second meets the sessions of `site` so much later, by a clock that goes on while it waits."""
+
+    def __init__(self, site: str, after_s: float, *, came_second: bool = True) -> None:
+        self.came_second = came_second
+        self.now_s = 100.0
+        self._met_s = 100.0 + after_s
+        self._site = site
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+    def alive(self, _key: str) -> set[str]:
+        return {alive_key(self._site, "scorer", "all")} if self.now_s >= self._met_s else set()
+
+
+def refuse_a_second(bus: LateBus, monkeypatch: pytest.MonkeyPatch, mode: str = "peer") -> float:
+    """How long it took to find nobody."""
+    monkeypatch.setattr("pipeline.launcher.time", bus)
+    config = load_config(DEMO / "demo.toml", [f"bus.mode='{mode}'"])
+    Launcher(config, (), lambda _line: None)._refuse_a_second(bus)  # type: ignore[arg-type]
+    return bus.now_s - 100.0
+
+
+def test_a_second_up_looks_out_for_ours_for_ten_seconds(monkeypatch):
+    with pytest.raises(UserError, match=r"site 'demo' already runs at \S+ \(scorer\): stop that"):
+        refuse_a_second(LateBus(SITE, after_s=9.0), monkeypatch)
+    assert refuse_a_second(LateBus(SITE, after_s=99.0), monkeypatch) == pytest.approx(10.0, abs=0.1)
+
+
+def test_once_another_site_is_met_ours_would_be_met_as_well(monkeypatch):
+    assert refuse_a_second(LateBus("other", after_s=1.0), monkeypatch) == pytest.approx(3.0, abs=0.1)
+    assert refuse_a_second(LateBus("", after_s=99.0), monkeypatch, mode="client") == pytest.approx(2.0, abs=0.1)
+
+
+def test_who_comes_first_waits_for_nobody(monkeypatch):
+    assert refuse_a_second(LateBus(SITE, after_s=1.0, came_second=False), monkeypatch) == 0.0
 
 
 @pytest.mark.parametrize(

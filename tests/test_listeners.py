@@ -39,10 +39,13 @@ def there(*labels: str) -> list[Present]:
         (["twin_integrator", "scorer"], ("raw", "grid", "prediction"), ["writes prediction itself", "--from grid"]),
         (["scorer", "viewer"], ALL, ["scorer", "writes score itself", "--from prediction"]),
         (["scorer", "viewer"], ("prediction", "twin"), []),
+        (["resampler", "scorer"], ("raw", "request"), ["scorer", "recorded requests are not", "leave request out"]),
+        (["scorer", "viewer"], (*ALL, "request"), ["scorer", "writes score itself", "--from prediction"]),
+        (["viewer", "recorder"], (*ALL, "request"), []),
         (["twin_integrator"], ("prediction", "twin"), ["writes prediction itself", "--from grid"]),
     ],
 )
-def test_nothing_is_replayed_that_a_running_stage_writes_and_no_command_beside_an_acquisition(labels, topics, said):
+def test_nothing_is_replayed_that_a_running_stage_writes_nor_what_was_asked_of_it_long_ago(labels, topics, said):
     line = conflict(there(*labels), topics, {"a"}, "plant")
     assert bool(line) == bool(said)
     assert "\n" not in line

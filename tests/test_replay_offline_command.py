@@ -93,6 +93,15 @@ def test_the_output_is_a_whole_recording(tmp_path):
     assert read_head(out).attachments.keys() == read_head(GOLDEN).attachments.keys()
 
 
+def test_the_output_has_the_requests_that_its_alarms_answer(tmp_path):
+    out = tmp_path / "out.mcap"
+    assert replay(GOLDEN, "-o", out).returncode == 0
+    made, recorded = ([entry.message for entry in read_recording(path, ("request",))] for path in (out, GOLDEN))
+    assert list(map(repr, made)) == list(map(repr, recorded)) and len(made) > 0
+    answered = {entry.message.request for entry in read_recording(out, ("alarm",))} - {""}  # type: ignore[union-attr]
+    assert answered == {f"{asked.header.producer}/{asked.header.sequence}" for asked in made}
+
+
 def test_an_imported_table_is_judged_at_the_twins_own_rate(tmp_path):
     site = Site(tmp_path, seed=1)
     site.run(600)

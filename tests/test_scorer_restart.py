@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from pipeline.memory_file import MemoryFile
+from pipeline.standing_alarms import StandingAlarm, standing_alarms
 from schemas.blocks import cut
-from schemas.messages import Action, Alarm, FanState, Memory, Prediction, Score, Transition, columns
+from schemas.messages import Action, Alarm, FanState, Header, Memory, Prediction, Score, Transition, columns
 from stages.scorer import ScorerCore
 from tests.scored import LIVELY, commissioned, core_of, feed, note_of, prediction_of, request_of
 from tests.test_scorer import eventful_prediction
@@ -165,12 +166,40 @@ def test_a_baseline_is_that_of_the_session_before() -> None:
     np.testing.assert_allclose(score.speed_baseline_rad_s, 3.0, rtol=1e-5)
 
 
-def test_what_is_remembered_of_another_twin_is_set_aside_and_counted() -> None:
+def standing_of(told: Sequence[Any]) -> list[StandingAlarm]:
+    """How the alarms stand for who has followed them from `raised` on."""
+    former = raised().restore(note_of(raised()))
+    messages = [*(("former", each) for each in former), *(("successor", each) for each in told)]
+    return standing_alarms(
+        replace(message, header=Header(producer, number, "tray1"))
+        for number, (producer, message) in enumerate(messages)
+        if isinstance(message, Alarm)
+    )
+
+
+def test_of_another_twin_only_what_operators_keep_quiet_is_gone_on_from() -> None:
     successor = core_of(3, sha256="another")
-    assert successor.restore(note_of(raised())) == []
+    memory, *told = successor.restore(note_of(raised()))
+    assert isinstance(memory, Memory) and memory.restored
     assert successor.counters()["memories_of_another_twin"] == 1
+    assert "the twin is another one" in successor.problem()
+    acknowledged, shelved = standing_of(told)
+    assert (acknowledged.is_retained, acknowledged.newest.message) == (False, "fan 0: stands no longer")
+    assert (shelved.is_quiet, shelved.newest.message) == (True, "fan 1: still stands")
+    assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
     assert (score.state == FanState.COMMISSIONING).all()
+    _, (unshelved,) = feed(successor, [request_of(Action.UNSHELVE, 1, sequence=2)])
+    assert unshelved.transition == Transition.UNSHELVED
+
+
+def test_what_was_set_aside_is_told_for_a_minute() -> None:
+    successor = core_of(3, sha256="another")
+    successor.restore(note_of(raised()))
+    feed(successor, [prediction_of(np.zeros((5999, 3)), first=100)])
+    assert "the twin is another one" in successor.problem()
+    feed(successor, [prediction_of(np.zeros((2, 3)), first=6099)])
+    assert successor.problem() == ""
 
 
 @pytest.mark.parametrize(
@@ -189,6 +218,7 @@ def test_a_memory_that_is_not_understood_is_set_aside_and_counted(state: str) ->
     successor = core_of(3)
     assert successor.restore(replace(note_of(raised()), state_json=state)) == []
     assert successor.counters()["memories_not_understood"] == 1
+    assert "what was remembered is not understood" in successor.problem()
     feed(successor, [prediction_of(np.zeros((200, 3)))])
 
 
@@ -237,6 +267,17 @@ def test_samples_of_another_story_are_judged_anew_and_those_kept_by_producers_ar
         assert (scores[0].state == FanState.COMMISSIONING).all()
     else:
         assert not scores or scores[0].t_ns[0] > prediction_of(np.zeros(1), first=99).t_ns[0]
+
+
+def test_an_alarm_of_another_story_stands_no_longer_whoever_told_it() -> None:
+    successor = core_of(3)
+    restated = successor.restore(note_of(raised()))
+    assert [each.is_retained or each.is_quiet for each in standing_of(restated)] == [True, True]
+    later = successor.step(prediction_of(np.zeros((20, 3)), first=-HOUR, producer="integrator-2"))
+    told = [message for message in later if isinstance(message, Alarm)]
+    assert [alarm.transition for alarm in told] == [Transition.RESTATED] * 2
+    assert [each.is_retained or each.is_quiet for each in standing_of([*restated, *later])] == [False, False]
+    assert [each.is_retained or each.is_quiet for each in standing_of(later)] == [False, False], "nothing was restated"
 
 
 def test_only_what_comes_first_can_be_of_another_story() -> None:

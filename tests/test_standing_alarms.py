@@ -16,10 +16,12 @@ from scoring.condition import UNTIL_IT_CLEARS_T_NS
 _numbers = itertools.count()
 
 
-def alarm(transition: Transition = Transition.RAISED, t_ns: int = 1, *, tray: str = "a", **more: Any) -> Alarm:
+def alarm(
+    transition: Transition = Transition.RAISED, t_ns: int = 1, *, tray: str = "a", producer: str = "p", **more: Any
+) -> Alarm:
     told: dict[str, Any] = {"fan": 0, "active": True, "severity": Severity.WARNING, "onset_t_ns": 1, "confirmed": True}
     told |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": f"{transition.name} at {t_ns}"}
-    return Alarm(header=Header("p", next(_numbers), tray), t_ns=t_ns, transition=transition, **told | more)
+    return Alarm(header=Header(producer, next(_numbers), tray), t_ns=t_ns, transition=transition, **told | more)
 
 
 def one(*messages: Alarm) -> StandingAlarm:
@@ -55,6 +57,15 @@ def test_a_log_says_what_happened_and_how_bad_it_is(transition, more, line):
 def test_of_messages_at_the_same_sample_the_one_sent_later_counts():
     first, second = alarm(), alarm(Transition.ACKNOWLEDGED, acknowledged=True)
     assert one(second, first).newest is second
+
+
+def test_of_several_scorers_the_one_that_spoke_last_counts_whatever_its_times():
+    before = alarm(t_ns=900, producer="killed")
+    again = alarm(Transition.RESTATED, 900, producer="b")
+    taken_back = alarm(Transition.RESTATED, 5, producer="b", active=False, severity=Severity.NONE, acknowledged=True)
+    after = alarm(t_ns=7, producer="c")
+    assert not one(before, taken_back, again).is_retained, "of one producer those that come late were sent before"
+    assert one(before, again, taken_back, after).newest is after
 
 
 def test_an_answer_takes_neither_message_nor_causes_away():

@@ -220,7 +220,8 @@ def test_where_nothing_runs_there_is_no_empty_table_and_no_good_news(endpoint):
 
 def test_the_live_view_that_saw_nobody_ends_with_the_line(endpoint):
     live = Running(["status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'"])
-    with Bus(BusConfig(mode="client", endpoint=endpoint), threading.Event()):  # the live view listens there
+    with Bus(BusConfig(endpoint=endpoint)) as bus:
+        eventually(bus._session.info.peers_zid, "the live view has come")
         assert live.end() == 1
     live.line_with(f"no stage of site 'demo' answers at {endpoint}")
     live.kill()

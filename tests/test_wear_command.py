@@ -82,16 +82,32 @@ def test_people_are_shown_a_table(tmp_path, notes):
     assert "balance, friction: command in %; drag, gain: % of healthy" in lines[-1]
 
 
+def never_quiet(note: Memory, *fans: int) -> Memory:
+    state = json.loads(note.state_json)
+    for fan in fans:
+        state["wear"]["fans"][fan]["t_ns"] = 0
+        for told in state["wear"]["fans"][fan]["parameters"].values():
+            series = told["series"]
+            told.clear()
+            told |= {"unit": "relative", "series": series}
+    return replace(note, state_json=json.dumps(state))
+
+
 def test_of_a_fan_that_was_never_quiet_nothing_is_shown(tmp_path, notes):
-    state = json.loads(notes[0].state_json)
-    state["wear"]["fans"][HEALTHY]["t_ns"] = 0
-    for told in state["wear"]["fans"][HEALTHY]["parameters"].values():
-        series = told["series"]
-        told.clear()
-        told |= {"unit": "relative", "series": series}
-    path = recording(tmp_path / "r.mcap", [replace(notes[0], state_json=json.dumps(state))])
+    path = recording(tmp_path / "r.mcap", [never_quiet(notes[0], HEALTHY)])
     assert {fan for fan, _ in rows(path)} == {WORN}
-    assert "nothing seen yet of fan 0" in fantwin("wear", path).stdout
+    assert (
+        "nothing seen yet of fan 0: that takes one that is commissioned and then quiet" in fantwin("wear", path).stdout
+    )
+
+
+def test_where_no_fan_was_quiet_one_line_says_what_that_takes(tmp_path, notes):
+    path = recording(tmp_path / "r.mcap", [never_quiet(notes[0], HEALTHY, WORN)])
+    for words in ((), ("--json",)):
+        said = said_instead("wear", path, *words)
+        assert said.startswith(
+            f"nothing seen yet of any fan of {TRAY}: that takes one that is commissioned and then quiet"
+        )
 
 
 @pytest.mark.parametrize("state", ["{}", "no json", '{"wear": 3}', '{"wear": {"fans": [{}]}}'])

@@ -68,6 +68,14 @@ def test_every_transition_is_one_line_that_names_the_fan(transition: Transition)
     assert told.startswith("fan 2: ") and len(told) > len("fan 2: ") and "\n" not in told
 
 
+def test_after_a_restart_it_is_told_what_still_stands_and_what_does_not() -> None:
+    over: dict[str, Any] = {"active": False, "acknowledged": True, "confirmed": True}
+    quiet: dict[str, Any] = {"suppressed": True}
+    assert line(Transition.RESTATED) == "fan 2: still stands"
+    assert line(Transition.RESTATED, **over, **quiet) == "fan 2: still stands"
+    assert line(Transition.RESTATED, **over) == "fan 2: stands no longer"
+
+
 def test_a_refusal_says_why() -> None:
     assert line(Transition.REFUSED, why_not="it is not latched") == "fan 2: refused: it is not latched"
 

@@ -26,7 +26,7 @@ from pipeline.signals import stop_on_signals
 from pipeline.standing_alarms import StandingAlarm, clock, standing_alarms, until
 from pipeline.watcher import Watcher
 from schemas.codec import CodecError, decode
-from schemas.messages import Action, Alarm, Diagnosis, Request, Severity, Transition
+from schemas.messages import Action, Alarm, Diagnosis, Request, Severity, Transition, newest_t_ns
 from schemas.topics import alive_key, tray_key
 
 _MEET_S = 5.0  # several healths of every stage
@@ -86,7 +86,7 @@ def alarms(
         if duration or comment or operator:
             raise UserError("--for, --comment and --operator go with an action: fantwin alarms ack TRAY FAN")
         stop_on_signals(stop)
-        with Bus(settings.bus, stop) as bus:
+        with Bus(settings.bus, stop, listens=False) as bus:
             _list(bus, settings, stop, show_all=show_all, watch=watch, json_output=json_output)
         return
     if show_all or watch:
@@ -101,7 +101,7 @@ def alarms(
         comment=comment,
     )
     stop_on_signals(stop)
-    with Bus(settings.bus, stop) as bus:
+    with Bus(settings.bus, stop, listens=False) as bus:
         meet(bus, Watcher(bus, settings.site), settings, stop)
         fans = set(range(settings.tray(name).fans)) if number < 0 else {number}
         answers = ask(bus, settings.site, name, request, fans, timeout_s, stop)
@@ -116,7 +116,11 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
     known: list[Alarm] = []
     for _, payload in bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_LOOK_S)):
         _decoded(payload, known.append)
-    found = [each for each in standing_alarms(known) if show_all or each.is_retained or each.is_quiet]
+    found = [
+        each
+        for each in standing_alarms(sorted(known, key=newest_t_ns))
+        if show_all or each.is_retained or each.is_quiet
+    ]
     console = Console(soft_wrap=True, highlight=False)
     if json_output:
         typer.echo(json.dumps({"alarms": [each.as_json() for each in found]}))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from datetime import UTC, datetime
@@ -13,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.commands.calibration_check import check_promise
+from pipeline.commands.calibration_check import check_promise, sha256_of
 from pipeline.commands.model_maker import model_maker
 from pipeline.commands.options import JsonOption, SetOption
 from pipeline.commands.progress import working
@@ -63,6 +62,12 @@ def calibrate(
     if not healthy and not verify:
         raise UserError("nothing to calibrate on: name healthy recordings, or --verify OTHER.mcap to test what is set")
     _named_once([*(healthy or ()), *(verify or ())])
+    for key in (override.partition("=")[0].strip() for override in overrides or () if healthy):
+        if key.startswith("scorer.") and key.removeprefix("scorer.") not in Timing.model_fields:
+            raise UserError(
+                f"--set {key}: does not change which limits are found; of [scorer] these do: "
+                f"{', '.join(Timing.model_fields)}"
+            )
     if output and (output.is_dir() or not output.parent.is_dir()):  # told now, and not after an hour of judging
         raise UserError(f"{output}: cannot write the twin: name a file in a folder that is there")
     result: dict[str, Any] = {}
@@ -97,13 +102,13 @@ def _calibrated(
     with working("judging healthy recordings") as tell:
         runs = HealthyRuns(healthy, twin, overrides, tell)
         try:
-            limits = find_limits(runs, top_speed_rad_s, Timing(), per_day, seed, extrapolate)
+            limits = find_limits(runs, top_speed_rad_s, runs.timing(), per_day, seed, extrapolate)
         except TooLittleError as error:
             raise UserError(_too_little(error, per_day)) from error
     assert limits.promise
     promise = limits.promise.model_copy(
         update={
-            "data": tuple({"name": path.name, "sha256": _sha256(path)} for path in healthy),
+            "data": tuple({"name": path.name, "sha256": sha256_of(path)} for path in healthy),
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         }
     )
@@ -117,11 +122,6 @@ def _named_once(recordings: list[Path]) -> None:
         if path.resolve() in seen:
             raise UserError(f"{path}: named twice: every recording counts once, and --verify takes others")
         seen.add(path.resolve())
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _too_little(error: TooLittleError, per_day: float) -> str:

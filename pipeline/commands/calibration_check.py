@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,11 +79,14 @@ def check_promise(twin: Path, recordings: Sequence[Path], overrides: Sequence[st
     """Judge other healthy recordings whole, as `fantwin replay --offline` does.
 
     Raises:
-        UserError: the twin declares nothing, a recording cannot be used, or none of its samples could be judged.
+        UserError: the twin declares nothing or was made of a recording, one cannot be used, or none of its samples
+            could be judged.
     """
-    calibration = TwinFile.load(twin).calibration
+    loaded = TwinFile.load(twin)
+    calibration = loaded.calibration
     if calibration is None or calibration.get("promise") is None:
         raise UserError(f"{twin}: its alarms were never calibrated: give healthy recordings and --false-alarms-per-day")
+    _refuse_what_it_was_made_of(twin, loaded, recordings)
     alarms, fan_hours = 0, 0.0
     with working("judging other healthy recordings") as tell:
         for path in recordings:
@@ -94,3 +99,20 @@ def check_promise(twin: Path, recordings: Sequence[Path], overrides: Sequence[st
                     fan_samples = judged.samples * tray.fans - judged.not_judged.total()
                     fan_hours += fan_samples * judged.step_ns / NS_PER_HOUR
     return Check(alarms, fan_hours, float(calibration["promise"]["false_alarms_per_day"]))
+
+
+def _refuse_what_it_was_made_of(path: Path, twin: TwinFile, recordings: Sequence[Path]) -> None:
+    card = json.loads(twin.card_json)
+    for verb, part in (("calibrated", card["calibration"]["promise"]), ("trained", card.get("training", {}))):
+        known = {data["sha256"] for data in part.get("data", ())}
+        for recording in recordings:
+            if recording.is_file() and sha256_of(recording) in known:
+                raise UserError(
+                    f"{recording}: {path} was {verb} on it, so that it proves nothing: --verify takes other recordings"
+                )
+
+
+def sha256_of(path: Path) -> str:
+    """Of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

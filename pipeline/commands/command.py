@@ -50,7 +50,7 @@ def command(
     message = _message(chosen, number, value, set_point)
     stop = threading.Event()
     stop_on_signals(stop)
-    with Bus(settings.bus, stop) as bus:
+    with Bus(settings.bus, stop, listens=False) as bus:
         _send(bus, Watcher(bus, settings.site), settings.site, chosen.name, message, stop)
     kind, unit = ("set-point", f" {chosen.speed_unit}") if set_point else ("command", "")
     if json_output:

@@ -109,7 +109,7 @@ def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Co
         (out / "up.log").open("w", encoding="utf-8") as log,
         _child(simulate, stdout=log, stderr=log) as device,
         _child(up, stdout=subprocess.PIPE, stderr=log) as pipeline,
-        Bus(config.bus) as bus,
+        Bus(config.bus, listens=False) as bus,
     ):
         console.print(f"simulated tray of {tray.fans} fans; six stages start as processes of their own")
         _watch(config, bus, device, pipeline, stop, console)

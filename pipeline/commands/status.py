@@ -42,7 +42,7 @@ def status(
     settings = load_config(config, overrides or ())
     stop = threading.Event()
     stop_on_signals(stop)
-    with Bus(settings.bus) as bus:
+    with Bus(settings.bus, listens=False) as bus:
         watcher = Watcher(bus, settings.site)
         if once or json_output:
             stop.wait(_LISTEN_S)

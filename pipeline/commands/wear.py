@@ -31,6 +31,7 @@ from schemas.topics import tray_key
 
 NS_PER_DAY = 86_400_000_000_000
 _LOOK_S = 0.02
+_QUIET = "one that is commissioned and then quiet (score below 0.5, no alarm, not too slow)"
 _TOLD = ("unit", "change", "per_day", "days", "limit", "reached_t_ns", "why_not")
 
 
@@ -58,7 +59,7 @@ def wear(
         settings, damage = load_config(config, overrides or ()), []
         stop = threading.Event()
         stop_on_signals(stop)
-        with Bus(settings.bus, stop) as bus:
+        with Bus(settings.bus, stop, listens=False) as bus:
             meet(bus, Watcher(bus, settings.site), settings, stop, what="wear")
             key = tray_key(settings.site, "*", "memory")
             replies = bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_LOOK_S))
@@ -67,6 +68,10 @@ def wear(
     found = [(tray, memory.t_ns, wear) for tray, memory in _latest(memories).items() for wear in _wear_in(memory)]
     if not found:
         raise UserError(nothing)
+    if not any(_rows(*each) for each in found):
+        raise UserError(
+            f"nothing seen yet of any fan of {', '.join(tray for tray, *_ in found)}: that takes {_QUIET}; ask again"
+        )
     if json_output:
         rows = [row for tray, t_ns, state in found for row in _rows(tray, t_ns, state)]
         typer.echo(json.dumps({"wear": rows}))
@@ -139,7 +144,7 @@ def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
     unit = escape(state["command_unit"])
     silent = [str(number) for number, fan in enumerate(state["fans"]) if not fan["t_ns"]]
     said = [f"balance, friction: command{f' in {unit}' if unit else ''}; drag, gain: % of healthy"]
-    said += [f"nothing seen yet of fan {', '.join(silent)}"] if silent else []
+    said += [f"nothing seen yet of fan {', '.join(silent)}: that takes {_QUIET}"] if silent else []
     table = Table(
         "fan",
         "parameter",

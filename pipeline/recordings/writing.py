@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import mimetypes
-import struct
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -17,17 +16,15 @@ from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
-from zlib import crc32
 
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Header, Metadata, Schema
+from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.schema import build_file_descriptor_set
-from zstandard import ZstdCompressor
 
+from pipeline.recordings.chunk import FillingChunk
 from pipeline.recordings.disk import WholeFile, refused, sync_folder
-from pipeline.recordings.index import SHORT_ENDING, Index, message_indexes
+from pipeline.recordings.index import SHORT_ENDING, Index
 from pipeline.recordings.ledger import (
     BEFORE_NAME,
     ENDED,
@@ -39,7 +36,7 @@ from pipeline.recordings.ledger import (
     as_metadata,
 )
 from pipeline.recordings.reading import METADATA_NAME, RecordingError
-from pipeline.recordings.records import MESSAGE, RECORD, record_bytes
+from pipeline.recordings.records import record_bytes
 from schemas.codec import encode, proto_type, type_name
 from schemas.messages import Health, Message, newest_t_ns
 from schemas.topics import topic_of
@@ -49,7 +46,6 @@ CHUNK_BYTES = 64 * 1024
 """What is not yet in a finished chunk is lost in a crash, and a reader holds one chunk in memory."""
 UNSYNCED_BYTES = 4 << 20
 """About so much is held in memory at most until it is through to the disk."""
-_MESSAGE_RECORD = struct.Struct(RECORD.format + MESSAGE.format.removeprefix("<"))
 
 
 class Pending(NamedTuple):
@@ -107,7 +103,7 @@ class RecordingWriter:
         self._ended = False
         self._index = Index()
         self._channels: dict[str, tuple[int, str]] = {}
-        self._chunk = _Chunk()
+        self._chunk = FillingChunk()
         self._active = path.with_name(path.name + ACTIVE_SUFFIX)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -238,7 +234,7 @@ class RecordingWriter:
         counts = {channel: len(flat) // 2 for channel, flat in self._chunk.entries.items()}
         self._unsynced.append(_WrittenChunk(index, counts, self._filling))
         self._unsynced_bytes += self._chunk.size
-        self._chunk, self._filling = _Chunk(), []
+        self._chunk, self._filling = FillingChunk(), []
 
     def _sync(self) -> None:
         """What is written goes through to the disk, and counts from then on."""
@@ -311,66 +307,6 @@ class _WrittenChunk(NamedTuple):
     counts: dict[int, int]
     """messages by channel"""
     messages: list[Pending]
-
-
-class _Chunk:
-    """The chunk that is being filled."""
-
-    def __init__(self) -> None:
-        self.size = 0
-        self.entries: dict[int, list[int]] = {}
-        """by channel: log time and place of each message, in turns"""
-        self._parts: list[bytes] = []
-
-    def append(self, record: bytes) -> None:
-        """Add a record that is no message."""
-        self._parts.append(record)
-        self.size += len(record)
-
-    def add(self, channel: int, sequence: int, log_time_ns: int, publish_time_ns: int, payload: bytes) -> None:
-        """Add a message. MCAP has no time before 1970 (the message itself keeps it), and 32 bits for the sequence."""
-        log_time_ns = max(0, log_time_ns)
-        publish_time_ns = max(0, publish_time_ns)
-        length = MESSAGE.size + len(payload)
-        head = _MESSAGE_RECORD.pack(
-            Opcode.MESSAGE, length, channel, sequence & 0xFFFFFFFF, log_time_ns, publish_time_ns
-        )
-        self._parts += (head, payload)
-        entries = self.entries.get(channel)
-        if entries is None:
-            entries = self.entries[channel] = []
-        entries += (log_time_ns, self.size)
-        self.size += RECORD.size + length
-
-    def made(self, offset: int) -> tuple[bytes, ChunkIndex]:
-        """The chunk's record and those of its index behind it, which are to stand at `offset`."""
-        data = b"".join(self._parts)
-        packed = ZstdCompressor().compress(data)
-        first_ns = min(min(flat[::2]) for flat in self.entries.values())
-        last_ns = max(max(flat[::2]) for flat in self.entries.values())
-        record = record_bytes(
-            Chunk(
-                compression="zstd",
-                data=packed,
-                message_start_time=first_ns,
-                message_end_time=last_ns,
-                uncompressed_crc=crc32(data),
-                uncompressed_size=len(data),
-            )
-        )
-        indexes, offsets = message_indexes(self.entries, offset + len(record))
-        index = ChunkIndex(
-            message_start_time=first_ns,
-            message_end_time=last_ns,
-            chunk_start_offset=offset,
-            chunk_length=len(record),
-            message_index_offsets=offsets,
-            message_index_length=len(indexes),
-            compression="zstd",
-            compressed_size=len(packed),
-            uncompressed_size=len(data),
-        )
-        return record + indexes, index
 
 
 @cache

@@ -94,8 +94,9 @@ class Chain:
         """Prepare a replay.
 
         contexts: of each stage of `pipeline.replay.plan.CHAIN`, for this tray. raw: the tray's raw packets in the order
-        they were recorded, from the beginning at each call. observe: is handed the raw samples, each once, and what
-        stages have made and others have taken. stretch_s: the part of the raw samples that is judged, since the first.
+        they were recorded, from the beginning at each call. observe: is handed the raw samples, each once, what
+        stages have made and others have taken, and what operators asked for. stretch_s: the part of the raw samples
+        that is judged, since the first.
         """
         self._contexts = dict(contexts)
         self._raw = raw
@@ -162,10 +163,12 @@ class Chain:
                 if row > done:
                     yield from core.step(cut(block, done, row))
                     done = row
+                self._observe(request)
                 yield from core.step(request)
             if done < len(block.t_ns):
                 yield from core.step(cut(block, done, len(block.t_ns)) if done else block)
         for _, request in requests:
+            self._observe(request)
             yield from core.step(request)
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pipeline.errors import UserError
 from pipeline.replay.chain import Chain
@@ -12,6 +13,7 @@ from pipeline.replay.material import open_material
 from pipeline.replay.plan import undisturbed
 from schemas.codec import CodecError
 from scoring.judge import Samples, samples_of
+from scoring.limits import Timing
 
 KEPT_SAMPLES = 10_000_000
 """of fans, about 80 bytes each: so many are kept between passes, what is beyond is made anew"""
@@ -61,6 +63,26 @@ class HealthyRuns:
             except CodecError as error:
                 raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
         self._kept = kept.runs
+
+    def timing(self) -> Timing:
+        """The times of the scorer, as the recordings' configuration has them, and the keys set on top.
+
+        Raises:
+            UserError: a recording cannot be used, or they are not the same for all.
+        """
+        found: dict[Timing, Path] = {}
+        for path in self._paths:
+            with open_material([path], None, self._overrides, self._twin) as material:
+                scorer: Any = material.config.sections["scorer"]
+                found.setdefault(scorer.timing(Timing()), path)
+        first, *others = found
+        for other in others:
+            names = [name for name in Timing.model_fields if getattr(first, name) != getattr(other, name)]
+            raise UserError(
+                f"{found[first]} and {found[other]} differ in scorer.{names[0]}, for which limits are found: "
+                "say which with --set"
+            )
+        return first
 
     def _of(self, path: Path) -> Iterator[tuple[HealthyRun, Iterator[Samples]]]:
         with open_material([path], None, self._overrides, self._twin) as material:

@@ -57,6 +57,12 @@ def conflict(present: Collection[Present], topics: Collection[str], trays: Colle
                 other = _other_start(present)
                 way_out = f"replay with --from {other}, or stop it" if other else "stop it"
                 return f"{each.label} of site {site!r} is running and writes {topic} itself: {way_out}"
+    answering = [each for each in present if "request" in each.stage.reads and "alarm" in each.stage.writes]
+    if "request" in topics and answering:
+        return (
+            f"{answering[0].label} of site {site!r} is running, and recorded requests are not for the alarms of today: "
+            "leave request out of --topics, or replay on a site or bus.endpoint of its own"
+        )
     return ""
 
 

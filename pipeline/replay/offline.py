@@ -25,7 +25,7 @@ from pipeline.replay.verify import (
 )
 from schemas.blocks import cut
 from schemas.codec import CodecError
-from schemas.messages import Alarm, Grid, Header, Message, Prediction, Raw, Score, newest_t_ns
+from schemas.messages import Alarm, Grid, Header, Message, Prediction, Raw, Request, Score, newest_t_ns
 from schemas.topics import TOPICS, tray_key
 
 Progress = Callable[[str, int], None]
@@ -231,6 +231,7 @@ class _Outputs:
         self._site = site
         self._tray = tray
         self._sequences: Counter[str] = Counter()
+        self._asked: set[Header] = set()
         self._written_t_ns: dict[type[Message], int] = defaultdict(lambda: np.iinfo(np.int64).min)
 
     def write(self, message: Message) -> None:
@@ -249,6 +250,11 @@ class _Outputs:
     def _write(self, message: Message) -> None:
         topic = _TOPIC_NAMES[type(message)]
         header = Header(f"offline-{topic}", self._sequences[topic], self._tray)
+        if isinstance(message, Request):  # answers name it
+            header = message.header
+            if header in self._asked:
+                return
+            self._asked.add(header)
         self._sequences[topic] += 1
         key = tray_key(self._site, self._tray, topic)
         self._writer.write_message(key, replace(message, header=header), newest_t_ns(message))

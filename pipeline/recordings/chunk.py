@@ -1,0 +1,75 @@
+"""A chunk of a recording while it is filled: message records, compressed together, and the index to go behind them."""
+
+from __future__ import annotations
+
+import struct
+from zlib import crc32
+
+from mcap.opcode import Opcode
+from mcap.records import Chunk, ChunkIndex
+from zstandard import ZstdCompressor
+
+from pipeline.recordings.index import message_indexes
+from pipeline.recordings.records import MESSAGE, RECORD, record_bytes
+
+_MESSAGE_RECORD = struct.Struct(RECORD.format + MESSAGE.format.removeprefix("<"))
+
+
+class FillingChunk:
+    """The chunk that is being filled."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        self.entries: dict[int, list[int]] = {}
+        """by channel: log time and place of each message, in turns"""
+        self._parts: list[bytes] = []
+
+    def append(self, record: bytes) -> None:
+        """Add a record that is no message."""
+        self._parts.append(record)
+        self.size += len(record)
+
+    def add(self, channel: int, sequence: int, log_time_ns: int, publish_time_ns: int, payload: bytes) -> None:
+        """Add a message. MCAP has no time before 1970 (the message itself keeps it), and 32 bits for the sequence."""
+        log_time_ns = max(0, log_time_ns)
+        publish_time_ns = max(0, publish_time_ns)
+        length = MESSAGE.size + len(payload)
+        head = _MESSAGE_RECORD.pack(
+            Opcode.MESSAGE, length, channel, sequence & 0xFFFFFFFF, log_time_ns, publish_time_ns
+        )
+        self._parts += (head, payload)
+        entries = self.entries.get(channel)
+        if entries is None:
+            entries = self.entries[channel] = []
+        entries += (log_time_ns, self.size)
+        self.size += RECORD.size + length
+
+    def made(self, offset: int) -> tuple[bytes, ChunkIndex]:
+        """The chunk's record and those of its index behind it, which are to stand at `offset`."""
+        data = b"".join(self._parts)
+        packed = ZstdCompressor().compress(data)
+        first_ns = min(min(flat[::2]) for flat in self.entries.values())
+        last_ns = max(max(flat[::2]) for flat in self.entries.values())
+        record = record_bytes(
+            Chunk(
+                compression="zstd",
+                data=packed,
+                message_start_time=first_ns,
+                message_end_time=last_ns,
+                uncompressed_crc=crc32(data),
+                uncompressed_size=len(data),
+            )
+        )
+        indexes, offsets = message_indexes(self.entries, offset + len(record))
+        index = ChunkIndex(
+            message_start_time=first_ns,
+            message_end_time=last_ns,
+            chunk_start_offset=offset,
+            chunk_length=len(record),
+            message_index_offsets=offsets,
+            message_index_length=len(indexes),
+            compression="zstd",
+            compressed_size=len(packed),
+            uncompressed_size=len(data),
+        )
+        return record + indexes, index
