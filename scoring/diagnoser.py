@@ -16,8 +16,8 @@ from scoring.diagnosis import diagnose
 from scoring.limits import summed_deviation
 from scoring.regression_window import HealthyBalance, Window
 
-WINDOW_S = 20.0
-AGAIN_AFTER_S = (1.0, 3.0, 10.0)  # after the raise
+WINDOW_S = 35.0
+AGAIN_AFTER_S = (1.0, 3.0, 10.0, 30.0)  # after the raise; the last within the window, with some health before it
 MOST_SAMPLES = 1 << 16  # of a fan are looked at: at a very fast rate, the last of the seconds
 LARGEST = 1e9  # a speed or a command beyond is none, and its powers would be no numbers
 LEAST_PROBABILITY = 0.005  # less is not worth telling

@@ -110,7 +110,8 @@ class Residual:
     def limit_sigmas(self, step_s: float) -> float:
         """How far the smoothed residual may be from its baseline, sigma; infinite where that is not judged.
 
-        It is a little more or less at speeds where healthy residuals vary more or less than on average.
+        It is a little more or less at speeds where healthy residuals vary more or less than on average, and more while
+        the speed changes.
         """
         limits = self._limits
         return self._deviation(step_s) * limits.step * limits.mean_spread if limits.step else math.inf

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -126,6 +127,55 @@ def test_a_tacho_that_misses_half_its_readings_can_still_be_told_from_one_that_i
 
     limits = calibrate(misses, TOP_RAD_S, Timing(), 600.0)
     assert 0.5 < limits.missing_share < 1.0
+
+
+# What differs from day to day
+
+
+def days(seed: int, power: int, runs: int, fans: int = 10, samples: int = 9_000) -> Runs:
+    """Runs in which speeds hold for ten seconds each; on every day the speed is off by a share, or by a constant."""
+
+    def each() -> Iterator[tuple[int, Iterable[Samples]]]:
+        for run in range(runs):
+            rng = np.random.default_rng(1000 * seed + run)
+            levels = np.repeat(rng.uniform(40.0, 180.0, (samples // 1000, fans)), 1000, axis=0)
+            off = 2.0 * rng.normal() * (levels / 100.0) ** power
+            speed = autoregressive(samples, fans, 0.0, 2000 * seed + 2 * run) + off
+            made = samples_of(speed, autoregressive(samples, fans, 0.0, 2000 * seed + 2 * run + 1))
+            yield fans, in_blocks(replace(made, speed_rad_s=levels + 1e-6 * made.speed_rad_s))
+
+    return each
+
+
+@pytest.fixture(scope="module")
+def limits_of_days() -> dict[int, Limits]:
+    """By the power with which offsets go with the speed."""
+    return {power: calibrate(days(20, power, 6), TOP_RAD_S, Timing(), 60.0) for power in (0, 1)}
+
+
+@pytest.mark.parametrize("power", [0, 1])
+def test_it_is_seen_whether_what_differs_between_days_goes_with_the_speed(
+    limits_of_days: dict[int, Limits], power: int
+) -> None:
+    limits = limits_of_days[power].speed
+    assert limits.baseline_power == power
+    assert limits.step is not None
+    assert limits.step * 0.16 < 1.0  # sigma: what a day does is followed, and not allowed for
+    assert limits_of_days[power].balance.baseline_power == 0
+
+
+def test_a_fan_on_another_day_alarms_at_no_other_speed_and_is_found_where_it_is_off_by_more(
+    limits_of_days: dict[int, Limits],
+) -> None:
+    limits = limits_of_days[1]
+    fresh = list(days(21, 1, 3)())
+    assert sum(len(alarms_of(limits, blocks, fans)) for fans, blocks in fresh) <= 5  # two are declared
+    fans, blocks = next(iter(days(22, 1, 1)()))
+    late = [
+        replace(b, speed_residual=b.speed_residual + 1.5 * (b.t_ns >= 60_000_000_000)[:, np.newaxis]) for b in blocks
+    ]
+    found = {alarm.fan for alarm in alarms_of(limits, late, fans) if alarm.t_s >= 60.0}
+    assert found == set(range(fans))
 
 
 # What they find

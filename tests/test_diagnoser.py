@@ -64,10 +64,10 @@ def test_blocks_of_any_size_are_diagnosed_the_same(keep) -> None:
 
 
 def test_only_the_last_seconds_are_looked_at_whatever_came_before() -> None:
-    whole, late = fed(3000, 10, from_s=29.0), fed(3000, 10, from_s=29.0, keep=slice(900, None))
-    at = int(times(3000)[-1])
+    whole, late = fed(5000, 10, from_s=49.0), fed(5000, 10, from_s=49.0, keep=slice(1400, None))
+    at = int(times(5000)[-1])
     for diagnoser in (whole, late):
-        diagnoser.raised(0, at, EPOCH_NS + 29 * S)
+        diagnoser.raised(0, at, EPOCH_NS + 49 * S)
     assert whole.diagnose(0, at) == late.diagnose(0, at)
 
 

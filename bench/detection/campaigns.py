@@ -54,8 +54,11 @@ def predictions(fleet: Fleet, plant: Plant, seconds: float, tell: Tell) -> Itera
 
 def calibrate(
     methods: Sequence[Method], stream: Iterator[tuple[str, Prediction]], alarms_per_hour: float
-) -> Calibration:
-    """Set the limits that are not fixed, all by the same rule on the same runs. alarms_per_hour: of a fan."""
+) -> Calibration | None:
+    """Set the limits that are not fixed, all by the same rule on the same runs. alarms_per_hour: of a fan.
+
+    None where no method has such a limit; the stream is gone through all the same.
+    """
     open_ones = [method for method in methods if not method.is_fixed]
     calibrations = {method.name: Calibration(alarms_per_hour) for method in open_ones}
     scores = {}
@@ -65,7 +68,7 @@ def calibrate(
             calibrations[method.name].take(run, block, one.take(block))
     for method in open_ones:
         method.limit = calibrations[method.name].limit()
-    return next(iter(calibrations.values()))
+    return next(iter(calibrations.values()), None)
 
 
 class Watch:

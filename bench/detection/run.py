@@ -44,6 +44,9 @@ def main(
         float, typer.Option(help="Faults begin so long after the run, or half a minute later.")
     ] = 60.0,
     extrapolate: Annotated[bool, typer.Option(help="Set limits beyond what the healthy fan-days can show.")] = True,
+    others: Annotated[
+        bool, typer.Option(help="Other methods as well; without, the simulated part is ours alone.")
+    ] = True,
     libraries: Annotated[bool, typer.Option(help="PyOD and river as well.")] = True,
     seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 1,
     json_output: JsonOption = False,
@@ -55,7 +58,7 @@ def main(
     if only != "measured":
         sizes = Sizes(fans, declared_days, calibration_days, healthy_days, runs, fault_runs, commissioned_s, seed)
         with tempfile.TemporaryDirectory() as folder:
-            _simulated(Path(folder), sizes, extrapolate, libraries, tables, notes)
+            _simulated(Path(folder), sizes, extrapolate, others, others and libraries, tables, notes)
     if only != "simulated":
         measured, told = measured_tables(progress, libraries=libraries)
         tables |= measured
@@ -68,12 +71,13 @@ def _simulated(
     folder: Path,
     sizes: Sizes,
     extrapolate: bool,
+    others: bool,
     libraries: bool,
     tables: dict[str, list[dict[str, Any]]],
     notes: list[str],
 ) -> None:
     try:
-        bench = prepared(folder, sizes, extrapolate=extrapolate, libraries=libraries, tell=progress)
+        bench = prepared(folder, sizes, extrapolate=extrapolate, others=others, libraries=libraries, tell=progress)
     except TooLittleError as error:
         raise SystemExit(
             f"{sizes.calibration_days:g} healthy fan-days cannot support one alarm of a fan in "
@@ -92,6 +96,10 @@ def _simulated(
         f"declared: one false alarm of a fan in {sizes.declared_days:g} days; by the calibration's own interval "
         f"{low:.2g} to {high:.2g}, from {promise.fan_hours / 24:.3g} fan-days"
         + (", extrapolated" if promise.extrapolated else ""),
+    ]
+    if not bench.calibration:
+        return
+    notes += [
         f"all other limits: no more than {bench.calibration.allowed} excursions on the same fan-days; '+-2 sigma, as "
         "published' and 'CUSUM, textbook limit' have their own",
         "PyOD judges one fan in 3, river one in 13; delays: median and quartiles of what was found",

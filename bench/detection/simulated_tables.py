@@ -65,7 +65,8 @@ class Bench:
     methods: list[Method]
     calibrated: list[Path]
     limits: Limits
-    calibration: Calibration
+    calibration: Calibration | None
+    """of the other methods, if there are any"""
 
     def watches(self, *, keep_scores: bool) -> dict[str, Watch]:
         """A new watch for each, ours first."""
@@ -85,7 +86,7 @@ class Bench:
         return Scorer(stage("scorer", self.calibrated[tray]))
 
 
-def prepared(folder: Path, sizes: Sizes, *, extrapolate: bool, libraries: bool, tell: Tell) -> Bench:
+def prepared(folder: Path, sizes: Sizes, *, extrapolate: bool, others: bool, libraries: bool, tell: Tell) -> Bench:
     """Train the twins, fit and calibrate all methods on the same healthy runs.
 
     Raises:
@@ -93,7 +94,7 @@ def prepared(folder: Path, sizes: Sizes, *, extrapolate: bool, libraries: bool, 
     """
     fleet = trained_fleet(folder, sizes.fans, sizes.seed, tell)
     per_hour = 1.0 / (24.0 * sizes.declared_days)
-    methods = plain_methods(RATE_HZ, per_hour)
+    methods = plain_methods(RATE_HZ, per_hour) if others else []
     if libraries:
         tell("fitting the libraries")
         methods += library_methods(RATE_HZ, _fitting(fleet, sizes.seed + 1000, tell), few_fans=True)
