@@ -1,5 +1,5 @@
 # make demo   install what the demo needs into .venv and run it
-# make test   install what the tests need, then check and test everything
+# make test   install what the tests need, check, and test: what only computes two at a time, then the rest alone
 # make check  format, lint, types, direction of imports, generated code
 # make bench  measurements, as ratios
 # make schema regenerate the code of schemas/fan.proto
@@ -24,7 +24,8 @@ demo: $(VENV)/.runtime
 	$(BIN)/fantwin demo
 
 test: $(VENV)/.development check
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not alone" --numprocesses 2 --dist worksteal
+	$(BIN)/python -m pytest -m alone
 
 check: $(VENV)/.development
 	$(BIN)/ruff format --check $(SOURCES)

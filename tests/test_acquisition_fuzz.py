@@ -185,9 +185,9 @@ def test_a_thousand_mutated_streams_are_accounted_for_to_the_last_frame(protocol
 
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_hundred_thousand_mutated_streams_are_accounted_for_to_the_last_frame(protocol: Protocol) -> None:
+def test_twenty_thousand_mutated_streams_are_accounted_for_to_the_last_frame(protocol: Protocol) -> None:
     chance, pool = random.Random(21), make_pool(protocol)
-    for _ in range(50_000):
+    for _ in range(10_000):
         check_one_stream(protocol, pool, chance)
 
 

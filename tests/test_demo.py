@@ -21,6 +21,7 @@ from tests.chain import fantwin
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
     out = tmp_path / "demo"
     done = fantwin("demo", "-o", out, timeout_s=200)

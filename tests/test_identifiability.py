@@ -114,10 +114,10 @@ def named(settings: dict[str, float]) -> str:
 
 @pytest.mark.slow
 def test_the_published_and_the_rough_fan_are_never_warned_about_but_for_a_lag() -> None:
-    lines = [line for make in (published_run, rough_run) for line in warnings_of(make(3, duration_s=60.0, fans=48))]
+    lines = [line for make in (published_run, rough_run) for line in warnings_of(make(3, duration_s=40.0, fans=24))]
     # One fan in a hundred without a lag comes out with one, below the sampling step; the warning says so.
     assert [line for line in lines if "lag_s" not in line] == []
-    assert len(lines) <= 3
+    assert len(lines) <= 1
 
 
 def test_settled_speeds_tell_the_drag_but_not_the_inertia() -> None:

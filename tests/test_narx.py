@@ -51,7 +51,7 @@ def filter_start(time_constant: float, rng: np.random.Generator) -> tuple[Array,
 
 @pytest.fixture(scope="module")
 def published() -> tuple[Run, Narx]:
-    run = fan_data.published_run(1, 80.0)
+    run = fan_data.published_run(1, 40.0)
     return run, trained(run)
 
 

@@ -23,6 +23,7 @@ from pipeline.table import read_table
 from schemas import wire
 from schemas.messages import Raw
 
+pytestmark = pytest.mark.alone
 FANTWIN = (
     sys.executable,
     "-P",

@@ -18,7 +18,18 @@ import pytest
 from pipeline.config import RAD_S_PER_UNIT, TrayConfig
 from pipeline.stage import Context, Core, StageError
 from pipeline.trace import Trace
-from schemas.messages import FanState, Header, Health, ModelCard, Score, StageStatus, WhyNot
+from schemas.messages import (
+    Alarm,
+    FanState,
+    Header,
+    Health,
+    ModelCard,
+    Score,
+    Severity,
+    StageStatus,
+    Transition,
+    WhyNot,
+)
 from stages.viewer import (
     FLUSH_PERIOD_NS,
     PAGE_PERIOD_NS,
@@ -26,6 +37,7 @@ from stages.viewer import (
     SAMPLES_HELD,
     ViewerConfig,
     ViewerCore,
+    alarm_line,
     build,
 )
 from tests.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
@@ -81,6 +93,25 @@ def play(core: Core, scores: Sequence[Score]) -> None:
     for score in scores:
         core.step(score)
         core.tick(int(score.t_ns[-1]))
+
+
+@pytest.mark.parametrize(
+    ("more", "level", "text"),
+    [
+        ({"transition": Transition.RAISED}, "WARN", "warning raised: so"),
+        ({"transition": Transition.RESTATED, "severity": Severity.ALARM}, "ERROR", "alarm restated: so"),
+        ({"transition": Transition.CLEARED, "active": False}, "INFO", "cleared: so"),
+        (
+            {"transition": Transition.RESTATED, "active": False, "severity": Severity.NONE, "suppressed": True},
+            "INFO",
+            "restated (never raised, suppressed): so",
+        ),
+    ],
+)
+def test_the_log_says_what_happened_to_an_alarm_and_how_bad_it_is(more: dict[str, Any], level: str, text: str) -> None:
+    told = {"fan": 0, "active": True, "severity": Severity.WARNING, "t_ns": 1, "onset_t_ns": 1, "acknowledged": True}
+    told |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "so", "confirmed": True}
+    assert alarm_line(Alarm(**told | more)) == (level, text)
 
 
 def test_samples_are_drawn_twice_a_second_and_none_is_left_out_or_drawn_twice() -> None:
@@ -345,6 +376,7 @@ def test_a_taken_port_is_told_in_one_line_and_no_file_is_begun(tmp_path: Path, k
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.alone
 def test_live_viewers_are_served_on_the_loopback_only(tmp_path: Path) -> None:
     port = free_port()
     core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core

@@ -18,6 +18,7 @@ from tests.chain import eventually
 from tests.score_data import made_up_tray
 from tests.test_viewer import LATER_NS, card, context, free_port, health, play
 
+pytestmark = pytest.mark.alone
 rerun_picture = pytest.importorskip("pipeline.rerun_picture", exc_type=ModuleNotFoundError)
 needs_a_driver = pytest.mark.skipif(
     not rerun_picture.has_vulkan_driver(), reason="no Vulkan driver here: apt-get install mesa-vulkan-drivers"
