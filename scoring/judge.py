@@ -245,6 +245,7 @@ class Judge:
                 f"{name}_shown": residual.shown.value,
                 f"{name}_smoothed": residual.low_pass.value,
                 f"{name}_cusum": residual.cusum.sums,
+                f"{name}_spread_mean": residual.spread.mean.value,
                 f"{name}_square": residual.spread.square.value,
             }
         return columns | {

@@ -55,7 +55,7 @@ class Residual:
         self._drift_s = summed_deviation(limits.autocorrelation_time_s, 0.01)
         cap = math.inf if limits.drift is None else CUSUM_CAP * limits.drift * self._drift_s
         self.cusum = Cusum(fans, limits.reference_sigmas, cap)
-        self.spread = Spread(fans)
+        self.spread = Spread(fans, timing.smoothing_s)
 
     @property
     def is_judged(self) -> bool:
@@ -93,11 +93,10 @@ class Residual:
         shown = self.shown.update(shift, valid, step_s)
         spread = self._spread(speed_rad_s, valid)
         raw = np.clip(shift / spread, -clip, clip)  # one wild reading must not raise an alarm
-        lasting = self._lasting(shape, speed_rad_s, motion_rad_s, valid, step_s)
-        z = raw / lasting
+        z = raw / self._lasting(shape, speed_rad_s, motion_rad_s, valid, step_s)
         smoothed = self.low_pass.update(z, valid, step_s)
         drift = self.cusum.update(z, valid, step_s)
-        growth = self.spread.update(raw, lasting * smoothed, valid, step_s)
+        growth = self.spread.update(raw, valid, step_s)
         ratios = np.stack(
             (
                 np.abs(smoothed) / (self._deviation(step_s) * (limits.step or math.inf)),

@@ -17,13 +17,16 @@ TIME_CONSTANT_S = 1.0
 class Spread:
     """Of a tray's fans."""
 
-    def __init__(self, fans: int) -> None:
+    def __init__(self, fans: int, smoothing_s: float) -> None:
+        self.mean = LowPass(fans, smoothing_s)
         self.square = LowPass(fans, TIME_CONSTANT_S)
 
     def reset(self, fans: Array) -> None:
         """Begin anew for some fans, (fans,) of bool; from zero, for only growth matters."""
+        self.mean.reset(fans)
         self.square.reset(fans)
 
-    def update(self, z: Array, smoothed: Array, valid: Array, step_s: float) -> Array:
-        """Take a block, (n, fans) each: the standardised residual and its low-pass. Returns the spread in sigma."""
-        return np.sqrt(self.square.update(np.where(valid, z - smoothed, 0.0) ** 2, valid, step_s))
+    def update(self, z: Array, valid: Array, step_s: float) -> Array:
+        """Take a block of a standardised residual, (n, fans). Returns the spread in sigma."""
+        beyond = np.where(valid, z - self.mean.update(z, valid, step_s), 0.0)
+        return np.sqrt(self.square.update(beyond**2, valid, step_s))

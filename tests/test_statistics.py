@@ -33,8 +33,8 @@ def of_cusum() -> Update:
 
 
 def of_spread() -> Update:
-    spread = Spread(FANS)
-    return lambda x, valid: spread.update(x, 0.5 * x, valid, STEP_S)
+    spread = Spread(FANS, 0.2)
+    return lambda x, valid: spread.update(x, valid, STEP_S)
 
 
 def of_sensor() -> Update:
@@ -128,14 +128,15 @@ def test_the_spread_of_noise_is_its_deviation_and_doubles_with_it() -> None:
     noise = np.random.default_rng(6).normal(size=(6000, 50))
     valid = np.ones(noise.shape, np.bool_)
     for scale in (1.0, 2.0):
-        made = Spread(50).update(scale * noise, np.zeros(noise.shape), valid, STEP_S)
+        made = Spread(50, 100.0).update(scale * noise, valid, STEP_S)
         assert np.sqrt((made[1000:] ** 2).mean()) == pytest.approx(scale, rel=0.02)
 
 
 def test_the_spread_does_not_see_a_shift_that_the_low_pass_has_followed() -> None:
-    z = np.full((1000, 1), 7.0)
-    valid = np.ones(z.shape, np.bool_)
-    assert Spread(1).update(z, z, valid, STEP_S).max() == 0.0
+    z = np.full((3000, 1), 7.0)
+    spread = Spread(1, 0.2).update(z, np.ones(z.shape, np.bool_), STEP_S)
+    assert spread.max() > 1.0  # it cannot know at once
+    assert spread[-1] < 1e-5
 
 
 def test_a_reading_that_repeats_itself_is_stuck_for_as_long_as_it_does() -> None:
@@ -189,9 +190,9 @@ def test_some_fans_begin_anew_and_the_others_go_on() -> None:
     x = np.random.default_rng(8).normal(0.5, 1.0, (200, 2))
     valid = np.ones(x.shape, np.bool_)
     first = np.array([True, False])
-    low_pass, cusum, spread = LowPass(2, 0.2), Cusum(2, 0.25, math.inf), Spread(2)
+    low_pass, cusum, spread = LowPass(2, 0.2), Cusum(2, 0.25, math.inf), Spread(2, 0.2)
     for each in (low_pass, cusum, spread):
-        each.update(x, valid, STEP_S) if not isinstance(each, Spread) else each.update(x, 0 * x, valid, STEP_S)
+        each.update(x, valid, STEP_S)
         each.reset(first)
     assert low_pass.value[0] == cusum.sums[:, 0].max() == spread.square.value[0] == 0.0
     assert low_pass.value[1] != 0.0
