@@ -10,7 +10,7 @@ from pipeline.stage import Packet
 from schemas.messages import Health, Input
 from schemas.topics import topic_of
 
-MOST_PRODUCERS = 64  # of a key: so many are known by name, the latest; every `fantwin alarms ack` is a new one
+MOST_PRODUCERS = 64  # of a key: so many are told of by name, the latest; every `fantwin alarms ack` is a new one
 Recover: TypeAlias = Callable[[str, str, int, int], Iterable[Packet]]
 
 
@@ -44,8 +44,6 @@ class Inlet:
         self._recover = recover
         self._lines: dict[str, dict[str, _Line]] = {}
         """of each key, by producer; who spoke last is at the end"""
-        self._silent: dict[str, _Line] = {}
-        """of each key, all that are no longer known by name"""
 
     def accept(self, packet: Packet) -> Iterator[Packet]:
         """The packets that are due now that this one has come: recovered ones first, nothing if it came before."""
@@ -69,8 +67,16 @@ class Inlet:
                 yield from self._fill(output.key, health.header.producer, line, output.published)
 
     def inputs(self) -> tuple[Input, ...]:
-        """The account, for health; of those that are not known by name, under an empty one."""
-        named = [(key, *of) for key, lines in self._lines.items() for of in lines.items()]
+        """The account, for health; of all but the latest producers of a key together, under an empty name."""
+        told: list[tuple[str, str, _Line]] = []
+        for key, lines in self._lines.items():
+            of = list(lines.items())
+            told += [(key, producer, line) for producer, line in of[-MOST_PRODUCERS:]]
+            if len(of) > MOST_PRODUCERS:
+                rest = _Line(next_sequence=0)
+                for _, line in of[:-MOST_PRODUCERS]:
+                    rest.add(line)
+                told.append((key, "", rest))
         return tuple(
             Input(
                 key=key,
@@ -80,15 +86,13 @@ class Inlet:
                 duplicated=line.duplicated,
                 next_sequence=line.next_sequence or 0,
             )
-            for key, producer, line in (*named, *((key, "", line) for key, line in self._silent.items()))
+            for key, producer, line in told
             if line.next_sequence is not None
         )
 
     def _line(self, key: str, producer: str) -> _Line:
         lines = self._lines.setdefault(key, {})
         line = lines[producer] = lines.pop(producer, None) or _Line()
-        if len(lines) > MOST_PRODUCERS:
-            self._silent.setdefault(key, _Line(next_sequence=0)).add(lines.pop(next(iter(lines))))
         return line
 
     def _fill(self, key: str, producer: str, line: _Line, until: int) -> Iterator[Packet]:

@@ -75,7 +75,7 @@ class Launcher:
             UserError: a stage cannot run as configured; the others have been stopped.
         """
         with Bus(self._config.bus, stop) as bus:
-            self._refuse_a_second(bus)
+            self._refuse_a_second(bus, stop)
             self._watcher = Watcher(bus, self._config.site)
             try:
                 self._start_all(stop)
@@ -88,7 +88,7 @@ class Launcher:
                 self.outcome.lost = self._watcher.losses()
         return self.outcome
 
-    def _refuse_a_second(self, bus: Bus) -> None:
+    def _refuse_a_second(self, bus: Bus, stop: threading.Event) -> None:
         """Somebody at the endpoint is of this site, or of another that shares it, or no stage at all. A busy machine
         takes seconds until the first is met; a router is met already."""
         ours = {alive_key(self._config.site, slot.row.stage, slot.row.instance): slot.row.label for slot in self._slots}
@@ -104,7 +104,8 @@ class Launcher:
             met_s = min(met_s, now_s if alive else math.inf)
             if not bus.came_second or now_s >= min(began_s + _MEETING_S, met_s + _OTHERS_S):
                 return
-            time.sleep(_LOOK_S)
+            if stop.wait(_LOOK_S):
+                return
 
     def _start_all(self, stop: threading.Event) -> None:
         """Whoever listens first: sources start when all others are ready, so that no first sample is missed."""

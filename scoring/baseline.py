@@ -11,9 +11,9 @@ afterwards not further from the commissioned one than the adaptation limit: what
 A fan's own offset may go with its speed, as `shape` says: one at the speed where the baseline is what it is, and less
 where it is slower. The mean of an interval is then by least squares, and an interval tells as much as the mean square
 of its shape. What a twin is wrong by at a low speed must not be taken for much more of it at a high one: each mean is
-drawn towards none, where healthy fans are, by ridge regression; an interval that tells much more than one of those that
-the baseline was commissioned by takes its place; and at a larger shape than theirs a baseline is known the less
-(`unknown`), the larger it is.
+drawn towards none, where healthy fans are, by ridge regression. At a larger shape than that of the intervals that told
+most a baseline is known the less (`unknown`), the larger it is; there it is followed the faster, and the commissioned
+one moves with it, by no more than was unknown.
 """
 
 from __future__ import annotations
@@ -101,9 +101,13 @@ class Baseline:
 
     def unknown(self, shape: Array) -> Array:
         """(n, fans) how far the fan's own offset may be from the baseline's at a shape, beyond what it is by, sigma."""
+        return UNUSUAL * self._settings.usual * np.maximum(shape - self.reached, 0.0)
+
+    @property
+    def reached(self) -> Array:
+        """(fans,) the shape where most was told."""
         weights = np.square(self.told)
-        told = (weights * self.told).sum(axis=0) / np.maximum(weights.sum(axis=0), LEAST_TOLD)
-        return UNUSUAL * self._settings.usual * np.maximum(shape - np.sqrt(told), 0.0)
+        return np.sqrt((weights * self.told).sum(axis=0) / np.maximum(weights.sum(axis=0), LEAST_TOLD))
 
     def restart(self, fans: Array) -> None:
         """Commission some fans anew, (fans,) of bool."""
@@ -146,19 +150,25 @@ class Baseline:
         self.waited += unsteady
         good = seen & ~unsteady & np.where(self.is_commissioning, normal, quiet)
         first = good & (self.intervals == 0)
-        young = good & (self.is_commissioning | (told > MORE * self.told.min(axis=0)))
+        young = good & self.is_commissioning
+        eager = good & ~young & (told > MORE * self.told.min(axis=0))
         worth = np.minimum(told, 1.0)
         self.worth += np.where(good, worth, 0.0)
         gain = worth / np.maximum(np.minimum(self.worth, self._settings.adaptation_intervals), LEAST_TOLD)
+        reached = self.reached
+        self._keep(mean, told, young | eager)
+        share = np.square(told) / np.maximum(np.square(self.told).sum(axis=0), LEAST_TOLD)
+        gain = np.where(eager, np.maximum(gain, share), gain)
         value = np.where(good, self.value + gain * (mean - self.value), self.value)
         if young.any():
-            self._keep(mean, told, young)
             median = _median(self.means[:, young], np.square(self.told[:, young]))
             value[young] = np.clip(median, -self._settings.farthest, self._settings.farthest)
+        moved = np.where(eager, UNUSUAL * self._settings.usual * np.maximum(self.reached - reached, 0.0), 0.0)
+        commissioned = np.clip(value, self.commissioned - moved, self.commissioned + moved)
         limit = self._settings.adaptation_limit
-        held = np.clip(value, self.commissioned - limit, self.commissioned + limit)
+        held = np.clip(value, commissioned - limit, commissioned + limit)
         self.value = np.where(young, value, held)
-        self.commissioned = np.where(young, self.value, self.commissioned)
+        self.commissioned = np.where(young, self.value, commissioned)
         self.intervals += good
         for column in (self.sums, self.shapes, self.squares, self.counts):
             column[:] = 0

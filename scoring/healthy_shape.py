@@ -34,8 +34,11 @@ def open_limits(limits: ResidualLimits) -> ResidualLimits:
 def followed(runs: Runs, limits: Limits, found: Healthy) -> tuple[Healthy, dict[str, dict[str, Any]]]:
     """Whether a fan's own offset goes with the speed, of each residual; and what baselines then leave.
 
-    It is taken to, when the healthy residual less such a baseline varies less.
+    It is taken to, when the healthy residual less such a baseline varies less; not by a few runs, which say little of
+    days.
     """
+    if len(found.maxima) < LEAST_BASELINES:
+        return found, {name: {} for name in RESIDUALS}
     reference = {"baseline_speed_rad_s": max(found.mean_speed_rad_s, 1e-9)}
     powers: dict[str, dict[str, Any]] = {
         name: {"baseline_power": power, "baseline_ridge": USUAL_RIDGE, **reference}

@@ -92,11 +92,12 @@ class Residual:
         shift = np.clip(np.where(valid, less_own, 0.0), -LARGEST, LARGEST)
         shown = self.shown.update(shift, valid, step_s)
         spread = self._spread(speed_rad_s, valid)
-        raw = np.clip(shift / spread, -clip, clip)  # one wild reading must not raise an alarm
-        z = raw / self._lasting(shape, speed_rad_s, motion_rad_s, valid, step_s)
+        raw = shift / spread
+        lasting = self._lasting(shape, speed_rad_s, motion_rad_s, valid)
+        z = np.clip(raw / lasting, -clip, clip)  # one wild reading must not raise an alarm
         smoothed = self.low_pass.update(z, valid, step_s)
         drift = self.cusum.update(z, valid, step_s)
-        growth = self.spread.update(raw, valid, step_s)
+        growth = self.spread.update(np.clip(raw, -clip, clip), valid, step_s)
         ratios = np.stack(
             (
                 np.abs(smoothed) / (self._deviation(step_s) * (limits.step or math.inf)),
@@ -136,9 +137,7 @@ class Residual:
             return limits.spread[0]
         return np.where(valid, np.interp(np.abs(speed_rad_s), limits.speeds_rad_s, limits.spread), 1.0)
 
-    def _lasting(
-        self, shape: Array, speed_rad_s: Array, motion_rad_s: Array, valid: Array, step_s: float
-    ) -> Array | float:
+    def _lasting(self, shape: Array, speed_rad_s: Array, motion_rad_s: Array, valid: Array) -> Array | float:
         """How much more what lasts varies here than where it varies least, and where a fan's own offset is known."""
         limits = self._limits
         more: Array | float = limits.lasting[0]
@@ -147,8 +146,8 @@ class Residual:
         if limits.motion_rad_s is not None:
             more = more * np.sqrt(1.0 + np.square(motion_rad_s / limits.motion_rad_s))
         if limits.baseline_usual_sigmas > 0.0:
-            unknown = np.where(valid, self.baseline.unknown(shape), 0.0) / self._deviation(step_s)
-            more = np.sqrt(np.square(more) + np.square(unknown))
+            # what an unknown offset adds is then within the drift's reference value
+            more = more + np.where(valid, self.baseline.unknown(shape), 0.0) / limits.reference_sigmas
         return more
 
     def forget(self, fans: Array) -> None:

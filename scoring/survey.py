@@ -105,8 +105,9 @@ def survey(runs: Runs, limits: Limits, top_speed_rad_s: float) -> Healthy:
         judge = Judge(fans, limits)
         judge.watch()
         windows = Windows(fans, limits.timing.on_delay_s)
+        seconds = {row + more: _Seconds() for row in FIRST for more in (0, 1)}
         for block in blocks:
-            _take(healthy, judge, windows, block)
+            _take(healthy, judge, windows, seconds, block)
         healthy.maxima.append(windows.end())
         for name in RESIDUALS:
             baseline = getattr(judge, name).baseline
@@ -115,7 +116,7 @@ def survey(runs: Runs, limits: Limits, top_speed_rad_s: float) -> Healthy:
     return healthy
 
 
-def _take(healthy: Healthy, judge: Judge, windows: Windows, block: Samples) -> None:
+def _take(healthy: Healthy, judge: Judge, windows: Windows, seconds: dict[int, _Seconds], block: Samples) -> None:
     verdict = judge.update(block)
     judged = np.isfinite(verdict.score)
     ratios, standard = judge.watched()
@@ -138,11 +139,11 @@ def _take(healthy: Healthy, judge: Judge, windows: Windows, block: Samples) -> N
             moments.growth += float(ratios[first + 2][use].sum())
             moments.lasting += _sums(bins[use].astype(int), SPEED_BINS, np.square(ratios[first][use]))
             shift = np.clip(np.where(use, residual - baseline, np.nan), -WILD, WILD)
-            _note(moments, shift, bins, healthy.step_s)
-            moments.standard += _below(np.square(_seconds(np.where(use, standard[first // 3], np.nan), healthy.step_s)))
-            moments.moved += _sums(
-                moving[use], MOTION_BINS, np.square(verdict.motion_rad_s[use]), np.square(smoothed[use])
-            )
+            _note(moments, shift, bins, seconds[first].of(shift, healthy.step_s))
+            lasts = seconds[first + 1].of(np.where(use, standard[first // 3], np.nan), healthy.step_s)
+            moments.standard += _below(np.square(lasts))
+            motions = np.square(verdict.motion_rad_s[use])
+            moments.moved += _sums(moving[use], MOTION_BINS, motions, np.square(smoothed[use]))
 
 
 def _sums(places: Array, bins: int, *columns: Array) -> Array:
@@ -150,24 +151,32 @@ def _sums(places: Array, bins: int, *columns: Array) -> Array:
     return np.stack([np.bincount(places, column, minlength=bins) for column in (np.ones(len(places)), *columns)])
 
 
-def _note(moments: Moments, shift: Array, bins: Array, step_s: float) -> None:
+def _note(moments: Moments, shift: Array, bins: Array, means: Array) -> None:
     use = np.isfinite(shift)
     where = bins[use].astype(int)
     moments.count += np.bincount(where, minlength=SPEED_BINS)
     moments.total += np.bincount(where, shift[use], minlength=SPEED_BINS)
     moments.square += np.bincount(where, shift[use] ** 2, minlength=SPEED_BINS)
-    squares = np.square(_seconds(shift, step_s))
+    squares = np.square(means)
     moments.means += squares.size
     moments.mean_square += float(squares.sum())
     moments.raw += _below(squares)
 
 
-def _seconds(shift: Array, step_s: float) -> Array:
-    """(m,) finite means over whole seconds of (n, fans)."""
-    second = max(1, round(1.0 / step_s))
-    whole = len(shift) // second * second
-    means = shift[:whole].reshape(-1, second, shift.shape[1]).mean(axis=1)
-    return means[np.isfinite(means)]
+class _Seconds:
+    """Means over whole seconds of one residual of one run, however its samples are cut into blocks."""
+
+    def __init__(self) -> None:
+        self._rest: Array | None = None
+
+    def of(self, shift: Array, step_s: float) -> Array:
+        """(m,) finite means that are now whole; shift: (n, fans)."""
+        second = max(1, round(1.0 / step_s))
+        rows = shift if self._rest is None else np.concatenate((self._rest, shift))
+        whole = len(rows) // second * second
+        self._rest = rows[whole:].copy()
+        means = rows[:whole].reshape(-1, second, rows.shape[1]).mean(axis=1)
+        return means[np.isfinite(means)]
 
 
 def _below(squares: Array) -> Array:
@@ -187,9 +196,10 @@ def beginnings(runs: Runs, count: int, fan_s: float) -> Runs:
 
 
 def _until(blocks: Iterable[Samples], seconds: float) -> Iterator[Samples]:
+    """The first block at least."""
     end_t_ns = None
     for block in blocks:
-        end_t_ns = end_t_ns or int(block.t_ns[0]) + round(seconds * 1e9)
-        if block.t_ns[-1] > end_t_ns:
+        if end_t_ns is not None and block.t_ns[-1] > end_t_ns:
             return
+        end_t_ns = end_t_ns or int(block.t_ns[0]) + round(seconds * 1e9)
         yield block

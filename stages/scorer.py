@@ -154,9 +154,9 @@ class ScorerCore(Core):
             state = json.loads(memory.state_json)
             self._desk.restore(state["desk"])
             if is_of_this_twin:
-                self._judge.restore(state["judge"])
                 if "wear" in state:
                     self._wear.restore(state["wear"])
+                self._judge.restore(state["judge"])
             self._fed_by = str(state["fed_by"])
         except (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError):
             self._begin()
@@ -237,7 +237,7 @@ class ScorerCore(Core):
         again = began_t_ns is not None and first_t_ns <= began_t_ns
         if not again and first_t_ns >= self._last_t_ns - BACK_IN_TIME_NS:
             return []
-        disowned = self._desk.disown(first_t_ns, stays_quiet=False)
+        disowned, self._set_aside = self._desk.disown(first_t_ns, stays_quiet=False), ""
         self._begin()
         self._first = []
         self._counts["memories_of_other_times"] += 1

@@ -200,3 +200,27 @@ def test_intervals_that_tell_more_take_the_place_of_those_that_told_little() -> 
 
 def _with(valid: np.ndarray, made: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return made[0], valid, made[1]
+
+
+def test_a_moment_at_a_higher_speed_does_not_bring_back_what_was_long_ago() -> None:
+    """It is followed there, and the adaptation limit goes with it by no more than was unknown."""
+    baseline = Baseline(2, BaselineSettings(5.0, 4.5, 60.0, ridge=0.01, usual=0.1))
+    for level in np.linspace(0.0, 4.0, 600):
+        baseline.add(np.full((SAMPLES, 2), level), EVERY, np.ones((SAMPLES, 2)))
+        baseline.end_interval(SAMPLES, GOOD, GOOD)
+    followed, commissioned = baseline.value.copy(), baseline.commissioned.copy()
+    assert followed.min() > 3.0
+    baseline.add(np.full((SAMPLES, 2), 1.5 * 4.0), EVERY, np.full((SAMPLES, 2), 1.5))
+    baseline.end_interval(SAMPLES, GOOD, GOOD)
+    assert (baseline.value > followed).all()
+    assert (np.abs(baseline.commissioned - commissioned) <= 3.0 * 0.1 * 0.5).all()
+
+
+def test_what_has_worn_to_its_limit_is_held_there_at_a_higher_speed_too() -> None:
+    baseline = Baseline(2, BaselineSettings(5.0, 1.0, 60.0, ridge=0.01, usual=0.1))
+    for level, shape in ((0.0, 1.0), (3.0, 1.0), (3.0 * 1.25, 1.25)):
+        for _ in range(300):
+            baseline.add(np.full((SAMPLES, 2), level), EVERY, np.full((SAMPLES, 2), shape))
+            baseline.end_interval(SAMPLES, GOOD, GOOD)
+    assert baseline.is_at_limit.all()
+    assert (baseline.value <= 1.0 + 3.0 * 0.1 * 0.25 + 1e-6).all()

@@ -62,7 +62,7 @@ class HealthyRuns:
                     yield run.fans, kept.noting(run.fans, blocks)
             except CodecError as error:
                 raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
-        self._kept = kept.runs
+        self._kept = kept.whole
 
     def timing(self) -> Timing:
         """The times of the scorer, as the recordings' configuration has them, and the keys set on top.
@@ -100,12 +100,19 @@ class _Kept:
     def __init__(self) -> None:
         self.runs: list[tuple[int, list[Samples]]] | None = []
         self._room = KEPT_SAMPLES
+        self._begun = 0
+
+    @property
+    def whole(self) -> list[tuple[int, list[Samples]]] | None:
+        """The runs, if there was room and every one was gone through to its end."""
+        return None if self._begun else self.runs
 
     def noting(self, fans: int, blocks: Iterable[Samples]) -> Iterator[Samples]:
         """The blocks of the next run."""
         mine: list[Samples] = []
         if self.runs is not None:
             self.runs.append((fans, mine))
+        self._begun += 1
         for block in blocks:
             self._room -= block.speed_rad_s.size
             if self._room < 0:
@@ -114,3 +121,4 @@ class _Kept:
             else:
                 mine.append(block)
             yield block
+        self._begun -= 1
