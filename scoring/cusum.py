@@ -26,6 +26,10 @@ class Cusum:
         self.sums = np.zeros((2, fans), np.int64)
         """(2, fans) C+ and C-, in fixed point"""
 
+    def uncap(self) -> None:
+        """Let the sums grow without end."""
+        self._cap = None
+
     def reset(self, fans: Array) -> None:
         """Begin anew for some fans, (fans,) of bool."""
         self.sums[:, fans] = 0

@@ -122,8 +122,12 @@ class Judge:
         return Verdict(**{name: np.concatenate([getattr(v, name) for v in verdicts]) for name in vars(verdicts[0])})
 
     def watch(self) -> None:
-        """Keep the ratios of all statistics, and what they are of, from now on, for `watched`."""
+        """Keep the ratios of all statistics, and what they are of, from now on, for `watched`; and end no sum at a cap:
+        how far beyond its limit a healthy one goes is to be known.
+        """
         self._watched = []
+        for residual in (self.speed, self.balance):
+            residual.cusum.uncap()
 
     def watched(self) -> tuple[Array, Array]:
         """(7, n, fans) the ratios since the last call, in the order of Statistic from 1 on, and (2, n, fans) both

@@ -285,3 +285,14 @@ def test_residuals_are_told_in_sigma_whatever_a_healthy_one_varies_by() -> None:
     np.testing.assert_allclose(verdict.speed_smoothed[1200:1500].mean(axis=0), 3.0, atol=0.1)
     judge = Judge(FANS, wide)
     assert judge.speed.limit_sigmas(0.01) == pytest.approx(4.0 * judge.balance.limit_sigmas(0.01))
+
+
+def test_who_watches_sees_how_far_a_drift_goes_beyond_its_limit() -> None:
+    samples = white(3000)
+    samples.speed_residual[1000:] += 0.6
+    judge, watched = Judge(FANS, LIMITS), Judge(FANS, LIMITS)
+    watched.watch()
+    verdict = judged(judge, samples)
+    assert verdict.score[verdict.statistic == Statistic.SPEED_DRIFT].max() < 1.1
+    judged(watched, samples)
+    assert watched.watched()[0][Statistic.SPEED_DRIFT - 1].max() > 3.0
