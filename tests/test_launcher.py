@@ -142,8 +142,10 @@ class LateBus:
     def monotonic(self) -> float:
         return self.now_s
 
-    def sleep(self, seconds: float) -> None:
+    def wait(self, seconds: float) -> bool:
+        """As an event that is never set."""
         self.now_s += seconds
+        return False
 
     def alive(self, _key: str) -> set[str]:
         return {alive_key(self._site, "scorer", "all")} if self.now_s >= self._met_s else set()
@@ -153,7 +155,7 @@ def refuse_a_second(bus: LateBus, monkeypatch: pytest.MonkeyPatch, mode: str = "
     """How long it took to find nobody."""
     monkeypatch.setattr("pipeline.launcher.time", bus)
     config = load_config(DEMO / "demo.toml", [f"bus.mode='{mode}'"])
-    Launcher(config, (), lambda _line: None)._refuse_a_second(bus)  # type: ignore[arg-type]
+    Launcher(config, (), lambda _line: None)._refuse_a_second(bus, bus)  # type: ignore[arg-type]
     return bus.now_s - 100.0
 
 
@@ -183,3 +185,12 @@ def test_who_comes_first_waits_for_nobody(monkeypatch):
 )
 def test_the_exit_code_says_whether_anything_was_lost(outcome, code):
     assert outcome.exit_code == code
+
+
+def test_who_is_stopped_while_it_looks_looks_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = LateBus("elsewhere", 5.0)
+    monkeypatch.setattr("pipeline.launcher.time", bus)
+    stop = threading.Event()
+    stop.set()
+    Launcher(load_config(DEMO / "demo.toml"), (), lambda _line: None)._refuse_a_second(bus, stop)  # type: ignore[arg-type]
+    assert bus.now_s == 100.0
