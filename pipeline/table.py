@@ -11,8 +11,9 @@ import csv
 import difflib
 import math
 import re
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -69,6 +70,8 @@ class Table:
     speed_unit: str
     """the unit the table has: rpm, rad/s, hz or deg/s"""
     mended: Mended
+    assumed: str = ""
+    """units that were not given, and how to give them, in one line; empty where all were"""
 
     @property
     def fans(self) -> int:
@@ -130,7 +133,7 @@ def read_table(
     rows = _rows(path)
     names = _names(path, next(rows, []))
     cells = [row + [""] * (len(names) - len(row)) for row in rows if any(row)]
-    times = _times(path, names, cells, time) if time else _counted_times(len(cells), period)
+    times, of_no_unit = _times(path, names, cells, time) if time else (_counted_times(len(cells), period), "")
     if time and period:
         raise UserError("--period is for tables without a time column: leave out --time or --period")
     commands = [_numbers(path, names, cells, _column(path, given, names, ())[0]) for given in command]
@@ -140,7 +143,8 @@ def read_table(
     unit = units[0] or "rad/s"
     speeds = [_numbers(path, names, cells, column) * RAD_S_PER_TABLE_UNIT[unit] for column in speed_columns]
     shared = len(speeds) // len(commands)
-    return _mend(path, times, np.column_stack(commands * shared), np.column_stack(speeds), unit)
+    table = _mend(path, times, np.column_stack(commands * shared), np.column_stack(speeds), unit)
+    return replace(table, assumed=_assumed(of_no_unit, "" if units[0] else names[speed_columns[0]]))
 
 
 def _rows(path: Path) -> Iterator[list[str]]:
@@ -210,12 +214,14 @@ def _number(cell: str) -> float:
         return math.nan
 
 
-def _times(path: Path, names: list[str], cells: list[list[str]], given: str) -> list[int | None]:
-    """The time of each row in ns, None where it cannot be read."""
+def _times(path: Path, names: list[str], cells: list[list[str]], given: str) -> tuple[list[int | None], str]:
+    """The time of each row in ns, None where it cannot be read; and the column's name if its unit was assumed."""
     column, unit = _column(path, given, names, (*NS_PER_UNIT, DATE_UNIT))
     first = next((row[column] for row in cells if row[column]), "")
+    assumed = ""
     if not unit:
         unit = DATE_UNIT if math.isnan(_number(first)) else "s"
+        assumed = "" if unit == DATE_UNIT else names[column]
     read = _date_ns if unit == DATE_UNIT else _count_ns(NS_PER_UNIT[unit])
     times = [read(row[column]) for row in cells]
     if not any(time is not None for time in times):
@@ -227,7 +233,23 @@ def _times(path: Path, names: list[str], cells: list[list[str]], given: str) -> 
         name, finer = names[column], _FINER.get(unit)
         hint = f"is it in ms, us or ns? write --time {name}:{finer}" if finer else "choose another time column"
         raise UserError(f"{path}: column {name!r} in {unit} gives times beyond the year 2116: {hint}")
-    return times
+    return times, assumed
+
+
+def _assumed(time: str, speed: str) -> str:
+    """What was taken for granted. time, speed: a column without a unit, empty where there is none."""
+    found = [
+        (what, f"{option} {shlex.quote(f'{name}:{other}')}")
+        for name, what, option, other in (
+            (time, "times in s", "--time", "ms"),
+            (speed, "speeds in rad/s", "--speed", "rpm"),
+        )
+        if name
+    ]
+    if not found:
+        return ""
+    what, otherwise = (" and ".join(words) for words in zip(*found, strict=True))
+    return f"no unit was given: {what} assumed; otherwise give it, such as {otherwise}"
 
 
 def _counted_times(rows: int, period: str | None) -> list[int | None]:

@@ -129,7 +129,7 @@ def _of_dropout(missing: float) -> tuple[Evidence | None, str]:
 def _why_not(names: list[str], weight: Array, healthy_share: float, speeds_after: Array | None) -> str:
     first, second = np.argsort(-weight[:-1])[:2]
     if weight[-1] < weight[first] * CLEAR:
-        return "the evidence is clear"
+        return f"little doubt: {names[first]} is more than twice as probable as all others together"
     if speeds_after is None:
         return "cannot tell yet: too few speeds since the onset"
     if healthy_share > CLEAR:

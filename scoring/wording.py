@@ -7,6 +7,7 @@ from math import pi
 from schemas.messages import Alarm, Statistic, Transition
 
 RAD_S_PER_RPM = 2.0 * pi / 60.0
+CANNOT_TELL = "cannot_tell"
 CAUSES = {
     "drag_up": "more drag (airflow blocked, filter clogged)",
     "drag_down": "less drag (blade lost, airflow freer than before)",
@@ -16,7 +17,7 @@ CAUSES = {
     "sensor_stuck": "a stuck tacho",
     "sensor_dropout": "a tacho that drops out",
     "sensor_scaling": "a tacho that counts wrongly",
-    "cannot_tell": "cannot tell yet",
+    CANNOT_TELL: "cannot tell yet",
 }
 PLAIN = {
     Transition.CLEARED: "back to normal",
@@ -67,7 +68,7 @@ class Wording:
         return f"takes {size:.2g} {self._command_unit} {side} than a healthy one (limit {limit:.2g}){_drifts(alarm)}"
 
     def _cause_if_known(self, alarm: Alarm) -> str:
-        known = alarm.causes and alarm.causes[0].cause != "cannot_tell"
+        known = alarm.causes and alarm.causes[0].cause != CANNOT_TELL
         return f"; {self._cause(alarm)}" if known else ""
 
     def _cause(self, alarm: Alarm) -> str:
@@ -75,6 +76,8 @@ class Wording:
             return "cause unknown"
         first = alarm.causes[0]
         words = CAUSES.get(first.cause, first.cause)
+        if first.cause == CANNOT_TELL:
+            return first.evidence or words  # its evidence begins with these words
         evidence = f": {first.evidence}" if first.evidence else ""
         return f"{words}, {100 * first.probability:.0f} %{evidence}"
 

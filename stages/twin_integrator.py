@@ -255,7 +255,7 @@ class TwinIntegratorCore(Core):
         since_t_ns = np.maximum(started_t_ns, self._run.last_out_of_range(grid.t_ns, beyond))
         settled = running & ((grid.t_ns[:, np.newaxis] - since_t_ns >= self._warm_up_ns) | ~in_range)
         in_range &= np.isfinite(predicted) | ~running
-        self._counts["out_of_range"] += int((settled & ~in_range).sum())
+        self._counts["not_predicted_out_of_range"] += int((settled & ~in_range).sum())
         why_not = np.where(settled, WhyNot.OUT_OF_RANGE, WhyNot.WARMING_UP)
         why_not = np.where(settled & in_range, WhyNot.NONE, why_not)
         why_not = np.where(grid.valid, why_not, grid.why_not).astype(np.uint8)

@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.config import TrayConfig
+from pipeline.extras import how_to_install
 from pipeline.loopback import check_free
 from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from pipeline.stages_page import StagesPage
@@ -26,7 +27,7 @@ from pipeline.standing_alarms import StandingAlarm
 from pipeline.trace import Trace, state_changes, state_name, trace_of
 from schemas.messages import Alarm, Array, Health, Message, ModelCard, Score, Severity, Transition
 
-NO_RERUN = "the viewer needs the `view` extra: pip install 'fantwin[view]', or take viewer out of launcher.stages"
+NO_RERUN = f"the viewer needs the extra `view`: take viewer out of launcher.stages; or {how_to_install('view')}"
 FLUSH_PERIOD_NS = 500_000_000
 REPEAT_STATES_NS = 5_000_000_000  # a viewer that joins late gets no state older than this
 PAGE_PERIOD_NS = 5_000_000_000  # at least, between two pages: what has no time is never dropped for being old

@@ -16,10 +16,11 @@ import pytest
 from chain import DEMO, FANTWIN, SITE, TRAY, eventually
 from fantwin_command import fantwin, said_instead
 
-from pipeline.commands.alarms import Asked
+from pipeline.commands.alarms import Asked, standing_lines
 from pipeline.config import load_config
 from pipeline.runner import Runner
 from pipeline.stage import Core, Parts, Stage
+from pipeline.standing_alarms import StandingAlarm
 from schemas.messages import Action, Alarm, Diagnosis, Header, Message, Request, StageStatus, Transition
 from scoring.condition import ConditionSettings, Standing
 from scoring.conditions import Conditions
@@ -168,6 +169,19 @@ def test_the_list_has_what_stands_and_with_all_what_is_over(site):
     first, cause, message = site.ask().splitlines()
     assert first.startswith(f"{TRAY} fan 3  ALARM    active, unacknowledged  since ")
     assert (cause.strip(), message.strip()) == ("drag_up 83 %, friction_up 10 %: drag +50 %", "too slow")
+
+
+def told_of_one_fan() -> list[Alarm]:
+    scorer = ToldScorer()
+    scorer.ratio[0] = 2.0
+    return [alarm for t_ns in range(3) for alarm in scorer.tick(t_ns) if isinstance(alarm, Alarm)]
+
+
+def test_a_cause_that_cannot_be_told_yet_is_said_once():
+    (raised,) = [alarm for alarm in told_of_one_fan() if alarm.transition == Transition.RAISED]
+    unknown = (Diagnosis(cause="cannot_tell", probability=0.6, evidence="cannot tell yet: the command is not moving"),)
+    _, cause, message = standing_lines(StandingAlarm(raised, "too slow", unknown, "")).plain.splitlines()
+    assert (cause.strip(), message.strip()) == ("cannot_tell 60 %: the command is not moving", "too slow")
 
 
 def test_an_acknowledgement_names_who_and_a_shelved_alarm_is_listed_and_not_presented(site):

@@ -10,6 +10,7 @@ from typing import Any
 import onnx
 import pytest
 
+from pipeline.command_line import spell_out
 from pipeline.commands.calibration_check import Check
 from pipeline.twin_file import TwinFile
 from scoring.limits import Limits, Timing
@@ -156,6 +157,14 @@ def test_a_promise_that_is_broken_is_exit_code_3(folder: Path, calibrated: Path)
     assert "declared 0.1: not kept" in result.stdout
 
 
+@pytest.mark.parametrize("alarms", range(20))
+def test_what_decides_is_the_interval_that_is_printed(alarms: int) -> None:
+    check = Check(alarms, 100.0, 1.0)
+    low, _ = check.interval_95
+    assert check.said.endswith(": not kept") == check.is_broken == (low > 1.0)
+    assert f"(95 %: {low:.2g} to " in check.said
+
+
 def test_a_twin_that_was_never_calibrated_has_nothing_to_verify(folder: Path) -> None:
     said = said_instead("calibrate", folder / "twin.onnx", "--verify", folder / "other.mcap")
     assert "never calibrated" in said
@@ -165,6 +174,41 @@ def test_what_is_missing_from_the_command_is_said(folder: Path) -> None:
     assert "nothing to calibrate on" in said_instead("calibrate", folder / "twin.onnx")
     said = said_instead("calibrate", folder / "twin.onnx", folder / "healthy.mcap")
     assert "--false-alarms-per-day" in said
+
+
+def test_a_twin_that_is_not_there_is_told_by_the_name_that_was_given(folder: Path) -> None:
+    said = said_instead("calibrate", folder / "no.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY)
+    assert said == f"{folder / 'no.onnx'}: there is no such twin: name the file that `fantwin train` wrote"
+
+
+def test_all_that_follows_verify_is_verified(folder: Path, calibrated: Path) -> None:
+    more, other = folder / "more.mcap", folder / "other.mcap"
+    simulated(more, 4, 30)
+    words = spell_out(list(map(str, ("calibrate", calibrated, "--verify", other, more, "--json"))))
+    result = fantwin(*words)
+    assert json.loads(result.stdout)["verify"]["fan_hours"] == pytest.approx(FANS * 90 / 3600, rel=0.1)
+
+
+def test_what_verify_swallowed_is_told(folder: Path, calibrated: Path) -> None:
+    other, healthy, twin = folder / "other.mcap", folder / "healthy.mcap", folder / "twin.onnx"
+    for option in (("--false-alarms-per-day", PER_DAY), ("--extrapolate",), ("-o", folder / "never.onnx")):
+        words = spell_out(list(map(str, ("calibrate", twin, *option, "--verify", other, healthy))))
+        said = said_instead(*words)
+        assert "those after --verify only test; name HEALTHY.mcap... before it" in said
+    words = spell_out(list(map(str, ("calibrate", calibrated, "--verify", other, twin))))
+    assert f"{twin}: --verify takes recordings" in said_instead(*words)
+
+
+def test_a_recording_in_which_something_was_wrong_is_named(folder: Path) -> None:
+    bad = folder / "bad.mcap"
+    simulated(bad, 5, 60, "--fault", "inlet:fan=1,start=20,stop=50,size=1.6")
+    said = (f"{bad}: tray1 fan 1 goes to", "times the limits that were found", "calibrate without this recording")
+    result = calibrate(folder, bad, "-o", folder / "doubtful.onnx", "--json")
+    (warning,) = json.loads(result.stdout)["warnings"]
+    assert all(part in warning for part in said)
+    assert warning in result.stderr.splitlines()
+    result = calibrate(folder, folder / "other.mcap", "-o", folder / "sure.onnx", "--json")
+    assert json.loads(result.stdout)["warnings"] == []
 
 
 @pytest.mark.parametrize("wrong", ["twin", "recording", "missing"])
@@ -246,7 +290,8 @@ def test_what_has_no_part_in_finding_limits_is_refused(folder: Path, calibrated:
 def test_a_rate_is_broken_only_by_more_alarms_than_chance_explains() -> None:
     assert not Check(0, 100.0, 1.0).is_broken
     assert not Check(7, 100.0, 1.0).is_broken  # 4.2 expected
-    assert Check(9, 100.0, 1.0).is_broken
+    assert Check(10, 100.0, 1.0).is_broken
+    assert not Check(0, 1e5, 1.0).is_broken, "fewer alarms than declared break nothing"
     low, high = Check(3, 72.0, 1.0).interval_95
     assert (low, high) == (pytest.approx(0.206, abs=0.001), pytest.approx(2.922, abs=0.001))
     assert math.isfinite(Check(0, 1.0, 1.0).interval_95[1])

@@ -59,7 +59,7 @@ def test_a_viewer_without_rerun_or_with_its_ports_taken_says_so(tmp_path, monkey
     assert viewer.STAGE.check(context(tmp_path, free)) == []
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
     (problem,) = viewer.STAGE.check(context(tmp_path, free))
-    assert "pip install 'fantwin[view]'" in problem
+    assert ".venv/bin/pip install -e '.[view]'" in problem
 
 
 def test_a_recorder_says_when_its_folder_cannot_be_made(tmp_path, monkeypatch):

@@ -90,9 +90,9 @@ def test_a_mistake_is_one_line_with_what_to_do(command, words, tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("command", "missing", "words"),
     [
-        ("plot RECORDING", "matplotlib", ["pip install 'fantwin[view]'"]),
-        ("picture RECORDING", "rerun", ["pip install 'fantwin[view]'"]),
-        ("train RECORDING -o twin.onnx --model physical", "onnx", ["pip install 'fantwin[train]'"]),
+        ("plot RECORDING", "matplotlib", [".venv/bin/pip install -e '.[view]'"]),
+        ("picture RECORDING", "rerun", [".venv/bin/pip install -e '.[view]'"]),
+        ("train RECORDING -o twin.onnx --model physical", "onnx", [".venv/bin/pip install -e '.[train]'"]),
     ],
 )
 def test_a_missing_extra_is_one_line_that_names_it(command, missing, words, recording, tmp_path):

@@ -44,6 +44,13 @@ def test_the_json_has_what_the_issue_asks_for() -> None:
     assert (told["causes"][0]["cause"], told["causes"][0]["probability"]) == ("drag_up", 0.6)
 
 
+def test_a_residual_that_nobody_knew_is_null_and_not_zero() -> None:
+    told = one(alarm(10, residual_rad_s=0.0, torque_balance_command=2.5)).as_json()
+    assert (told["residual"], told["torque_balance"]) == (None, 2.5)
+    told = one(alarm(10, residual_rad_s=-1e-9, torque_balance_command=0.0)).as_json()
+    assert (told["residual"], told["torque_balance"]) == (-1e-9, None)
+
+
 def test_what_is_told_again_after_a_restart_is_the_same_episode() -> None:
     episode = one(alarm(10), alarm(10, Transition.RESTATED), alarm(30, Transition.CLEARED))
     assert (episode.raised_ns, episode.cleared_ns) == (10, 30)

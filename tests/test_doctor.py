@@ -81,8 +81,8 @@ def test_what_is_not_installed_is_a_problem_and_a_missing_extra_is_not(capsys, m
     monkeypatch.setattr(module, "_version", lambda name: "" if name in ("pyserial", "torch") else versions(name))
     code, found = examine(capsys)
     assert code == 1
-    assert found["problems"] == ["pyserial is not installed: pip install fantwin"]
-    assert "extra 'train': not installed (torch); pip install 'fantwin[train]'" in found["good"]
+    assert found["problems"] == ["pyserial is not installed; in the checkout: .venv/bin/pip install -e '.'"]
+    assert "extra 'train': not installed (torch); in the checkout: .venv/bin/pip install -e '.[train]'" in found["good"]
 
 
 def test_little_disk_is_a_problem(capsys, tmp_path, port, monkeypatch):

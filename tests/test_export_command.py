@@ -246,7 +246,7 @@ def test_without_pyarrow_parquet_names_the_extra_and_csv_works(tmp_path, monkeyp
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     path = recording(tmp_path)
-    assert "pip install 'fantwin[parquet]'" in said_instead("export", path, "--to", "parquet", "-o", tmp_path)
+    assert ".venv/bin/pip install -e '.[parquet]'" in said_instead("export", path, "--to", "parquet", "-o", tmp_path)
     assert fantwin("export", path, "--to", "csv", "-o", tmp_path).exit_code == 0
 
 

@@ -61,6 +61,30 @@ def test_a_machine_is_told_the_counts(tmp_path):
     assert told["speed_unit"] == "rpm"
 
 
+def test_units_that_nobody_gave_are_told_with_how_to_give_them(tmp_path):
+    path, _ = measured(tmp_path)
+    for given, said in (
+        (
+            ("--time", "t", "--command", "u", "--speed", "y1"),
+            "times in s and speeds in rad/s assumed; otherwise give it, such as --time t:ms and --speed y1:rpm",
+        ),
+        (
+            ("--time", "t:s", "--command", "u", "--speed", "y1"),
+            "speeds in rad/s assumed; otherwise give it, such as --speed y1:rpm",
+        ),
+        (
+            ("--time", "t", "--command", "u", "--speed", "y1:rpm"),
+            "times in s assumed; otherwise give it, such as --time t:ms",
+        ),
+    ):
+        words = ("import", path, *given, "-o", tmp_path / "r.mcap", "--force")
+        assert fantwin(*words).stdout.splitlines()[1] == f"  no unit was given: {said}"
+        assert json.loads(fantwin(*words, "--json").stdout)["assumed"] == f"no unit was given: {said}"
+    words = ("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--force")
+    assert "assumed" not in fantwin(*words).stdout
+    assert json.loads(fantwin(*words, "--json").stdout)["assumed"] == ""
+
+
 def test_the_recording_says_unit_source_and_tray(tmp_path):
     path, _ = measured(tmp_path)
     fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--tray", "bench-2")

@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.recordings.reading import read_head, read_recording
 from pipeline.recordings.writing import RecordingWriter
+from schemas.messages import Alarm, WhyNot
 from tests.chain import fantwin
 from tests.killed_site import Site
 from tests.test_offline import changed
@@ -69,6 +70,26 @@ def test_the_decision_as_json():
     assert told["hours"] == pytest.approx((told["samples"] - not_judged) * 0.02 / 3600, abs=1e-4)
 
 
+def test_the_list_names_severity_and_probable_cause_and_is_not_wide():
+    (alarm,) = json.loads(replay("--json", GOLDEN).stdout)["alarms"]
+    first = alarm["causes"][0]
+    lines = replay(GOLDEN).stdout.splitlines()
+    (row,) = [line for line in lines if line.lstrip().startswith("tray1")]
+    for told in (alarm["severity"], f"{first['cause']} {100 * first['probability']:.0f} %", "takes "):
+        assert told in row
+    what_if = replay(GOLDEN, "--set", "scorer.limit_factor=1000").stdout.splitlines()
+    (gone,) = [line for line in what_if if line.lstrip().startswith("tray1")]
+    assert alarm["severity"] in gone and first["cause"] in gone
+    assert max(map(len, lines + what_if)) <= 100
+
+
+def test_counts_of_stages_and_reasons_of_not_judging_have_names_of_their_own():
+    told = json.loads(replay("--json", GOLDEN).stdout)
+    reasons = {why.name.lower() for why in WhyNot}
+    assert set(told["not_judged"]["tray1"]) <= reasons
+    assert reasons.isdisjoint(told["counts"]["tray1"]) and "not_predicted_out_of_range" in told["counts"]["tray1"]
+
+
 def test_another_threshold_says_what_is_gained_and_lost():
     told = json.loads(replay("--json", GOLDEN, "--set", "scorer.limit_factor=1000").stdout)
     assert told["alarms"] == [] and told["what_if"]["gained"] == []
@@ -98,7 +119,8 @@ def test_the_output_has_the_requests_that_its_alarms_answer(tmp_path):
     assert replay(GOLDEN, "-o", out).returncode == 0
     made, recorded = ([entry.message for entry in read_recording(path, ("request",))] for path in (out, GOLDEN))
     assert list(map(repr, made)) == list(map(repr, recorded)) and len(made) > 0
-    answered = {entry.message.request for entry in read_recording(out, ("alarm",))} - {""}  # type: ignore[union-attr]
+    alarms = [entry.message for entry in read_recording(out, ("alarm",))]
+    answered = {alarm.request for alarm in alarms if isinstance(alarm, Alarm)} - {""}
     assert answered == {f"{asked.header.producer}/{asked.header.sequence}" for asked in made}
 
 

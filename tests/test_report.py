@@ -396,7 +396,7 @@ def test_a_missing_extra_is_told_with_what_to_install(folder, tmp_path, command,
         [sys.executable, "-c", code, command, *given], capture_output=True, text=True, check=False, cwd=tmp_path
     )
     assert done.returncode == 1
-    assert done.stderr.strip().endswith("pip install 'fantwin[train]'")
+    assert done.stderr.strip().endswith(".venv/bin/pip install -e '.[train]'")
     assert done.stderr.count("\n") == 1
     assert not any(tmp_path.iterdir())
 

@@ -161,6 +161,13 @@ def test_a_table_without_times_counts_periods_from_zero(tmp_path, period, step_n
     assert read.t_ns.tolist() == [0, step_ns, 2 * step_ns]
 
 
+def test_dates_and_periods_need_no_unit_and_a_name_with_blanks_is_quoted(tmp_path):
+    dates = "t,u,y\n2019-11-05 17:14:08,1,10\n2019-11-05 17:14:09,2,20\n"
+    assert table(tmp_path, dates, speed=["y:rpm"]).assumed == ""
+    read = table(tmp_path, "the u,the y\n1,10\n2,20\n", None, ["the u"], ["the y"], "10ms")
+    assert read.assumed == "no unit was given: speeds in rad/s assumed; otherwise give it, such as --speed 'the y:rpm'"
+
+
 def test_a_column_whose_name_has_a_colon_is_found(tmp_path):
     read = table(tmp_path, "t:ms,u,motor:speed\n0,1,10\n1,2,20\n", time="t:ms:ms", speed=("motor:speed:rpm",))
     assert read.t_ns.tolist() == [0, 1_000_000]

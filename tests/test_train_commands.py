@@ -219,4 +219,4 @@ def test_a_missing_extra_is_told_with_what_to_install(folder, twin, monkeypatch,
         "train": (folder / "healthy.mcap", "-o", folder / "t.onnx"),
         "evaluate": (twin, folder / "healthy.mcap"),
     }[command]
-    assert said_instead(command, *arguments).endswith("pip install 'fantwin[train]'")
+    assert said_instead(command, *arguments).endswith(".venv/bin/pip install -e '.[train]'")

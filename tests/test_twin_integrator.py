@@ -255,7 +255,7 @@ def test_a_command_outside_what_the_twin_was_made_from_is_not_judged() -> None:
     prediction = feed(core, [grid_of(np.array([40.0, 104.9, 105.1, -5.1, -4.9]))])
     out = WhyNot.OUT_OF_RANGE
     assert prediction.why_not[:, 0].tolist() == [WhyNot.NONE, WhyNot.NONE, out, out, WhyNot.NONE]
-    assert core.counters()["out_of_range"] == 2
+    assert core.counters()["not_predicted_out_of_range"] == 2
 
 
 def why_not_of(command: list[float], **config: float) -> list[int]:

@@ -28,6 +28,7 @@ from pipeline.watcher import Watcher
 from schemas.codec import CodecError, decode
 from schemas.messages import Action, Alarm, Diagnosis, Request, Severity, Transition, newest_t_ns
 from schemas.topics import alive_key, tray_key
+from scoring.wording import CANNOT_TELL, CAUSES
 
 _MEET_S = 5.0  # several healths of every stage
 _LOOK_S = 0.02
@@ -126,7 +127,7 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
         typer.echo(json.dumps({"alarms": [each.as_json() for each in found]}))
     else:
         for each in found:
-            console.print(_standing_lines(each))
+            console.print(standing_lines(each))
         if not found:
             console.print(Text("no alarms", style="green"))
     names = {(alarm.header.producer, alarm.header.sequence, alarm.header.tray) for alarm in known}
@@ -230,7 +231,8 @@ def _word(alarm: Alarm) -> str:
     return alarm.transition.name.lower()
 
 
-def _standing_lines(standing: StandingAlarm) -> Text:
+def standing_lines(standing: StandingAlarm) -> Text:
+    """How an alarm stands, for people: two lines or three."""
     alarm = standing.newest
     by = f" by {standing.acknowledged_by}" if standing.acknowledged_by else ""
     words = [f"{word}{by}" if word == "acknowledged" else word for word in standing.words()]
@@ -241,7 +243,8 @@ def _standing_lines(standing: StandingAlarm) -> Text:
     if standing.causes:
         evidence = standing.causes[0].evidence
         told = not evidence or evidence in standing.message
-        text.append(f"\n    {_probable(standing.causes)}{'' if told else f': {evidence}'}")
+        why = "" if told else f": {evidence.removeprefix(f'{CAUSES[CANNOT_TELL]}: ')}"
+        text.append(f"\n    {_probable(standing.causes)}{why}")
     if standing.message:
         text.append(f"\n    {standing.message}")
     return text

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.commands.calibration_check import check_promise, sha256_of
+from pipeline.commands.calibration_doubt import doubt
 from pipeline.commands.model_maker import model_maker
 from pipeline.commands.options import JsonOption, SetOption
 from pipeline.commands.progress import working
@@ -37,7 +38,11 @@ def calibrate(
     ] = None,
     verify: Annotated[
         list[Path] | None,
-        typer.Option(metavar="OTHER.mcap...", help="Other healthy recordings, to test what was declared."),
+        typer.Option(
+            metavar="OTHER.mcap...",
+            help="Other healthy recordings, to test what was declared: all words that follow, up to the next option. "
+            "So TWIN.onnx and HEALTHY.mcap... stand before it.",
+        ),
     ] = None,
     extrapolate: Annotated[
         bool, typer.Option("--extrapolate", help="Set limits beyond what so little data can show; promises nothing.")
@@ -57,27 +62,27 @@ def calibrate(
 
     Exit codes: 0 well; 1 could not be done; 3 --verify found more false alarms than declared.
 
-    Example: fantwin calibrate TWIN.onnx healthy-1.mcap healthy-2.mcap --false-alarms-per-day 1 --verify healthy-3.mcap
+    Example: fantwin calibrate TWIN.onnx healthy-1.mcap healthy-2.mcap --false-alarms-per-day 1
+
+    Example: fantwin calibrate TWIN.onnx --verify healthy-3.mcap healthy-4.mcap
     """
-    if not healthy and not verify:
-        raise UserError("nothing to calibrate on: name healthy recordings, or --verify OTHER.mcap to test what is set")
-    _named_once([*(healthy or ()), *(verify or ())])
-    for key in (override.partition("=")[0].strip() for override in overrides or () if healthy):
-        if key.startswith("scorer.") and key.removeprefix("scorer.") not in Timing.model_fields:
-            raise UserError(
-                f"--set {key}: does not change which limits are found; of [scorer] these do: "
-                f"{', '.join(Timing.model_fields)}"
-            )
+    _refuse_what_makes_no_sense(twin, healthy or [], verify or [], overrides or [])
+    if not healthy:
+        finding = {"--false-alarms-per-day": false_alarms_per_day, "--extrapolate": extrapolate, "--output": output}
+        _refuse_without_healthy([name for name, value in finding.items() if value])
     if output and (output.is_dir() or not output.parent.is_dir()):  # told now, and not after an hour of judging
         raise UserError(f"{output}: cannot write the twin: name a file in a folder that is there")
     result: dict[str, Any] = {}
     if healthy:
         if false_alarms_per_day is None:
             raise UserError("say what is declared: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
-        limits = _calibrated(twin, healthy, false_alarms_per_day, extrapolate, overrides or [], seed)
+        limits, warning = _calibrated(twin, healthy, false_alarms_per_day, extrapolate, overrides or [], seed)
         output = output or twin
         _write(twin, output, limits)
         result = {"twin": str(output), "calibration": json.loads(limits.model_dump_json())}
+        result["warnings"] = [warning] if warning else []
+        if warning:
+            typer.echo(warning, err=True)
         if not json_output:
             _tell(output, limits)
     check = check_promise(output or twin, verify, overrides or []) if verify else None
@@ -93,7 +98,8 @@ def calibrate(
 
 def _calibrated(
     twin: Path, healthy: list[Path], per_day: float, extrapolate: bool, overrides: list[str], seed: int
-) -> Limits:
+) -> tuple[Limits, str]:
+    """The limits, and what is to be told of the recordings, empty if nothing."""
     top_speed_rad_s = TwinFile.load(twin).top_speed_rad_s
     if not 0.0 < top_speed_rad_s < math.inf:
         raise UserError(
@@ -105,6 +111,8 @@ def _calibrated(
             limits = find_limits(runs, top_speed_rad_s, runs.timing(), per_day, seed, extrapolate)
         except TooLittleError as error:
             raise UserError(_too_little(error, per_day)) from error
+        tell("comparing the recordings")
+        warning = doubt(runs, limits, top_speed_rad_s)
     assert limits.promise
     promise = limits.promise.model_copy(
         update={
@@ -112,7 +120,32 @@ def _calibrated(
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         }
     )
-    return limits.model_copy(update={"promise": promise})
+    return limits.model_copy(update={"promise": promise}), warning
+
+
+def _refuse_what_makes_no_sense(twin: Path, healthy: list[Path], verify: list[Path], overrides: list[str]) -> None:
+    if not twin.is_file():
+        raise UserError(f"{twin}: there is no such twin: name the file that `fantwin train` wrote")
+    if not healthy and not verify:
+        raise UserError("nothing to calibrate on: name healthy recordings, or --verify OTHER.mcap to test what is set")
+    for path in (path for path in verify if path.suffix == ".onnx"):
+        raise UserError(f"{path}: --verify takes recordings, all that follow it: name TWIN.onnx before it")
+    _named_once([*healthy, *verify])
+    for key in (override.partition("=")[0].strip() for override in overrides if healthy):
+        if key.startswith("scorer.") and key.removeprefix("scorer.") not in Timing.model_fields:
+            raise UserError(
+                f"--set {key}: does not change which limits are found; of [scorer] these do: "
+                f"{', '.join(Timing.model_fields)}"
+            )
+
+
+def _refuse_without_healthy(names: list[str]) -> None:
+    """names: of options that were given and say how to find limits."""
+    if names:
+        raise UserError(
+            f"{names[0]} goes with recordings to calibrate on, and there are none: those after --verify only test; "
+            "name HEALTHY.mcap... before it"
+        )
 
 
 def _named_once(recordings: list[Path]) -> None:

@@ -17,6 +17,7 @@ from rich.console import Console
 
 from pipeline.commands.options import JsonOption, SetOption
 from pipeline.config import Config, ConfigError, load_config
+from pipeline.extras import how_to_install
 from pipeline.processes import process_list
 from pipeline.stage import Context
 from pipeline.table_of_stages import load_stage
@@ -57,11 +58,11 @@ def _findings(config: Path | None, overrides: list[str] | None) -> Iterator[tupl
     yield True, f"Python {sys.version.split()[0]}"
     for name in _NEEDED:
         found = _version(name)
-        yield bool(found), f"{name} {found}" if found else f"{name} is not installed: pip install fantwin"
+        yield bool(found), f"{name} {found}" if found else f"{name} is not installed; {how_to_install()}"
     for extra, names in _EXTRAS.items():
         missing = [name for name in names if not _version(name)]
         line = f"extra {extra!r}: " + (
-            f"not installed ({', '.join(missing)}); pip install 'fantwin[{extra}]'" if missing else "installed"
+            f"not installed ({', '.join(missing)}); {how_to_install(extra)}" if missing else "installed"
         )
         yield True, line
     if config is None:

@@ -19,6 +19,7 @@ from rich.console import Console
 from pipeline.commands.model_maker import made_folder
 from pipeline.commands.options import JsonOption
 from pipeline.errors import UserError
+from pipeline.extras import how_to_install
 from pipeline.recordings.arrays import Block, in_order, read_topics
 from pipeline.recordings.reading import read_head, read_recording
 from pipeline.recordings.tables import Form, TableFile, open_table
@@ -48,7 +49,7 @@ def export(
     Example: fantwin export runs/demo/recording.mcap --to csv --topic score --topic alarm -o tables
     """
     if to == "parquet" and find_spec("pyarrow") is None:
-        raise UserError("--to parquet needs the `parquet` extra: pip install 'fantwin[parquet]'; or use --to csv")
+        raise UserError(f"--to parquet needs the extra `parquet`: use --to csv; or {how_to_install('parquet')}")
     parts = in_order(recordings)
     topics = list(dict.fromkeys(topic or _default_topics(parts)))
     arrays = read_topics(parts, topics, tray)

@@ -31,11 +31,14 @@ def import_table(
     ],
     speed: Annotated[
         list[str],
-        typer.Option(metavar="COLUMN[:UNIT]", help="Speed of a fan in rad/s, rpm, hz or deg/s. Repeatable: more fans."),
+        typer.Option(
+            metavar="COLUMN[:UNIT]",
+            help="Speed of a fan in rpm, hz, deg/s or rad/s (if not given). Repeatable: more fans.",
+        ),
     ],
     time: Annotated[
         str | None,
-        typer.Option(metavar="COLUMN[:UNIT]", help="Time in s, ms, us, ns, or iso for dates (found out if not given)."),
+        typer.Option(metavar="COLUMN[:UNIT]", help="Time in ms, us, ns, s or iso; if not given, numbers are s."),
     ] = None,
     period: Annotated[
         str | None, typer.Option(metavar="TIME", help="Time between samples where no column has it, e.g. 10ms.")
@@ -62,7 +65,7 @@ def import_table(
     fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"
     step = f"{table.median_step_s * 1e3:.3g} ms apart (median)"
     typer.echo(f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {step}")
-    for note in table.notes:
+    for note in (*filter(None, [table.assumed]), *table.notes):
         typer.echo(f"  {note}")
 
 
@@ -101,6 +104,7 @@ def account(table: Table, output: Path) -> dict[str, object]:
         "duration_s": table.duration_s,
         "median_rate_hz": 1 / table.median_step_s,
         "speed_unit": table.speed_unit,
+        "assumed": table.assumed,
         "gaps": table.gaps,
         **asdict(table.mended),
     }

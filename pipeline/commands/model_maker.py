@@ -14,6 +14,7 @@ import typer
 
 from pipeline.commands.options import fan_numbers
 from pipeline.errors import UserError
+from pipeline.extras import how_to_install
 from pipeline.recordings.runs import RecordedRun, read_runs
 from pipeline.table import RAD_S_PER_TABLE_UNIT
 
@@ -109,7 +110,7 @@ def model_maker() -> Iterator[None]:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] not in _EXTRA_MODULES:
             raise
-        raise UserError(f"this needs the extra `train` ({error.name}): pip install 'fantwin[train]'") from error
+        raise UserError(f"this needs the extra `train` ({error.name}); {how_to_install('train')}") from error
 
 
 def data_cards(material: Material) -> list[DataCard]:

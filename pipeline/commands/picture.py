@@ -11,6 +11,7 @@ from rich.console import Console
 
 from pipeline.commands.options import JsonOption, fan_numbers
 from pipeline.errors import UserError
+from pipeline.extras import how_to_install
 
 
 def picture(
@@ -34,7 +35,7 @@ def picture(
     except ModuleNotFoundError as error:
         if error.name not in ("rerun", "PIL"):
             raise
-        raise UserError("pictures need the `view` extra: pip install 'fantwin[view]'") from error
+        raise UserError(f"pictures need the extra `view`; {how_to_install('view')}") from error
     with Console(stderr=True).status(f"drawing {view_file}"):
         drawn = draw_picture(view_file, tray=tray, fans=fan_numbers(fans), at_s=at, window_s=window, view=view)
     output.write_bytes(drawn.png)

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from pipeline.commands.options import JsonOption, fan_numbers
 from pipeline.errors import UserError
+from pipeline.extras import how_to_install
 
 
 def plot(
@@ -33,7 +34,7 @@ def plot(
     except ModuleNotFoundError as error:
         if error.name != "matplotlib":
             raise
-        raise UserError("plots need the `view` extra: pip install 'fantwin[view]'") from error
+        raise UserError(f"plots need the extra `view`; {how_to_install('view')}") from error
     if unit not in ("rpm", "rad/s", None):
         raise UserError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
     with Console(stderr=True).status(f"drawing {output}"):

@@ -17,7 +17,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn
 from rich.table import Table
 
 from pipeline.errors import UserError
-from pipeline.replay.decisions import Episode, WhatIf, compare_episodes, episodes
+from pipeline.replay.decisions import WhatIf, compare_episodes, episodes
 from pipeline.replay.material import Material, open_material
 from pipeline.replay.offline import CannotCompareError, JudgedTray, judge
 from pipeline.replay.verify import when
@@ -25,6 +25,8 @@ from pipeline.replay.verify import when
 EXIT_DIFFERS, EXIT_CANNOT_COMPARE, EXIT_LOST = 1, 2, 3
 _SHOWN = 40
 """so many alarms are listed"""
+_WIDEST = 100
+"""columns of the list"""
 
 
 def run_offline(
@@ -131,11 +133,9 @@ def _what_if(found: WhatIf) -> dict[str, Any]:
 
 def _tell(trays: Sequence[JudgedTray], result: dict[str, Any], output: Path | None) -> None:
     console = Console(highlight=False, soft_wrap=True)
-    now = episodes(alarm for tray in trays for alarm in tray.alarms)
-    if now:
-        console.print(_table(now[:_SHOWN], result["start_ns"]))
-    if len(now) > _SHOWN:
-        console.print(f"and {len(now) - _SHOWN} more; all with --json")
+    console.width = min(_WIDEST, console.width) if console.is_terminal else _WIDEST
+    now, start_ns = result["alarms"], result["start_ns"]
+    _list(console, "alarms", now, start_ns)
     console.print(
         f"{len(now)} alarm{'s' * (len(now) != 1)} in {_duration(result['hours'])}, {result['samples']} samples, "
         f"{result['lost']} lost; "
@@ -151,10 +151,8 @@ def _tell(trays: Sequence[JudgedTray], result: dict[str, Any], output: Path | No
     if "what_if" in result:
         for name in ("gained", "lost"):
             found = result["what_if"][name]
-            console.print(f"against the recording: {len(found)} alarms {name}" + (":" if found else ""))
-            for one in found[:_SHOWN]:
-                line = f"  {one['tray']} fan {one['fan']}, {when(one['raised_ns'])}: {one['message']}"
-                console.print(line, markup=False)
+            console.print(f"against the recording: {len(found)} alarms {name}")
+            _list(console, name, found, start_ns)
     if "verified" in result:
         _tell_verified(result["verified"], console)
     if output:
@@ -185,14 +183,28 @@ def _tell_verified(found: dict[str, Any], console: Console) -> None:
         console.print(f"{found['samples_not_recorded']} samples made anew are not in the recording")
 
 
-def _table(shown: Sequence[Episode], start_ns: int) -> Table:
-    table = Table("tray", title="alarms, s since " + when(start_ns), title_justify="left", box=SIMPLE_HEAD)
+def _list(console: Console, title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> None:
+    if not alarms:
+        return
+    console.print(_table(f"{title}, s since {when(start_ns)}", alarms[:_SHOWN], start_ns))
+    if len(alarms) > _SHOWN:
+        console.print(f"and {len(alarms) - _SHOWN} more; all with --json")
+
+
+def _table(title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> Table:
+    table = Table("tray", title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("fan", "raised", "cleared"):
         table.add_column(column, justify="right")
+    for column in ("severity", "probable cause"):
+        table.add_column(column, no_wrap=True)
     table.add_column("what")
-    for one in shown:
-        cleared = "standing" if one.cleared_ns is None else f"{(one.cleared_ns - start_ns) / 1e9:.2f}"
-        table.add_row(one.tray, str(one.fan), f"{(one.raised_ns - start_ns) / 1e9:.2f}", cleared, escape(one.message))
+    for one in alarms:
+        raised = f"{(one['raised_ns'] - start_ns) / 1e9:.2f}"
+        cleared = "standing" if one["cleared_ns"] is None else f"{(one['cleared_ns'] - start_ns) / 1e9:.2f}"
+        first = f"{one['causes'][0]['cause']} {100 * one['causes'][0]['probability']:.0f} %" if one["causes"] else "-"
+        # the message of the raise names fan and cause, too: the one stands beside it, the other is known better now
+        what = one["message"].removeprefix(f"fan {one['fan']}: ").partition("; ")[0]
+        table.add_row(one["tray"], str(one["fan"]), raised, cleared, one["severity"], first, escape(what))
     return table
 
 

@@ -20,8 +20,9 @@ class Episode:
     onset_ns: int
     severity: str
     """the highest"""
-    residual_rad_s: float
-    torque_balance_command: float
+    residual_rad_s: float | None
+    torque_balance_command: float | None
+    """as it was raised; None where none was known"""
     message: str
     causes: tuple[Diagnosis, ...]
     """as they were known last"""
@@ -103,8 +104,13 @@ def _episode(told: list[Alarm], cleared_ns: int | None) -> Episode:
         cleared_ns=cleared_ns,
         onset_ns=first.onset_t_ns,
         severity=max(alarm.severity for alarm in told).name.lower(),
-        residual_rad_s=first.residual_rad_s,
-        torque_balance_command=first.torque_balance_command,
+        residual_rad_s=_known(first.residual_rad_s),
+        torque_balance_command=_known(first.torque_balance_command),
         message=first.message,
         causes=next((alarm.causes for alarm in reversed(told) if alarm.causes), ()),
     )
+
+
+def _known(value: float) -> float | None:
+    """Of an alarm: a message holds 0 for what was not known, and what was is never so to the last bit."""
+    return value or None
