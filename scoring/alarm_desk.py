@@ -25,7 +25,7 @@ from scoring.wording import Wording
 
 NS_PER_S = 1_000_000_000
 STILL_THERE = 0.5  # of the torque balance that it had
-MOST_PRODUCERS = 64  # of requests: so many are known by name, the latest
+MOST_PRODUCERS = 64  # of requests: so many are known, the latest; docs/alarms.md tells what follows of it
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,9 @@ SHORTEST_DAYS = 1.0
 """a limit is foretold from a day and a night on: before that all is the weather, or a bearing that warms up"""
 SOON_DAYS = 7.0
 """what lies nearer is told"""
+WINDOW_S = 35.0
+"""so far a point looks back"""
+NEVER_NS = int(np.iinfo(np.int64).min)
 LARGEST = 1e6
 """no fan changes so much: what is larger is left out"""
 
@@ -53,6 +56,8 @@ class WearWatch:
         self._every_ns = round(every_s * 1e9)
         self._unit = command_unit
         self._tried = 0
+        self._disturbed_t_ns = np.full(len(healthy), NEVER_NS)
+        """(fans,) the last sample that no point may look back on"""
         self._fans = [_Fan() for _ in healthy]
 
     def update(
@@ -60,37 +65,39 @@ class WearWatch:
         t_ns: Array,
         origin_t_ns: int,
         quiet: Array,
+        disturbed: Array,
         commissioned_command: Array,
         held: Array,
         limit_command: Array,
     ) -> None:
         """Take a block that the diagnoser has taken; (n, fans) each but t_ns, (n,), and limit_command, (fans,).
 
+        quiet: a point may be taken here. disturbed: nor is one for as long as it would look back on this.
         commissioned_command: baseline of the balance at the end of commissioning, NaN before. held: it may go no
         further, and says nothing more. limit_command: how far the balance may be from that until its alarm comes.
         """
-        tries = (t_ns - origin_t_ns) // TRY_NS
-        if tries[-1] <= self._tried:
-            return
-        rows = np.flatnonzero(np.diff(tries, prepend=self._tried) > 0)
-        self._tried = int(tries[-1])
-        for row in rows.tolist():
+        tries = np.maximum((t_ns - origin_t_ns) // TRY_NS, self._tried)
+        for row in np.flatnonzero(np.diff(tries, prepend=self._tried) > 0).tolist():
             at_ns = int(t_ns[row])
             slot = (at_ns - origin_t_ns) // self._every_ns
-            for fan in np.flatnonzero(quiet[row] & np.isfinite(commissioned_command[row])).tolist():
+            undisturbed = self._last_disturbed(t_ns[: row + 1], disturbed[: row + 1]) <= at_ns - round(WINDOW_S * 1e9)
+            for fan in np.flatnonzero(quiet[row] & undisturbed & np.isfinite(commissioned_command[row])).tolist():
                 due = slot > self._fans[fan].slot
                 if due and self._look(fan, at_ns, float(commissioned_command[row, fan]), bool(held[row, fan])):
                     self._fans[fan].slot = slot
                     self._fans[fan].tell(at_ns, float(limit_command[fan]))
+        self._tried = int(tries[-1])
+        self._disturbed_t_ns = self._last_disturbed(t_ns, disturbed)
 
     def of(self, fan: int) -> Mapping[str, Wear]:
         """What is known of a fan, by parameter; empty before its first point."""
         return self._fans[fan].told
 
-    def forget(self, fans: Array) -> None:
-        """Begin anew with some fans, (fans,) of bool: they are commissioned anew."""
+    def forget(self, fans: Array, t_ns: int) -> None:
+        """Begin anew with some fans, (fans,) of bool: after t_ns, the last sample taken, they are commissioned anew."""
         for fan in np.flatnonzero(fans).tolist():
             self._fans[fan] = _Fan()
+            self._disturbed_t_ns[fan] = t_ns
 
     def problem(self, now_ns: int) -> str:
         """One line while a limit is likely to be reached within days; empty otherwise."""
@@ -115,7 +122,12 @@ class WearWatch:
 
     def snapshot(self) -> dict[str, Any]:
         """All it knows, as JSON can hold it, with what it tells of each parameter."""
-        return {"command_unit": self._unit, "tried": self._tried, "fans": [fan.snapshot() for fan in self._fans]}
+        return {
+            "command_unit": self._unit,
+            "tried": self._tried,
+            "disturbed_t_ns": self._disturbed_t_ns.tolist(),
+            "fans": [fan.snapshot() for fan in self._fans],
+        }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from a snapshot of a watch of as many fans; without it nothing has changed when this raises.
@@ -124,13 +136,18 @@ class WearWatch:
             ValueError, KeyError, TypeError: it is not one.
         """
         fans = [_Fan.restore(fan) for fan in state["fans"]]
-        if len(fans) != len(self._fans):
+        disturbed_t_ns = np.array(state.get("disturbed_t_ns", self._disturbed_t_ns), np.int64)  # not kept at first
+        if len(fans) != len(self._fans) or disturbed_t_ns.shape != self._disturbed_t_ns.shape:
             raise ValueError("wear of another number of fans")
-        self._tried, self._fans = int(state["tried"]), fans
+        self._tried, self._disturbed_t_ns, self._fans = int(state["tried"]), disturbed_t_ns, fans
+
+    def _last_disturbed(self, t_ns: Array, disturbed: Array) -> Array:
+        """(fans,) when each was disturbed last, up to the end of these rows."""
+        return np.where(disturbed, t_ns[:, np.newaxis], self._disturbed_t_ns).max(axis=0)
 
     def _look(self, fan: int, at_ns: int, commissioned: float, held: bool) -> bool:
         """Add a point of each parameter; False where the last seconds are too few for it, or too slow."""
-        window = self._diagnoser.window(fan, at_ns, at_ns)
+        window = self._diagnoser.window(fan, at_ns, at_ns, WINDOW_S)
         if window is None:
             return False
         drifts = parameter_drifts(replace(window, offset=commissioned), self._healthy[fan])

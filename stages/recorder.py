@@ -333,7 +333,7 @@ class Recorder(Core):
         if health.header.producer == self._own_producer:
             for line in health.inputs:
                 before = self._duplicated.get((line.key, line.producer), 0)
-                if line.producer and line.duplicated > before:  # without one: those of former producers, noted before
+                if line.producer and line.duplicated > before:  # no name: earlier producers, noted while they had one
                     self._ledger.note_duplicated(line.key, line.producer, line.duplicated - before)
                     self._duplicated[line.key, line.producer] = line.duplicated
 

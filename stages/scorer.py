@@ -27,17 +27,7 @@ from pipeline.memory_file import MemoryFile
 from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from pipeline.twin_file import TwinFile, twin_of
 from schemas.blocks import chosen
-from schemas.messages import (
-    Alarm,
-    Array,
-    FanState,
-    Memory,
-    Prediction,
-    Request,
-    Score,
-    Transition,
-    WhyNot,
-)
+from schemas.messages import Alarm, Array, FanState, Memory, Prediction, Request, Score, Transition, WhyNot
 from scoring.alarm_desk import AlarmDesk, Distance
 from scoring.condition import ConditionSettings
 from scoring.diagnoser import Diagnoser
@@ -52,8 +42,11 @@ NS_PER_S = 1_000_000_000
 BAND_SIGMAS = 2.0
 MEMORY_NS = 60 * NS_PER_S  # how often it is noted when nothing happens
 SET_ASIDE_NS = 60 * NS_PER_S  # so long it is told that something was
-ANOTHER_TWIN = "the twin is another one: baselines, alarms and wear begin anew; what operators keep quiet stays so"
+ALL_BUT_QUIET = "baselines, alarms and wear begin anew; what operators keep quiet stays so"
+ANOTHER_TWIN = f"the twin is another one: {ALL_BUT_QUIET}"
+IN_PART = f"what was remembered is understood in part: {ALL_BUT_QUIET}"
 NOT_UNDERSTOOD = "what was remembered is not understood: baselines, alarms and wear begin anew, nothing is kept quiet"
+NO_SNAPSHOT = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 BACK_IN_TIME_NS = 120 * NS_PER_S  # who is restarted catches up with less; samples still older are another story
 
 
@@ -147,29 +140,35 @@ class ScorerCore(Core):
     def restore(self, memory: Memory) -> list[Alarm | Memory]:
         """Go on from what another session has kept. Gives what is to be told of it.
 
-        Of another twin only what belongs to operators is taken: what they want quiet, and that they were answered.
+        Of another twin, or where the rest is not understood, as after an update, only what belongs to operators is
+        taken: what they want quiet, and that they were answered.
         """
-        is_of_this_twin = memory.twin_sha256 == self._healthy.sha256
         try:
             state = json.loads(memory.state_json)
             self._desk.restore(state["desk"])
-            if is_of_this_twin:
-                if "wear" in state:
-                    self._wear.restore(state["wear"])
-                self._judge.restore(state["judge"])
-            self._fed_by = str(state["fed_by"])
-        except (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError):
+            fed_by = str(state["fed_by"])
+        except NO_SNAPSHOT:
             self._begin()
             self._counts["memories_not_understood"] += 1
             self._set_aside = NOT_UNDERSTOOD
             return []
+        if memory.twin_sha256 != self._healthy.sha256:
+            self._counts["memories_of_another_twin"] += 1
+            self._set_aside = ANOTHER_TWIN
+        else:
+            try:
+                if "wear" in state:
+                    self._wear.restore(state["wear"])
+                self._judge.restore(state["judge"])
+            except NO_SNAPSHOT:
+                self._begin()
+                self._desk.restore(state["desk"])
+                self._counts["memories_not_understood"] += 1
+                self._set_aside = IN_PART
         self._last_t_ns = self._noted_t_ns = memory.t_ns
-        self._may_be_of_other_times = True
-        if is_of_this_twin:
-            return [replace(memory, restored=True), *self._desk.restate()]
-        self._counts["memories_of_another_twin"] += 1
-        self._set_aside = ANOTHER_TWIN
-        return [replace(memory, restored=True), *self._desk.disown(memory.t_ns, stays_quiet=True)]
+        self._fed_by, self._may_be_of_other_times = fed_by, True
+        told = self._desk.disown(memory.t_ns, stays_quiet=True) if self._set_aside else self._desk.restate()
+        return [replace(memory, restored=True), *told]
 
     def tick(self, now_ns: int) -> list[Alarm | Memory]:
         """Say once what was remembered."""
@@ -287,10 +286,12 @@ class ScorerCore(Core):
     def _watch_wear(self, item: Prediction, verdict: Verdict, state: Array) -> None:
         assert self._judge.origin_t_ns is not None
         sigma_command, known = item.torque_balance_sigma_command, np.isfinite(item.torque_balance_command)
+        normal = state == FanState.NORMAL
         self._wear.update(
             item.t_ns,
             self._judge.origin_t_ns,
-            quiet=(verdict.score < QUIET) & (state == FanState.NORMAL) & known,
+            quiet=(verdict.score < QUIET) & normal & known,
+            disturbed=(verdict.score >= QUIET) | ~(normal | (state == FanState.UNKNOWN)),
             commissioned_command=verdict.balance_commissioned * sigma_command,
             held=verdict.balance_held,
             limit_command=self._judge.balance.lasting_limit_sigmas(item.step_ns / NS_PER_S) * sigma_command,
@@ -311,7 +312,7 @@ class ScorerCore(Core):
         again = np.zeros(self._fans, np.bool_)
         again[[alarm.fan for alarm in told if alarm.transition == Transition.COMMISSIONING]] = True
         self._judge.forget(again)
-        self._wear.forget(again)
+        self._wear.forget(again, self._last_t_ns)
         self._counts["requests"] += 1
         return [*told, *self._note(True)]
 

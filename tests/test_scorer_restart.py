@@ -193,6 +193,25 @@ def test_of_another_twin_only_what_operators_keep_quiet_is_gone_on_from() -> Non
     assert unshelved.transition == Transition.UNSHELVED
 
 
+@pytest.mark.parametrize("of", ["judge", "wear"])
+def test_of_a_memory_in_an_older_form_what_operators_keep_quiet_is_gone_on_from(of: str) -> None:
+    memory = note_of(raised())
+    state = json.loads(memory.state_json)
+    state["wear"]["tried"] = 5
+    state[of].popitem()
+    successor = core_of(3)
+    first, *told = successor.restore(replace(memory, state_json=json.dumps(state)))
+    assert isinstance(first, Memory) and first.restored
+    assert successor.counters()["memories_not_understood"] == 1
+    assert "is understood in part" in successor.problem()
+    acknowledged, shelved = standing_of(told)
+    assert (acknowledged.is_retained, shelved.is_quiet) == (False, True)
+    assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
+    (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
+    assert (score.state == FanState.COMMISSIONING).all()
+    assert json.loads(note_of(successor).state_json)["wear"]["tried"] == 0, "wear begins anew"
+
+
 def test_what_was_set_aside_is_told_for_a_minute() -> None:
     successor = core_of(3, sha256="another")
     successor.restore(note_of(raised()))

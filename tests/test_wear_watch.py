@@ -22,6 +22,7 @@ from tests.scored import (
     TWIN_SPEED,
     balance_of_a_fan,
     core_of,
+    feed,
     note_of,
     request_of,
 )
@@ -200,6 +201,15 @@ def test_a_memory_from_before_wear_was_watched_is_taken() -> None:
     assert wear_of(note_of(successor)) == wear_of(note_of(core_after_one_sample()))
 
 
+def test_a_memory_from_before_disturbances_were_kept_is_taken(after_eight_days) -> None:
+    memory = note_of(after_eight_days[0])
+    state = json.loads(memory.state_json)
+    del state["wear"]["disturbed_t_ns"]
+    successor = core()
+    successor.restore(replace(memory, state_json=json.dumps(state)))
+    assert wear_of(note_of(successor)) == wear_of(memory)
+
+
 def core_after_one_sample() -> ScorerCore:
     young = core()
     young.step(cut(burst(0), 0, 1))
@@ -246,13 +256,58 @@ def test_of_a_fan_that_is_not_quiet_nothing_is_learnt() -> None:
     assert len(worn(HEALTHY, "friction", one)["series"]["t_ns"]) > before
 
 
-def test_a_fan_that_is_not_quiet_when_it_is_due_is_looked_at_again() -> None:
-    one, block = core(), burst(0)
+def first_point_s(fan: int, core: ScorerCore) -> float | None:
+    times = worn(fan, "friction", core)["series"]["t_ns"]
+    return (times[0] - EPOCH_NS) / 1e9 if times else None
+
+
+def test_a_fan_that_was_not_quiet_is_looked_at_once_that_is_out_of_sight() -> None:
+    one, block = core(), burst(0, seconds=60.0)
     measured = block.measured_speed_rad_s.copy()
     measured[435:520, WORN] = measured[434, WORN]  # more than half as long as a reading may repeat itself
     one.step(replace(block, measured_speed_rad_s=measured))
-    first_s = [(worn(fan, "friction", one)["series"]["t_ns"][0] - EPOCH_NS) / 1e9 for fan in (HEALTHY, WORN)]
-    assert first_s == [10.0, 20.0]
+    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)
+
+
+def with_a_fault(first_s: int = 7) -> Prediction:
+    """Of the second fan, for 2 s: it takes 2 more of the command."""
+    block = burst(0, seconds=60.0)
+    more = np.zeros((len(block.t_ns), 2))
+    more[50 * first_s : 50 * (first_s + 2), WORN] = 2.0
+    return replace(block, command=block.command + more, torque_balance_command=block.torque_balance_command + more)
+
+
+def test_no_point_looks_back_on_a_fault_that_has_cleared() -> None:
+    one = core()
+    _, alarms = feed(one, [with_a_fault()])
+    cleared_s = [(alarm.t_ns - EPOCH_NS) / 1e9 for alarm in alarms if alarm.transition == Transition.CLEARED]
+    assert len(cleared_s) == 1 and 9.0 < cleared_s[0] < 15.0
+    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)
+    (friction,) = worn(WORN, "friction", one)["series"]["value"]
+    assert abs(friction) < 0.1, "nothing of the fault is in it"
+
+
+@pytest.mark.parametrize("first_s", [7, 11])
+@pytest.mark.parametrize("block", [1, 37, 512])
+def test_how_far_back_a_fault_is_does_not_depend_on_blocks(block: int, first_s: int) -> None:
+    whole, cut_up, faulty = core(), core(), with_a_fault(first_s)
+    feed(whole, [faulty])
+    feed(cut_up, [cut(faulty, first, min(first + block, 3000)) for first in range(0, 3000, block)])
+    assert wear_of(note_of(cut_up)) == wear_of(note_of(whole))
+
+
+def test_after_a_restart_it_is_known_how_far_back_a_fault_is() -> None:
+    killed, faulty = core(), with_a_fault()
+    feed(killed, [cut(faulty, 0, 1500)])
+    successor = restored(killed)
+    feed(successor, [cut(faulty, 1500, 3000)])
+    assert first_point_s(WORN, successor) == 50.0
+
+
+def test_no_point_looks_back_on_what_was_before_a_fan_was_commissioned_anew() -> None:
+    one, block = core(), burst(0, seconds=60.0)
+    feed(one, [cut(block, 0, 500), request_of(Action.COMMISSION, WORN), cut(block, 500, 3000)])
+    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)
 
 
 def test_a_fan_that_stands_tells_nothing() -> None:
