@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from pipeline.stage import Context, StageError
 from schemas.messages import Array
@@ -31,6 +31,7 @@ OUTPUTS = ("speed_rad_s", "state_out")
 DEAD_ZONE = 0.25  # of the range of commands: a friction above so much of it is none
 
 Range: TypeAlias = tuple[float, float]
+Four: TypeAlias = tuple[float, float, float, float]
 Advance: TypeAlias = Callable[[Array, Array, Array], tuple[Array, Array]]
 """(state (fans, n_state), command (n, fans), step_s (n,)) -> (speed_rad_s (n, fans), state (fans, n_state))."""
 
@@ -53,12 +54,21 @@ class BalanceCard(_OfCard):
     viscous: tuple[float, ...]
     drag: tuple[float, ...]
     friction: tuple[float, ...]
-    std_errors: tuple[tuple[float, float, float, float], ...]
+    covariance: tuple[tuple[Four, Four, Four, Four], ...]
     lag_s: tuple[Annotated[float, Field(ge=0)], ...]
     sigma_command: tuple[Annotated[float, Field(gt=0)], ...]
     autocorrelation_time_s: tuple[Annotated[float, Field(gt=0)], ...]
     lowest_speed_rad_s: tuple[Annotated[float, Field(ge=0)], ...]
     filter_rate_per_s: float = Field(gt=0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_older_card(cls, card: Any) -> Any:
+        """Cards once had the errors one by one; how they go together is not known of those."""
+        if isinstance(card, dict) and "covariance" not in card and "std_errors" in card:
+            errors = TypeAdapter(tuple[Four, ...]).validate_python(card["std_errors"])
+            return card | {"covariance": [np.diag(np.square(of_fan)).tolist() for of_fan in errors]}
+        return card
 
     @property
     def of_fans(self) -> dict[str, tuple[Any, ...]]:
@@ -103,15 +113,15 @@ class Balance:
     """The torque balance of each fan: what it needs, and how far a healthy one strays from it within a run.
 
     needed command = inertia w' + viscous w + drag w|w| + friction, with a constant friction, and both sides through
-    lambda / (s + lambda). Units are those of the command with rad/s and s. std_errors: (fans, 4), of these four. The
-    others are (fans,), but for lambda.
+    lambda / (s + lambda). Units are those of the command with rad/s and s. covariance: (fans, 4, 4) of the errors of
+    these four. The others are (fans,), but for lambda.
     """
 
     inertia: Array
     viscous: Array
     drag: Array
     friction: Array
-    std_errors: Array
+    covariance: Array
     lag_s: Array
     """of the command before it acts"""
     sigma_command: Array
@@ -183,7 +193,7 @@ class TwinFile:
                 drag=float(of.drag[fan]),
                 friction=float(of.friction[fan]),
                 lag_s=float(of.lag_s[fan]),
-                std_errors=of.std_errors[fan],
+                covariance=of.covariance[fan],
                 filter_rate_per_s=rate_per_s,
                 sigma_command=float(of.sigma_command[fan]),
                 autocorrelation_time_s=float(of.autocorrelation_time_s[fan]),

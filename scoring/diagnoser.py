@@ -16,8 +16,8 @@ from scoring.diagnosis import diagnose
 from scoring.limits import summed_deviation
 from scoring.regression_window import HealthyBalance, Window
 
-WINDOW_S = 35.0
-AGAIN_AFTER_S = (1.0, 3.0, 10.0, 30.0)  # after the raise; the last within the window, with some health before it
+WINDOW_S = 95.0
+AGAIN_AFTER_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # after the raise; the last with some health before it
 MOST_SAMPLES = 1 << 16  # of a fan are looked at: at a very fast rate, the last of the seconds
 LARGEST = 1e9  # a speed or a command beyond is none, and its powers would be no numbers
 LEAST_PROBABILITY = 0.005  # less is not worth telling
@@ -60,7 +60,7 @@ class Diagnoser:
             self._step_ns = step_ns
         offset_s = np.broadcast_to(offset_s, offset_command.shape)
         self._blocks.append(_Block(t_ns, command, speed_rad_s, offset_command, offset_s))
-        oldest_t_ns = int(t_ns[0]) - round(WINDOW_S * NS_PER_S)
+        oldest_t_ns = int(t_ns[0]) - min(round(WINDOW_S * NS_PER_S), MOST_SAMPLES * step_ns)
         while int(self._blocks[0].t_ns[-1]) < oldest_t_ns:
             self._blocks.popleft()
 
@@ -122,9 +122,9 @@ class Diagnoser:
         if not all(0 <= fan < len(self._healthy) for fan in (*self._due, *self._onset_t_ns)):
             raise ValueError("a fan that is not there")
 
-    def window(self, fan: int, t_ns: int, onset_t_ns: int) -> Window | None:
-        """The last seconds of a fan up to t_ns; None where there are none."""
-        first_t_ns = t_ns - min(round(WINDOW_S * NS_PER_S), MOST_SAMPLES * self._step_ns)
+    def window(self, fan: int, t_ns: int, onset_t_ns: int, seconds: float = WINDOW_S) -> Window | None:
+        """The last seconds, at most WINDOW_S, of a fan up to t_ns; None where there are none."""
+        first_t_ns = t_ns - min(round(seconds * NS_PER_S), MOST_SAMPLES * self._step_ns)
         times = np.concatenate([block.t_ns for block in self._blocks])
         rows = (times > first_t_ns) & (times <= t_ns)
         if np.count_nonzero(rows) < 2:

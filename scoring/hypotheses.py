@@ -128,21 +128,20 @@ class Comparison:
         self._variance = self._sigma**2 * inflation
         self._effective = window.rows / inflation
         self._constant_need = window.constant_need
-        samples = np.arange(window.samples)
-        seconds = (samples - window.onset) * window.step_s
-        steps_s = STEP_S[(seconds[0] < STEP_S) & (seconds[-1] > STEP_S)]
-        steps: Array = (seconds >= steps_s[:, np.newaxis] - window.step_s / 2.0).astype(np.float64)
-        begin = RAMP_S[:, np.newaxis]
-        ramps: Array = np.maximum((seconds - begin) / (seconds[-1] - begin), 0.0)
-        courses = np.vstack((steps, ramps, np.ones_like(seconds))).astype(np.float64)
+        first_s, last_s = -window.onset * window.step_s, (window.samples - 1 - window.onset) * window.step_s
+        steps_s = STEP_S[(first_s < STEP_S) & (last_s > STEP_S)]
+        begin_s = np.concatenate((steps_s, RAMP_S, [-np.inf]))
+        is_step = np.arange(len(begin_s)) < len(steps_s)
         self._log_course = {
-            True: np.where(np.arange(len(courses)) < len(steps), -np.log(len(steps)), -np.inf),
-            False: np.where(np.arange(len(courses)) < len(steps), -np.inf, -np.log(len(ramps) + 1)),
+            True: np.where(is_step, -np.log(len(steps_s)), -np.inf),
+            False: np.where(is_step, -np.inf, -np.log(len(RAMP_S) + 1)),
         }
-        columns = window.columns(courses)
+        grows = (begin_s < last_s) & ~is_step & np.isfinite(begin_s)
+        columns = window.columns(begin_s, np.where(grows, last_s, begin_s))
         self._products = columns @ columns.swapaxes(-1, -2)
-        pieces = np.floor(seconds / VARYING_S) == np.arange(np.ceil(max(seconds[-1], 1e-9) / VARYING_S))[:, np.newaxis]
-        whole = np.vstack((columns[np.searchsorted(steps_s, 0.0)], window.torque(pieces.astype(np.float64))))
+        edges_s = np.append(np.arange(0.0, max(last_s, 1e-9), VARYING_S), np.inf)
+        from_edges = window.columns(edges_s, edges_s)[:, CONSTANT]
+        whole = np.vstack((columns[np.searchsorted(steps_s, 0.0)], from_edges[:-1] - from_edges[1:]))
         self._varying_products = whole @ whole.T
 
     def nothing(self) -> float:

@@ -8,11 +8,17 @@ command that acts after its lag, m_k = (w_k + w_k+1) / 2 and the healthy coeffic
     f_k+1 = a f_k + (1 - a) x_k
 
 A fault changes one term from some time on. With a course p, 0 before and up to 1 after, the same filter over p times
-that term gives its column, and the residual of the fault is f - size * column. One pass of a first-order recursion
-over the samples; whatever is asked of the window later needs only the products of these columns.
+that term gives its column, and the residual of the fault is f - size * column. A course that begins at sample j, and is
+linear in time from then on, needs no filter of its own: with F the filter over the whole term,
 
-Healthy coefficients and the offset of commissioning are known up to their standard errors. Each error has a column,
-too, with the weight that it may have at most.
+    F_j = F - a^(k-j+1) F at j-1      from j on
+
+So each term goes through it twice, as it is and times the time; whatever is asked of the window later needs only the
+products of these columns.
+
+Healthy coefficients and the offset of commissioning are known up to their errors. A fan that was seen at few speeds is
+known better than any one of its coefficients: their errors make good for one another. So each independent combination
+of them has a column, with its standard deviation.
 """
 
 from __future__ import annotations
@@ -51,8 +57,8 @@ class HealthyBalance:
     drag: float
     friction: float
     lag_s: float
-    std_errors: Array
-    """(4,) of inertia, viscous, drag and friction"""
+    covariance: Array
+    """(4, 4) of the errors of inertia, viscous, drag and friction"""
     filter_rate_per_s: float
     sigma_command: float
     """standard deviation of the healthy balance"""
@@ -89,47 +95,89 @@ class RegressionWindow:
         acting = acting_command(_held(window.command), h, healthy.lag_s)[:-1]
         motion = np.stack((np.diff(speed) / h, middle, middle * np.abs(middle), np.ones_like(middle)))
         coefficients = np.array((healthy.inertia, healthy.viscous, healthy.drag, healthy.friction))
-        errors = np.hypot(healthy.std_errors, LACK_OF_FIT * coefficients)
-        errors[3] = np.hypot(errors[3], window.offset_std_error)
+        errors = healthy.covariance + np.diag(np.square(LACK_OF_FIT * coefficients))
+        errors[3, 3] += window.offset_std_error**2
         square = healthy.drag * motion[2]
         # A rotor without blades has no drag by the square of its speed; then all that rises with speed is its drag.
-        told = healthy.drag > TOLD * healthy.std_errors[2]
+        told = healthy.drag > TOLD * np.sqrt(healthy.covariance[2, 2])
         drag = square if told else square + healthy.viscous * middle
-        self._terms = np.stack((acting, drag, square, motion[3]))
         self._momentum = healthy.inertia * speed[:-1] / h
+        self._seconds = (np.arange(len(speed)) - window.onset) * h
         counts = _counts(window, healthy, speed)
         self._after = counts & (np.arange(1, len(speed)) > window.onset)
         self.per_row = max(1, round(MEAN_OVER_S / h))
         """samples in a row"""
         self._starts = np.arange(0, len(middle), self.per_row)
+        self._ends = np.append(self._starts[1:], len(middle))
         valid = np.add.reduceat(counts.astype(float), self._starts)
         self._enough = valid >= self.per_row / 2.0
         self._weight = counts / np.repeat(np.maximum(valid, 1.0), self.per_row)[: len(counts)]
-        self._fixed = self._rows(
-            np.vstack((acting - coefficients @ motion - window.offset, motion * errors[:, np.newaxis]))
-        )
+        fixed = np.vstack((acting - coefficients @ motion - window.offset, _independent(errors) @ motion))
+        self._fixed = self._rows(_summed(self._filtered(fixed) * self._weight), np.zeros(1, int))[0]
+        terms = np.stack((acting, drag, square, motion[3]))
+        changing = np.concatenate((terms, terms * self._seconds[:-1], self._momentum[np.newaxis]))
+        self._changing = self._filtered(changing)
+        self._changing_sums = _summed(self._changing * self._weight)
+        self._decay_sums = _summed(self._weight * self._decay ** (np.arange(len(middle)) % self.per_row))
         self.rows = self._fixed.shape[-1]
         self.typical_command = float(np.abs(acting).mean())
         self.constant_need = healthy.friction + window.offset
         self.speeds_after = np.abs(middle[self._after])
         """of the samples that count since the onset, rad/s"""
 
-    def columns(self, course: Array) -> Array:
-        """(..., FIRST_ERROR + 4, rows) of faults whose sizes follow these courses. course: (..., samples)."""
-        faulty = course[..., np.newaxis, :-1] * self._terms
-        jump = (np.diff(course) * self._momentum)[..., np.newaxis, :]
-        changed = self._rows(np.concatenate((faulty, jump), axis=-2))
-        fixed = np.broadcast_to(self._fixed, (*course.shape[:-1], *self._fixed.shape))
-        return np.concatenate((fixed[..., :1, :], changed, fixed[..., 1:, :]), axis=-2)
+    def columns(self, begin_s: Array, full_s: Array) -> Array:
+        """(courses, FIRST_ERROR + 4, rows) of faults that grow evenly from nothing to their sizes.
 
-    def torque(self, course: Array) -> Array:
-        """(..., rows) the column of a torque that follows these courses (..., samples)."""
-        return self._rows(course[..., :-1])
+        begin_s, full_s: (courses,) from when to when, in seconds after the onset. A step, where both are the same;
+        there all the time, where that is before the window. Only a step is full before the window ends.
+        """
+        is_step = begin_s == full_s
+        first = np.where(is_step, begin_s - self.step_s / 2.0, np.nextafter(begin_s, np.inf))
+        at: Any = np.searchsorted(self._seconds[:-1], first)
+        slope, level = np.zeros(len(at)), np.ones(len(at))
+        slope[~is_step] = 1.0 / (full_s[~is_step] - begin_s[~is_step])
+        level[~is_step] = -slope[~is_step] * begin_s[~is_step]
+        whole = self._rows(self._changing_sums, at)
+        past = np.where(at > 0, self._changing[:, at - 1], 0.0).T[..., np.newaxis] * self._decay
+        since = whole - past * self._decayed(at)[:, np.newaxis]
+        slope, level = slope[:, np.newaxis, np.newaxis], level[:, np.newaxis, np.newaxis]
+        changed = level * since[:, :4] + slope * since[:, 4:8]
+        before = np.maximum(at - 1, 0)
+        height = np.where(at > 0, level[:, 0, 0] + slope[:, 0, 0] * self._seconds[at], 0.0) * self._momentum[before]
+        jump = slope * self.step_s * since[:, 8:]
+        jump += ((1.0 - self._decay) * height)[:, np.newaxis, np.newaxis] * self._decayed(before)[:, np.newaxis]
+        fixed = np.broadcast_to(self._fixed, (len(at), *self._fixed.shape))
+        return np.concatenate((fixed[:, :1], changed, jump, fixed[:, 1:]), axis=1)
 
-    def _rows(self, terms: Array) -> Array:
-        """Filtered, and averaged over the samples of each row that count."""
+    def _filtered(self, terms: Array) -> Array:
         filtered: Any = lfilter([1.0 - self._decay], [1.0, -self._decay], terms, axis=-1)
-        return np.add.reduceat(filtered * self._weight, self._starts, axis=-1)[..., self._enough]
+        return filtered
+
+    def _rows(self, sums: Array, at: Array) -> Array:
+        """(courses, terms, rows) means over rows of what has these running sums (terms, n), from samples `at` on."""
+        begins = np.clip(self._starts, at[:, np.newaxis], self._ends)
+        found = sums[:, self._ends] - sums[:, begins].swapaxes(0, 1)
+        return found[..., self._enough]
+
+    def _decayed(self, at: Array) -> Array:
+        """(courses, rows) means of a^(k - at) from samples `at` on."""
+        begins = np.clip(self._starts, at[:, np.newaxis], self._ends)
+        since = np.maximum(self._starts - at[:, np.newaxis], -self.per_row)
+        found = self._decay**since * (self._decay_sums[self._ends] - self._decay_sums[begins])
+        return found[:, self._enough]
+
+
+def _summed(values: Array) -> Array:
+    """(..., n + 1) running sums, the first of nothing."""
+    return np.concatenate((np.zeros((*values.shape[:-1], 1)), np.cumsum(values, axis=-1)), axis=-1)
+
+
+def _independent(covariance: Array) -> Array:
+    """(4, 4) combinations whose errors are independent and of variance one."""
+    scale = np.sqrt(np.diag(covariance))
+    known = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(known, known))
+    return (scale[:, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0))).T
 
 
 def acting_command(command: Array, step_s: float, lag_s: float) -> Array:

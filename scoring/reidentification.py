@@ -41,7 +41,8 @@ def parameter_drifts(window: Window, healthy: HealthyBalance) -> tuple[Drift, ..
     regression = RegressionWindow(window, healthy)
     if regression.rows < FEWEST_ROWS:
         return ()
-    columns = regression.columns(np.ones(regression.samples))
+    always = np.full(1, -np.inf)
+    columns = regression.columns(always, always)[0]
     variance, inflation = mean_of_correlated(healthy.autocorrelation_time_s / window.step_s, regression.per_row)
     residual = columns[RESIDUAL]
     drifts = []

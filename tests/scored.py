@@ -44,7 +44,7 @@ def balance_of_a_fan() -> HealthyBalance:
         drag=(NEEDED - 5.0 - 0.05 * TWIN_SPEED) / TWIN_SPEED**2,
         friction=5.0,
         lag_s=0.0,
-        std_errors=np.array([0.001, 0.001, 1e-6, 0.1]),
+        covariance=np.diag(np.square([0.001, 0.001, 1e-6, 0.1])),
         filter_rate_per_s=3.0,
         sigma_command=SIGMA_COMMAND,
         autocorrelation_time_s=0.02,

@@ -99,6 +99,32 @@ def test_standard_errors_are_about_the_scatter_from_recording_to_recording(plant
     assert np.all((ratio > 0.6) & (ratio < 2.5)), ratio
 
 
+def test_what_a_fan_needs_is_known_better_than_any_one_of_its_coefficients(plants) -> None:
+    run, identification = plants
+    fit = fit_balance([run], [], identification)
+    chosen = np.array(fit.sources) == "least-squares"
+    speed_rad_s = float(np.median(run.speed_rad_s))
+    terms = np.array([0.0, speed_rad_s, speed_rad_s**2, 1.0])
+    needed = fit.coefficients[chosen] @ terms
+    known = np.sqrt(np.mean(np.einsum("i,fij,j->f", terms, fit.covariance[chosen], terms)))
+    one_by_one = np.sqrt(np.mean(np.square(fit.std_errors[chosen] * terms).sum(axis=1)))
+    assert 0.6 < known / needed.std(ddof=1) < 2.5
+    assert one_by_one > 4.0 * known
+
+
+def test_friction_makes_good_what_the_physics_are_wrong_by(published) -> None:
+    run, identification = published
+    fit = fit_balance([run], [], identification)
+    assert fit.sources == ("physics",)
+    speed_rad_s = float(np.mean(run.speed_rad_s[np.isfinite(run.speed_rad_s)]))
+    square = float(np.mean(run.speed_rad_s[np.isfinite(run.speed_rad_s)] ** 2))
+    terms = np.array([0.0, speed_rad_s, square, 1.0])
+    of_need = np.sqrt(terms @ fit.covariance[0] @ terms)
+    assert of_need < 0.5 * np.sqrt(np.square(fit.std_errors[0] * terms).sum())
+    np.testing.assert_allclose(fit.covariance[0], fit.covariance[0].T)
+    assert np.linalg.eigvalsh(fit.covariance[0] / np.outer(fit.std_errors[0], fit.std_errors[0])).min() > -1e-9
+
+
 def test_held_out_runs_judge_and_teach_nothing(published) -> None:
     run, identification = published
     other = published_fan.published_test(5).run

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scoring.diagnosis import Diagnosis, Evidence, Suspect, diagnose
-from scoring.regression_window import HealthyBalance, Window, acting_command
+from scoring.regression_window import FIRST_ERROR, HealthyBalance, RegressionWindow, Window, acting_command
 from scoring.reidentification import parameter_drifts
 from twin.faults import Fault
 from twin.lag import effective_command
@@ -88,6 +88,19 @@ def test_the_evidence_is_told_in_words() -> None:
         f"drag +{100 * evidence.change:.0f} % (95 %: {100 * evidence.low:.0f} to {100 * evidence.high:.0f})"
     )
     assert evidence.unit == "relative"
+
+
+def test_the_words_beside_cannot_tell_fit_its_probability() -> None:
+    command = data.moving_command(0)
+    for readings in (faulty_speed("drag_up", command, 0)[0], data.measured(data.speeds(command), 0)):
+        found = diagnose(data.window(command, readings), data.HEALTHY)
+        doubt = of(found, "cannot_tell")
+        others = [suspect for suspect in found.suspects if suspect is not doubt]
+        if 2.0 * doubt.probability < others[0].probability:
+            sure = f"little doubt: {others[0].cause} is more than twice as probable as all others together"
+            assert doubt.sentence == sure and found.first is others[0]
+        else:
+            assert doubt.sentence.startswith("cannot tell yet: ") and found.first is doubt
 
 
 def test_95_percent_intervals_hold_the_change_about_so_often() -> None:
@@ -193,7 +206,24 @@ def test_a_twin_that_is_known_poorly_accuses_nobody() -> None:
     wrong = replace(data.HEALTHY, drag=data.HEALTHY.drag * 0.85, viscous=data.HEALTHY.viscous * 1.04)
     errors = np.array((0.0, 0.1 * wrong.viscous, 0.2 * wrong.drag, 0.005))
     assert diagnose(data.window(command, readings), wrong).first.cause != "cannot_tell"
-    assert diagnose(data.window(command, readings), replace(wrong, std_errors=errors)).first.cause == "cannot_tell"
+    assert (
+        diagnose(data.window(command, readings), replace(wrong, covariance=np.diag(errors**2))).first.cause
+        == "cannot_tell"
+    )
+
+
+def test_errors_that_make_good_for_one_another_are_small_where_the_fan_was_seen() -> None:
+    # Seen at one speed: the friction makes good what the viscous part is wrong by, and only at that speed.
+    command = data.still_command(8)
+    held = data.window(command, data.measured(data.speeds(command), 8))
+    error = 0.8 * data.HEALTHY.viscous * np.array((0.0, 1.0, 0.0, -held.speed_rad_s.mean()))
+    together, always = np.outer(error, error), np.full(1, -np.inf)
+    exact, joint, apart = (
+        RegressionWindow(held, replace(data.HEALTHY, covariance=errors)).columns(always, always)[0][FIRST_ERROR:].std()
+        for errors in (np.zeros((4, 4)), together, np.diag(np.diag(together)))
+    )
+    assert joint < 2.0 * exact
+    assert apart > 20.0 * joint
 
 
 def test_what_the_fan_showed_at_commissioning_is_no_fault() -> None:
@@ -338,10 +368,13 @@ def healthy_balance(command: np.ndarray, speed_rad_s: np.ndarray, lag_s: float) 
         np.linalg.lstsq(np.hstack(rest)[1:].T, np.hstack(rest)[0], rcond=None)[0]
         for rest in ([block for block in blocks if block is not left_out] for left_out in blocks)
     ]
-    errors = np.sqrt(7.0 / 8.0 * np.square(np.array(without) - np.mean(without, axis=0)).sum(axis=0))
+    apart = np.array(without) - np.mean(without, axis=0)
+    covariance = 7.0 / 8.0 * apart.T @ apart
     sigma = float(np.std(used[0] - fit @ used[1:]))
     inertia, viscous, drag, friction = fit.tolist()
-    return HealthyBalance(inertia, viscous, drag, friction, lag_s, errors, rate, sigma, 0.01, lowest_speed_rad_s=40.0)
+    return HealthyBalance(
+        inertia, viscous, drag, friction, lag_s, covariance, rate, sigma, 0.01, lowest_speed_rad_s=40.0
+    )
 
 
 @pytest.mark.slow

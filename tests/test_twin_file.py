@@ -69,11 +69,20 @@ def test_the_balance_of_each_fan_is_read_and_that_of_one_fan_holds_for_all(tmp_p
         np.testing.assert_allclose(value, expected)
     assert two.filter_rate_per_s == 3.0
     five = TwinFile.load(write_twin(tmp_path / "one.onnx"), 5).balance
-    assert five.std_errors.shape == (5, 4)
+    assert five.covariance.shape == (5, 4, 4)
     for array in (five.inertia, five.friction, five.sigma_command, five.autocorrelation_time_s):
         assert array.shape == (5,)
         assert np.ptp(array) == 0.0
     np.testing.assert_allclose(five.sigma_command, SIGMA_COMMAND)
+
+
+def test_of_an_older_card_errors_are_known_one_by_one(tmp_path: Path) -> None:
+    older = asdict(made_up_balance((PARAMETERS,)))
+    del older["covariance"]
+    balance = TwinFile.load(write_twin(tmp_path / "twin.onnx", balance=older), 1).balance
+    np.testing.assert_allclose(balance.covariance[0], np.diag(np.square(older["std_errors"][0])))
+    older["std_errors"] = [[1.0, 1.0, 1.0]]
+    assert "balance" in _refusal(write_twin(tmp_path / "twin.onnx", balance=older))
 
 
 def test_a_calibration_is_carried_as_it_stands(tmp_path: Path) -> None:
@@ -87,7 +96,7 @@ def test_a_balance_that_makes_no_sense_is_refused_by_name(tmp_path: Path) -> Non
     for changes, named in (
         ({"sigma_command": [0.0]}, "balance.sigma_command"),
         ({"inertia": [0.1, 0.1]}, "balance.inertia must have one value for each fan"),
-        ({"std_errors": [[1.0, 1.0, 1.0]]}, "balance.std_errors"),
+        ({"covariance": [[[1.0, 1.0, 1.0]] * 4]}, "balance.covariance"),
         ({"filter_rate_per_s": 0.0}, "balance.filter_rate_per_s"),
     ):
         assert named in _refusal(write_twin(tmp_path / "twin.onnx", balance=whole | changes))

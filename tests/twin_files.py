@@ -25,6 +25,8 @@ PARAMETERS = (0.15, 0.12, 0.0005, 0.02)
 """J, alpha, C_D, lag_s of a fan that settles within about a second."""
 SIGMA_RAD_S = 3.0
 SIGMA_COMMAND = 1.0
+STD_ERRORS = (0.001, 0.001, 1e-5, 0.1)
+COVARIANCE = ((1e-6, 0.0, 0.0, 0.0), (0.0, 1e-6, 0.0, 0.0), (0.0, 0.0, 1e-10, 0.0), (0.0, 0.0, 0.0, 0.01))
 COMMAND_RANGE = (0.0, 100.0)
 
 
@@ -78,7 +80,8 @@ def made_up_balance(parameters: tuple[tuple[float, ...], ...]) -> BalanceCard:
         viscous=viscous,
         drag=drag,
         friction=tuple((0.0 * each).tolist()),
-        std_errors=((0.001, 0.001, 1e-5, 0.1),) * len(parameters),
+        std_errors=(STD_ERRORS,) * len(parameters),
+        covariance=(COVARIANCE,) * len(parameters),
         lag_s=lag_s,
         source=("physics",) * len(parameters),
         sigma_command=tuple((SIGMA_COMMAND * each).tolist()),

@@ -16,9 +16,9 @@ Measurement Error Models, 1987, section 1.1). So least squares is chosen where i
 being below that of the physics times sqrt(r), r = inertia / J but within 1/2 and 1: a J of twice the inertia or more
 is not explained by noise.
 
-A fan that stands, starts or stops is left out, and so is the first second of each stretch. Standard errors are those
-of the identification where coefficients come from there, otherwise of the jackknife over the groups, which allows for
-errors that are correlated within a group and for runs that differ.
+A fan that stands, starts or stops is left out, and so is the first second of each stretch. Errors are those of the
+identification where coefficients come from there, otherwise of the jackknife over the groups, which allows for errors
+that are correlated within a group and for runs that differ.
 """
 
 from collections.abc import Sequence
@@ -48,19 +48,24 @@ LEAST_COEFFICIENTS = (0.0, 0.0, 0.0, -np.inf)
 class BalanceFit:
     """The torque balance of each fan, in units of the command.
 
-    coefficients, std_errors: (fans, 4) in the order of balance.COEFFICIENTS; an error is zero where a coefficient stays
-    at its bound whatever is left out. The others are (fans,): lag_s, sigma_command (the healthy spread within a run),
-    autocorrelation_time_s (as in residual_analysis; the filter's own where the runs are too short to tell),
-    lowest_speed_rad_s (below it the balance means nothing), sources (which candidate).
+    coefficients: (fans, 4) in the order of balance.COEFFICIENTS. covariance: (fans, 4, 4) of their errors, zero where a
+    coefficient stays at its bound whatever is left out. The others are (fans,): lag_s, sigma_command (the healthy
+    spread within a run), autocorrelation_time_s (as in residual_analysis; the filter's own where the runs are too short
+    to tell), lowest_speed_rad_s (below it the balance means nothing), sources (which candidate).
     """
 
     coefficients: Array
-    std_errors: Array
+    covariance: Array
     lag_s: Array
     sigma_command: Array
     autocorrelation_time_s: Array
     lowest_speed_rad_s: Array
     sources: tuple[Source, ...]
+
+    @property
+    def std_errors(self) -> Array:
+        """(fans, 4)"""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +99,7 @@ def fit_balance(runs: Sequence[Run], held_out: Sequence[Run], identification: Id
         raise TwinError(f"fan {np.argmin(sigma > 0.0)}: its torque balance never moves; check the speed column")
     return BalanceFit(
         coefficients=coefficients,
-        std_errors=np.array([errors for _, errors, _ in chosen]),
+        covariance=np.array([covariance for _, covariance, _ in chosen]),
         lag_s=lag_s,
         sigma_command=sigma,
         autocorrelation_time_s=np.array([_autocorrelation_time_s(judged, coefficients[fan], fan) for fan in fans]),
@@ -136,7 +141,7 @@ def _bridged(speed_rad_s: Array) -> Array:
 
 
 def _choose(learned: Sequence[_Stretch], identification: Identification, fan: int) -> tuple[Array, Array, Source]:
-    """(4,) coefficients of a fan, their (4,) standard errors, and which candidate they are."""
+    """(4,) coefficients of a fan, the (4, 4) covariance of their errors, and which candidate they are."""
     runs = _by_run(learned, fan)
     parts = 1 if len(runs) >= ENOUGH_RUNS else -(-GROUPS // len(runs))
     groups = [np.array_split(run, parts) for run in runs]
@@ -144,24 +149,30 @@ def _choose(learned: Sequence[_Stretch], identification: Identification, fan: in
     triangles = [np.linalg.qr(group).R for of_run in groups for group in of_run]
     free = _least_squares(triangles)
     without = [_least_squares([other for other in triangles if other is not left_out]) for left_out in triangles]
-    physics, physics_errors = _physics([group for of_run in groups for group in of_run], identification, fan)
+    physics, of_physics = _physics([group for of_run in groups for group in of_run], identification, fan)
     of_others = iter(without)
     spread = _spread([np.concatenate([balance_of(group, next(of_others)) for group in of_run]) for of_run in groups])
     spread_of_physics = _spread([balance_of(run, physics) for run in runs])
     reliability = np.clip(free[INERTIA] / physics[INERTIA], LEAST_RELIABILITY, 1.0)
     if spread < spread_of_physics * np.sqrt(reliability):
         return free, _jackknife(np.array(without)), "least-squares"
-    return physics, physics_errors, "physics"
+    return physics, of_physics, "physics"
 
 
 def _physics(groups: Sequence[Array], identification: Identification, fan: int) -> tuple[Array, Array]:
-    """(4,) identified coefficients with the friction that is left, and their (4,) standard errors."""
+    """(4,) identified coefficients with the friction that is left, and the (4, 4) covariance of their errors.
+
+    What the identified ones are wrong by, the friction makes good on the mean.
+    """
     own = np.append(identification.parameters[fan, :LAG], 0.0)
     samples = np.array([len(group) for group in groups])
     total = np.array([balance_of(group, own).sum() for group in groups])
     without = (total.sum() - total) / (samples.sum() - samples)
     own[FRICTION] = total.sum() / samples.sum()
-    return own, np.append(identification.standard_errors[fan, :LAG], _jackknife(without))
+    makes_good = np.vstack((np.eye(LAG), -np.concatenate(groups)[:, 1 : 1 + LAG].mean(axis=0)))
+    covariance = makes_good @ identification.covariance[fan, :LAG, :LAG] @ makes_good.T
+    covariance[FRICTION, FRICTION] += _jackknife(without[:, np.newaxis]).item()
+    return own, covariance
 
 
 def _least_squares(triangles: Sequence[Array]) -> Array:
@@ -172,8 +183,9 @@ def _least_squares(triangles: Sequence[Array]) -> Array:
 
 
 def _jackknife(without: Array) -> Array:
-    """Standard errors (...,) from the estimates (groups, ...) that leave out one group each."""
-    return np.sqrt((len(without) - 1) / len(without) * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
+    """(k, k) covariance of the errors, from the estimates (groups, k) that leave out one group each."""
+    apart = without - without.mean(axis=0)
+    return (len(without) - 1) / len(without) * apart.T @ apart
 
 
 def _by_run(stretches: Sequence[_Stretch], fan: int) -> list[Array]:

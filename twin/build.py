@@ -258,7 +258,8 @@ def _balance_card(balance: BalanceFit) -> BalanceCard:
         viscous=viscous,
         drag=drag,
         friction=friction,
-        std_errors=tuple((row[0], row[1], row[2], row[3]) for row in balance.std_errors.tolist()),
+        std_errors=_fours(balance.std_errors),
+        covariance=tuple(_fours(of_fan) for of_fan in balance.covariance),
         lag_s=tuple(balance.lag_s.tolist()),
         source=balance.sources,
         sigma_command=tuple(balance.sigma_command.tolist()),
@@ -266,6 +267,10 @@ def _balance_card(balance: BalanceFit) -> BalanceCard:
         lowest_speed_rad_s=tuple(balance.lowest_speed_rad_s.tolist()),
         filter_rate_per_s=FILTER_RATE_PER_S,
     )
+
+
+def _fours(rows: Array) -> tuple[tuple[float, float, float, float], ...]:
+    return tuple((row[0], row[1], row[2], row[3]) for row in rows.tolist())
 
 
 def _validation_card(

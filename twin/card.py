@@ -91,7 +91,8 @@ class HealthyCard:
 class BalanceCard:
     """The torque balance (twin.balance), one entry a fan, in command units with rad/s and s.
 
-    std_errors: of inertia, viscous, drag and friction. source: which candidate they are, see twin.balance_fit.
+    std_errors: of inertia, viscous, drag and friction. covariance: of these errors, None in cards that
+    do not have it. source: which candidate they are, see twin.balance_fit.
     sigma_command: the healthy standard deviation of the balance within a run. lowest_speed_rad_s: below it the balance
     means nothing.
     """
@@ -107,6 +108,7 @@ class BalanceCard:
     autocorrelation_time_s: tuple[float, ...]
     lowest_speed_rad_s: tuple[float, ...]
     filter_rate_per_s: float
+    covariance: tuple[tuple[tuple[float, float, float, float], ...], ...] | None = None
 
 
 @dataclass(frozen=True, config=STRICT)
