@@ -17,6 +17,7 @@ import numpy as np
 
 from schemas.messages import Array
 from scoring.alarm_rate import rate_interval
+from scoring.fan_offsets import fan_offsets
 from scoring.healthy_shape import FAR, between_runs, followed, lasting, open_limits, shape
 from scoring.limits import Limits, Promise, ResidualLimits, Timing, smoothed_deviation
 from scoring.survey import FIRST, RESIDUALS, Healthy, Runs, beginnings, survey
@@ -40,6 +41,7 @@ USUAL = 0.999  # of the seconds: what lasts for one of them, and no longer, is n
 STATISTICS = 7
 SEEN_WINDOWS = 50.0  # with an alarm, to count how often statistics alarm together
 SCORE = 7  # after the statistics
+ROUNDING = 1e-9
 
 
 class TooLittleError(Exception):
@@ -101,11 +103,14 @@ def calibrate(
 def _shaped(runs: Runs, limits: Limits, found: Healthy, each: float) -> Limits:
     """How the residuals vary, and about how far each statistic then goes. found: by limits that nothing reaches."""
     top_speed_rad_s = found.top_speed_rad_s
-    if found.fan_s > SHAPE_FAN_S:
-        runs = beginnings(runs, len(found.maxima), SHAPE_FAN_S)
+    fans = {name: fan_offsets(found.moments[name].cells, found.centres_rad_s, found.step_s) for name in RESIDUALS}
+    limits = _each(limits, lambda of, name: of.model_copy(update={"fans": fans[name]}))
+    if found.fan_s > SHAPE_FAN_S or any(fans.values()):
+        if found.fan_s > SHAPE_FAN_S:
+            runs = beginnings(runs, len(found.maxima), SHAPE_FAN_S)
         found = survey(runs, limits, top_speed_rad_s)
     found, powers = followed(runs, limits, found)
-    limits = _each(limits, lambda _, name: shape(found, name).model_copy(update=powers[name]))
+    limits = _each(limits, lambda _, name: shape(found, name).model_copy(update=powers[name] | {"fans": fans[name]}))
     by_shape = survey(runs, limits, top_speed_rad_s)
     limits = _each(
         limits,
@@ -130,7 +135,24 @@ def _factors(found: Healthy, target: float) -> Array:
     together = np.concatenate([peaks(_score(run, at)).ravel() for run in found.maxima])
     passed = float((together[np.isfinite(together)] > 1.0).mean())
     alike = min(max(passed / (often / STATISTICS), 1.0), float(STATISTICS))  # as so many unrelated statistics
-    return np.array([_level(found, row, target / alike) for row in range(STATISTICS)])
+    factors = np.array([_level(found, row, target / alike) for row in range(STATISTICS)])
+    return _no_oftener(found, factors, int(target * found.windows + ROUNDING))
+
+
+def _no_oftener(found: Healthy, factors: Array, allowed: int) -> Array:
+    """The same, but that these runs have no more alarms than that: a tail by many fans says little of the worst one.
+
+    What raises most alarms has to go further, by one of its excursions at a time.
+    """
+    factors = factors.copy()
+    while True:
+        above = [[peaks(run[:, row] / factors[row]) for row in range(STATISTICS)] for run in found.maxima]
+        alarms = sum(int((peaks(_score(run, factors)) > 1.0).sum()) for run in found.maxima)
+        if alarms <= allowed:
+            return factors
+        beyond = [np.concatenate([run[row][run[row] > 1.0] for run in above]) for row in range(STATISTICS)]
+        most = max(range(STATISTICS), key=lambda row: len(beyond[row]))
+        factors[most] *= beyond[most].min() * (1.0 + ROUNDING)
 
 
 def _cautious(limits: ResidualLimits, name: str, found: Healthy, timing: Timing) -> ResidualLimits:

@@ -120,7 +120,7 @@ def lasting(limits: ResidualLimits, moments: Moments, top_speed_rad_s: float) ->
 
 def _over_speeds(moments: Moments, found: Healthy) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Knots, means and standard deviations, each of enough healthy running; one knot where there is little."""
-    centre = (np.arange(SPEED_BINS) + 0.5) / SPEED_BINS * found.top_speed_rad_s
+    centre = found.centres_rad_s
     groups: list[list[int]] = [[]]
     for number in range(SPEED_BINS):
         groups[-1].append(number)

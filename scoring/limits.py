@@ -19,11 +19,31 @@ class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+class FanOffsets(_Part):
+    """What the healthy residual of each fan is at these speeds, either way round. offset_sigmas: (fans, speeds)."""
+
+    speeds_rad_s: tuple[float, ...] = Field(min_length=1)
+    offset_sigmas: tuple[tuple[float, ...], ...]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> FanOffsets:
+        if list(self.speeds_rad_s) != sorted(set(self.speeds_rad_s)):
+            raise ValueError("speeds_rad_s must rise")
+        if any(len(row) != len(self.speeds_rad_s) for row in self.offset_sigmas):
+            raise ValueError("offset_sigmas must have one value for each of speeds_rad_s")
+        return self
+
+    def of(self, fans: range) -> FanOffsets:
+        """Of some fans."""
+        return self.model_copy(update={"offset_sigmas": tuple(self.offset_sigmas[fan] for fan in fans)})
+
+
 class ResidualLimits(_Part):
     """Of one residual; sigma is the card's, of each fan.
 
-    speeds_rad_s, offset_sigmas, spread: what the healthy residual is on average at these speeds, either way round, and
-    how much it varies, in sigma; between them by interpolation. Limits are None where a statistic is not used. step:
+    fans: what it is at each speed of each fan, where the twin knows them one by one and that was seen. speeds_rad_s,
+    offset_sigmas, spread: what is left on average at these speeds, either way round, and how much it varies, in sigma;
+    between them by interpolation. Limits are None where a statistic is not used. step:
     of the low-passed residual in its own standard deviations. drift: of the CUSUM in standard deviations of a second's
     sum, with reference_sigmas. growth: of the spread, that is usual_growth on average. baseline_sigmas: how far a fan's
     own offset may be from none. adaptation_sigmas: how far the baseline may follow afterwards.
@@ -36,6 +56,7 @@ class ResidualLimits(_Part):
     healthy ones, and baseline_usual_sigmas the root mean square of these.
     """
 
+    fans: FanOffsets | None = None
     speeds_rad_s: tuple[float, ...] = (0.0,)
     offset_sigmas: tuple[float, ...] = (0.0,)
     spread: tuple[float, ...] = (1.0,)
@@ -123,6 +144,14 @@ class Limits(_Part):
     missing_share: float = Field(default=0.25, gt=0, le=1)
     timing: Timing = Timing()
     promise: Promise | None = None
+
+    def of(self, fans: range | None) -> Limits:
+        """For a tray of some of the fans; None: of fans that the twin does not know one by one."""
+
+        def part(of: ResidualLimits) -> ResidualLimits:
+            return of.model_copy(update={"fans": of.fans.of(fans) if of.fans and fans is not None else None})
+
+        return self.model_copy(update={"speed": part(self.speed), "balance": part(self.balance)})
 
     def times(self, factor: float) -> Limits:
         """All statistics may go so many times as far; what was promised is then no longer."""

@@ -10,7 +10,7 @@ import numpy as np
 from schemas.messages import Array
 from scoring.baseline import Baseline, BaselineSettings
 from scoring.cusum import Cusum
-from scoring.limits import ResidualLimits, Timing, smoothed_deviation, summed_deviation
+from scoring.limits import FanOffsets, ResidualLimits, Timing, smoothed_deviation, summed_deviation
 from scoring.low_pass import LowPass
 from scoring.spread import Spread
 
@@ -37,6 +37,10 @@ class Residual:
 
     def __init__(self, fans: int, limits: ResidualLimits, timing: Timing) -> None:
         self._limits = limits
+        self._of_fans = np.array(limits.fans.offset_sigmas).T if limits.fans else np.zeros((1, fans))
+        """(speeds, fans)"""
+        if self._of_fans.shape[1] != fans:
+            raise ValueError(f"limits of {self._of_fans.shape[1]} fans for {fans}")
         self._timing = timing
         adaptation = max(timing.adaptation_s / timing.baseline_s, 1.0)
         self.baseline = Baseline(
@@ -65,10 +69,21 @@ class Residual:
 
     def standardise(self, residual_sigmas: Array, speed_rad_s: Array) -> Array:
         """(n, fans) the residual less what it is at this speed. Both (n, fans); the residual in sigma of each fan."""
-        limits = self._limits
+        limits, speed = self._limits, np.abs(speed_rad_s)
+        if limits.fans is not None:
+            residual_sigmas = residual_sigmas - self._own(limits.fans, speed)
         if len(limits.speeds_rad_s) == 1:
             return residual_sigmas - limits.offset_sigmas[0]
-        return residual_sigmas - np.interp(np.abs(speed_rad_s), limits.speeds_rad_s, limits.offset_sigmas)
+        return residual_sigmas - np.interp(speed, limits.speeds_rad_s, limits.offset_sigmas)
+
+    def _own(self, fans: FanOffsets, speed: Array) -> Array:
+        """(n, fans) of each fan, between the speeds by interpolation."""
+        last = len(fans.speeds_rad_s) - 1
+        place = np.interp(np.nan_to_num(speed), fans.speeds_rad_s, np.arange(last + 1.0))
+        before = np.minimum(place.astype(int), max(last - 1, 0))
+        column = np.arange(speed.shape[1])
+        low = self._of_fans[before, column]
+        return low + (place - before) * (self._of_fans[np.minimum(before + 1, last), column] - low)
 
     def learn(self, standard: Array, shape: Array, speed_rad_s: Array, valid: Array, step_s: float) -> None:
         """Note for the baseline what standardise gives; one wild reading must not move it. All (n, fans)."""

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from schemas.messages import Array, Statistic
+from scoring.fan_offsets import Cells
 from scoring.judge import Judge, Samples
 from scoring.limits import Limits
 from scoring.windows import Windows, peaks
@@ -22,8 +24,17 @@ RESIDUALS = ("speed", "balance")
 FIRST = (Statistic.SPEED_STEP - 1, Statistic.BALANCE_STEP - 1)
 """the first of the three statistics of each residual"""
 
-Runs = Callable[[], Iterable[tuple[int, Iterable[Samples]]]]
-"""At each call the healthy runs from the beginning: how many fans, and the blocks."""
+
+class Running(NamedTuple):
+    """A healthy run. known_as: which fans of the twin these are; None where it does not know one from another."""
+
+    fans: int
+    blocks: Iterable[Samples]
+    known_as: range | None = None
+
+
+Runs = Callable[[], Iterable[Running]]
+"""At each call the healthy runs from the beginning."""
 
 
 @dataclass
@@ -32,6 +43,8 @@ class Moments:
 
     count: Array = field(default_factory=lambda: np.zeros(SPEED_BINS))
     total: Array = field(default_factory=lambda: np.zeros(SPEED_BINS))
+    cells: list[Cells] = field(default_factory=list)
+    """of each run of fans that the twin knows"""
     square: Array = field(default_factory=lambda: np.zeros(SPEED_BINS))
     means: int = 0
     mean_square: float = 0.0
@@ -88,6 +101,11 @@ class Healthy:
         return every[np.isfinite(every)]
 
     @property
+    def centres_rad_s(self) -> Array:
+        """(SPEED_BINS,)"""
+        return (np.arange(SPEED_BINS) + 0.5) / SPEED_BINS * self.top_speed_rad_s
+
+    @property
     def mean_speed_rad_s(self) -> float:
         """Of the samples that were judged."""
         return self.speeds * self.step_s / max(self.fan_s, 1e-9)
@@ -101,22 +119,35 @@ class Healthy:
 def survey(runs: Runs, limits: Limits, top_speed_rad_s: float) -> Healthy:
     """Judge healthy runs by some limits and keep what calibration needs."""
     healthy = Healthy(top_speed_rad_s)
-    for fans, blocks in runs():
-        judge = Judge(fans, limits)
+    for fans, blocks, known_as in runs():
+        judge = Judge(fans, limits.of(known_as))
         judge.watch()
         windows = Windows(fans, limits.timing.on_delay_s)
         seconds = {row + more: _Seconds() for row in FIRST for more in (0, 1)}
+        cells = {name: np.zeros((2, fans, SPEED_BINS)) for name in RESIDUALS}
         for block in blocks:
-            _take(healthy, judge, windows, seconds, block)
+            _take(healthy, judge, windows, seconds, cells, block)
         healthy.maxima.append(windows.end())
         for name in RESIDUALS:
             baseline = getattr(judge, name).baseline
             settled = baseline.is_set & ~baseline.is_commissioning
+            count, total = cells[name]
+            healthy.moments[name].count += count.sum(axis=0)
+            healthy.moments[name].total += total.sum(axis=0)
+            if known_as is not None:
+                healthy.moments[name].cells.append(Cells(known_as, count, total))
             healthy.moments[name].baselines.append(baseline.commissioned[settled if settled.any() else baseline.is_set])
     return healthy
 
 
-def _take(healthy: Healthy, judge: Judge, windows: Windows, seconds: dict[int, _Seconds], block: Samples) -> None:
+def _take(
+    healthy: Healthy,
+    judge: Judge,
+    windows: Windows,
+    seconds: dict[int, _Seconds],
+    cells: dict[str, Array],
+    block: Samples,
+) -> None:
     verdict = judge.update(block)
     judged = np.isfinite(verdict.score)
     ratios, standard = judge.watched()
@@ -139,7 +170,7 @@ def _take(healthy: Healthy, judge: Judge, windows: Windows, seconds: dict[int, _
             moments.growth += float(ratios[first + 2][use].sum())
             moments.lasting += _sums(bins[use].astype(int), SPEED_BINS, np.square(ratios[first][use]))
             shift = np.clip(np.where(use, residual - baseline, np.nan), -WILD, WILD)
-            _note(moments, shift, bins, seconds[first].of(shift, healthy.step_s))
+            _note(moments, cells[name], shift, bins, seconds[first].of(shift, healthy.step_s))
             lasts = seconds[first + 1].of(np.where(use, standard[first // 3], np.nan), healthy.step_s)
             moments.standard += _below(np.square(lasts))
             motions = np.square(verdict.motion_rad_s[use])
@@ -151,11 +182,12 @@ def _sums(places: Array, bins: int, *columns: Array) -> Array:
     return np.stack([np.bincount(places, column, minlength=bins) for column in (np.ones(len(places)), *columns)])
 
 
-def _note(moments: Moments, shift: Array, bins: Array, means: Array) -> None:
+def _note(moments: Moments, cells: Array, shift: Array, bins: Array, means: Array) -> None:
     use = np.isfinite(shift)
     where = bins[use].astype(int)
-    moments.count += np.bincount(where, minlength=SPEED_BINS)
-    moments.total += np.bincount(where, shift[use], minlength=SPEED_BINS)
+    of_fans = where + SPEED_BINS * np.nonzero(use)[1]
+    for column, values in enumerate((None, shift[use])):
+        cells[column] += np.bincount(of_fans, values, minlength=cells[column].size).reshape(-1, SPEED_BINS)
     moments.square += np.bincount(where, shift[use] ** 2, minlength=SPEED_BINS)
     squares = np.square(means)
     moments.means += squares.size
@@ -188,9 +220,9 @@ def _below(squares: Array) -> Array:
 def beginnings(runs: Runs, count: int, fan_s: float) -> Runs:
     """The beginnings of so many runs, together not more than so much running of fans."""
 
-    def each() -> Iterator[tuple[int, Iterable[Samples]]]:
-        for fans, blocks in runs():
-            yield fans, _until(blocks, fan_s / count / fans)
+    def each() -> Iterator[Running]:
+        for fans, blocks, known_as in runs():
+            yield Running(fans, _until(blocks, fan_s / count / fans), known_as)
 
     return each
 

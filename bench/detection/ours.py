@@ -13,13 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from bench.detection.methods import Change, Verdict
-from bench.detection.plant import BLOCK, STEP_NS
+from bench.detection.plant import BLOCK, STEP_NS, TRAY_FANS
+from bench.detection.simulated import tray_number
 from pipeline.stage import Core
 from pipeline.twin_file import TwinFile
 from schemas.messages import Alarm, Array, Prediction, Score
 from scoring.calibration import calibrate
 from scoring.judge import Samples, samples_of
 from scoring.limits import Limits, Timing
+from scoring.survey import Running
 from twin.calibrated import with_calibration
 
 NAME = "fantwin"
@@ -65,10 +67,10 @@ class HealthySamples:
             with self._file(run, name).open("ab") as file:
                 column.astype(np.float32 if name in COLUMNS else np.bool_).tofile(file)
 
-    def __call__(self) -> Iterator[tuple[int, Iterable[Samples]]]:
+    def __call__(self) -> Iterator[Running]:
         """All runs from the beginning, as scoring.calibration wants them."""
         for run, fans in self._fans.items():
-            yield fans, self._blocks(run, fans)
+            yield Running(fans, self._blocks(run, fans), fans_of(tray_number(run)))
 
     def clear(self) -> None:
         """Remove the files."""
@@ -107,9 +109,14 @@ def calibrated_twins(
     given = list(twins)
     top_speed_rad_s = max(max(json.loads(TwinFile.load(path).card_json)["speed_range_rad_s"]) for path in given)
     limits = calibrate(healthy, top_speed_rad_s, Timing(), alarms_per_day, extrapolate=extrapolate)
-    calibration = json.loads(limits.model_dump_json())
     made = []
-    for path in given:
+    for number, path in enumerate(given):
         made.append(path.with_name(f"calibrated-{path.name}"))
+        calibration = json.loads(limits.of(fans_of(number)).model_dump_json())
         made[-1].write_bytes(with_calibration(path.read_bytes(), calibration))
     return made, limits
+
+
+def fans_of(tray: int) -> range:
+    """Which of the fleet's fans a tray has."""
+    return range(TRAY_FANS * tray, TRAY_FANS * (tray + 1))

@@ -121,6 +121,11 @@ def run_name(unit: int, trays: int) -> str:
     return f"run{unit // trays + 1}/tray{unit % trays + 1}"
 
 
+def tray_number(run: str) -> int:
+    """Of a run so named, from 0 on."""
+    return int(run.rpartition("tray")[2]) - 1
+
+
 def _one_sample() -> Grid:
     nothing = np.zeros((1, TRAY_FANS))
     valid = np.ones((1, TRAY_FANS), np.bool_)

@@ -27,7 +27,7 @@ from bench.detection.metrics import (
 from bench.detection.ours import NAME, HealthySamples, Scorer, calibrated_twins
 from bench.detection.plant import RATE_HZ
 from bench.detection.severities import KINDS
-from bench.detection.simulated import Fleet, stage, trained_fleet
+from bench.detection.simulated import Fleet, stage, trained_fleet, tray_number
 from schemas.messages import Prediction
 from scoring.limits import Limits
 
@@ -82,8 +82,7 @@ class Bench:
         return next((method.every for method in self.methods if method.name == name), 1)
 
     def _scorer(self, run: str, _fans: int) -> Scorer:
-        tray = int(run.rpartition("tray")[2]) - 1
-        return Scorer(stage("scorer", self.calibrated[tray]))
+        return Scorer(stage("scorer", self.calibrated[tray_number(run)]))
 
 
 def prepared(folder: Path, sizes: Sizes, *, extrapolate: bool, others: bool, libraries: bool, tell: Tell) -> Bench:

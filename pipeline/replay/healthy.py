@@ -11,9 +11,11 @@ from pipeline.errors import UserError
 from pipeline.replay.chain import Chain
 from pipeline.replay.material import open_material
 from pipeline.replay.plan import undisturbed
+from pipeline.twin_file import TwinFile
 from schemas.codec import CodecError
 from scoring.judge import Samples, samples_of
 from scoring.limits import Timing
+from scoring.survey import Running
 
 KEPT_SAMPLES = 10_000_000
 """of fans, about 80 bytes each: so many are kept between passes, what is beyond is made anew"""
@@ -38,12 +40,13 @@ class HealthyRuns:
         self._twin = twin
         self._overrides = overrides
         self._progress = progress
+        self._knows_fans = TwinFile.load(twin).fans > 1
         self._pass = 0
-        self._kept: list[tuple[int, list[Samples]]] | None = None
+        self._kept: list[Running] | None = None
         self.runs: list[HealthyRun] = []
 
-    def __call__(self) -> Iterator[tuple[int, Iterable[Samples]]]:
-        """All runs from the beginning: how many fans, and the blocks.
+    def __call__(self) -> Iterator[Running]:
+        """All runs from the beginning.
 
         Raises:
             UserError: a recording cannot be used.
@@ -59,7 +62,8 @@ class HealthyRuns:
             try:
                 for run, blocks in self._of(path):
                     self.runs.append(run)
-                    yield run.fans, kept.noting(run.fans, blocks)
+                    known_as = range(run.fans) if self._knows_fans else None
+                    yield kept.noting(Running(run.fans, blocks, known_as))
             except CodecError as error:
                 raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
         self._kept = kept.whole
@@ -98,20 +102,23 @@ class _Kept:
     """The blocks of all runs, as long as there is room for them. runs: None once there was none."""
 
     def __init__(self) -> None:
-        self.runs: list[tuple[int, list[Samples]]] | None = []
+        self.runs: list[Running] | None = []
         self._room = KEPT_SAMPLES
         self._begun = 0
 
     @property
-    def whole(self) -> list[tuple[int, list[Samples]]] | None:
+    def whole(self) -> list[Running] | None:
         """The runs, if there was room and every one was gone through to its end."""
         return None if self._begun else self.runs
 
-    def noting(self, fans: int, blocks: Iterable[Samples]) -> Iterator[Samples]:
-        """The blocks of the next run."""
+    def noting(self, run: Running) -> Running:
+        """The next run, whose blocks are noted as they go by."""
         mine: list[Samples] = []
         if self.runs is not None:
-            self.runs.append((fans, mine))
+            self.runs.append(run._replace(blocks=mine))
+        return run._replace(blocks=self._noted(run.blocks, mine))
+
+    def _noted(self, blocks: Iterable[Samples], mine: list[Samples]) -> Iterator[Samples]:
         self._begun += 1
         for block in blocks:
             self._room -= block.speed_rad_s.size
