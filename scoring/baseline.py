@@ -33,7 +33,7 @@ STEADY = 2.0  # standard deviations of a healthy residual: more within an interv
 PATIENCE = 10  # intervals that may go by before an unsteady one will do
 ROUNDING = 1e-9
 UNUSUAL = 3.0  # times the root mean square: so far an offset may be
-MORE = 1.5  # times as much told, to be commissioned by another interval
+MORE = 1.5  # times as much told as by the one of those kept that told least: such an interval is followed the faster
 LEAST_TOLD = 1e-12
 
 
@@ -66,7 +66,7 @@ class Baseline:
         self.waited = np.zeros(fans, np.int64)
         """(fans,) unsteady intervals before the first good one"""
         self.means = np.full((COMMISSIONING_INTERVALS, fans), np.nan)
-        """sigma, of the good intervals while commissioning that told most"""
+        """sigma, of the good intervals that told most; while commissioning the baseline is their median"""
         self.told = np.zeros((COMMISSIONING_INTERVALS, fans))
         """how much each of them told"""
         self.worth = np.zeros(fans)

@@ -81,8 +81,6 @@ class Verdict:
     """what the baseline was at the end of commissioning; NaN before"""
     balance_held: Array
     """the baseline may go no further from that"""
-    motion_rad_s: Array
-    """see scoring.motion"""
 
 
 class Judge:
@@ -101,7 +99,7 @@ class Judge:
         self.origin_t_ns: int | None = None
         self.interval = 0
         self._interval_ns = max(1, round(limits.timing.baseline_s * NS_PER_S))
-        self._watched: list[tuple[Array, Array]] | None = None
+        self._watched: list[tuple[Array, Array, Array]] | None = None
 
     def update(self, block: Samples) -> Verdict:
         """Judge a block of at least one sample."""
@@ -129,13 +127,13 @@ class Judge:
         for residual in (self.speed, self.balance):
             residual.cusum.uncap()
 
-    def watched(self) -> tuple[Array, Array]:
-        """(7, n, fans) the ratios since the last call, in the order of Statistic from 1 on, and (2, n, fans) both
-        standardised residuals.
+    def watched(self) -> tuple[Array, Array, Array]:
+        """(7, n, fans) the ratios since the last call, in the order of Statistic from 1 on, (2, n, fans) both
+        standardised residuals, and (n, fans) the motion, see scoring.motion.
         """
         assert self._watched is not None
-        (ratios, standard), self._watched = zip(*self._watched, strict=True), []
-        return np.concatenate(ratios, axis=1), np.concatenate(standard, axis=1)
+        (ratios, standard, motion_rad_s), self._watched = zip(*self._watched, strict=True), []
+        return np.concatenate(ratios, axis=1), np.concatenate(standard, axis=1), np.concatenate(motion_rad_s)
 
     def forget(self, fans: Array) -> None:
         """Take new baselines of some fans, (fans,) of bool."""
@@ -183,7 +181,7 @@ class Judge:
         sensor = self.sensor.update(speed_rad_s, block.missing[rows], alive, block.step_ns)
         ratios = np.concatenate((*parts, np.where(alive, sensor, 0.0)[np.newaxis]))
         if self._watched is not None:
-            self._watched.append((ratios, np.stack(standardised)))
+            self._watched.append((ratios, np.stack(standardised), motion_rad_s))
         largest = ratios.argmax(axis=0)
         score = np.take_along_axis(ratios, largest[np.newaxis], axis=0)[0]
         highest = score.max(axis=0)
@@ -201,7 +199,6 @@ class Judge:
             balance_baseline=baselines[1],
             balance_baseline_s=np.broadcast_to(balance.weight * self.limits.timing.baseline_s, known.shape),
             balance_commissioned=np.where(balance.is_commissioning, np.nan, commissioned[-1]),
-            motion_rad_s=motion_rad_s,
             balance_held=np.broadcast_to(balance.is_at_limit, known.shape),
         )
 

@@ -150,7 +150,7 @@ def _take(
 ) -> None:
     verdict = judge.update(block)
     judged = np.isfinite(verdict.score)
-    ratios, standard = judge.watched()
+    ratios, standard, motion_rad_s = judge.watched()
     windows.add(block.t_ns, block.step_ns, ratios, judged)
     healthy.step_s = block.step_ns / 1e9
     healthy.fan_s += float(judged.sum()) * healthy.step_s
@@ -158,7 +158,7 @@ def _take(
     healthy.stuck_s = max(healthy.stuck_s, judge.sensor.longest_s)
     healthy.missing = max(healthy.missing, judge.sensor.most_missing)
     bins = np.clip(np.abs(block.speed_rad_s) / healthy.top_speed_rad_s * SPEED_BINS, 0, SPEED_BINS - 1)
-    octaves = np.log2(np.maximum(verdict.motion_rad_s / healthy.top_speed_rad_s, 1e-9))
+    octaves = np.log2(np.maximum(motion_rad_s / healthy.top_speed_rad_s, 1e-9))
     moving = np.clip(np.ceil(octaves) + MOTION_BINS - 1, 0, MOTION_BINS - 1).astype(int)
     for name, first, residual, valid, smoothed, baseline in (
         ("speed", FIRST[0], block.speed_residual, block.speed_valid, verdict.speed_smoothed, verdict.speed_baseline),
@@ -173,7 +173,7 @@ def _take(
             _note(moments, cells[name], shift, bins, seconds[first].of(shift, healthy.step_s))
             lasts = seconds[first + 1].of(np.where(use, standard[first // 3], np.nan), healthy.step_s)
             moments.standard += _below(np.square(lasts))
-            motions = np.square(verdict.motion_rad_s[use])
+            motions = np.square(motion_rad_s[use])
             moments.moved += _sums(moving[use], MOTION_BINS, motions, np.square(smoothed[use]))
 
 
