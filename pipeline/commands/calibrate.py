@@ -12,9 +12,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.commands.calibration_check import check_promise, sha256_of
+from pipeline.commands.calibration_check import check_promise
 from pipeline.commands.calibration_doubt import doubt
-from pipeline.commands.model_maker import model_maker
+from pipeline.commands.model_maker import model_maker, sha256_of
 from pipeline.commands.options import JsonOption, SetOption
 from pipeline.commands.progress import working
 from pipeline.errors import UserError

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.commands.model_maker import sha256_of
 from pipeline.commands.progress import working
 from pipeline.errors import UserError
 from pipeline.replay.decisions import episodes
@@ -107,9 +107,3 @@ def _refuse_what_it_was_made_of(path: Path, twin: TwinFile, recordings: Sequence
                 raise UserError(
                     f"{recording}: {path} was {verb} on it, so that it proves nothing: --verify takes other recordings"
                 )
-
-
-def sha256_of(path: Path) -> str:
-    """Of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -122,9 +122,14 @@ def data_cards(material: Material) -> list[DataCard]:
         samples[run.path] = samples.get(run.path, 0) + len(run.t_s)
     fans = material.runs[0].fans
     return [
-        DataCard(name=path.name, sha256=hashlib.sha256(path.read_bytes()).hexdigest(), fans=fans, samples=count)
-        for path, count in samples.items()
+        DataCard(name=path.name, sha256=sha256_of(path), fans=fans, samples=count) for path, count in samples.items()
     ]
+
+
+def sha256_of(path: Path) -> str:
+    """Of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_held_out(
