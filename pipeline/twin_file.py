@@ -183,6 +183,14 @@ class TwinFile:
         friction = self.balance.friction
         return np.where((friction > 0.0) & (friction < low + DEAD_ZONE * (high - low)), friction, -np.inf)
 
+    @property
+    def bend_rad_s(self) -> float | None:
+        """Where drag and viscous part each make half of what a little more speed needs; None without either."""
+        of = self.balance
+        if not np.all((of.viscous > 0.0) & (of.drag > 0.0)):
+            return None
+        return float(np.median(of.viscous / (2.0 * of.drag)))
+
     def healthy_balances(self) -> list[HealthyBalance]:
         """The balance fan by fan, as those that judge want it."""
         of, rate_per_s = self.balance, self.balance.filter_rate_per_s

@@ -62,8 +62,11 @@ def calibrate(
     false_alarms_per_day: float,
     seed: int = 0,
     extrapolate: bool = False,
+    bend_rad_s: float | None = None,
 ) -> Limits:
     """Limits with a declared number of false alarms per fan and day.
+
+    bend_rad_s: viscous / (2 drag) of the fans, see scoring.limits; None where it is not known.
 
     Raises:
         TooLittleError: the runs are too short for that, and extrapolate is not set; or too short for anything.
@@ -82,7 +85,7 @@ def calibrate(
             "missing_share": min(MOST_MISSING, max(LEAST_MISSING, MISSING_MARGIN * found.missing)),
         }
     )
-    limits = _shaped(runs, limits, found, each)
+    limits = _shaped(runs, limits, found, each, bend_rad_s)
     found = survey(runs, limits, top_speed_rad_s)
     factors = _factors(found, target)
     for name, first in zip(RESIDUALS, FIRST, strict=True):
@@ -100,7 +103,7 @@ def calibrate(
     return limits.model_copy(update={"promise": promise})
 
 
-def _shaped(runs: Runs, limits: Limits, found: Healthy, each: float) -> Limits:
+def _shaped(runs: Runs, limits: Limits, found: Healthy, each: float, bend_rad_s: float | None) -> Limits:
     """How the residuals vary, and about how far each statistic then goes. found: by limits that nothing reaches."""
     top_speed_rad_s = found.top_speed_rad_s
     fans = {name: fan_offsets(found.moments[name].cells, found.centres_rad_s, found.step_s) for name in RESIDUALS}
@@ -109,7 +112,7 @@ def _shaped(runs: Runs, limits: Limits, found: Healthy, each: float) -> Limits:
         if found.fan_s > SHAPE_FAN_S:
             runs = beginnings(runs, len(found.maxima), SHAPE_FAN_S)
         found = survey(runs, limits, top_speed_rad_s)
-    found, powers = followed(runs, limits, found)
+    found, powers = followed(runs, limits, found, bend_rad_s)
     limits = _each(limits, lambda _, name: shape(found, name).model_copy(update=powers[name] | {"fans": fans[name]}))
     by_shape = survey(runs, limits, top_speed_rad_s)
     limits = _each(

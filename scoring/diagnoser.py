@@ -31,6 +31,7 @@ class _Block:
     speed_rad_s: Array
     offset_command: Array
     offset_s: Array
+    usual_command: Array
 
 
 class Diagnoser:
@@ -51,15 +52,17 @@ class Diagnoser:
         speed_rad_s: Array,
         offset_command: Array,
         offset_s: Array | float = math.inf,
+        usual_command: Array | float = 0.0,
     ) -> None:
         """Keep a block, (n, fans) each but t_ns, (n,). command: NaN where it is not known. offset_command: what of the
-        balance is the fan's own. offset_s: of how many seconds of healthy running that is known.
+        balance is the fan's own. offset_s: of how many seconds of healthy running that is known. usual_command: what
+        the healthy balance is at these speeds beside that.
         """
         if step_ns != self._step_ns:
             self._blocks.clear()
             self._step_ns = step_ns
-        offset_s = np.broadcast_to(offset_s, offset_command.shape)
-        self._blocks.append(_Block(t_ns, command, speed_rad_s, offset_command, offset_s))
+        offset_s, usual_command = (np.broadcast_to(one, offset_command.shape) for one in (offset_s, usual_command))
+        self._blocks.append(_Block(t_ns, command, speed_rad_s, offset_command, offset_s, usual_command))
         oldest_t_ns = int(t_ns[0]) - min(round(WINDOW_S * NS_PER_S), MOST_SAMPLES * step_ns)
         while int(self._blocks[0].t_ns[-1]) < oldest_t_ns:
             self._blocks.popleft()
@@ -134,8 +137,10 @@ class Diagnoser:
         if place[-1] < 1:
             return None
         command, speed = np.full(place[-1] + 1, np.nan), np.full(place[-1] + 1, np.nan)
+        usual = np.zeros(place[-1] + 1)
         command[place] = self._kept("command", fan, rows)
         speed[place] = self._kept("speed_rad_s", fan, rows)
+        usual[place] = self._kept("usual_command", fan, rows)
         healthy, step_s = self._healthy[fan], self._step_ns / NS_PER_S
         of_a_second = healthy.sigma_command * summed_deviation(healthy.autocorrelation_time_s, step_s)
         for values in (command, speed):
@@ -146,6 +151,7 @@ class Diagnoser:
             command=command,
             speed_rad_s=speed,
             onset=int(place[min(onset, len(place) - 1)]),
+            usual=usual,
             offset=float(self._kept("offset_command", fan, rows)[-1]),
             offset_std_error=of_a_second / math.sqrt(max(self._kept("offset_s", fan, rows)[-1], step_s)),
         )

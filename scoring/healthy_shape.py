@@ -18,7 +18,7 @@ KNOT_S = 300.0  # of healthy running for each point of the curve over speed
 LONGEST_S = 1000.0  # of a residual's memory
 BASELINE_MARGIN, BASELINE_COVERAGE = 1.5, 0.999
 LEAST_BASELINES, FEW_BASELINES = 3, 5.0  # fewer say little of days: then so many sigma, or three times what was seen
-POWERS = (1, 2)  # of the speed, that offsets go with when the air is lighter or heavier
+POWER = 2  # of the speed, that the balance goes with when the air is lighter or heavier; the speed too, up to its bend
 GAIN = 0.97  # of the mean square over seconds, at most, for them to be taken
 UNLIKE = 3.0  # of the mean square in motion: what one fan is wrong by on its way, it is each time, and others are not
 MOST_RIDGE, USUAL_RIDGE = 1.0, 0.1
@@ -31,8 +31,12 @@ def open_limits(limits: ResidualLimits) -> ResidualLimits:
     )
 
 
-def followed(runs: Runs, limits: Limits, found: Healthy) -> tuple[Healthy, dict[str, dict[str, Any]]]:
+def followed(
+    runs: Runs, limits: Limits, found: Healthy, bend_rad_s: float | None
+) -> tuple[Healthy, dict[str, dict[str, Any]]]:
     """Whether a fan's own offset goes with the speed, of each residual; and what baselines then leave.
+
+    bend_rad_s: of what a little more speed needs the drag makes half there; None where that is not known.
 
     It is taken to, when the healthy residual less such a baseline varies less; not by a few runs, which say little of
     days.
@@ -41,9 +45,10 @@ def followed(runs: Runs, limits: Limits, found: Healthy) -> tuple[Healthy, dict[
         return found, {name: {} for name in RESIDUALS}
     reference = {"baseline_speed_rad_s": max(found.mean_speed_rad_s, 1e-9)}
     powers: dict[str, dict[str, Any]] = {
-        name: {"baseline_power": power, "baseline_ridge": USUAL_RIDGE, **reference}
-        for name, power in zip(RESIDUALS, POWERS, strict=True)
+        "speed": {"baseline_power": POWER if bend_rad_s else POWER - 1, "baseline_bend_rad_s": bend_rad_s},
+        "balance": {"baseline_power": POWER},
     }
+    powers = {name: {**powers[name], "baseline_ridge": USUAL_RIDGE, **reference} for name in RESIDUALS}
     moving = {name: getattr(limits, name).model_copy(update=powers[name]) for name in RESIDUALS}
     other = survey(runs, limits.model_copy(update=moving), found.top_speed_rad_s)
     for name in RESIDUALS:

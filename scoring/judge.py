@@ -75,6 +75,8 @@ class Verdict:
     speed_baseline: Array
     balance_smoothed: Array
     balance_baseline: Array
+    balance_usual: Array
+    """what calibration found it to be at this speed, beside the baseline"""
     balance_baseline_s: Array
     """seconds of healthy running that this baseline varies as the mean of; 0: there is none yet"""
     balance_commissioned: Array
@@ -155,6 +157,7 @@ class Judge:
         standardised: list[Array] = []
         smoothed: list[Array] = []
         baselines: list[Array] = []
+        usuals: list[Array] = []
         commissioned: list[Array] = []
         judged = np.zeros(speed_rad_s.shape, np.bool_)
         known = np.zeros(speed_rad_s.shape, np.bool_)
@@ -163,7 +166,8 @@ class Judge:
             (self.speed, block.speed_residual[rows], block.speed_valid[rows]),
             (self.balance, block.balance[rows], block.balance_valid[rows]),
         ):
-            standard = residual.standardise(values, speed_rad_s)
+            usual = residual.usual(speed_rad_s)
+            standard = values - usual
             shape = residual.shape(speed_rad_s, valid)
             own = residual.baseline.value * shape
             residual.learn(standard, shape, speed_rad_s, valid, step_s)
@@ -173,6 +177,7 @@ class Judge:
             standardised.append(found.standard)
             smoothed.append(np.where(may, found.smoothed, np.nan))
             baselines.append(own)
+            usuals.append(usual)
             commissioned.append(residual.baseline.commissioned * shape)
             if residual.is_judged:
                 judged |= may
@@ -197,6 +202,7 @@ class Judge:
             speed_baseline=baselines[0],
             balance_smoothed=smoothed[1],
             balance_baseline=baselines[1],
+            balance_usual=usuals[1],
             balance_baseline_s=np.broadcast_to(balance.weight * self.limits.timing.baseline_s, known.shape),
             balance_commissioned=np.where(balance.is_commissioning, np.nan, commissioned[-1]),
             balance_held=np.broadcast_to(balance.is_at_limit, known.shape),

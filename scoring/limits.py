@@ -50,10 +50,11 @@ class ResidualLimits(_Part):
 
     lasting: how much more than usual, at these speeds or at all, what lasts of the healthy residual varies;
     motion_rad_s: and where a fan moves by so much (scoring.motion), root two times as much as where its speed holds,
-    None for no more. baseline_power: a fan's own offset goes with this power of the speed, and baselines are those at
-    baseline_speed_rad_s: 0 where friction is what differs from day to day; where it is the density of the air, 1 of
-    the speed and 2 of the balance. Then baseline_ridge is the variance of what baselines cannot follow in that of
-    healthy ones, and baseline_usual_sigmas the root mean square of these.
+    None for no more. baseline_power: a fan's own offset goes with this power of the speed, from baseline_bend_rad_s on
+    with one less, and baselines are those at baseline_speed_rad_s. 0 where friction is what differs from day to day, 2
+    where it is the density of the air: then the balance is off by a part of the drag, and the speed by that in what a
+    little more speed needs, viscous + 2 drag w, which bends at viscous / (2 drag). baseline_ridge is the variance of
+    what baselines cannot follow in that of healthy ones, and baseline_usual_sigmas the root mean square of these.
     """
 
     fans: FanOffsets | None = None
@@ -72,6 +73,7 @@ class ResidualLimits(_Part):
     adaptation_sigmas: float = Field(default=1.0, ge=0)
     baseline_power: int = Field(default=0, ge=0, le=2)
     baseline_speed_rad_s: float = Field(default=1.0, gt=0)
+    baseline_bend_rad_s: float | None = Field(default=None, gt=0)
     baseline_ridge: float = Field(default=0.0, ge=0)
     baseline_usual_sigmas: float = Field(default=0.0, ge=0)
 

@@ -28,6 +28,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.signal import lfilter
 
 Array: TypeAlias = NDArray[np.float64]
@@ -41,6 +42,8 @@ GAP_MEMORIES = 4.0
 """time constants of the filter: by as much a command that was not known can be wrong"""
 TOLD = 2.0
 """standard errors from zero at which a coefficient is told from it"""
+FEWEST_ROWS, STAYS_S, STILL = 25, 5.0, 0.03
+"""to tell what noise is shared: so many rows in which for so long the speed stays within this share of it"""
 MEAN_OVER_S = 0.2
 """rows are means over so long; the filter is slower than that, the noise of a tacho is not"""
 RESIDUAL, COMMAND, DRAG, SQUARE, CONSTANT, JUMP = range(6)
@@ -72,7 +75,8 @@ class Window:
     """The last grid samples of one fan. command, speed_rad_s: (n,), NaN where unknown or where the sensor gave none.
 
     onset: index of the first anomalous sample, as the detector has it. offset: balance of this fan when healthy, from
-    commissioning, and its standard error; both in units of the command.
+    commissioning, and its standard error. usual: (n,) what the healthy balance is at each speed beside that, from
+    calibration. All in units of the command.
     """
 
     step_s: float
@@ -81,6 +85,7 @@ class Window:
     onset: int
     offset: float = 0.0
     offset_std_error: float = 0.0
+    usual: Array | float = 0.0
 
 
 class RegressionWindow:
@@ -111,10 +116,14 @@ class RegressionWindow:
         self._ends = np.append(self._starts[1:], len(middle))
         valid = np.add.reduceat(counts.astype(float), self._starts)
         self._enough = valid >= self.per_row / 2.0
+        self._enough_before_onset = (self._ends <= window.onset)[self._enough]
         self._weight = counts / np.repeat(np.maximum(valid, 1.0), self.per_row)[: len(counts)]
-        fixed = np.vstack((acting - coefficients @ motion - window.offset, _independent(errors) @ motion))
-        self._fixed = self._rows(_summed(self._filtered(fixed) * self._weight), np.zeros(1, int))[0]
+        healthy_balance = np.broadcast_to(window.offset + window.usual, speed.shape)[:-1]
+        residual = acting - coefficients @ motion - healthy_balance
+        fixed = np.vstack((residual, _independent(errors) @ motion))
+        self._fixed = self._whole(fixed)
         terms = np.stack((acting, drag, square, motion[3]))
+        terms -= self._shared(terms, residual, middle)[:, np.newaxis] * residual
         changing = np.concatenate((terms, terms * self._seconds[:-1], self._momentum[np.newaxis]))
         self._changing = self._filtered(changing)
         self._changing_sums = _summed(self._changing * self._weight)
@@ -148,6 +157,35 @@ class RegressionWindow:
         jump += ((1.0 - self._decay) * height)[:, np.newaxis, np.newaxis] * self._decayed(before)[:, np.newaxis]
         fixed = np.broadcast_to(self._fixed, (len(at), *self._fixed.shape))
         return np.concatenate((fixed[:, :1], changed, jump, fixed[:, 1:]), axis=1)
+
+    def _shared(self, terms: Array, residual: Array, speed_rad_s: Array) -> Array:
+        """(terms,) how much of the residual's own noise is in each term too.
+
+        A controller answers the noise of the tacho: its command then goes with the residual of a healthy fan as that of
+        a weak drive does, for ever. And that noise is in the drag. Before the onset, and where the speed is held: of a
+        fan that moves they go together for better reasons. None where it is not told from none.
+        """
+        rows = self._whole(np.vstack((speed_rad_s, terms, residual)))[:, self._enough_before_onset]
+        shared = np.zeros(len(terms))
+        if rows.shape[1] < FEWEST_ROWS:
+            return shared
+        span = round(STAYS_S / MEAN_OVER_S)
+        means = uniform_filter1d(rows, span, axis=1)
+        speed, *each, left = rows - means
+        still = maximum_filter1d(np.abs(speed), span) <= STILL * np.abs(means[0])
+        power = float(left[still] @ left[still])
+        if np.count_nonzero(still) < FEWEST_ROWS or power <= 0.0:
+            return shared
+        for number, term in enumerate(each):
+            share = float(term[still] @ left[still]) / power
+            unexplained = np.square(term[still] - share * left[still]).sum()
+            if abs(share) > TOLD * np.sqrt(unexplained / power / np.count_nonzero(still)):
+                shared[number] = np.clip(share, -1.0, 1.0)
+        return shared
+
+    def _whole(self, terms: Array) -> Array:
+        """(terms, rows) filtered, as means over rows."""
+        return self._rows(_summed(self._filtered(terms) * self._weight), np.zeros(1, int))[0]
 
     def _filtered(self, terms: Array) -> Array:
         filtered: Any = lfilter([1.0 - self._decay], [1.0, -self._decay], terms, axis=-1)

@@ -67,26 +67,23 @@ class Residual:
         limits = self._limits
         return any(limit is not None for limit in (limits.step, limits.drift, limits.growth))
 
-    def standardise(self, residual_sigmas: Array, speed_rad_s: Array) -> Array:
-        """(n, fans) the residual less what it is at this speed. Both (n, fans); the residual in sigma of each fan."""
-        limits, speed = self._limits, np.abs(speed_rad_s)
-        if limits.fans is not None:
-            residual_sigmas = residual_sigmas - self._own(limits.fans, speed)
-        if len(limits.speeds_rad_s) == 1:
-            return residual_sigmas - limits.offset_sigmas[0]
-        return residual_sigmas - np.interp(speed, limits.speeds_rad_s, limits.offset_sigmas)
+    def usual(self, speed_rad_s: Array) -> Array:
+        """(n, fans) what the healthy residual is at these speeds (n, fans), in sigma of each fan."""
+        limits, speed = self._limits, np.abs(np.nan_to_num(speed_rad_s))
+        usual = np.interp(speed, limits.speeds_rad_s, limits.offset_sigmas)
+        return usual if limits.fans is None else usual + self._own(limits.fans, speed)
 
     def _own(self, fans: FanOffsets, speed: Array) -> Array:
         """(n, fans) of each fan, between the speeds by interpolation."""
         last = len(fans.speeds_rad_s) - 1
-        place = np.interp(np.nan_to_num(speed), fans.speeds_rad_s, np.arange(last + 1.0))
+        place = np.interp(speed, fans.speeds_rad_s, np.arange(last + 1.0))
         before = np.minimum(place.astype(int), max(last - 1, 0))
         column = np.arange(speed.shape[1])
         low = self._of_fans[before, column]
         return low + (place - before) * (self._of_fans[np.minimum(before + 1, last), column] - low)
 
     def learn(self, standard: Array, shape: Array, speed_rad_s: Array, valid: Array, step_s: float) -> None:
-        """Note for the baseline what standardise gives; one wild reading must not move it. All (n, fans)."""
+        """Note for the baseline what is not usual; one wild reading must not move it. All (n, fans)."""
         reach = self._limits.baseline_sigmas * shape + self._clip(step_s) * self._spread(speed_rad_s, valid)
         centre = self.baseline.value * shape
         self.baseline.add(np.clip(np.where(valid, standard, centre), centre - reach, centre + reach), valid, shape)
@@ -96,13 +93,16 @@ class Residual:
         limits = self._limits
         if limits.baseline_power == 0:
             return np.ones(speed_rad_s.shape)
-        speed = np.where(valid, np.abs(speed_rad_s), 0.0) / limits.baseline_speed_rad_s
-        return np.minimum(speed, FASTEST) ** limits.baseline_power
+        speed = np.minimum(np.where(valid, np.abs(speed_rad_s), 0.0) / limits.baseline_speed_rad_s, FASTEST)
+        if limits.baseline_bend_rad_s is None:
+            return speed**limits.baseline_power
+        bend = limits.baseline_bend_rad_s / limits.baseline_speed_rad_s
+        return speed**limits.baseline_power * (1.0 + bend) / (speed + bend)
 
     def judge(
         self, less_own: Array, shape: Array, speed_rad_s: Array, motion_rad_s: Array, valid: Array, step_s: float
     ) -> Judged:
-        """Take a stretch. less_own: what standardise gives less what is the fan's own. valid: to be judged."""
+        """Take a stretch. less_own: the residual less what is usual and the fan's own. valid: to be judged."""
         limits, clip = self._limits, self._clip(step_s)
         shift = np.clip(np.where(valid, less_own, 0.0), -LARGEST, LARGEST)
         shown = self.shown.update(shift, valid, step_s)

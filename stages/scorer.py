@@ -251,7 +251,8 @@ class ScorerCore(Core):
         valid = np.isfinite(verdict.score)
         balance_baseline = verdict.balance_baseline * sigma_command
         told = np.where(np.isin(why_not, (WhyNot.GAP, WhyNot.STALE)), np.nan, command)
-        self._diagnoser.take(t_ns, item.step_ns, told, measured, balance_baseline, verdict.balance_baseline_s)
+        usual, known_s = verdict.balance_usual * sigma_command, verdict.balance_baseline_s
+        self._diagnoser.take(t_ns, item.step_ns, told, measured, balance_baseline, known_s, usual)
         state, changes = self._desk.states(t_ns, item.step_ns, verdict.score, valid)
         why_not = np.where(valid, WhyNot.NONE, np.where(why_not == WhyNot.NONE, WhyNot.WARMING_UP, why_not))
         self._not_judged.update(item.step_ns, valid, why_not.astype(np.uint8))

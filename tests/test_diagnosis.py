@@ -226,6 +226,37 @@ def test_errors_that_make_good_for_one_another_are_small_where_the_fan_was_seen(
     assert apart > 20.0 * joint
 
 
+def held_by_a_loop(seed: int, per_rad_s: float, per_rad: float, drag: float = 1.3, duration_s: float = 60.0) -> Window:
+    """A fan whose speed a PI controller holds by a noisy tacho; more drag in the second half."""
+    rng, fan, step_s = np.random.default_rng(seed), data.HEALTHY, data.STEP_S
+    samples, set_point = round(duration_s / step_s), 450.0
+    needed = fan.viscous * set_point + fan.drag * set_point**2 + fan.friction
+    speed, total, command, readings = set_point, needed, np.empty(samples), np.empty(samples)
+    for k in range(samples):
+        readings[k] = speed + data.NOISE_RAD_S * rng.normal()
+        total += per_rad * step_s * (set_point - readings[k])
+        command[k] = total + per_rad_s * (set_point - readings[k])
+        takes = fan.viscous * speed + (drag if 2 * k >= samples else 1.0) * fan.drag * speed**2 + fan.friction
+        speed += step_s * (command[k] - takes) / fan.inertia
+    return Window(step_s, command, readings, samples // 2)
+
+
+@pytest.mark.parametrize(("per_rad_s", "per_rad"), [(0.001, 0.002), (0.005, 0.02), (0.02, 0.02)])
+def test_a_controller_that_answers_the_noise_of_the_tacho_is_no_weak_drive(per_rad_s: float, per_rad: float) -> None:
+    found = [diagnose(held_by_a_loop(seed, per_rad_s, per_rad), data.HEALTHY) for seed in range(6)]
+    assert np.mean([of(one, "gain_down").probability for one in found]) < 0.5
+
+
+def test_what_calibration_found_usual_at_a_speed_is_no_fault() -> None:
+    command = data.moving_command(7)
+    readings = data.measured(data.speeds(command, gain=0.97), 7)
+    usual = 0.03 * command
+    whole = data.window(command, readings)
+    assert diagnose(whole, data.HEALTHY).first.cause != "cannot_tell"
+    known = diagnose(replace(whole, usual=usual), data.HEALTHY)
+    assert known.first.cause == "cannot_tell"
+
+
 def test_what_the_fan_showed_at_commissioning_is_no_fault() -> None:
     command = data.moving_command(7)
     readings = data.measured(data.speeds(command, torque=0.03), 7)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from schemas.messages import Statistic
 from scoring.judge import Judge, Samples, Verdict
 from scoring.limits import Limits, ResidualLimits, Timing
+from scoring.residual import Residual
 from tests.healthy_residuals import autoregressive, rows_of, samples_of
 
 FANS = 3
@@ -296,3 +297,13 @@ def test_who_watches_sees_how_far_a_drift_goes_beyond_its_limit() -> None:
     assert verdict.score[verdict.statistic == Statistic.SPEED_DRIFT].max() < 1.1
     judged(watched, samples)
     assert watched.watched()[0][Statistic.SPEED_DRIFT - 1].max() > 3.0
+
+
+def test_an_offset_goes_with_the_speed_as_what_a_little_more_speed_needs_says() -> None:
+    # A balance off by a part of the drag, over viscous + 2 drag w, in that at the baseline's speed.
+    viscous, drag = 6e-4, 4e-7
+    speed = np.array([[50.0, 200.0, 500.0, 900.0]])
+    off = drag * speed**2 / (viscous + 2.0 * drag * speed)
+    limits = ResidualLimits(baseline_power=2, baseline_speed_rad_s=500.0, baseline_bend_rad_s=viscous / (2.0 * drag))
+    found = Residual(4, limits, Timing()).shape(speed, np.ones_like(speed, np.bool_))
+    np.testing.assert_allclose(found, off / off[0, 2])

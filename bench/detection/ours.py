@@ -107,8 +107,16 @@ def calibrated_twins(
         TooLittleError: the healthy running cannot support so low a rate.
     """
     given = list(twins)
-    top_speed_rad_s = max(max(json.loads(TwinFile.load(path).card_json)["speed_range_rad_s"]) for path in given)
-    limits = calibrate(healthy, top_speed_rad_s, Timing(), alarms_per_day, extrapolate=extrapolate)
+    known = [TwinFile.load(path) for path in given]
+    bends = [twin.bend_rad_s for twin in known if twin.bend_rad_s is not None]
+    limits = calibrate(
+        healthy,
+        max(twin.top_speed_rad_s for twin in known),
+        Timing(),
+        alarms_per_day,
+        extrapolate=extrapolate,
+        bend_rad_s=float(np.median(bends)) if len(bends) == len(known) else None,
+    )
     made = []
     for number, path in enumerate(given):
         made.append(path.with_name(f"calibrated-{path.name}"))

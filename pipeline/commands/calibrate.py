@@ -100,7 +100,8 @@ def _calibrated(
     twin: Path, healthy: list[Path], per_day: float, extrapolate: bool, overrides: list[str], seed: int
 ) -> tuple[Limits, str]:
     """The limits, and what is to be told of the recordings, empty if nothing."""
-    top_speed_rad_s = TwinFile.load(twin).top_speed_rad_s
+    known = TwinFile.load(twin)
+    top_speed_rad_s = known.top_speed_rad_s
     if not 0.0 < top_speed_rad_s < math.inf:
         raise UserError(
             f"{twin}: its card does not say up to which speed it was made (speed_range_rad_s): train it anew"
@@ -108,7 +109,7 @@ def _calibrated(
     with working("judging healthy recordings") as tell:
         runs = HealthyRuns(healthy, twin, overrides, tell)
         try:
-            limits = find_limits(runs, top_speed_rad_s, runs.timing(), per_day, seed, extrapolate)
+            limits = find_limits(runs, top_speed_rad_s, runs.timing(), per_day, seed, extrapolate, known.bend_rad_s)
         except TooLittleError as error:
             raise UserError(_too_little(error, per_day)) from error
         tell("comparing the recordings")
