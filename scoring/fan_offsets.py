@@ -17,7 +17,9 @@ import numpy as np
 from schemas.messages import Array
 from scoring.limits import FanOffsets
 
-FEWEST_FANS, FEWEST_RUNS = 3, 3  # fewer say little of how fans differ, or days
+FEWEST_FANS = 3
+FEWEST_RUNS = 12
+"""of a fan: what is learned from a run is off by that day, and limits are set by the same runs, which do not see it"""
 LEAST_S, WHOLE_S = 3.0, 30.0  # of one run in a bin of speed, to count at all, and to count as a whole one
 ROUNDS = 20
 DIGITS = 4
