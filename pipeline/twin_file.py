@@ -66,9 +66,19 @@ class BalanceCard(_OfCard):
     def _of_older_card(cls, card: Any) -> Any:
         """Cards once had the errors one by one; how they go together is not known of those."""
         if isinstance(card, dict) and "covariance" not in card and "std_errors" in card:
-            errors = TypeAdapter(tuple[Four, ...]).validate_python(card["std_errors"])
+            try:
+                errors = TypeAdapter(tuple[Four, ...]).validate_python(card["std_errors"])
+            except ValidationError as error:
+                raise ValueError("std_errors must have four numbers for each fan") from error
             return card | {"covariance": [np.diag(np.square(of_fan)).tolist() for of_fan in errors]}
         return card
+
+    @model_validator(mode="after")
+    def _covariance_is_one(self) -> BalanceCard:
+        for matrix in map(np.array, self.covariance):
+            if not np.allclose(matrix, matrix.T) or matrix.diagonal().min() < 0.0:
+                raise ValueError("covariance must be symmetric, with no variance below zero")
+        return self
 
     @property
     def of_fans(self) -> dict[str, tuple[Any, ...]]:

@@ -40,7 +40,7 @@ SHARE_OF_STEP = 0.25  # the CUSUM's reference value, of the limit of the step
 USUAL = 0.999  # of the seconds: what lasts for one of them, and no longer, is no drift
 STATISTICS = 7
 SEEN_WINDOWS = 50.0  # with an alarm, to count how often statistics alarm together
-SCORE = 7  # after the statistics
+SENSOR, SCORE = 6, 7  # after the statistics of both residuals
 ROUNDING = 1e-9
 
 
@@ -139,23 +139,27 @@ def _factors(found: Healthy, target: float) -> Array:
     passed = float((together[np.isfinite(together)] > 1.0).mean())
     alike = min(max(passed / (often / STATISTICS), 1.0), float(STATISTICS))  # as so many unrelated statistics
     factors = np.array([_level(found, row, target / alike) for row in range(STATISTICS)])
+    factors[SENSOR] = 1.0  # its limits are not found by how rare they are
     return _no_oftener(found, factors, int(target * found.windows + ROUNDING))
 
 
 def _no_oftener(found: Healthy, factors: Array, allowed: int) -> Array:
     """The same, but that these runs have no more alarms than that: a tail by many fans says little of the worst one.
 
-    What raises most alarms has to go further, by one of its excursions at a time.
+    What raises most alarms has to go further, by a few of its excursions at a time.
     """
     factors = factors.copy()
     while True:
-        above = [[peaks(run[:, row] / factors[row]) for row in range(STATISTICS)] for run in found.maxima]
-        alarms = sum(int((peaks(_score(run, factors)) > 1.0).sum()) for run in found.maxima)
-        if alarms <= allowed:
+        too_many = sum(int((peaks(_score(run, factors)) > 1.0).sum()) for run in found.maxima) - allowed
+        each = [
+            np.concatenate([peaks(run[:, row] / factors[row]).ravel() for run in found.maxima]) for row in range(SENSOR)
+        ]
+        beyond = [np.sort(of[of > 1.0]) for of in each]
+        most = max(range(SENSOR), key=lambda row: len(beyond[row]))
+        if too_many <= 0 or not len(beyond[most]):
             return factors
-        beyond = [np.concatenate([run[row][run[row] > 1.0] for run in above]) for row in range(STATISTICS)]
-        most = max(range(STATISTICS), key=lambda row: len(beyond[row]))
-        factors[most] *= beyond[most].min() * (1.0 + ROUNDING)
+        at_once = min(max(too_many // STATISTICS, 1), len(beyond[most]))
+        factors[most] *= beyond[most][at_once - 1] * (1.0 + ROUNDING)
 
 
 def _cautious(limits: ResidualLimits, name: str, found: Healthy, timing: Timing) -> ResidualLimits:

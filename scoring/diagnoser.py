@@ -56,7 +56,7 @@ class Diagnoser:
     ) -> None:
         """Keep a block, (n, fans) each but t_ns, (n,). command: NaN where it is not known. offset_command: what of the
         balance is the fan's own. offset_s: of how many seconds of healthy running that is known. usual_command: what
-        the healthy balance is at these speeds beside that.
+        the healthy balance is at these speeds beside that, NaN where they are not known.
         """
         if step_ns != self._step_ns:
             self._blocks.clear()
@@ -128,7 +128,10 @@ class Diagnoser:
     def window(self, fan: int, t_ns: int, onset_t_ns: int, seconds: float = WINDOW_S) -> Window | None:
         """The last seconds, at most WINDOW_S, of a fan up to t_ns; None where there are none."""
         first_t_ns = t_ns - min(round(seconds * NS_PER_S), MOST_SAMPLES * self._step_ns)
-        times = np.concatenate([block.t_ns for block in self._blocks])
+        blocks = [block for block in self._blocks if first_t_ns < block.t_ns[-1] and block.t_ns[0] <= t_ns]
+        if not blocks:
+            return None
+        times = np.concatenate([block.t_ns for block in blocks])
         rows = (times > first_t_ns) & (times <= t_ns)
         if np.count_nonzero(rows) < 2:
             return None
@@ -137,10 +140,10 @@ class Diagnoser:
         if place[-1] < 1:
             return None
         command, speed = np.full(place[-1] + 1, np.nan), np.full(place[-1] + 1, np.nan)
-        usual = np.zeros(place[-1] + 1)
-        command[place] = self._kept("command", fan, rows)
-        speed[place] = self._kept("speed_rad_s", fan, rows)
-        usual[place] = self._kept("usual_command", fan, rows)
+        usual = np.full(place[-1] + 1, np.nan)
+        command[place] = _kept(blocks, "command", fan, rows)
+        speed[place] = _kept(blocks, "speed_rad_s", fan, rows)
+        usual[place] = _kept(blocks, "usual_command", fan, rows)
         healthy, step_s = self._healthy[fan], self._step_ns / NS_PER_S
         of_a_second = healthy.sigma_command * summed_deviation(healthy.autocorrelation_time_s, step_s)
         for values in (command, speed):
@@ -152,9 +155,10 @@ class Diagnoser:
             speed_rad_s=speed,
             onset=int(place[min(onset, len(place) - 1)]),
             usual=usual,
-            offset=float(self._kept("offset_command", fan, rows)[-1]),
-            offset_std_error=of_a_second / math.sqrt(max(self._kept("offset_s", fan, rows)[-1], step_s)),
+            offset=float(_kept(blocks, "offset_command", fan, rows)[-1]),
+            offset_std_error=of_a_second / math.sqrt(max(_kept(blocks, "offset_s", fan, rows)[-1], step_s)),
         )
 
-    def _kept(self, column: str, fan: int, rows: Array) -> Array:
-        return np.concatenate([getattr(block, column)[:, fan] for block in self._blocks])[rows]
+
+def _kept(blocks: Sequence[_Block], column: str, fan: int, rows: Array) -> Array:
+    return np.concatenate([getattr(block, column)[:, fan] for block in blocks])[rows]

@@ -45,6 +45,9 @@ def fan_offsets(runs: Sequence[Cells], centres_rad_s: Array, step_s: float) -> F
     seconds = count * step_s
     weight = np.where(seconds >= LEAST_S, np.minimum(seconds / WHOLE_S, 1.0), 0.0)
     runs_of = _by_fan(weight, numbers)
+    seen = runs_of.sum(axis=0) > 0.0
+    if not seen.any():
+        return None
     own = of_all = np.zeros_like(runs_of)
     for _ in range(ROUNDS):
         of_day = _mean(weight, mean - own[numbers])
@@ -52,7 +55,6 @@ def fan_offsets(runs: Sequence[Cells], centres_rad_s: Array, step_s: float) -> F
         of_all = (runs_of * own).sum(axis=0) / np.maximum(runs_of.sum(axis=0), LEAST)
         own = own - _mean(runs_of, own - of_all)  # what a fan is off by at all speeds alike is its baseline's
     of_day = _mean(weight, mean - own[numbers])
-    seen = runs_of.sum(axis=0) > 0.0
     left_over = (weight * np.square(mean - of_day - own[numbers])).sum()
     parameters = (
         np.count_nonzero(runs_of) + np.count_nonzero(weight.any(axis=1)) - np.count_nonzero(runs_of.any(axis=1))

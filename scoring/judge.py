@@ -101,7 +101,7 @@ class Judge:
         self.origin_t_ns: int | None = None
         self.interval = 0
         self._interval_ns = max(1, round(limits.timing.baseline_s * NS_PER_S))
-        self._watched: list[tuple[Array, Array, Array]] | None = None
+        self._watched: list[tuple[Array, ...]] | None = None
 
     def update(self, block: Samples) -> Verdict:
         """Judge a block of at least one sample."""
@@ -129,13 +129,14 @@ class Judge:
         for residual in (self.speed, self.balance):
             residual.cusum.uncap()
 
-    def watched(self) -> tuple[Array, Array, Array]:
-        """(7, n, fans) the ratios since the last call, in the order of Statistic from 1 on, (2, n, fans) both
-        standardised residuals, and (n, fans) the motion, see scoring.motion.
+    def watched(self) -> tuple[Array, Array, Array, Array]:
+        """Since the last call: (7, n, fans) the ratios, in the order of Statistic from 1 on; of both residuals, (2, n,
+        fans) standardised, and what is usual at these speeds; (n, fans) the motion, see scoring.motion.
         """
         assert self._watched is not None
-        (ratios, standard, motion_rad_s), self._watched = zip(*self._watched, strict=True), []
-        return np.concatenate(ratios, axis=1), np.concatenate(standard, axis=1), np.concatenate(motion_rad_s)
+        (ratios, standard, usual, motion_rad_s), self._watched = zip(*self._watched, strict=True), []
+        every, both, known = (np.concatenate(one, axis=1) for one in (ratios, standard, usual))
+        return every, both, known, np.concatenate(motion_rad_s)
 
     def forget(self, fans: Array) -> None:
         """Take new baselines of some fans, (fans,) of bool."""
@@ -186,7 +187,7 @@ class Judge:
         sensor = self.sensor.update(speed_rad_s, block.missing[rows], alive, block.step_ns)
         ratios = np.concatenate((*parts, np.where(alive, sensor, 0.0)[np.newaxis]))
         if self._watched is not None:
-            self._watched.append((ratios, np.stack(standardised), motion_rad_s))
+            self._watched.append((ratios, np.stack(standardised), np.stack(usuals), motion_rad_s))
         largest = ratios.argmax(axis=0)
         score = np.take_along_axis(ratios, largest[np.newaxis], axis=0)[0]
         highest = score.max(axis=0)

@@ -23,7 +23,7 @@ class FanOffsets(_Part):
     """What the healthy residual of each fan is at these speeds, either way round. offset_sigmas: (fans, speeds)."""
 
     speeds_rad_s: tuple[float, ...] = Field(min_length=1)
-    offset_sigmas: tuple[tuple[float, ...], ...]
+    offset_sigmas: tuple[tuple[float, ...], ...] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _consistent(self) -> FanOffsets:

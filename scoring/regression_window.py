@@ -76,7 +76,7 @@ class Window:
 
     onset: index of the first anomalous sample, as the detector has it. offset: balance of this fan when healthy, from
     commissioning, and its standard error. usual: (n,) what the healthy balance is at each speed beside that, from
-    calibration. All in units of the command.
+    calibration, NaN where the speed is not known. All in units of the command.
     """
 
     step_s: float
@@ -118,7 +118,7 @@ class RegressionWindow:
         self._enough = valid >= self.per_row / 2.0
         self._enough_before_onset = (self._ends <= window.onset)[self._enough]
         self._weight = counts / np.repeat(np.maximum(valid, 1.0), self.per_row)[: len(counts)]
-        healthy_balance = np.broadcast_to(window.offset + window.usual, speed.shape)[:-1]
+        healthy_balance = (window.offset + _bridged(np.broadcast_to(window.usual, speed.shape)))[:-1]
         residual = acting - coefficients @ motion - healthy_balance
         fixed = np.vstack((residual, _independent(errors) @ motion))
         self._fixed = self._whole(fixed)

@@ -150,7 +150,7 @@ def _take(
 ) -> None:
     verdict = judge.update(block)
     judged = np.isfinite(verdict.score)
-    ratios, standard, motion_rad_s = judge.watched()
+    ratios, standard, usual, motion_rad_s = judge.watched()
     windows.add(block.t_ns, block.step_ns, ratios, judged)
     healthy.step_s = block.step_ns / 1e9
     healthy.fan_s += float(judged.sum()) * healthy.step_s
@@ -169,7 +169,7 @@ def _take(
             moments = healthy.moments[name]
             moments.growth += float(ratios[first + 2][use].sum())
             moments.lasting += _sums(bins[use].astype(int), SPEED_BINS, np.square(ratios[first][use]))
-            shift = np.clip(np.where(use, residual - baseline, np.nan), -WILD, WILD)
+            shift = np.clip(np.where(use, residual - usual[first // 3] - baseline, np.nan), -WILD, WILD)
             _note(moments, cells[name], shift, bins, seconds[first].of(shift, healthy.step_s))
             lasts = seconds[first + 1].of(np.where(use, standard[first // 3], np.nan), healthy.step_s)
             moments.standard += _below(np.square(lasts))

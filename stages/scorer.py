@@ -251,8 +251,8 @@ class ScorerCore(Core):
         valid = np.isfinite(verdict.score)
         balance_baseline = verdict.balance_baseline * sigma_command
         told = np.where(np.isin(why_not, (WhyNot.GAP, WhyNot.STALE)), np.nan, command)
-        usual, known_s = verdict.balance_usual * sigma_command, verdict.balance_baseline_s
-        self._diagnoser.take(t_ns, item.step_ns, told, measured, balance_baseline, known_s, usual)
+        usual = np.where(np.isfinite(measured), verdict.balance_usual * sigma_command, np.nan)
+        self._diagnoser.take(t_ns, item.step_ns, told, measured, balance_baseline, verdict.balance_baseline_s, usual)
         state, changes = self._desk.states(t_ns, item.step_ns, verdict.score, valid)
         why_not = np.where(valid, WhyNot.NONE, np.where(why_not == WhyNot.NONE, WhyNot.WARMING_UP, why_not))
         self._not_judged.update(item.step_ns, valid, why_not.astype(np.uint8))
@@ -373,6 +373,12 @@ def _healthy(context: Context, twin: TwinFile) -> Healthy:
             f"{context.tray.twin}: its calibration cannot be used: {where}: {error.errors()[0]['msg']}; "
             "calibrate it anew: fantwin calibrate"
         ) from error
+    for part in (limits.speed, limits.balance):
+        if part.fans is not None and len(part.fans.offset_sigmas) != context.tray.fans:
+            raise StageError(
+                f"{context.tray.twin}: its calibration is of {len(part.fans.offset_sigmas)} fans, the tray has "
+                f"{context.tray.fans}; calibrate it anew: fantwin calibrate"
+            )
     return Healthy(twin.sha256, limits, twin.healthy_balances(), twin.command_unit)
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from scoring.alarm_rate import dispersion, poisson_interval, rate_interval
-from scoring.calibration import TooLittleError, calibrate
+from scoring.calibration import TooLittleError, _no_oftener, calibrate
 from scoring.judge import Judge
 from scoring.limits import Limits, Timing
-from scoring.survey import Running, Runs, survey
+from scoring.survey import Healthy, Running, Runs, survey
 from scoring.tail import Tail
 from scoring.windows import Windows, peaks
 from tests.healthy_residuals import Raised, alarms_of, autoregressive, in_blocks, samples_of
@@ -201,6 +201,8 @@ def test_what_the_twin_is_wrong_by_of_each_fan_is_learned_where_it_knows_them_on
     assert known.speed.fans is not None
     assert len(known.speed.fans.offset_sigmas) == 10
     assert known.speed.adaptation_sigmas < 0.65 * unknown.speed.adaptation_sigmas, "the limit of a step, in sigma"
+    assert np.abs(known.speed.offset_sigmas).max() < 0.3, "what is the fans' own is not there once more"
+    assert known.speed.mean_spread < unknown.speed.mean_spread - 0.05
     fresh = list(days(24, 0, 4, wrong_sigmas=1.0)())
     assert sum(len(alarms_of(known, blocks, fans)) for fans, blocks, _ in fresh) <= 7  # three are declared
     with pytest.raises(ValueError, match="limits of 10 fans for 3"):
@@ -226,6 +228,16 @@ def test_the_recordings_themselves_have_no_more_alarms_than_declared() -> None:
     limits = calibrate(with_one_that_strays, TOP_RAD_S, Timing(), declared)
     alarms = sum(len(alarms_of(limits, blocks, fans)) for fans, blocks, _ in with_one_that_strays())
     assert alarms <= declared * 8 * 90.0 * 10 / 86_400.0
+
+
+def test_the_tacho_has_its_own_limits_and_widens_no_others() -> None:
+    # The seventh row, of the tacho, is beyond its limit for ever: no factor of the others can help that.
+    maxima = np.full((20, 8, 3), 0.5)
+    maxima[::3, 6] = 1.5
+    found = Healthy(TOP_RAD_S, maxima=[maxima])
+    np.testing.assert_array_equal(_no_oftener(found, np.ones(7), 0), np.ones(7))
+    maxima[::4, 2, 1] = 3.0
+    np.testing.assert_allclose(_no_oftener(found, np.ones(7), 0), [1.0, 1.0, 3.0, 1.0, 1.0, 1.0, 1.0])
 
 
 # What they find

@@ -255,6 +255,9 @@ def test_what_calibration_found_usual_at_a_speed_is_no_fault() -> None:
     assert diagnose(whole, data.HEALTHY).first.cause != "cannot_tell"
     known = diagnose(replace(whole, usual=usual), data.HEALTHY)
     assert known.first.cause == "cannot_tell"
+    missing = np.random.default_rng(7).random(len(readings)) < 0.02
+    some = replace(whole, speed_rad_s=np.where(missing, np.nan, readings), usual=np.where(missing, np.nan, usual))
+    assert diagnose(some, data.HEALTHY).first.cause == "cannot_tell"
 
 
 def test_what_the_fan_showed_at_commissioning_is_no_fault() -> None:

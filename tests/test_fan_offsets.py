@@ -60,6 +60,11 @@ def test_of_few_fans_or_days_nothing_is_said(fans: int, days: int) -> None:
     assert fan_offsets(runs_of(np.zeros((fans, BINS)), days, noise=1.0), CENTRES, STEP_S) is None
 
 
+def test_of_runs_that_were_nowhere_for_long_nothing_is_said() -> None:
+    short = [Cells(run.known_as, run.count / 20.0, run.total) for run in runs_of(np.zeros((5, BINS)), 12, noise=1.0)]
+    assert fan_offsets(short, CENTRES, STEP_S) is None
+
+
 def test_a_table_with_a_hole_is_refused() -> None:
     with pytest.raises(ValueError, match="one value for each"):
         FanOffsets(speeds_rad_s=(1.0, 2.0), offset_sigmas=((0.0, 0.0), (0.0,)))

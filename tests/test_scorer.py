@@ -320,6 +320,16 @@ def test_a_calibration_that_cannot_be_used_is_told_in_one_line(tmp_path: Path) -
     assert STAGE.check(context) == [str(refused.value)]
 
 
+@pytest.mark.parametrize("fans", [1, 3])
+def test_a_calibration_of_another_number_of_fans_is_told_in_one_line(tmp_path: Path, fans: int) -> None:
+    own = {"speeds_rad_s": [100.0], "offset_sigmas": [[0.5]] * fans}
+    context = context_of(tmp_path, calibration={"speed": {"fans": own}, "balance": {}})
+    (problem,) = STAGE.check(context)
+    assert f"its calibration is of {fans} fans, the tray has 2; calibrate it anew" in problem
+    with pytest.raises(StageError, match="calibrate it anew"):
+        STAGE.build(context)
+
+
 # requests
 
 

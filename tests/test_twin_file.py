@@ -82,7 +82,7 @@ def test_of_an_older_card_errors_are_known_one_by_one(tmp_path: Path) -> None:
     balance = TwinFile.load(write_twin(tmp_path / "twin.onnx", balance=older), 1).balance
     np.testing.assert_allclose(balance.covariance[0], np.diag(np.square(older["std_errors"][0])))
     older["std_errors"] = [[1.0, 1.0, 1.0]]
-    assert "balance" in _refusal(write_twin(tmp_path / "twin.onnx", balance=older))
+    assert "std_errors must have four numbers" in _refusal(write_twin(tmp_path / "twin.onnx", balance=older))
 
 
 def test_a_calibration_is_carried_as_it_stands(tmp_path: Path) -> None:
@@ -98,6 +98,8 @@ def test_a_balance_that_makes_no_sense_is_refused_by_name(tmp_path: Path) -> Non
         ({"inertia": [0.1, 0.1]}, "balance.inertia must have one value for each fan"),
         ({"covariance": [[[1.0, 1.0, 1.0]] * 4]}, "balance.covariance"),
         ({"filter_rate_per_s": 0.0}, "balance.filter_rate_per_s"),
+        ({"covariance": [np.diag([1.0, 1.0, -1.0, 1.0]).tolist()]}, "no variance below zero"),
+        ({"covariance": [np.triu(np.ones((4, 4))).tolist()]}, "must be symmetric"),
     ):
         assert named in _refusal(write_twin(tmp_path / "twin.onnx", balance=whole | changes))
     assert "balance" in _refusal(write_twin(tmp_path / "twin.onnx", balance=None))
