@@ -464,5 +464,5 @@ def test_the_output_is_a_recording_that_is_decided_the_same(tmp_path):
 def test_the_golden_recording_is_decided_as_it_was():
     tray = verified(Path(__file__).parent / "data" / "golden.mcap")
     assert tray.plan.restarts == 2, "two stages were killed while it was made"
-    assert made_equal(tray) > 500
+    assert made_equal(tray) > 400
     assert tray.comparison and tray.comparison.alarms_equal >= 2

@@ -251,7 +251,7 @@ def test_without_the_extra_the_stage_loads_and_building_it_says_what_to_install(
     monkeypatch.setitem(sys.modules, "rerun", None)
     for name in [name for name in sys.modules if name.startswith("pipeline.rerun")]:
         monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(StageError, match=r"pip install 'fantwin\[view\]'"):
+    with pytest.raises(StageError, match=r"pip install -e '\.\[view\]'"):
         build(context(tmp_path))
 
 
