@@ -65,7 +65,7 @@ class BalanceCard(_OfCard):
     @classmethod
     def _of_older_card(cls, card: Any) -> Any:
         """Cards once had the errors one by one; how they go together is not known of those."""
-        if isinstance(card, dict) and "covariance" not in card and "std_errors" in card:
+        if isinstance(card, dict) and card.get("covariance") is None and "std_errors" in card:
             try:
                 errors = TypeAdapter(tuple[Four, ...]).validate_python(card["std_errors"])
             except ValidationError as error:
