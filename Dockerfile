@@ -8,6 +8,7 @@ COPY schemas schemas
 COPY scoring scoring
 COPY pipeline pipeline
 COPY stages stages
+COPY simulation simulation
 COPY twin twin
 RUN pip install --no-cache-dir --no-deps . && useradd --create-home --uid 1000 fantwin \
     && mkdir /runs && chown fantwin /runs

@@ -15,7 +15,7 @@ COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --gen
 TORCH := torch==2.13.0
 BENCHES := published_table interval_coverage rough_table measured_table onnx_speed training_race restart \
 	recorder_throughput recorder_kills replay_bus replay_speed
-SOURCES := schemas scoring pipeline stages twin tests bench
+SOURCES := schemas scoring pipeline simulation stages twin tests bench
 
 .PHONY: demo test check bench schema twin lock clean
 .DEFAULT_GOAL := demo

@@ -1,5 +1,5 @@
 """`python -m pipeline` is the command line: how the launcher starts stages."""
 
-from pipeline.command_line import main
+from pipeline.cli.main import main
 
 main()

@@ -1,6 +1,7 @@
 """Blocks: several messages of one kind made one, and one cut into several.
 
-A message holds one sample or many (docs/messages.md); what a stage makes of samples does not depend on how they are cut
+A message holds one sample or many (docs/reference/messages.md); what a stage makes of samples does not depend on how
+they are cut
 into messages. So whoever has many small messages at hand may join them and spare the work that each one costs.
 """
 

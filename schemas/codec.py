@@ -19,12 +19,13 @@ from schemas.messages import (
     MESSAGE_TYPES,
     Action,
     Array,
-    Cause,
     Counter,
     Diagnosis,
     FanState,
     Header,
     Input,
+    InputPosition,
+    InvalidReason,
     Message,
     Output,
     Prediction,
@@ -33,7 +34,6 @@ from schemas.messages import (
     StageStatus,
     Statistic,
     Transition,
-    WhyNot,
     columns,
 )
 
@@ -46,15 +46,15 @@ _ENUMS = {
     "statistic": Statistic,
     "action": Action,
 }
-_ENUM_COLUMNS = {"why_not": max(WhyNot), "state": max(FanState), "statistic": max(Statistic)}
+_ENUM_COLUMNS = {"invalid_reason": max(InvalidReason), "state": max(FanState), "statistic": max(Statistic)}
 _OF_SOME_DEVICES = {"device_clock_us", "device_sequence"}  # the only columns of samples that may be empty
 _ADDED_LATER: dict[type[Message], set[str]] = {
     Prediction: {"torque_balance_command", "torque_balance_sigma_command"},
     Score: {"torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic"},
 }
 """columns that older recordings do not have: they read as NaN, or 0"""
-LARGEST_STEP_NS = 86_400_000_000_000  # a day
-FURTHEST_T_NS = (1 << 62) - LARGEST_STEP_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits
+LARGEST_PERIOD_NS = 86_400_000_000_000  # a day
+FURTHEST_T_NS = (1 << 62) - LARGEST_PERIOD_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits
 _FURTHEST = {"host_receive_t_ns": FURTHEST_T_NS, "t_ns": 1 << 62}  # the grid may go a little beyond what was received
 _FEW = 48  # up to so many values a list is a quicker way into an array than the protobuf field itself
 _SCALARS = {
@@ -125,13 +125,13 @@ def encode(message: Message) -> bytes:
     proto.header.producer = message.header.producer
     proto.header.sequence = message.header.sequence
     proto.header.tray = message.header.tray
-    if (cause := message.header.cause) is not None:
-        proto.header.cause.topic = cause.topic
-        proto.header.cause.producer = cause.producer
-        proto.header.cause.sequence = cause.sequence
-        proto.header.cause.taken = cause.taken
-        proto.header.cause.since = cause.since
-        proto.header.cause.by_time = cause.by_time
+    if (position := message.header.input_position) is not None:
+        proto.header.input_position.topic = position.topic
+        proto.header.input_position.producer = position.producer
+        proto.header.input_position.sequence = position.sequence
+        proto.header.input_position.consumed_count = position.consumed_count
+        proto.header.input_position.contiguous_from = position.contiguous_from
+        proto.header.input_position.from_timer = position.from_timer
     for name in _SCALARS[kind]:
         value = getattr(message, name)
         if name in _RECORDS:
@@ -197,11 +197,13 @@ def decode(message_type: type[Message], data: bytes) -> Message:
 
 
 def _header(proto: Any) -> Header:
-    cause = None
-    if proto.HasField("cause"):
-        made = proto.cause
-        cause = Cause(made.topic, made.producer, made.sequence, made.taken, made.since, made.by_time)
-    return Header(proto.producer, proto.sequence, proto.tray, cause)
+    position = None
+    if proto.HasField("input_position"):
+        of = proto.input_position
+        position = InputPosition(
+            of.topic, of.producer, of.sequence, of.consumed_count, of.contiguous_from, of.from_timer
+        )
+    return Header(proto.producer, proto.sequence, proto.tray, position)
 
 
 def _array(message_type: type[Message], column: _Column, field: Any) -> Array:
@@ -232,9 +234,9 @@ def _sample_count(message: Message) -> int:
 
 
 def _check_step(message: Message) -> None:
-    step_ns = getattr(message, "step_ns", 1)
-    if not 0 < step_ns <= LARGEST_STEP_NS:
-        raise CodecError(f"{type_name(type(message))}.step_ns = {step_ns}: a step is 1 ns to a day")
+    period_ns = getattr(message, "period_ns", 1)
+    if not 0 < period_ns <= LARGEST_PERIOD_NS:
+        raise CodecError(f"{type_name(type(message))}.period_ns = {period_ns}: a step is 1 ns to a day")
 
 
 def _check_limits(message_type: type[Message], column: _Column, values: list[int] | Array) -> None:

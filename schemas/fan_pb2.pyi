@@ -7,16 +7,16 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
-class WhyNot(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+class InvalidReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
-    WHY_NOT_NONE: _ClassVar[WhyNot]
-    WHY_NOT_STALE: _ClassVar[WhyNot]
-    WHY_NOT_GAP: _ClassVar[WhyNot]
-    WHY_NOT_WARMING_UP: _ClassVar[WhyNot]
-    WHY_NOT_OUT_OF_RANGE: _ClassVar[WhyNot]
-    WHY_NOT_SATURATED: _ClassVar[WhyNot]
-    WHY_NOT_NO_SPEED: _ClassVar[WhyNot]
-    WHY_NOT_NO_TWIN: _ClassVar[WhyNot]
+    INVALID_REASON_NONE: _ClassVar[InvalidReason]
+    INVALID_REASON_STALE: _ClassVar[InvalidReason]
+    INVALID_REASON_GAP: _ClassVar[InvalidReason]
+    INVALID_REASON_WARMING_UP: _ClassVar[InvalidReason]
+    INVALID_REASON_OUT_OF_RANGE: _ClassVar[InvalidReason]
+    INVALID_REASON_SATURATED: _ClassVar[InvalidReason]
+    INVALID_REASON_NO_SPEED: _ClassVar[InvalidReason]
+    INVALID_REASON_NO_TWIN: _ClassVar[InvalidReason]
 
 class FanState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -30,12 +30,12 @@ class FanState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
 class Statistic(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     STATISTIC_NONE: _ClassVar[Statistic]
-    STATISTIC_SPEED_STEP: _ClassVar[Statistic]
+    STATISTIC_SPEED_SMOOTHED: _ClassVar[Statistic]
     STATISTIC_SPEED_DRIFT: _ClassVar[Statistic]
-    STATISTIC_SPEED_SPREAD: _ClassVar[Statistic]
-    STATISTIC_BALANCE_STEP: _ClassVar[Statistic]
+    STATISTIC_SPEED_VARIANCE_GROWTH: _ClassVar[Statistic]
+    STATISTIC_BALANCE_SMOOTHED: _ClassVar[Statistic]
     STATISTIC_BALANCE_DRIFT: _ClassVar[Statistic]
-    STATISTIC_BALANCE_SPREAD: _ClassVar[Statistic]
+    STATISTIC_BALANCE_VARIANCE_GROWTH: _ClassVar[Statistic]
     STATISTIC_SENSOR: _ClassVar[Statistic]
 
 class Transition(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
@@ -55,7 +55,7 @@ class Transition(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     TRANSITION_OUT_OF_SERVICE: _ClassVar[Transition]
     TRANSITION_IN_SERVICE: _ClassVar[Transition]
     TRANSITION_COMMISSIONING: _ClassVar[Transition]
-    TRANSITION_RESTATED: _ClassVar[Transition]
+    TRANSITION_REPUBLISHED: _ClassVar[Transition]
     TRANSITION_REFUSED: _ClassVar[Transition]
 
 class Action(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
@@ -84,14 +84,14 @@ class StageStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     STAGE_STATUS_OK: _ClassVar[StageStatus]
     STAGE_STATUS_DEGRADED: _ClassVar[StageStatus]
     STAGE_STATUS_STOPPED: _ClassVar[StageStatus]
-WHY_NOT_NONE: WhyNot
-WHY_NOT_STALE: WhyNot
-WHY_NOT_GAP: WhyNot
-WHY_NOT_WARMING_UP: WhyNot
-WHY_NOT_OUT_OF_RANGE: WhyNot
-WHY_NOT_SATURATED: WhyNot
-WHY_NOT_NO_SPEED: WhyNot
-WHY_NOT_NO_TWIN: WhyNot
+INVALID_REASON_NONE: InvalidReason
+INVALID_REASON_STALE: InvalidReason
+INVALID_REASON_GAP: InvalidReason
+INVALID_REASON_WARMING_UP: InvalidReason
+INVALID_REASON_OUT_OF_RANGE: InvalidReason
+INVALID_REASON_SATURATED: InvalidReason
+INVALID_REASON_NO_SPEED: InvalidReason
+INVALID_REASON_NO_TWIN: InvalidReason
 FAN_STATE_UNKNOWN: FanState
 FAN_STATE_NORMAL: FanState
 FAN_STATE_SUSPECT: FanState
@@ -99,12 +99,12 @@ FAN_STATE_ALARM: FanState
 FAN_STATE_RETURNING: FanState
 FAN_STATE_COMMISSIONING: FanState
 STATISTIC_NONE: Statistic
-STATISTIC_SPEED_STEP: Statistic
+STATISTIC_SPEED_SMOOTHED: Statistic
 STATISTIC_SPEED_DRIFT: Statistic
-STATISTIC_SPEED_SPREAD: Statistic
-STATISTIC_BALANCE_STEP: Statistic
+STATISTIC_SPEED_VARIANCE_GROWTH: Statistic
+STATISTIC_BALANCE_SMOOTHED: Statistic
 STATISTIC_BALANCE_DRIFT: Statistic
-STATISTIC_BALANCE_SPREAD: Statistic
+STATISTIC_BALANCE_VARIANCE_GROWTH: Statistic
 STATISTIC_SENSOR: Statistic
 TRANSITION_NONE: Transition
 TRANSITION_RAISED: Transition
@@ -121,7 +121,7 @@ TRANSITION_UNSUPPRESSED: Transition
 TRANSITION_OUT_OF_SERVICE: Transition
 TRANSITION_IN_SERVICE: Transition
 TRANSITION_COMMISSIONING: Transition
-TRANSITION_RESTATED: Transition
+TRANSITION_REPUBLISHED: Transition
 TRANSITION_REFUSED: Transition
 ACTION_NONE: Action
 ACTION_ACKNOWLEDGE: Action
@@ -143,32 +143,32 @@ STAGE_STATUS_DEGRADED: StageStatus
 STAGE_STATUS_STOPPED: StageStatus
 
 class Header(_message.Message):
-    __slots__ = ("producer", "sequence", "tray", "cause")
+    __slots__ = ("producer", "sequence", "tray", "input_position")
     PRODUCER_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     TRAY_FIELD_NUMBER: _ClassVar[int]
-    CAUSE_FIELD_NUMBER: _ClassVar[int]
+    INPUT_POSITION_FIELD_NUMBER: _ClassVar[int]
     producer: str
     sequence: int
     tray: str
-    cause: Cause
-    def __init__(self, producer: _Optional[str] = ..., sequence: _Optional[int] = ..., tray: _Optional[str] = ..., cause: _Optional[_Union[Cause, _Mapping]] = ...) -> None: ...
+    input_position: InputPosition
+    def __init__(self, producer: _Optional[str] = ..., sequence: _Optional[int] = ..., tray: _Optional[str] = ..., input_position: _Optional[_Union[InputPosition, _Mapping]] = ...) -> None: ...
 
-class Cause(_message.Message):
-    __slots__ = ("topic", "producer", "sequence", "taken", "since", "by_time")
+class InputPosition(_message.Message):
+    __slots__ = ("topic", "producer", "sequence", "consumed_count", "contiguous_from", "from_timer")
     TOPIC_FIELD_NUMBER: _ClassVar[int]
     PRODUCER_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
-    TAKEN_FIELD_NUMBER: _ClassVar[int]
-    SINCE_FIELD_NUMBER: _ClassVar[int]
-    BY_TIME_FIELD_NUMBER: _ClassVar[int]
+    CONSUMED_COUNT_FIELD_NUMBER: _ClassVar[int]
+    CONTIGUOUS_FROM_FIELD_NUMBER: _ClassVar[int]
+    FROM_TIMER_FIELD_NUMBER: _ClassVar[int]
     topic: str
     producer: str
     sequence: int
-    taken: int
-    since: int
-    by_time: bool
-    def __init__(self, topic: _Optional[str] = ..., producer: _Optional[str] = ..., sequence: _Optional[int] = ..., taken: _Optional[int] = ..., since: _Optional[int] = ..., by_time: _Optional[bool] = ...) -> None: ...
+    consumed_count: int
+    contiguous_from: int
+    from_timer: bool
+    def __init__(self, topic: _Optional[str] = ..., producer: _Optional[str] = ..., sequence: _Optional[int] = ..., consumed_count: _Optional[int] = ..., contiguous_from: _Optional[int] = ..., from_timer: _Optional[bool] = ...) -> None: ...
 
 class Raw(_message.Message):
     __slots__ = ("header", "fans", "host_receive_t_ns", "device_clock_us", "device_sequence", "command", "speed_rad_s")
@@ -189,60 +189,60 @@ class Raw(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., host_receive_t_ns: _Optional[_Iterable[int]] = ..., device_clock_us: _Optional[_Iterable[int]] = ..., device_sequence: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Grid(_message.Message):
-    __slots__ = ("header", "fans", "step_ns", "t_ns", "command", "speed_rad_s", "valid", "why_not")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "speed_rad_s", "valid", "invalid_reason")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
-    STEP_NS_FIELD_NUMBER: _ClassVar[int]
+    PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
     T_NS_FIELD_NUMBER: _ClassVar[int]
     COMMAND_FIELD_NUMBER: _ClassVar[int]
     SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
     VALID_FIELD_NUMBER: _ClassVar[int]
-    WHY_NOT_FIELD_NUMBER: _ClassVar[int]
+    INVALID_REASON_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
-    step_ns: int
+    period_ns: int
     t_ns: _containers.RepeatedScalarFieldContainer[int]
     command: _containers.RepeatedScalarFieldContainer[float]
     speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
     valid: _containers.RepeatedScalarFieldContainer[bool]
-    why_not: _containers.RepeatedScalarFieldContainer[WhyNot]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., step_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., why_not: _Optional[_Iterable[_Union[WhyNot, str]]] = ...) -> None: ...
+    invalid_reason: _containers.RepeatedScalarFieldContainer[InvalidReason]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., speed_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ...) -> None: ...
 
 class Prediction(_message.Message):
-    __slots__ = ("header", "fans", "step_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "why_not", "twin", "torque_balance_command", "torque_balance_sigma_command")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "sigma_rad_s", "valid", "invalid_reason", "twin", "torque_balance_command", "torque_balance_sigma_command")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
-    STEP_NS_FIELD_NUMBER: _ClassVar[int]
+    PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
     T_NS_FIELD_NUMBER: _ClassVar[int]
     COMMAND_FIELD_NUMBER: _ClassVar[int]
     MEASURED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
     PREDICTED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
     SIGMA_RAD_S_FIELD_NUMBER: _ClassVar[int]
     VALID_FIELD_NUMBER: _ClassVar[int]
-    WHY_NOT_FIELD_NUMBER: _ClassVar[int]
+    INVALID_REASON_FIELD_NUMBER: _ClassVar[int]
     TWIN_FIELD_NUMBER: _ClassVar[int]
     TORQUE_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
     TORQUE_BALANCE_SIGMA_COMMAND_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
-    step_ns: int
+    period_ns: int
     t_ns: _containers.RepeatedScalarFieldContainer[int]
     command: _containers.RepeatedScalarFieldContainer[float]
     measured_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
     predicted_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
     sigma_rad_s: _containers.RepeatedScalarFieldContainer[float]
     valid: _containers.RepeatedScalarFieldContainer[bool]
-    why_not: _containers.RepeatedScalarFieldContainer[WhyNot]
+    invalid_reason: _containers.RepeatedScalarFieldContainer[InvalidReason]
     twin: str
     torque_balance_command: _containers.RepeatedScalarFieldContainer[float]
     torque_balance_sigma_command: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., step_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., why_not: _Optional[_Iterable[_Union[WhyNot, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Score(_message.Message):
-    __slots__ = ("header", "fans", "step_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "lower_bound_rad_s", "upper_bound_rad_s", "band_variance", "residual_rad_s", "smoothed_residual_rad_s", "outside", "state", "valid", "why_not", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "lower_bound_rad_s", "upper_bound_rad_s", "band_variance", "residual_rad_s", "smoothed_residual_rad_s", "outside", "state", "valid", "invalid_reason", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
-    STEP_NS_FIELD_NUMBER: _ClassVar[int]
+    PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
     T_NS_FIELD_NUMBER: _ClassVar[int]
     COMMAND_FIELD_NUMBER: _ClassVar[int]
     MEASURED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
@@ -255,7 +255,7 @@ class Score(_message.Message):
     OUTSIDE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
     VALID_FIELD_NUMBER: _ClassVar[int]
-    WHY_NOT_FIELD_NUMBER: _ClassVar[int]
+    INVALID_REASON_FIELD_NUMBER: _ClassVar[int]
     TORQUE_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
     SPEED_BASELINE_RAD_S_FIELD_NUMBER: _ClassVar[int]
     BALANCE_BASELINE_COMMAND_FIELD_NUMBER: _ClassVar[int]
@@ -263,7 +263,7 @@ class Score(_message.Message):
     STATISTIC_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
-    step_ns: int
+    period_ns: int
     t_ns: _containers.RepeatedScalarFieldContainer[int]
     command: _containers.RepeatedScalarFieldContainer[float]
     measured_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
@@ -276,13 +276,13 @@ class Score(_message.Message):
     outside: _containers.RepeatedScalarFieldContainer[bool]
     state: _containers.RepeatedScalarFieldContainer[FanState]
     valid: _containers.RepeatedScalarFieldContainer[bool]
-    why_not: _containers.RepeatedScalarFieldContainer[WhyNot]
+    invalid_reason: _containers.RepeatedScalarFieldContainer[InvalidReason]
     torque_balance_command: _containers.RepeatedScalarFieldContainer[float]
     speed_baseline_rad_s: _containers.RepeatedScalarFieldContainer[float]
     balance_baseline_command: _containers.RepeatedScalarFieldContainer[float]
     score: _containers.RepeatedScalarFieldContainer[float]
     statistic: _containers.RepeatedScalarFieldContainer[Statistic]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., step_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., lower_bound_rad_s: _Optional[_Iterable[float]] = ..., upper_bound_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., residual_rad_s: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., outside: _Optional[_Iterable[bool]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., why_not: _Optional[_Iterable[_Union[WhyNot, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., lower_bound_rad_s: _Optional[_Iterable[float]] = ..., upper_bound_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., residual_rad_s: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., outside: _Optional[_Iterable[bool]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ...) -> None: ...
 
 class Diagnosis(_message.Message):
     __slots__ = ("cause", "probability", "parameter", "change", "change_low", "change_high", "unit", "evidence")
@@ -374,7 +374,7 @@ class Request(_message.Message):
     comment: str
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., action: _Optional[_Union[Action, str]] = ..., fan: _Optional[int] = ..., duration_s: _Optional[float] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ...) -> None: ...
 
-class Memory(_message.Message):
+class ScorerSnapshot(_message.Message):
     __slots__ = ("header", "t_ns", "twin_sha256", "restored", "state_json")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     T_NS_FIELD_NUMBER: _ClassVar[int]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Array: TypeAlias = NDArray[Any]
 
 
-class WhyNot(IntEnum):
+class InvalidReason(IntEnum):
     """Why a sample must not be judged."""
 
     NONE = 0
@@ -44,12 +44,12 @@ class Statistic(IntEnum):
     """Which statistic is the furthest towards its limit."""
 
     NONE = 0
-    SPEED_STEP = 1
+    SPEED_SMOOTHED = 1
     SPEED_DRIFT = 2
-    SPEED_SPREAD = 3
-    BALANCE_STEP = 4
+    SPEED_VARIANCE_GROWTH = 3
+    BALANCE_SMOOTHED = 4
     BALANCE_DRIFT = 5
-    BALANCE_SPREAD = 6
+    BALANCE_VARIANCE_GROWTH = 6
     SENSOR = 7
 
 
@@ -71,7 +71,7 @@ class Transition(IntEnum):
     OUT_OF_SERVICE = 12
     IN_SERVICE = 13
     COMMISSIONING = 14
-    RESTATED = 15
+    REPUBLISHED = 15
     REFUSED = 16
 
 
@@ -109,31 +109,33 @@ class StageStatus(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
+class InputPosition:
     """What a stage had taken of its inputs, for one tray, when it made a message.
 
-    `topic`, `producer` and `sequence` name the message taken last, `taken` counts all, that one included. From `since`
-    on up to `sequence` none is missing. `by_time`: made since, because time had passed or the stage ended, and not on
+    `topic`, `producer` and `sequence` name the message taken last, `consumed_count` counts all, that one included.
+    From `contiguous_from`
+    on up to `sequence` none is missing. `from_timer`: made since, because time had passed or the stage ended, and not
+    on
     taking it.
     """
 
     topic: str
     producer: str
     sequence: int
-    taken: int
-    since: int
-    by_time: bool = False
+    consumed_count: int
+    contiguous_from: int
+    from_timer: bool = False
 
     @classmethod
-    def after(cls, before: Cause | None, topic: str, header: Header) -> Cause:
+    def after(cls, before: InputPosition | None, topic: str, header: Header) -> InputPosition:
         """What has been taken once a message with this header has, too."""
         follows = before is not None and (before.producer, before.sequence + 1) == (header.producer, header.sequence)
         return cls(
             topic=topic,
             producer=header.producer,
             sequence=header.sequence,
-            taken=before.taken + 1 if before else 1,
-            since=before.since if before and follows else header.sequence,
+            consumed_count=before.consumed_count + 1 if before else 1,
+            contiguous_from=before.contiguous_from if before and follows else header.sequence,
         )
 
 
@@ -144,7 +146,7 @@ class Header:
     producer: str = ""
     sequence: int = 0
     tray: str = ""
-    cause: Cause | None = None
+    input_position: InputPosition | None = None
 
 
 def _column(shape: str, dtype: type) -> Any:
@@ -183,12 +185,12 @@ class Grid:
 
     header: Header = Header()
     fans: int
-    step_ns: int
+    period_ns: int
     t_ns: Array = _samples(np.int64)
     command: Array = _samples_fans(np.float64)
     speed_rad_s: Array = _samples_fans(np.float64)
     valid: Array = _samples_fans(np.bool_)
-    why_not: Array = _samples_fans(np.uint8)
+    invalid_reason: Array = _samples_fans(np.uint8)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -197,14 +199,14 @@ class Prediction:
 
     header: Header = Header()
     fans: int
-    step_ns: int
+    period_ns: int
     t_ns: Array = _samples(np.int64)
     command: Array = _samples_fans(np.float64)
     measured_speed_rad_s: Array = _samples_fans(np.float64)
     predicted_speed_rad_s: Array = _samples_fans(np.float64)
     sigma_rad_s: Array = _fans(np.float64)
     valid: Array = _samples_fans(np.bool_)
-    why_not: Array = _samples_fans(np.uint8)
+    invalid_reason: Array = _samples_fans(np.uint8)
     twin: str = ""
     torque_balance_command: Array = _samples_fans(np.float64)
     torque_balance_sigma_command: Array = _fans(np.float64)
@@ -216,7 +218,7 @@ class Score:
 
     header: Header = Header()
     fans: int
-    step_ns: int
+    period_ns: int
     t_ns: Array = _samples(np.int64)
     command: Array = _samples_fans(np.float64)
     measured_speed_rad_s: Array = _samples_fans(np.float64)
@@ -229,7 +231,7 @@ class Score:
     outside: Array = _samples_fans(np.bool_)
     state: Array = _samples_fans(np.uint8)
     valid: Array = _samples_fans(np.bool_)
-    why_not: Array = _samples_fans(np.uint8)
+    invalid_reason: Array = _samples_fans(np.uint8)
     torque_balance_command: Array = _samples_fans(np.float64)
     speed_baseline_rad_s: Array = _samples_fans(np.float64)
     balance_baseline_command: Array = _samples_fans(np.float64)
@@ -295,7 +297,7 @@ class Request:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Memory:
+class ScorerSnapshot:
     """What a scorer must not forget when it is restarted."""
 
     header: Header = Header()
@@ -386,9 +388,11 @@ class Health:
     process_id: int = 0
 
 
-Message: TypeAlias = Raw | Grid | Prediction | Score | Alarm | Request | Memory | Command | ModelCard | Clock | Health
+Message: TypeAlias = (
+    Raw | Grid | Prediction | Score | Alarm | Request | ScorerSnapshot | Command | ModelCard | Clock | Health
+)
 MESSAGE_TYPES: tuple[type[Message], ...] = (
-    Raw, Grid, Prediction, Score, Alarm, Request, Memory, Command, ModelCard, Clock, Health,
+    Raw, Grid, Prediction, Score, Alarm, Request, ScorerSnapshot, Command, ModelCard, Clock, Health,
 )  # fmt: skip
 
 

@@ -13,13 +13,13 @@ from schemas.messages import (
     Command,
     Grid,
     Health,
-    Memory,
     Message,
     ModelCard,
     Prediction,
     Raw,
     Request,
     Score,
+    ScorerSnapshot,
 )
 
 ON_CHANGE = "on change"
@@ -53,13 +53,15 @@ TOPICS: tuple[Topic, ...] = (
     Topic("score", Score, "as prediction", True, 1024, "judged samples, ready to draw"),
     Topic("alarm", Alarm, ON_CHANGE, True, 1024, "what happened to an alarm"),
     Topic("request", Request, ON_CHANGE, True, 64, "what an operator wants of the alarms"),
-    Topic("memory", Memory, "on change, and each minute", True, 4, "what a scorer must not forget"),
+    Topic("snapshot", ScorerSnapshot, "on change, and each minute", True, 4, "what a scorer must not forget"),
     Topic("command", Command, ON_CHANGE, True, 64, "what is wanted of the fans"),
     Topic("twin", ModelCard, ON_CHANGE, True, 8, "the twin in force"),
     Topic("clock", Clock, "20 Hz", False, 1, "the time of a replay"),
     Topic("health", Health, "1 Hz for each stage", True, 8, "how a stage is"),
 )
 BY_NAME = {topic.name: topic for topic in TOPICS}
+FORMER_NAMES = {"memory": "snapshot"}
+"""what topics were called in recordings of earlier versions"""
 
 
 def tray_key(site: str, tray: str, topic: str) -> str:
@@ -87,5 +89,5 @@ def topic_of(key: str) -> Topic:
     if len(parts) == 5 and parts[0] == ROOT and parts[2] == HEALTH_CHUNK:
         return BY_NAME["health"]
     if len(parts) == 4 and parts[0] == ROOT:
-        return BY_NAME[parts[3]]
+        return BY_NAME[FORMER_NAMES.get(parts[3], parts[3])]
     raise KeyError(key)

@@ -2,7 +2,7 @@
 
 Up the line a device sends samples; down the line a host sends commands and set-points. Two forms, one
 meaning: `binary` (COBS, CRC-32) and `text` (lines that any sketch can print). Numbers are float32 in both, so
-that encoding and decoding are exact inverses on float32 values. Reference: docs/wire-protocol.md.
+that encoding and decoding are exact inverses on float32 values. Reference: docs/reference/wire-protocol.md.
 """
 
 from __future__ import annotations

@@ -1,1 +1,2 @@
-"""Deciding: residuals to statistics, thresholds, states and causes. Pure; docs/deciding.md tells the whole."""
+"""Deciding: residuals to statistics, thresholds, states and causes. Pure; docs/explanation/deciding.md tells the
+whole."""

@@ -1,6 +1,6 @@
 """What the statistics are judged by: how a healthy residual varies, and how far each statistic may go.
 
-`fantwin calibrate` writes this into the twin's card as `calibration`; docs/calibration.md explains each entry. A
+`fantwin calibrate` writes this into the twin's card as `calibration`; docs/how-to/calibrate.md explains each entry. A
 twin that was not calibrated gets limits on its speed residual alone, from the scorer's settings.
 """
 
@@ -49,7 +49,8 @@ class ResidualLimits(_Part):
     own offset may be from none. adaptation_sigmas: how far the baseline may follow afterwards.
 
     lasting: how much more than usual, at these speeds or at all, what lasts of the healthy residual varies;
-    motion_rad_s: and where a fan moves by so much (scoring.motion), root two times as much as where its speed holds,
+    motion_rad_s: and where a fan moves by so much (scoring.detectors.motion), root two times as much as where its
+    speed holds,
     None for no more. baseline_power: a fan's own offset goes with this power of the speed, from baseline_bend_rad_s on
     with one less, and baselines are those at baseline_speed_rad_s. 0 where friction is what differs from day to day, 2
     where it is the density of the air: then the balance is off by a part of the drag, and the speed by that in what a
@@ -120,7 +121,7 @@ class Timing(_Part):
     on_delay_s: float = Field(default=0.1, ge=0)
 
 
-class Promise(_Part):
+class DeclaredRate(_Part):
     """What was declared, and what healthy running it rests on. rates: false alarms per fan and day.
 
     interval_95: of the rate that these limits have, by the healthy running that they were set on. extrapolated: limits
@@ -145,7 +146,7 @@ class Limits(_Part):
     stuck_s: float = Field(default=5.0, gt=0)
     missing_share: float = Field(default=0.25, gt=0, le=1)
     timing: Timing = Timing()
-    promise: Promise | None = None
+    promise: DeclaredRate | None = None
 
     def of(self, fans: range | None) -> Limits:
         """For a tray of some of the fans; None: of fans that the twin does not know one by one."""

@@ -1,7 +1,7 @@
 """Acquisition: bytes of a tray's serial line in, raw samples out; commands back down the same line.
 
 Reads: topic `command` (fan commands in the tray's command unit, set-points in rad/s), and the serial line in the
-protocol of docs/wire-protocol.md (speed in the tray's speed unit).
+protocol of docs/reference/wire-protocol.md (speed in the tray's speed unit).
 Writes: topic `raw`: device clock (us, wraps), device sequence (wraps), host's time of receipt (ns), command,
 speed (rad/s).
 Timing: a message of `block_size` samples as soon as they are there; an incomplete block waits `block_wait_s` at most.
@@ -23,12 +23,13 @@ from typing import TypeAlias
 import numpy as np
 from pydantic import Field
 
-from pipeline.config import RAD_S_PER_UNIT, TrayConfig
-from pipeline.line import Line, LineDown, LineUp, Received
-from pipeline.serial_line import SerialLine
-from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.config.models import TrayConfig
+from pipeline.devices.byte_link import ByteLink, LinkDown, LinkUp, Received
+from pipeline.devices.serial_port import SerialPort
+from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from schemas import wire
 from schemas.messages import Command, Raw
+from schemas.units import RAD_S_PER_UNIT
 
 LARGEST_GAP = 1 << 24  # samples; 46 h at 100 Hz. A larger step of the sequence is a device that began anew.
 _REPEATS_KNOWN = 64  # how far back a repeated sample is recognised
@@ -107,13 +108,13 @@ def raw_of(block: Sequence[_Kept], tray: TrayConfig) -> Raw:
     )
 
 
-Item: TypeAlias = Received | LineUp | LineDown | Command
+Item: TypeAlias = Received | LinkUp | LinkDown | Command
 
 
 class AcquisitionCore(Core):
     """One tray's line. Counts every piece of the stream that is not a sample, and never raises on any bytes."""
 
-    def __init__(self, tray: TrayConfig, config: AcquisitionConfig, line: Line, started_t_ns: int) -> None:
+    def __init__(self, tray: TrayConfig, config: AcquisitionConfig, line: ByteLink, started_t_ns: int) -> None:
         self._tray = tray
         self._config = config
         self._line = line
@@ -133,7 +134,7 @@ class AcquisitionCore(Core):
         if isinstance(item, Command):
             self._send(item)
             return []
-        if isinstance(item, LineUp):
+        if isinstance(item, LinkUp):
             self._counts["line_up"] += 1
             self._down_because = None
             self._last_valid_t_ns = self._last_byte_t_ns = self._now_ns
@@ -158,7 +159,7 @@ class AcquisitionCore(Core):
         return self._flush()
 
     def counters(self) -> Mapping[str, int]:
-        """What came of the line's bytes, by kind; docs/wire-protocol.md explains each."""
+        """What came of the line's bytes, by kind; docs/reference/wire-protocol.md explains each."""
         return dict(self._counts)
 
     def problem(self) -> str:
@@ -263,7 +264,7 @@ def build(context: Context) -> Parts:
     tray = context.tray
     if not tray.port:
         raise StageError(f'[[tray]] {tray.name}: port is missing; add for example port = "/dev/ttyUSB0"')
-    line = SerialLine(str(context.resolve(Path(tray.port))), tray.baud)
+    line = SerialPort(str(context.resolve(Path(tray.port))), tray.baud)
     return Parts(AcquisitionCore(tray, context.config, line, context.started_t_ns), line)
 
 

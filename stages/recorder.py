@@ -1,7 +1,7 @@
 """Recorder: keeps everything that goes over the bus in MCAP files.
 
 Reads   every topic of the table that is to be recorded, of all trays, and the health of all stages
-Writes  nothing on the bus; a recording in one part or several, docs/recordings.md
+Writes  nothing on the bus; a recording in one part or several, docs/reference/recordings.md
 Units   as in the messages: bytes are kept as they came
 Timing  a message is safe from a crash, of the machine too, after `flush_interval_s` at most
 """
@@ -21,12 +21,13 @@ from typing import Protocol
 from pydantic import Field, field_validator
 
 from pipeline.recordings.disk import DiskError
-from pipeline.recordings.head import head_of
-from pipeline.recordings.ledger import Ledger, Line
-from pipeline.recordings.parts import Shelf
+from pipeline.recordings.metadata import head_of
+from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import RecordingError
+from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
 from pipeline.recordings.writing import Pending
-from pipeline.stage import Context, Core, Packet, Parts, Stage, StageConfig, StageError
+from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from schemas.envelope import Envelope
 from schemas.messages import Health, Message
 from schemas.topics import TOPICS
 
@@ -87,11 +88,11 @@ class OpenPart(Protocol):
 
 
 class PartsPlace(Protocol):
-    """Where parts begin; see `pipeline.recordings.parts.Shelf`."""
+    """Where parts begin; see `pipeline.recordings.parts.RecordingParts`."""
 
     @property
-    def before(self) -> Mapping[Line, int]: ...  # noqa: D102
-    def begin(self, t_ns: int, ledger: Ledger, about: Mapping[str, str]) -> OpenPart: ...  # noqa: D102
+    def before(self) -> Mapping[StreamId, int]: ...  # noqa: D102
+    def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> OpenPart: ...  # noqa: D102
     def free_bytes(self) -> int: ...  # noqa: D102
     def delete_oldest(self) -> str | None: ...  # noqa: D102
 
@@ -112,11 +113,11 @@ class Recorder(Core):
         self._place = place
         self._config = config
         self._part: OpenPart | None = None
-        self._ledger = Ledger(place.before)
+        self._ledger = SequenceLedger(place.before)
         self._before = place.before
         self._cards: dict[str, Pending] = {}
         self._own_producer = ""
-        self._duplicated: dict[Line, int] = {}
+        self._duplicated: dict[StreamId, int] = {}
         self._recorded: Counter[str] = Counter()
         self._counts: Counter[str] = Counter(lost_unwritten=0)
         self._held: deque[Pending] = deque()
@@ -136,7 +137,7 @@ class Recorder(Core):
         if shortage:
             self._pause(shortage)
 
-    def step(self, item: Packet) -> Sequence[Message]:
+    def step(self, item: Envelope) -> Sequence[Message]:
         """Record one packet."""
         header = item.message.header
         self._now_ns = max(self._now_ns, item.received_t_ns)
@@ -348,7 +349,7 @@ def build(context: Context) -> Parts:
     metadata, attachments = head_of(context)
     metadata["flush_interval_s"] = f"{config.flush_interval_s:g}"
     try:
-        shelf = Shelf(context.run_folder / config.file, metadata, attachments, session=secrets.token_hex(4))
+        shelf = RecordingParts(context.run_folder / config.file, metadata, attachments, session=secrets.token_hex(4))
         for recovery in shelf.mended:
             found = recovery.found
             _LOG.warning(
@@ -394,6 +395,6 @@ STAGE = Stage(
     config=RecorderConfig,
     build=build,
     core_per_tray=False,
-    wants_packets=True,
+    wants_envelopes=True,
     check=check,
 )

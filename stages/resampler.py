@@ -1,7 +1,7 @@
 """Resampler: irregular samples in, the same samples on a uniform grid of time out.
 
 Reads: topic `raw` (device clock us, host's time of receipt ns, command, speed rad/s).
-Writes: topic `grid`: `rate_hz` samples a second at absolute multiples of the step (t_ns % step_ns == 0), speed
+Writes: topic `grid`: `rate_hz` samples a second at absolute multiples of the step (t_ns % period_ns == 0), speed
 interpolated linearly, command held (that of the last sample at or before the grid's time).
 Timing: a grid sample leaves as soon as a raw sample at or after its time has come. Where one fan has no reading, all
 wait for its next one, `gap_limit_s` at most. Where nothing comes at all, `watermark_s` at most.
@@ -9,7 +9,7 @@ wait for its next one, `gap_limit_s` at most. Where nothing comes at all, `water
 Gaps longer than `gap_limit_s` are never bridged: their grid samples are not valid, GAP up to `watermark_s` after the
 last raw sample and STALE from there on, and `stale_for_s` after it the grid ends until the line returns. All of that
 depends on the samples' times only; the host's time, in `tick`, merely decides that it is said while it lasts. So a
-replay gives the same grid. See docs/time.md.
+replay gives the same grid. See docs/explanation/time.md.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from typing import NamedTuple, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pipeline.device_time import NS_PER_S, UINT32, DeviceClock
-from pipeline.stage import Context, Core, Parts, Stage, StageConfig
+from pipeline.devices.device_clock import UINT32, DeviceClock
+from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig
 from schemas.blocks import cut, join
-from schemas.messages import Array, Grid, Raw, WhyNot
+from schemas.messages import Array, Grid, InvalidReason, Raw
+from schemas.units import NS_PER_S
 
 LONGEST_TICK_NS = 100_000_000  # a longer pause between ticks is the host's own, and says nothing of the line
 LONG_AGO_NS = -(1 << 62)
 SET_BACK_NS = NS_PER_S  # a new sample so much older than the newest: the host's clock was set back
-GAP, STALE, NO_SPEED = (np.uint8(why) for why in (WhyNot.GAP, WhyNot.STALE, WhyNot.NO_SPEED))
+GAP, STALE, NO_SPEED = (np.uint8(why) for why in (InvalidReason.GAP, InvalidReason.STALE, InvalidReason.NO_SPEED))
 LARGEST_GAP = 1 << 24  # samples; a larger step of the device's sequence is a device that began anew
 
 
@@ -69,9 +70,9 @@ class Samples(NamedTuple):
         return Samples(self.t_ns[wanted], self.command[wanted], self.speed_rad_s[wanted])
 
 
-def first_grid_time(t_ns: int, step_ns: int) -> int:
+def first_grid_time(t_ns: int, period_ns: int) -> int:
     """The first multiple of the step at or after `t_ns`."""
-    return -(-t_ns // step_ns) * step_ns
+    return -(-t_ns // period_ns) * period_ns
 
 
 def _all(mask: Array) -> bool:
@@ -214,7 +215,7 @@ class ResamplerCore(Core):
         return self.give_up_until(self._newest_t_ns)
 
     def counters(self) -> Mapping[str, int]:
-        """docs/time.md says what each counts."""
+        """docs/explanation/time.md says what each counts."""
         return {**self._counts, "clock_restarts": max(0, self._clock.segments - 1)}
 
     def problem(self) -> str:
@@ -350,17 +351,17 @@ class ResamplerCore(Core):
     def _make(self, t_ns: Array, command: Array, speed: Array, why: Array | np.uint8) -> None:
         """Grid samples, at least one; `why` those that have no speed are not valid."""
         valid = np.isfinite(speed)
-        why_not = np.zeros(speed.shape, np.uint8)
+        invalid_reason = np.zeros(speed.shape, np.uint8)
         if not _all(valid):
-            np.copyto(why_not, why, where=~valid)
+            np.copyto(invalid_reason, why, where=~valid)
         grid = Grid(
             fans=self._fans,
-            step_ns=self._step_ns,
+            period_ns=self._step_ns,
             t_ns=t_ns,
             command=command,
             speed_rad_s=speed,
             valid=valid,
-            why_not=why_not,
+            invalid_reason=invalid_reason,
         )
         self._made.append(grid)
         self._made_rows += len(t_ns)

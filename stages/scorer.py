@@ -3,12 +3,14 @@
 Reads: topic `prediction` (measured and predicted speed rad/s, torque balance in command units), and `request` (what
 operators want of alarms).
 Writes: topic `score` (residuals, baselines, the statistic furthest towards its limit, state), `alarm` (every transition
-of a fan's alarm), `memory` (what a restart must not forget).
+of a fan's alarm), `snapshot` (what a restart must not forget).
 Timing: a score for every prediction, at once, block for block; delays count the valid samples' own time.
 
-Four things, kept apart: the *statistics* on the two residuals (scoring.judge), their *limits* (scoring.limits, from the
-twin's card), the *state* of each alarm after OPC UA Part 9 (scoring.conditions), its *diagnosis* (scoring.diagnosis).
-The +-2 sigma band is shown beside them and is no alarm. See docs/deciding.md.
+Four things, kept apart: the *statistics* on the two residuals (scoring.fan_scorer), their *limits* (scoring.limits,
+from the
+twin's card), the *state* of each alarm after OPC UA Part 9 (scoring.alarms.tray_alarms), its *diagnosis*
+(scoring.diagnosis.diagnosis).
+The +-2 sigma band is shown beside them and is no alarm. See docs/explanation/deciding.md.
 """
 
 from __future__ import annotations
@@ -22,31 +24,40 @@ from typing import Any
 import numpy as np
 from pydantic import Field, ValidationError
 
-from pipeline.config import SpeedUnit
-from pipeline.memory_file import MemoryFile
-from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
-from pipeline.twin_file import TwinFile, twin_of
+from pipeline.runtime.snapshot_store import SnapshotStore
+from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.runtime.twin_file import TwinFile, twin_of
 from schemas.blocks import chosen
-from schemas.messages import Alarm, Array, FanState, Memory, Prediction, Request, Score, Transition, WhyNot
-from scoring.alarm_desk import AlarmDesk, Distance
-from scoring.condition import ConditionSettings
-from scoring.diagnoser import Diagnoser
-from scoring.judge import QUIET, Judge, Verdict, samples_of
+from schemas.messages import (
+    Alarm,
+    Array,
+    FanState,
+    InvalidReason,
+    Prediction,
+    Request,
+    Score,
+    ScorerSnapshot,
+    Transition,
+)
+from schemas.units import NS_PER_S, SpeedUnit
+from scoring.alarms.alarm_manager import AlarmContext, AlarmManager
+from scoring.alarms.alarm_state import ConditionSettings
+from scoring.alarms.alarm_text import AlarmText
+from scoring.alarms.unscored_monitor import UnscoredMonitor
+from scoring.diagnosis.diagnoser import Diagnoser
+from scoring.diagnosis.regression_window import HealthyBalance
+from scoring.fan_scorer import QUIET, FanScorer, ScoredBlock, samples_of
 from scoring.limits import Limits, Timing, uncalibrated
-from scoring.not_judged import NotJudged
-from scoring.regression_window import HealthyBalance
-from scoring.wear_watch import WearWatch
-from scoring.wording import Wording
+from scoring.wear.wear_monitor import WearMonitor
 
-NS_PER_S = 1_000_000_000
 BAND_SIGMAS = 2.0
-MEMORY_NS = 60 * NS_PER_S  # how often it is noted when nothing happens
+SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # how often it is noted when nothing happens
 SET_ASIDE_NS = 60 * NS_PER_S  # so long it is told that something was
 ALL_BUT_QUIET = "baselines, alarms and wear begin anew; what operators keep quiet stays so"
 ANOTHER_TWIN = f"the twin is another one: {ALL_BUT_QUIET}"
 IN_PART = f"what was remembered is understood in part: {ALL_BUT_QUIET}"
 NOT_UNDERSTOOD = "what was remembered is not understood: baselines, alarms and wear begin anew, nothing is kept quiet"
-NO_SNAPSHOT = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
+RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 BACK_IN_TIME_NS = 120 * NS_PER_S  # who is restarted catches up with less; samples still older are another story
 
 
@@ -98,13 +109,13 @@ class ScorerCore(Core):
         speed_unit: SpeedUnit,
         config: ScorerConfig,
         healthy: Healthy,
-        keeper: MemoryFile | None = None,
+        snapshot_store: SnapshotStore | None = None,
     ) -> None:
-        """keeper: where to keep what must not be forgotten; None: nowhere, as in a replay."""
+        """snapshot_store: where to keep what must not be forgotten; None: nowhere, as in a replay."""
         self._fans = fans
         self._healthy = healthy
         self._config = config
-        self._wording = Wording(speed_unit, healthy.command_unit)
+        self._wording = AlarmText(speed_unit, healthy.command_unit)
         self._settings = ConditionSettings(
             on_delay_ns=round(healthy.limits.timing.on_delay_s * NS_PER_S),
             off_delay_ns=round(config.off_delay_s * NS_PER_S),
@@ -113,69 +124,69 @@ class ScorerCore(Core):
             latching=config.latching,
             confirming=config.confirming,
         )
-        self._not_judged = NotJudged(fans, max(1, round(config.not_judged_s * NS_PER_S)))
-        self._keeper = keeper
+        self._unscored = UnscoredMonitor(fans, max(1, round(config.not_judged_s * NS_PER_S)))
+        self._snapshot_store = snapshot_store
         self._wrong_fans = 0
         self._counts: Counter[str] = Counter()
         self._set_aside = ""
         """what was not gone on from"""
         self._begin()
-        self._first: list[Alarm | Memory] = []
-        memory = keeper.load() if keeper else None
-        if memory is not None:
-            self._first = [*self.restore(memory)]
+        self._first: list[Alarm | ScorerSnapshot] = []
+        snapshot = snapshot_store.load() if snapshot_store else None
+        if snapshot is not None:
+            self._first = [*self.restore(snapshot)]
 
     def _begin(self) -> None:
-        self._judge = Judge(self._fans, self._healthy.limits)
+        self._judge = FanScorer(self._fans, self._healthy.limits)
         self._diagnoser = Diagnoser(self._healthy.balances)
-        self._wear = WearWatch(
+        self._wear = WearMonitor(
             self._healthy.balances, self._diagnoser, self._config.wear_every_s, self._healthy.command_unit
         )
-        self._desk = AlarmDesk(self._fans, self._settings, self._diagnoser, self._wording)
+        self._alarms = AlarmManager(self._fans, self._settings, self._diagnoser, self._wording)
         self._last_t_ns = np.iinfo(np.int64).min
         self._noted_t_ns = np.iinfo(np.int64).min
         self._fed_by = ""  # who made the last prediction
         self._may_be_of_other_times = False
 
-    def restore(self, memory: Memory) -> list[Alarm | Memory]:
+    def restore(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
         """Go on from what another session has kept. Gives what is to be told of it.
 
         Of another twin, or where the rest is not understood, as after an update, only what belongs to operators is
         taken: what they want quiet, and that they were answered.
         """
         try:
-            state = json.loads(memory.state_json)
-            self._desk.restore(state["desk"])
+            state = json.loads(snapshot.state_json)
+            self._alarms.restore(state["desk"])
             fed_by = str(state["fed_by"])
-        except NO_SNAPSHOT:
+        except RESTORE_ERRORS:
             self._begin()
-            self._counts["memories_not_understood"] += 1
+            self._counts["snapshots_not_understood"] += 1
             self._set_aside = NOT_UNDERSTOOD
             return []
-        if memory.twin_sha256 != self._healthy.sha256:
-            self._counts["memories_of_another_twin"] += 1
+        if snapshot.twin_sha256 != self._healthy.sha256:
+            self._counts["snapshots_of_another_twin"] += 1
             self._set_aside = ANOTHER_TWIN
         else:
             try:
                 if "wear" in state:
                     self._wear.restore(state["wear"])
                 self._judge.restore(state["judge"])
-            except NO_SNAPSHOT:
+            except RESTORE_ERRORS:
                 self._begin()
-                self._desk.restore(state["desk"])
-                self._counts["memories_not_understood"] += 1
+                self._alarms.restore(state["desk"])
+                self._counts["snapshots_not_understood"] += 1
                 self._set_aside = IN_PART
-        self._last_t_ns = self._noted_t_ns = memory.t_ns
+        self._last_t_ns = self._noted_t_ns = snapshot.t_ns
         self._fed_by, self._may_be_of_other_times = fed_by, True
-        told = self._desk.disown(memory.t_ns, stays_quiet=True) if self._set_aside else self._desk.restate()
-        return [replace(memory, restored=True), *told]
+        told = self._alarms.disown(snapshot.t_ns, stays_quiet=True) if self._set_aside else self._alarms.restate()
+        return [replace(snapshot, restored=True), *told]
 
-    def tick(self, now_ns: int) -> list[Alarm | Memory]:
+    def tick(self, now_ns: int) -> list[Alarm | ScorerSnapshot]:
         """Say once what was remembered."""
         first, self._first = self._first, []
         return first
 
-    def step(self, item: Prediction | Request) -> list[Score | Alarm | Memory]:
+    def step(self, item: Prediction | Request) -> list[Score | Alarm | ScorerSnapshot]:
         """Judge a block: its score, and then what happened to alarms; or answer a request."""
         if isinstance(item, Request):
             return [*self.tick(0), *self._answer(item)]
@@ -195,8 +206,8 @@ class ScorerCore(Core):
         return [*self.tick(0), *disowned, score, *alarms, *self._note(bool(alarms))]
 
     def counters(self) -> Mapping[str, int]:
-        """docs/deciding.md says what each counts."""
-        desk = self._desk
+        """docs/explanation/deciding.md says what each counts."""
+        desk = self._alarms
         of_alarms = {
             "alarms_raised": desk.raised,
             "alarms_cleared": desk.cleared,
@@ -210,8 +221,8 @@ class ScorerCore(Core):
             return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
         began_t_ns = self._judge.origin_t_ns
         is_new = began_t_ns is None or self._last_t_ns < began_t_ns + SET_ASIDE_NS
-        problems = [self._set_aside if is_new else "", self._not_judged.problem()]
-        problems += [self._keeper.problem] if self._keeper else []
+        problems = [self._set_aside if is_new else "", self._unscored.problem()]
+        problems += [self._snapshot_store.problem] if self._snapshot_store else []
         judged = [residual for residual in (self._judge.speed, self._judge.balance) if residual.is_judged]
         adrift = np.flatnonzero(np.any([residual.baseline.is_at_limit for residual in judged], axis=0))
         if len(adrift):
@@ -220,7 +231,7 @@ class ScorerCore(Core):
         problems.append(self._wear.problem(self._last_t_ns))
         return "; ".join(filter(None, problems))
 
-    def close(self) -> list[Memory]:
+    def close(self) -> list[ScorerSnapshot]:
         """Note what is known for the next session."""
         return self._note(True) if self._last_t_ns > np.iinfo(np.int64).min else []
 
@@ -236,31 +247,35 @@ class ScorerCore(Core):
         again = began_t_ns is not None and first_t_ns <= began_t_ns
         if not again and first_t_ns >= self._last_t_ns - BACK_IN_TIME_NS:
             return []
-        disowned, self._set_aside = self._desk.disown(first_t_ns, stays_quiet=False), ""
+        disowned, self._set_aside = self._alarms.disown(first_t_ns, stays_quiet=False), ""
         self._begin()
         self._first = []
-        self._counts["memories_of_other_times"] += 1
+        self._counts["snapshots_of_other_times"] += 1
         return disowned
 
     def _judge_block(self, item: Prediction) -> tuple[Score, list[Alarm]]:
-        t_ns, why_not, command = item.t_ns, item.why_not, item.command
+        t_ns, invalid_reason, command = item.t_ns, item.invalid_reason, item.command
         measured, predicted = item.measured_speed_rad_s, item.predicted_speed_rad_s
         sigma, sigma_command = item.sigma_rad_s, item.torque_balance_sigma_command
         residual = measured - predicted
         verdict = self._judge.update(samples_of(item))
         valid = np.isfinite(verdict.score)
         balance_baseline = verdict.balance_baseline * sigma_command
-        told = np.where(np.isin(why_not, (WhyNot.GAP, WhyNot.STALE)), np.nan, command)
+        told = np.where(np.isin(invalid_reason, (InvalidReason.GAP, InvalidReason.STALE)), np.nan, command)
         usual = np.where(np.isfinite(measured), verdict.balance_usual * sigma_command, np.nan)
-        self._diagnoser.take(t_ns, item.step_ns, told, measured, balance_baseline, verdict.balance_baseline_s, usual)
-        state, changes = self._desk.states(t_ns, item.step_ns, verdict.score, valid)
-        why_not = np.where(valid, WhyNot.NONE, np.where(why_not == WhyNot.NONE, WhyNot.WARMING_UP, why_not))
-        self._not_judged.update(item.step_ns, valid, why_not.astype(np.uint8))
+        self._diagnoser.take(t_ns, item.period_ns, told, measured, balance_baseline, verdict.balance_baseline_s, usual)
+        state, changes = self._alarms.states(t_ns, item.period_ns, verdict.score, valid)
+        invalid_reason = np.where(
+            valid,
+            InvalidReason.NONE,
+            np.where(invalid_reason == InvalidReason.NONE, InvalidReason.WARMING_UP, invalid_reason),
+        )
+        self._unscored.update(item.period_ns, valid, invalid_reason.astype(np.uint8))
         self._watch_wear(item, verdict, state)
         band = BAND_SIGMAS * sigma
         score = Score(
             fans=self._fans,
-            step_ns=item.step_ns,
+            period_ns=item.period_ns,
             t_ns=t_ns,
             command=command,
             measured_speed_rad_s=measured,
@@ -273,18 +288,18 @@ class ScorerCore(Core):
             outside=np.abs(residual) > band,
             state=np.where(verdict.commissioning & ~valid, int(FanState.COMMISSIONING), state).astype(np.uint8),
             valid=valid,
-            why_not=why_not.astype(np.uint8),
+            invalid_reason=invalid_reason.astype(np.uint8),
             torque_balance_command=item.torque_balance_command,
             speed_baseline_rad_s=verdict.speed_baseline * sigma,
             balance_baseline_command=balance_baseline,
             score=verdict.score,
             statistic=verdict.statistic,
         )
-        return score, self._desk.tell(
-            changes, score, self._distance(verdict, item.step_ns / NS_PER_S, sigma, sigma_command)
+        return score, self._alarms.tell(
+            changes, score, self._distance(verdict, item.period_ns / NS_PER_S, sigma, sigma_command)
         )
 
-    def _watch_wear(self, item: Prediction, verdict: Verdict, state: Array) -> None:
+    def _watch_wear(self, item: Prediction, verdict: ScoredBlock, state: Array) -> None:
         assert self._judge.origin_t_ns is not None
         sigma_command, known = item.torque_balance_sigma_command, np.isfinite(item.torque_balance_command)
         normal = state == FanState.NORMAL
@@ -295,18 +310,18 @@ class ScorerCore(Core):
             disturbed=(verdict.score >= QUIET) | ~(normal | (state == FanState.UNKNOWN)),
             commissioned_command=verdict.balance_commissioned * sigma_command,
             held=verdict.balance_held,
-            limit_command=self._judge.balance.lasting_limit_sigmas(item.step_ns / NS_PER_S) * sigma_command,
+            limit_command=self._judge.balance.lasting_limit_sigmas(item.period_ns / NS_PER_S) * sigma_command,
         )
 
-    def _distance(self, verdict: Verdict, step_s: float, sigma: Array, sigma_command: Array) -> Distance:
-        return Distance(
+    def _distance(self, verdict: ScoredBlock, step_s: float, sigma: Array, sigma_command: Array) -> AlarmContext:
+        return AlarmContext(
             balance_command=verdict.balance_smoothed * sigma_command,
             limit_rad_s=self._judge.speed.limit_sigmas(step_s) * sigma,
             balance_limit_command=self._judge.balance.limit_sigmas(step_s) * sigma_command,
         )
 
-    def _answer(self, request: Request) -> list[Alarm | Memory]:
-        told = self._desk.answer(request, max(self._last_t_ns, 0))
+    def _answer(self, request: Request) -> list[Alarm | ScorerSnapshot]:
+        told = self._alarms.answer(request, max(self._last_t_ns, 0))
         if not told:
             self._counts["requests_repeated"] += 1
             return []
@@ -317,25 +332,25 @@ class ScorerCore(Core):
         self._counts["requests"] += 1
         return [*told, *self._note(True)]
 
-    def _note(self, at_once: bool) -> list[Memory]:
+    def _note(self, at_once: bool) -> list[ScorerSnapshot]:
         """What must not be forgotten: when something happened, and now and then."""
-        if not at_once and self._last_t_ns - self._noted_t_ns < MEMORY_NS:
+        if not at_once and self._last_t_ns - self._noted_t_ns < SNAPSHOT_PERIOD_NS:
             return []
         self._noted_t_ns = self._last_t_ns
         state = {
             "judge": self._judge.snapshot(),
-            "desk": self._desk.snapshot(),
+            "desk": self._alarms.snapshot(),
             "wear": self._wear.snapshot(),
             "fed_by": self._fed_by,
         }
-        memory = Memory(
+        snapshot = ScorerSnapshot(
             t_ns=max(self._last_t_ns, 0),
             twin_sha256=self._healthy.sha256,
             state_json=json.dumps(state, allow_nan=False),
         )
-        if self._keeper:
-            self._keeper.keep(memory)
-        return [memory]
+        if self._snapshot_store:
+            self._snapshot_store.keep(snapshot)
+        return [snapshot]
 
 
 def build(context: Context) -> Parts:
@@ -345,9 +360,11 @@ def build(context: Context) -> Parts:
         StageError: the tray names no twin, or one that cannot be used; what an earlier session kept cannot be read.
     """
     tray = context.tray
-    keeper = MemoryFile(context.memory_folder / f"scorer-{tray.name}.memory") if context.memory_folder else None
+    snapshot_store = (
+        SnapshotStore(context.snapshot_folder / f"scorer-{tray.name}.snapshot") if context.snapshot_folder else None
+    )
     healthy = _healthy(context, twin_of(context))
-    return Parts(ScorerCore(tray.fans, tray.speed_unit, context.config, healthy, keeper))
+    return Parts(ScorerCore(tray.fans, tray.speed_unit, context.config, healthy, snapshot_store))
 
 
 def limits_in_force(config: ScorerConfig, calibration: Mapping[str, Any] | None) -> Limits:
@@ -399,7 +416,7 @@ STAGE = Stage(
     name="scorer",
     about="two residuals, their statistics, and the fans' alarms",
     reads=("prediction", "request"),
-    writes=("score", "alarm", "memory"),
+    writes=("score", "alarm", "snapshot"),
     config=ScorerConfig,
     build=build,
     check=check,

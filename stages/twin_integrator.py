@@ -11,7 +11,7 @@ the line returns. Samples in the first `warm_up_s` of a free run are not valid (
 `warm_up_s` after a command that was out of the twin's range or too small to turn the rotor (OUT_OF_RANGE).
 
 Beside it goes the *torque balance*: the command given, less the command that a healthy fan needs for what was measured.
-It needs no free run, and so is there a third of a second after the first sample (scoring.torque_balance).
+It needs no free run, and so is there a third of a second after the first sample (scoring.detectors.torque_balance).
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from itertools import pairwise
 import numpy as np
 from pydantic import Field
 
-from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
-from pipeline.twin_file import TwinFile, twin_of
+from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.runtime.twin_file import TwinFile, twin_of
 from schemas.blocks import chosen
-from schemas.messages import Array, Grid, ModelCard, Prediction, WhyNot
-from scoring.torque_balance import BalanceModel, TorqueBalance
+from schemas.messages import Array, Grid, InvalidReason, ModelCard, Prediction
+from schemas.units import NS_PER_S
+from scoring.detectors.torque_balance import BalanceModel, TorqueBalance
 
-NS_PER_S = 1_000_000_000
 RANGE_MARGIN = 0.05  # of the range's width: so far beyond the commands it was made from a twin is still believed
 LONGEST_BRIDGE = 1 << 16  # grid samples; more than half a second at 100 kHz takes longer to run than to start anew
 HIGHEST_SPEED = 1.5  # of the top speed it was made from: the balance is believed up to there
@@ -195,14 +195,14 @@ class TwinIntegratorCore(Core):
         grid = self._only_new(item)
         if not len(grid.t_ns):
             return messages
-        if grid.step_ns != self._step_ns:
+        if grid.period_ns != self._step_ns:
             self._run.stop(np.ones_like(self._run.running))
             self._balance.reset()
-            self._step_ns = grid.step_ns
-        if self._twin.is_discrete and abs(grid.step_ns * self._twin.rate_hz / NS_PER_S - 1) > RATE_TOLERANCE:
+            self._step_ns = grid.period_ns
+        if self._twin.is_discrete and abs(grid.period_ns * self._twin.rate_hz / NS_PER_S - 1) > RATE_TOLERANCE:
             self._problem = (
                 f"twin {self._twin.name} holds at {self._twin.rate_hz:g} Hz only, the grid has "
-                f"{NS_PER_S / grid.step_ns:g} Hz: set [resampler] rate_hz = {self._twin.rate_hz:g}"
+                f"{NS_PER_S / grid.period_ns:g} Hz: set [resampler] rate_hz = {self._twin.rate_hz:g}"
             )
             messages.append(self._without_twin(grid))
         else:
@@ -216,7 +216,7 @@ class TwinIntegratorCore(Core):
         return card
 
     def counters(self) -> Mapping[str, int]:
-        """docs/deciding.md says what each counts."""
+        """docs/explanation/deciding.md says what each counts."""
         return dict(self._counts)
 
     def problem(self) -> str:
@@ -256,31 +256,31 @@ class TwinIntegratorCore(Core):
         settled = running & ((grid.t_ns[:, np.newaxis] - since_t_ns >= self._warm_up_ns) | ~in_range)
         in_range &= np.isfinite(predicted) | ~running
         self._counts["not_predicted_out_of_range"] += int((settled & ~in_range).sum())
-        why_not = np.where(settled, WhyNot.OUT_OF_RANGE, WhyNot.WARMING_UP)
-        why_not = np.where(settled & in_range, WhyNot.NONE, why_not)
-        why_not = np.where(grid.valid, why_not, grid.why_not).astype(np.uint8)
-        return self._prediction(grid, predicted, why_not)
+        invalid_reason = np.where(settled, InvalidReason.OUT_OF_RANGE, InvalidReason.WARMING_UP)
+        invalid_reason = np.where(settled & in_range, InvalidReason.NONE, invalid_reason)
+        invalid_reason = np.where(grid.valid, invalid_reason, grid.invalid_reason).astype(np.uint8)
+        return self._prediction(grid, predicted, invalid_reason)
 
     def _inputs(self, grid: Grid) -> Inputs:
-        silent = (grid.why_not == int(WhyNot.GAP)) | (grid.why_not == int(WhyNot.STALE))
+        silent = (grid.invalid_reason == int(InvalidReason.GAP)) | (grid.invalid_reason == int(InvalidReason.STALE))
         known = ~silent & np.isfinite(grid.command)
         command, known_before_t_ns = self._run.hold(grid.t_ns, grid.command, known)
         return Inputs(
             command=command,
             unknown=~known,
-            overdue=grid.t_ns[:, np.newaxis] - known_before_t_ns - grid.step_ns > self._hold_limit_ns,
+            overdue=grid.t_ns[:, np.newaxis] - known_before_t_ns - grid.period_ns > self._hold_limit_ns,
             reads=known & grid.valid & np.isfinite(grid.speed_rad_s),
             missing=self._missing(grid.t_ns, np.all(silent, axis=1)),
         )
 
     def _missing(self, t_ns: Array, line_is_silent: Array) -> Array:
         """How many grid samples are missing before each, (n,); counts those that no gap of the line explains."""
-        step_ns = self._step_ns
-        last_t_ns = t_ns[0] - step_ns if self._last_t_ns is None else self._last_t_ns
+        period_ns = self._step_ns
+        last_t_ns = t_ns[0] - period_ns if self._last_t_ns is None else self._last_t_ns
         since_ns = t_ns - np.concatenate(([last_t_ns], t_ns[:-1]))
         missing = np.zeros(len(t_ns), np.int64)
         for row in np.flatnonzero(since_ns > self._longest_step_ns).tolist():
-            missing[row] = round(int(since_ns[row]) / step_ns) - 1
+            missing[row] = round(int(since_ns[row]) / period_ns) - 1
             if not (line_is_silent[row - 1] if row else self._line_is_silent):
                 self._counts["lost_grid_samples"] += int(missing[row])
         self._line_is_silent = bool(line_is_silent[-1])
@@ -306,8 +306,8 @@ class TwinIntegratorCore(Core):
         return speed_rad_s
 
     def _without_twin(self, grid: Grid) -> Prediction:
-        why_not = np.where(grid.valid, WhyNot.NO_TWIN, grid.why_not).astype(np.uint8)
-        return self._prediction(grid, np.full(grid.command.shape, np.nan), why_not)
+        invalid_reason = np.where(grid.valid, InvalidReason.NO_TWIN, grid.invalid_reason).astype(np.uint8)
+        return self._prediction(grid, np.full(grid.command.shape, np.nan), invalid_reason)
 
     def _torque_balance(self, grid: Grid) -> Array:
         """(n, fans) in command units. Where samples are missing it begins anew."""
@@ -329,17 +329,17 @@ class TwinIntegratorCore(Core):
     def _longest_step_ns(self) -> int:
         return self._step_ns + (self._step_ns - 1) // 2  # from one and a half steps on samples are missing
 
-    def _prediction(self, grid: Grid, predicted_speed_rad_s: Array, why_not: Array) -> Prediction:
+    def _prediction(self, grid: Grid, predicted_speed_rad_s: Array, invalid_reason: Array) -> Prediction:
         return Prediction(
             fans=grid.fans,
-            step_ns=grid.step_ns,
+            period_ns=grid.period_ns,
             t_ns=grid.t_ns,
             command=grid.command,
             measured_speed_rad_s=grid.speed_rad_s,
             predicted_speed_rad_s=predicted_speed_rad_s,
             sigma_rad_s=self._twin.sigma_rad_s,
-            valid=why_not == WhyNot.NONE,
-            why_not=why_not,
+            valid=invalid_reason == InvalidReason.NONE,
+            invalid_reason=invalid_reason,
             twin=self._twin.name,
             torque_balance_command=self._torque_balance(grid),
             torque_balance_sigma_command=self._twin.balance.sigma_command,

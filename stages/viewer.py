@@ -18,14 +18,14 @@ from typing import Protocol
 import numpy as np
 from pydantic import Field
 
-from pipeline.config import TrayConfig
-from pipeline.extras import how_to_install
-from pipeline.loopback import check_free
-from pipeline.stage import Context, Core, Parts, Stage, StageConfig, StageError
-from pipeline.stages_page import StagesPage
-from pipeline.standing_alarms import StandingAlarm
-from pipeline.trace import Trace, state_changes, state_name, trace_of
+from pipeline.config.models import TrayConfig
+from pipeline.optional_dependencies import how_to_install
+from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.viewing.loopback import check_free
+from pipeline.viewing.stages_page import StagesPage
+from pipeline.viewing.trace import Trace, state_changes, state_name, trace_of
 from schemas.messages import Alarm, Array, Health, Message, ModelCard, Score, Severity, Transition
+from scoring.alarms.current_alarms import CurrentAlarm
 
 NO_RERUN = f"the viewer needs the extra `view`: take viewer out of launcher.stages; or {how_to_install('view')}"
 FLUSH_PERIOD_NS = 500_000_000
@@ -81,10 +81,10 @@ class ViewSink(Protocol):
 def alarm_line(alarm: Alarm) -> tuple[str, str]:
     """Level and text of what happened to an alarm, for people."""
     happened = alarm.transition.name.lower().replace("_", " ")
-    if alarm.severity == Severity.NONE and alarm.transition == Transition.RESTATED:
-        states = StandingAlarm(alarm, alarm.message, (), "").words()
+    if alarm.severity == Severity.NONE and alarm.transition == Transition.REPUBLISHED:
+        states = CurrentAlarm(alarm, alarm.message, (), "").words()
         return "INFO", f"{happened} ({', '.join(states)}): {alarm.message}"
-    if alarm.transition not in (Transition.RAISED, Transition.SEVERITY, Transition.RESTATED):
+    if alarm.transition not in (Transition.RAISED, Transition.SEVERITY, Transition.REPUBLISHED):
         return "INFO", f"{happened}: {alarm.message}"
     level = "ERROR" if alarm.severity == Severity.ALARM else "WARN"
     return level, f"{alarm.severity.name.lower()} {happened}: {alarm.message}"
@@ -200,7 +200,7 @@ class ViewerCore(Core):
         for fan in range(trace.fans):
             t_ns, names = state_changes(trace, fan, view.states.get(fan))
             if not names and repeat:
-                t_ns, names = trace.t_ns[-1:], [state_name(trace.state[-1, fan], trace.why_not[-1, fan])]
+                t_ns, names = trace.t_ns[-1:], [state_name(trace.state[-1, fan], trace.invalid_reason[-1, fan])]
             if names:
                 view.states[fan] = names[-1]
                 self._sink.change_states(trace.tray, fan, np.asarray(t_ns), names)
@@ -213,7 +213,7 @@ def build(context: Context) -> Parts:
         StageError: Rerun is not installed, a port is taken, or the file cannot be written.
     """
     try:
-        from pipeline.rerun_sink import RerunSink  # noqa: PLC0415  the extra `view` may not be installed
+        from pipeline.viewing.rerun_sink import RerunSink  # noqa: PLC0415  the extra `view` may not be installed
     except ModuleNotFoundError as error:
         if error.name != "rerun":
             raise

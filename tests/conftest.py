@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from small_disk import mount, unmount
+
+from tests.support.small_disk import mount, unmount
 
 # The same examples on every run, and no judgement of how long one takes: machines differ.
 settings.register_profile("house", derandomize=True, deadline=None)
@@ -49,5 +50,5 @@ def measured_data() -> Path:
     """The folder of the measured data sets; skips where they are not."""
     folder = Path(os.environ.get("FANTWIN_DATA", Path(__file__).parents[2] / "shared" / "data"))
     if not folder.is_dir():
-        pytest.skip(f"no measured data at {folder}; set FANTWIN_DATA, see docs/datasets.md")
+        pytest.skip(f"no measured data at {folder}; set FANTWIN_DATA, see docs/how-to/datasets.md")
     return folder

@@ -10,36 +10,36 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from twin.balance import FILTER_RATE_PER_S
-from twin.balance_fit import BalanceFit, fit_balance
-from twin.card import BalanceCard, Card, DataCard, HealthyCard, NetworkCard, TrainingCard, ValidationCard
-from twin.cross_validation import chosen_spread
 from twin.errors import TwinError
-from twin.evaluation import (
+from twin.evaluation.accuracy import (
     Evaluation,
     Figures,
     evaluate_model,
     evaluation_pieces,
     free_run_residuals,
 )
-from twin.export import export_onnx
-from twin.hybrid import UNITS as HYBRID_UNITS
-from twin.hybrid import Hybrid
-from twin.identification import Identification, identify
-from twin.models import KINDS, Kind, Model, NetworkOde
-from twin.narx import PARAMETER_COUNT, Narx
-from twin.narx import UNITS as NARX_UNITS
-from twin.narx_training import train_narx
-from twin.network import TanhNetwork
-from twin.neural_ode import UNITS as NEURAL_ODE_UNITS
-from twin.neural_ode import NeuralOde
-from twin.onnx_twin import OnnxTwin
-from twin.physical import PhysicalModel
-from twin.physics import PARAMETER_NAMES
-from twin.placement import initial_weights
-from twin.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
+from twin.evaluation.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
+from twin.export.card import BalanceCard, Card, DataCard, HealthyCard, NetworkCard, TrainingCard, ValidationCard
+from twin.export.onnx_export import export_onnx
+from twin.export.onnx_twin import OnnxTwin
+from twin.fitting.balance import FILTER_RATE_PER_S
+from twin.fitting.balance_fit import BalanceFit, fit_balance
+from twin.fitting.cross_validation import chosen_spread
+from twin.fitting.identification import Identification, identify
+from twin.fitting.initial_weights import initial_weights
+from twin.fitting.narx_training import train_narx
+from twin.fitting.training import GRID_SPREAD, Physics, Progress, data_scaling, train_network
+from twin.models.hybrid import UNITS as HYBRID_UNITS
+from twin.models.hybrid import Hybrid
+from twin.models.model import KINDS, Kind, Model, NetworkOde
+from twin.models.narx import PARAMETER_COUNT, Narx
+from twin.models.narx import UNITS as NARX_UNITS
+from twin.models.network import TanhNetwork
+from twin.models.neural_ode import UNITS as NEURAL_ODE_UNITS
+from twin.models.neural_ode import NeuralOde
+from twin.models.physical import PhysicalModel
+from twin.models.physics import PARAMETER_NAMES
 from twin.runs import Array, Run, common_fans
-from twin.training import GRID_SPREAD, Physics, Progress, data_scaling, train_network
 
 Trainer = Literal["levenberg-marquardt", "adam"]
 NETWORK_UNITS: dict[Kind, int] = {"neural-ode": NEURAL_ODE_UNITS, "hybrid": HYBRID_UNITS}
@@ -210,7 +210,7 @@ def _train(
     untrained: NetworkOde = Hybrid(network) if kind == "hybrid" else NeuralOde(network)
     if trainer == "adam":
         # torch is needed by this trainer alone, and takes seconds to import.
-        from twin.torch_reference import train_adam  # noqa: PLC0415
+        from twin.fitting.torch_reference import train_adam  # noqa: PLC0415
 
         pieces = evaluation_pieces(runs)
         (theta,) = initial_weights(untrained, pieces, identification, np.random.default_rng(seed), 1)

@@ -93,7 +93,7 @@ class Watch:
         verdict = self._detectors[run].take(block)
         self._log.take(run, verdict.changes)
         self._judged += int(np.isfinite(verdict.score).sum())
-        self._step_ns, self._end_ns[run] = block.step_ns, int(block.t_ns[-1])
+        self._step_ns, self._end_ns[run] = block.period_ns, int(block.t_ns[-1])
         if self._keep:
             self._kept.setdefault(run, []).append(thinned(verdict.score).astype(np.float32))
 

@@ -81,7 +81,7 @@ class FilteredBalance:
         """See methods.Scores."""
         terms = self._filtered.take(block)
         balance = terms[:, 0] - terms[:, 1:] @ self._coefficients
-        seconds = (self._row + np.arange(len(balance))) * block.step_ns / 1e9
+        seconds = (self._row + np.arange(len(balance))) * block.period_ns / 1e9
         self._row += len(balance)
         if math.isnan(self._baseline):
             self._first += balance[seconds < BASELINE_S].tolist()
@@ -103,12 +103,12 @@ class _Filtered:
     def take(self, block: Prediction) -> Array:
         """(n, 5), NaN where the speed is not known."""
         w, effort = block.measured_speed_rad_s[:, 0], block.command[:, 0]
-        rise = np.diff(w, prepend=self._speed_rad_s) / (block.step_ns / 1e9)
+        rise = np.diff(w, prepend=self._speed_rad_s) / (block.period_ns / 1e9)
         self._speed_rad_s = float(w[-1])
         one = np.ones_like(w)
         signals = np.column_stack((effort, one, w, w * np.abs(w), rise, one))
         known = np.asarray(np.isfinite(signals).all(axis=1))
-        keep = math.exp(-FILTER_RATE_PER_S * block.step_ns / 1e9)
+        keep = math.exp(-FILTER_RATE_PER_S * block.period_ns / 1e9)
         weighed = np.where(known[:, np.newaxis], signals, 0.0)
         outcome = lfilter([1.0 - keep], [1.0, -keep], weighed, axis=0, zi=self._state)
         filtered, self._state = np.asarray(outcome[0]), np.asarray(outcome[1])

@@ -1,4 +1,4 @@
-"""Measured data with labelled faults, the rosa rig (docs/datasets.md), as a newcomer would judge them.
+"""Measured data with labelled faults, the rosa rig (docs/how-to/datasets.md), as a newcomer would judge them.
 
 `fantwin import`, `train`, `calibrate` and `replay --offline --json`, nothing else, and healthy runs alone decide on
 twins and limits. Healthy runs are held out in turn: of the others every second one by speed trains, the rest sets the
@@ -35,7 +35,7 @@ from bench.detection.metrics import (
 from bench.detection.ours import NAME
 from pipeline.recordings.reading import read_recording
 from schemas.messages import Array, Prediction, Score
-from tests.chain import fantwin
+from tests.support.running_chain import fantwin
 
 FOLDER = Path(os.environ.get("FANTWIN_DATA", Path(__file__).parents[3] / "shared" / "data")) / "rosa"
 COLUMNS = ("--time", "Time:ms", "--command", "Shaft Control Effort", "--speed", "Actual Speed:rpm")
@@ -89,7 +89,9 @@ class Tally:
 def measured_tables(tell: Tell, *, libraries: bool) -> tuple[dict[str, Rows], list[str]]:
     """The tables of the rig, and what has to be said about them. Ends the program where the data are not there."""
     if not FOLDER.is_dir():
-        raise SystemExit(f"{FOLDER}: not there; set FANTWIN_DATA to the folder of measured sets (docs/datasets.md)")
+        raise SystemExit(
+            f"{FOLDER}: not there; set FANTWIN_DATA to the folder of measured sets (docs/how-to/datasets.md)"
+        )
     tallies: dict[str, Tally] = {}
     with tempfile.TemporaryDirectory() as folder:
         runs = imported(FOLDER, Path(folder))
@@ -171,7 +173,7 @@ def judged_fold(
         blocks[run.name] = _judge(run, twin, place, ours)
     for run in (*training, *calibrating):
         blocks[run.name] = _judge(run, twin, place, Judged())
-    rate_hz = 1e9 / blocks[training[0].name][0].step_ns
+    rate_hz = 1e9 / blocks[training[0].name][0].period_ns
     learned = [blocks[run.name] for run in training]
     coefficients = fitted_balance(learned)
     methods = [
@@ -234,7 +236,7 @@ def _watch(method: Method, run: str, blocks: Sequence[Prediction], judged: Judge
     score = np.concatenate(scores)
     judged.alarms[run] = log.alarms
     judged.scores[run] = (np.concatenate([block.t_ns for block in blocks]), score)
-    judged.hours[run] = float(np.isfinite(score).sum()) * blocks[0].step_ns / 3.6e12
+    judged.hours[run] = float(np.isfinite(score).sum()) * blocks[0].period_ns / 3.6e12
 
 
 def _add(tally: Tally, judged: Judged, held_out: Sequence[Measured], runs: Sequence[Measured]) -> None:

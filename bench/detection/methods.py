@@ -95,7 +95,7 @@ class Limited:
             return Verdict(score, [])
         last = np.maximum.accumulate(np.where(exceeds, rows, self._last), axis=0)
         self._last = last[-1]
-        active = rows - last <= round(OFF_DELAY_S * 1e9 / block.step_ns)
+        active = rows - last <= round(OFF_DELAY_S * 1e9 / block.period_ns)
         before = np.concatenate((self._was_active[np.newaxis], active[:-1]))
         self._was_active = active[-1]
         changed = zip(*np.nonzero(active != before), strict=True)
@@ -117,7 +117,7 @@ class Calibration:
     def take(self, run: str, block: Prediction, score: Array) -> None:
         """Note the scores of a block of a run, (n, fans)."""
         judged = np.isfinite(score)
-        self._judged_ns += int(judged.sum()) * block.step_ns
+        self._judged_ns += int(judged.sum()) * block.period_ns
         window = (run, int(block.t_ns[0] // round(WINDOW_S * 1e9)))
         largest: Array = np.max(np.where(judged, score, -np.inf), axis=0)
         before = self._windows.get(window)

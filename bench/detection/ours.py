@@ -15,14 +15,14 @@ import numpy as np
 from bench.detection.methods import Change, Verdict
 from bench.detection.plant import BLOCK, STEP_NS, TRAY_FANS
 from bench.detection.simulated import tray_number
-from pipeline.stage import Core
-from pipeline.twin_file import TwinFile
+from pipeline.runtime.stage import Core
+from pipeline.runtime.twin_file import TwinFile
 from schemas.messages import Alarm, Array, Prediction, Score
-from scoring.calibration import calibrate
-from scoring.judge import Samples, samples_of
+from scoring.calibration.calibration import calibrate
+from scoring.calibration.healthy_statistics import Running
+from scoring.fan_scorer import Samples, samples_of
 from scoring.limits import Limits, Timing
-from scoring.survey import Running
-from twin.calibrated import with_calibration
+from twin.export.calibrated import with_calibration
 
 NAME = "fantwin"
 COLUMNS = ("speed_rad_s", "speed_residual", "balance")
@@ -68,7 +68,7 @@ class HealthySamples:
                 column.astype(np.float32 if name in COLUMNS else np.bool_).tofile(file)
 
     def __call__(self) -> Iterator[Running]:
-        """All runs from the beginning, as scoring.calibration wants them."""
+        """All runs from the beginning, as scoring.calibration.calibration wants them."""
         for run, fans in self._fans.items():
             yield Running(fans, self._blocks(run, fans), fans_of(tray_number(run)))
 
@@ -89,7 +89,7 @@ class HealthySamples:
             rows = slice(first, min(first + BLOCK, shape[0]))
             yield Samples(
                 t_ns=STEP_NS * np.arange(rows.start, rows.stop),
-                step_ns=STEP_NS,
+                period_ns=STEP_NS,
                 **{name: np.array(column[rows], np.float64) for name, column in columns.items() if name in COLUMNS},
                 **{name: np.array(column[rows]) for name, column in columns.items() if name in FLAGS},
             )

@@ -16,8 +16,8 @@ import numpy as np
 
 from bench.detection.knobs import Knobs
 from schemas.messages import Array, Raw
-from twin.simulated_plant import Disturbance, FanParameters, Tacho, advance, at_rest
-from twin.simulated_tray import LOOP_GAIN, LOOP_INTEGRAL_GAIN_PER_S
+from simulation.plant import Disturbance, FanParameters, Tacho, advance, at_rest
+from simulation.tray import LOOP_GAIN, LOOP_INTEGRAL_GAIN_PER_S
 
 RATE_HZ = 100.0
 STEP_NS = 10_000_000
@@ -128,7 +128,7 @@ class Plant:
         )
 
     def _decide(self, t_s: float, reading_rad_s: Array) -> Array:
-        """(c,) duty: of the profile, or of the device's own speed loop, as in twin.simulated_tray."""
+        """(c,) duty: of the profile, or of the device's own speed loop, as in simulation.tray."""
         wanted = self._knobs.at(t_s)
         looped = self._knobs.is_looped
         error_rad_s = np.where(looped, np.nan_to_num(wanted - reading_rad_s), 0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.messages import Array, Prediction, WhyNot
+from schemas.messages import Array, InvalidReason, Prediction
 
 
 def speed_sigmas(block: Prediction) -> Array:
@@ -15,7 +15,7 @@ def speed_sigmas(block: Prediction) -> Array:
 
 def balance_sigmas(block: Prediction) -> Array:
     """(n, fans) the torque balance in the card's sigma; NaN where it is not valid. It needs no free run to warm up."""
-    valid = block.valid | (block.why_not == WhyNot.WARMING_UP)
+    valid = block.valid | (block.invalid_reason == InvalidReason.WARMING_UP)
     return np.where(valid, block.torque_balance_command / block.torque_balance_sigma_command, np.nan)
 
 

@@ -29,7 +29,7 @@ from bench.detection.simulated_tables import (
     prepared,
 )
 from bench.printing import JsonOption, progress, show
-from scoring.calibration import TooLittleError
+from scoring.calibration.calibration import TooLittleError
 
 
 def main(

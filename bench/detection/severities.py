@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.messages import Array
-from twin.simulated_plant import FanParameters, drive
+from simulation.plant import FanParameters, drive
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ import numpy as np
 
 from bench.detection.knobs import BY_HAND, Knobs
 from bench.detection.plant import RATE_HZ, START_NS, TRAY_FANS, Plant
-from pipeline.config import parse_config
-from pipeline.stage import Context, Core
-from pipeline.table_of_stages import load_stage
+from pipeline.config.models import parse_config
+from pipeline.config.registry import load_stage
+from pipeline.runtime.stage import Context, Core
 from schemas.messages import Array, Grid, Prediction, Raw
+from simulation.plant import FanParameters, tray_of_fans
 from twin.build import train_twin
 from twin.runs import Run
-from twin.simulated_plant import FanParameters, tray_of_fans
 
 FANS_SEED = 7
 TRAINING_S = 120.0
@@ -131,6 +131,6 @@ def _one_sample() -> Grid:
     valid = np.ones((1, TRAY_FANS), np.bool_)
     t_ns = np.array([START_NS])
     return Grid(
-        fans=TRAY_FANS, step_ns=10_000_000, t_ns=t_ns, command=nothing, speed_rad_s=nothing, valid=valid,
-        why_not=np.zeros((1, TRAY_FANS), np.uint8),
+        fans=TRAY_FANS, period_ns=10_000_000, t_ns=t_ns, command=nothing, speed_rad_s=nothing, valid=valid,
+        invalid_reason=np.zeros((1, TRAY_FANS), np.uint8),
     )  # fmt: skip

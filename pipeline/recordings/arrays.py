@@ -1,6 +1,6 @@
 """Recordings as NumPy arrays: the columns of a topic in blocks of samples, one block of each tray in memory at a time.
 
-A recording may lie in several files, the parts of one. See docs/reading.md.
+A recording may lie in several files, the parts of one. See docs/how-to/read-recordings.md.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy as np
 
 from pipeline.recordings.order import Seen, in_order
 from pipeline.recordings.reading import Entry, RecordingError, read_recording
-from schemas.messages import MESSAGE_TYPES, Array, FanState, Message, Severity, StageStatus, WhyNot, columns
+from schemas.messages import MESSAGE_TYPES, Array, FanState, InvalidReason, Message, Severity, StageStatus, columns
 from schemas.topics import BY_NAME, HEALTH_CHUNK, TOPICS
 
 WORDS: Mapping[str, type[IntEnum]] = {
     "state": FanState,
-    "why_not": WhyNot,
+    "invalid_reason": InvalidReason,
     "severity": Severity,
     "status": StageStatus,
 }
@@ -112,7 +112,7 @@ def read_arrays(recording: Path | Iterable[Path], topic: str, tray: str | None =
 
     Args:
         recording: a file, or the parts of one recording in any order. A message that is in two parts counts once.
-        topic: see docs/messages.md.
+        topic: see docs/reference/messages.md.
         tray: only this one; None for all. A stage's health is of no tray and always there.
         rows: in a block. As many of each tray are in memory.
 

@@ -11,20 +11,20 @@ from mcap.reader import make_reader
 from mcap.summary import Summary
 
 from pipeline.recordings.disk import unwritten
-from pipeline.recordings.ledger import (
+from pipeline.recordings.reading import CORRUPT_DATA_ERRORS, METADATA_NAME
+from pipeline.recordings.records import RECORD, open_chunk, payloads_of
+from pipeline.recordings.scan import Scan, scan
+from pipeline.recordings.sequence_ledger import (
     BEFORE_NAME,
     ENDED,
     LEDGER_NAME,
-    Account,
-    Line,
+    StreamCounts,
+    StreamId,
     accounts_of,
     before_of,
     next_of,
     recovered_of,
 )
-from pipeline.recordings.reading import BROKEN, METADATA_NAME
-from pipeline.recordings.records import RECORD, open_chunk, payloads_of
-from pipeline.recordings.scan import Scan, scan
 from schemas.codec import CodecError, decode
 from schemas.messages import Health, Message, ModelCard
 from schemas.topics import topic_of
@@ -45,10 +45,10 @@ class Contents:
     size_bytes: int
     metadata: Mapping[str, str]
     attachments: tuple[str, ...]
-    accounts: Mapping[Line, Account]
+    accounts: Mapping[StreamId, StreamCounts]
     others: Mapping[str, int]
     """messages on channels that are none of ours, by topic"""
-    before: Mapping[Line, int]
+    before: Mapping[StreamId, int]
     first_ns: int | None
     last_ns: int | None
     messages: int
@@ -63,7 +63,7 @@ class Contents:
     """what is wrong with the file, one line each"""
 
     @property
-    def next(self) -> dict[Line, int]:
+    def next(self) -> dict[StreamId, int]:
         """With which number each producer should go on after this file."""
         return next_of(self.before, self.accounts)
 
@@ -77,7 +77,7 @@ def contents_of(path: Path) -> Contents:
     try:
         with path.open("rb") as file:
             found = _by_index(path, file)
-    except (OSError, *BROKEN, LookupError):
+    except (OSError, *CORRUPT_DATA_ERRORS, LookupError):
         found = None
     if found:
         return found

@@ -24,7 +24,7 @@ def refused(what: str, error: OSError, advice: str) -> RecordingError:
     return kind(f"{what}: {error.strerror}; {advice}")
 
 
-class WholeFile:
+class AtomicAppendFile:
     """A file in which every write is whole or has not been: on a full disk it keeps what it had."""
 
     def __init__(self, path: Path, *, keep: bool = False) -> None:

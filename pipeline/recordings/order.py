@@ -6,7 +6,7 @@ from bisect import bisect_right
 from collections.abc import Iterable
 from pathlib import Path
 
-from pipeline.recordings.reading import RecordingError, read_head, read_recording
+from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 
 
 def in_order(parts: Iterable[Path]) -> list[Path]:
@@ -18,7 +18,9 @@ def in_order(parts: Iterable[Path]) -> list[Path]:
     paths = list(dict.fromkeys(parts))
     if len(paths) > 1:
         for path in paths:
-            if "source" in read_head(path).metadata:  # its messages are counted from 0, as those of the next one are
+            if (
+                "source" in read_metadata(path).metadata
+            ):  # its messages are counted from 0, as those of the next one are
                 raise RecordingError(
                     f"{path}: made by import or simulate or an offline replay, so no part of another: read it by itself"
                 )
@@ -32,7 +34,7 @@ def _sessions_in_order(paths: Iterable[Path]) -> list[Path]:
     """By the time each session of a recorder began, and in it by part: the host's clock may be set back between two."""
     sessions: dict[str, list[tuple[int, int, Path]]] = {}
     for path in paths:
-        metadata = read_head(path).metadata
+        metadata = read_metadata(path).metadata
         part = metadata.get("part", "")
         entry = (int(part) if part.isdecimal() else 0, _start_ns(path), path)
         sessions.setdefault(metadata.get("session") or str(path), []).append(entry)

@@ -14,8 +14,8 @@ from google.protobuf.message import DecodeError
 from mcap.opcode import Opcode
 from mcap.records import Channel
 
-from pipeline.recordings.reading import BROKEN, Reading
-from pipeline.recordings.records import MESSAGE, RECORD, Walk, message_of, open_chunk, parse
+from pipeline.recordings.reading import CORRUPT_DATA_ERRORS, Reading
+from pipeline.recordings.records import MESSAGE, RECORD, RecordReader, message_of, open_chunk, parse
 from schemas import fan_pb2
 from schemas.codec import CodecError, decode, proto_type
 from schemas.messages import Message
@@ -55,14 +55,14 @@ class PacketReading:
 
     def _of_part(self, path: Path, reading: Reading) -> Iterator[Packet]:
         channels: dict[int, tuple[str, Topic]] = {}
-        walk = Walk(path)
+        walk = RecordReader(path)
         for found in walk:
             try:
                 if found.opcode == Opcode.CHUNK:
                     packets = self._of_chunk(open_chunk(found.content).data, channels)
                 else:
                     packets = self._of_record(found.opcode, found.content, channels)
-            except BROKEN:
+            except CORRUPT_DATA_ERRORS:
                 reading.damaged_chunks += 1
             else:
                 yield from packets

@@ -14,13 +14,13 @@ from pathlib import Path
 
 from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.disk import Disk, DiskError, refused, sync_folder
-from pipeline.recordings.ledger import Ledger
-from pipeline.recordings.reading import RecordingError, read_head
-from pipeline.recordings.recovery import TORN_SUFFIX, Recovery, free_torn_name, mend
+from pipeline.recordings.reading import RecordingError, read_metadata
+from pipeline.recordings.repair import TORN_SUFFIX, Recovery, free_torn_name, mend
+from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.recordings.writing import ACTIVE_SUFFIX, RecordingWriter
 
 
-class Shelf:
+class RecordingParts:
     """Where the parts of one recording stand, and begin."""
 
     def __init__(self, path: Path, metadata: Mapping[str, str], attachments: Mapping[str, bytes], session: str) -> None:
@@ -57,7 +57,7 @@ class Shelf:
         self.before = last.next if last else {}
         """of each key and producer, the sequence number that is due after the last part there is"""
 
-    def begin(self, t_ns: int, ledger: Ledger, about: Mapping[str, str]) -> RecordingWriter:
+    def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> RecordingWriter:
         """Begin the next part, at `t_ns`. about: what is special about it, for its metadata.
 
         Raises:
@@ -111,7 +111,7 @@ class Shelf:
 
     def _is_ours(self, path: Path) -> bool:
         try:
-            return read_head(path).metadata.get("recording") == self._path.name
+            return read_metadata(path).metadata.get("recording") == self._path.name
         except RecordingError:
             return False
 

@@ -1,7 +1,7 @@
 """Reading recordings: MCAP files that hold what went over the bus, as any MCAP reader understands it.
 
 A channel is a key of the bus, its messages are the protobuf bytes that were sent, and the schema is embedded. A file
-that breaks off, or is damaged in the middle, is read as far as it goes. See docs/recordings.md.
+that breaks off, or is damaged in the middle, is read as far as it goes. See docs/reference/recordings.md.
 """
 
 from __future__ import annotations
@@ -94,11 +94,11 @@ class Reading:
                     continue
                 try:
                     inside = breakup_chunk(record, validate_crc=True)
-                except BROKEN:
+                except CORRUPT_DATA_ERRORS:
                     self.damaged_chunks += 1
                 else:
                     yield from inside
-        except BROKEN:
+        except CORRUPT_DATA_ERRORS:
             self.torn = True
 
 
@@ -108,13 +108,13 @@ def read_recording(path: Path, topics: Collection[str] | None = None) -> Reading
     Raises:
         RecordingError: there is no such file, or it is no recording.
     """
-    with suppress(*BROKEN):
+    with suppress(*CORRUPT_DATA_ERRORS):
         next(records_of(path))
     return Reading(path, topics)
 
 
 @dataclass(frozen=True)
-class Head:
+class RecordingMetadata:
     """What stands before the first message of a recording."""
 
     metadata: Mapping[str, str]
@@ -125,7 +125,7 @@ class Head:
         return self.metadata.get(f"speed_unit.{tray}") or self.metadata.get("speed_unit", "rad/s")
 
 
-def read_head(path: Path) -> Head:
+def read_metadata(path: Path) -> RecordingMetadata:
     """The metadata and attachments of a recording.
 
     Raises:
@@ -133,7 +133,7 @@ def read_head(path: Path) -> Head:
     """
     metadata: dict[str, str] = {}
     attachments: dict[str, bytes] = {}
-    with suppress(*BROKEN):
+    with suppress(*CORRUPT_DATA_ERRORS):
         for record in records_of(path):
             if isinstance(record, Metadata) and record.name == METADATA_NAME:
                 metadata.update(record.metadata)
@@ -141,10 +141,10 @@ def read_head(path: Path) -> Head:
                 attachments[record.name] = record.data
             elif isinstance(record, Chunk):
                 break
-    return Head(metadata, attachments)
+    return RecordingMetadata(metadata, attachments)
 
 
-BROKEN = (McapError, ZstdError, ValueError, struct.error, OverflowError, MemoryError)
+CORRUPT_DATA_ERRORS = (McapError, ZstdError, ValueError, struct.error, OverflowError, MemoryError)
 """What reading bytes that are not what they should be raises; the last two where a damaged length asks for too much."""
 
 

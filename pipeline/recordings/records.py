@@ -19,7 +19,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdDecompressor
 
-from pipeline.recordings.reading import BROKEN, RecordingError
+from pipeline.recordings.reading import CORRUPT_DATA_ERRORS, RecordingError
 
 RECORD = struct.Struct("<BQ")
 """before each record: opcode, length"""
@@ -83,7 +83,7 @@ class LooseMessage(NamedTuple):
 
 
 @dataclass
-class Walk:
+class RecordReader:
     """All records of a file up to the footer, in order; one is in memory at a time.
 
     Where what follows cannot be one, the walk goes on at the next whole chunk, if there is one. Once it is through:
@@ -173,7 +173,7 @@ class Walk:
             return False
         try:
             open_chunk(file.read(length))
-        except BROKEN:
+        except CORRUPT_DATA_ERRORS:
             return False
         return True
 
@@ -188,7 +188,7 @@ def _is_of_its_length(opcode: int, content: bytes) -> bool:
             return struct.unpack_from("<I", content, 2)[0] == len(content) - 6
         if opcode in _DESCRIBING:
             parse(_DESCRIBING[opcode], content)
-    except BROKEN:
+    except CORRUPT_DATA_ERRORS:
         return False
     return True
 

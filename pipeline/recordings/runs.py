@@ -1,6 +1,6 @@
 """A recording as the model maker wants it: time, command and speed of one tray as arrays.
 
-A sample's time is found as in the pipeline, from the device's clock where there is one (pipeline.device_time).
+A sample's time is found as in the pipeline, from the device's clock where there is one (pipeline.devices.device_clock).
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.device_time import DeviceClock
-from pipeline.recordings.reading import RecordingError, read_head, read_recording
-from pipeline.table import held
+from pipeline.devices.device_clock import DeviceClock
+from pipeline.devices.measured_table import held
+from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from schemas.messages import Array, Raw
 
 
@@ -77,7 +77,7 @@ def read_runs(
     runs = [run for run in runs if len(run.t_s) > 1]
     if not runs:
         raise RecordingError(f"{path}: fewer than two raw samples from {from_s:g} s to {to_s:g} s; see --from and --to")
-    return RecordedTray(tuple(runs), read_head(path).speed_unit(name), reading.damage)
+    return RecordedTray(tuple(runs), read_metadata(path).speed_unit(name), reading.damage)
 
 
 Columns = tuple[Array, Array, Array]

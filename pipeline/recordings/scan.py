@@ -14,31 +14,31 @@ from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Sche
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
-from pipeline.recordings.census import Census
 from pipeline.recordings.index import Index, message_indexes
-from pipeline.recordings.ledger import (
-    BEFORE_NAME,
-    ENDED,
-    LEDGER_NAME,
-    Account,
-    Ledger,
-    Line,
-    accounts_of,
-    before_of,
-    corrected,
-    recovered_of,
-)
-from pipeline.recordings.reading import BROKEN, METADATA_NAME
+from pipeline.recordings.message_counts import MessageCounts
+from pipeline.recordings.reading import CORRUPT_DATA_ERRORS, METADATA_NAME
 from pipeline.recordings.records import (
     MESSAGE,
     RECORD,
     ChunkContent,
     Found,
-    Walk,
+    RecordReader,
     open_chunk,
     parse,
     record_bytes,
     records_in,
+)
+from pipeline.recordings.sequence_ledger import (
+    BEFORE_NAME,
+    ENDED,
+    LEDGER_NAME,
+    SequenceLedger,
+    StreamCounts,
+    StreamId,
+    accounts_of,
+    before_of,
+    corrected,
+    recovered_of,
 )
 
 Keep = Callable[[bytes], int]
@@ -50,14 +50,14 @@ class Scan:
     """What was found in a file by `scan`."""
 
     path: Path
-    walk: Walk
+    walk: RecordReader
     index: Index = field(default_factory=Index)
     """of what was kept"""
-    census: Census = field(default_factory=Census)
+    census: MessageCounts = field(default_factory=MessageCounts)
     """of the messages that were found"""
-    recorded: dict[Line, Account] | None = None
+    recorded: dict[StreamId, StreamCounts] | None = None
     """the ledger that stands in the file, if it was finished"""
-    before: dict[Line, int] = field(default_factory=dict)
+    before: dict[StreamId, int] = field(default_factory=dict)
     """with which number each producer should go on, by the parts before"""
     has_ended: bool = False
     """its recorder ended in order with this file, and not because something was in its way"""
@@ -98,7 +98,7 @@ class Scan:
         return self.index.messages.total()
 
     @property
-    def accounts(self) -> dict[Line, Account]:
+    def accounts(self) -> dict[StreamId, StreamCounts]:
         """The ledger that was kept while it was written, if it is there, less what is damaged; or the one found."""
         found = self.census.ledger.accounts
         if self.recorded is None:
@@ -120,7 +120,7 @@ def scan(path: Path, keep: Keep | None = None) -> Scan:
 
 class _Scanner:
     def __init__(self, path: Path, keep: Keep | None) -> None:
-        self._found = Scan(path, Walk(path))
+        self._found = Scan(path, RecordReader(path))
         self._offset = len(MCAP0_MAGIC)
         self._keep = keep or self._pass_over
         self._late: Summary | None = None
@@ -150,7 +150,7 @@ class _Scanner:
         found = self._found
         try:
             self._take_kind(record)
-        except BROKEN:
+        except CORRUPT_DATA_ERRORS:
             found.thrown_away_bytes += record.length
             found.damaged_chunks += record.opcode == Opcode.CHUNK
             found.damaged_attachments += record.opcode == Opcode.ATTACHMENT
@@ -207,7 +207,7 @@ class _Scanner:
             found.metadata.update(metadata.metadata)
         elif metadata.name == BEFORE_NAME:
             found.before = before_of(metadata.metadata)
-            found.census.ledger = Ledger(found.before)
+            found.census.ledger = SequenceLedger(found.before)
         found.index.note_metadata(metadata, self._keep_record(record), record.length)
 
     def _take_attachment(self, record: Found) -> None:
@@ -298,5 +298,5 @@ def summary_of(path: Path) -> Summary:
     with path.open("rb") as file:
         try:
             return make_reader(file).get_summary() or Summary()
-        except BROKEN:
+        except CORRUPT_DATA_ERRORS:
             return Summary()

@@ -10,8 +10,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
+from pipeline.devices.simulated_device import Device, DeviceSample, Played
 from pipeline.recordings.writing import RecordingWriter
-from pipeline.simulated_line import Device, DeviceSample, Played
 from schemas.messages import Header, Raw
 from schemas.topics import tray_key
 

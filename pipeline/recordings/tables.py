@@ -1,7 +1,7 @@
 """Blocks of a recording as tables for other programs: a row for each sample and fan, in a CSV or a Parquet file.
 
 A table is written in pieces, so what is in memory does not grow with it. Codes become words, and what is not there (NaN
-in the messages) is empty. See docs/reading.md.
+in the messages) is empty. See docs/how-to/read-recordings.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Writing recordings: MCAP files, whole at every moment as far as they go.
 
 Metadata and attachments stand before the first message, so that a file that was torn off still says what it is; the
-ledger stands behind the last. While it is written a file is called NAME.mcap.active. See docs/recordings.md.
+ledger stands behind the last. While it is written a file is called NAME.mcap.active. See docs/reference/recordings.md.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from pipeline.recordings.chunk import FillingChunk
-from pipeline.recordings.disk import WholeFile, refused, sync_folder
+from pipeline.recordings.disk import AtomicAppendFile, refused, sync_folder
 from pipeline.recordings.index import SHORT_ENDING, Index
-from pipeline.recordings.ledger import (
+from pipeline.recordings.reading import METADATA_NAME, RecordingError
+from pipeline.recordings.records import record_bytes
+from pipeline.recordings.sequence_ledger import (
     BEFORE_NAME,
     ENDED,
     LEDGER_NAME,
     RECOVERED,
-    Account,
-    Ledger,
-    Line,
+    SequenceLedger,
+    StreamCounts,
+    StreamId,
     as_metadata,
 )
-from pipeline.recordings.reading import METADATA_NAME, RecordingError
-from pipeline.recordings.records import record_bytes
 from schemas.codec import encode, proto_type, type_name
 from schemas.messages import Health, Message, newest_t_ns
 from schemas.topics import topic_of
@@ -71,7 +71,7 @@ class RecordingWriter:
         *,
         t_ns: int = 0,
         overwrite: bool = False,
-        ledger: Ledger | None = None,
+        ledger: SequenceLedger | None = None,
     ) -> None:
         """Begin `path`, under its active name. What a killed process has left under that name is lost: see
         `pipeline.recordings.parts` for what keeps it.
@@ -80,7 +80,7 @@ class RecordingWriter:
 
         Args:
             path: NAME.mcap.
-            metadata: what the recording is about, see docs/recordings.md.
+            metadata: what the recording is about, see docs/reference/recordings.md.
             attachments: name -> content.
             t_ns: when it begins, ns since 1970.
             overwrite: replace a finished file.
@@ -91,7 +91,7 @@ class RecordingWriter:
             RecordingError: it cannot be written there, or another process is writing it.
         """
         self.path = path
-        self.ledger = ledger or Ledger()
+        self.ledger = ledger or SequenceLedger()
         self.written: Counter[str] = Counter()
         """messages of each topic that are in the file for good: through to the disk"""
         self._filling: list[Pending] = []
@@ -107,7 +107,7 @@ class RecordingWriter:
         self._active = path.with_name(path.name + ACTIVE_SUFFIX)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = WholeFile(self._active)
+            self._file = AtomicAppendFile(self._active)
         except BlockingIOError as error:
             raise RecordingError(
                 f"{self._active}: another recorder is writing it; stop it, or name another file"
@@ -315,9 +315,9 @@ def _schema(message_type: type[Message]) -> bytes:
 
 
 def write_ending(
-    file: WholeFile,
+    file: AtomicAppendFile,
     index: Index,
-    accounts: Mapping[Line, Account],
+    accounts: Mapping[StreamId, StreamCounts],
     *,
     before: bytes = b"",
     has_ended: bool = False,

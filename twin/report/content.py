@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.build import evaluate
-from twin.card import Card, DataCard
-from twin.evaluation import Evaluation, Figures, evaluation_pieces, free_run_speeds
-from twin.onnx_twin import OnnxTwin
+from twin.evaluation.accuracy import Evaluation, Figures, evaluation_pieces, free_run_speeds
+from twin.evaluation.residual_analysis import ResidualAnalysis, analyse_residual
+from twin.export.card import Card, DataCard
+from twin.export.onnx_twin import OnnxTwin
 from twin.report.speed_bins import SpeedBin, speed_bins
 from twin.report.timeline import Timeline, timeline
-from twin.residual_analysis import ResidualAnalysis, analyse_residual
 from twin.runs import Array, Run
 
 

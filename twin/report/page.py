@@ -9,11 +9,11 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from twin.evaluation.residual_analysis import SIGNIFICANCE
 from twin.report import figures
 from twin.report.content import Content, FanContent
 from twin.report.steady_states import StaticCurve, static_curve
 from twin.report.verdict import AS_DECLARED, LOOSER, PHYSICS_USED, Verdict, judge, level_of
-from twin.residual_analysis import SIGNIFICANCE
 
 MOST_FANS_DRAWN = 12
 FOUR_DIGITS = ".4g"

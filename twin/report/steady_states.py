@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin import physics
-from twin.models import TwinModel
+from twin.models import physics
+from twin.models.model import TwinModel
 from twin.runs import Array, Run
 
 SETTLED = 0.01

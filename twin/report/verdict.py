@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from twin.models import Kind
+from twin.models.model import Kind
 from twin.report.content import Content, FanContent, Parameter
 
 Level = Literal["as declared", "looser than declared", "not followed"]
@@ -19,7 +19,7 @@ WORSE: dict[Level, str] = {
     "looser than declared": "follows {} less closely than its card says",
 }
 RANGE_TOLERANCE = 0.05
-"""Commands may leave the trained range by this share of its width, as in production (docs/deciding.md)."""
+"""Commands may leave the trained range by this share of its width, as in production (docs/explanation/deciding.md)."""
 RATE_TOLERANCE = 0.01
 UNCERTAIN = 1.0
 """A parameter is poorly determined when half its 95 % interval is wider than this share of it."""

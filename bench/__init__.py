@@ -1,0 +1,1 @@
+"""Measurements, as ratios: training, detection and runtime."""

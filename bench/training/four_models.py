@@ -1,0 +1,24 @@
+"""Figures of the models that `fantwin compare` sets side by side (twin.evaluation.comparison), over runs held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from twin.build import evaluate
+from twin.evaluation.accuracy import Figures
+from twin.evaluation.comparison import Contender
+from twin.runs import Run
+
+NO_FIGURES = Figures(np.inf, np.inf, -np.inf, np.inf, 0.0, 0)
+
+
+def held_out_figures(contender: Contender, runs: Sequence[Run]) -> Figures:
+    """Of the free run, all fans together. Infinite where it diverges, or where the model could not be trained."""
+    return evaluate(contender.twin, runs).pooled if contender.twin else NO_FIGURES
+
+
+def trained_in_s(contender: Contender) -> float:
+    """How long identification and training took."""
+    return contender.twin.card.training.duration_s if contender.twin else np.nan

@@ -1,0 +1,1 @@
+"""Commands that read, repair, convert and replay recordings."""

@@ -1,0 +1,195 @@
+"""`fantwin export`: a recording becomes tables for pandas, spreadsheets and databases."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Any, Self
+
+import typer
+from rich.console import Console
+
+from pipeline.cli.options import JsonOption
+from pipeline.cli.twins.training_data import made_folder
+from pipeline.errors import UserError
+from pipeline.optional_dependencies import how_to_install
+from pipeline.recordings.arrays import Block, in_order, read_topics
+from pipeline.recordings.reading import read_metadata, read_recording
+from pipeline.recordings.tables import Form, TableFile, open_table
+from pipeline.recordings.writing import ACTIVE_SUFFIX
+
+_PART = ".part"
+
+
+def export(
+    recordings: Annotated[list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts.")],
+    to: Annotated[Form, typer.Option("--to", help="Form of the tables; parquet needs the extra of that name.")],
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TOPIC", help="raw, grid, prediction, score, alarm ... Repeatable. Scores, else raw."),
+    ] = None,
+    tray: Annotated[str | None, typer.Option(help="Only this tray. All if not given.")] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for the tables, or the file if it is one.")
+    ] = Path(),
+    force: Annotated[bool, typer.Option("--force", help="Replace tables that exist.")] = False,
+    json_output: JsonOption = False,
+) -> None:
+    """Export a recording as tables: one for each topic and tray, with a row for each sample and fan.
+
+    Exits with 3 where the recording could not be read in full; what could is in the tables.
+
+    Example: fantwin export runs/demo/recording.mcap --to csv --topic score --topic alarm -o tables
+    """
+    if to == "parquet" and find_spec("pyarrow") is None:
+        raise UserError(f"--to parquet needs the extra `parquet`: use --to csv; or {how_to_install('parquet')}")
+    parts = in_order(recordings)
+    topics = list(dict.fromkeys(topic or _default_topics(parts)))
+    arrays = read_topics(parts, topics, tray)
+    with (
+        Console(stderr=True).status(f"exporting {parts[0]}") as status,
+        _Tables(parts, to, output, replace=force) as tables,
+    ):
+        for block in arrays:
+            tables.add(block)
+            status.update(f"exporting {parts[0]}: {tables.rows} rows")
+        if not tables.begun:
+            raise UserError(_nothing(parts[0], topics, tray, arrays.damage))
+        tables.finish("; ".join(arrays.damage))
+    told = [table.account() for table in tables.begun.values()]
+    absent = [name for name in topics if name not in {table["topic"] for table in told}]
+    if json_output:
+        typer.echo(
+            json.dumps({"tables": told, "absent": absent, "duplicated": arrays.duplicated, "damage": arrays.damage})
+        )
+    else:
+        for table in told:
+            typer.echo(f"{table['file']}: {table['rows']} rows")
+    for name in absent:
+        typer.echo(f"no {name} in this recording", err=True)
+    for line in arrays.damage:
+        typer.echo(line, err=True)
+    if arrays.damage:
+        raise typer.Exit(3)
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A table on its way: under a temporary name until all are whole."""
+
+    site: str
+    tray: str
+    topic: str
+    path: Path
+    file: TableFile
+
+    def holds(self, block: Block) -> bool:
+        return (self.site, self.tray, self.topic) == (block.site, block.tray, block.topic)
+
+    def account(self) -> dict[str, Any]:
+        return {"file": str(self.path), "topic": self.topic, "tray": self.tray, "rows": self.file.rows}
+
+
+class _Tables:
+    """The tables of an export, each begun when its first rows come; without `finish` nothing stays of them."""
+
+    def __init__(self, parts: Sequence[Path], form: Form, output: Path, *, replace: bool) -> None:
+        """Output is a folder, or the one file if it ends like one. Raises UserError where it cannot be."""
+        if output.suffix in (".csv", ".parquet") and output.suffix != f".{form}":
+            raise UserError(f"{output}: name a file that ends in .{form} with -o, or a folder")
+        self.begun: dict[Path, _Table] = {}
+        self._head = read_metadata(parts[0])
+        self._stem = parts[0].name.removesuffix(ACTIVE_SUFFIX).removesuffix(".mcap")
+        self._form: Form = form
+        self._output = output
+        self._is_file = output.suffix == f".{form}"
+        self._replace = replace
+        made_folder(output.parent if self._is_file else output)
+
+    @property
+    def rows(self) -> int:
+        return sum(table.file.rows for table in self.begun.values())
+
+    def add(self, block: Block) -> None:
+        """Append a block to the table it belongs to.
+
+        Raises:
+            UserError: the table cannot be written, exists already, or is one too many for one file.
+        """
+        path = self._path(block)
+        try:
+            if path not in self.begun:
+                self._begin(path, block)
+            table = self.begun[path]
+            if not table.holds(block):
+                raise UserError(
+                    f"{path}: would hold both {table.topic} of {table.tray or table.site} and {block.topic} of "
+                    f"{block.tray or block.site}: name a folder with -o, or choose with --topic and --tray"
+                )
+            table.file.add(block)
+        except OSError as error:
+            raise _refused(path, error) from error
+
+    def finish(self, damage: str) -> None:
+        """End all tables and give them their names. Raises UserError where the disk refuses."""
+        for path, table in self.begun.items():
+            try:
+                table.file.close(damage)
+                _unfinished(path).replace(path)
+            except OSError as error:
+                raise _refused(path, error) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        for table in self.begun.values():
+            with suppress(OSError):  # a disk that is full refuses what the file still held, too
+                table.file.close()
+            _unfinished(table.path).unlink(missing_ok=True)
+
+    def _path(self, block: Block) -> Path:
+        if self._is_file:
+            return self._output
+        name = ".".join(part for part in (self._stem, block.tray, block.topic, self._form) if part)
+        return self._output / name
+
+    def _begin(self, path: Path, block: Block) -> None:
+        if path.exists() and not self._replace:
+            raise UserError(f"{path}: exists; name another folder or file with -o, or replace it with --force")
+        about = {
+            **self._head.metadata,
+            "topic": block.topic,
+            "tray": block.tray,
+            "speed_unit": self._head.speed_unit(block.tray),
+            "exported_by": f"fantwin {version('fantwin')}",
+        }
+        file = open_table(self._form, _unfinished(path), block.topic, about)
+        self.begun[path] = _Table(block.site, block.tray, block.topic, path, file)
+
+
+def _refused(path: Path, error: OSError) -> UserError:
+    why = os.strerror(error.errno) if error.errno else str(error)  # Arrow's own text is long
+    return UserError(f"{path}: cannot be written: {why}; name another folder with -o")
+
+
+def _unfinished(path: Path) -> Path:
+    return path.with_name(path.name + _PART)
+
+
+def _default_topics(parts: Sequence[Path]) -> tuple[str]:
+    has_scores = any(True for part in parts for _ in read_recording(part, topics=("score",)))
+    return ("score",) if has_scores else ("raw",)
+
+
+def _nothing(path: Path, topics: Sequence[str], tray: str | None, damage: Sequence[str]) -> str:
+    of_tray = f" of a tray {tray!r}" if tray else ""
+    lost = f" ({'; '.join(damage)})" if damage else ""
+    return f"{path}: no {' or '.join(topics)}{of_tray} in this recording{lost}; see --topic and --tray"

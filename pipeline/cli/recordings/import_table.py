@@ -1,0 +1,110 @@
+"""`fantwin import`: a measured table becomes a recording."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.options import JsonOption
+from pipeline.config.models import NAME_PATTERN
+from pipeline.devices.measured_table import Table, read_table
+from pipeline.errors import UserError
+from pipeline.recordings.writing import RecordingWriter
+from schemas.messages import Header, Raw
+from schemas.topics import RESERVED_TRAY_NAMES, tray_key
+
+SITE = "imported"
+SAMPLES_A_MESSAGE = 100
+
+
+def import_table(
+    file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Measured table: text, columns with names.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="REC.mcap", help="Recording to write.")],
+    command: Annotated[
+        list[str], typer.Option(metavar="COLUMN", help="Command; one for all fans, or one for each. Repeatable.")
+    ],
+    speed: Annotated[
+        list[str],
+        typer.Option(
+            metavar="COLUMN[:UNIT]",
+            help="Speed of a fan in rpm, hz, deg/s or rad/s (if not given). Repeatable: more fans.",
+        ),
+    ],
+    time: Annotated[
+        str | None,
+        typer.Option(metavar="COLUMN[:UNIT]", help="Time in ms, us, ns, s or iso; if not given, numbers are s."),
+    ] = None,
+    period: Annotated[
+        str | None, typer.Option(metavar="TIME", help="Time between samples where no column has it, e.g. 10ms.")
+    ] = None,
+    tray: Annotated[str, typer.Option(help="Name of the tray in the recording.")] = "tray1",
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing recording.")] = False,
+    json_output: JsonOption = False,
+) -> None:
+    """Turn a measured table into a recording: the one data format for training, evaluation and replay.
+
+    What is odd in the table (repeated times, gaps, empty cells) is counted and told, never filled in.
+
+    Example: fantwin import FILE.csv --time t:s --command u --speed y:rpm -o REC.mcap
+    """
+    if not re.match(NAME_PATTERN, tray) or tray in RESERVED_TRAY_NAMES:
+        raise UserError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
+    if output.exists() and not force:
+        raise UserError(f"{output}: exists; name another file with -o, or replace it with --force")
+    table = read_table(file, time, command, speed, period=period)
+    write_table(table, output, tray)
+    if json_output:
+        typer.echo(json.dumps(account(table, output)))
+        return
+    fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"
+    step = f"{table.median_step_s * 1e3:.3g} ms apart (median)"
+    typer.echo(f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {step}")
+    for note in (*filter(None, [table.assumed]), *table.notes):
+        typer.echo(f"  {note}")
+
+
+def write_table(table: Table, output: Path, tray: str) -> None:
+    """Write a table's samples as raw messages; each counts as received at its own time.
+
+    Raises:
+        RecordingError: it cannot be written.
+    """
+    metadata = {
+        "made_by": f"fantwin {version('fantwin')}",
+        "source": table.path.name,
+        "site": SITE,
+        "trays": tray,
+        "speed_unit": table.speed_unit,
+    }
+    with RecordingWriter(output, metadata, t_ns=int(table.t_ns[0]), overwrite=True) as writer:
+        for sequence, first in enumerate(range(0, len(table.t_ns), SAMPLES_A_MESSAGE)):
+            rows = slice(first, first + SAMPLES_A_MESSAGE)
+            raw = Raw(
+                header=Header("import", sequence, tray),
+                fans=table.fans,
+                host_receive_t_ns=table.t_ns[rows],
+                command=table.command[rows],
+                speed_rad_s=table.speed_rad_s[rows],
+            )
+            writer.write_message(tray_key(SITE, tray, "raw"), raw, int(table.t_ns[rows][-1]))
+
+
+def account(table: Table, output: Path) -> dict[str, object]:
+    """What a machine is told of an import."""
+    return {
+        "recording": str(output),
+        "samples": len(table.t_ns),
+        "fans": table.fans,
+        "duration_s": table.duration_s,
+        "median_rate_hz": 1 / table.median_step_s,
+        "speed_unit": table.speed_unit,
+        "assumed": table.assumed,
+        "gaps": table.gaps,
+        **asdict(table.mended),
+    }

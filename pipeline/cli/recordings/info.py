@@ -1,0 +1,203 @@
+"""`fantwin info`: what is in a recording, and what is missing in it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pipeline.cli.options import JsonOption
+from pipeline.cli.progress import working
+from pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
+from pipeline.recordings.metadata import CONFIGURATION
+from pipeline.recordings.sequence_ledger import StreamCounts, add_up
+from schemas.messages import Health
+
+
+def info(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="A recording, or the parts of one.")],
+    json_output: JsonOption = False,
+) -> None:
+    """Show what is in a recording: time, trays, twins, topics with what is missing, and what its stages said last.
+
+    Of several parts it is checked too that each goes on where the one before ended. A file without an index is gone
+    through as far as it can be read. Exit code 3 when messages are missing or a file is damaged.
+
+    Example: fantwin info runs/recording.mcap
+    """
+    with working(f"reading {', '.join(str(file) for file in files)}"):
+        parts = sorted((contents_of(file) for file in dict.fromkeys(files)), key=lambda part: part.first_ns or 0)
+    breaks = continuity(parts)
+    if json_output:
+        typer.echo(json.dumps(as_json(parts, breaks)))
+    else:
+        _show(parts, breaks)
+    if breaks or any(_has_lost(part) for part in parts):
+        raise typer.Exit(3)
+
+
+def as_json(parts: Sequence[Contents], breaks: Sequence[str]) -> dict[str, Any]:
+    """What a machine is told: each file, and the topics of all together."""
+    together = add_up(item for part in parts for item in part.accounts.items())
+    return {
+        "files": [_part_as_json(part) for part in parts],
+        "topics": {key: _account_as_json(account) for key, account in together.items()},
+        "continuity": list(breaks),
+    }
+
+
+def _part_as_json(part: Contents) -> dict[str, Any]:
+    return {
+        "file": str(part.path),
+        "size_bytes": part.size_bytes,
+        "messages": part.messages,
+        "first_ns": part.first_ns,
+        "last_ns": part.last_ns,
+        "duration_s": _duration_s(part),
+        "metadata": dict(part.metadata),
+        "attachments": list(part.attachments),
+        "has_configuration": _has_configuration(part),
+        "twins": {_tray(key): {"twin": c.twin, "kind": c.kind, "sha256": c.sha256} for key, c in part.cards.items()},
+        "topics": {key: _account_as_json(account) for key, account in add_up(part.accounts.items()).items()},
+        "producers": [{"key": key, "producer": producer, **asdict(a)} for (key, producer), a in part.accounts.items()],
+        "other_topics": dict(part.others),
+        "stages": {
+            _stage(health): {
+                "status": health.status.name.lower(),
+                "problem": health.problem,
+                "lost": health.lost,
+                "counters": {counter.name: counter.value for counter in health.counters},
+            }
+            for health in part.healths.values()
+        },
+        "recovered": list(part.recovered),
+        "damage": list(part.damage),
+    }
+
+
+def _account_as_json(account: StreamCounts) -> dict[str, Any]:
+    return {
+        "messages": account.messages,
+        "missing": account.missing,
+        "duplicated": account.duplicated,
+        "first_ns": account.first_ns,
+        "last_ns": account.last_ns,
+        "rate_hz": _rate_hz(account),
+    }
+
+
+def _show(parts: Iterable[Contents], breaks: Iterable[str]) -> None:
+    console = Console(soft_wrap=True, highlight=False)
+    for part in parts:
+        for line in _about(part):
+            console.print(line)
+        if part.accounts or part.others:
+            console.print(_table(part))
+        for health in sorted(part.healths.values(), key=_stage):
+            if health.problem or health.lost:
+                lost = f"; {health.lost} lost" if health.lost else ""
+                console.print(f"[red]{escape(_stage(health))}: {escape(health.problem or 'well')}{lost}[/red]")
+        for line in part.recovered:
+            console.print(f"[red]was mended: {escape(line)}[/red]")
+        for line in part.damage:
+            advice = "" if line == STILL_WRITTEN else "; `fantwin recover` mends it"
+            console.print(f"[red]{escape(line)}{advice}[/red]")
+    for line in breaks:
+        console.print(f"[red]{escape(line)}[/red]")
+
+
+def _about(part: Contents) -> list[str]:
+    """What is said of a file before its topics."""
+    said = part.metadata
+    lines = [f"[bold]{escape(str(part.path))}[/bold]: {part.size_bytes / 1e6:,.2f} MB, {part.messages} messages"]
+    if part.first_ns is not None and part.last_ns is not None:
+        lines.append(f"from {_date(part.first_ns)} to {_date(part.last_ns)}: {_duration_s(part):,.1f} s")
+    if not said and not part.accounts:
+        lines.append("not a recording of fantwin: none of its channels is ours")
+    if "part" in said:
+        after = f", continues {said['continues']}" if "continues" in said else ""
+        lines.append(f"part {said['part']} of session {said.get('session', '?')}{after}, site {said.get('site', '?')}")
+    with suppress(KeyError, ValueError):  # others may have metadata of these names
+        gap_s = (int(said["resumed_t_ns"]) - int(said["paused_t_ns"])) / 1e9
+        lost, why = said["lost_in_pause"], said["paused_because"]
+        lines.append(f"before it nothing was recorded for {gap_s:,.1f} s; messages lost: {lost}")
+        lines.append(f"  because {why}")
+    for tray in filter(None, said.get("trays", "").split(",")):
+        fans = f", {said[f'fans.{tray}']} fans" if f"fans.{tray}" in said else ""
+        lines.append(
+            f"tray {tray}{fans}, speeds in {said.get(f'speed_unit.{tray}') or said.get('speed_unit', 'rad/s')}"
+        )
+    for key, card in part.cards.items():
+        lines.append(f"twin of {_tray(key)}: {card.twin}, {card.kind}, sha256 {card.sha256[:12]}")
+    if "source" in said:
+        lines.append(f"made of: {said['source']}")
+    if part.attachments:
+        lines.append(f"attached: {', '.join(part.attachments)}")
+    return [lines[0], *(escape(line) for line in lines[1:])]
+
+
+def _table(part: Contents) -> Table:
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("topic", overflow="fold")
+    for column in ("messages", "missing", "twice", "first", "last", "per s"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for key, account in add_up(part.accounts.items()).items():
+        missing = f"[red]{account.missing}[/red]" if account.missing else "0"
+        rate_hz = _rate_hz(account)
+        table.add_row(
+            escape(key.split("/", 2)[2]),
+            str(account.messages),
+            missing,
+            str(account.duplicated),
+            _time(account.first_ns),
+            _time(account.last_ns),
+            "" if rate_hz is None else f"{rate_hz:.1f}",
+        )
+    for topic, messages in sorted(part.others.items()):
+        table.add_row(escape(topic), str(messages), "", "", "", "", "", style="dim")
+    return table
+
+
+def _has_lost(part: Contents) -> bool:
+    has_missing = any(account.missing for account in part.accounts.values())
+    return has_missing or bool(part.recovered) or not NO_LOSS.issuperset(part.damage)
+
+
+def _duration_s(part: Contents) -> float:
+    return (part.last_ns - part.first_ns) / 1e9 if part.last_ns is not None and part.first_ns is not None else 0.0
+
+
+def _rate_hz(account: StreamCounts) -> float | None:
+    if account.first_ns is None or account.last_ns is None or account.last_ns <= account.first_ns:
+        return None
+    return (account.messages - 1) / ((account.last_ns - account.first_ns) / 1e9)
+
+
+def _has_configuration(part: Contents) -> bool:
+    return CONFIGURATION in part.attachments
+
+
+def _tray(key: str) -> str:
+    return key.split("/")[2]
+
+
+def _stage(health: Health) -> str:
+    return health.stage if health.instance == "all" else f"{health.stage}/{health.instance}"
+
+
+def _time(t_ns: int | None) -> str:
+    return "" if t_ns is None else datetime.fromtimestamp(t_ns / 1e9).strftime("%H:%M:%S")
+
+
+def _date(t_ns: int) -> str:
+    return datetime.fromtimestamp(t_ns / 1e9).isoformat(sep=" ", timespec="milliseconds")

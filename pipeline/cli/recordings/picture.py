@@ -1,0 +1,48 @@
+"""`fantwin picture`: a view as a PNG, drawn by Rerun's own viewer without a display."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from pipeline.cli.options import JsonOption, fan_numbers
+from pipeline.errors import UserError
+from pipeline.optional_dependencies import how_to_install
+
+
+def picture(
+    view_file: Annotated[Path, typer.Argument(metavar="VIEW.rrd", help="What the viewer stage wrote.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The PNG to write.")] = Path("view.png"),
+    tray: Annotated[str | None, typer.Option(help="Which tray, where there are several.")] = None,
+    fans: Annotated[str | None, typer.Option(help="Which fans, e.g. 2,5. The first eight if not given.")] = None,
+    at: Annotated[
+        float | None, typer.Option(help="End of the picture, s after the first sample. The last one.")
+    ] = None,
+    window: Annotated[float, typer.Option(min=0.1, help="How much is shown before that, s.")] = 30.0,
+    view: Annotated[str | None, typer.Option(help="Only this view: part of its name, e.g. 'fan 2'.")] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Draw a view file as a picture, by a headless Rerun viewer (needs a Vulkan driver).
+
+    Example: fantwin picture runs/demo/view.rrd --fans 2,5 --at 25 -o view.png
+    """
+    try:
+        from pipeline.viewing.rerun_picture import draw_picture  # noqa: PLC0415  the extra `view` may not be installed
+    except ModuleNotFoundError as error:
+        if error.name not in ("rerun", "PIL"):
+            raise
+        raise UserError(f"pictures need the extra `view`; {how_to_install('view')}") from error
+    with Console(stderr=True).status(f"drawing {view_file}"):
+        drawn = draw_picture(view_file, tray=tray, fans=fan_numbers(fans), at_s=at, window_s=window, view=view)
+    output.write_bytes(drawn.png)
+    if json_output:
+        typer.echo(json.dumps({"picture": str(output), "views": drawn.reports}))
+        return
+    typer.echo(f"{output}: {', '.join(sorted(drawn.reports))}")
+    for name, reports in drawn.reports.items():
+        for report in reports:
+            typer.echo(f"{name}: {report}", err=True)

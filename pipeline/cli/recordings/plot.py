@@ -1,0 +1,45 @@
+"""`fantwin plot`: the fans of a recording beside their twins, as a picture."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from pipeline.cli.options import JsonOption, fan_numbers
+from pipeline.errors import UserError
+from pipeline.optional_dependencies import how_to_install
+
+
+def plot(
+    recordings: Annotated[list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The picture: .png, .svg or .pdf.")] = Path(
+        "bands.png"
+    ),
+    tray: Annotated[str | None, typer.Option(help="Which tray, where there are several.")] = None,
+    fans: Annotated[str | None, typer.Option(help="Which fans, e.g. 2,5. Those with alarms and one without.")] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of speed, rpm or rad/s. The recording's own.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="A simulated tray's account of its faults (JSON).")] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Plot measured speed, prediction, band, alarms and states of a recording.
+
+    Example: fantwin plot runs/demo/recording.mcap --truth runs/demo/truth.json -o bands.png
+    """
+    try:
+        from pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  the extra `view` may not be installed
+    except ModuleNotFoundError as error:
+        if error.name != "matplotlib":
+            raise
+        raise UserError(f"plots need the extra `view`; {how_to_install('view')}") from error
+    if unit not in ("rpm", "rad/s", None):
+        raise UserError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
+    with Console(stderr=True).status(f"drawing {output}"):
+        drawn = plot_recording(recordings, output, tray=tray, fans=fan_numbers(fans), speed_unit=unit, truth=truth)
+    if json_output:
+        typer.echo(json.dumps({"plot": str(output), "fans": drawn}))
+    else:
+        typer.echo(f"{output}: fans {', '.join(map(str, drawn))}")

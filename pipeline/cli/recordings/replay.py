@@ -1,0 +1,226 @@
+"""`fantwin replay`: a recording, on the bus again."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import typer
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from pipeline.cli.options import JsonOption, SetOption
+from pipeline.replay.live.keyboard import Keys
+from pipeline.replay.live.listeners import FROM
+from pipeline.replay.live.pace import Pace
+from pipeline.replay.live.player import Progress
+from pipeline.replay.live.publishing import Outcome, publish
+from pipeline.replay.live.recording_playback import RecordingPlayback
+from pipeline.replay.resolve_config import resolve_config
+from pipeline.runtime.signals import stop_on_signals
+from schemas.topics import TOPICS
+
+REPLAYED = tuple(topic.name for topic in TOPICS if topic.recorded and topic.name != "health")
+"""What is replayed where nothing else is said; the health of stages that are gone is told to nobody."""
+_KEYS_HELP = "space pause, → step, ↑↓ rate, q quit"
+_SHOWN_EVERY_S = 0.1
+LARGEST_RATE = 1e6
+LONGEST_S = 1e10
+"""three centuries, and still a time in ns"""
+_Show: TypeAlias = Callable[[Progress], None]
+_VIEWING = "Viewing"
+_DECIDING = "Deciding again, without a bus"
+
+
+def replay(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE", help="Recordings: the parts of one, in any order.")],
+    rate: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X|max",
+            help="Seconds of the recording a second; max: as fast as it goes.",
+            rich_help_panel=_VIEWING,
+        ),
+    ] = None,
+    start: Annotated[float, typer.Option(help="Where to begin, s since the recording began.")] = 0.0,
+    end: Annotated[float, typer.Option(help="Where to end, s since the recording began.")] = math.inf,
+    pause: Annotated[
+        bool, typer.Option("--pause", help="Begin paused: space goes on.", rich_help_panel=_VIEWING)
+    ] = False,
+    loop: Annotated[
+        bool, typer.Option("--loop", help="Again and again, times going on.", rich_help_panel=_VIEWING)
+    ] = False,
+    topics: Annotated[
+        str | None,
+        typer.Option(metavar="A,B", help="Topics to publish; without it, all of the trays.", rich_help_panel=_VIEWING),
+    ] = None,
+    from_topic: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="|".join(FROM),
+            help="Publish only what the stages after it need; they judge it anew.",
+            rich_help_panel=_VIEWING,
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "-c",
+            "--config",
+            help="Configuration file (TOML): its site, trays and bus. Without it, the one in the recording; where "
+            "there is none, as in an imported table, site and trays of the recording, and defaults.",
+        ),
+    ] = None,
+    overrides: SetOption = None,
+    json_output: JsonOption = False,
+    offline: Annotated[
+        bool, typer.Option("--offline", help="Run the stages in this process instead.", rich_help_panel=_DECIDING)
+    ] = False,
+    twin: Annotated[
+        Path | None, typer.Option(metavar="TWIN.onnx", help="Another twin.", rich_help_panel=_DECIDING)
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="OUT.mcap", help="Write what was decided.", rich_help_panel=_DECIDING),
+    ] = None,
+    verify: Annotated[
+        bool,
+        typer.Option("--verify", help="Compare with what was recorded, bit for bit.", rich_help_panel=_DECIDING),
+    ] = False,
+) -> None:
+    """Publish a recording on the bus in recorded time, for the viewer or for the stages; or decide it again offline.
+
+    In a terminal: space pauses, right arrow or s goes to the next sample, up and down double and halve the rate, q
+    quits. Nothing is published that a running stage writes itself. Exit code 3 when a stage lost something, or part of
+    the recording could not be read.
+
+    Example: fantwin replay recording.mcap --rate 4 --from raw -c fantwin.toml
+    """
+    viewing = {"--rate": rate, "--pause": pause, "--loop": loop, "--topics": topics, "--from": from_topic}
+    deciding = {"--twin": twin, "--output": output, "--verify": verify}
+    for name in (name for name, value in (viewing if offline else deciding).items() if value):
+        raise typer.BadParameter(f"{name} {'cannot go' if offline else 'goes only'} with --offline")
+    if not 0.0 <= start < min(end, LONGEST_S) or (end > LONGEST_S and not math.isinf(end)):
+        raise typer.BadParameter("0 <= --start < --end, in seconds", param_hint="--start, --end")
+    if offline:
+        from pipeline.cli.recordings.replay_offline import run_offline  # noqa: PLC0415  with all that decides
+
+        run_offline(
+            files,
+            config=config,
+            overrides=overrides or (),
+            twin=twin,
+            output=output,
+            verify=verify,
+            from_s=start,
+            to_s=end,
+            json_output=json_output,
+        )
+        return
+    chosen = _chosen_topics(topics, from_topic)
+    pace = Pace(_rate(rate or "1"), paused=pause)
+    keys = Keys()
+    if pause and not keys.are_there:
+        raise typer.BadParameter("nobody could press a key to go on: this is no terminal", param_hint="--pause")
+    reel = RecordingPlayback(files, chosen, start, end)
+    place = resolve_config(reel.files[0], reel.first, config, overrides or ())
+    stop = threading.Event()
+    stop_on_signals(stop)
+    console = Console(stderr=True, highlight=False)
+    with keys, _status_line(console, reel.end_s(), reel.seconds_at) as show:
+        outcome = publish(
+            reel,
+            chosen,
+            pace,
+            place,
+            stop,
+            loop=loop,
+            keys=keys.pressed,
+            show=show,
+            say=lambda line: console.print(line, markup=False, soft_wrap=True),
+        )
+    for line in outcome.damage:
+        console.print(line, markup=False, soft_wrap=True)
+    for name in outcome.behind:
+        console.print(f"{name} has not said that it took all: look at `fantwin status`", markup=False, soft_wrap=True)
+    if json_output:
+        typer.echo(json.dumps({"files": [str(file) for file in reel.files], **asdict(outcome)}))
+    else:
+        typer.echo(_sentence(outcome))
+    if outcome.exit_code:
+        raise typer.Exit(outcome.exit_code)
+
+
+def _chosen_topics(topics: str | None, from_topic: str | None) -> tuple[str, ...]:
+    if from_topic is not None:
+        if topics is not None:
+            raise typer.BadParameter("--topics or --from, not both", param_hint="--from")
+        if from_topic not in FROM:
+            raise typer.BadParameter(f"{from_topic!r} is none of {', '.join(FROM)}", param_hint="--from")
+        return FROM[from_topic]
+    if topics is None:
+        return REPLAYED
+    chosen = tuple(topics.split(","))
+    for name in chosen:
+        if name not in REPLAYED:
+            raise typer.BadParameter(f"{name!r} is none of {', '.join(REPLAYED)}", param_hint="--topics")
+    return chosen
+
+
+def _rate(text: str) -> float:
+    try:
+        rate = math.inf if text == "max" else float(text)
+    except ValueError:
+        rate = math.nan
+    if text != "max" and not 0.0 < rate <= LARGEST_RATE:
+        raise typer.BadParameter(f"{text!r}: give a number above 0, to {LARGEST_RATE:g}, or max", param_hint="--rate")
+    return rate
+
+
+@contextmanager
+def _status_line(console: Console, end_s: float | None, seconds_at: Callable[[int], float]) -> Iterator[_Show]:
+    """Where the replay has come to, in the terminal's last line; nothing where there is none."""
+    if not console.is_terminal:
+        yield lambda _progress: None
+        return
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        shown_s = 0.0
+
+        def show(progress: Progress) -> None:
+            nonlocal shown_s
+            if time.monotonic() - shown_s >= _SHOWN_EVERY_S or progress.paused:
+                shown_s = time.monotonic()
+                live.update(
+                    Text(status_line(progress, seconds_at(progress.t_ns), end_s), no_wrap=True, overflow="ellipsis"),
+                    refresh=True,
+                )
+
+        yield show
+
+
+def status_line(progress: Progress, at_s: float, end_s: float | None) -> str:
+    """One line: recorded time, place in the recording, rate, messages sent."""
+    when = datetime.fromtimestamp(progress.t_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
+    place = f"{at_s:.2f} s" + (f" of {end_s:.2f} s" if end_s is not None and not progress.round else "")
+    rounds = f"  round {progress.round + 1}" if progress.round else ""
+    rate = "as fast as it goes" if math.isinf(progress.rate) else f"x {progress.rate:g}"
+    state = "paused, " if progress.paused else ""
+    return f"{when} UTC  {place}{rounds}  {state}{rate}  {progress.messages:,} sent  ({_KEYS_HELP})"
+
+
+def _sentence(outcome: Outcome) -> str:
+    messages = ", ".join(f"{count:,} {name}" for name, count in outcome.messages.items()) or "nothing"
+    rate = f", {outcome.rate:.3g} times real time" if outcome.rate is not None else ""
+    lost = ", ".join(f"{name} {count}" for name, count in outcome.lost.items()) or "nothing"
+    ended = "stopped; " if outcome.stopped else ""
+    return f"{ended}published {messages}: {outcome.recorded_s:.1f} s in {outcome.elapsed_s:.1f} s{rate}; lost: {lost}"

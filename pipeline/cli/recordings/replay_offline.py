@@ -1,0 +1,214 @@
+"""`fantwin replay --offline`: judge a recording again, compare, and say what came of it."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress, SpinnerColumn, TextColumn
+from rich.table import Table
+
+from pipeline.errors import UserError
+from pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, episodes
+from pipeline.replay.offline.judging import CannotCompareError, JudgedTray, judge
+from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
+from pipeline.replay.offline.verify import when
+
+EXIT_DIFFERS, EXIT_CANNOT_COMPARE, EXIT_LOST = 1, 2, 3
+_SHOWN = 40
+"""so many alarms are listed"""
+_WIDEST = 100
+"""columns of the list"""
+
+
+def run_offline(
+    files: Sequence[Path],
+    *,
+    config: Path | None,
+    overrides: Sequence[str],
+    twin: Path | None,
+    output: Path | None,
+    verify: bool,
+    from_s: float,
+    to_s: float,
+    json_output: bool,
+) -> None:
+    """Judge, print, and exit: 0 well, 1 could not be done, 3 something was lost; with `verify` 0 equal, 1 differs,
+    2 could not compare.
+
+    Raises:
+        UserError: it cannot be done.
+    """
+    began_s = time.monotonic()
+    try:
+        with open_replay_input(files, config, overrides, twin, from_s, to_s) as material:
+            if verify and not material.is_as_recorded:
+                raise CannotCompareError(
+                    f"{files[0]}: --verify compares with the recording: leave out --twin, -c and --set, and give a "
+                    "recording that holds its configuration"
+                )
+            trays = _judged(material, output, verify)
+            took_s = time.monotonic() - began_s
+            result = _result(material, trays, took_s)
+    except UserError as error:
+        if not verify:
+            raise
+        _say_cannot(str(error), json_output)
+        raise typer.Exit(EXIT_CANNOT_COMPARE) from error
+    if json_output:
+        typer.echo(json.dumps(result))
+    else:
+        _tell(trays, result, output)
+    problems = [tray.problem for tray in trays if tray.problem]
+    if problems and not verify and not any(tray.judged for tray in trays):
+        raise UserError(f"{files[0]}: {'; '.join(problems)}")
+    if verify:
+        raise typer.Exit(0 if result["verified"]["equal"] else EXIT_DIFFERS)
+    if result["lost"] or result["damage"]:
+        raise typer.Exit(EXIT_LOST)
+
+
+def _judged(material: ReplayInput, output: Path | None, verify: bool) -> list[JudgedTray]:
+    columns = (SpinnerColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task("reading what the stages were fed")
+        first: dict[str, int] = {}
+
+        def progress(tray: str, t_ns: int) -> None:
+            since_s = (t_ns - first.setdefault(tray, t_ns)) / 1e9
+            shown.update(task, description=f"judging {tray}: {since_s:.0f} s of it")
+
+        return judge(material, output, verify, progress)
+
+
+def _result(material: ReplayInput, trays: Sequence[JudgedTray], took_s: float) -> dict[str, Any]:
+    now = episodes(alarm for tray in trays for alarm in tray.alarms)
+    judged_s = sum(tray.hours for tray in trays) * 3600
+    result: dict[str, Any] = {
+        "alarms": [episode.as_json() for episode in now],
+        "start_ns": min((tray.start_ns for tray in trays if tray.samples), default=0),
+        "hours": sum(tray.hours for tray in trays),
+        "samples": sum(tray.samples for tray in trays),
+        "lost": sum(tray.lost for tray in trays),
+        "not_judged": {tray.tray: dict(tray.not_judged.most_common()) for tray in trays},
+        "counts": {tray.tray: dict(sorted(tray.counts.items())) for tray in trays},
+        "restarts": sum(tray.plan.restarts for tray in trays),
+        "damage": list(material.damage.values()),
+        "took_s": took_s,
+        "times_real_time": judged_s / took_s if took_s else math.inf,
+    }
+    compared = [tray.comparison for tray in trays if tray.comparison]
+    if compared:
+        result["verified"] = {
+            "equal": all(one.is_equal for one in compared),
+            "samples_equal": sum(one.equal for one in compared),
+            "samples_different": sum(one.different for one in compared),
+            "samples_not_made": sum(one.not_made for one in compared),
+            "samples_not_recorded": sum(one.not_recorded for one in compared),
+            "alarms_equal": sum(one.alarms_equal for one in compared),
+            "alarms_different": sum(one.alarms_different for one in compared),
+            "alarms_not_recorded": sum(one.alarms_not_recorded for one in compared),
+            "differences": [line for one in compared for line in one.named],
+        }
+    elif not material.is_as_recorded and any(tray.recorded_alarms for tray in trays):
+        within = [
+            alarm for tray in trays for alarm in tray.recorded_alarms if tray.start_ns <= alarm.t_ns <= tray.end_ns
+        ]
+        what_if = compare_episodes(now, episodes(within))
+        result["what_if"] = _what_if(what_if)
+    return result
+
+
+def _what_if(found: AlarmDiff) -> dict[str, Any]:
+    return {name: [episode.as_json() for episode in getattr(found, name)] for name in ("gained", "lost", "kept")}
+
+
+def _tell(trays: Sequence[JudgedTray], result: dict[str, Any], output: Path | None) -> None:
+    console = Console(highlight=False, soft_wrap=True)
+    console.width = min(_WIDEST, console.width) if console.is_terminal else _WIDEST
+    now, start_ns = result["alarms"], result["start_ns"]
+    _list(console, "alarms", now, start_ns)
+    console.print(
+        f"{len(now)} alarm{'s' * (len(now) != 1)} in {_duration(result['hours'])}, {result['samples']} samples, "
+        f"{result['lost']} lost; "
+        f"{result['times_real_time']:.0f} times real time"
+    )
+    for tray in trays:
+        if tray.problem:
+            console.print(f"[bold yellow]not judged:[/bold yellow] {escape(tray.problem)}")
+    if result["restarts"]:
+        console.print(f"{result['restarts']} restarts of stages, replayed as they were recorded")
+    for damage in result["damage"]:
+        console.print(f"[bold yellow]damaged:[/bold yellow] {escape(damage)}")
+    if "what_if" in result:
+        for name in ("gained", "lost"):
+            found = result["what_if"][name]
+            console.print(f"against the recording: {len(found)} alarms {name}")
+            _list(console, name, found, start_ns)
+    if "verified" in result:
+        _tell_verified(result["verified"], console)
+    if output:
+        console.print(f"written to {output}", markup=False)
+
+
+def _duration(hours: float) -> str:
+    return (
+        f"{hours:.3g} h" if hours >= 1.0 else f"{hours * 60:.3g} min" if hours * 60 >= 1.0 else f"{hours * 3600:.3g} s"
+    )
+
+
+def _tell_verified(found: dict[str, Any], console: Console) -> None:
+    if found["equal"]:
+        console.print(
+            f"[bold green]equal:[/bold green] {found['samples_equal']} samples and {found['alarms_equal']} alarms, "
+            "to the bit"
+        )
+    else:
+        console.print(
+            f"[bold red]DIFFERS:[/bold red] {found['samples_different']} of "
+            f"{found['samples_different'] + found['samples_equal']} samples differ, {found['samples_not_made']} "
+            f"were not made anew, {found['alarms_different']} alarms differ; the first differences:"
+        )
+        for line in found["differences"]:
+            console.print(f"  {line}", markup=False)
+    if found["samples_not_recorded"]:
+        console.print(f"{found['samples_not_recorded']} samples made anew are not in the recording")
+
+
+def _list(console: Console, title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> None:
+    if not alarms:
+        return
+    console.print(_table(f"{title}, s since {when(start_ns)}", alarms[:_SHOWN], start_ns))
+    if len(alarms) > _SHOWN:
+        console.print(f"and {len(alarms) - _SHOWN} more; all with --json")
+
+
+def _table(title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> Table:
+    table = Table("tray", title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for column in ("fan", "raised", "cleared"):
+        table.add_column(column, justify="right")
+    for column in ("severity", "probable cause"):
+        table.add_column(column, no_wrap=True)
+    table.add_column("what")
+    for one in alarms:
+        raised = f"{(one['raised_ns'] - start_ns) / 1e9:.2f}"
+        cleared = "standing" if one["cleared_ns"] is None else f"{(one['cleared_ns'] - start_ns) / 1e9:.2f}"
+        first = f"{one['causes'][0]['cause']} {100 * one['causes'][0]['probability']:.0f} %" if one["causes"] else "-"
+        # the message of the raise names fan and cause, too: the one stands beside it, the other is known better now
+        what = one["message"].removeprefix(f"fan {one['fan']}: ").partition("; ")[0]
+        table.add_row(one["tray"], str(one["fan"]), raised, cleared, one["severity"], first, escape(what))
+    return table
+
+
+def _say_cannot(reason: str, json_output: bool) -> None:
+    if json_output:
+        typer.echo(json.dumps({"verified": None, "cannot_compare": reason}))
+    Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]could not compare:[/red] {escape(reason)}")

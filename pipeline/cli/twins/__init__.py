@@ -1,0 +1,1 @@
+"""Commands that make, calibrate and evaluate twins."""

@@ -1,0 +1,109 @@
+"""Whether a declared false-alarm rate is kept: alarms on other healthy recordings, counted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.cli.progress import working
+from pipeline.cli.twins.training_data import sha256_of
+from pipeline.errors import UserError
+from pipeline.replay.offline.alarm_episodes import episodes
+from pipeline.replay.offline.judging import judge
+from pipeline.replay.offline.replay_input import open_replay_input
+from pipeline.runtime.twin_file import TwinFile
+from scoring.calibration.alarm_rate import poisson_interval
+
+NS_PER_HOUR = 3.6e12
+
+
+@dataclass(frozen=True)
+class Check:
+    """Alarms in so many fan-hours, beside what was declared per fan and day."""
+
+    alarms: int
+    fan_hours: float
+    declared_per_day: float
+
+    @property
+    def expected(self) -> float:
+        """Alarms by the declared rate."""
+        return self.declared_per_day * self.fan_hours / 24
+
+    @property
+    def interval_95(self) -> tuple[float, float]:
+        """Of the rate per fan and day."""
+        days = self.fan_hours / 24
+        low, high = poisson_interval(self.alarms)
+        return low / days, high / days
+
+    @property
+    def is_broken(self) -> bool:
+        """More alarms than chance explains: even the low end of the interval is above what was declared."""
+        return self.interval_95[0] > self.declared_per_day
+
+    @property
+    def said(self) -> str:
+        """In one line."""
+        low, high = self.interval_95
+        found = (
+            f"{self.alarms} alarm{'s' * (self.alarms != 1)} in {self.fan_hours:.3g} fan-hours: "
+            f"{self.alarms / self.fan_hours * 24:.2g} per fan and day (95 %: {low:.2g} to {high:.2g}); "
+            f"declared {self.declared_per_day:g}"
+        )
+        if self.is_broken:
+            return f"{found}: not kept"
+        if self.expected < 1.0:
+            return f"{found}: kept, as far as so little running can tell ({self.expected:.2g} alarms were expected)"
+        return f"{found}: kept"
+
+    def as_json(self) -> dict[str, Any]:
+        """For machines."""
+        return {
+            "alarms": self.alarms,
+            "fan_hours": self.fan_hours,
+            "declared_per_day": self.declared_per_day,
+            "interval_95": self.interval_95,
+            "expected": self.expected,
+            "kept": not self.is_broken,
+        }
+
+
+def check_promise(twin: Path, recordings: Sequence[Path], overrides: Sequence[str]) -> Check:
+    """Judge other healthy recordings whole, as `fantwin replay --offline` does.
+
+    Raises:
+        UserError: the twin declares nothing or was made of a recording, one cannot be used, or none of its samples
+            could be judged.
+    """
+    loaded = TwinFile.load(twin)
+    calibration = loaded.calibration
+    if calibration is None or calibration.get("promise") is None:
+        raise UserError(f"{twin}: its alarms were never calibrated: give healthy recordings and --false-alarms-per-day")
+    _refuse_what_it_was_made_of(twin, loaded, recordings)
+    alarms, fan_hours = 0, 0.0
+    with working("judging other healthy recordings") as tell:
+        for path in recordings:
+            tell(f"verifying: {path}")
+            with open_replay_input([path], None, overrides, twin) as material:
+                for tray, judged in zip(material.trays, judge(material, None, False), strict=True):
+                    if judged.problem:
+                        raise UserError(f"{path}: {judged.problem}")
+                    alarms += len(episodes(judged.alarms))
+                    fan_samples = judged.samples * tray.fans - judged.not_judged.total()
+                    fan_hours += fan_samples * judged.period_ns / NS_PER_HOUR
+    return Check(alarms, fan_hours, float(calibration["promise"]["false_alarms_per_day"]))
+
+
+def _refuse_what_it_was_made_of(path: Path, twin: TwinFile, recordings: Sequence[Path]) -> None:
+    card = json.loads(twin.card_json)
+    for verb, part in (("calibrated", card["calibration"]["promise"]), ("trained", card.get("training", {}))):
+        known = {data["sha256"] for data in part.get("data", ())}
+        for recording in recordings:
+            if recording.is_file() and sha256_of(recording) in known:
+                raise UserError(
+                    f"{recording}: {path} was {verb} on it, so that it proves nothing: --verify takes other recordings"
+                )

@@ -1,0 +1,215 @@
+"""`fantwin evaluate`: how well a twin follows recordings."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.cli.options import JsonOption, fan_numbers
+from pipeline.cli.twins.figures import figures_in, sentence, shown
+from pipeline.cli.twins.training_data import (
+    FansOption,
+    FromOption,
+    Material,
+    RecordingsArgument,
+    ToOption,
+    TrayOption,
+    data_cards,
+    model_maker,
+    read_material,
+)
+from pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from twin.evaluation.accuracy import Evaluation
+    from twin.evaluation.resampling import Grid
+    from twin.evaluation.residual_analysis import ResidualAnalysis
+    from twin.report.content import Content
+    from twin.report.verdict import Verdict
+
+EXPECTED_COVERAGE = math.erf(math.sqrt(2.0))
+"""share of a normal distribution within two standard deviations"""
+
+
+def evaluate(
+    twin: Annotated[Path, typer.Argument(metavar="TWIN.onnx", help="The twin, as `fantwin train` makes it.")],
+    recordings: RecordingsArgument,
+    from_s: FromOption = 0.0,
+    to_s: ToOption = math.inf,
+    tray: TrayOption = None,
+    fans: FansOption = None,
+    rate: Annotated[
+        list[str] | None,
+        typer.Option(metavar="HZ|irregular", help="Judge it on this grid, too, e.g. 50. Repeatable."),
+    ] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Run a twin freely over recordings and compare it with what was measured, in the recording's own units.
+
+    The free run gets one initial speed and then the commands alone. The one-step error is given beside it; it says
+    little, because it is corrected at each sample. What is left is tested: a good twin leaves white noise that does
+    not follow the command.
+
+    Example: fantwin evaluate TWIN.onnx held-out.mcap --rate 20 --rate irregular --json
+    """
+    grids: list[Grid] = [_grid(text) for text in rate or []]
+    with model_maker():
+        # The command line loads twin only when it is needed.
+        from twin.build import evaluate as evaluate_twin  # noqa: PLC0415
+        from twin.evaluation.resampling import on_grid  # noqa: PLC0415
+        from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
+        from twin.report.content import SpeedUnit, report_content  # noqa: PLC0415
+        from twin.report.verdict import judge  # noqa: PLC0415
+
+        loaded = OnnxTwin(twin)
+        material = read_material(recordings, tray, fans, from_s, to_s)
+        unit = SpeedUnit(material.speed_unit, material.rad_s_per_unit)
+        content = report_content(loaded, material.runs, data_cards(material), unit, fan_numbers(fans))
+        judged = judge(content)
+        on_grids: list[tuple[Grid, Evaluation]] = [
+            (grid, evaluate_twin(loaded, on_grid(material.runs, grid), fan_numbers(fans))) for grid in grids
+        ]
+    told = account(content, judged, on_grids, material)
+    if json_output:
+        typer.echo(json.dumps(told))
+        return
+    typer.echo(f"{told['headline']}\n{sentence(told, material.speed_unit)}")
+    console = Console()
+    console.print(_fan_table(told))
+    if grids:
+        console.print(_grid_table(told))
+    for warning in told["warnings"]:
+        typer.echo(warning, err=True)
+
+
+def account(
+    content: Content,
+    judged: Verdict,
+    on_grids: Sequence[tuple[Grid, Evaluation]],
+    material: Material,
+) -> dict[str, Any]:
+    """What a machine is told of an evaluation; speeds in the recordings' own unit, None where a figure is undefined."""
+    scale = material.rad_s_per_unit
+
+    def figures_of(evaluation: Evaluation) -> dict[str, Any]:
+        by_fan = zip(material.fans, evaluation.per_fan, strict=True)
+        return figures_in(evaluation.pooled, scale) | {
+            "fans": [{"fan": number} | figures_in(fan, scale) for number, fan in by_fan]
+        }
+
+    told = figures_of(content.evaluation)
+    for its, fan in zip(told["fans"], content.fans, strict=True):
+        its["residual"] = residual_account(fan.residual, scale)
+    return told | {
+        "speed_unit": material.speed_unit,
+        "expected_coverage_2_sigma": EXPECTED_COVERAGE,
+        "verdict": judged.level,
+        "headline": judged.headline,
+        "warnings": [*material.outliers, *judged.warnings],
+        "grids": [{"rate": grid} | figures_of(evaluation) for grid, evaluation in on_grids],
+    }
+
+
+def residual_account(analysis: ResidualAnalysis, rad_s_per_unit: float) -> dict[str, Any]:
+    """One fan's residual analysis for machines; the mean in a unit of theirs."""
+    return {
+        "samples": analysis.samples,
+        "step_s": analysis.step_s,
+        "mean": _finite(analysis.mean_rad_s / rad_s_per_unit),
+        "independent_samples": _finite(analysis.independent_samples),
+        "autocorrelation_time_s": _finite(analysis.autocorrelation_time_s),
+        "white": analysis.white,
+        "ljung_box_p": _finite(analysis.ljung_box_p),
+        "ljung_box_lags": analysis.ljung_box_lags,
+        "lags_s": analysis.lags_s.tolist(),
+        "autocorrelation": _finite_list(analysis.autocorrelation),
+        "bound_95": _finite(analysis.bound_95),
+        "cross_over_bound": _finite(analysis.cross_over_bound),
+        "cross_peak_lag_s": _finite(analysis.cross_peak_lag_s),
+        "cross_lags_s": analysis.cross_lags_s.tolist(),
+        "cross_correlation": _finite_list(analysis.cross_correlation),
+        "cross_bound_95": _finite(analysis.cross_bound_95),
+    }
+
+
+def _grid(text: str) -> Grid:
+    if text == "irregular":
+        return "irregular"
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = math.nan
+    if not (math.isfinite(rate_hz) and rate_hz > 0.0):
+        raise UserError(f"--rate {text}: give a rate in Hz, e.g. --rate 50, or --rate irregular")
+    return rate_hz
+
+
+def _fan_table(told: dict[str, Any]) -> Table:
+    unit = told["speed_unit"]
+    table = _empty_table("fan")
+    expected = f"in ±2σ\n({EXPECTED_COVERAGE:.1%})"
+    for header in (
+        f"rmse\n{unit}",
+        f"max error\n{unit}",
+        "R2",
+        f"one step\n{unit}",
+        expected,
+        "white p",
+        "cross\n/ bound",
+    ):
+        table.add_column(header, justify="right", no_wrap=True)
+    for figures in told["fans"]:
+        residual = figures["residual"]
+        tests = (_probability(residual["ljung_box_p"]), shown(residual["cross_over_bound"], ".1f", "-"))
+        table.add_row(str(figures["fan"]), *_cells(figures), *tests)
+    if len(told["fans"]) > 1:
+        table.add_row("all", *_cells(told), "", "")
+    return table
+
+
+def _grid_table(told: dict[str, Any]) -> Table:
+    """Figures of all fans together on the recordings' own grid and on the others."""
+    unit = told["speed_unit"]
+    table = _empty_table("grid")
+    for header in ("samples", f"rmse\n{unit}", f"max error\n{unit}", "R2", f"one step\n{unit}", "in ±2σ"):
+        table.add_column(header, justify="right", no_wrap=True)
+    for grid in ({"rate": None} | told, *told["grids"]):
+        rate = grid["rate"]
+        name = "own" if rate is None else rate if rate == "irregular" else f"{rate:g} Hz"
+        table.add_row(name, str(grid["samples"]), *_cells(grid))
+    return table
+
+
+def _cells(figures: dict[str, Any]) -> tuple[str, ...]:
+    formats = {"rmse": ".4g", "max_error": ".4g", "r2": ".4f", "one_step_rmse": ".4g", "coverage_2_sigma": ".1%"}
+    return tuple(shown(figures[name], form, "-") for name, form in formats.items())
+
+
+def _empty_table(first: str) -> Table:
+    """Narrow, so that numbers are whole on a terminal of 80 columns."""
+    table = Table(box=SIMPLE_HEAD, padding=0)
+    table.add_column(first, no_wrap=True)
+    return table
+
+
+def _probability(value: float | None) -> str:
+    return "<0.001" if value is not None and value < 0.001 else shown(value, ".3f", "-")
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _finite_list(values: NDArray[np.float64]) -> list[float | None]:
+    return [_finite(value) for value in values.tolist()]

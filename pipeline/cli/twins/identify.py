@@ -1,0 +1,144 @@
+"""`fantwin identify`: the physical parameters of the fans in recordings."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.cli.options import JsonOption
+from pipeline.cli.progress import working
+from pipeline.cli.twins.training_data import (
+    FansOption,
+    FromOption,
+    Material,
+    RecordingsArgument,
+    ToOption,
+    TrayOption,
+    model_maker,
+    read_material,
+)
+
+if TYPE_CHECKING:
+    from twin.fitting.identification import Identification
+    from twin.runs import Array
+
+UNITS = {
+    "J": "command units per rad/s²",
+    "alpha": "command units per rad/s",
+    "C_D": "command units per (rad/s)²",
+    "lag_s": "seconds",
+}
+
+
+def identify(
+    recordings: RecordingsArgument,
+    from_s: FromOption = 0.0,
+    to_s: ToOption = math.inf,
+    tray: TrayOption = None,
+    fans: FansOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Find J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, and the lag of its command.
+
+    Each comes with its 95 % interval. w is in rad/s and the command in its own unit, so the parameters are in that unit
+    too: only their ratios are mechanical. What the recordings cannot tell, and why, is said on stderr.
+
+    Example: fantwin identify REC.mcap --json
+    """
+    with model_maker():
+        from twin.fitting.identification import identify as identify_fans  # noqa: PLC0415  loads twin only when it is needed
+
+        material = read_material(recordings, tray, fans, from_s, to_s)
+        samples = sum(run.samples for run in material.runs)
+        with working(f"identifying {material.runs[0].fans} fan(s) from {samples:,} samples each"):
+            found = identify_fans(material.runs)
+    told = account(found, material)
+    if json_output:
+        typer.echo(json.dumps(told))
+        return
+    Console().print(_table(told))
+    for warning in told["warnings"]:
+        typer.secho(f"warning: {warning}", fg=typer.colors.YELLOW, err=True)
+
+
+def account(found: Identification, material: Material) -> dict[str, Any]:
+    """What a machine is told of an identification; None where a figure is undefined.
+
+    Rows and columns of covariance and correlation are in the order of `parameters`; those of a lag that was not found
+    are zero, and undefined.
+    """
+    from twin.models.physics import PARAMETER_NAMES  # noqa: PLC0415
+
+    fans = [
+        {
+            "fan": material.fans[fan],
+            **dict(zip(PARAMETER_NAMES, found.parameters[fan].tolist(), strict=True)),
+            **{f"{name}_95": _interval(found, fan, k) for k, name in enumerate(PARAMETER_NAMES)},
+            "covariance": found.covariance[fan].tolist(),
+            "correlation": _correlation(found.covariance[fan]),
+            "time_constant_s": float(found.time_constant_s[fan]),
+            "lambda_per_s": float(found.lambda_per_s[fan]),
+            "rmse": float(found.rmse_rad_s[fan]) / material.rad_s_per_unit,
+        }
+        for fan in range(len(found.parameters))
+    ]
+    return {
+        "fans": fans,
+        "parameters": list(PARAMETER_NAMES),
+        "units": {name: UNITS[name] for name in PARAMETER_NAMES},
+        "speed_unit": material.speed_unit,
+        "iterations": found.iterations,
+        "warnings": material.named([*found.warnings, *found.misfits]),
+    }
+
+
+def _interval(found: Identification, fan: int, index: int) -> list[float] | None:
+    """None for a parameter that was not estimated: a lag that was not seen."""
+    return found.interval_95[fan, index].tolist() if found.covariance[fan, index, index] > 0.0 else None
+
+
+def _correlation(covariance: Array) -> list[list[float | None]]:
+    errors = [math.sqrt(covariance[k, k]) for k in range(len(covariance))]
+
+    def between(row: int, column: int) -> float | None:
+        product = errors[row] * errors[column]
+        return min(max(float(covariance[row, column]) / product, -1.0), 1.0) if product > 0.0 else None
+
+    return [[between(row, column) for column in range(len(errors))] for row in range(len(errors))]
+
+
+def _table(told: dict[str, Any]) -> Table:
+    """A row for each fan, the half width of each interval below its value."""
+    mechanical = [name for name in told["parameters"] if name != "lag_s"]
+    units = "; ".join(f"{name} in {told['units'][name]}" for name in mechanical)
+    table = Table(
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        caption=f"{units}. ± is half a 95 % interval; the time constant is that at the median speed.",
+        caption_justify="left",
+    )
+    table.add_column("fan", no_wrap=True)
+    for header in (*mechanical, "lag\nms", "time\nconst. s", f"rmse\n{told['speed_unit']}", "lambda\n1/s"):
+        table.add_column(header, justify="right", no_wrap=True)
+    for fan in told["fans"]:
+        values = [_with_interval(fan[name], fan[f"{name}_95"]) for name in mechanical]
+        figures = (f"{fan['time_constant_s']:.3g}", f"{fan['rmse']:.4g}", f"{fan['lambda_per_s']:.3g}")
+        table.add_row(str(fan["fan"]), *values, _lag(fan), *figures)
+    return table
+
+
+def _lag(fan: dict[str, Any]) -> str:
+    if fan["lag_s_95"] is None:
+        return "none seen"
+    low, high = fan["lag_s_95"]
+    return _with_interval(1e3 * fan["lag_s"], [1e3 * low, 1e3 * high])
+
+
+def _with_interval(value: float, interval: list[float]) -> str:
+    return f"{value:.4g}\n± {(interval[1] - interval[0]) / 2:.1g}"

@@ -1,0 +1,214 @@
+"""`fantwin demo`: a simulated tray, the whole pipeline, two faults, and an account of what happened."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from pipeline.bus.session import Bus
+from pipeline.cli.options import JsonOption
+from pipeline.cli.watch.demo_report import Summary, summarise
+from pipeline.cli.watch.demo_screen import DemoScreen
+from pipeline.config.models import Config, load_config
+from pipeline.errors import UserError
+from pipeline.runtime.signals import stop_on_signals
+
+DEMO_FOLDER = Path(__file__).parents[2] / "demo"
+DURATION_S = 34.0
+FAULTS = (
+    ("inlet", "fan=2,start=8,stop=14,size=1.8"),
+    ("rotor", "fan=5,start=18,stop=24,size=0.8"),
+)
+OUTPUTS = ("recording*.mcap*", "view*.rrd", "bands.png", "summary.json", "truth.json", "up.log", "tray", "*.snapshot")
+_START_TIMEOUT_S = 60.0
+_STOP_TIMEOUT_S = 60.0
+
+
+def demo(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for what it makes.")] = Path("runs/demo"),
+    seed: Annotated[int, typer.Option(help="Seed of the simulated tray's commands and noise.")] = 7,
+    json_output: JsonOption = False,
+) -> None:
+    """Run a simulated tray of eight fans through the whole pipeline, cover one inlet, disturb one rotor.
+
+    Exit code 1 when a fault was missed, a healthy fan alarmed, or anything was lost.
+
+    Example: fantwin demo -o runs/demo
+    """
+    console = Console(stderr=json_output, highlight=False)
+    out = out.resolve()
+    _clear(out)
+    overrides = [
+        "viewer.serve=false",
+        f"run_folder={json.dumps(str(out))}",
+        f"tray.0.port={json.dumps(str(out / 'tray'))}",
+        f"bus.endpoint='tcp/127.0.0.1:{_free_port()}'",
+    ]
+    config = load_config(DEMO_FOLDER / "demo.toml", overrides)
+    started_s = time.monotonic()
+    lost = _run(config, overrides, out, seed, console)
+    summary = summarise(out / "truth.json", sorted(out.glob("recording*.mcap")), lost)
+    _draw(out, console)
+    (out / "summary.json").write_text(summary.to_json() + "\n", encoding="utf-8")
+    if json_output:
+        typer.echo(summary.to_json())
+    _tell(summary, out, time.monotonic() - started_s, console)
+    if summary.problems:
+        raise typer.Exit(1)
+
+
+def _clear(out: Path) -> None:
+    """Remove what an earlier demo made, and nothing else."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for pattern in OUTPUTS:
+            for path in out.glob(pattern):
+                path.unlink()
+    except OSError as error:
+        raise UserError(
+            f"{out}: cannot be used for the demo's files: {error.strerror}; name another with -o"
+        ) from error
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Console) -> dict[str, int]:
+    """Run tray and pipeline to the end of the schedule; what each stage says it has lost."""
+    stop = threading.Event()
+    stop_on_signals(stop)
+    tray = config.trays[0]
+    simulate = [
+        *("simulate", "--fans", str(tray.fans), "--profile", "manual", "--seed", str(seed)),
+        *("--duration", str(DURATION_S), "--speed-unit", tray.speed_unit, "--link", tray.port),
+        *("--truth", str(out / "truth.json"), "--wait-for-reader"),
+    ]
+    for kind, settings in FAULTS:
+        simulate += ["--fault", f"{kind}:{settings}"]
+    up = ["up", "-c", str(config.path), "--json", *(word for override in overrides for word in ("--set", override))]
+    with (
+        (out / "up.log").open("w", encoding="utf-8") as log,
+        _child(simulate, stdout=log, stderr=log) as device,
+        _child(up, stdout=subprocess.PIPE, stderr=log) as pipeline,
+        Bus(config.bus, listens=False) as bus,
+    ):
+        console.print(f"simulated tray of {tray.fans} fans; six stages start as processes of their own")
+        _watch(config, bus, device, pipeline, stop, console)
+        if pipeline.poll() is None:
+            pipeline.send_signal(signal.SIGINT)
+        answer, _ = pipeline.communicate(timeout=_STOP_TIMEOUT_S)
+    if stop.is_set():
+        raise UserError(f"stopped before the end of the schedule; what was recorded is in {out}")
+    if device.returncode or pipeline.returncode not in (0, 3):
+        raise UserError(
+            f"the pipeline did not run to its end: {_last_line(out / 'up.log')} (all of it in {out / 'up.log'})"
+        )
+    return {name: count for name, count in json.loads(answer)["lost"].items() if count}
+
+
+@contextmanager
+def _child(arguments: list[str], **streams: object) -> Iterator[subprocess.Popen[str]]:
+    """A `fantwin` command in a process (group) of its own, ended whatever happens."""
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", "pipeline", *arguments],
+        stdin=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+        **streams,  # pyright: ignore[reportArgumentType, reportCallIssue]
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(_STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def _watch(
+    config: Config,
+    bus: Bus,
+    device: subprocess.Popen[str],
+    pipeline: subprocess.Popen[str],
+    stop: threading.Event,
+    console: Console,
+) -> None:
+    """Show what happens until the tray has sent its last sample, or something ends too early."""
+    screen = DemoScreen(config, bus)
+    began_s = time.monotonic()
+    deadline_s = began_s + _START_TIMEOUT_S
+    next_line_s = 0.0
+    live = Live(console=console, refresh_per_second=4, transient=True) if console.is_terminal else None
+    if live:
+        live.start()
+    try:
+        while device.poll() is None and pipeline.poll() is None and not stop.wait(0.25):
+            if live:
+                live.update(screen.render())
+            elif time.monotonic() >= next_line_s:
+                next_line_s = time.monotonic() + 4.0
+                console.print(f"{time.monotonic() - began_s:5.0f} s  {screen.line()}")
+            if not screen.has_score and time.monotonic() > deadline_s:
+                raise UserError(f"no score came in {_START_TIMEOUT_S:.0f} s; see up.log, and `fantwin doctor`")
+    finally:
+        if live:
+            live.stop()
+
+
+def _draw(out: Path, console: Console) -> None:
+    from pipeline.viewing.band_plot import plot_recording  # noqa: PLC0415  matplotlib is slow to import
+
+    with console.status("drawing bands.png"):
+        plot_recording(sorted(out.glob("recording*.mcap")), out / "bands.png", truth=out / "truth.json")
+
+
+def _last_line(path: Path) -> str:
+    lines = path.read_text(encoding="utf-8").strip().splitlines()
+    return lines[-1] if lines else "it said nothing"
+
+
+def _tell(summary: Summary, out: Path, took_s: float, console: Console) -> None:
+    table = Table("fault", title="what happened, seconds since the first sample", title_justify="left", box=SIMPLE_HEAD)
+    for column in ("fan", "start", "alarm", "delay", "removed", "cleared"):
+        table.add_column(column, justify="right")
+    table.add_column("probable cause")
+    for fault in summary.faults:
+        times = (fault.start_ns, fault.alarm_ns, None, fault.stop_ns, fault.cleared_ns)
+        cells = ["missed" if t is None else f"{(t - summary.start_ns) / 1e9:.2f}" for t in times]
+        cells[2] = "" if fault.delay_s is None else f"{fault.delay_s:.2f}"
+        cause = f"{fault.cause.replace('_', ' ')}, {fault.probability:.0%}" if fault.cause else ""
+        table.add_row(fault.kind, str(fault.fan), *cells, cause)
+    console.print(table)
+    p50, p99 = ("unknown" if t is None else f"{t:.1f} ms" for t in summary.latency_ms.values())
+    console.print(
+        f"{summary.fans} fans, {summary.samples_sent} samples of the tray sent, {summary.samples_recorded} recorded, "
+        f"{summary.lost} lost, {summary.false_alarms} false alarms; "
+        f"sample to score {p50} (median), {p99} (p99); "
+        f"{took_s:.0f} s in all"
+    )
+    shown, programs = (Path(os.path.relpath(path)) for path in (out, Path(sys.executable).parent))
+    console.print(f"all of it in {shown / 'summary.json'} and {shown / 'recording.mcap'}")
+    console.print(f"look at {shown / 'bands.png'}, or over time: {programs / 'rerun'} {shown / 'view.rrd'}")
+    for problem in summary.problems:
+        console.print(f"[bold red]NOT AS IT MUST BE:[/bold red] {problem}")

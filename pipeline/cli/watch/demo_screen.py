@@ -1,0 +1,86 @@
+"""What the demo shows while it runs: stages and alarms, and every fan beside its twin."""
+
+from __future__ import annotations
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from pipeline.bus.session import Bus
+from pipeline.cli.watch.status import stage_table
+from pipeline.config.models import Config
+from pipeline.launch.watcher import Watcher
+from schemas.codec import decode
+from schemas.messages import FanState, InvalidReason, Score
+from schemas.topics import tray_key
+from schemas.units import RAD_S_PER_UNIT
+
+_STYLES = {FanState.NORMAL: "green", FanState.UNKNOWN: "dim", FanState.SUSPECT: "yellow"}
+
+
+class DemoScreen:
+    """What is shown while the demo runs."""
+
+    def __init__(self, config: Config, bus: Bus) -> None:
+        self._config = config
+        self._tray = config.trays[0]
+        self._watcher = Watcher(bus, config.site)
+        self._score: Score | None = None
+        bus.subscribe(tray_key(config.site, self._tray.name, "score"), self._note_score)
+
+    def _note_score(self, _key: str, payload: bytes) -> None:
+        score = decode(Score, payload)
+        assert isinstance(score, Score)
+        self._score = score
+
+    @property
+    def has_score(self) -> bool:
+        """Whether any sample has been judged yet."""
+        return self._score is not None
+
+    def render(self) -> Group:
+        """Stages and alarms, and below them the fans."""
+        starting = Text("the stages start", style="dim")
+        stages = stage_table(self._watcher, self._config) if self._watcher.stages() else starting
+        return Group(stages, self._fan_table())
+
+    def line(self) -> str:
+        """The same in a line, where there is no terminal."""
+        if self._score is None:
+            return "waiting for the first score"
+        states = [FanState(state) for state in self._score.state[-1]]
+        notable = [f"fan {fan} {state.name.lower()}" for fan, state in enumerate(states) if state != FanState.NORMAL]
+        if len(notable) == len(states):
+            return f"all fans {states[0].name.lower()}" + (" (twins warming up)" if self._warming_up() else "")
+        return (", ".join(notable) or "all fans normal") + f"; lost {sum(self._watcher.losses().values())}"
+
+    def _warming_up(self) -> bool:
+        return self._score is not None and bool((self._score.invalid_reason[-1] == InvalidReason.WARMING_UP).all())
+
+    def _fan_table(self) -> Table:
+        unit = self._tray.speed_unit
+        table = Table("fan", title=f"{self._tray.name}, speeds in {unit}", title_justify="left", box=SIMPLE_HEAD)
+        for column in ("command", "measured", "twin", "residual"):
+            table.add_column(column, justify="right")
+        table.add_column("state")
+        score = self._score
+        if score is None:
+            return table
+        scale = 1 / RAD_S_PER_UNIT[unit]
+        for fan in range(score.fans):
+            state = FanState(score.state[-1, fan])
+            why = (
+                ""
+                if score.valid[-1, fan]
+                else f" ({InvalidReason(score.invalid_reason[-1, fan]).name.lower().replace('_', ' ')})"
+            )
+            table.add_row(
+                str(fan),
+                f"{score.command[-1, fan]:.2f}",
+                f"{score.measured_speed_rad_s[-1, fan] * scale:.0f}",
+                f"{score.predicted_speed_rad_s[-1, fan] * scale:.0f}",
+                f"{score.smoothed_residual_rad_s[-1, fan] * scale:+.0f}",
+                Text(state.name.lower() + why, style=_STYLES.get(state, "bold red")),
+            )
+        return table

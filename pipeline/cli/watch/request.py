@@ -1,0 +1,48 @@
+"""One request to the scorer of a tray, and its answers."""
+
+from __future__ import annotations
+
+import queue
+import secrets
+import threading
+import time
+from dataclasses import replace
+
+from pipeline.bus.session import Bus
+from pipeline.errors import UserError
+from schemas.codec import CodecError, decode, encode, type_name
+from schemas.messages import Alarm, Header, Request
+from schemas.topics import BY_NAME, tray_key
+
+_LOOK_S = 0.05
+
+
+def ask(
+    bus: Bus, site: str, tray: str, request: Request, fans: set[int], timeout_s: float, stop: threading.Event
+) -> list[Alarm]:
+    """Publish a request, once the stages have been met, and give the answer for each of `fans`, in their order.
+
+    Raises:
+        UserError: not all have been answered in time.
+    """
+    producer = f"alarms-{tray}-{secrets.token_hex(4)}"
+    outlet = bus.outlet(tray_key(site, tray, "request"), BY_NAME["request"], type_name(Request), producer)
+    name = f"{producer}/{outlet.published}"
+    heard: queue.Queue[bytes] = queue.Queue()
+    bus.subscribe(tray_key(site, tray, "alarm"), lambda _key, payload: heard.put(payload))
+    outlet.put(encode(replace(request, header=Header(producer, outlet.published, tray))))
+    answers: dict[int, Alarm] = {}
+    until_s = time.monotonic() + timeout_s
+    while set(answers) < fans:
+        if time.monotonic() > until_s or stop.is_set():
+            missing = ", ".join(map(str, sorted(fans - set(answers))))
+            raise UserError(
+                f"tray {tray}: no answer for fan {missing} in {timeout_s:g} s: does a scorer judge this tray?"
+            )
+        try:
+            alarm = decode(Alarm, heard.get(timeout=_LOOK_S))
+        except (queue.Empty, CodecError):
+            continue
+        if isinstance(alarm, Alarm) and alarm.request == name:
+            answers[alarm.fan] = alarm
+    return [answers[fan] for fan in sorted(fans)]

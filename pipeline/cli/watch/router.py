@@ -1,0 +1,31 @@
+"""`fantwin router`: the meeting point of stages on several hosts or in containers."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import Annotated
+
+import typer
+
+from pipeline.bus.session import open_router
+from pipeline.cli.options import JsonOption
+from pipeline.runtime.signals import stop_on_signals
+
+
+def router(
+    listen: Annotated[str, typer.Option(help="Where to listen.")] = "tcp/127.0.0.1:7447",
+    json_output: JsonOption = False,
+) -> None:
+    """Run a Zenoh router until Ctrl-C, for stages with bus.mode = "client".
+
+    On one host none is needed. It listens on loopback unless told otherwise: on other addresses whoever reaches
+    the port reads and writes everything.
+
+    Example: fantwin router --listen tcp/0.0.0.0:7447
+    """
+    stop = threading.Event()
+    stop_on_signals(stop)
+    with open_router(listen):
+        typer.echo(json.dumps({"listening": listen}) if json_output else f"router listening on {listen}")
+        stop.wait()

@@ -1,0 +1,64 @@
+"""`fantwin run`: one stage in this process."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from pipeline.config.models import load_config
+from pipeline.config.registry import STAGES, load_stage
+from pipeline.errors import UserError
+from pipeline.launch.processes import EXIT_CANNOT_START
+from pipeline.runtime.runner import Runner
+from pipeline.runtime.signals import stop_on_signals
+
+
+def run(
+    stage: Annotated[str, typer.Argument(help=f"One of {', '.join(STAGES)}.")],
+    config: ConfigOption = DEFAULT_CONFIG,
+    tray: Annotated[str | None, typer.Option(help="Which tray, for a stage with one process for each.")] = None,
+    overrides: SetOption = None,
+    json_output: JsonOption = False,
+    until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
+) -> None:
+    """Run one stage alone, until Ctrl-C.
+
+    It meets the other stages on the bus, whoever starts first. `fantwin up` starts all of them.
+
+    Example: fantwin run scorer -c fantwin.toml
+    """
+    if stage not in STAGES:
+        raise UserError(f"no stage called {stage!r}; known: {', '.join(STAGES)}")
+    settings = load_config(config, overrides or ())
+    stop = threading.Event()
+    stop_on_signals(stop)
+    try:
+        runner = Runner(load_stage(stage), settings, tray, stop)
+    except UserError as error:
+        if not until_stdin_closes:
+            raise
+        typer.echo(error, err=True)  # for the launcher, which then gives up instead of starting it again
+        raise typer.Exit(EXIT_CANNOT_START) from error
+    if until_stdin_closes:
+        threading.Thread(target=_set_when_stdin_closes, args=(runner.orphaned,), daemon=True).start()
+    last = runner.run()
+    if json_output:
+        typer.echo(
+            json.dumps({"stage": stage, "lost": last.lost, "counters": {c.name: c.value for c in last.counters}})
+        )
+    if last.lost:
+        typer.echo(f"{stage}: {last.lost} lost, see the counters in `fantwin status` or in the recording", err=True)
+        raise typer.Exit(3)
+
+
+def _set_when_stdin_closes(orphaned: threading.Event) -> None:
+    """The launcher holds our standard input open for as long as it lives."""
+    while os.read(sys.stdin.fileno(), 1024):  # not sys.stdin.read(): its lock would be held at the interpreter's end
+        pass
+    orphaned.set()

@@ -1,0 +1,141 @@
+"""`fantwin status`: what every stage does, live."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from typing import Annotated
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from pipeline.bus.session import Bus
+from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from pipeline.config.models import Config, load_config
+from pipeline.errors import UserError
+from pipeline.launch.watcher import StageView, Watcher
+from pipeline.runtime.signals import stop_on_signals
+from schemas.messages import Severity, StageStatus
+from scoring.alarms.current_alarms import CurrentAlarm, clock
+
+_STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
+_LISTEN_S = 2.5  # two healths of every stage, so that there are rates
+
+
+def status(
+    config: ConfigOption = DEFAULT_CONFIG,
+    once: Annotated[bool, typer.Option("--once", help="Print once and exit instead of staying live.")] = False,
+    overrides: SetOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Show stages, rates, latency, losses and alarms of a running site.
+
+    Exit code 1 when no stage answers, 3 when one says it has lost something.
+
+    Example: fantwin status -c fantwin.toml --once
+    """
+    settings = load_config(config, overrides or ())
+    stop = threading.Event()
+    stop_on_signals(stop)
+    with Bus(settings.bus, listens=False) as bus:
+        watcher = Watcher(bus, settings.site)
+        if once or json_output:
+            stop.wait(_LISTEN_S)
+            watcher.ask_for_past_alarms()
+            _require_someone(watcher, settings)
+            if json_output:
+                typer.echo(json.dumps(as_json(watcher)))
+            else:
+                Console().print(stage_table(watcher, settings))
+        else:
+            watcher.ask_for_past_alarms()
+            with Live(console=Console(), refresh_per_second=4) as live:
+                while not stop.wait(0.25):
+                    live.update(stage_table(watcher, settings))
+            _require_someone(watcher, settings)
+        if any(watcher.losses().values()):
+            raise typer.Exit(3)
+
+
+def _require_someone(watcher: Watcher, config: Config) -> None:
+    if not watcher.stages():
+        raise UserError(f"{_nobody(config)}; is `fantwin up -c {config.path}` running?")
+
+
+def _nobody(config: Config) -> str:
+    return f"no stage of site {config.site!r} answers at {config.bus.endpoint}"
+
+
+def stage_table(watcher: Watcher, config: Config) -> Group:
+    """What a person is shown: a row for each stage, what is wrong, and the alarms."""
+    table = Table("stage", "state", title="stages", title_justify="left", box=SIMPLE_HEAD)
+    for column in ("in /s", "out /s", "p50 ms", "p99 ms", "lost"):
+        table.add_column(column, justify="right")
+    views = watcher.stages()
+    problems = [] if any(view.alive for view in views) else [Text(_nobody(config), style="red")]
+    for view in views:
+        health = view.health
+        name = health.stage if health.instance == "all" else f"{health.stage}/{health.instance}"
+        lost = Text(str(health.lost), style="red" if health.lost else "")
+        latency = (
+            (f"{health.latency_p50_ms:.1f}", f"{health.latency_p99_ms:.1f}") if health.latency_p99_ms else ("", "")
+        )
+        table.add_row(name, _state(view), f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}", *latency, lost)
+        if health.problem and view.alive:
+            problems.append(Text(f"{name}: {health.problem}", style="red"))
+    alarms = [_alarm_line(each) for each in watcher.standing() if each.is_retained or each.is_quiet]
+    if not any(view.alive and view.health.stage == "scorer" for view in views):
+        alarms.append(Text("alarms unknown: no scorer is alive", style="red"))
+    return Group(*([table] if views else []), *problems, *(alarms or [Text("no alarms", style="green")]))
+
+
+def _state(view: StageView) -> Text:
+    if not view.alive:
+        stopped = view.health.status == StageStatus.STOPPED
+        return Text("stopped" if stopped else "gone", style="yellow" if stopped else "red")
+    if time.time_ns() - view.health.t_ns > 5e9:
+        return Text("silent", style="red")
+    styles = {StageStatus.STARTING: "yellow", StageStatus.OK: "green", StageStatus.DEGRADED: "red"}
+    return Text(view.health.status.name.lower(), style=styles.get(view.health.status, "yellow"))
+
+
+def _alarm_line(standing: CurrentAlarm) -> Text:
+    alarm = standing.newest
+    style = _STYLES[alarm.severity] if alarm.active else "green"
+    text = Text.assemble(
+        (f"{clock(alarm.t_ns)}  {alarm.severity.name:7}", style if standing.is_presented else "dim"),
+        f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(standing.words())}",
+    )
+    about = standing.message.removeprefix(f"fan {alarm.fan}: ")
+    if standing.causes:
+        first = standing.causes[0]
+        text.append(f", {first.cause} {100 * first.probability:.0f} %")
+    return text.append(f"; {about}") if about else text
+
+
+def as_json(watcher: Watcher) -> dict[str, object]:
+    """What a machine is shown."""
+    return {
+        "stages": [
+            {
+                "stage": view.health.stage,
+                "instance": view.health.instance,
+                "alive": view.alive,
+                "status": view.health.status.name.lower(),
+                "problem": view.health.problem,
+                "process_id": view.health.process_id,
+                "rate_in_hz": round(view.rate_in_hz, 1),
+                "rate_out_hz": round(view.rate_out_hz, 1),
+                "latency_ms": {"p50": view.health.latency_p50_ms, "p99": view.health.latency_p99_ms},
+                "lost": view.health.lost,
+                "counters": {counter.name: counter.value for counter in view.health.counters},
+            }
+            for view in watcher.stages()
+        ],
+        "alarms": [standing.as_json() for standing in watcher.standing()],
+    }

@@ -1,0 +1,192 @@
+"""`fantwin wear`: what wears slowly, how fast, and when it will alarm."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterable
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pipeline.bus.session import Bus
+from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from pipeline.cli.progress import working
+from pipeline.cli.watch.alarms import meet
+from pipeline.config.models import load_config
+from pipeline.errors import UserError
+from pipeline.launch.watcher import Watcher
+from pipeline.recordings.reading import read_recording
+from pipeline.runtime.signals import stop_on_signals
+from schemas.codec import CodecError, decode
+from schemas.messages import ScorerSnapshot
+from schemas.topics import tray_key
+
+NS_PER_DAY = 86_400_000_000_000
+_LOOK_S = 0.02
+_QUIET = "one that is commissioned and then quiet (score below 0.5, no alarm, not too slow)"
+_TOLD = ("unit", "change", "per_day", "days", "limit", "reached_t_ns", "invalid_reason")
+
+
+def wear(
+    recordings: Annotated[
+        list[Path] | None, typer.Argument(metavar="REC.mcap", help="Recordings; without them, the running site.")
+    ] = None,
+    config: ConfigOption = DEFAULT_CONFIG,
+    overrides: SetOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Show how each fan has changed since commissioning, per day, and when its limit will be reached
+    (docs/explanation/wear.md).
+
+    By what the scorer of each tray has noted last, which is at most a minute old. Exit code 0: shown; 1: nothing is
+    known; 3: a recording could not be read in full.
+
+    Example: fantwin wear
+
+    Example: fantwin wear runs/recording.mcap
+    """
+    if recordings:
+        snapshots, damage = _recorded(recordings)
+        nothing = f"no wear in {', '.join(map(str, recordings))}: a scorer notes it each minute and at the end"
+    else:
+        settings, damage = load_config(config, overrides or ()), []
+        stop = threading.Event()
+        stop_on_signals(stop)
+        with Bus(settings.bus, stop, listens=False) as bus:
+            meet(bus, Watcher(bus, settings.site), settings, stop, what="wear")
+            key = tray_key(settings.site, "*", "snapshot")
+            replies = bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_LOOK_S))
+            snapshots = [snapshot for _, payload in replies for snapshot in _decoded(payload)]
+        nothing = "no scorer has noted anything so far: it does so each minute; ask again"
+    found = [
+        (tray, snapshot.t_ns, wear) for tray, snapshot in _latest(snapshots).items() for wear in _wear_in(snapshot)
+    ]
+    if not found:
+        raise UserError(nothing)
+    if not any(_rows(*each) for each in found):
+        raise UserError(
+            f"nothing seen yet of any fan of {', '.join(tray for tray, *_ in found)}: that takes {_QUIET}; ask again"
+        )
+    if json_output:
+        rows = [row for tray, t_ns, state in found for row in _rows(tray, t_ns, state)]
+        typer.echo(json.dumps({"wear": rows}))
+    else:
+        console = Console(soft_wrap=True, highlight=False)
+        for tray, t_ns, state in found:
+            console.print(_table(tray, t_ns, state))
+    for line in damage:
+        typer.echo(line, err=True)
+    if damage:
+        raise typer.Exit(3)
+
+
+def _recorded(recordings: Iterable[Path]) -> tuple[list[ScorerSnapshot], list[str]]:
+    snapshots, damage = [], []
+    with working(f"reading {', '.join(map(str, recordings))}"):
+        for path in recordings:
+            reading = read_recording(path, {"snapshot"})
+            snapshots += [entry.message for entry in reading if isinstance(entry.message, ScorerSnapshot)]
+            damage += [reading.damage] if reading.damage else []
+    return snapshots, damage
+
+
+def _latest(snapshots: Iterable[ScorerSnapshot]) -> dict[str, ScorerSnapshot]:
+    """The last of each tray."""
+    latest: dict[str, ScorerSnapshot] = {}
+    for snapshot in sorted(snapshots, key=lambda snapshot: (snapshot.t_ns, snapshot.header.sequence)):
+        latest[snapshot.header.tray] = snapshot
+    return dict(sorted(latest.items()))
+
+
+def _wear_in(snapshot: ScorerSnapshot) -> list[dict[str, Any]]:
+    """What was noted of wear; nothing where the scorer did not watch it yet."""
+    try:
+        wear = json.loads(snapshot.state_json)["wear"]
+        _rows("", 0, wear)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return []
+    return [wear]
+
+
+def _decoded(payload: bytes) -> list[ScorerSnapshot]:
+    """An onlooker judges nobody: what it cannot read, the stages count."""
+    try:
+        message = decode(ScorerSnapshot, payload)
+    except CodecError:
+        return []
+    return [message] if isinstance(message, ScorerSnapshot) else []
+
+
+def _rows(tray: str, t_ns: int, state: dict[str, Any]) -> list[dict[str, Any]]:
+    """What a machine is shown: one for each fan and parameter of which there is anything."""
+    return [
+        {
+            "tray": tray,
+            "fan": number,
+            "parameter": parameter,
+            **{name: told[name] for name in _TOLD},
+            "command_unit": state["command_unit"],
+            "seen_t_ns": fan["t_ns"],
+            "t_ns": t_ns,
+        }
+        for number, fan in enumerate(state["fans"])
+        for parameter, told in fan["parameters"].items()
+        if "change" in told
+    ]
+
+
+def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
+    unit = escape(state["command_unit"])
+    silent = [str(number) for number, fan in enumerate(state["fans"]) if not fan["t_ns"]]
+    said = [f"balance, friction: command{f' in {unit}' if unit else ''}; drag, gain: % of healthy"]
+    said += [f"nothing seen yet of fan {', '.join(silent)}: that takes {_QUIET}"] if silent else []
+    table = Table(
+        "fan",
+        "parameter",
+        title=f"wear of {escape(tray)} up to {datetime.fromtimestamp(t_ns / 1e9):%Y-%m-%d %H:%M}",
+        title_justify="left",
+        caption="\n".join(said),
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+    )
+    for column in ("change", "per day, 95 %"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("limit reached")
+    before = None
+    for row in _rows(tray, t_ns, state):
+        name, before = "" if row["fan"] == before else str(row["fan"]), row["fan"]
+        per_day = row["per_day"]
+        worn = per_day and not per_day["low"] <= 0.0 <= per_day["high"]
+        change = _number(row, row["change"])
+        table.add_row(name, row["parameter"], change, _per_day(row), _when(row), style="" if worn else "dim")
+    return table
+
+
+def _number(row: dict[str, Any], value: float, digits: int = 3) -> str:
+    return f"{100 * value if row['unit'] == 'relative' else value:+.{digits}g}"
+
+
+def _per_day(row: dict[str, Any]) -> str:
+    per_day = row["per_day"]
+    if per_day is None:
+        return ""
+    half = (per_day["high"] - per_day["low"]) / 2
+    return f"{_number(row, per_day['value'])} ± {_number(row, half, digits=2)[1:]}"
+
+
+def _when(row: dict[str, Any]) -> str:
+    reached = row["reached_t_ns"]
+    if reached is None:
+        return str(row["invalid_reason"]) if row["parameter"] == "balance" else ""
+    earliest, likely, latest = (
+        max(reached[name] - row["t_ns"], 0) / NS_PER_DAY for name in ("earliest", "likely", "latest")
+    )
+    return f"in {likely:.1f} days ({earliest:.1f} to {latest:.1f})"

@@ -1,0 +1,1 @@
+"""Where samples come from: serial ports, simulated devices and measured tables."""

@@ -1,0 +1,146 @@
+"""The time of a sample: from the device's wrapping 32-bit clock to the host's clock.
+
+The host's time of receipt is the sample's time plus a delay that is never negative, often milliseconds, sometimes far
+more. So the offset `receipt - device clock` is bounded from below by a straight line, whose slope is the drift of the
+device's clock and whose height is the smallest delay. The line is the edge of the lower convex hull below the mean of
+the points: of all lines under all points it lies highest on average (Moon, Skelly and Towsley, Estimation and removal
+of clock skew from network delay measurements, INFOCOM 1999; by hull: Zhang, Liu and Xia, INFOCOM 2002). It runs over a
+sliding window, one point (the least delayed sample) a bucket.
+
+Times never jump to a better line: they approach it slowly, so that differences of neighbouring samples stay those of
+the device's clock. docs/explanation/time.md derives this and gives what was measured.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+from schemas.units import NS_PER_S
+
+UINT32 = 1 << 32
+NS_PER_US = 1_000
+
+BUCKET_NS = NS_PER_S  # device time over which one least delayed sample is kept, and between two fits of the line
+WINDOW_BUCKETS = 60  # long enough to see a drift of some ppm, short enough to follow the temperature
+DRIFT_SPAN_NS = 10 * NS_PER_S  # points that span less say nothing of the drift
+MAX_DRIFT = 0.02  # a ceramic resonator is within 0.5 %, an RC oscillator within 2 %
+SLEW_TIME_NS = 20 * NS_PER_S  # time constant with which times approach the line
+MAX_SLEW = 0.01  # so much faster or slower than the device's clock at most
+JUMP_NS = NS_PER_S  # a disagreement beyond this is a clock that was set or restarted, not a delay
+LATE_BUCKETS = 5  # every sample that late for so many buckets: the host's clock was set forward
+LONGEST_SILENCE_NS = 600 * NS_PER_S  # after this the 32-bit clock may have wrapped unseen (it does in 71 minutes)
+
+Point = tuple[int, int]
+"""Device time and offset (receipt - device time), both ns."""
+
+
+class DeviceClock:
+    """Maps one device's clock to the host's. Fed sample by sample, so that blocks make no difference.
+
+    A *segment* is a stretch over which the device's clock ran on; in each, times are continuous. It ends when the
+    device restarts, when either clock is set by more than a second, or after ten minutes of silence.
+    """
+
+    def __init__(self) -> None:
+        self.segments = 0
+        """How many segments have begun; one in a device's life is normal."""
+        self.drift = 0.0
+        """How much slower than the host's the device's clock is, relative: 1e-6 is 1 ppm."""
+        self._last_us = 0  # of the newest sample, as the device gave it
+        self._device_ns = 0  # the same, unwrapped, from the start of the segment
+        self._receive_t_ns = 0
+        self._points: deque[Point] = deque(maxlen=WINDOW_BUCKETS)
+        self._lowest: Point = (0, 0)  # of the bucket being filled
+        self._late_buckets = 0
+        self._from_device_ns = 0  # where the present piece of the mapping starts
+        self._from_t_ns = 0
+        self._slew = 0.0
+
+    def to_host_ns(self, device_clock_us: int, receive_t_ns: int) -> int:
+        """The host's time (ns since the epoch) at which the sample was taken, up to the smallest delay of the line.
+
+        device_clock_us: the device's clock, wrapping at 2^32. A sample that is not newer than the newest one is given
+        its place among the others and changes nothing.
+        """
+        if self.segments == 0 or receive_t_ns - self._receive_t_ns > LONGEST_SILENCE_NS:
+            return self._begin(device_clock_us, receive_t_ns)
+        step_us = (device_clock_us - self._last_us + UINT32 // 2) % UINT32 - UINT32 // 2
+        device_ns = self._device_ns + step_us * NS_PER_US
+        t_ns = self._map(device_ns)
+        if step_us <= 0:
+            is_old = -step_us * NS_PER_US < JUMP_NS or receive_t_ns < self._receive_t_ns
+            return t_ns if is_old else self._begin(device_clock_us, receive_t_ns)
+        if t_ns - receive_t_ns > JUMP_NS:  # taken long after it was received: not the clock we knew
+            return self._begin(device_clock_us, receive_t_ns)
+        self._last_us, self._device_ns, self._receive_t_ns = device_clock_us, device_ns, receive_t_ns
+        if device_ns - self._from_device_ns >= BUCKET_NS:
+            self._end_bucket(device_ns, t_ns)
+            if self._late_buckets >= LATE_BUCKETS:
+                return self._begin(device_clock_us, receive_t_ns)
+            self._lowest = (device_ns, receive_t_ns - device_ns)
+        elif receive_t_ns - device_ns < self._lowest[1]:
+            self._lowest = (device_ns, receive_t_ns - device_ns)
+        return t_ns
+
+    def _begin(self, device_clock_us: int, receive_t_ns: int) -> int:
+        self.segments += 1
+        self._last_us, self._device_ns, self._receive_t_ns = device_clock_us, 0, receive_t_ns
+        self._points.clear()
+        self._lowest = (0, receive_t_ns)
+        self._late_buckets = 0
+        self._from_device_ns, self._from_t_ns, self._slew = 0, receive_t_ns, 0.0
+        return receive_t_ns
+
+    def _map(self, device_ns: int) -> int:
+        elapsed_ns = device_ns - self._from_device_ns
+        # The slew was meant for one bucket; a silence must not carry it on.
+        correction_ns = self.drift * elapsed_ns + self._slew * min(elapsed_ns, BUCKET_NS)
+        return self._from_t_ns + elapsed_ns + round(correction_ns)
+
+    def _end_bucket(self, device_ns: int, t_ns: int) -> None:
+        """Begin a new piece of the mapping at this sample, without a jump, with the slope the points now ask for."""
+        lowest_device_ns, lowest_offset_ns = self._lowest
+        late = lowest_offset_ns + lowest_device_ns - self._map(lowest_device_ns) > JUMP_NS
+        self._late_buckets = self._late_buckets + 1 if late else 0
+        self._slew = 0.0
+        if not late:
+            self._points.append(self._lowest)
+            while self._points[0][0] < device_ns - WINDOW_BUCKETS * BUCKET_NS and len(self._points) > 1:
+                self._points.popleft()
+            self.drift, line_offset_ns = line_below(self._points, device_ns, self.drift)
+            error_ns = line_offset_ns - (t_ns - device_ns)
+            self._slew = _clamp(error_ns / SLEW_TIME_NS, MAX_SLEW)
+        self._from_device_ns, self._from_t_ns = device_ns, t_ns
+
+
+def line_below(points: Sequence[Point], at_ns: int, drift: float) -> tuple[float, float]:
+    """The line below all points, highest at their mean: its slope, and its height (ns) at device time `at_ns`.
+
+    points: at least one, by rising device time. If they span too little time, the slope is `drift`.
+    """
+    first_ns, base_ns = points[0]
+    x = [float(device_ns - first_ns) for device_ns, _ in points]
+    y = [float(offset_ns - base_ns) for _, offset_ns in points]
+    if x[-1] < DRIFT_SPAN_NS:
+        height = min(yi - drift * xi for xi, yi in zip(x, y, strict=True))
+        return drift, base_ns + height + drift * (at_ns - first_ns)
+    hull: list[int] = []
+    for k in range(len(x)):
+        while len(hull) > 1 and not _turns_up(x, y, hull[-2], hull[-1], k):
+            hull.pop()
+        hull.append(k)
+    mean = sum(x) / len(x)
+    right = next(k for k in range(1, len(hull)) if x[hull[k]] >= mean)
+    a, b = hull[right - 1], hull[right]
+    slope = _clamp((y[b] - y[a]) / (x[b] - x[a]), MAX_DRIFT)
+    return slope, base_ns + y[a] + slope * (at_ns - first_ns - x[a])
+
+
+def _turns_up(x: list[float], y: list[float], a: int, b: int, c: int) -> bool:
+    """Whether the slope grows from a-b to b-c."""
+    return (y[b] - y[a]) * (x[c] - x[b]) < (y[c] - y[b]) * (x[b] - x[a])
+
+
+def _clamp(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)

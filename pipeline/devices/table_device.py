@@ -1,0 +1,67 @@
+"""A measured table played as if a device measured it now: each sample at its own time, gaps and all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.devices.measured_table import Table
+from pipeline.errors import UserError
+
+
+@dataclass(frozen=True)
+class TableSample:
+    """A row of the table, t_s after the first one played. Its clock is the table's time, its sequence counts rows."""
+
+    t_s: float
+    clock_us: int
+    sequence: int
+    command: NDArray[np.float64]
+    speed_rad_s: NDArray[np.float64]
+    lost: bool = False
+
+
+class TableDevice:
+    """A `Device` (see pipeline.devices.simulated_device) that gives the rows of a table. Commands sent to it change
+    nothing."""
+
+    def __init__(self, table: Table, from_s: float, to_s: float) -> None:
+        """Rows from `from_s` up to, not including, `to_s`, in seconds since the table's first.
+
+        Raises:
+            UserError: there is no row between them.
+        """
+        since_first_s = (table.t_ns - table.t_ns[0]) / 1e9
+        rows = (since_first_s >= from_s) & (since_first_s < to_s)
+        if not rows.any():
+            raise UserError(
+                f"{table.path}: no row from {from_s:g} s to {to_s:g} s; it is {table.duration_s:g} s long, "
+                "see --from and --to"
+            )
+        t_ns = table.t_ns[rows]
+        self._t_s = (t_ns - t_ns[0]) / 1e9
+        self._clock_us = (t_ns - t_ns[0]) // 1000 % 2**32
+        self._command = table.command[rows]
+        self._speed_rad_s = table.speed_rad_s[rows]
+        self._next = 0
+        self.fans = table.fans
+
+    def due_s(self) -> float | None:
+        """When the next row is due, s since the first; None after the last."""
+        return float(self._t_s[self._next]) if self._next < len(self._t_s) else None
+
+    def take(self) -> TableSample:
+        """The next row."""
+        row = self._next
+        self._next += 1
+        return TableSample(
+            float(self._t_s[row]), int(self._clock_us[row]), row, self._command[row], self._speed_rad_s[row]
+        )
+
+    def command(self, values: NDArray[np.float64]) -> None:
+        """What was measured is measured: nothing changes."""
+
+    def set_point(self, values_rad_s: NDArray[np.float64]) -> None:
+        """What was measured is measured: nothing changes."""

@@ -1,0 +1,105 @@
+"""Child processes: one for each stage (and tray, where a stage has one each)."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.config.models import Config
+from pipeline.config.registry import STAGES, load_stage
+
+EXIT_CANNOT_START = 78  # the stage said in one line why it cannot run as configured (EX_CONFIG of sysexits.h)
+
+
+@dataclass(frozen=True)
+class StageProcess:
+    """What to start: one row of the process list, which is data."""
+
+    stage: str
+    instance: str
+    tray: str | None
+
+    @property
+    def label(self) -> str:
+        """Name in messages: the stage, and its tray where it has one."""
+        return f"{self.stage}/{self.tray}" if self.tray else self.stage
+
+
+def process_list(config: Config) -> list[StageProcess]:
+    """The processes of a configuration, in the order of the data."""
+    rows: list[StageProcess] = []
+    for name in STAGES:
+        if name not in config.launcher.stages:
+            continue
+        if load_stage(name).process_per_tray:
+            rows += [StageProcess(name, tray.name, tray.name) for tray in config.trays]
+        else:
+            rows.append(StageProcess(name, "all", None))
+    return rows
+
+
+class Child:
+    """One running child. What it writes to standard error is handed on line by line."""
+
+    def __init__(
+        self,
+        row: StageProcess,
+        config_path: Path,
+        overrides: Iterable[str],
+        on_line: Callable[[StageProcess, str], None],
+    ) -> None:
+        command = [sys.executable, "-P", "-m", "pipeline", "run", row.stage, "-c", str(config_path)]
+        if row.tray:
+            command += ["--tray", row.tray]
+        for override in overrides:
+            command += ["--set", override]
+        self.row = row
+        self.started_s = time.monotonic()
+        self.last_line = ""
+        # its own process group, so that Ctrl-C in the terminal reaches the launcher alone, which stops in order;
+        # standard input is held open by the launcher: when it ends, however it ends, the child stops too
+        self._process = subprocess.Popen(
+            [*command, "--until-stdin-closes"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self._on_line = on_line
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def process_id(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    def exit_status(self) -> int | None:
+        """None while it runs; negative: ended by that signal."""
+        return self._process.poll()
+
+    def stop(self, timeout_s: float) -> int | None:
+        """Ask it to stop and wait; None when it had to be killed."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+        try:
+            status = self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+            status = None
+        self._reader.join(timeout=1.0)
+        return status
+
+    def _read(self) -> None:
+        assert self._process.stderr is not None
+        for line in self._process.stderr:
+            self.last_line = line.rstrip()
+            self._on_line(self.row, self.last_line)

@@ -1,0 +1,38 @@
+"""What stands before the first message of a recorder's recording: what it is about, its configuration and its twins."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from importlib.metadata import version
+
+from pipeline.runtime.stage import Context
+
+CONFIGURATION = "configuration.toml"
+_LOG = logging.getLogger(__name__)
+
+
+def head_of(context: Context) -> tuple[dict[str, str], dict[str, bytes]]:
+    """Metadata and attachments of every part: what is needed to read it, and to judge it again, anywhere."""
+    metadata = {
+        "made_by": f"fantwin {version('fantwin')}",
+        "site": context.site,
+        "trays": ",".join(tray.name for tray in context.trays),
+    }
+    if context.overrides:
+        metadata["overrides"] = json.dumps(context.overrides)
+    attachments = {CONFIGURATION: context.configuration_text.encode()}
+    for tray in context.trays:
+        metadata[f"fans.{tray.name}"] = str(tray.fans)
+        metadata[f"speed_unit.{tray.name}"] = tray.speed_unit
+        if tray.twin is not None:
+            path = context.resolve(tray.twin)
+            try:
+                twin = path.read_bytes()
+            except OSError as error:
+                _LOG.warning("%s: the twin is not in the recording: %s", path, error.strerror)
+                continue
+            metadata[f"twin_sha256.{tray.name}"] = hashlib.sha256(twin).hexdigest()
+            attachments[f"{tray.name}.onnx"] = twin
+    return metadata, attachments

@@ -1,0 +1,170 @@
+"""Who is on the bus with the replayer: who reads what it sends, who must not be there, and what they lost."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+from pipeline.bus.session import Bus
+from pipeline.config.registry import STAGES, load_stage
+from pipeline.launch.loss_accounting import label
+from pipeline.launch.watcher import StageView, Watcher
+from pipeline.runtime.clock import REPLAY
+from pipeline.runtime.stage import Stage
+from schemas.messages import Health
+from schemas.topics import alive_key
+
+FROM: dict[str, tuple[str, ...]] = {"raw": ("raw",), "grid": ("grid",), "prediction": ("prediction", "twin")}
+"""What the stages after one of these topics need"""
+
+_LOOK_S = 0.02
+_NOBODY_S = 2.0  # within which somebody is met; stages whose first peer has died try its endpoint every second
+_MEETING_S = 4.0  # within which all have told their health
+_STEADY_S = 1.0  # nobody new for so long: all are met
+_PATIENCE_S = 10.0  # how long nothing may change at the end before those who are behind are given up
+
+
+@dataclass(frozen=True)
+class Present:
+    """A stage that is on the bus."""
+
+    stage: Stage
+    instance: str
+
+    @property
+    def label(self) -> str:
+        """Its name for people."""
+        return self.stage.name if self.instance == "all" else f"{self.stage.name}/{self.instance}"
+
+
+def conflict(present: Collection[Present], topics: Collection[str], trays: Collection[str], site: str) -> str:
+    """Why a replay of these topics must not be: one line, empty if it may."""
+    if "command" in topics:
+        driving = [each for each in present if each.stage.process_per_tray and "command" in each.stage.reads]
+        if driving:
+            return (
+                f"{driving[0].label} of site {site!r} is running, and recorded commands are not for the fans of today: "
+                "stop it, or replay on a site or bus.endpoint of its own"
+            )
+    for each in present:
+        if each.stage.process_per_tray and each.instance not in trays:
+            continue
+        for topic in each.stage.writes:
+            if topic in topics:
+                other = _other_start(present)
+                way_out = f"replay with --from {other}, or stop it" if other else "stop it"
+                return f"{each.label} of site {site!r} is running and writes {topic} itself: {way_out}"
+    answering = [each for each in present if "request" in each.stage.reads and "alarm" in each.stage.writes]
+    if "request" in topics and answering:
+        return (
+            f"{answering[0].label} of site {site!r} is running, and recorded requests are not for the alarms of today: "
+            "leave request out of --topics, or replay on a site or bus.endpoint of its own"
+        )
+    return ""
+
+
+def _other_start(present: Collection[Present]) -> str:
+    """From where to replay so that stages which are there have something to do, and none of them does it, too."""
+    for start, topics in FROM.items():
+        written = any(topic in each.stage.writes for each in present for topic in topics)
+        if not written and any(start in each.stage.reads for each in present if each.stage.writes):
+            return start
+    return ""
+
+
+class Listeners:
+    """The stages on the bus of a replay."""
+
+    def __init__(self, bus: Bus, site: str) -> None:
+        """Begin to look; the replayer itself is not there yet."""
+        self._site = site
+        self._watcher = Watcher(bus, site)
+        self._alive: set[str] = set()
+        bus.watch_alive(alive_key(site, "*", "*"), self._note_alive)
+        self._before: dict[str, int] = {}
+        self._there_at_start: set[str] = set()
+
+    def meet(self, stop: threading.Event) -> None:
+        """Wait until those who were there before are connected, and each has said how it is."""
+        began_s = steady_s = time.monotonic()
+        known: set[str] = set()
+        while not stop.wait(_LOOK_S):
+            now_s = time.monotonic()
+            views = {view.health.header.producer for view in self._views()}
+            if views != known:
+                known, steady_s = views, now_s
+            told = len(views) >= len(self.present()) and now_s - steady_s > _STEADY_S
+            if now_s - began_s > (_MEETING_S if self._alive else _NOBODY_S) or (views and told):
+                break
+        self._before = self._watcher.losses()
+        self._there_at_start = known
+
+    def present(self) -> list[Present]:
+        """The stages that are there."""
+        names = [tuple(key.split("/")[3:]) for key in sorted(self._alive)]
+        return [Present(load_stage(stage), instance) for stage, instance in names if stage in STAGES]
+
+    def is_replaying(self) -> bool:
+        """Whether another replay, or this one, is on the bus."""
+        return alive_key(self._site, REPLAY, "all") in self._alive
+
+    def readers(self, topics: Collection[str]) -> list[str]:
+        """Who reads any of these topics."""
+        return [each.label for each in self.present() if any(topic in topics for topic in each.stage.reads)]
+
+    def settle(
+        self, producer: str, published: Mapping[str, int], stop: threading.Event, beat: Callable[[], None]
+    ) -> list[str]:
+        """Wait until all that was sent, and all that the stages made of it, has been taken. Returns who is behind.
+
+        `beat` is called all the while: the replayer is still there, and answers.
+        """
+        old = {view.health.header.producer: view.health.header.sequence for view in self._views()}
+        seen: object = None
+        changed_s = time.monotonic()
+        while behind := self._behind(producer, published, old):
+            healths = tuple(line for view in self._views() for line in view.health.inputs)
+            if healths != seen:
+                seen, changed_s = healths, time.monotonic()
+            if stop.is_set():
+                return []
+            if time.monotonic() - changed_s > _PATIENCE_S:
+                return behind
+            beat()
+            stop.wait(_LOOK_S)
+        return []
+
+    def lost(self, producer: str, published: Mapping[str, int]) -> dict[str, int]:
+        """What each stage has lost since the replay began, of what was sent before it was known to listen, too."""
+        now = self._watcher.losses()
+        lost = Counter({name: count - self._before.get(name, 0) for name, count in now.items()})
+        for view in self._views():
+            if view.health.header.producer in self._there_at_start and not load_stage(view.health.stage).may_drop:
+                for line in view.health.inputs:
+                    if line.producer == producer and line.key in published:
+                        lost[label(view.health)] += line.next_sequence - line.received - line.missing
+        return {name: count for name, count in lost.items() if count > 0}
+
+    def _behind(self, producer: str, published: Mapping[str, int], old: Mapping[str, int]) -> list[str]:
+        """Who has not yet said, in a health newer than the `old` ones, that it has all that its producers have sent."""
+        healths = [view.health for view in self._views()]
+        sent = {(key, producer): count for key, count in published.items()}
+        sent |= {(out.key, each.header.producer): out.published for each in healths for out in each.outputs}
+        return [
+            label(each)
+            for each in healths
+            if each.header.sequence <= old.get(each.header.producer, -1) or _lacks(each, sent)
+        ]
+
+    def _views(self) -> list[StageView]:
+        return [view for view in self._watcher.stages() if view.alive and view.health.stage in STAGES]
+
+    def _note_alive(self, key: str, alive: bool) -> None:
+        (self._alive.add if alive else self._alive.discard)(key)
+
+
+def _lacks(health: Health, sent: Mapping[tuple[str, str], int]) -> bool:
+    return any(line.next_sequence < sent.get((line.key, line.producer), 0) for line in health.inputs)

@@ -1,0 +1,83 @@
+"""The replayer on the bus: a producer like any other, with sequences, health and a liveliness token of its own."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+
+from pipeline.bus.session import Bus, Publisher
+from pipeline.errors import UserError
+from pipeline.recordings.reading import Entry
+from pipeline.runtime.clock import REPLAY
+from pipeline.runtime.health import HealthBook
+from schemas.codec import encode, type_name
+from schemas.messages import Clock, Header, Message, Output, StageStatus
+from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+
+
+class Sender:
+    """Publishes messages under the site's keys, stamped anew; and the clock of every tray, and health."""
+
+    def __init__(self, bus: Bus, site: str, trays: Collection[str]) -> None:
+        """Come onto the bus; `trays` are those that the site has."""
+        self.producer = f"{REPLAY}-all-{secrets.token_hex(4)}"
+        self.sent: Counter[str] = Counter()
+        """messages of each topic"""
+        self._bus = bus
+        self._site = site
+        self._outlets: dict[str, Publisher] = {}
+        self._clocks = {tray: self._outlet(tray_key(site, tray, "clock"), "clock") for tray in trays}
+        self._health = self._outlet(health_key(site, REPLAY, "all"), "health")
+        self._book = HealthBook(REPLAY, "all", time.time_ns(), may_drop=False)
+        self.tell_health(StageStatus.STARTING)
+        bus.declare_alive(alive_key(site, REPLAY, "all"))
+
+    def send(self, entry: Entry) -> None:
+        """Publish a message; waits while those who read it are behind.
+
+        Raises:
+            UserError: it is of a tray that the site does not have.
+        """
+        tray = tray_of(entry.key)
+        if tray not in self._clocks:
+            raise UserError(f"the recording has a tray {tray!r}, the configuration has none of that name: see -c")
+        key = tray_key(self._site, tray, entry.topic)
+        if key not in self._outlets:
+            self._outlets[key] = self._outlet(key, entry.topic)
+        self._put(self._outlets[key], entry.message, tray)
+        self.sent[entry.topic] += 1
+
+    def tell_clock(self, t_ns: int, rate: float) -> None:
+        """Say what recorded time is now, and how fast it goes."""
+        for tray, outlet in self._clocks.items():
+            self._put(outlet, Clock(t_ns=t_ns, rate=rate), tray)
+
+    def tell_health(self, status: StageStatus = StageStatus.OK, problem: str = "") -> None:
+        """Say how it is and how much has been sent, so that whoever missed the last messages asks for them."""
+        health = self._book.make(
+            status=status,
+            problems=[problem],
+            inputs=(),
+            outputs=[Output(key=key, published=count) for key, count in self.published().items()],
+            counters={},
+            now_ns=time.time_ns(),
+        )
+        self._put(self._health, health, "")
+
+    def published(self) -> Mapping[str, int]:
+        """How many messages have been sent on each key."""
+        return {key: outlet.published for key, outlet in self._outlets.items()}
+
+    def _outlet(self, key: str, topic: str) -> Publisher:
+        return self._bus.outlet(key, BY_NAME[topic], type_name(BY_NAME[topic].message), self.producer)
+
+    def _put(self, outlet: Publisher, message: Message, tray: str) -> None:
+        outlet.put(encode(replace(message, header=Header(self.producer, outlet.published, tray))))
+
+
+def tray_of(key: str) -> str:
+    """The tray in a key of the bus."""
+    return key.split("/")[2]

@@ -1,0 +1,1 @@
+"""What people look at: the Rerun view, pictures and plots."""

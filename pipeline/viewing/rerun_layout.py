@@ -1,0 +1,173 @@
+"""How a view is laid out in Rerun: a tab for each tray, a plot for each fan, state lanes, alarms; and the stages.
+
+Measured with Rerun 0.41; see docs/how-to/viewing.md. The only modules that import rerun are this, `rerun_sink` and
+`rerun_picture`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.archetypes import TextLogColumns
+from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
+
+from pipeline.viewing.trace import state_names
+from schemas.units import SpeedUnit
+
+TIMELINE = "time"
+STAGES_PATH = "stages"
+FANS_ON_A_PAGE = 8  # a page of a hundred plots is drawn seven times a second only
+MARGIN_FOR_LEGEND = {1: 0.12, 2: 0.25, 4: 0.45}  # columns of plots -> share of the window kept free at its right
+
+LINE_WIDTH = 1.2
+WHITE = (235, 235, 235)
+GREEN = (60, 220, 110)
+RED = (255, 60, 60)
+GREY = (150, 150, 150)
+STATE_COLORS = {
+    "normal": (38, 150, 76),
+    "suspect": (250, 178, 0),
+    "alarm": (224, 36, 36),
+    "returning": (232, 120, 60),
+    "commissioning": (90, 140, 200),
+}
+UNKNOWN_COLOR = (110, 110, 110)
+
+
+@dataclass(frozen=True)
+class TrayLayout:
+    """What of a tray is shown: `fans` are numbers counted from 0."""
+
+    name: str
+    fans: Sequence[int]
+    speed_unit: SpeedUnit
+
+
+def fan_path(tray: str, fan: int, part: str) -> str:
+    """Entity of one fan: parts are `speed` (measured, twin), `alarm_zone`, `outside` and `not_judged`."""
+    return f"{tray}/fan_{fan}/{part}"
+
+
+def state_path(tray: str, fan: int) -> str:
+    """Entity of a fan's state lane."""
+    return f"{tray}/state/fan_{fan}"
+
+
+def log_path(tray: str) -> str:
+    """Entity of a tray's log."""
+    return f"{tray}/log"
+
+
+def speed_style(unit: SpeedUnit, width: float) -> rr.Measurements:
+    """Style of the two series of a fan's `speed`: measured line, and twin with its band; width 0 leaves the band."""
+    return rr.Measurements.from_fields(
+        names=[f"measured ({unit})", f"twin ± 2σ ({unit})"],
+        colors=[WHITE, GREEN],
+        widths=[width, width],
+    )
+
+
+def log_styles(recording: rr.RecordingStream, tray: TrayLayout) -> None:
+    """Log what never changes: names, colours and widths of every series of a tray."""
+    for fan in tray.fans:
+        zone = rr.Measurements.from_fields(names=["alarm zone"] * 2, colors=[RED] * 2, widths=[0.0, 0.0])
+        recording.log(fan_path(tray.name, fan, "speed"), speed_style(tray.speed_unit, LINE_WIDTH), static=True)
+        recording.log(fan_path(tray.name, fan, "alarm_zone"), zone, static=True)
+        recording.log(
+            fan_path(tray.name, fan, "outside"),
+            rr.SeriesPoints(names="outside the band", colors=RED, marker_sizes=2.0),
+            static=True,
+        )
+        recording.log(
+            fan_path(tray.name, fan, "not_judged"),
+            rr.SeriesLines(names="not judged", colors=GREY, widths=LINE_WIDTH),
+            static=True,
+        )
+        names = state_names()
+        recording.log(
+            state_path(tray.name, fan),
+            rr.StateConfiguration(values=names, colors=[STATE_COLORS.get(name, UNKNOWN_COLOR) for name in names]),
+            static=True,
+        )
+
+
+def blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_picture: bool = False) -> rrb.Blueprint:
+    """The whole layout, with a window of `window_s` that follows the newest data. A picture has no panels,
+    and nothing in it is later than the cursor."""
+    tabs: list[rrb.Container | rrb.View] = [_tray_tab(tray, window_s, for_picture) for tray in trays]
+    if not for_picture:
+        tabs.append(rrb.TextDocumentView(origin=f"/{STAGES_PATH}", name="stages"))
+    return rrb.Blueprint(
+        rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else tabs[0],
+        rrb.TopPanel(state="hidden" if for_picture else "expanded"),
+        rrb.TimePanel(timeline=TIMELINE, play_state="following", state="hidden" if for_picture else "collapsed"),
+        auto_views=False,
+        collapse_panels=True,
+    )
+
+
+def _tray_tab(tray: TrayLayout, window_s: float, for_picture: bool) -> rrb.Container:
+    starts = range(0, len(tray.fans), FANS_ON_A_PAGE)
+    pages = [_page(tray, tray.fans[start : start + FANS_ON_A_PAGE], window_s, for_picture) for start in starts]
+    return rrb.Tabs(*pages, active_tab=0, name=tray.name) if len(pages) > 1 else pages[0]
+
+
+def _page(tray: TrayLayout, fans: Sequence[int], window_s: float, for_picture: bool) -> rrb.Container:
+    """Up to `FANS_ON_A_PAGE` plots, their state lanes and the tray's log."""
+    name = tray.name if len(fans) == len(tray.fans) else f"{tray.name} / fans {fans[0]} to {fans[-1]}"
+    columns = 1 if len(fans) <= 2 else 2 if len(fans) <= 4 else 4
+    axis = _rolling(window_s, MARGIN_FOR_LEGEND[columns])
+    past = _until_cursor() if for_picture else None
+    lanes = rrb.StateTimelineView(
+        origin=f"/{tray.name}",
+        contents=[f"/{state_path(tray.name, fan)}" for fan in fans],
+        name=f"{tray.name} / state of each fan",
+        time_view=_rolling(window_s, 0.0),
+    )
+    lane_share = (1.7 + len(fans)) / 24
+    return rrb.Vertical(
+        rrb.Grid(*(_fan_view(tray, fan, axis, past) for fan in fans), grid_columns=columns),
+        rrb.Horizontal(lanes, _log_view(tray.name), column_shares=[3, 2]),
+        row_shares=[1 - lane_share, lane_share],
+        name=name,
+    )
+
+
+def _fan_view(tray: TrayLayout, fan: int, axis: rrb.TimeAxis, past: rrb.VisibleTimeRange | None) -> rrb.TimeSeriesView:
+    speed = fan_path(tray.name, fan, "speed")
+    fill, lines = speed_style(tray.speed_unit, 0.0), speed_style(tray.speed_unit, LINE_WIDTH)
+    return rrb.TimeSeriesView(
+        origin=f"/{tray.name}/fan_{fan}",
+        contents=[f"/{fan_path(tray.name, fan, part)}" for part in ("speed", "alarm_zone", "outside", "not_judged")],
+        name=f"{tray.name} / fan {fan} speed ({tray.speed_unit})",
+        axis_x=axis,
+        time_ranges=past,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+        # One band is faint: the same data drawn twice makes it solid, and costs no bytes.
+        overrides={speed: [fill.visualizer(), lines.visualizer()]},
+    )
+
+
+def _log_view(tray: str) -> rrb.TextLogView:
+    return rrb.TextLogView(
+        origin=f"/{log_path(tray)}",
+        name=f"{tray} / alarm log",
+        columns=TextLogColumns(
+            timeline_columns=[TimelineColumn(TIMELINE, visible=False)],  # too narrow to read: lines bear their time
+            text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
+        ),
+    )
+
+
+def _rolling(window_s: float, margin: float) -> rrb.TimeAxis:
+    """A window that follows the cursor; `margin` of it stays empty at its right."""
+    cursor = rrb.TimeRangeBoundary.cursor_relative
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=cursor(seconds=-window_s), end=cursor(seconds=margin * window_s)))
+
+
+def _until_cursor() -> rrb.VisibleTimeRange:
+    boundary = rrb.TimeRangeBoundary
+    return rrb.VisibleTimeRange(TIMELINE, start=boundary.infinite(), end=boundary.cursor_relative())

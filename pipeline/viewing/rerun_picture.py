@@ -1,0 +1,236 @@
+"""Pictures of a view without a display: a headless Rerun viewer draws an .rrd and hands back what it shows.
+
+Needs a Vulkan driver; on a machine without a graphics card Mesa's software one will do.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from PIL import Image
+from rerun.chunk import Chunk, RrdReader
+from rerun.experimental import ViewerClient
+
+from pipeline.errors import UserError
+from pipeline.viewing.rerun_layout import TIMELINE, TrayLayout, blueprint
+from pipeline.viewing.rerun_sink import APPLICATION, LOOPBACK, rerun_program
+from schemas.messages import Array
+from schemas.units import SpeedUnit
+
+SIZE = (1920, 1080)
+TOP_BAR_SHARE = 0.035  # of the height; it stays, empty, when it is hidden
+PATIENCE_S = 60.0
+POLL_S = 0.2
+NOTICE_S = 6.0  # the viewer shows a notice on where it listens, over a corner of the window, for about five seconds
+_DRIVER_FOLDERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
+_DRIVER_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES", "VK_ADD_DRIVER_FILES")
+
+
+class PictureError(UserError):
+    """A picture cannot be drawn: one line that says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What was drawn: the PNG of the window, the names of its views, and what each complains about."""
+
+    png: bytes
+    reports: dict[str, list[str]]
+
+
+@dataclass(frozen=True)
+class _View:
+    """What an .rrd of ours holds."""
+
+    chunks: Sequence[Chunk]
+    trays: dict[str, tuple[list[int], SpeedUnit]]
+    first_ns: int
+    last_ns: int
+
+
+def has_vulkan_driver() -> bool:
+    """Whether the headless viewer can draw here. Elsewhere than on Linux the system itself brings what it needs."""
+    if sys.platform != "linux":
+        return True
+    named = [Path(path) for name in _DRIVER_VARIABLES for path in os.environ.get(name, "").split(":") if path]
+    if named:
+        return any(path.is_file() for path in named)
+    return any(any(Path(folder).glob("*.json")) for folder in _DRIVER_FOLDERS)
+
+
+def draw_picture(
+    rrd: Path,
+    *,
+    tray: str | None = None,
+    fans: Sequence[int] | None = None,
+    at_s: float | None = None,
+    window_s: float = 30.0,
+    view: str | None = None,
+) -> Picture:
+    """Draw a view kept by the viewer stage.
+
+    Args:
+        rrd: the file.
+        tray: which tray; may be left out where there is one.
+        fans: which fans, counted from 0; the first eight if not given.
+        at_s: the picture ends so many seconds after the file's first sample; at its last one if not given.
+        window_s: how much of the time before that is shown.
+        view: part of the name of the one view to draw; the whole window if not given.
+
+    Raises:
+        PictureError: no driver, no such file, tray, fan or view, or the viewer did not draw it in time.
+    """
+    if not has_vulkan_driver():
+        raise PictureError(
+            "no Vulkan driver found, which the headless viewer needs: apt-get install mesa-vulkan-drivers"
+        )
+    kept = _read(rrd)
+    layout = _layout(rrd, kept, tray, fans)
+    end_ns = kept.last_ns if at_s is None else kept.first_ns + round(at_s * 1e9)
+    with _headless_viewer() as viewer:
+        began_s = time.monotonic()
+        recording = rr.RecordingStream(APPLICATION)
+        recording.connect_grpc(viewer.url, default_blueprint=blueprint([layout], window_s, for_picture=True))
+        recording.send_chunks(kept.chunks)
+        recording.flush()
+        _wait_until_loaded(viewer, kept.last_ns)
+        viewer.set_time(TIMELINE, timestamp=np.datetime64(end_ns, "ns"), play_state="paused")
+        state = viewer.get_state()
+        chosen = None
+        if view is not None:
+            chosen = next((shown.view_id for shown in state.views if view in shown.name), None)
+            if chosen is None:
+                names = ", ".join(sorted(repr(shown.name) for shown in state.views))
+                raise PictureError(f"{rrd}: no view called {view!r}; there are {names}")
+        if chosen is None:
+            time.sleep(max(0.0, began_s + NOTICE_S - time.monotonic()))
+        png = _settled_screenshot(viewer, chosen)
+        reports = {shown.name: [str(report) for report in shown.reports] for shown in viewer.get_state().views}
+        recording.disconnect()
+    return Picture(png if chosen else _without_top_bar(png), reports)
+
+
+def _read(rrd: Path) -> _View:
+    if not rrd.is_file():
+        raise PictureError(f"{rrd}: no such file; the viewer stage writes view.rrd into run_folder")
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*no footer")
+            chunks = list(RrdReader(rrd).stream())
+    except (RuntimeError, ValueError, OSError) as error:
+        raise PictureError(f"{rrd}: not a file of Rerun's: {error}") from error
+    trays: dict[str, tuple[list[int], SpeedUnit]] = {}
+    times: list[Array] = []
+    for chunk in chunks:
+        parts = chunk.entity_path.strip("/").split("/")
+        if len(parts) != 3 or parts[2] != "speed":
+            continue
+        batch = chunk.to_record_batch()
+        if chunk.is_static:
+            name = batch.column("Measurements:names")[0].as_py()[0]
+            unit: SpeedUnit = "rpm" if name.endswith("(rpm)") else "rad/s"
+            trays.setdefault(parts[0], ([], unit))[0].append(int(parts[1].removeprefix("fan_")))
+        else:
+            times.append(np.asarray(batch.column(TIMELINE)).astype("datetime64[ns]").astype(np.int64))
+    if not times:
+        raise PictureError(f"{rrd}: holds no speeds drawn by the viewer stage")
+    all_times = np.concatenate(times)
+    return _View(chunks, trays, int(all_times.min()), int(all_times.max()))
+
+
+def _layout(rrd: Path, kept: _View, tray: str | None, fans: Sequence[int] | None) -> TrayLayout:
+    if tray is None:
+        if len(kept.trays) > 1:
+            raise PictureError(f"{rrd}: several trays, say which with --tray: {', '.join(kept.trays)}")
+        (tray,) = kept.trays
+    if tray not in kept.trays:
+        raise PictureError(f"{rrd}: no tray called {tray!r}; there are {', '.join(kept.trays)}")
+    known, unit = kept.trays[tray]
+    for fan in fans or ():
+        if fan not in known:
+            raise PictureError(f"{rrd}: {tray} has no fan {fan}; it has fans {min(known)} to {max(known)}")
+    return TrayLayout(tray, list(fans) if fans else sorted(known)[:8], unit)
+
+
+@contextmanager
+def _headless_viewer() -> Iterator[ViewerClient]:
+    """A viewer of our own on a free loopback port, quiet, gone at the end."""
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        port = probe.getsockname()[1]
+    size = f"{SIZE[0]}x{SIZE[1]}"
+    command = [rerun_program(), "--headless", "--bind", LOOPBACK, "--port", str(port), "--window-size", size]
+    with tempfile.TemporaryFile() as complaints:
+        process = subprocess.Popen(
+            [*command, "--hide-welcome-screen", "--expect-data-soon"],
+            stdout=complaints,
+            stderr=complaints,
+            env={**os.environ, "RERUN_APP_ONLY": "true", "RUST_LOG": "error"},
+        )
+        try:
+            yield _connect(process, port)
+        except (ConnectionError, RuntimeError) as error:
+            complaints.seek(0)
+            said = complaints.read().decode(errors="replace").strip().splitlines()
+            raise PictureError(
+                f"the headless viewer failed: {error}; it said: {said[-1] if said else 'nothing'}"
+            ) from error
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def _connect(process: subprocess.Popen[bytes], port: int) -> ViewerClient:
+    deadline = time.monotonic() + PATIENCE_S
+    while process.poll() is None and time.monotonic() < deadline:
+        with socket.socket() as probe:
+            if probe.connect_ex((LOOPBACK, port)) == 0:
+                return ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+        time.sleep(POLL_S)
+    raise ConnectionError("it did not start")
+
+
+def _wait_until_loaded(viewer: ViewerClient, last_ns: int) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        state = viewer.get_state()
+        ends = [line.end for entry in state.recordings for line in entry.timelines if line.name == TIMELINE]
+        # Rerun's own account of a time is that of a float.
+        if state.views and any(end is not None and end >= last_ns - 1_000 for end in ends):
+            return
+        time.sleep(POLL_S)
+    raise ConnectionError(f"it did not load the file in {PATIENCE_S:.0f} s")
+
+
+def _settled_screenshot(viewer: ViewerClient, view_id: str | None) -> bytes:
+    """The first screenshot that looks like the one before it."""
+    deadline = time.monotonic() + PATIENCE_S
+    before = viewer.take_screenshot(view_id)
+    while time.monotonic() < deadline:
+        time.sleep(POLL_S)
+        now = viewer.take_screenshot(view_id)
+        if now == before:
+            return now
+        before = now
+    raise ConnectionError(f"the picture did not settle in {PATIENCE_S:.0f} s")
+
+
+def _without_top_bar(png: bytes) -> bytes:
+    image = Image.open(BytesIO(png))
+    cropped = image.crop((0, round(TOP_BAR_SHARE * image.height), image.width, image.height))
+    out = BytesIO()
+    cropped.save(out, "PNG", optimize=True)
+    return out.getvalue()

@@ -1,0 +1,194 @@
+"""The viewer's adapter: a Rerun recording that goes to a file and to live viewers on this host.
+
+One entity a fan, its series side by side in it, one `send_columns` a flush. Zones, outside samples and samples that
+are not judged are sent only where there are any.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+os.environ.setdefault(
+    "RUST_LOG", "warn,re_log_encoding=error"
+)  # else every start warns that we chose to have no footer
+import rerun as rr
+
+from pipeline.config.models import TrayConfig
+from pipeline.runtime.stage import StageError
+from pipeline.viewing.loopback import LOOPBACK, check_free
+from pipeline.viewing.rerun_layout import (
+    STAGES_PATH,
+    TIMELINE,
+    TrayLayout,
+    blueprint,
+    fan_path,
+    log_path,
+    log_styles,
+    state_path,
+)
+from pipeline.viewing.trace import Trace
+from schemas.messages import Array
+
+APPLICATION = "fantwin"
+ZONE_HEIGHT = 2.0  # of an alarm zone, in half heights of the band
+# Rerun's own page server in a shell that ends with us, however we end: the pipe to its standard input closes.
+_PAGE_SCRIPT = '"$@" >/dev/null 2>&1 & cat >/dev/null; kill $!'
+
+
+def rerun_program() -> Path:
+    """Rerun's own program, which comes with its package (the `rerun` on the path is a wrapper around it)."""
+    spec = importlib.util.find_spec("rerun_cli")
+    assert spec is not None and spec.origin is not None, "rerun-sdk always brings rerun_cli"
+    folder = Path(spec.origin).parent
+    return folder / "Rerun.app/Contents/MacOS/Rerun" if sys.platform == "darwin" else folder / "rerun"
+
+
+def unused_path(path: Path) -> Path:
+    """`path`, or the first of path-2, path-3 ... that does not exist; created empty, so that it is ours.
+
+    Raises:
+        StageError: it cannot be created.
+    """
+    candidate, number = path, 1
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while candidate.exists():
+            number += 1
+            candidate = path.with_stem(f"{path.stem}-{number}")
+        candidate.open("xb").close()
+    except OSError as error:
+        raise StageError(f"{candidate}: cannot write the view: {error.strerror}; change viewer.file") from error
+    return candidate
+
+
+class RerunSink:
+    """A Rerun recording, written to a file and served to viewers."""
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        trays: Sequence[TrayConfig],
+        started_t_ns: int,
+        window_s: float,
+        file: Path | None,
+        grpc_port: int | None,
+        web_port: int | None,
+        memory_limit: str,
+    ) -> None:
+        """Open what is asked for: `file`, a server of data at `grpc_port`, a page for browsers at `web_port`.
+
+        Raises:
+            StageError: the file cannot be written, or a port is taken.
+        """
+        for key, port in (("grpc_port", grpc_port), ("web_port", web_port)):
+            if port is not None:
+                check_free(port, key)
+        layouts = [TrayLayout(tray.name, range(tray.fans), tray.speed_unit) for tray in trays]
+        self._recording = rr.RecordingStream(APPLICATION)
+        self._zone_is_open: set[str] = set()
+        sinks: list[rr.FileSink | rr.GrpcServerSink] = []
+        if file is not None:
+            # Without a footer nothing is kept in memory for it, and the file opens after a crash, too.
+            sinks.append(rr.FileSink(unused_path(file), write_footer=False))
+        if grpc_port is not None:
+            server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=memory_limit)
+            sinks.append(server)
+        self._recording.set_sinks(*sinks, default_blueprint=blueprint(layouts, window_s))
+        self._recording.send_recording_name(f"{name} {np.datetime64(started_t_ns, 'ns').astype('datetime64[s]')} UTC")
+        for layout in layouts:
+            log_styles(self._recording, layout)
+        self._recording.flush()  # the styles are in the file before anything that could be killed
+        self._page = _serve_page(web_port, grpc_port) if web_port is not None and grpc_port is not None else None
+
+    def draw(self, trace: Trace) -> None:
+        """Send the next stretch of a tray."""
+        for fan in range(trace.fans):
+            self._draw_fan(trace, fan)
+
+    def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
+        """Colour a fan's lane from each time on."""
+        self._send(state_path(tray, fan), t_ns, rr.StateChange.columns(state=list(names)))
+
+    def log(self, tray: str, t_ns: int, level: str, text: str) -> None:
+        """Add a line to the log of a tray, with its time of day (UTC)."""
+        times = np.array([t_ns])
+        clock = np.datetime_as_string(times.astype("datetime64[ns]"), unit="ms")[0].split("T")[1]
+        self._send(log_path(tray), times, rr.TextLog.columns(text=[f"{clock}  {text}"], level=[level]))
+
+    def show_stages(self, page: str) -> None:
+        """Replace the page on the stages. It has no time, so it moves no cursor that follows the newest time."""
+        self._recording.log(STAGES_PATH, rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN), static=True)
+
+    def flush(self) -> None:
+        """Hand everything to the system: it outlives this process, however that ends."""
+        self._recording.flush()
+
+    def close(self) -> None:
+        """Write out everything, stop serving."""
+        self._recording.flush()
+        self._recording.disconnect()
+        if self._page is not None:
+            assert self._page.stdin is not None
+            self._page.stdin.close()
+            self._page.wait()
+
+    def _draw_fan(self, trace: Trace, fan: int) -> None:
+        measured, predicted, half_width = trace.measured[:, fan], trace.predicted[:, fan], trace.half_width[:, fan]
+        judged = trace.valid[:, fan]
+        shown = np.stack([np.where(judged, measured, np.nan), predicted], axis=1)
+        variances = np.stack([np.zeros_like(half_width), half_width**2], axis=1)
+        self._send_measurements(fan_path(trace.tray, fan, "speed"), trace.t_ns, shown, variances)
+        self._draw_zone(trace, fan)
+        outside = trace.outside[:, fan]
+        if outside.any():
+            columns = rr.Scalars.columns(scalars=measured[outside])
+            self._send(fan_path(trace.tray, fan, "outside"), trace.t_ns[outside], columns)
+        self._send_where(fan_path(trace.tray, fan, "not_judged"), trace.t_ns, np.where(judged, np.nan, measured))
+
+    def _draw_zone(self, trace: Trace, fan: int) -> None:
+        """Red above and below the band while an alarm is active."""
+        path = fan_path(trace.tray, fan, "alarm_zone")
+        half_width = trace.half_width[:, fan]
+        zone = np.where(trace.in_alarm[:, fan], trace.predicted[:, fan], np.nan)
+        if not self._is_worth_sending(path, zone):
+            return
+        half_height = half_width * ZONE_HEIGHT / 2
+        middles = np.stack([zone + half_width + half_height, zone - half_width - half_height], axis=1)
+        self._send_measurements(path, trace.t_ns, middles, np.stack([half_height**2] * 2, axis=1))
+
+    def _send_where(self, path: str, t_ns: Array, values: Array) -> None:
+        if self._is_worth_sending(path, values):
+            self._send(path, t_ns, rr.Scalars.columns(scalars=values))
+
+    def _is_worth_sending(self, path: str, values: Array) -> bool:
+        """Whether there is anything but NaN, or something open that NaN must end, lest a line be drawn on."""
+        was_open = path in self._zone_is_open
+        if np.isfinite(values[-1]):
+            self._zone_is_open.add(path)
+        else:
+            self._zone_is_open.discard(path)
+        return was_open or bool(np.isfinite(values).any())
+
+    def _send_measurements(self, path: str, t_ns: Array, values: Array, variances: Array) -> None:
+        columns = rr.Measurements.columns(values=values.reshape(-1), variances=variances.reshape(-1))
+        self._send(path, t_ns, columns.partition([values.shape[1]] * len(values)))
+
+    def _send(self, path: str, t_ns: Array, columns: rr.ComponentColumnList) -> None:
+        time = rr.TimeColumn(TIMELINE, timestamp=t_ns.astype("datetime64[ns]"))
+        self._recording.send_columns(path, indexes=[time], columns=columns)
+
+
+def _serve_page(web_port: int, grpc_port: int) -> subprocess.Popen[bytes]:
+    """The browser viewer's page, on the loopback only (the call in Rerun's package listens on all interfaces)."""
+    data = f"rerun+http://{LOOPBACK}:{grpc_port}/proxy"
+    page = [rerun_program(), "--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(web_port), data]
+    # A session of its own: Ctrl-C must not reach the shell before it has ended the server.
+    return subprocess.Popen(["sh", "-c", _PAGE_SCRIPT, "sh", *page], stdin=subprocess.PIPE, start_new_session=True)

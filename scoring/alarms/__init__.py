@@ -1,0 +1,1 @@
+"""Alarm states after OPC UA Part 9, and the events that people and machines read."""

@@ -1,0 +1,96 @@
+"""What happened to an alarm, in one line for people."""
+
+from __future__ import annotations
+
+from math import pi
+
+from schemas.messages import Alarm, Statistic, Transition
+
+RAD_S_PER_RPM = 2.0 * pi / 60.0
+CANNOT_TELL = "cannot_tell"
+CAUSES = {
+    "drag_up": "more drag (airflow blocked, filter clogged)",
+    "drag_down": "less drag (blade lost, airflow freer than before)",
+    "friction_up": "more friction (bearing)",
+    "gain_down": "less drive (supply, driver)",
+    "external_torque": "an external torque (something touches the rotor)",
+    "sensor_stuck": "a stuck tacho",
+    "sensor_dropout": "a tacho that drops out",
+    "sensor_scaling": "a tacho that counts wrongly",
+    CANNOT_TELL: "cannot tell yet",
+}
+PLAIN = {
+    Transition.CLEARED: "back to normal",
+    Transition.ACKNOWLEDGED: "acknowledged",
+    Transition.CONFIRMED: "confirmed",
+    Transition.RESET: "reset",
+    Transition.SHELVED: "shelved",
+    Transition.UNSHELVED: "no longer shelved",
+    Transition.SUPPRESSED: "suppressed",
+    Transition.UNSUPPRESSED: "no longer suppressed",
+    Transition.OUT_OF_SERVICE: "out of service",
+    Transition.IN_SERVICE: "in service",
+    Transition.COMMISSIONING: "a new baseline is being taken",
+}
+
+
+class AlarmText:
+    """In the units of a tray."""
+
+    def __init__(self, speed_unit: str, command_unit: str) -> None:
+        self._speed_unit = speed_unit
+        self._command_unit = command_unit or "of command"
+
+    def of(self, alarm: Alarm, invalid_reason: str = "") -> str:
+        """The line. invalid_reason: of a request that was refused."""
+        fan = f"fan {alarm.fan}"
+        if alarm.transition == Transition.REFUSED:
+            return f"{fan}: refused: {invalid_reason}"
+        if alarm.transition == Transition.DIAGNOSED:
+            return f"{fan}: {self._cause(alarm)}"
+        if alarm.transition in (Transition.RAISED, Transition.SEVERITY):
+            return f"{fan}: {self._departure(alarm)}{self._cause_if_known(alarm)}"
+        if alarm.transition == Transition.REPUBLISHED:
+            return f"{fan}: {'still stands' if _stands(alarm) else 'stands no longer'}"
+        return f"{fan}: {PLAIN[alarm.transition]}"
+
+    def _departure(self, alarm: Alarm) -> str:
+        if alarm.statistic == Statistic.SENSOR:
+            return "the tacho repeats one reading, or gives none"
+        if alarm.statistic in (Statistic.SPEED_VARIANCE_GROWTH, Statistic.BALANCE_VARIANCE_GROWTH):
+            return f"unsteady, {alarm.score:.1f} times the limit"
+        if alarm.statistic in (Statistic.SPEED_SMOOTHED, Statistic.SPEED_DRIFT):
+            side = "below" if alarm.residual_rad_s < 0 else "above"
+            size, limit = self._speed(abs(alarm.residual_rad_s)), self._speed(alarm.limit_rad_s)
+            return f"{size} {self._speed_unit} {side} the twin (limit {limit}){_drifts(alarm)}"
+        side = "more" if alarm.torque_balance_command > 0 else "less"
+        size, limit = abs(alarm.torque_balance_command), alarm.torque_balance_limit_command
+        return f"takes {size:.2g} {self._command_unit} {side} than a healthy one (limit {limit:.2g}){_drifts(alarm)}"
+
+    def _cause_if_known(self, alarm: Alarm) -> str:
+        known = alarm.causes and alarm.causes[0].cause != CANNOT_TELL
+        return f"; {self._cause(alarm)}" if known else ""
+
+    def _cause(self, alarm: Alarm) -> str:
+        if not alarm.causes:
+            return "cause unknown"
+        first = alarm.causes[0]
+        words = CAUSES.get(first.cause, first.cause)
+        if first.cause == CANNOT_TELL:
+            return first.evidence or words  # its evidence begins with these words
+        evidence = f": {first.evidence}" if first.evidence else ""
+        return f"{words}, {100 * first.probability:.0f} %{evidence}"
+
+    def _speed(self, speed_rad_s: float) -> str:
+        speed = speed_rad_s / RAD_S_PER_RPM if self._speed_unit == "rpm" else speed_rad_s
+        return f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
+
+
+def _stands(alarm: Alarm) -> bool:
+    """Whether there is an alarm, or one that is to come is kept quiet."""
+    retained = alarm.active or alarm.latched or not (alarm.acknowledged and alarm.confirmed)
+    return retained or bool(alarm.shelved_until_t_ns) or alarm.suppressed or alarm.out_of_service
+
+
+def _drifts(alarm: Alarm) -> str:
+    return ", for long" if alarm.statistic in (Statistic.SPEED_DRIFT, Statistic.BALANCE_DRIFT) else ""

@@ -1,0 +1,1 @@
+"""Alarm limits from healthy running, for a declared false-alarm rate."""

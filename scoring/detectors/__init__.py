@@ -1,0 +1,1 @@
+"""Statistics on residuals: one detector a file."""

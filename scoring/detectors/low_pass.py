@@ -1,0 +1,51 @@
+"""A first-order low-pass over valid samples: a sample that is not valid leaves it where it was."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from schemas.messages import Array
+from scoring.detectors.torque_balance import filter_rows
+
+
+class LowPass:
+    """y[k] = keep y[k-1] + (1 - keep) x[k] with keep = exp(-step / time constant), exact for a held input."""
+
+    def __init__(self, columns: int, time_constant_s: float, start: float = 0.0) -> None:
+        self._time_constant_s = time_constant_s
+        self.value = np.full(columns, start)
+        """(columns,) the last y"""
+
+    def keep(self, step_s: float) -> float:
+        """What is left of the past after one step."""
+        return math.exp(-step_s / self._time_constant_s) if self._time_constant_s > 0 else 0.0
+
+    def reset(self, columns: Array, to: float = 0.0) -> None:
+        """Begin anew for some columns, (columns,) of bool."""
+        self.value[columns] = to
+
+    def update(self, x: Array, valid: Array, step_s: float) -> Array:
+        """Take a block, (n, columns) each, and return y after each sample."""
+        keep = self.keep(step_s)
+        whole = valid.all(axis=0)
+        if len(x) == 1:
+            y = np.where(valid, (1.0 - keep) * x + keep * self.value, self.value)
+        elif whole.all():
+            y, _ = filter_rows(keep, x, keep * self.value[np.newaxis])
+        else:
+            y = np.empty_like(x)
+            if whole.any():
+                y[:, whole], _ = filter_rows(keep, x[:, whole], keep * self.value[np.newaxis, whole])
+            y[:, ~whole] = self.value[~whole]
+            for column in np.flatnonzero(~whole & valid.any(axis=0)).tolist():
+                y[:, column] = self._held(x[:, column], valid[:, column], keep, self.value[column])
+        self.value = y[-1].copy()
+        return y
+
+    @staticmethod
+    def _held(x: Array, valid: Array, keep: float, before: float) -> Array:
+        rows = np.flatnonzero(valid)
+        y, _ = filter_rows(keep, x[rows, np.newaxis], np.array([[keep * before]]))
+        return np.concatenate(([before], y[:, 0]))[np.cumsum(valid)]

@@ -1,0 +1,1 @@
+"""Which fault explains an alarm, with probabilities."""

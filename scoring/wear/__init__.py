@@ -1,0 +1,1 @@
+"""Slow change over days and weeks."""

@@ -1,0 +1,170 @@
+"""Faults of the simulated tray, on a schedule.
+
+Each works on one fan from `start_s` until `stop_s`, and is wholly gone then. `size` means, by kind:
+
+| kind | what it is | size | default |
+|---|---|---|---|
+| inlet | covered inlet | factor on the drag C_D | 1.6 |
+| rotor | disturbed rotor | braking torque, V | 1.0 |
+| wear | worn bearing | sliding friction added at stop, V; grows linearly from 0 at start | 0.8 |
+| supply | supply sag | factor on the supply voltage | 0.85 |
+| tacho-stuck | tacho repeats its last reading | (none) | |
+| tacho-dropout | tacho gives no reading (NaN) | share of readings that are missing, 0 to 1 | 1.0 |
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from simulation.plant import Disturbance
+from twin.errors import TwinError
+
+
+@dataclass(frozen=True)
+class _Kind:
+    default_size: float | None  # None: this kind has no size
+    smallest: float = 0.0
+    largest: float = math.inf
+
+
+KINDS: dict[str, _Kind] = {
+    "inlet": _Kind(1.6, smallest=0.01),
+    "rotor": _Kind(1.0),
+    "wear": _Kind(0.8),
+    "supply": _Kind(0.85),
+    "tacho-stuck": _Kind(None),
+    "tacho-dropout": _Kind(1.0, largest=1.0),
+}
+KEYS = ("fan", "start", "stop", "size")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault: `fan` counted from 0, times in seconds since the tray began; stop_s may be infinite."""
+
+    kind: str
+    fan: int
+    start_s: float = 0.0
+    stop_s: float = math.inf
+    size: float | None = None
+
+    def active(self, t_s: float) -> bool:
+        """Whether it is there at t_s."""
+        return self.start_s <= t_s < self.stop_s
+
+    def size_at(self, t_s: float) -> float:
+        """Its size while it is there; that of wear grows."""
+        assert self.size is not None
+        grown = (t_s - self.start_s) / (self.stop_s - self.start_s) if self.kind == "wear" else 1.0
+        return self.size * grown
+
+
+def parse_fault(text: str) -> Fault:
+    """A fault as written on the command line: `KIND:fan=N[,start=S][,stop=S][,size=X]`.
+
+    Raises:
+        TwinError: one line that says which part is wrong, with the nearest known word.
+    """
+    kind, _, settings = text.partition(":")
+    if kind not in KINDS:
+        raise TwinError(f"fault {text!r}: unknown kind {kind!r}; {_nearest(kind, KINDS)}")
+    values: dict[str, float] = {}
+    for setting in filter(None, settings.split(",")):
+        key, _, number = setting.partition("=")
+        if key not in KEYS:
+            raise TwinError(f"fault {text!r}: unknown key {key!r}; {_nearest(key, KEYS)}")
+        if key in values:
+            raise TwinError(f"fault {text!r}: {key} is given twice")
+        try:
+            values[key] = float(number)
+        except ValueError as error:
+            raise TwinError(f"fault {text!r}: {key} = {number!r} is not a number") from error
+        if not math.isfinite(values[key]):
+            raise TwinError(f"fault {text!r}: {key} = {number} must be finite")
+    if "fan" not in values:
+        raise TwinError(f"fault {text!r}: say which fan, counted from 0: {kind}:fan=0")
+    if values["fan"] != int(values["fan"]) or values["fan"] < 0:
+        raise TwinError(f"fault {text!r}: fan must be a whole number from 0 on")
+    fault = Fault(
+        kind,
+        int(values["fan"]),
+        values.get("start", 0.0),
+        values.get("stop", math.inf),
+        values.get("size", KINDS[kind].default_size),
+    )
+    _check(fault, f"fault {text!r}")
+    return fault
+
+
+def _check(fault: Fault, where: str) -> None:
+    kind = KINDS[fault.kind]
+    if fault.start_s < 0.0:
+        raise TwinError(f"{where}: start must not be negative")
+    if fault.stop_s <= fault.start_s:
+        raise TwinError(f"{where}: stop must come after start")
+    if fault.size is None:
+        return
+    if kind.default_size is None:
+        raise TwinError(f"{where}: {fault.kind} has no size; leave it out")
+    if not kind.smallest <= fault.size <= kind.largest:
+        upto = f" to {kind.largest:g}" if math.isfinite(kind.largest) else " on"
+        raise TwinError(f"{where}: size = {fault.size:g}; give one from {kind.smallest:g}{upto}")
+
+
+def check_schedule(faults: Iterable[Fault], fans: int, duration_s: float) -> None:
+    """Whether these faults fit a tray of so many fans that runs so long.
+
+    Raises:
+        TwinError: a fan that is not there, wear without an end to grow towards, or a start after the end.
+    """
+    for fault in faults:
+        if fault.fan >= fans:
+            raise TwinError(f"{fault.kind} fault: fan {fault.fan} is not there; the tray's are 0 to {fans - 1}")
+        if fault.start_s >= duration_s:
+            raise TwinError(f"{fault.kind} fault: start = {fault.start_s:g} s is after the end at {duration_s:g} s")
+        if fault.kind == "wear" and math.isinf(fault.stop_s):
+            raise TwinError("wear fault: give stop=S, when it has grown to its size")
+
+
+def _nearest(word: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
+
+
+@dataclass(frozen=True)
+class TachoTrouble:
+    """What is wrong with the tachos: which are stuck (fans,), and the share of missing readings (fans,)."""
+
+    stuck: np.ndarray
+    dropout: np.ndarray
+
+
+def disturbance(faults: Sequence[Fault], fans: int, t_s: float) -> Disturbance:
+    """What the active faults do to the fans at t_s. Several of one fan add up: factors multiply, torques add."""
+    drag, brake, supply = np.ones(fans), np.zeros(fans), np.ones(fans)
+    for fault in faults:
+        if not fault.active(t_s):
+            continue
+        if fault.kind == "inlet":
+            drag[fault.fan] *= fault.size_at(t_s)
+        elif fault.kind in ("rotor", "wear"):
+            brake[fault.fan] += fault.size_at(t_s)
+        elif fault.kind == "supply":
+            supply[fault.fan] *= fault.size_at(t_s)
+    return Disturbance(drag, brake, supply)
+
+
+def tacho_trouble(faults: Sequence[Fault], fans: int, t_s: float) -> TachoTrouble:
+    """What the active faults do to the tachos at t_s."""
+    stuck, dropout = np.zeros(fans, dtype=bool), np.zeros(fans)
+    for fault in faults:
+        if fault.kind == "tacho-stuck" and fault.active(t_s):
+            stuck[fault.fan] = True
+        elif fault.kind == "tacho-dropout" and fault.active(t_s):
+            dropout[fault.fan] = max(dropout[fault.fan], fault.size_at(t_s))
+    return TachoTrouble(stuck, dropout)

@@ -1,0 +1,193 @@
+"""A simulated tray: fans, tachos, a clock and a profile, giving one sample after the other.
+
+The command of a sample is in force from that sample to the next, as on a real device that sets its outputs when it
+measures; so are the faults. Nothing here knows the wall clock: a line plays the samples in real time, a recording
+takes them as fast as they come, and both get the same ones from the same seed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulation.excitation import excitation
+from simulation.faults import Fault, check_schedule, disturbance, tacho_trouble
+from simulation.plant import HEALTHY, DeviceClock, Tacho, advance, at_rest, tray_of_fans
+from twin.errors import TwinError
+
+Array: TypeAlias = NDArray[np.float64]
+
+MAX_FANS = 64
+MAX_JITTER_PERIODS = 0.4
+# Speed loop of a fan given a set-point, in duty per rad/s and duty per rad. A fan gives about 900 rad/s at full duty
+# and takes about a second: the integral cancels that second, and the closed loop follows about four times as fast.
+LOOP_GAIN = 4e-3
+LOOP_INTEGRAL_GAIN_PER_S = 4e-3
+
+
+@dataclass(frozen=True)
+class TraySettings:
+    """Which tray to simulate."""
+
+    fans: int = 8
+    rate_hz: float = 100.0
+    duration_s: float = math.inf
+    profile: str = "manual"
+    seed: int = 1
+    """of commands, noise, jitter and losses"""
+    fans_seed: int = 1
+    """which fans: how they differ from one another"""
+    spread: float = 0.03
+    """relative standard deviation of the fans' parameters"""
+    lost: float = 0.0
+    """share of the samples that never reach the line"""
+    jitter_us: float = 100.0
+    """standard deviation of the time of sampling, cut at 0.4 periods"""
+    tacho: Tacho = Tacho()
+    clock: DeviceClock = DeviceClock()
+    faults: tuple[Fault, ...] = ()
+
+
+@dataclass(frozen=True)
+class TraySample:
+    """One sample at true time t_s since the tray began. A lost one takes its sequence number with it."""
+
+    t_s: float
+    clock_us: int
+    sequence: int
+    command: Array
+    speed_rad_s: Array
+    lost: bool
+
+
+class SimulatedTray:
+    """Gives samples while there are any: ask `due_s` when the next one is measured, then `take` it.
+
+    Raises:
+        TwinError: a setting is out of its range.
+    """
+
+    def __init__(self, settings: TraySettings) -> None:
+        _check(settings)
+        self.settings = settings
+        self.fans = settings.fans
+        profile, *others = np.random.SeedSequence(settings.seed).generate_state(5).tolist()
+        self.parameters = tray_of_fans(settings.fans, settings.fans_seed, settings.spread)
+        self._excitation = excitation(settings.profile, settings.fans, profile)
+        self._jitter_rng, self._loss_rng, self._tacho_rng, self._dropout_rng = map(np.random.default_rng, others)
+        self._state = at_rest(settings.fans)
+        self._disturbance = HEALTHY
+        self._command = np.zeros(settings.fans)
+        self._override = np.full(settings.fans, np.nan)
+        self._set_point_rad_s = np.full(settings.fans, np.nan)
+        self._integral = np.zeros(settings.fans)
+        self._reading_rad_s = np.zeros(settings.fans)
+        self._count = 0
+        self._t_s = 0.0
+        self._started_s: dict[int, float] = {}
+        self._stopped_s: dict[int, float] = {}
+        self._due_s = self._next_due_s()
+
+    def due_s(self) -> float | None:
+        """When the next sample is measured, s since the tray began; None after the last."""
+        return self._due_s if self._count / self.settings.rate_hz < self.settings.duration_s else None
+
+    def take(self) -> TraySample:
+        """Let the fans run until the next sample is due, and measure."""
+        t_s, step_s = self._due_s, self._due_s - self._t_s
+        self._state = advance(self._state, self._command, step_s, self.parameters, self._disturbance)
+        self._t_s = t_s
+        speed_rad_s = self._measure(t_s)
+        self._command = self._decide(t_s, speed_rad_s, step_s)
+        self._disturbance = disturbance(self.settings.faults, self.fans, t_s)
+        self._note_faults(t_s)
+        sample = TraySample(
+            t_s,
+            self.settings.clock.at(t_s),
+            self._count % 2**32,
+            self._command,
+            speed_rad_s,
+            bool(self._loss_rng.random() < self.settings.lost),
+        )
+        self._count += 1
+        self._due_s = self._next_due_s()
+        return sample
+
+    def command(self, values: Array) -> None:
+        """Take fans out of the profile (or of the speed loop): values (fans,) duty, NaN leaves a fan as it is."""
+        given = ~np.isnan(values)
+        self._override = np.where(given, np.clip(values, 0.0, 1.0), self._override)
+        self._set_point_rad_s = np.where(given, np.nan, self._set_point_rad_s)
+
+    def set_point(self, values_rad_s: Array) -> None:
+        """Let the device hold speeds itself: values (fans,) rad/s, NaN leaves a fan as it is."""
+        given = ~np.isnan(values_rad_s)
+        self._integral = np.where(given & np.isnan(self._set_point_rad_s), self._command, self._integral)
+        self._set_point_rad_s = np.where(given, values_rad_s, self._set_point_rad_s)
+
+    def happened(self, fault: int) -> tuple[float | None, float | None]:
+        """When the fault (by its place in the settings) began and ended, s since the tray began; None: it has not."""
+        return self._started_s.get(fault), self._stopped_s.get(fault)
+
+    @property
+    def t_s(self) -> float:
+        """Time of the sample last taken, s since the tray began."""
+        return self._t_s
+
+    def _next_due_s(self) -> float:
+        period_s = 1.0 / self.settings.rate_hz
+        limit_s = MAX_JITTER_PERIODS * period_s
+        jitter_s = self._jitter_rng.normal() * self.settings.jitter_us * 1e-6
+        return max(0.0, self._count * period_s + min(max(jitter_s, -limit_s), limit_s))
+
+    def _measure(self, t_s: float) -> Array:
+        """(fans,) what the tachos say. Random numbers are drawn alike with and without faults."""
+        trouble = tacho_trouble(self.settings.faults, self.fans, t_s)
+        fresh = self.settings.tacho.read(self._state.speed_rad_s, self._tacho_rng)
+        self._reading_rad_s = np.where(trouble.stuck, self._reading_rad_s, fresh)
+        missing = self._dropout_rng.random(self.fans) < trouble.dropout
+        return np.where(missing, np.nan, self._reading_rad_s)
+
+    def _decide(self, t_s: float, speed_rad_s: Array, step_s: float) -> Array:
+        """(fans,) duty from now on: of the profile, of whoever commands over the line, or of the speed loop."""
+        duty = np.where(np.isnan(self._override), self._excitation.command(t_s), self._override)
+        looped = ~np.isnan(self._set_point_rad_s)
+        if not looped.any():
+            return duty
+        error_rad_s = np.nan_to_num(self._set_point_rad_s - speed_rad_s)  # without a reading the loop waits
+        proportional = LOOP_GAIN * error_rad_s
+        wanted = proportional + self._integral + LOOP_INTEGRAL_GAIN_PER_S * step_s * error_rad_s
+        possible = np.clip(wanted, 0.0, 1.0)
+        self._integral = possible - proportional  # what cannot be given is not remembered: no wind-up
+        return np.where(looped, possible, duty)
+
+    def _note_faults(self, t_s: float) -> None:
+        for number, fault in enumerate(self.settings.faults):
+            if fault.active(t_s):
+                self._started_s.setdefault(number, t_s)
+            elif number in self._started_s:
+                self._stopped_s.setdefault(number, t_s)
+
+
+def _check(settings: TraySettings) -> None:
+    limits = (
+        ("fans", settings.fans, 1, MAX_FANS),
+        ("rate", settings.rate_hz, 0.1, 10_000.0),
+        ("duration", settings.duration_s, 0.0, math.inf),
+        ("seed", settings.seed, 0, 2**63),
+        ("fans seed", settings.fans_seed, 0, 2**63),
+        ("lost", settings.lost, 0.0, 1.0),
+        ("jitter", settings.jitter_us, 0.0, math.inf),
+        ("drift", settings.clock.drift_ppm, -100_000.0, 100_000.0),
+        ("clock start", settings.clock.start_us, 0, 2**32 - 1),
+        ("tacho noise", settings.tacho.noise_rad_s, 0.0, math.inf),
+    )
+    for name, value, smallest, largest in limits:
+        if not smallest <= value <= largest:
+            upto = f"to {largest:g}" if math.isfinite(largest) else "on"
+            raise TwinError(f"{name} = {value:g}; give one from {smallest:g} {upto}")
+    check_schedule(settings.faults, settings.fans, settings.duration_s)

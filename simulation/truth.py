@@ -1,0 +1,72 @@
+"""The ground truth of a simulated run: what was really done to which fan, and when, for whoever judges an alarm.
+
+A JSON file beside the run. It is there from the start (`complete` false, times unknown) and is replaced as a whole at
+the end. Times are nanoseconds since the epoch at which a fault really began and ended: those of the first samples
+with it and without it. A fault still there at the end ends with the run; one that never came has null.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from simulation.plant import fan
+from simulation.tray import SimulatedTray
+
+
+def truth(tray: SimulatedTray, start_ns: int | None, *, complete: bool, counts: Mapping[str, int]) -> dict[str, Any]:
+    """What is known of the run so far. start_ns: the epoch time of t_s = 0, None before it has begun.
+
+    counts: `samples_sent`, `samples_dropped`, `samples_unsent` and whatever else was counted.
+    """
+    settings = tray.settings
+    return {
+        "complete": complete,
+        "start_ns": start_ns,
+        "end_ns": _at(start_ns, tray.t_s) if complete else None,
+        **counts,
+        "faults": [_fault(tray, number, start_ns, complete) for number in range(len(settings.faults))],
+        "fans": settings.fans,
+        "rate_hz": settings.rate_hz,
+        "profile": settings.profile,
+        "seed": settings.seed,
+        "fans_seed": settings.fans_seed,
+        "spread": settings.spread,
+        "lost": settings.lost,
+        "jitter_us": settings.jitter_us,
+        "clock": asdict(settings.clock),
+        "tacho": asdict(settings.tacho),
+        "parameters": [asdict(fan(tray.parameters, index)) for index in range(settings.fans)],
+    }
+
+
+def _fault(tray: SimulatedTray, number: int, start_ns: int | None, complete: bool) -> dict[str, Any]:
+    fault = tray.settings.faults[number]
+    began_s, ended_s = tray.happened(number)
+    if complete and began_s is not None and ended_s is None:
+        ended_s = tray.t_s
+    return {
+        "kind": fault.kind,
+        "fan": fault.fan,
+        "start_ns": _at(start_ns, began_s),
+        "stop_ns": _at(start_ns, ended_s),
+        "size": fault.size,
+    }
+
+
+def _at(start_ns: int | None, t_s: float | None) -> int | None:
+    return None if start_ns is None or t_s is None else start_ns + round(t_s * 1e9)
+
+
+def write_truth(path: Path, content: Mapping[str, Any]) -> None:
+    """Replace the file as a whole, so that no reader ever sees half of it.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    unfinished = path.with_name(path.name + ".part")
+    unfinished.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    unfinished.replace(path)

@@ -1,0 +1,31 @@
+"""A recorder that is killed under load: every part is readable, and what is missing is counted to the message."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.support.killed_recorder import Kills, Outcome
+
+pytestmark = pytest.mark.slow
+
+
+def outcome(folder, endpoint, history: int) -> Outcome:
+    kills = Kills(folder, endpoint, trays=1, fans=8, history=history)
+    try:
+        return kills.run(4, seed=1)
+    finally:
+        kills.close()
+
+
+def test_with_what_the_bus_still_holds_nothing_is_lost(tmp_path, endpoint):
+    found = outcome(tmp_path, endpoint, history=1024)
+    assert found.unreadable == []
+    assert found.recorded > 1000
+    assert (found.missing, found.counted_missing, found.repeated) == (0, 0, 0)
+
+
+def test_what_the_bus_no_longer_holds_is_missing_and_counted_to_the_message(tmp_path, endpoint):
+    found = outcome(tmp_path, endpoint, history=4)
+    assert found.unreadable == []
+    assert found.missing == found.counted_missing > 100
+    assert found.repeated == 0

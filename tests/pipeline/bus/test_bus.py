@@ -1,0 +1,148 @@
+"""The bus between real processes: nothing lost, whoever starts first, whoever dies."""
+
+from __future__ import annotations
+
+import queue
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from pipeline.bus.session import KEPT_BYTES, Bus, BusError
+from pipeline.config.models import BusConfig
+from schemas.topics import alive_key
+from tests.support.bus_peer import KEY, TOPIC
+from tests.support.running_chain import eventually
+
+COUNT = 400
+
+
+def peer(role: str, endpoint: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.support.bus_peer", role, endpoint, str(COUNT)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parents[3],
+    )
+
+
+def line_of(process: subprocess.Popen[str]) -> str:
+    assert process.stdout
+    return process.stdout.readline().strip()
+
+
+def collected(collector: subprocess.Popen[str], publisher: subprocess.Popen[str]) -> str:
+    """What the collector prints in the end; until then the publisher is told to publish one more."""
+    result: queue.Queue[str] = queue.Queue()
+    threading.Thread(target=lambda: result.put(line_of(collector)), daemon=True).start()
+    assert publisher.stdin
+    for _ in range(300):
+        publisher.stdin.write("one more\n")
+        publisher.stdin.flush()
+        try:
+            return result.get(timeout=0.1)
+        except queue.Empty:
+            continue
+    pytest.fail("the collector did not get what it waits for")
+
+
+@pytest.fixture
+def peers(endpoint):
+    """Starts peers, waits for their first word, and ends them after the test."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(role: str) -> subprocess.Popen[str]:
+        started.append(peer(role, endpoint))
+        assert line_of(started[-1]) in {"published", "ready"}
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+ALL = " ".join(map(str, range(COUNT)))
+
+
+def test_every_message_arrives_in_order_when_the_consumer_starts_first(peers):
+    collector, publisher = peers("collect"), peers("publish")
+    assert collected(collector, publisher).startswith(ALL)
+
+
+def test_every_message_arrives_in_order_when_the_consumer_starts_last(peers):
+    publisher, collector = peers("publish"), peers("collect")
+    assert collected(collector, publisher).startswith(ALL)
+
+
+def test_peers_meet_after_the_process_that_held_the_endpoint_was_killed(peers):
+    holder, collector = peers("collect"), peers("collect")
+    holder.kill()
+    holder.wait()
+    assert collected(collector, peers("publish")).startswith(ALL)
+
+
+def test_a_token_tells_when_a_process_comes_and_when_it_is_gone(endpoint):
+    seen: list[bool] = []
+    changed = threading.Event()
+
+    def note(_key: str, alive: bool) -> None:
+        seen.append(alive)
+        changed.set()
+
+    with Bus(BusConfig(endpoint=endpoint)) as watcher:
+        watcher.watch_alive(alive_key("site", "*", "*"), note)
+        with Bus(BusConfig(endpoint=endpoint)) as other:
+            other.declare_alive(alive_key("site", "scorer", "all"))
+            assert changed.wait(20)
+            changed.clear()
+        assert changed.wait(20)
+    assert seen == [True, False]
+
+
+def test_who_only_looks_in_leaves_the_endpoint_to_those_who_stay(endpoint):
+    config = BusConfig(endpoint=endpoint)
+    with Bus(config, listens=False) as first, Bus(config) as staying:
+        assert not staying.came_second
+        staying.declare_alive(alive_key("site", "scorer", "all"))
+        eventually(lambda: first.alive(alive_key("site", "*", "*")), "they meet all the same")
+        with Bus(config, listens=False) as late:
+            assert late.came_second
+
+
+def test_an_outlet_keeps_the_newest_messages_that_fit_its_memory(endpoint):
+    size, count = KEPT_BYTES // 4, 6
+    patient = BusConfig(endpoint=endpoint, recovery_timeout_s=30)
+    pause = threading.Event()
+
+    def wait() -> None:
+        pause.wait(0.002)
+
+    met = threading.Event()
+    with Bus(patient) as publisher, Bus(patient) as asker:
+        publisher.declare_alive(alive_key("site", "big", "all"))
+        asker.watch_alive(alive_key("site", "*", "*"), lambda _key, _alive: met.set())
+        assert met.wait(20)
+        outlet = publisher.outlet(KEY, TOPIC, "", "big")
+        for number in range(count):
+            outlet.put(bytes([number]) * size)
+        # the asker has to have heard who answers for them
+        eventually(lambda: list(asker.recover(KEY, "big", count - 1, count - 1, wait)), "somebody answers")
+        kept = [payload[0] for _, payload in asker.recover(KEY, "big", 0, count, wait)]
+        assert kept == [2, 3, 4, 5]
+        for _ in range(TOPIC.history + 1):
+            outlet.put(b"small")
+        assert len(list(asker.recover(KEY, "big", 0, 2**63, wait))) == TOPIC.history
+
+
+def test_asking_where_nobody_answers_ends_empty(endpoint):
+    with Bus(BusConfig(endpoint=endpoint)) as bus:
+        assert list(bus.recover(KEY, "nobody", 0, 5, lambda: None)) == []
+
+
+def test_a_wrong_endpoint_is_one_line():
+    with pytest.raises(BusError, match="bus.endpoint = 'nonsense' cannot be used"):
+        Bus(BusConfig(endpoint="nonsense"))

@@ -1,0 +1,97 @@
+"""`fantwin router`: sessions on several hosts meet there."""
+
+from __future__ import annotations
+
+import queue
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from pipeline.bus.session import Bus, BusError
+from pipeline.config.models import BusConfig
+from schemas.topics import BY_NAME, tray_key
+from tests.support.running_chain import DEMO, Running, eventually, fantwin
+
+KEY = tray_key("site", "tray", "alarm")
+
+
+@pytest.fixture
+def started() -> Iterator[list[Running]]:
+    processes: list[Running] = []
+    yield processes
+    for process in processes:
+        process.kill()
+
+
+def client(endpoint: str, stop: threading.Event | None = None) -> Bus:
+    return Bus(BusConfig(mode="client", endpoint=endpoint), stop)
+
+
+def exchange(listener: Bus, speaker: Bus) -> bytes:
+    """What the one hears of the other; said again until it is, since nobody knows when they have met."""
+    heard: queue.Queue[bytes] = queue.Queue()
+    listener.subscribe(KEY, lambda _key, payload: heard.put(payload))
+    outlet = speaker.outlet(KEY, BY_NAME["alarm"], "x", "speaker")
+    for _ in range(600):
+        outlet.put(b"hello")
+        try:
+            return heard.get(timeout=0.1)
+        except queue.Empty:
+            continue
+    raise AssertionError("nothing was heard in a minute")
+
+
+def test_two_clients_hear_each_other_through_the_router(endpoint, started):
+    router = Running(["router", "--listen", endpoint, "--json"])
+    started.append(router)
+    with client(endpoint, threading.Event()) as one, client(endpoint) as other:
+        assert exchange(one, other) == b"hello"
+        assert exchange(other, one) == b"hello"
+    assert router.end() == 0
+    assert router.output() == {"listening": endpoint}
+
+
+def test_clients_that_start_before_the_router_get_through_once_it_is_there(endpoint, started):
+    config, never = BusConfig(mode="client", endpoint=endpoint), threading.Event()
+    with ThreadPoolExecutor() as pool:
+        try:
+            waiting = [pool.submit(Bus, config, never) for _ in range(2)]
+            with pytest.raises(BusError, match="no router answers"):
+                client(endpoint)  # there is none yet, and this one does not wait
+            assert not any(bus.done() for bus in waiting)
+            started.append(Running(["router", "--listen", endpoint]))
+            one, other = (bus.result(timeout=60) for bus in waiting)
+        finally:
+            never.set()
+    with one, other:
+        assert exchange(one, other) == b"hello"
+
+
+def test_waiting_for_a_router_ends_when_told_to_stop(endpoint, started):
+    """In another process, by a signal: it must not be deaf to it."""
+    words = ["run", "scorer", "-c", DEMO / "demo.toml", "--set", "bus.mode=client", "--set"]
+    stage = Running([*words, f"bus.endpoint={endpoint}"])
+    started.append(stage)
+    eventually(lambda: catches_interrupts(stage.process.pid), "it handles Ctrl-C")
+    assert stage.end() == 1
+    assert "no router answers" in stage.line_with("fantwin:")
+
+
+def catches_interrupts(process_id: int) -> bool:
+    status = Path(f"/proc/{process_id}/status").read_text()
+    caught = int(status.split("SigCgt:")[1].split()[0], 16)
+    return bool(caught >> (signal.SIGTERM - 1) & 1)  # Python itself catches SIGINT from the first
+
+
+def test_a_second_router_at_the_same_place_is_refused_in_one_line(endpoint, started):
+    first = Running(["router", "--listen", endpoint])
+    started.append(first)
+    client(endpoint, threading.Event()).close()  # it is there
+    done = fantwin("router", "--listen", endpoint)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "is one running already?" in done.stderr

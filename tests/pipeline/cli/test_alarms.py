@@ -1,0 +1,271 @@
+"""`fantwin alarms`: the command, over a real bus, with a scorer that raises when it is told to."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.cli.watch.alarms import Asked, standing_lines
+from pipeline.config.models import load_config
+from pipeline.runtime.runner import Runner
+from pipeline.runtime.stage import Core, Parts, Stage
+from schemas.messages import Action, Alarm, Diagnosis, Header, Message, Request, StageStatus, Transition
+from scoring.alarms.alarm_state import AlarmState, ConditionSettings
+from scoring.alarms.current_alarms import CurrentAlarm
+from scoring.alarms.tray_alarms import Conditions
+from stages.scorer import ScorerConfig
+from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
+
+FANS = 8
+CAUSES = (
+    Diagnosis(cause="drag_up", probability=0.83, evidence="drag +50 %"),
+    Diagnosis(cause="friction_up", probability=0.1),
+)
+
+
+class ToldScorer(Core):
+    """The conditions of a tray whose ratios a test sets; answers requests as a scorer does."""
+
+    def __init__(self) -> None:
+        self.conditions = Conditions(FANS, ConditionSettings(0, 0))
+        self.ratio: dict[int, float] = {}
+        self.deaf = False
+        self._now_ns = 0
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        self._now_ns = now_ns
+        ratio = np.array([[self.ratio.get(fan, 0.0) for fan in range(FANS)]])
+        course = self.conditions.update(np.array([now_ns]), 1, ratio, ratio >= 0)
+        return [self._alarm(c.fan, c.transition, c.standing, "too slow") for c in course.changes]
+
+    def step(self, item: Any) -> Sequence[Message]:
+        if self.deaf or not isinstance(item, Request):
+            return []
+        fans = range(FANS) if item.fan < 0 else [item.fan]
+        asked = (item.action, fans, self._now_ns, item.duration_s * 1e9, item.operator_name, item.comment)
+        name = f"{item.header.producer}/{item.header.sequence}"
+        return [
+            replace(
+                self._alarm(fan, transition, self.conditions.standing(fan), _in_words(fan, transition, why)),
+                request=name,
+                operator_name=item.operator_name,
+                comment=item.comment,
+            )
+            for fan, transition, why in self.conditions.request(*asked)
+        ]
+
+    def _alarm(self, fan: int, transition: Transition, standing: AlarmState, message: str) -> Alarm:
+        return Alarm(
+            header=Header(),
+            fan=fan,
+            active=standing.active,
+            severity=standing.severity,
+            t_ns=self._now_ns,
+            onset_t_ns=standing.onset_t_ns,
+            residual_rad_s=0.0,
+            limit_rad_s=1.0,
+            message=message,
+            transition=transition,
+            acknowledged=standing.acknowledged,
+            confirmed=standing.confirmed,
+            latched=standing.latched,
+            shelved_until_t_ns=standing.shelved_until_t_ns,
+            suppressed=standing.suppressed,
+            out_of_service=standing.out_of_service,
+            causes=CAUSES if transition == Transition.RAISED else (),
+        )
+
+
+def _in_words(fan: int, transition: Transition, why: str) -> str:
+    return f"fan {fan}: refused: {why}" if why else f"fan {fan}: {transition.name.lower()}"
+
+
+class Site:
+    """The scorer in a thread, and the words that lead a command to its bus."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.core = ToldScorer()
+        self.words = ("-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
+        stage = Stage(
+            name="scorer",
+            about="",
+            reads=("prediction", "request"),
+            writes=("alarm",),
+            config=ScorerConfig,
+            build=lambda _context: Parts(self.core),
+        )
+        self._stop = threading.Event()
+        config = load_config(DEMO / "demo.toml", [f"bus.endpoint='{endpoint}'"])
+        self.runner = Runner(stage, config, None, self._stop)
+        self.last: Any = None
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        self.last = self.runner.run()
+
+    def end(self) -> None:
+        self._stop.set()
+        self._thread.join(20)
+
+    def raise_alarm(self, fan: int, ratio: float = 2.0) -> None:
+        self.core.ratio[fan] = ratio
+        eventually(lambda: self.core.conditions.standing(fan).active, f"fan {fan} has an alarm")
+
+    def ask(self, *words: object) -> str:
+        """What the command prints; it must end well."""
+        done = fantwin("alarms", *words, *self.words)
+        assert done.exit_code == 0, done.exception
+        return done.stdout
+
+    def refused(self, *words: object) -> str:
+        return said_instead("alarms", *words, *self.words)
+
+    def listed(self, *words: object) -> list[dict[str, Any]]:
+        return json.loads(self.ask("--json", *words))["alarms"]
+
+
+@pytest.fixture
+def site(endpoint: str) -> Iterator[Site]:
+    site = Site(endpoint)
+    yield site
+    site.end()
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """The commands run in this process: its signals are given back."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_the_list_has_what_stands_and_with_all_what_is_over(site):
+    assert site.listed() == []
+    assert site.ask() == "no alarms\n"
+    site.raise_alarm(3)
+    site.raise_alarm(5)
+    site.core.ratio[5] = 0.0
+    eventually(lambda: not site.core.conditions.standing(5).active, "it has cleared")
+    before_ns = time.time_ns()
+    assert [(a["tray"], a["fan"], a["active"]) for a in site.listed()] == [(TRAY, 3, True), (TRAY, 5, False)]
+    site.ask("ack", TRAY, 5)
+    (alarm,) = site.listed()
+    assert (alarm["fan"], alarm["severity"], alarm["presented"]) == (3, "alarm", True)
+    assert alarm["causes"][0] == {"cause": "drag_up", "probability": 0.83, "evidence": "drag +50 %"}
+    assert 0 < alarm["onset_t_ns"] < before_ns
+    assert [a["fan"] for a in site.listed("--all")] == [3, 5]
+    first, cause, message = site.ask().splitlines()
+    assert first.startswith(f"{TRAY} fan 3  ALARM    active, unacknowledged  since ")
+    assert (cause.strip(), message.strip()) == ("drag_up 83 %, friction_up 10 %: drag +50 %", "too slow")
+
+
+def told_of_one_fan() -> list[Alarm]:
+    scorer = ToldScorer()
+    scorer.ratio[0] = 2.0
+    return [alarm for t_ns in range(3) for alarm in scorer.tick(t_ns) if isinstance(alarm, Alarm)]
+
+
+def test_a_cause_that_cannot_be_told_yet_is_said_once():
+    (raised,) = [alarm for alarm in told_of_one_fan() if alarm.transition == Transition.RAISED]
+    unknown = (Diagnosis(cause="cannot_tell", probability=0.6, evidence="cannot tell yet: the command is not moving"),)
+    _, cause, message = standing_lines(CurrentAlarm(raised, "too slow", unknown, "")).plain.splitlines()
+    assert (cause.strip(), message.strip()) == ("cannot_tell 60 %: the command is not moving", "too slow")
+
+
+def test_an_acknowledgement_names_who_and_a_shelved_alarm_is_listed_and_not_presented(site):
+    site.raise_alarm(3)
+    said = site.ask("ack", TRAY, 3, "--operator", "Ann", "--comment", "on my way")
+    assert said == f"{TRAY}: fan 3: acknowledged\n"
+    assert site.core.conditions.standing(3).comment == "on my way"
+    (answer,) = json.loads(site.ask("shelve", TRAY, 3, "--for", "30m", "--json"))["answers"]
+    assert (answer["transition"], answer["fan"]) == ("shelved", 3)
+    assert answer["shelved_until_t_ns"] == pytest.approx(time.time_ns() + 1800e9, abs=60e9)
+    (alarm,) = site.listed()
+    assert (alarm["acknowledged_by"], alarm["retained"], alarm["presented"]) == ("Ann", True, False)
+    assert "acknowledged by Ann, shelved until" in site.ask()
+    site.ask("unshelve", TRAY, 3)
+    assert site.listed()[0]["presented"]
+
+
+def test_what_is_refused_is_one_line_that_says_why(site):
+    assert site.refused("ack", TRAY, 2) == f"{TRAY}: fan 2: refused: no alarm has been raised"
+
+
+def test_a_request_for_all_fans_is_well_if_it_could_be_granted_for_one(site):
+    site.raise_alarm(3)
+    lines = site.ask("ack", TRAY).splitlines()
+    assert lines[3] == f"{TRAY}: fan 3: acknowledged"
+    assert lines[4] == f"{TRAY}: fan 4: refused: no alarm has been raised"
+    assert len(lines) == FANS
+    assert "ack refused for all fans" in site.refused("ack", TRAY)
+
+
+def test_commands_that_come_and_go_are_no_loss_to_the_scorer(site):
+    for action in ("suppress", "unsuppress", "out-of-service", "in-service"):
+        site.ask(action, TRAY, 1)
+    site.end()
+    assert (site.last.status, site.last.problem, site.last.lost) == (StageStatus.STOPPED, "", 0)
+    assert [line.received for line in site.last.inputs] == [1] * 4
+
+
+def test_watching_prints_what_happens_as_it_happens(site):
+    site.raise_alarm(3)
+    words = [*FANTWIN, "alarms", "--watch", "--json", *map(str, site.words)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as watching:
+        assert watching.stdout
+        standing = json.loads(watching.stdout.readline())["alarms"]
+        assert [(a["fan"], a["active"]) for a in standing] == [(3, True)]
+        site.core.ratio[3] = 0.0
+        cleared = json.loads(watching.stdout.readline())
+        site.ask("ack", TRAY, 3, "--operator", "Ann")
+        acknowledged = json.loads(watching.stdout.readline())
+        watching.send_signal(signal.SIGINT)
+        assert watching.wait(20) == 0
+    assert (cleared["transition"], cleared["fan"], cleared["active"]) == ("cleared", 3, False)
+    assert (acknowledged["transition"], acknowledged["acknowledged_by"]) == ("acknowledged", "Ann")
+
+
+def test_a_scorer_that_does_not_answer_is_told_after_the_timeout(site):
+    site.core.deaf = True
+    said = site.refused("ack", TRAY, 3, "--timeout", 0.5)
+    assert said == f"tray {TRAY}: no answer for fan 3 in 0.5 s: does a scorer judge this tray?"
+
+
+@pytest.mark.parametrize("words", [(), ("ack", TRAY, 3)], ids=["list", "ack"])
+def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, monkeypatch):
+    monkeypatch.setattr("pipeline.cli.watch.alarms._MEET_S", 0.3)
+    said = said_instead("alarms", *words, "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
+    assert f"alarms unknown: no scorer of site '{SITE}' answers at {endpoint}" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("ack", "say of which tray: fantwin alarms ack TRAY [FAN] (of tray1)"),
+        ("ack nobody", "no tray called 'nobody'"),
+        ("ack tray1 8", "fan 8: tray tray1 has fans 0 to 7"),
+        ("shelve tray1 3 --for 3", "--for 3: give a time such as 90s, 30m, 8h or 2d"),
+        ("shelve tray1 3 --for 0m", "--for 0m: give a time such as 90s, 30m, 8h or 2d"),
+        ("ack tray1 3 --for 3m", "--for goes with shelve, and not with ack"),
+        ("ack tray1 3 --watch", "--all and --watch are for the list: leave them out with ack"),
+        ("--operator Ann", "--for, --comment and --operator go with an action"),
+    ],
+)
+def test_what_cannot_be_meant_is_one_line(words, said):
+    assert said in said_instead("alarms", *words.split(), "-c", DEMO / "demo.toml")
+
+
+def test_every_action_can_be_typed():
+    assert [asked.action for asked in Asked] == [action for action in Action if action != Action.NONE]

@@ -1,0 +1,297 @@
+"""`fantwin calibrate` on simulated recordings: what it promises and refuses, and that it leaves the twin as it was."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import onnx
+import pytest
+
+from pipeline.cli.main import spell_out
+from pipeline.cli.twins.calibration_check import Check
+from pipeline.runtime.twin_file import TwinFile
+from scoring.limits import Limits, Timing
+from tests.support.fantwin_command import fantwin, said_instead
+
+FANS = 2
+PER_DAY = 1500
+
+
+def simulated(path: Path, seed: int, seconds: float, *more: object) -> Path:
+    result = fantwin(
+        "simulate", "--fans", FANS, "--profile", "multisine", "--seed", seed, "--duration", seconds,
+        "--epoch-ns", 0, "--recording", path, *more,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("calibrate")
+    simulated(path / "training.mcap", 1, 60)
+    simulated(path / "healthy.mcap", 2, 120)
+    simulated(path / "other.mcap", 3, 60)
+    result = fantwin("train", path / "training.mcap", "--model", "physical", "-o", path / "twin.onnx")
+    assert result.exit_code == 0, result.output
+    return path
+
+
+@pytest.fixture(scope="module")
+def calibrated(folder: Path) -> Path:
+    output = folder / "calibrated.onnx"
+    result = calibrate(folder, "-o", output)
+    assert result.exit_code == 0, result.output
+    return output
+
+
+def calibrate(folder: Path, *more: object):
+    return fantwin("calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY, *more)
+
+
+def card(twin: Path) -> dict[str, Any]:
+    return json.loads(TwinFile.load(twin).card_json)
+
+
+def test_the_limits_are_in_the_card_and_all_else_of_the_twin_is_as_it_was(folder: Path, calibrated: Path) -> None:
+    before, after = folder / "twin.onnx", calibrated
+    assert TwinFile.load(before).calibration is None
+    assert {**card(after), "calibration": None} == {**card(before), "calibration": card(before).get("calibration")}
+    graphs = [onnx.load(twin).graph.SerializeToString(deterministic=True) for twin in (before, after)]
+    assert graphs[0] == graphs[1]
+    limits = Limits.model_validate(TwinFile.load(after).calibration)
+    assert limits.speed.step and limits.balance.step
+    assert limits.promise
+    assert limits.promise.false_alarms_per_day == PER_DAY
+    assert limits.promise.interval_95[0] < PER_DAY < limits.promise.interval_95[1]
+    assert limits.promise.data[0]["name"] == "healthy.mcap"
+    assert len(limits.promise.data[0]["sha256"]) == 64
+
+
+def test_the_limits_decide_what_a_replay_finds(folder: Path, calibrated: Path) -> None:
+    alarmed = [
+        alarmed_s(fantwin("replay", folder / "other.mcap", "--offline", "--twin", twin, "--json").stdout)
+        for twin in (calibrated, strict(folder, calibrated))
+    ]
+    assert alarmed[1] > alarmed[0] + 30.0
+
+
+def alarmed_s(replayed: str) -> float:
+    """How long fans were in alarm, all together."""
+    alarms = json.loads(replayed)["alarms"]
+    return sum((alarm["cleared_ns"] or 60_000_000_000) - alarm["raised_ns"] for alarm in alarms) / 1e9
+
+
+def strict(folder: Path, calibrated: Path) -> Path:
+    """The twin with limits that healthy fans pass all the time, and a promise that they never do."""
+    from twin.export.calibrated import with_calibration  # noqa: PLC0415
+
+    was = Limits.model_validate(TwinFile.load(calibrated).calibration)
+    assert was.promise
+    promise = was.promise.model_copy(update={"false_alarms_per_day": 0.1})
+    limits = was.times(0.3).model_copy(update={"promise": promise})
+    path = folder / "strict.onnx"
+    path.write_bytes(with_calibration(calibrated.read_bytes(), json.loads(limits.model_dump_json())))
+    return path
+
+
+def test_it_says_what_it_found_in_lines_a_person_can_read(folder: Path) -> None:
+    told = calibrate(folder, "-o", folder / "said.onnx").stdout
+    assert "said.onnx: alarms calibrated on 0.06" in told
+    assert f"declared: {PER_DAY} false alarms per fan and day" in told
+    assert "--verify" in told
+
+
+def test_json_is_one_document_of_the_limits_and_the_test_of_them(folder: Path) -> None:
+    result = calibrate(folder, "-o", folder / "json.onnx", "--json", "--verify", folder / "other.mcap")
+    told = json.loads(result.stdout)
+    assert told["twin"].endswith("json.onnx")
+    Limits.model_validate(told["calibration"])
+    assert told["verify"]["kept"] is True
+    assert told["verify"]["fan_hours"] == pytest.approx(FANS * 60 / 3600, rel=0.1)
+
+
+def test_without_an_output_the_twin_itself_is_calibrated(folder: Path) -> None:
+    twin = folder / "in-place.onnx"
+    twin.write_bytes((folder / "twin.onnx").read_bytes())
+    result = fantwin("calibrate", twin, folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY)
+    assert result.exit_code == 0, result.output
+    assert TwinFile.load(twin).calibration is not None
+
+
+def test_too_little_is_refused_with_what_would_be_needed_and_the_twin_is_left_alone(folder: Path) -> None:
+    before = (folder / "twin.onnx").read_bytes()
+    said = said_instead("calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1)
+    assert "fan-hours of healthy running cannot support 1 false alarm per fan and day: that takes 72" in said
+    assert "--extrapolate" in said
+    assert (folder / "twin.onnx").read_bytes() == before
+
+
+def test_what_is_extrapolated_promises_nothing(folder: Path) -> None:
+    output = folder / "extrapolated.onnx"
+    result = fantwin(
+        "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1, "--extrapolate",
+        "-o", output,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "nothing is promised" in result.stdout
+    promise = Limits.model_validate(TwinFile.load(output).calibration).promise
+    assert promise
+    assert promise.extrapolated
+
+
+def test_what_was_declared_is_kept_on_other_healthy_running(folder: Path, calibrated: Path) -> None:
+    result = fantwin("calibrate", calibrated, "--verify", folder / "other.mcap")
+    assert result.exit_code == 0, result.output
+    assert "kept" in result.stdout
+    assert f"declared {PER_DAY}" in result.stdout
+    assert len(result.stdout.strip().splitlines()) == 1
+
+
+def test_a_promise_that_is_broken_is_exit_code_3(folder: Path, calibrated: Path) -> None:
+    result = fantwin("calibrate", strict(folder, calibrated), "--verify", folder / "other.mcap")
+    assert result.exit_code == 3, result.output
+    assert "declared 0.1: not kept" in result.stdout
+
+
+@pytest.mark.parametrize("alarms", range(20))
+def test_what_decides_is_the_interval_that_is_printed(alarms: int) -> None:
+    check = Check(alarms, 100.0, 1.0)
+    low, _ = check.interval_95
+    assert check.said.endswith(": not kept") == check.is_broken == (low > 1.0)
+    assert f"(95 %: {low:.2g} to " in check.said
+
+
+def test_a_twin_that_was_never_calibrated_has_nothing_to_verify(folder: Path) -> None:
+    said = said_instead("calibrate", folder / "twin.onnx", "--verify", folder / "other.mcap")
+    assert "never calibrated" in said
+
+
+def test_what_is_missing_from_the_command_is_said(folder: Path) -> None:
+    assert "nothing to calibrate on" in said_instead("calibrate", folder / "twin.onnx")
+    said = said_instead("calibrate", folder / "twin.onnx", folder / "healthy.mcap")
+    assert "--false-alarms-per-day" in said
+
+
+def test_a_twin_that_is_not_there_is_told_by_the_name_that_was_given(folder: Path) -> None:
+    said = said_instead("calibrate", folder / "no.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY)
+    assert said == f"{folder / 'no.onnx'}: there is no such twin: name the file that `fantwin train` wrote"
+
+
+def test_all_that_follows_verify_is_verified(folder: Path, calibrated: Path) -> None:
+    more, other = folder / "more.mcap", folder / "other.mcap"
+    simulated(more, 4, 30)
+    words = spell_out(list(map(str, ("calibrate", calibrated, "--verify", other, more, "--json"))))
+    result = fantwin(*words)
+    assert json.loads(result.stdout)["verify"]["fan_hours"] == pytest.approx(FANS * 90 / 3600, rel=0.1)
+
+
+def test_what_verify_swallowed_is_told(folder: Path, calibrated: Path) -> None:
+    other, healthy, twin = folder / "other.mcap", folder / "healthy.mcap", folder / "twin.onnx"
+    for option in (("--false-alarms-per-day", PER_DAY), ("--extrapolate",), ("-o", folder / "never.onnx")):
+        words = spell_out(list(map(str, ("calibrate", twin, *option, "--verify", other, healthy))))
+        said = said_instead(*words)
+        assert "those after --verify only test; name HEALTHY.mcap... before it" in said
+    words = spell_out(list(map(str, ("calibrate", calibrated, "--verify", other, twin))))
+    assert f"{twin}: --verify takes recordings" in said_instead(*words)
+
+
+def test_a_recording_in_which_something_was_wrong_is_named(folder: Path) -> None:
+    bad = folder / "bad.mcap"
+    simulated(bad, 5, 60, "--fault", "inlet:fan=1,start=20,stop=50,size=1.6")
+    said = (f"{bad}: tray1 fan 1 goes to", "times the limits that were found", "calibrate without this recording")
+    result = calibrate(folder, bad, "-o", folder / "doubtful.onnx", "--json")
+    (warning,) = json.loads(result.stdout)["warnings"]
+    assert all(part in warning for part in said)
+    assert warning in result.stderr.splitlines()
+    result = calibrate(folder, folder / "other.mcap", "-o", folder / "sure.onnx", "--json")
+    assert json.loads(result.stdout)["warnings"] == []
+
+
+@pytest.mark.parametrize("wrong", ["twin", "recording", "missing"])
+def test_files_of_another_kind_are_named_in_one_line(folder: Path, wrong: str, tmp_path: Path) -> None:
+    twin, recording = folder / "twin.onnx", folder / "healthy.mcap"
+    if wrong == "twin":
+        twin = tmp_path / "not-a-twin.onnx"
+        twin.write_bytes(b"nothing of the kind")
+    elif wrong == "recording":
+        recording = tmp_path / "not-a-recording.mcap"
+        recording.write_bytes(b"nothing of the kind")
+    else:
+        recording = tmp_path / "missing.mcap"
+    said = said_instead("calibrate", twin, recording, "--false-alarms-per-day", PER_DAY)
+    assert str(twin if wrong == "twin" else recording) in said
+
+
+def test_an_output_that_cannot_be_written_is_said_in_one_line(folder: Path) -> None:
+    said = said_instead(
+        "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY,
+        "-o", folder / "no-folder" / "twin.onnx",
+    )  # fmt: skip
+    assert "cannot write the twin" in said
+
+
+def test_a_folder_as_output_is_said_before_anything_is_judged(folder: Path) -> None:
+    said = said_instead(
+        "calibrate", folder / "twin.onnx", folder / "missing.mcap", "--false-alarms-per-day", PER_DAY, "-o", folder
+    )
+    assert "cannot write the twin" in said
+    assert not folder.with_name(folder.name + ".new").exists()
+
+
+def test_a_recording_counts_once(folder: Path) -> None:
+    healthy, verify = folder / "healthy.mcap", ("--verify", folder / "healthy.mcap")
+    twin, rate = folder / "twin.onnx", ("--false-alarms-per-day", PER_DAY)
+    assert "named twice" in said_instead("calibrate", twin, healthy, healthy, *rate)
+    assert "named twice" in said_instead("calibrate", twin, healthy, *rate, *verify)
+
+
+def test_what_the_twin_was_made_of_verifies_nothing_under_any_name(folder: Path, calibrated: Path) -> None:
+    copy = folder / "copy.mcap"
+    copy.write_bytes((folder / "healthy.mcap").read_bytes())
+    said = said_instead("calibrate", calibrated, "--verify", folder / "other.mcap", "--verify", copy)
+    assert f"{copy}: {calibrated} was calibrated on it, so that it proves nothing" in said
+    said = said_instead("calibrate", calibrated, "--verify", folder / "training.mcap")
+    assert f"{calibrated} was trained on it" in said
+
+
+def test_limits_are_found_for_the_times_that_the_scorer_is_set_to(folder: Path, calibrated: Path) -> None:
+    output = folder / "slow.onnx"
+    result = calibrate(folder, "-o", output, "--set", "scorer.smoothing_s=1.0")
+    assert result.exit_code == 0, result.output
+    slow, usual = (Limits.model_validate(TwinFile.load(twin).calibration) for twin in (output, calibrated))
+    assert (usual.timing, slow.timing) == (Timing(), Timing(smoothing_s=1.0))
+    assert slow.speed.step != usual.speed.step
+
+
+def test_recordings_of_scorers_with_other_times_are_refused(folder: Path) -> None:
+    slow, twin = folder / "slow.mcap", folder / "twin.onnx"
+    result = fantwin(
+        "replay", folder / "other.mcap", "--offline", "--twin", twin, "--set", "scorer.on_delay_s=1.0", "-o", slow
+    )
+    assert result.exit_code == 0, result.output
+    said = said_instead("calibrate", twin, folder / "healthy.mcap", slow, "--false-alarms-per-day", PER_DAY)
+    assert f"healthy.mcap and {slow} differ in scorer.on_delay_s, for which limits are found: say which" in said
+
+
+def test_what_has_no_part_in_finding_limits_is_refused(folder: Path, calibrated: Path) -> None:
+    said = said_instead(
+        "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY,
+        "--set", "scorer.limit_factor=2",
+    )  # fmt: skip
+    assert "--set scorer.limit_factor: does not change which limits are found" in said
+    result = fantwin("calibrate", calibrated, "--verify", folder / "other.mcap", "--set", "scorer.off_delay_s=2.0")
+    assert result.exit_code == 0, result.output
+
+
+def test_a_rate_is_broken_only_by_more_alarms_than_chance_explains() -> None:
+    assert not Check(0, 100.0, 1.0).is_broken
+    assert not Check(7, 100.0, 1.0).is_broken  # 4.2 expected
+    assert Check(10, 100.0, 1.0).is_broken
+    assert not Check(0, 1e5, 1.0).is_broken, "fewer alarms than declared break nothing"
+    low, high = Check(3, 72.0, 1.0).interval_95
+    assert (low, high) == (pytest.approx(0.206, abs=0.001), pytest.approx(2.922, abs=0.001))
+    assert math.isfinite(Check(0, 1.0, 1.0).interval_95[1])

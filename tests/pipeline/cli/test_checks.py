@@ -1,0 +1,74 @@
+"""What the stages say, before they start, would keep them from working."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+from pipeline.config.models import TrayConfig
+from pipeline.runtime.stage import Context
+from stages import acquisition, recorder, twin_integrator, viewer
+from tests.support.twin_files import write_twin
+
+
+def context(folder: Path, config: Any, **tray: Any) -> Context:
+    trays = (TrayConfig(name="tray1", fans=1, **tray),)
+    return Context(site="s", trays=trays, config=config, folder=folder, run_folder=folder / "run", started_t_ns=0)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_the_port_is_found_beside_the_configuration(tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    (tmp_path / "line").touch()
+    here = context(tmp_path, acquisition.AcquisitionConfig(), port="line")
+    assert acquisition.check(here) == []
+    source = acquisition.build(here).source
+    assert source is not None and vars(source)["_name"] == str(tmp_path / "line")
+    (problem,) = acquisition.check(context(tmp_path, acquisition.AcquisitionConfig(), port="none"))
+    assert f"{tmp_path / 'none'}: no such port" in problem
+
+
+def test_a_twin_is_loaded_to_see_whether_it_can_be(tmp_path):
+    config = twin_integrator.TwinIntegratorConfig()
+    write_twin(tmp_path / "twin.onnx")
+    assert twin_integrator.STAGE.check(context(tmp_path, config, twin="twin.onnx")) == []
+    (problem,) = twin_integrator.STAGE.check(context(tmp_path, config, twin="none.onnx"))
+    assert "cannot read the twin" in problem
+    (problem,) = twin_integrator.STAGE.check(context(tmp_path, config))
+    assert "has no twin" in problem
+
+
+def test_a_viewer_without_rerun_or_with_its_ports_taken_says_so(tmp_path, monkeypatch):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        config = viewer.ViewerConfig(grpc_port=taken.getsockname()[1], web_port=0)
+        (problem,) = viewer.STAGE.check(context(tmp_path, config))
+        assert "viewer.grpc_port" in problem and "is taken" in problem
+        assert viewer.STAGE.check(context(tmp_path, config.model_copy(update={"serve": False}))) == []
+    free = viewer.ViewerConfig(grpc_port=free_port(), web_port=0)
+    assert viewer.STAGE.check(context(tmp_path, free)) == []
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
+    (problem,) = viewer.STAGE.check(context(tmp_path, free))
+    assert ".venv/bin/pip install -e '.[view]'" in problem
+
+
+def test_a_recorder_says_when_its_folder_cannot_be_made(tmp_path, monkeypatch):
+    here = context(tmp_path, recorder.RecorderConfig())
+    assert recorder.STAGE.check(here) == []
+    (tmp_path / "run").touch()
+    (problem,) = recorder.STAGE.check(here)
+    assert "no folder this user may write in" in problem
+    (tmp_path / "run").unlink()
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    (problem,) = recorder.STAGE.check(here)
+    assert str(tmp_path) in problem

@@ -1,0 +1,87 @@
+"""`fantwin command`: what is wanted of a fan reaches its line, or one line says why not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.bus.session import Bus
+from pipeline.cli.watch.command import _message
+from pipeline.config.models import BusConfig, TrayConfig
+from schemas.codec import decode
+from schemas.messages import Raw
+from schemas.topics import tray_key
+from tests.support.running_chain import DEMO, TRAY, Chain, Running, eventually, fantwin
+
+
+@pytest.fixture
+def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
+    chain = Chain(tmp_path, endpoint)
+    yield chain
+    chain.close()
+
+
+@pytest.fixture
+def acquisition(chain: Chain) -> Iterator[Running]:
+    running = Running(["run", "acquisition", *chain.words("run")[1:]])
+    yield running
+    running.kill()
+
+
+def test_a_fan_of_the_tray_follows_the_command(chain, acquisition):
+    chain.start_tray()
+    with Bus(BusConfig(endpoint=chain.endpoint)) as bus:
+        newest: dict[str, np.ndarray] = {}
+        bus.subscribe(
+            tray_key("demo", TRAY, "raw"),
+            lambda _key, payload: newest.update(command=decode(Raw, payload).command[-1]),  # pyright: ignore[reportAttributeAccessIssue]
+        )
+        done = fantwin(*chain.words("command"), "--fan", 3, 0.625, "--json")
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout) == {"tray": TRAY, "fan": 3, "kind": "command", "value": 0.625, "unit": ""}
+        eventually(lambda: "command" in newest and newest["command"][3] == 0.625, "fan 3 has its command")
+        assert np.count_nonzero(newest["command"] == 0.625) == 1
+
+
+def test_a_command_that_the_line_did_not_take_is_one_line_that_says_why(chain, acquisition):
+    done = fantwin(*chain.words("command"), "--fan", 3, 0.5)  # there is no tray
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "acquisition could not send the command" in done.stderr
+    assert str(chain.port) in done.stderr
+
+
+def test_without_an_acquisition_nobody_takes_the_command(chain):
+    done = fantwin(*chain.words("command"), "--fan", 3, 0.5)
+    assert done.returncode == 1
+    said = "fantwin: no acquisition of tray tray1 took the command: is `fantwin up` running?\n"
+    assert done.stderr == said
+
+
+def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():
+    message = _message(TrayConfig(name="a", fans=2, speed_unit="rpm", speed_max=9000), 1, 6000.0, True)
+    np.testing.assert_allclose(message.set_point_rad_s, [np.nan, 6000 * 2 * np.pi / 60])
+    assert np.isnan(message.command).all()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--fan 8 0.5", "tray tray1 has fans 0 to 7"),
+        ("--fan -1 0.5", "tray tray1 has fans 0 to 7"),
+        ("--fan 2 1.5", "the command must be within 0 to 1"),
+        ("--fan 2 -0.1", "the command must be within 0 to 1"),
+        ("--fan 2 nan", "the command must be within 0 to 1"),
+        ("--fan 2 20001 --set-point", "the set-point, rpm, must be within -20000 to 20000"),
+        ("--tray nobody --fan 2 0.5", "no tray called 'nobody'"),
+    ],
+)
+def test_what_the_tray_cannot_carry_out_is_refused_in_one_line(words, said):
+    done = fantwin("command", "-c", DEMO / "demo.toml", *words.split())
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert said in done.stderr

@@ -1,0 +1,123 @@
+"""`fantwin compare`: every model is trained, judged by data it has not seen, and kept as it was judged."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.pipeline.cli.test_train_commands import record
+from tests.support.fan_data import rough_run
+from tests.support.fantwin_command import fantwin, said_instead
+from twin.build import train_twin
+from twin.errors import TwinError
+from twin.evaluation.comparison import CANDIDATES, Contender, best
+from twin.runs import Run
+
+FIGURES = ("rmse", "max_error", "r2", "one_step_rmse", "coverage_2_sigma")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recordings")
+    for seed, name in ((1, "healthy"), (2, "held-out"), (3, "untouched")):
+        record(path / f"{name}.mcap", rough_run(seed, 20.0), unit="rpm")
+    return path
+
+
+@pytest.fixture(scope="module")
+def compared(folder: Path) -> dict:
+    """All models on three recordings, few iterations, the twins kept."""
+    parts = ("--validate", folder / "held-out.mcap", "--test", folder / "untouched.mcap")
+    result = fantwin("compare", folder / "healthy.mcap", *parts, "--iterations", 3, "-o", folder / "twins", "--json")
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def test_all_models_are_there_with_the_parameters_of_their_layers(compared):
+    counts = {its["model"]: its["network_parameters"] for its in compared["models"]}
+    assert counts == {"physical": 0, "narx": 1151, "neural-ode": 81, "hybrid": 41, "hybrid-w": 31}
+    physical = {its["model"]: its["physical_parameters"] for its in compared["models"]}
+    assert physical["narx"] == 0
+    assert physical["physical"] in (3, 4)
+
+
+def test_the_best_has_the_smallest_error_over_the_untouched_recordings(compared):
+    assert compared["judged_on"] == "test"
+    errors = {its["model"]: its["figures"]["test"]["rmse"] for its in compared["models"]}
+    assert compared["best"] == min(errors, key=errors.__getitem__)
+
+
+def test_a_kept_twin_gives_on_each_recording_the_figures_that_were_told(folder, compared):
+    assert json.loads((folder / "twins" / "comparison.json").read_text()) == compared
+    for its in compared["models"]:
+        for part, recording in (("held-out", "held-out"), ("test", "untouched")):
+            evaluated = json.loads(fantwin("evaluate", its["twin"], folder / f"{recording}.mcap", "--json").stdout)
+            for figure in FIGURES:
+                assert evaluated[figure] == pytest.approx(its["figures"][part][figure], rel=1e-4), (its, figure)
+        trained_on = json.loads(fantwin("evaluate", its["twin"], folder / "healthy.mcap", "--json").stdout)
+        assert its["training_rmse"] == pytest.approx(trained_on["rmse"], rel=1e-4)
+
+
+def test_the_untouched_recordings_take_no_part_in_training(folder, compared):
+    arguments = ("--validate", folder / "held-out.mcap", "--iterations", 3, "--model", "hybrid", "--json")
+    without = json.loads(fantwin("compare", folder / "healthy.mcap", *arguments).stdout)
+    assert (without["judged_on"], without["best"]) == ("held-out", "hybrid")
+    (alone,), (among,) = without["models"], [its for its in compared["models"] if its["model"] == "hybrid"]
+    assert alone["figures"] == {"held-out": among["figures"]["held-out"]}
+    assert alone["twin"] is None
+
+
+def test_without_other_recordings_it_says_that_the_figures_flatter(folder):
+    arguments = (folder / "healthy.mcap", "--model", "physical")
+    told = json.loads(fantwin("compare", *arguments, "--json").stdout)
+    (its,) = told["models"]
+    assert (told["judged_on"], list(its["figures"])) == ("training", ["training"])
+    assert its["training_rmse"] == pytest.approx(its["figures"]["training"]["rmse"])
+    assert "the training recordings, which flatters" in fantwin("compare", *arguments).stdout
+
+
+def test_the_table_fits_a_terminal_and_marks_the_best(folder):
+    validate = ("--validate", folder / "held-out.mcap", "--test", folder / "untouched.mcap")
+    chosen = ("--model", "hybrid-w,physical,hybrid", "--iterations", 1)
+    lines = fantwin("compare", folder / "healthy.mcap", *validate, *chosen).stdout.splitlines()
+    rows = [line for line in lines if line.strip().startswith(("hybrid", "physical"))]
+    assert [row.split("  ")[0].strip(" *") for row in rows][1] == "physical"
+    assert rows[0].strip().startswith("hybrid [w]")
+    assert rows[2].strip().startswith("hybrid [w, tau]")
+    assert sum("*" in row for row in rows) == 1
+    assert not any("…" in line for line in lines)
+    assert "* best: smallest free-run rmse over the test recordings" in " ".join(lines)
+
+
+def test_a_model_that_cannot_be_trained_is_a_row_and_not_the_end(folder, monkeypatch):
+    def train_or_diverge(runs, validation_runs, kind, **options):
+        if kind == "narx":
+            raise TwinError("the narx model diverges")
+        return train_twin(runs, validation_runs, kind, **options)
+
+    monkeypatch.setattr("twin.evaluation.comparison.train_twin", train_or_diverge)
+    arguments = ("compare", folder / "healthy.mcap", "--model", "narx,physical")
+    told = json.loads(fantwin(*arguments, "--json").stdout)
+    assert told["best"] == "physical"
+    assert told["models"][0] == {"model": "narx", "said": "NARX", "invalid_reason": "the narx model diverges"}
+    shown = fantwin(*arguments)
+    assert shown.exit_code == 0
+    assert "NARX: not trained: the narx model diverges" in shown.stderr
+
+
+def test_nothing_that_can_be_trained_is_an_error_that_says_why():
+    with pytest.raises(TwinError, match="nothing moved"):
+        best([Contender(candidate, invalid_reason="nothing moved") for candidate in CANDIDATES])
+
+
+def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
+    healthy = folder / "healthy.mcap"
+    assert "--model hybird: no such model; known: physical" in said_instead("compare", healthy, "--model", "hybird")
+    assert "cannot read the recording" in said_instead("compare", healthy, "--test", tmp_path / "nowhere.mcap")
+    (tmp_path / "file").touch()
+    unwritable = ("-o", tmp_path / "file" / "twins", "--model", "physical")
+    assert "cannot be made" in said_instead("compare", healthy, *unwritable)
+    still = rough_run(1, 5.0)
+    record(tmp_path / "still.mcap", Run("still", still.t_s, np.full_like(still.command, 50.0), still.speed_rad_s))
+    assert "command" in said_instead("compare", tmp_path / "still.mcap")

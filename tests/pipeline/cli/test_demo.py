@@ -1,0 +1,98 @@
+"""`make demo`, as a newcomer runs it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from PIL import Image
+
+from pipeline.cli.watch.demo import DEMO_FOLDER, demo
+from pipeline.config.models import Config, load_config
+from pipeline.errors import UserError
+from tests.support.running_chain import fantwin
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
+    out = tmp_path / "demo"
+    done = fantwin("demo", "-o", out, timeout_s=200)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+
+    summary = json.loads((out / "summary.json").read_text())
+    assert [(fault["fan"], fault["kind"]) for fault in summary["faults"]] == [(2, "inlet"), (5, "rotor")]
+    for fault in summary["faults"]:
+        assert fault["start_ns"] < fault["alarm_ns"] < fault["stop_ns"] < fault["cleared_ns"]
+    assert summary["samples_sent"] == summary["samples_recorded"] == 3400
+    assert (summary["false_alarms"], summary["lost"], summary["problems"]) == (0, 0, [])
+    assert 0 < summary["latency_ms"]["p50"] <= summary["latency_ms"]["p99"]
+
+    with (out / "recording.mcap").open("rb") as file:  # by the library's own reader, without our code
+        topics = {
+            channel.topic
+            for _, channel, _, _ in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        }
+    assert {
+        f"fantwin/demo/tray1/{topic}" for topic in ("raw", "grid", "prediction", "score", "alarm", "twin")
+    } <= topics
+    assert {f"fantwin/demo/health/{stage}/all" for stage in ("resampler", "scorer", "recorder", "viewer")} <= topics
+    with Image.open(out / "bands.png") as picture:
+        assert picture.width > 1000
+    assert (out / "view.rrd").stat().st_size > 100_000
+
+    told = fantwin("replay", "--offline", "--verify", out / "recording.mcap", "--json")
+    assert told.returncode == 0, told.stdout + told.stderr
+    verified = json.loads(told.stdout)["verified"]
+    assert verified["samples_equal"] > 3100 and verified["alarms_equal"] >= 4
+
+
+def test_a_wheel_brings_what_the_demo_reads(tmp_path):
+    root = Path(__file__).parents[3]
+    for part in ("pyproject.toml", "README.md", "LICENSE"):  # a copy: a build leaves its traces in the source
+        shutil.copy(root / part, tmp_path)
+    for part in ("schemas", "scoring", "pipeline", "stages", "twin"):
+        shutil.copytree(root / part, tmp_path / part, ignore=shutil.ignore_patterns("__pycache__"))
+    build = "import sys, setuptools.build_meta as backend; print(backend.build_wheel(sys.argv[1]))"
+    done = subprocess.run(
+        [sys.executable, "-c", build, str(tmp_path)], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    installed = tmp_path / "installed"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(installed)
+    folder = installed / DEMO_FOLDER.relative_to(root)
+    config = load_config(folder / "demo.toml")
+    assert config.trays[0].twin
+    assert (folder / config.trays[0].twin).is_file()
+
+
+def test_a_folder_with_an_apostrophe_is_a_folder_like_any_other(tmp_path, monkeypatch):
+    seen: list[Config] = []
+
+    def note(config: Config, *_: object) -> dict[str, int]:
+        seen.append(config)
+        raise UserError("far enough")
+
+    monkeypatch.setattr("pipeline.cli.watch.demo._run", note)
+    out = tmp_path / 'o\'clock "demo"'
+    with pytest.raises(UserError, match="far enough"):
+        demo(out)
+    assert (seen[0].run_folder, seen[0].trays[0].port) == (out, str(out / "tray"))
+
+
+def test_a_folder_that_cannot_be_used_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    done = fantwin("demo", "-o", tmp_path / "file" / "demo")
+    assert done.returncode == 1
+    assert "cannot be used for the demo's files" in done.stderr
+    assert "Traceback" not in done.stderr

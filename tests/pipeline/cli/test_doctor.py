@@ -1,0 +1,100 @@
+"""`fantwin doctor` says what keeps an installation or a configuration from working, and what to do."""
+
+from __future__ import annotations
+
+import json
+import os
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typer
+
+from pipeline.cli.watch import doctor as module
+from pipeline.cli.watch.doctor import doctor
+from tests.support.running_chain import DEMO
+
+
+@pytest.fixture
+def port() -> Iterator[str]:
+    """A serial port that is there."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    yield os.ttyname(slave)
+    os.close(slave)
+    os.close(master)
+
+
+def examine(capsys: pytest.CaptureFixture[str], config: Path | None = None, *settings: str) -> tuple[int, dict]:
+    code = 0
+    try:
+        doctor(config, list(settings), json_output=True)
+    except typer.Exit as end:
+        code = end.exit_code
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_an_installation_in_order_is_fine(capsys):
+    code, found = examine(capsys)
+    assert code == 0
+    assert found["ok"] and found["problems"] == []
+    assert any(line.startswith("eclipse-zenoh 1.") for line in found["good"])
+
+
+def test_a_configuration_in_order_can_start(capsys, tmp_path, port):
+    code, found = examine(capsys, DEMO / "demo.toml", f"tray.0.port='{port}'", f"run_folder='{tmp_path}'")
+    assert (code, found["problems"]) == (0, [])
+    assert {"acquisition/tray1: can start", "twin_integrator: can start"} <= set(found["good"])
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("tray.0.port='/dev/none'", ["acquisition/tray1: /dev/none: no such port", "connect the device"]),
+        ("tray.0.port=''", ["acquisition/tray1", "port is missing"]),
+        ("tray.0.twin='none.onnx'", ["twin_integrator", "none.onnx: cannot read the twin", "correct [[tray]] twin"]),
+        ("tray.0.twin='demo.toml'", ["twin_integrator", "not an ONNX file"]),
+        ("tray.0.fans=3", ["twin_integrator", "a twin of 8 fans", "choose a twin that fits"]),
+        ("run_folder='/etc/hostname/x'", ["run_folder /etc/hostname/x", "no folder this user may write in"]),
+        ("scorer.on_dealy_s=1", ["scorer.on_dealy_s", "did you mean 'on_delay_s'"]),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line_with_what_to_do(capsys, tmp_path, port, setting, words):
+    settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", setting]
+    code, found = examine(capsys, DEMO / "demo.toml", *settings)
+    assert code == 1
+    (line, *again) = found["problems"]
+    assert not again or setting.startswith("run_folder")  # the recorder, too, says that it cannot write there
+    for word in words:
+        assert word in line
+
+
+def test_a_missing_configuration_is_a_problem_and_no_crash(capsys, tmp_path):
+    code, found = examine(capsys, tmp_path / "none.toml")
+    assert code == 1
+    assert "cannot read the configuration" in found["problems"][0]
+
+
+def test_what_is_not_installed_is_a_problem_and_a_missing_extra_is_not(capsys, monkeypatch):
+    versions = module._version
+    monkeypatch.setattr(module, "_version", lambda name: "" if name in ("pyserial", "torch") else versions(name))
+    code, found = examine(capsys)
+    assert code == 1
+    assert found["problems"] == ["pyserial is not installed; in the checkout: .venv/bin/pip install -e '.'"]
+    assert "extra 'train': not installed (torch); in the checkout: .venv/bin/pip install -e '.[train]'" in found["good"]
+
+
+def test_little_disk_is_a_problem(capsys, tmp_path, port, monkeypatch):
+    monkeypatch.setattr(module, "_LITTLE_DISK_BYTES", 1 << 62)
+    code, found = examine(capsys, DEMO / "demo.toml", f"tray.0.port='{port}'", f"run_folder='{tmp_path}'")
+    assert code == 1
+    assert "make room" in found["problems"][0]
+
+
+def test_people_are_told_too_and_what_must_be_mended_stands_out(capsys):
+    with pytest.raises(typer.Exit):
+        doctor(DEMO / "demo.toml", ["tray.0.port='/dev/none'"])
+    out = capsys.readouterr().out
+    assert "MEND acquisition/tray1: /dev/none" in out
+    assert "ok   scorer: can start" in out

@@ -1,0 +1,274 @@
+"""The figures, against residuals that are known, and the command that prints them."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from pipeline.cli.twins.evaluate import _fan_table
+from tests.pipeline.cli.test_train_commands import record
+from tests.support import fan_data
+from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.twin_files import write_twin
+from twin.build import evaluate, train_twin
+from twin.errors import TwinError
+from twin.evaluation.accuracy import evaluate_model, free_run_residuals, healthy_sigma_rad_s, one_step_residuals
+from twin.export.onnx_twin import OnnxTwin
+from twin.models.model import TwinModel
+from twin.models.narx import PARAMETER_COUNT, Narx
+from twin.models.network import Scaling
+from twin.models.physical import PhysicalModel
+from twin.models.physics import PARAMETER_NAMES
+from twin.runs import Array, Run
+
+
+def parameters_of(**values: float) -> Array:
+    return np.array([[values.get(name, 0.0) for name in PARAMETER_NAMES]])
+
+
+PUBLISHED = dict(zip(("J", "alpha", "C_D"), fan_data.PUBLISHED_PARAMETERS.tolist(), strict=True))
+PARAMETERS = parameters_of(**PUBLISHED)
+SIGMA = np.array([fan_data.NOISE_RAD_S])
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    return fan_data.published_run(21, 30.0)
+
+
+def test_the_true_model_leaves_the_noise_and_two_sigma_cover_95_percent(run: Run) -> None:
+    figures = evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [run]).pooled
+    assert figures.rmse_rad_s == pytest.approx(fan_data.NOISE_RAD_S, rel=0.05)
+    assert figures.coverage_2_sigma == pytest.approx(0.954, abs=0.02)
+    assert figures.r2 > 0.99
+    assert figures.samples == run.samples
+
+
+def test_r2_is_zero_for_a_model_as_good_as_the_mean() -> None:
+    still = parameters_of(J=1.0, alpha=1e-9)
+    speed = np.tile([5.0, 5.0, 5.0, 5.0, 5.0, 4.0, 6.0], 10)
+    run = Run("flat", np.arange(70) / 100.0, np.zeros(70), speed)
+    figures = evaluate_model(PhysicalModel(), still, np.ones(1), [run]).pooled
+    assert figures.r2 == pytest.approx(0.0, abs=1e-6)
+    assert figures.max_error_rad_s == pytest.approx(1.0)
+
+
+def test_missing_samples_count_nowhere(run: Run) -> None:
+    missing = np.random.default_rng(3).random(run.samples) < 0.4
+    missing[:10] = False
+    speed = run.speed_rad_s.copy()
+    speed[missing] = np.nan
+    figures = evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [Run("lossy", run.t_s, run.command, speed)]).pooled
+    whole = free_run_residuals(PhysicalModel(), PARAMETERS, [run])
+    assert figures.samples == np.count_nonzero(~missing)
+    assert figures.rmse_rad_s == pytest.approx(np.sqrt(np.mean(whole[~missing] ** 2)), rel=1e-12)
+
+
+def test_the_free_run_starts_again_after_a_long_gap(run: Run) -> None:
+    later = run.t_s + np.where(run.t_s > 15.0, 3600.0, 0.0)
+    gapped = Run("gapped", later, run.command, run.speed_rad_s)
+    assert evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [gapped]).pooled.rmse_rad_s < 1.1 * fan_data.NOISE_RAD_S
+
+
+@pytest.mark.parametrize("every", [1, 5, 10])
+def test_a_fan_that_gathers_speed_from_the_first_sample_on_is_not_started_too_fast(every: int) -> None:
+    # From rest towards 126 rad/s; every tenth sample: the mean of the first five is 40 rad/s, the first one 0.
+    fine = Run("start", np.arange(3000) / 100.0, np.full(3000, 60.0), np.zeros(3000))
+    speed, _ = PhysicalModel().advance(np.array([[0.0, 60.0]]), fine.command, fine.step_s, PARAMETERS)
+    run = Run("start", fine.t_s, fine.command, speed)
+    thinned = Run("thinned", run.t_s[::every], run.command[::every], run.speed_rad_s[::every])
+    assert evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [thinned]).pooled.max_error_rad_s < 0.1
+    sparse = np.where(np.arange(3000)[:, np.newaxis] % every == 0, run.speed_rad_s, np.nan)
+    missing = Run("missing", run.t_s, run.command, sparse)
+    assert evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [missing]).pooled.max_error_rad_s < 0.1
+
+
+def test_a_fan_first_measured_when_its_start_is_long_forgotten_is_still_followed(run: Run) -> None:
+    speed = run.speed_rad_s.copy()
+    speed[:2000] = np.nan
+    late = Run("late", run.t_s, run.command, speed)
+    figures = evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [late]).pooled
+    assert figures.rmse_rad_s == pytest.approx(fan_data.NOISE_RAD_S, rel=0.06)
+    assert figures.samples == 1000
+
+
+def lossy_and_irregular(samples: int = 400) -> Run:
+    rng = np.random.default_rng(5)
+    t_s = np.cumsum(rng.choice([0.008, 0.01, 0.013], samples))
+    speed = rng.normal(80.0, 5.0, (samples, 2))
+    speed[rng.random((samples, 2)) < 0.1] = np.nan
+    return Run("lossy and irregular", t_s, fan_data.stairs(rng, samples, 2), speed)
+
+
+def random_narx() -> Narx:
+    rng = np.random.default_rng(6)
+    return Narx(rng.normal(0.0, 0.2, PARAMETER_COUNT), Scaling(80.0, 20.0, 50.0, 30.0, 100.0))
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.05])
+@pytest.mark.parametrize("model", [PhysicalModel(), random_narx()], ids=["physical", "narx"])
+def test_the_one_step_error_takes_speeds_from_the_fan_and_past_commands_from_the_run(
+    model: TwinModel, lag_s: float
+) -> None:
+    run = lossy_and_irregular()
+    parameters = np.tile(parameters_of(**PUBLISHED, lag_s=lag_s), (2, 1))
+    expected = np.full_like(run.speed_rad_s, np.nan)
+    speeds = model.state_layout.speed
+    state = model.state_layout.initial_state(np.zeros(2), run.command[0])
+    for k in range(run.samples - 1):
+        if k >= speeds - 1:
+            state[:, :speeds] = run.speed_rad_s[k - speeds + 1 : k + 1][::-1].T
+        _, state = model.advance(state, run.command[k : k + 1], run.step_s[k : k + 1], parameters)
+        if k >= speeds - 1:
+            expected[k + 1] = run.speed_rad_s[k + 1] - state[:, 0]
+        state[:, :speeds] = 0.0
+    found = one_step_residuals(model, parameters, [run])
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7)
+    assert 0.2 < np.mean(np.isfinite(found)) < 0.9
+
+
+def test_the_one_step_error_of_the_true_model_is_the_noise_of_two_samples(run: Run) -> None:
+    figures = evaluate_model(PhysicalModel(), PARAMETERS, SIGMA, [run]).pooled
+    # One noise in the speed it starts from, hardly damped in 10 ms, and one in the speed it is compared with.
+    assert figures.one_step_rmse_rad_s == pytest.approx(np.sqrt(2.0) * fan_data.NOISE_RAD_S, rel=0.05)
+
+
+def test_sigma_is_about_the_twin_so_a_bias_widens_it() -> None:
+    assert healthy_sigma_rad_s(np.array([[3.0, 1.0], [3.0, -1.0], [np.nan, 1.0]])).tolist() == [3.0, 1.0]
+
+
+def test_a_diverging_free_run_is_infinite_not_an_exception(run: Run) -> None:
+    runaway = parameters_of(J=0.001, C_D=-1.0)
+    figures = evaluate_model(PhysicalModel(), runaway, SIGMA, [run]).pooled
+    assert figures.rmse_rad_s == np.inf
+    assert figures.r2 == -np.inf
+
+
+def test_a_twin_of_one_fan_serves_many_and_a_twin_of_two_does_not_serve_three() -> None:
+    one = train_twin([fan_data.published_run(1, 15.0)], [], "physical", name="one")
+    three = fan_data.published_run(2, 15.0, fans=3)
+    assert len(evaluate(one, [three]).per_fan) == 3
+    two = train_twin([fan_data.published_run(1, 15.0, fans=2)], [], "physical", name="two")
+    with pytest.raises(TwinError, match="twin 'two' is of fans 0, 1, the runs of 0, 1, 2"):
+        evaluate(two, [three])
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A twin and a recording of two fans."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    recording = record(folder / "two.mcap", fan_data.published_run(4, 15.0, fans=2), unit="rpm")
+    trained = fantwin("train", recording, "--model", "narx", "--iterations", 1, "-o", folder / "twin.onnx")
+    assert trained.exit_code == 0, trained.output
+    return folder / "twin.onnx", recording
+
+
+def test_evaluate_tells_machines_of_other_grids_and_of_what_is_left(recorded: tuple[Path, Path]) -> None:
+    arguments = ("--rate", "50", "--rate", "irregular", "--json")
+    told = json.loads(fantwin("evaluate", *recorded, *arguments).stdout)
+    assert [(grid["rate"], grid["samples"], len(grid["fans"])) for grid in told["grids"][:1]] == [(50.0, 1500, 2)]
+    assert told["grids"][1]["rate"] == "irregular"
+    assert told["grids"][0]["rmse"] != told["rmse"]
+    assert told["expected_coverage_2_sigma"] == pytest.approx(0.9545, abs=1e-4)
+    for fan in told["fans"]:
+        left = fan["residual"]
+        assert left["samples"] == 1500 - 300
+        assert len(left["lags_s"]) == len(left["autocorrelation"]) > 100
+        assert len(left["cross_lags_s"]) == len(left["cross_correlation"]) == 2 * len(left["lags_s"]) + 1
+        assert left["white"] == (left["ljung_box_p"] >= 0.05)
+        peak = left["cross_over_bound"] * left["cross_bound_95"]
+        at = np.argmin(np.abs(np.array(left["cross_lags_s"]) - left["cross_peak_lag_s"]))
+        assert left["cross_correlation"][at] == pytest.approx(peak)
+        assert left["independent_samples"] <= left["samples"]
+
+
+def test_evaluate_shows_a_row_for_each_fan_and_each_grid(recorded: tuple[Path, Path]) -> None:
+    shown = fantwin("evaluate", *recorded, "--rate", "12.5", "--rate", "irregular").stdout
+    rows = re.findall(r"^ ([\d.]+ Hz|\d+|all|own|irregular) ", shown, re.MULTILINE)
+    assert rows == ["0", "1", "all", "own", "12.5 Hz", "irregular"]
+    assert "free run: rmse" in shown.splitlines()[1]
+    assert "Hz" not in fantwin("evaluate", *recorded).stdout
+
+
+def test_evaluate_warns_as_the_report_does(recorded: tuple[Path, Path]) -> None:
+    evaluated = json.loads(fantwin("evaluate", *recorded, "--json").stdout)
+    reported = json.loads(fantwin("report", *recorded, "-o", recorded[0].parent / "page.html", "--json").stdout)
+    for said in ("warnings", "verdict", "headline"):
+        assert evaluated[said] == reported[said]
+    assert "two.mcap: used in training" in evaluated["warnings"][0]
+    assert fantwin("evaluate", *recorded).stderr.splitlines() == evaluated["warnings"]
+
+
+def test_numbers_beyond_reason_are_shown_whole_in_the_table_and_with_an_exponent() -> None:
+    wild = {"rmse": 3.21e14, "max_error": 123456.7, "r2": -4.56e18, "one_step_rmse": 8.7e300, "coverage_2_sigma": 0.0}
+    residual = {"ljung_box_p": 0.0, "cross_over_bound": -1.2e9}
+    told = {"speed_unit": "rpm", "fans": [{"fan": 63, **wild, "residual": residual}]}
+    console = Console(width=80)
+    with console.capture() as captured:
+        console.print(_fan_table(told))
+    shown = captured.get()
+    assert shown.split()[-8:] == ["63", "3.21e+14", "123457", "-4.56e+18", "8.7e+300", "0.0%", "<0.001", "-1.2e+09"]
+    assert "…" not in shown
+
+
+@pytest.fixture(scope="module")
+def tray(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recording of three fans that differ, and a twin of the first and the last."""
+    folder = tmp_path_factory.mktemp("tray")
+    recording = record(folder / "three.mcap", fan_data.rough_run(5, 15.0, fans=3))
+    record(folder / "two.mcap", fan_data.rough_run(5, 15.0, fans=2))
+    made = fantwin("train", recording, "--fans", "0,2", "--model", "physical", "-o", folder / "twin.onnx")
+    assert made.exit_code == 0, made.output
+    return folder
+
+
+def test_a_card_names_the_fans_it_is_of_and_a_fan_is_judged_by_its_own_parameters(tray: Path) -> None:
+    twin, recording = tray / "twin.onnx", tray / "three.mcap"
+    assert OnnxTwin(twin).card.training.fans == (0, 2)
+    both = json.loads(fantwin("evaluate", twin, recording, "--fans", "0,2", "--rate", "50", "--json").stdout)
+    last = json.loads(fantwin("evaluate", twin, recording, "--fans", "2", "--rate", "50", "--json").stdout)
+    assert last["fans"] == [both["fans"][1]]
+    assert last["grids"][0]["fans"] == [both["grids"][0]["fans"][1]]
+    page = tray / "page.html"
+    reported = json.loads(fantwin("report", twin, recording, "--fans", "2", "-o", page, "--json").stdout)
+    assert [fan["fan"] for fan in reported["fans"]] == [2]
+    assert reported["fans"][0]["rmse"] == last["rmse"]
+    parameters = OnnxTwin(twin).parameters
+    assert f'<data value="{parameters[1, 0]}">' in page.read_text()
+    assert f'<data value="{parameters[0, 0]}">' not in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("three.mcap",), "is of fans 0, 2, the runs of 0, 1, 2; choose its fans with --fans"),
+        (("three.mcap", "--fans", "0,1"), "is of fans 0, 2, the runs of 0, 1;"),
+        (("two.mcap",), "is of fans 0, 2, the runs of 0, 1;"),
+    ],
+)
+def test_where_the_fans_are_not_those_of_the_twin_one_line_says_so(tray: Path, arguments: tuple, words: str) -> None:
+    file, *options = arguments
+    assert words in said_instead("evaluate", tray / "twin.onnx", tray / file, *options)
+    assert words in said_instead("report", tray / "twin.onnx", tray / file, *options, "-o", tray / "none.html")
+
+
+def test_a_twin_made_before_cards_named_fans_is_still_read_and_serves_as_many(tray: Path) -> None:
+    training = {"trainer": "none", "physics": "fixed", "seed": 0, "iterations": 0, "duration_s": 0.0, "data": []}
+    old = write_twin(tray / "old.onnx", fans=2, training=training)
+    assert OnnxTwin(old).card.training.fans == ()
+    for options in (("two.mcap",), ("three.mcap", "--fans", "0,2")):
+        told = json.loads(fantwin("evaluate", old, tray / options[0], *options[1:], "--json").stdout)
+        assert len(told["fans"]) == 2
+    assert "is of 2 fans and does not say which" in said_instead("evaluate", old, tray / "two.mcap", "--fans", "1")
+
+
+@pytest.mark.parametrize("rate", ["0", "-50", "fast", "nan", "inf"])
+def test_a_rate_that_is_none_is_told_in_one_line(recorded: tuple[Path, Path], rate: str) -> None:
+    assert f"--rate {rate}: give a rate in Hz" in said_instead("evaluate", *recorded, f"--rate={rate}")
+
+
+def test_a_rate_too_low_for_the_recording_is_told_in_one_line(recorded: tuple[Path, Path]) -> None:
+    assert "no run is long enough to be judged at 0.01 Hz" in said_instead("evaluate", *recorded, "--rate", "0.01")

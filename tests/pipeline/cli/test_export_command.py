@@ -1,0 +1,296 @@
+"""`fantwin export`: tables in which pandas finds every sample of every fan, and nothing that was not recorded."""
+
+import json
+import re
+import resource
+import sys
+import tracemalloc
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from pipeline.recordings import read_arrays
+from pipeline.recordings.tables import PIECE_ROWS, open_table, table_columns
+from pipeline.recordings.writing import RecordingWriter
+from schemas.messages import MESSAGE_TYPES, Health, ModelCard, Raw
+from tests.pipeline.recordings.test_arrays import alarm, raw, write
+from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.score_data import START_NS, made_up_tray
+
+READING = Path(__file__).parents[3] / "docs" / "how-to" / "read-recordings.md"
+FORMS = ("csv", "parquet")
+
+
+def recording(folder: Path, *, trays: tuple[str, ...] = ("tray1",), alarms: bool = True) -> Path:
+    """Raw samples, scores and alarms of some trays."""
+    messages = [raw(n, tray=tray) for n in range(3) for tray in trays]
+    for tray in trays:
+        messages += made_up_tray(tray=tray, seconds=2, gap_s=(1.0, 1.5), fault_s=(0.5, 1.2))[0]
+    return write(
+        folder / "r.mcap", [*messages, *([alarm(0)] if alarms else [])], {"site": "plant", "speed_unit": "rpm"}
+    )
+
+
+def table(path: Path) -> pd.DataFrame:
+    return pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@contextmanager
+def disk_of(size: int):
+    """Files of this process cannot grow beyond `size` bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_pandas_finds_every_sample_of_every_fan_with_its_exact_numbers(tmp_path, form):
+    path = recording(tmp_path)
+    result = fantwin("export", path, "--to", form, "-o", tmp_path / "out")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == f"{tmp_path}/out/r.tray1.score.{form}: 600 rows\n"
+    frame = table(tmp_path / "out" / f"r.tray1.score.{form}")
+    (block,) = read_arrays(path, "score")
+    assert len(frame) == 200 * 3
+    assert frame["fan"].tolist() == [0, 1, 2] * 200
+    assert frame["t_ns"].dtype == np.int64
+    np.testing.assert_array_equal(frame["t_ns"], np.repeat(block.t_ns, 3))
+    for name in ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "residual_rad_s", "outside", "valid"):
+        np.testing.assert_array_equal(frame[name], block[name].ravel(), name)
+        assert frame[name].dtype == block[name].dtype
+    wide = frame.pivot(index="t_ns", columns="fan", values="measured_speed_rad_s")
+    np.testing.assert_array_equal(wide.to_numpy(), block["measured_speed_rad_s"])
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_codes_are_words_and_what_is_not_there_is_empty(tmp_path, form):
+    fantwin("export", recording(tmp_path), "--to", form, "-o", tmp_path / f"scores.{form}")
+    frame = table(tmp_path / f"scores.{form}")
+    if form == "csv":
+        assert "nan" not in (tmp_path / "scores.csv").read_text()
+    else:
+        assert pq.read_table(tmp_path / "scores.parquet")["measured_speed_rad_s"].null_count == 50
+    (gap,) = frame.query(f"fan == 1 and t_ns == {START_NS + 1_200_000_000}").to_dict("records")
+    assert (gap["state"], gap["invalid_reason"], gap["valid"]) == ("UNKNOWN", "GAP", False)
+    assert np.isnan(gap["measured_speed_rad_s"])
+    assert set(frame["state"]) == {"NORMAL", "SUSPECT", "ALARM", "RETURNING", "UNKNOWN"}
+    assert set(frame["invalid_reason"]) == {"NONE", "GAP"}
+
+
+def test_parquet_has_true_times_and_says_what_it_is_of(tmp_path):
+    fantwin("export", recording(tmp_path), "--to", "parquet", "-o", tmp_path)
+    path = tmp_path / "r.tray1.score.parquet"
+    frame = table(path)
+    assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
+    assert frame["time"].astype("int64").tolist() == frame["t_ns"].tolist()
+    assert str(frame["state"].dtype) == "category"
+    said = {name.decode(): value.decode() for name, value in pq.read_schema(path).metadata.items()}
+    assert said["fantwin.site"] == "plant"
+    assert said["fantwin.tray"] == "tray1"
+    assert said["fantwin.topic"] == "score"
+    assert said["fantwin.speed_unit"] == "rpm"
+    assert said["fantwin.exported_by"] == f"fantwin {version('fantwin')}"
+    assert "fantwin.damage" not in said
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_what_the_messages_do_not_have_is_empty(tmp_path, form):
+    path = write(
+        tmp_path / "r.mcap",
+        [
+            raw(0),
+            raw(1, clock=False),
+            ModelCard(t_ns=6, twin="t", kind="hybrid", sha256="00"),
+        ],
+    )
+    fantwin("export", path, "--to", form, "--topic", "raw", "--topic", "twin", "-o", tmp_path)
+    frame = table(tmp_path / f"r.tray1.raw.{form}")
+    assert frame["device_clock_us"].isna().tolist() == [False] * 20 + [True] * 20
+    (twin,) = (table(p).to_dict("records") for p in tmp_path.glob(f"*.twin.{form}"))
+    assert (len(twin), twin[0]["kind"], pd.isna(twin[0]["sigma_rad_s"])) == (1, "hybrid", True)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_events_are_tables_of_their_own(tmp_path, form):
+    result = fantwin("export", recording(tmp_path), "--to", form, "--topic", "alarm", "-o", tmp_path)
+    assert result.exit_code == 0
+    (row,) = table(tmp_path / f"r.tray1.alarm.{form}").to_dict("records")
+    assert (row["t_ns"], row["onset_t_ns"], row["fan"], row["active"]) == (70, 50, 0, True)
+    assert (row["severity"], row["message"], row["producer"]) == ("ALARM", "alarm 0", "s")
+
+
+def test_there_is_a_table_for_each_topic_and_tray(tmp_path):
+    path = recording(tmp_path, trays=("left", "right"))
+    out = tmp_path / "out"
+    assert fantwin("export", path, "--to", "csv", "--topic", "score", "--topic", "raw", "-o", out).exit_code == 0
+    assert names(out) == ["r.left.raw.csv", "r.left.score.csv", "r.right.raw.csv", "r.right.score.csv"]
+    assert fantwin("export", path, "--to", "csv", "--tray", "left", "-o", tmp_path / "left").exit_code == 0
+    assert names(tmp_path / "left") == ["r.left.score.csv"]
+
+
+def test_scores_are_what_is_wanted_or_else_raw_samples(tmp_path):
+    path = write(tmp_path / "r.mcap", [raw(0), raw(1)])
+    result = fantwin("export", path, "--to", "csv", "-o", tmp_path / "out")
+    assert result.stdout == f"{tmp_path}/out/r.tray1.raw.csv: 40 rows\n"
+
+
+def test_parts_become_one_table_under_the_name_of_the_first(tmp_path):
+    late = write(tmp_path / "a.mcap", (raw(n) for n in range(2, 6)), start=100)
+    early = write(tmp_path / "b.mcap", (raw(n) for n in range(4)))
+    result = fantwin("export", late, early, "--to", "csv", "-o", tmp_path, "--json")
+    told = json.loads(result.stdout)
+    assert told["tables"] == [{"file": f"{tmp_path}/b.tray1.raw.csv", "topic": "raw", "tray": "tray1", "rows": 120}]
+    assert told["duplicated"] == 2
+    assert table(tmp_path / "b.tray1.raw.csv")["host_receive_t_ns"].is_monotonic_increasing
+
+
+def test_a_topic_that_was_not_recorded_is_told(tmp_path):
+    path = recording(tmp_path, alarms=False)
+    result = fantwin("export", path, "--to", "csv", "--topic", "score", "--topic", "alarm", "-o", tmp_path, "--json")
+    assert (result.exit_code, result.stderr) == (0, "no alarm in this recording\n")
+    assert json.loads(result.stdout)["absent"] == ["alarm"]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_what_could_be_read_of_a_torn_recording_is_exported_with_exit_code_3(tmp_path, form):
+    whole = write(tmp_path / "whole.mcap", (raw(n) for n in range(900)))
+    path = tmp_path / "torn.mcap.active"
+    path.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    result = fantwin("export", path, "--to", form, "-o", tmp_path, "--json")
+    assert result.exit_code == 3
+    assert result.stderr == f"{path}: it breaks off, as after a crash; read up to there\n"
+    told = json.loads(result.stdout)
+    assert told["damage"] == [result.stderr.strip()]
+    frame = table(tmp_path / f"torn.tray1.raw.{form}")
+    assert 0 < len(frame) == told["tables"][0]["rows"] < 900 * 20
+    if form == "parquet":
+        metadata = pq.read_metadata(tmp_path / "torn.tray1.raw.parquet").metadata
+        assert metadata[b"fantwin.damage"].decode() == told["damage"][0]
+
+
+def test_a_table_that_exists_is_replaced_only_if_asked_and_only_by_a_whole_one(tmp_path):
+    path = recording(tmp_path)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "r.tray1.score.csv").write_text("mine")
+    said = said_instead("export", path, "--to", "csv", "-o", out)
+    assert said == f"{out}/r.tray1.score.csv: exists; name another folder or file with -o, or replace it with --force"
+    with disk_of(20_000):
+        said = said_instead("export", path, "--to", "csv", "-o", out, "--force")
+    assert "r.tray1.score.csv: cannot be written: File too large" in said
+    assert (out / "r.tray1.score.csv").read_text() == "mine"
+    assert fantwin("export", path, "--to", "csv", "-o", out, "--force").exit_code == 0
+    assert len(table(out / "r.tray1.score.csv")) == 600
+    assert names(out) == ["r.tray1.score.csv"]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_full_disk_is_told_in_one_line_and_leaves_nothing(tmp_path, form):
+    path = recording(tmp_path)
+    with disk_of(2000):
+        said = said_instead("export", path, "--to", form, "-o", tmp_path / "out")
+    assert said == (
+        f"{tmp_path}/out/r.tray1.score.{form}: cannot be written: File too large; name another folder with -o"
+    )
+    assert names(tmp_path / "out") == []
+
+
+def test_one_file_holds_one_table(tmp_path):
+    path = recording(tmp_path, trays=("left", "right"))
+    one = tmp_path / "one.csv"
+    assert said_instead("export", path, "--to", "csv", "-o", one) == (
+        f"{one}: would hold both score of left and score of right: name a folder with -o, or choose with --topic and "
+        "--tray"
+    )
+    assert names(tmp_path) == ["r.mcap"]
+    assert fantwin("export", path, "--to", "csv", "--tray", "right", "-o", one).exit_code == 0
+    assert len(table(one)) == 600
+
+
+def test_the_same_tray_of_two_sites_does_not_become_one_table(tmp_path):
+    path = tmp_path / "r.mcap"
+    with RecordingWriter(path, {}) as writer:
+        for site in ("here", "there"):
+            writer.write_message(f"fantwin/{site}/tray1/raw", raw(0), 1)
+    assert "would hold both" in said_instead("export", path, "--to", "csv", "-o", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--to", "csv", "--topic", "scor"), "no topic is called 'scor'; known: raw, grid"),
+        (("--to", "csv", "--topic", "grid"), "no grid in this recording; see --topic and --tray"),
+        (("--to", "csv", "--tray", "tray7"), "no score of a tray 'tray7' in this recording"),
+        (("--to", "csv", "-o", "x.parquet"), "x.parquet: name a file that ends in .csv with -o, or a folder"),
+    ],
+)
+def test_what_cannot_be_done_is_told_in_one_line(tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert words in said_instead("export", recording(tmp_path), *arguments)
+    assert names(tmp_path) == ["r.mcap"]
+
+
+def test_without_pyarrow_parquet_names_the_extra_and_csv_works(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    path = recording(tmp_path)
+    assert ".venv/bin/pip install -e '.[parquet]'" in said_instead("export", path, "--to", "parquet", "-o", tmp_path)
+    assert fantwin("export", path, "--to", "csv", "-o", tmp_path).exit_code == 0
+
+
+def test_the_examples_of_the_documentation_run(tmp_path, monkeypatch, capsys):
+    recording(tmp_path).rename(tmp_path / "recording.mcap")
+    monkeypatch.chdir(tmp_path)
+    assert fantwin("export", "recording.mcap", "--to", "parquet", "-o", "tables").exit_code == 0
+    examples = re.findall(r"```python\n(.*?)```", READING.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(examples) == 4
+    for example in examples:
+        exec(example, {})
+    assert "(200,) (200, 3)" in capsys.readouterr().out
+
+
+def test_every_topic_has_a_table_of_plain_columns():
+    for kind in MESSAGE_TYPES:
+        found = table_columns(kind)
+        assert next(iter(found)) == ("host_receive_t_ns" if kind is Raw else "t_ns")
+        assert ("fan" in found) == (kind.__name__ not in ("Health", "Clock", "Memory"))
+        assert all(dtype.kind in "iufbO" for dtype in found.values())
+    assert not {"inputs", "outputs", "counters"} & set(table_columns(Health))
+
+
+def test_parquet_is_written_in_pieces(tmp_path):
+    fans = 1000
+    path = write(tmp_path / "r.mcap", (raw(n, samples=50, fans=fans) for n in range(4)))
+    (block,) = read_arrays(path, "raw")
+    table_file = open_table("parquet", tmp_path / "t.parquet", "raw", {})
+    table_file.add(block)
+    table_file.close()
+    metadata = pq.read_metadata(tmp_path / "t.parquet")
+    assert metadata.num_rows == 200 * fans
+    sizes = [metadata.row_group(number).num_rows for number in range(metadata.num_row_groups)]
+    assert max(sizes) <= PIECE_ROWS < sum(sizes)
+
+
+def test_memory_does_not_grow_with_the_recording(tmp_path):
+    def peak(messages: int) -> int:
+        path = write(tmp_path / "r.mcap", (raw(n, samples=1000, fans=1) for n in range(messages)))
+        tracemalloc.start()
+        assert fantwin("export", path, "--to", "csv", "-o", tmp_path / "t.csv", "--force").exit_code == 0
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return most
+
+    peak(1)  # what is imported and cached on first use
+    assert peak(36) < 1.5 * peak(9)

@@ -1,0 +1,148 @@
+"""`fantwin import`: a measured table becomes a recording that holds the same numbers."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.recordings.reading import read_metadata, read_recording
+from pipeline.recordings.runs import read_runs
+from schemas.messages import Array, Raw
+from tests.support.fantwin_command import fantwin, said_instead
+
+
+def measured(folder: Path, rows: int = 1234, start_s: float = 0.0) -> tuple[Path, Array]:
+    """A table of two fans and its numbers: time, command, two speeds in rpm."""
+    rng = np.random.default_rng(3)
+    t_s = start_s + np.round(np.cumsum(rng.uniform(0.008, 0.012, rows)), 6)
+    values = np.column_stack([t_s, rng.integers(0, 100, rows), rng.normal(3000, 10, (rows, 2)).round(3)])
+    path = folder / "measured.csv"
+    np.savetxt(path, values, delimiter=",", header="t,u,y1,y2", comments="", fmt="%.6f")
+    return path, values
+
+
+def columns(recording: Path) -> tuple[Array, Array, Array]:
+    messages = [entry.message for entry in read_recording(recording)]
+    assert all(isinstance(message, Raw) for message in messages)
+    raws = [message for message in messages if isinstance(message, Raw)]
+    return (
+        np.concatenate([raw.host_receive_t_ns for raw in raws]),
+        np.concatenate([raw.command for raw in raws]),
+        np.concatenate([raw.speed_rad_s for raw in raws]),
+    )
+
+
+ARGUMENTS = ("--time", "t:s", "--command", "u", "--speed", "y1:rpm", "--speed", "y2:rpm")
+
+
+def test_the_recording_holds_the_numbers_of_the_table(tmp_path):
+    path, values = measured(tmp_path)
+    recording = tmp_path / "r.mcap"
+    result = fantwin("import", path, *ARGUMENTS, "-o", recording)
+    assert result.exit_code == 0
+    assert result.stdout.startswith(f"{recording}: 1234 samples of 2 fans over 12.3 s")
+    t_ns, command, speed_rad_s = columns(recording)
+    np.testing.assert_allclose(t_ns / 1e9, values[:, 0], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(command, values[:, [1, 1]])
+    np.testing.assert_allclose(speed_rad_s / (2 * np.pi / 60), values[:, 2:], rtol=1e-14)
+
+
+def test_a_machine_is_told_the_counts(tmp_path):
+    path, values = measured(tmp_path)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:100], lines[99], *lines[400:]]) + "\n")
+    result = fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--json")
+    told = json.loads(result.stdout)
+    assert told["samples"] == 1234 - 300
+    assert (told["rows"], told["repeated"], told["gaps"], told["fans"]) == (935, 1, 1, 2)
+    assert told["duration_s"] == pytest.approx(values[-1, 0] - values[0, 0])
+    assert told["median_rate_hz"] == pytest.approx(100, rel=0.02)
+    assert told["speed_unit"] == "rpm"
+
+
+def test_units_that_nobody_gave_are_told_with_how_to_give_them(tmp_path):
+    path, _ = measured(tmp_path)
+    for given, said in (
+        (
+            ("--time", "t", "--command", "u", "--speed", "y1"),
+            "times in s and speeds in rad/s assumed; otherwise give it, such as --time t:ms and --speed y1:rpm",
+        ),
+        (
+            ("--time", "t:s", "--command", "u", "--speed", "y1"),
+            "speeds in rad/s assumed; otherwise give it, such as --speed y1:rpm",
+        ),
+        (
+            ("--time", "t", "--command", "u", "--speed", "y1:rpm"),
+            "times in s assumed; otherwise give it, such as --time t:ms",
+        ),
+    ):
+        words = ("import", path, *given, "-o", tmp_path / "r.mcap", "--force")
+        assert fantwin(*words).stdout.splitlines()[1] == f"  no unit was given: {said}"
+        assert json.loads(fantwin(*words, "--json").stdout)["assumed"] == f"no unit was given: {said}"
+    words = ("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--force")
+    assert "assumed" not in fantwin(*words).stdout
+    assert json.loads(fantwin(*words, "--json").stdout)["assumed"] == ""
+
+
+def test_the_recording_says_unit_source_and_tray(tmp_path):
+    path, _ = measured(tmp_path)
+    fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--tray", "bench-2")
+    head = read_metadata(tmp_path / "r.mcap")
+    assert head.speed_unit("bench-2") == "rpm"
+    assert head.metadata["source"] == "measured.csv"
+    entries = list(read_recording(tmp_path / "r.mcap"))
+    assert {entry.key for entry in entries} == {"fantwin/imported/bench-2/raw"}
+    assert {entry.message.header.tray for entry in entries} == {"bench-2"}
+    assert [entry.message.header.sequence for entry in entries] == list(range(13))
+
+
+def test_the_same_table_gives_the_same_bytes(tmp_path):
+    path, _ = measured(tmp_path)
+    for name in ("a.mcap", "b.mcap"):
+        fantwin("import", path, *ARGUMENTS, "-o", tmp_path / name)
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_times_before_zero_are_kept(tmp_path):
+    path, values = measured(tmp_path, start_s=-5.0)
+    fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap")
+    np.testing.assert_allclose(columns(tmp_path / "r.mcap")[0] / 1e9, values[:, 0], rtol=0, atol=1e-9)
+
+
+def test_an_existing_recording_is_replaced_only_when_forced(tmp_path):
+    path, _ = measured(tmp_path)
+    recording = tmp_path / "r.mcap"
+    recording.write_bytes(b"precious")
+    arguments = ("import", path, *ARGUMENTS, "-o", recording)
+    assert said_instead(*arguments) == f"{recording}: exists; name another file with -o, or replace it with --force"
+    assert recording.read_bytes() == b"precious"
+    assert fantwin(*arguments, "--force").exit_code == 0
+    assert len(list(read_recording(recording))) == 13
+
+
+def test_a_table_that_cannot_be_read_leaves_no_recording(tmp_path):
+    path, _ = measured(tmp_path)
+    assert "no column 'y3'; did you mean" in said_instead(
+        "import", path, "--time", "t", "--command", "u", "--speed", "y3", "-o", tmp_path / "r.mcap"
+    )
+    assert [p.name for p in tmp_path.iterdir()] == ["measured.csv"]
+
+
+@pytest.mark.parametrize("tray", ["a/b", "", "health", "tray 1"])
+def test_a_name_that_no_key_can_have_is_refused(tmp_path, tray):
+    path, _ = measured(tmp_path)
+    assert "use letters, digits" in said_instead("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--tray", tray)
+
+
+def test_the_model_maker_gets_the_numbers_of_the_table(tmp_path):
+    path, values = measured(tmp_path)
+    fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap")
+    found = read_runs(tmp_path / "r.mcap", fans=[1], from_s=2.0, to_s=6.0)
+    (run,) = found.runs
+    t_s = values[:, 0] - values[0, 0]
+    part = (t_s >= 2.0) & (t_s < 6.0)
+    np.testing.assert_allclose(run.t_s, t_s[part], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(run.command[:, 0], values[part, 1])
+    np.testing.assert_allclose(run.speed_rad_s[:, 0] * 60 / (2 * np.pi), values[part, 3])
+    assert (found.speed_unit, found.damage) == ("rpm", "")

@@ -1,0 +1,236 @@
+"""`fantwin info`: what is in a recording, by its index, and the same where all of it has to be gone through."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.writer import Writer
+
+from pipeline.recordings import contents
+from pipeline.recordings.contents import contents_of
+from pipeline.recordings.sequence_ledger import SequenceLedger
+from pipeline.recordings.writing import RecordingWriter
+from schemas.messages import Counter, Header, Health, ModelCard, StageStatus
+from schemas.topics import health_key, tray_key
+from tests.pipeline.recordings.test_parts import part, shelf
+from tests.pipeline.recordings.test_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
+from tests.support.fantwin_command import fantwin, said_instead
+
+METADATA = {"site": "plant", "trays": "tray1", "fans.tray1": "2", "speed_unit.tray1": "rpm", "made_by": "fantwin"}
+SECOND_NS = 1_000_000_000
+
+
+def told(*files: Path, exit_code: int = 0) -> dict[str, Any]:
+    done = fantwin("info", *files, "--json")
+    assert done.exit_code == exit_code, done.output
+    return json.loads(done.stdout)
+
+
+def recording(path: Path) -> Path:
+    """With a hole, a repetition, a twin, and a stage that complains."""
+    with RecordingWriter(path, METADATA, {"configuration.toml": b"", "tray1.onnx": b"twin"}) as writer:
+        for number, sequence in enumerate((0, 1, 4, 5, 5)):
+            writer.write_message(RAW_KEY, raw(sequence), number * SECOND_NS)
+        card = ModelCard(header=Header("ti-1", 0, "tray1"), t_ns=1, twin="demo", kind="hybrid", sha256="ab" * 32)
+        writer.write_message(tray_key("plant", "tray1", "twin"), card, 5 * SECOND_NS)
+        for number, problem in enumerate(("", "the line is silent: look at the cable")):
+            health = Health(
+                header=Header("acquisition-1", number, ""),
+                stage="acquisition",
+                instance="tray1",
+                status=StageStatus.DEGRADED,
+                t_ns=1,
+                uptime_s=1.0,
+                problem=problem,
+                counters=(Counter(name="lost_samples", value=3 * number),),
+                lost=3 * number,
+            )
+            writer.write_message(health_key("plant", "acquisition", "tray1"), health, 6 * SECOND_NS)
+    return path
+
+
+def test_topics_are_told_with_what_is_missing(tmp_path):
+    found = told(recording(tmp_path / "r.mcap"), exit_code=3)
+    assert found["topics"][RAW_KEY] == {
+        "messages": 5,
+        "missing": 2,
+        "duplicated": 1,
+        "first_ns": 0,
+        "last_ns": 4 * SECOND_NS,
+        "rate_hz": 1.0,
+    }
+
+
+def test_it_tells_what_the_recording_is_about(tmp_path):
+    (found,) = told(recording(tmp_path / "r.mcap"), exit_code=3)["files"]
+    assert found["metadata"] == METADATA
+    assert (found["messages"], found["duration_s"]) == (8, 6.0)
+    assert found["size_bytes"] == (tmp_path / "r.mcap").stat().st_size
+    assert found["has_configuration"] is True
+    assert found["twins"] == {"tray1": {"twin": "demo", "kind": "hybrid", "sha256": "ab" * 32}}
+    assert found["stages"] == {
+        "acquisition/tray1": {
+            "status": "degraded",
+            "problem": "the line is silent: look at the cable",
+            "lost": 3,
+            "counters": {"lost_samples": 3},
+        }
+    }
+    assert found["damage"] == []
+
+
+def test_people_are_told_the_same(tmp_path):
+    said = fantwin("info", recording(tmp_path / "r.mcap")).stdout
+    for words in (
+        "r.mcap: 0.0",
+        "8 messages",
+        "6.0 s",
+        "tray tray1, 2 fans, speeds in rpm",
+        "twin of tray1: demo, hybrid, sha256 abababababab",
+        "attached: configuration.toml, tray1.onnx",
+        "acquisition/tray1: the line is silent: look at the cable; 3 lost",
+    ):
+        assert words in said
+    (line,) = (line for line in said.splitlines() if "tray1/raw" in line)
+    assert line.split()[1:4] == ["5", "2", "1"]
+
+
+def test_a_torn_file_is_gone_through_and_the_rest_is_told_as_before(tmp_path):
+    whole = recording(tmp_path / "r.mcap")
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(whole.read_bytes()[:-50])
+    (of_whole,), (of_torn,) = (told(path, exit_code=3)["files"] for path in (whole, torn))
+    assert of_torn["damage"] == ["it has no index"]
+    different = {name for name in of_whole if of_whole[name] != of_torn[name]}
+    assert different == {"file", "size_bytes", "damage"}
+
+
+def test_a_file_that_lacks_only_its_index_has_lost_nothing(tmp_path):
+    path = write(tmp_path / "r.mcap", 30)
+    path.write_bytes(path.read_bytes()[:-50])
+    told(path, exit_code=0)
+
+
+def test_a_file_that_breaks_off_is_told(tmp_path):
+    path = write(tmp_path / "r.mcap", 300)
+    path.write_bytes(path.read_bytes()[:40_000])
+    (found,) = told(path, exit_code=3)["files"]
+    assert found["damage"][0] == "it breaks off, as after a crash"
+    assert "it breaks off, as after a crash; `fantwin recover` mends it" in fantwin("info", path).stdout
+
+
+def test_a_file_that_is_still_being_written_is_shown_as_far_as_it_is_on_the_disk(tmp_path):
+    with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
+        writer.write_message(RAW_KEY, raw(0), 1)
+        writer.flush()
+        writer.write_message(RAW_KEY, raw(1), 2)
+        (found,) = told(tmp_path / "r.mcap.active")["files"]
+    assert found["damage"] == ["it is still being written"]
+    assert found["topics"][RAW_KEY]["messages"] == 1
+
+
+def test_where_there_are_index_and_ledger_not_all_of_the_file_is_read(tmp_path, monkeypatch):
+    path = recording(tmp_path / "r.mcap")
+    monkeypatch.setattr(contents, "scan", None)
+    assert contents_of(path).messages == 8
+
+
+def test_parts_are_added_up_and_checked_to_go_on_from_one_another(tmp_path):
+    place, ledger = shelf(tmp_path), SequenceLedger()
+    for first in (0, 10, 23):
+        part(place, range(first, first + 10), ledger).close()
+        ledger = ledger.following()
+    names = [tmp_path / name for name in ("r-3.mcap", "r.mcap", "r-2.mcap")]
+    found = told(*names, exit_code=3)
+    assert found["topics"][RAW_KEY]["messages"] == 30
+    assert found["topics"][RAW_KEY]["missing"] == 3
+    assert [Path(each["file"]).name for each in found["files"]] == ["r.mcap", "r-2.mcap", "r-3.mcap"]
+    assert found["continuity"] == []
+
+
+def test_what_is_left_of_a_ring_of_parts_is_well(tmp_path):
+    place, ledger = shelf(tmp_path), SequenceLedger()
+    for first in (0, 10, 20):
+        part(place, range(first, first + 10), ledger).close()
+        ledger = ledger.following()
+    assert place.delete_oldest() == "r.mcap"
+    assert told(tmp_path / "r-2.mcap", tmp_path / "r-3.mcap")["continuity"] == []
+    assert "continues r.mcap" in fantwin("info", tmp_path / "r-2.mcap", tmp_path / "r-3.mcap").stdout
+
+
+def test_a_file_that_is_named_twice_counts_once(tmp_path):
+    with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
+        writer.write_message(RAW_KEY, raw(0), 1)
+    assert told(tmp_path / "r.mcap", tmp_path / "r.mcap")["topics"][RAW_KEY]["messages"] == 1
+
+
+def test_metadata_of_others_under_our_names_are_passed_over(tmp_path):
+    with RecordingWriter(tmp_path / "r.mcap", {"paused_t_ns": "yesterday", "resumed_t_ns": "1"}):
+        pass
+    done = fantwin("info", tmp_path / "r.mcap")
+    assert (done.exit_code, "nothing was recorded" in done.stdout) == (0, False)
+
+
+def test_a_part_that_is_not_among_them_is_missed(tmp_path):
+    place, ledger = shelf(tmp_path), SequenceLedger()
+    for first in (0, 10, 20):
+        part(place, range(first, first + 10), ledger).close()
+        ledger = ledger.following()
+    found = told(tmp_path / "r.mcap", tmp_path / "r-3.mcap", exit_code=3)
+    assert found["continuity"] == ["r-3.mcap continues r-2.mcap, which is not among these files"]
+    assert "which is not among these" in fantwin("info", tmp_path / "r.mcap", tmp_path / "r-3.mcap").stdout
+
+
+def test_a_part_that_begins_elsewhere_than_the_one_before_ended_is_told(tmp_path):
+    place = shelf(tmp_path)
+    part(place, range(10)).close()
+    part(place, range(12, 20), SequenceLedger({(RAW_KEY, "acquisition-1"): 12})).close()
+    found = told(tmp_path / "r.mcap", tmp_path / "r-2.mcap", exit_code=3)
+    assert found["continuity"] == [f"r-2.mcap goes on at 12 of {RAW_KEY} acquisition-1, but r.mcap ends before 10"]
+
+
+def test_a_pause_is_told(tmp_path):
+    about = {"paused_t_ns": "1", "resumed_t_ns": "2500000001", "paused_because": "no room", "lost_in_pause": "7"}
+    shelf(tmp_path).begin(0, SequenceLedger(), about).close()
+    said = fantwin("info", tmp_path / "r.mcap").stdout
+    assert "before it nothing was recorded for 2.5 s; messages lost: 7" in said
+    assert "because no room" in said
+
+
+def test_a_file_of_others_is_told_for_what_it_is(tmp_path):
+    path = tmp_path / "camera.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/camera", "json", 0)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    (found,) = told(path)["files"]
+    assert (found["topics"], found["other_topics"]) == ({}, {"/camera": 1})
+    said = fantwin("info", path).stdout
+    assert "not a recording of fantwin: none of its channels is ours" in said
+    assert "/camera" in said
+
+
+def test_a_recording_without_messages_is_shown_too(tmp_path):
+    RecordingWriter(tmp_path / "r.mcap", METADATA).close()
+    (found,) = told(tmp_path / "r.mcap")["files"]
+    assert (found["messages"], found["first_ns"], found["duration_s"]) == (0, None, 0.0)
+    assert "0 messages" in fantwin("info", tmp_path / "r.mcap").stdout
+
+
+def test_an_alarm_alone_has_no_rate(tmp_path):
+    with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
+        writer.write_message(ALARM_KEY, alarm(0), 5)
+    assert told(tmp_path / "r.mcap")["topics"][ALARM_KEY]["rate_hz"] is None
+
+
+@pytest.mark.parametrize("content", [b"", b"t,u\n", None])
+def test_what_is_no_recording_is_told_in_one_line(tmp_path, content):
+    path = tmp_path / "r.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    assert f"{path}: " in said_instead("info", path)

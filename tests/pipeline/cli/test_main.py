@@ -1,0 +1,144 @@
+"""The command line: every command explains itself, and every mistake is one line and an exit code."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import main as command_line
+from pipeline.cli.main import COMMANDS, spell_out
+from tests.support.running_chain import DEMO, fantwin
+
+CONFIG = DEMO / "demo.toml"
+README = DEMO.parents[1] / "README.md"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _all_commands() -> None:
+    registered = {command.name for command in command_line.app.registered_commands}
+    command_line._register(name for name in COMMANDS if name not in registered)
+
+
+def help_of(*words: str) -> str:
+    result = CliRunner().invoke(command_line.app, [*words, "--help"], env={"COLUMNS": "200", "NO_COLOR": "1"})
+    assert result.exit_code == 0
+    return result.output
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_an_example_and_prints_json_if_asked(command):
+    text = help_of(command)
+    assert f"Example: fantwin {command}" in " ".join(text.split())
+    assert "--json" in text
+
+
+def test_help_lists_every_command_and_the_exit_codes():
+    text = help_of()
+    assert all(f" {command} " in text for command in COMMANDS)
+    assert "Exit codes: 0 all well" in text
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recorded") / "tray.mcap"
+    assert fantwin("simulate", "--fans", 1, "--duration", 2, "--recording", path).returncode == 0
+    return path
+
+
+def assert_one_line(done: subprocess.CompletedProcess[str], code: int, words: Sequence[str]) -> None:
+    assert done.returncode == code, done.stderr
+    assert done.stderr.startswith("fantwin: ")
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert done.stdout == ""
+    for word in words:
+        assert word in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("up -c none.toml", ["none.toml", "cannot read the configuration", "-c FILE"]),
+        (f"run scorr -c {CONFIG}", ["'scorr'", "known: acquisition"]),
+        (f"run scorer -c {CONFIG} --set scorer.on_dealy_s=1", ["scorer.on_dealy_s", "did you mean 'on_delay_s'"]),
+        (f"run acquisition -c {CONFIG} --set tray.0.port=''", ["port is missing", "/dev/ttyUSB0"]),
+        (f"run acquisition -c {CONFIG} --tray nobody", ["no tray called 'nobody'", "tray1"]),
+        (f"run twin_integrator -c {CONFIG} --set tray.0.twin=none.onnx", ["none.onnx", "correct [[tray]] twin"]),
+        (f"run twin_integrator -c {CONFIG} --set tray.0.fans=3", ["a twin of 8 fans", "choose a twin that fits"]),
+        (f"run scorer -c {CONFIG} --set bus.endpoint=nowhere", ["bus.endpoint = 'nowhere'", "<protocol>/<address>"]),
+        ("router --listen nowhere", ["'nowhere'", "<protocol>/<address>"]),
+        ("plot none.mcap", ["none.mcap", "cannot read the recording"]),
+        (f"plot {README}", ["not a recording", "fantwin import"]),
+        ("train none.mcap -o twin.onnx", ["none.mcap", "cannot read the recording"]),
+        (f"evaluate {DEMO / 'twin.onnx'} {README}", ["not a recording"]),
+        ("picture none.rrd", ["none.rrd", "no such file"]),
+        ("import none.csv --time t:s --command u --speed y:rpm -o x.mcap", ["none.csv", "cannot read the table"]),
+        ("simulate --fans 99", ["fans = 99", "1 to 64"]),
+        ("demo -o /proc/demo", ["/proc/demo", "name another with -o"]),
+    ],
+)
+def test_a_mistake_is_one_line_with_what_to_do(command, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert_one_line(fantwin(*command.split()), 1, words)
+
+
+@pytest.mark.parametrize(
+    ("command", "missing", "words"),
+    [
+        ("plot RECORDING", "matplotlib", [".venv/bin/pip install -e '.[view]'"]),
+        ("picture RECORDING", "rerun", [".venv/bin/pip install -e '.[view]'"]),
+        ("train RECORDING -o twin.onnx --model physical", "onnx", [".venv/bin/pip install -e '.[train]'"]),
+    ],
+)
+def test_a_missing_extra_is_one_line_that_names_it(command, missing, words, recording, tmp_path):
+    without = f"import sys; sys.modules[{missing!r}] = None; from pipeline.cli.main import main; main()"
+    arguments = command.replace("RECORDING", str(recording)).split()
+    done = subprocess.run(
+        [sys.executable, "-c", without, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        cwd=tmp_path,
+    )
+    assert_one_line(done, 1, words)
+
+
+def test_wrong_usage_has_its_own_exit_code():
+    done = fantwin("plott")
+    assert done.returncode == 2
+    assert "No such command" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "spelt"),
+    [
+        ("train A B --validate C D -o T", "train A B --validate C --validate D -o T"),
+        ("train A --validate C D", "train A --validate C --validate D"),
+        ("train A --validate C --validate D E", "train A --validate C --validate D --validate E"),
+        ("train A --validate=C -o T", "train A --validate=C -o T"),
+        ("train A --validate -o T", "train A --validate -o T"),
+        ("train A -o T B", "train A -o T B"),
+        ("evaluate T --validate A B", "evaluate T --validate A B"),
+        ("", ""),
+    ],
+)
+def test_a_variadic_option_takes_all_words_up_to_the_next_option(words, spelt):
+    assert spell_out(words.split()) == spelt.split()
+
+
+def test_train_takes_every_recording_after_validate_as_one_to_judge_by(recording, tmp_path):
+    twin = tmp_path / "twin.onnx"
+    other = shutil.copy(recording, tmp_path / "other.mcap")
+    words = ["train", recording, "--model", "physical", "--validate", other, "none.mcap", "-o", twin]
+    assert_one_line(fantwin(*words), 1, ["none.mcap: cannot read the recording"])
+    words[6] = other
+    done = fantwin(*words, "--json")
+    assert done.returncode == 0, done.stderr
+    assert '"judged_on": "held-out"' in done.stdout

@@ -1,0 +1,36 @@
+"""What is said on stderr while a command works and nobody watches a terminal."""
+
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from pipeline.cli import progress
+from pipeline.cli.twins.training_data import Material
+
+MATERIAL = cast("Material", SimpleNamespace(rad_s_per_unit=0.1, speed_unit="rpm"))
+
+
+def test_without_a_terminal_a_line_tells_every_few_seconds_how_far_a_training_is(monkeypatch, capsys) -> None:
+    now_s = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now_s[0])
+    with progress.training_progress(MATERIAL) as start:
+        tell = start("hybrid")
+        for iteration in range(1, 14):
+            now_s[0] += 1.0
+            tell(iteration, 60, 0.5)
+        start("NARX")
+    said = capsys.readouterr()
+    assert said.err.splitlines() == [
+        "hybrid: identifying",
+        "hybrid: 5/60, free-run rmse 5 rpm, 5 s",
+        "hybrid: 10/60, free-run rmse 5 rpm, 10 s",
+        "NARX: identifying",
+    ]
+    assert said.out == ""
+
+
+def test_without_a_terminal_work_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress.working("drawing page.html"):
+        pass
+    assert capsys.readouterr().err == "drawing page.html\n"

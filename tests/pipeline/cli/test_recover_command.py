@@ -1,0 +1,178 @@
+"""`fantwin recover`: a torn recording becomes whole, and the exit code says whether anything was lost."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from mcap.opcode import Opcode
+
+from pipeline.recordings.contents import BREAKS_OFF, contents_of
+from pipeline.recordings.records import RecordReader
+from pipeline.recordings.repair import mend
+from pipeline.recordings.writing import RecordingWriter
+from schemas.messages import Header, Health, Output, StageStatus
+from schemas.topics import health_key
+from tests.pipeline.recordings.test_recordings import RAW_KEY, raw
+from tests.pipeline.recordings.test_repair import chunk_ends, read_by_others, small
+from tests.support.fantwin_command import fantwin, said_instead
+
+
+@pytest.fixture
+def whole(tmp_path) -> Path:
+    return small(tmp_path / "whole.mcap")
+
+
+@pytest.fixture
+def torn(tmp_path, whole) -> Path:
+    path = tmp_path / "r.mcap.active"
+    path.write_bytes(whole.read_bytes()[: chunk_ends(whole)[3][0] + 100])
+    return path
+
+
+def test_a_torn_file_is_made_whole_in_place_and_the_loss_is_told(tmp_path, torn):
+    done = fantwin("recover", torn)
+    assert done.exit_code == 3
+    assert f"{torn}: 20 messages are whole again in {tmp_path / 'r.mcap'}; the torn file is" in done.stdout
+    assert f"{RAW_KEY}: 20 messages, the last at 1970" in done.stdout
+    assert "it breaks off, as after a crash: what was in the unfinished chunk may be missing" in done.stdout
+    assert len(read_by_others(tmp_path / "r.mcap")) == 20
+    assert (tmp_path / "r.mcap.torn").exists()
+
+
+def test_it_says_so_to_machines_too(tmp_path, torn):
+    done = fantwin("recover", torn, "-o", tmp_path / "out.mcap", "--json")
+    told = json.loads(done.stdout)
+    assert done.exit_code == 3
+    assert told["whole"] == str(tmp_path / "out.mcap")
+    assert told["torn"] is None
+    assert told["messages"] == 20
+    assert told["topics"][RAW_KEY] == {
+        "messages": 20,
+        "missing": 0,
+        "duplicated": 0,
+        "first_ns": 1000,
+        "last_ns": 1019,
+    }
+    assert told["thrown_away_bytes"] > 0
+    assert torn.exists(), "with -o the torn file stays what it is"
+
+
+def test_a_whole_file_is_left_alone(whole):
+    before = whole.read_bytes()
+    done = fantwin("recover", whole)
+    assert done.exit_code == 0
+    assert "is whole already, with 41 messages; nothing to recover" in done.stdout
+    assert "nothing was lost" in done.stdout
+    assert whole.read_bytes() == before
+
+
+def test_a_file_that_lacks_only_its_index_has_lost_nothing(whole):
+    whole.write_bytes(whole.read_bytes()[:-100])
+    done = fantwin("recover", whole)
+    assert done.exit_code == 0
+    assert "nothing was lost" in done.stdout
+    assert len(read_by_others(whole)) == 41
+
+
+def test_a_damaged_chunk_is_told(whole):
+    content = bytearray(whole.read_bytes())
+    content[chunk_ends(whole)[3][0] - 5] ^= 0xFF
+    whole.write_bytes(content)
+    done = fantwin("recover", whole)
+    assert done.exit_code == 3
+    assert "damaged chunks: 1" in done.stdout
+    assert f"{RAW_KEY}: 5 messages of acquisition-1 missing in between" in done.stdout
+
+
+def healths_of(producer: str) -> Health:
+    return Health(
+        header=Header(producer, 0, ""),
+        stage="scorer",
+        instance="all",
+        status=StageStatus.OK,
+        t_ns=2,
+        uptime_s=1.0,
+    )
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_what_a_recovered_file_has_lost_info_says_ever_after(tmp_path, number):
+    """Whichever chunk it was: the ledger of the damaged file still knows what there had been."""
+    path, keys = tmp_path / "r.mcap", health_key("plant", "scorer", "all")
+    with RecordingWriter(path, {}) as writer:
+        for chunk in range(3):
+            for sequence in range(5):
+                writer.write_message(RAW_KEY, raw(5 * chunk + sequence), 1000)
+            writer.write_message(keys, healths_of(f"scorer-{chunk}"), 1000)
+            writer.flush()
+    chunks = [record for record in RecordReader(path) if record.opcode == Opcode.CHUNK]
+    content = bytearray(path.read_bytes())
+    content[chunks[number].offset + chunks[number].length // 2] ^= 0xFF
+    path.write_bytes(content)
+    assert fantwin("recover", path, "-o", tmp_path / "out.mcap").exit_code == 3
+    done = fantwin("info", tmp_path / "out.mcap", "--json")
+    assert done.exit_code == 3
+    told = json.loads(done.stdout)
+    assert told["topics"][RAW_KEY]["missing"] == 5
+    assert told["topics"][keys]["missing"] == 1
+    (file,) = told["files"]
+    assert (file["recovered"][1:], file["damage"]) == (["damaged chunks: 1"], [])
+    assert contents_of(tmp_path / "out.mcap").next[RAW_KEY, "acquisition-1"] == 15
+    assert "was mended: damaged chunks: 1" in fantwin("info", tmp_path / "out.mcap").stdout
+    assert fantwin("recover", tmp_path / "out.mcap").exit_code == 3, "it still is what it is"
+
+
+def test_what_a_torn_file_may_have_lost_info_says_ever_after(tmp_path, torn):
+    assert fantwin("recover", torn, "-o", tmp_path / "out.mcap").exit_code == 3
+    mended = mend(torn)
+    assert mended is not None
+    for path in (tmp_path / "out.mcap", mended.path):
+        done = fantwin("info", path, "--json")
+        assert done.exit_code == 3
+        (file,) = json.loads(done.stdout)["files"]
+        assert file["recovered"] == [f"{BREAKS_OFF}: what was in the unfinished chunk may be missing"]
+
+
+def test_where_the_output_cannot_be_it_says_to_name_another(tmp_path, whole):
+    said = said_instead("recover", whole, "-o", tmp_path / "nowhere" / "out.mcap")
+    assert "No such file or directory; whole.mcap is left as it was; name another file with -o" in said
+
+
+def test_what_a_health_says_was_published_and_is_not_there_is_told(tmp_path):
+    writer = RecordingWriter(tmp_path / "r.mcap", {"flush_interval_s": "0.5"})
+    writer.write_message(RAW_KEY, raw(0), 1)
+    health = Health(
+        header=Header("acquisition-1", 0, ""),
+        stage="acquisition",
+        instance="tray1",
+        status=StageStatus.OK,
+        t_ns=2,
+        uptime_s=1.0,
+        outputs=(Output(key=RAW_KEY, published=4),),
+    )
+    writer.write_message(health_key("plant", "acquisition", "tray1"), health, 2)
+    writer.flush()
+    writer._file.close()
+    done = fantwin("recover", tmp_path / "r.mcap.active")
+    assert done.exit_code == 3
+    assert "what came in the last 0.5 s may be missing" in done.stdout
+    assert f"{RAW_KEY}: 3 messages of acquisition-1 published, by its health, after the last one here" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "not a recording (MCAP)"),
+        (b"t,u,y\n1,2,3\n", "not a recording (MCAP)"),
+        (b"\x89MCAP0\r\n", "there is no whole message in it: nothing can be recovered"),
+        (None, "cannot read the recording: No such file or directory"),
+    ],
+)
+def test_where_nothing_can_be_recovered_it_says_why_and_makes_nothing(tmp_path, content, said):
+    path = tmp_path / "r.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    assert said in said_instead("recover", path, "-o", tmp_path / "out.mcap")
+    assert [p.name for p in tmp_path.iterdir()] == ([] if content is None else ["r.mcap"])

@@ -1,0 +1,439 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import serial
+
+from pipeline.cli.simulation.simulate import simulate
+from pipeline.devices import simulated_device as simulated_line
+from pipeline.devices.measured_table import read_table
+from pipeline.devices.simulated_device import PseudoTerminal, play, wait_for_reader
+from pipeline.devices.table_device import TableDevice, TableSample
+from pipeline.errors import UserError
+from pipeline.recordings.reading import read_recording
+from schemas import wire
+from schemas.messages import Raw
+
+pytestmark = pytest.mark.alone
+FANTWIN = (
+    sys.executable,
+    "-P",
+    "-c",
+    "import typer; from pipeline.cli.simulation.simulate import simulate as s; typer.run(s)",
+)
+KEEP = float("nan")
+
+
+@contextmanager
+def simulated(folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """`fantwin simulate` in a process of its own, once its line is there; link and truth lie in the folder."""
+    arguments = (*FANTWIN, "--link", str(folder / "tray"), "--truth", str(folder / "truth.json"), *options)
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True)
+    assert process.stdout
+    try:
+        assert " on /" in process.stdout.readline()
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def truth_of(folder: Path) -> dict:
+    return json.loads((folder / "truth.json").read_text())
+
+
+class Reader:
+    """The host's end of the line."""
+
+    def __init__(self, port: Path, protocol: wire.Protocol = "binary", fans: int = 8) -> None:
+        self.serial = serial.Serial(str(port), timeout=5.0, exclusive=True)
+        self.protocol: wire.Protocol = protocol
+        self.decoder = wire.Decoder(protocol, fans)
+        self.samples: list[wire.Sample] = []
+        self.faults: list[wire.Fault] = []
+
+    def read_some(self) -> bool:
+        """Whether the device is still there."""
+        try:
+            data = self.serial.read(1)
+            data += self.serial.read(self.serial.in_waiting)
+        except OSError:
+            return False
+        assert data, "nothing came for 5 s"
+        for frame in self.decoder.feed(data):
+            if isinstance(frame, wire.Sample):
+                self.samples.append(frame)
+            else:
+                assert isinstance(frame, wire.Fault)
+                self.faults.append(frame)
+        return True
+
+    def read_until(self, samples: int) -> None:
+        while len(self.samples) < samples:
+            assert self.read_some(), "the device has gone"
+
+    def read_all(self) -> None:
+        while self.read_some():
+            pass
+
+    def send(self, frame: wire.Frame) -> None:
+        self.serial.write(wire.encode(self.protocol, frame))
+
+
+@pytest.mark.parametrize("protocol", ["binary", "text"])
+def test_a_reader_gets_every_sample_from_the_first_on_and_the_truth_counts_the_same(
+    tmp_path: Path, protocol: wire.Protocol
+) -> None:
+    options = (
+        "--duration",
+        "2",
+        "--protocol",
+        protocol,
+        "--wait-for-reader",
+        "--fault",
+        "inlet:fan=1,start=0.5,stop=1",
+    )
+    with simulated(tmp_path, *options) as process:
+        opened_ns = time.time_ns()
+        reader = Reader(tmp_path / "tray", protocol)
+        reader.read_all()
+        assert process.wait(10.0) == 0
+    truth = truth_of(tmp_path)
+    assert reader.faults == []
+    assert [sample.sequence for sample in reader.samples] == list(range(200))
+    assert truth["complete"]
+    assert (truth["samples_sent"], truth["samples_dropped"], truth["samples_unsent"]) == (200, 0, 0)
+    assert truth["start_ns"] >= opened_ns
+    (fault,) = truth["faults"]
+    assert (fault["kind"], fault["fan"], fault["size"]) == ("inlet", 1, 1.6)
+    assert fault["start_ns"] - truth["start_ns"] == pytest.approx(0.5e9, abs=11e6)
+    assert fault["stop_ns"] - truth["start_ns"] == pytest.approx(1.0e9, abs=11e6)
+    assert len(truth["parameters"]) == truth["fans"] == 8
+    assert not (tmp_path / "tray").is_symlink()
+
+
+def test_simulated_losses_are_gaps_in_the_sequence(tmp_path: Path) -> None:
+    with simulated(tmp_path, "--duration", "1", "--lost", "0.2", "--wait-for-reader") as process:
+        reader = Reader(tmp_path / "tray")
+        reader.read_all()
+        assert process.wait(10.0) == 0
+    truth = truth_of(tmp_path)
+    assert truth["samples_sent"] == len(reader.samples)
+    assert truth["samples_sent"] + truth["samples_dropped"] == 100
+    assert 5 <= truth["samples_dropped"] <= 40
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_asked_to_stop_it_completes_the_truth_and_takes_the_link_away(tmp_path: Path, number: int) -> None:
+    with simulated(tmp_path, "--wait-for-reader", "--fault", "rotor:fan=0,start=0") as process:
+        reader = Reader(tmp_path / "tray")
+        reader.read_until(5)
+        running = truth_of(tmp_path)
+        process.send_signal(number)
+        reader.read_all()
+        assert process.wait(10.0) == 0
+    assert not running["complete"]
+    truth = truth_of(tmp_path)
+    assert truth["complete"]
+    assert truth["start_ns"] == running["start_ns"]
+    assert truth["samples_sent"] == len(reader.samples)
+    assert truth["faults"][0]["stop_ns"] == truth["end_ns"] > truth["start_ns"]
+    assert not (tmp_path / "tray").is_symlink()
+
+
+def test_asked_to_stop_before_anybody_reads_it_says_that_nothing_happened(tmp_path: Path) -> None:
+    with simulated(tmp_path, "--wait-for-reader", "--fault", "rotor:fan=0,start=0") as process:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10.0) == 0
+    truth = truth_of(tmp_path)
+    assert truth["complete"]
+    assert truth["samples_sent"] == 0
+    assert truth["start_ns"] is None
+    assert truth["faults"][0]["start_ns"] is None
+
+
+def test_what_nobody_reads_is_counted_and_a_later_reader_sees_the_gap(tmp_path: Path) -> None:
+    with simulated(tmp_path, "--wait-for-reader", "--duration", "1.5") as process:
+        first = Reader(tmp_path / "tray")
+        first.read_until(10)
+        first.serial.close()
+        second = Reader(tmp_path / "tray")
+        second.read_until(10)
+        second.serial.close()
+        assert process.wait(10.0) == 0
+    truth = truth_of(tmp_path)
+    first_end, second_start = first.samples[-1].sequence, second.samples[0].sequence
+    assert first_end is not None
+    assert second_start is not None
+    assert second_start > first_end
+    assert truth["samples_sent"] + truth["samples_unsent"] == 150
+    assert truth["samples_unsent"] > 50
+
+
+def test_commands_and_set_points_come_back_up_the_line(tmp_path: Path) -> None:
+    with simulated(tmp_path, "--fans", "2", "--wait-for-reader", "--speed-unit", "rpm", "--noise", "0") as process:
+        reader = Reader(tmp_path / "tray", fans=2)
+        reader.read_until(1)
+        reader.send(wire.CommandFrame((0.25, KEEP)))
+        reader.send(wire.SetPointFrame((KEEP, 3000.0)))
+        reader.read_until(300)
+        process.send_signal(signal.SIGINT)
+        reader.read_all()
+        assert process.wait(10.0) == 0
+    assert reader.samples[299].command[0] == 0.25
+    assert reader.samples[299].speed[1] == pytest.approx(3000.0, rel=0.05)
+    truth = truth_of(tmp_path)
+    assert (truth["commands_received"], truth["set_points_received"], truth["commands_refused"]) == (1, 1, 0)
+
+
+class Burst:
+    """A device whose samples are all due at once."""
+
+    def __init__(self, samples: int, fans: int) -> None:
+        self.fans = fans
+        self.left = samples
+        self.commands: list[np.ndarray] = []
+
+    def due_s(self) -> float | None:
+        return 0.0 if self.left else None
+
+    def take(self) -> TableSample:
+        self.left -= 1
+        return TableSample(0.0, 7, self.left, np.zeros(self.fans), np.ones(self.fans))
+
+    def command(self, values: np.ndarray) -> None:
+        self.commands.append(values)
+
+    def set_point(self, values_rad_s: np.ndarray) -> None:
+        raise AssertionError(values_rad_s)
+
+
+@pytest.fixture
+def line() -> Iterator[PseudoTerminal]:
+    terminal = PseudoTerminal()
+    yield terminal
+    terminal.close()
+
+
+def test_a_full_line_does_not_block_and_tears_no_frame(line: PseudoTerminal) -> None:
+    decoder = wire.Decoder("binary", 64)
+    received: list[wire.Frame | wire.Fault] = []
+    port = os.open(line.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+
+    def take_all() -> None:
+        while True:
+            try:
+                data = os.read(port, 65536)
+            except BlockingIOError:
+                return
+            received.extend(decoder.feed(data))
+
+    sent = 0
+    for round_number in range(3):
+        sequence = 1000 * round_number
+        while line.write(wire.encode("binary", wire.Sample(0, sequence, (0.0,) * 64, (1.0,) * 64))):
+            sequence += 1
+            sent += 1
+        assert sequence > 1000 * round_number
+        while True:
+            take_all()
+            if line.flush() and len(received) == sent:
+                break
+    os.close(port)
+    assert all(isinstance(frame, wire.Sample) for frame in received)
+
+
+def test_a_device_held_up_sends_all_it_missed_and_says_how_late_it_was(line: PseudoTerminal) -> None:
+    port = serial.Serial(line.port, timeout=5.0)
+    bytes_to_come = 30 * len(wire.encode("binary", wire.Sample(7, 1, (0.0,) * 2, (1.0,) * 2)))
+    reader = threading.Thread(target=port.read, args=(bytes_to_come,))
+    reader.start()
+    nobody_stops_it = threading.Event()
+    played = play(Burst(30, fans=2), line, "binary", 1.0, nobody_stops_it, began=lambda _: nobody_stops_it.wait(0.05))
+    reader.join(10.0)
+    port.close()
+    assert played.samples_sent == played.samples_late == 30
+    assert played.worst_lateness_s >= 0.05
+
+
+def test_garbage_down_the_line_is_counted_and_does_no_harm(line: PseudoTerminal) -> None:
+    port = os.open(line.port, os.O_RDWR | os.O_NOCTTY)
+    os.write(port, b"\0hello\0" + wire.encode("binary", wire.CommandFrame((0.5, KEEP))))
+    device = Burst(1, fans=2)
+    reader = threading.Thread(target=os.read, args=(port, 4096))
+    reader.start()
+    played = play(device, line, "binary", 1.0, threading.Event())
+    reader.join(10.0)
+    os.close(port)
+    assert played.commands_refused == 1
+    assert played.commands_received == 1
+    assert device.commands[0][0] == 0.5
+
+
+def test_waiting_for_a_reader_ends_when_there_is_one_and_when_asked_to_stop(line: PseudoTerminal) -> None:
+    assert not line.somebody_reads()
+    stop = threading.Event()
+    waiting = threading.Thread(target=wait_for_reader, args=(line, stop))
+    waiting.start()
+    port = os.open(line.port, os.O_RDONLY | os.O_NOCTTY)
+    waiting.join(10.0)
+    assert not waiting.is_alive()
+    assert not stop.is_set()
+    os.close(port)
+    assert not line.somebody_reads()
+    stop.set()
+    wait_for_reader(line, stop)
+
+
+def test_who_opens_the_line_for_a_moment_only_is_no_reader(line: PseudoTerminal) -> None:
+    ports = [os.open(line.port, os.O_RDONLY | os.O_NOCTTY)]
+
+    class LeavesAtOnce(threading.Event):
+        """The first wait is the settling: the visitor leaves. The second is for the next reader: enough seen."""
+
+        def wait(self, timeout: float | None = None) -> bool:
+            if ports:
+                os.close(ports.pop())
+            else:
+                self.set()
+            return self.is_set()
+
+    stop = LeavesAtOnce()
+    wait_for_reader(line, stop)
+    assert stop.is_set()
+
+
+def test_the_end_waits_for_the_reader_and_tells_what_it_did_not_take(
+    line: PseudoTerminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = os.open(line.port, os.O_RDWR | os.O_NOCTTY)
+    monkeypatch.setattr(simulated_line, "DRAIN_LIMIT_S", 0.05)
+    played = play(Burst(3, fans=2), line, "binary", 1.0, threading.Event())
+    assert played.bytes_unread > 50
+    assert played.samples_sent == 3
+    reader = threading.Thread(target=os.read, args=(port, 4096))
+    reader.start()
+    assert line.drain(limit_s=10.0) == 0
+    reader.join(10.0)
+    os.close(port)
+
+
+def test_a_link_never_replaces_a_file_but_does_replace_a_stale_link(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("mine")
+    with pytest.raises(UserError, match="is there already and is no symbolic link"):
+        PseudoTerminal(file)
+    assert file.read_text() == "mine"
+    link = tmp_path / "tray"
+    link.symlink_to("/nowhere")
+    first = PseudoTerminal(link)
+    assert str(link.readlink()) == first.port
+    second = PseudoTerminal(link)
+    first.close()
+    assert str(link.readlink()) == second.port  # the link is the second one's now
+    second.close()
+    assert not link.is_symlink()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fault": ["inlte:fan=1"]}, "did you mean 'inlet'"),
+        ({"profile": "manuel"}, "did you mean 'manual'"),
+        ({"fans": 65}, "fans = 65"),
+        ({"fault": ["inlet:fan=8"]}, "fan 8 is not there"),
+        ({"time": "t:s"}, "name it with --from-csv"),
+        ({"recording": Path("x.mcap")}, "--recording needs --duration"),
+        ({"from_csv": Path("x.csv"), "fault": ["inlet:fan=1"]}, "leave out --fault"),
+        ({"truth": Path("/nowhere/truth.json")}, "/nowhere/truth.json: cannot be written"),
+    ],
+)
+def test_a_wrong_option_is_told_in_one_line(options: dict, message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        simulate(**options)
+    assert "\n" not in str(caught.value)
+
+
+def raw_of(path: Path) -> list[Raw]:
+    return [entry.message for entry in read_recording(path) if isinstance(entry.message, Raw)]
+
+
+def test_a_recording_holds_the_tray_and_the_same_seed_and_epoch_give_the_same_bytes(tmp_path: Path) -> None:
+    one, two, other = (tmp_path / name for name in ("one.mcap", "two.mcap", "other.mcap"))
+    for path, seed in ((one, 3), (two, 3), (other, 4)):
+        options = {"duration": 3.05, "lost": 0.1, "fans": 2, "fault": ["inlet:fan=1,start=1,stop=2"]}
+        simulate(recording=path, seed=seed, epoch_ns=10**18, truth=tmp_path / "truth.json", **options)
+    with pytest.raises(UserError, match="exists; name another file"):
+        simulate(recording=one, duration=1.0)
+    assert one.read_bytes() == two.read_bytes()
+    assert one.read_bytes() != other.read_bytes()
+    messages = raw_of(other)
+    truth = truth_of(tmp_path)
+    sequence = np.concatenate([raw.device_sequence for raw in messages])
+    t_ns = np.concatenate([raw.host_receive_t_ns for raw in messages])
+    assert len(sequence) == truth["samples_sent"] == 305 - truth["samples_dropped"]
+    assert t_ns[0] - 10**18 == pytest.approx(sequence[0] * 1e7, abs=1e6)
+    assert np.all(np.diff(t_ns) > 0)
+    assert truth["faults"][0]["start_ns"] - 10**18 == pytest.approx(1e9, abs=5e6)
+    assert all(raw.speed_rad_s.shape == (len(raw.host_receive_t_ns), 2) for raw in messages)
+
+
+def test_line_and_recording_carry_the_same_samples(tmp_path: Path) -> None:
+    recording = tmp_path / "same.mcap"
+    simulate(recording=recording, duration=0.5, seed=9, epoch_ns=0)
+    with simulated(tmp_path, "--duration", "0.5", "--seed", "9", "--wait-for-reader") as process:
+        reader = Reader(tmp_path / "tray")
+        reader.read_all()
+        assert process.wait(10.0) == 0
+    (raw,) = raw_of(recording)
+    assert raw.device_clock_us.tolist() == [sample.clock_us for sample in reader.samples]
+    assert np.array_equal(raw.speed_rad_s.astype(np.float32), [sample.speed for sample in reader.samples])
+
+
+TABLE = """t ms,duty,rpm,rpm2
+1000,10,0,5
+1004,20,60,
+1004.5,30,120,7
+1300,40,180,8
+9000,50,240,9
+"""
+
+
+def test_a_measured_file_is_played_at_its_own_times_in_its_own_units(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text(TABLE)
+    columns = ("--time", "t ms:ms", "--command", "duty", "--speed", "rpm:rpm", "--speed", "rpm2:rpm")
+    options = ("--from-csv", str(tmp_path / "run.csv"), *columns, "--to", "1", "--speed-unit", "rpm")
+    with simulated(tmp_path, *options, "--wait-for-reader") as process:
+        reader = Reader(tmp_path / "tray", fans=2)
+        reader.read_all()
+        assert process.wait(10.0) == 0
+    assert [sample.clock_us for sample in reader.samples] == [0, 4000, 4500, 300_000]
+    assert [sample.command for sample in reader.samples] == [(10.0, 10.0), (20.0, 20.0), (30.0, 30.0), (40.0, 40.0)]
+    assert [sample.speed[0] for sample in reader.samples] == pytest.approx([0.0, 60.0, 120.0, 180.0])
+    assert np.isnan(reader.samples[1].speed[1])
+    truth = truth_of(tmp_path)
+    assert (truth["complete"], truth["samples_sent"], truth["faults"]) == (True, 4, [])
+
+
+def test_a_part_of_a_file_that_holds_nothing_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text(TABLE)
+    with pytest.raises(UserError, match=r"no row from 100 s to inf s; it is 8 s long"):
+        TableDevice(read_table(path, "t ms:ms", ["duty"], ["rpm:rpm"]), 100.0, float("inf"))
+
+
+@pytest.mark.parametrize("duration", [float("inf"), float("nan")])
+def test_a_recording_without_an_end_is_refused(tmp_path, duration):
+    with pytest.raises(UserError, match="duration"):
+        simulate(duration=duration, recording=tmp_path / "x.mcap")
+    assert not (tmp_path / "x.mcap").exists()

@@ -1,0 +1,252 @@
+"""`fantwin status` and what it looks at: stages, rates, losses and alarms of a site, seen from outside."""
+
+from __future__ import annotations
+
+import io
+import json
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from pipeline.bus.session import Bus, Publisher
+from pipeline.cli.watch.status import as_json, stage_table
+from pipeline.config.models import BusConfig, load_config
+from pipeline.launch.watcher import StageView, Watcher
+from schemas.codec import encode, type_name
+from schemas.messages import (
+    Alarm,
+    Counter,
+    Diagnosis,
+    Header,
+    Health,
+    Input,
+    Output,
+    Severity,
+    StageStatus,
+    Transition,
+)
+from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from schemas.units import NS_PER_S
+from tests.support.running_chain import DEMO, SITE, TRAY, Running, eventually, fantwin
+
+HEALTH = Health(
+    header=Header("scorer-all-1", 0, ""),
+    stage="scorer",
+    instance="all",
+    status=StageStatus.OK,
+    t_ns=1_700_000_000 * NS_PER_S,
+    uptime_s=1.0,
+    inputs=(Input(key="k", producer="p", received=100, missing=3, duplicated=0, next_sequence=103),),
+    outputs=(Output(key="o", published=50),),
+    counters=(Counter(name="lost_on_purpose", value=4),),
+    latency_p50_ms=1.5,
+    latency_p99_ms=2.5,
+    lost=7,
+    process_id=4711,
+)
+ALARM = Alarm(
+    header=Header("scorer-all-1", 0, TRAY),
+    fan=2,
+    active=True,
+    severity=Severity.ALARM,
+    t_ns=1_700_000_000 * NS_PER_S,
+    onset_t_ns=1_699_999_999 * NS_PER_S,
+    residual_rad_s=-20.0,
+    limit_rad_s=9.0,
+    message="fan 2 is slower than its twin",
+)
+
+
+class Site:
+    """A made-up stage on a real bus, and a watcher in a session of its own."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.buses = [Bus(BusConfig(endpoint=endpoint)) for _ in range(2)]
+        stage, outside = self.buses
+        self.health = self._outlet(stage, health_key(SITE, "scorer", "all"), "health", HEALTH.header.producer)
+        self.alarm = self._outlet(stage, tray_key(SITE, TRAY, "alarm"), "alarm", ALARM.header.producer)
+        stage.declare_alive(alive_key(SITE, "scorer", "all"))
+        self.outside = outside
+
+    @staticmethod
+    def _outlet(bus: Bus, key: str, topic: str, producer: str) -> Publisher:
+        return bus.outlet(key, BY_NAME[topic], type_name(BY_NAME[topic].message), producer)
+
+    def close(self) -> None:
+        for bus in self.buses:
+            bus.close()
+
+
+@pytest.fixture
+def site(endpoint: str) -> Iterator[Site]:
+    site = Site(endpoint)
+    yield site
+    site.close()
+
+
+def view(site: Site, watcher: Watcher, *healths: Health) -> StageView:
+    """What the watcher makes of healths, said until it has heard the last of them."""
+    for health in healths:
+
+        def heard(health: Health = health) -> StageView | None:
+            site.health.put(encode(health))
+            (*_, last) = watcher.stages() or [None]
+            return last if last and last.health.t_ns == health.t_ns and last.alive else None
+
+        eventually(heard, "the watcher hears it")
+    (last,) = watcher.stages()
+    return last
+
+
+def shown(watcher: Watcher) -> str:
+    console = Console(width=120, file=io.StringIO(), record=True)
+    console.print(stage_table(watcher, load_config(DEMO / "demo.toml")))
+    return console.export_text()
+
+
+def later(health: Health, seconds: float, received: int, published: int) -> Health:
+    (line,), (output,) = health.inputs, health.outputs
+    return replace(
+        health,
+        t_ns=health.t_ns + round(seconds * NS_PER_S),
+        inputs=(replace(line, received=received),),
+        outputs=(replace(output, published=published),),
+    )
+
+
+def test_rates_are_what_came_between_two_healths():
+    seen = StageView(later(HEALTH, 2.0, 300, 90), HEALTH, alive=True)
+    assert (seen.rate_in_hz, seen.rate_out_hz) == (100.0, 20.0)
+    assert StageView(HEALTH, None, alive=True).rate_in_hz == 0.0
+
+
+def test_a_session_that_follows_another_takes_its_place_and_the_losses_add_up(site):
+    watcher = Watcher(site.outside, SITE)
+    view(site, watcher, HEALTH)
+    follower = replace(HEALTH, header=Header("scorer-all-2", 0, ""), t_ns=HEALTH.t_ns + NS_PER_S, inputs=(), lost=2)
+    assert view(site, watcher, follower).health.header.producer == "scorer-all-2"
+    assert watcher.losses() == {"scorer": 9}
+
+
+def test_alarms_raised_before_the_watcher_came_are_fetched_and_the_last_of_a_fan_counts(site):
+    site.alarm.put(encode(ALARM))
+    site.alarm.put(encode(replace(ALARM, active=False, t_ns=ALARM.t_ns + 1, header=Header("scorer-all-1", 1, TRAY))))
+    watcher = Watcher(site.outside, SITE)
+    view(site, watcher, HEALTH)  # they have met
+    watcher.ask_for_past_alarms()
+    assert [(alarm.fan, alarm.active) for alarm in watcher.alarms()] == [(2, False)]
+
+
+def test_machines_are_told_stages_rates_losses_and_alarms(site):
+    watcher = Watcher(site.outside, SITE)
+    site.alarm.put(encode(ALARM))
+    view(site, watcher, HEALTH)
+    watcher.ask_for_past_alarms()
+    told = json.loads(json.dumps(as_json(watcher)))
+    (stage,), (alarm,) = told["stages"], told["alarms"]
+    assert (stage["stage"], stage["alive"], stage["status"], stage["process_id"]) == ("scorer", True, "ok", 4711)
+    assert stage["lost"] == 7
+    assert stage["counters"] == {"lost_on_purpose": 4}
+    assert stage["latency_ms"] == {"p50": 1.5, "p99": 2.5}
+    assert (alarm["tray"], alarm["fan"], alarm["active"]) == (TRAY, 2, True)
+
+
+def test_people_are_told_how_alarms_stand_and_what_is_probably_wrong(site):
+    def tell(number: int, transition: Transition, **more: Any) -> None:
+        header, t_ns = Header("scorer-all-1", number, TRAY), ALARM.t_ns + number
+        site.alarm.put(
+            encode(replace(ALARM, header=header, t_ns=t_ns, transition=transition, **{"confirmed": True} | more))
+        )
+
+    over = {"active": False, "acknowledged": True}
+    cause = Diagnosis(cause="drag_up", probability=0.87)
+    tell(0, Transition.RAISED)
+    tell(1, Transition.DIAGNOSED, causes=(cause,), message="fan 2: more drag")
+    tell(2, Transition.ACKNOWLEDGED, causes=(cause,), acknowledged=True, message="fan 2: acknowledged")
+    tell(3, Transition.RAISED, fan=3, onset_t_ns=7)
+    tell(4, Transition.CLEARED, fan=3, onset_t_ns=7, **over)
+    tell(5, Transition.SHELVED, fan=4, onset_t_ns=0, severity=Severity.NONE, shelved_until_t_ns=2**63 - 1, **over)
+    watcher = Watcher(site.outside, SITE)
+    view(site, watcher, HEALTH)
+    watcher.ask_for_past_alarms()
+    text = shown(watcher)
+    assert "fan 2: active, acknowledged, drag_up 87 %; more drag" in " ".join(text.split())
+    assert "fan 3" not in text, "it is over, and everybody knows"
+    assert "fan 4: never raised, shelved until it clears" in text
+    told = {alarm["fan"]: alarm for alarm in as_json(watcher)["alarms"]}  # type: ignore[attr-defined]
+    assert (told[2]["acknowledged"], told[2]["causes"][0]["cause"]) == (True, "drag_up")
+    assert (told[3]["retained"], told[4]["presented"]) == (False, False)
+
+
+@pytest.mark.parametrize(
+    ("health", "word"),
+    [
+        (replace(HEALTH, problem="the line is silent"), "scorer: the line is silent"),
+        (HEALTH, "silent"),  # its last word is years old
+    ],
+)
+def test_people_are_told_what_is_wrong(site, health, word):
+    watcher = Watcher(site.outside, SITE)
+    view(site, watcher, health)
+    text = shown(watcher)
+    assert word in text
+    assert "no alarms" in text
+
+
+def test_a_stage_that_vanished_is_shown_as_gone(site):
+    watcher = Watcher(site.outside, SITE)
+    view(site, watcher, HEALTH)
+    site.buses[0].close()
+    eventually(lambda: not watcher.stages()[0].alive, "the watcher sees it go")
+    text = shown(watcher)
+    assert "gone" in text
+    assert "no stage of site 'demo' answers at tcp/" in text
+    assert "alarms unknown: no scorer is alive" in text
+    assert "no alarms" not in text
+
+
+def test_where_nothing_runs_there_is_no_empty_table_and_no_good_news(endpoint):
+    with Bus(BusConfig(endpoint=endpoint)) as bus:
+        text = shown(Watcher(bus, SITE))
+    assert "no stage of site 'demo' answers at tcp/" in text
+    assert "alarms unknown: no scorer is alive" in text
+    assert "stages" not in text
+    assert "no alarms" not in text
+
+
+def test_the_live_view_that_saw_nobody_ends_with_the_line(endpoint):
+    live = Running(["status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'"])
+    with Bus(BusConfig(endpoint=endpoint)) as bus:
+        eventually(bus._session.info.peers_zid, "the live view has come")
+        assert live.end() == 1
+    live.line_with(f"no stage of site 'demo' answers at {endpoint}")
+    live.kill()
+
+
+def test_the_command_shows_a_running_site_once_and_exits_3_if_something_was_lost(site):
+    done: list = []
+    words = ("status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{site.buses[0]._config.endpoint}'")
+    threads = [
+        threading.Thread(target=lambda w=w: done.append(fantwin(*words, *w))) for w in (("--json",), ("--once",))
+    ]
+    for thread in threads:
+        thread.start()
+    for number in range(6000):
+        if not any(thread.is_alive() for thread in threads):
+            break
+        site.health.put(encode(replace(HEALTH, t_ns=HEALTH.t_ns + number)))
+        threads[0].join(0.05)
+        threads[1].join(0.05)
+    assert [answer.returncode for answer in done] == [3, 3], done
+    assert all("scorer" in answer.stdout for answer in done)
+
+
+def test_the_command_says_where_it_found_nobody(endpoint):
+    done = fantwin("status", "-c", DEMO / "demo.toml", "--once", "--set", f"bus.endpoint='{endpoint}'")
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert f"no stage of site 'demo' answers at {endpoint}" in done.stderr

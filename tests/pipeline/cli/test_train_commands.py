@@ -1,0 +1,222 @@
+"""`fantwin identify`, `train` and `evaluate` on recordings, from the command line to the ONNX file."""
+
+import builtins
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.recordings.writing import RecordingWriter
+from schemas.messages import Header, Raw
+from schemas.topics import tray_key
+from tests.support.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, published_run
+from tests.support.fantwin_command import fantwin, said_instead
+from twin.runs import Run
+
+RPM = 60 / (2 * np.pi)
+
+
+def record(path: Path, run: Run, unit: str = "rad/s", tray: str = "tray1") -> Path:
+    with RecordingWriter(path, {"speed_unit": unit}, overwrite=True) as writer:
+        t_ns = np.rint(run.t_s * 1e9).astype(np.int64)
+        raw = Raw(
+            header=Header("test", 0, tray),
+            fans=run.fans,
+            host_receive_t_ns=t_ns,
+            command=run.command,
+            speed_rad_s=run.speed_rad_s,
+        )
+        writer.write_message(tray_key("test", tray, "raw"), raw, int(t_ns[-1]))
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings of the published fan: one in rad/s, the same in rpm, one held out, one of two fans."""
+    path = tmp_path_factory.mktemp("recordings")
+    record(path / "healthy.mcap", published_run(1))
+    record(path / "healthy-rpm.mcap", published_run(1), unit="rpm")
+    record(path / "held-out.mcap", published_run(2))
+    record(path / "two.mcap", published_run(3, fans=2))
+    return path
+
+
+@pytest.fixture(scope="module")
+def twin(folder: Path) -> Path:
+    result = fantwin("train", folder / "healthy.mcap", "--model", "physical", "-o", folder / "physical.onnx")
+    assert result.exit_code == 0, result.output
+    return folder / "physical.onnx"
+
+
+def test_identify_finds_the_published_fan(folder):
+    told = json.loads(fantwin("identify", folder / "healthy.mcap", "--json").stdout)
+    (fan,) = told["fans"]
+    for name, published in zip(("J", "alpha", "C_D"), PUBLISHED_PARAMETERS, strict=True):
+        low, high = fan[f"{name}_95"]
+        assert low < fan[name] < high
+        assert fan[name] == pytest.approx(published, rel=0.15)
+    assert told["speed_unit"] == "rad/s"
+
+
+def test_identify_shows_a_row_for_each_fan(folder):
+    shown = fantwin("identify", folder / "two.mcap").stdout
+    assert "rmse" in shown
+    rows = [line.split() for line in shown.splitlines()]
+    assert [row[0] for row in rows if row and row[0].isdigit()] == ["0", "1"]
+
+
+@pytest.mark.parametrize("model", ["physical", "narx", "neural-ode", "hybrid"])
+def test_each_model_is_trained_and_its_file_evaluates_as_it_said(folder, tmp_path, model):
+    file = tmp_path / "twin.onnx"
+    arguments = ("--model", model, "--validate", folder / "held-out.mcap", "--iterations", "2", "--json")
+    told = json.loads(fantwin("train", folder / "healthy.mcap", *arguments, "-o", file).stdout)
+    assert (told["model"], told["twin"], told["judged_on"], told["fans"]) == (model, str(file), "held-out", 1)
+    evaluated = json.loads(fantwin("evaluate", file, folder / "held-out.mcap", "--json").stdout)
+    for figure in ("rmse", "max_error", "r2", "one_step_rmse", "coverage_2_sigma"):
+        assert evaluated[figure] == pytest.approx(told[figure], rel=1e-4), figure
+    assert evaluated["samples"] == 4000
+
+
+def test_a_good_twin_is_as_good_as_the_noise_lets_it(folder, twin):
+    told = json.loads(fantwin("evaluate", twin, folder / "held-out.mcap", "--json").stdout)
+    assert told["rmse"] == pytest.approx(np.sqrt(10), rel=0.05)
+    assert told["r2"] > 0.98
+    assert told["coverage_2_sigma"] == pytest.approx(0.954, abs=0.02)
+
+
+def test_figures_are_in_the_recordings_own_unit(folder, twin):
+    radians = json.loads(fantwin("evaluate", twin, folder / "healthy.mcap", "--json").stdout)
+    rpm = json.loads(fantwin("evaluate", twin, folder / "healthy-rpm.mcap", "--json").stdout)
+    assert (radians["speed_unit"], rpm["speed_unit"]) == ("rad/s", "rpm")
+    for figure in ("rmse", "max_error", "one_step_rmse"):
+        assert rpm[figure] == pytest.approx(radians[figure] * RPM)
+    for figure in ("r2", "coverage_2_sigma", "samples"):
+        assert rpm[figure] == radians[figure]
+    assert " rpm, max error " in fantwin("evaluate", twin, folder / "healthy-rpm.mcap").stdout
+
+
+def test_a_part_of_a_recording_can_be_used(folder, twin):
+    whole = json.loads(fantwin("evaluate", twin, folder / "healthy.mcap", "--json").stdout)
+    part = json.loads(fantwin("evaluate", twin, folder / "healthy.mcap", "--from", 10, "--to", 25, "--json").stdout)
+    assert (whole["samples"], part["samples"]) == (4000, 1500)
+    told = json.loads(
+        fantwin("train", folder / "healthy.mcap", "--to", 20, "--validate", folder / "healthy.mcap",
+                "--validate-from", 30, "--model", "physical", "-o", folder / "part.onnx", "--json").stdout
+    )  # fmt: skip
+    assert (told["judged_on"], told["samples"]) == ("held-out", 1000)
+
+
+def test_without_held_out_recordings_it_says_so(folder, tmp_path):
+    result = fantwin("train", folder / "healthy.mcap", "--model", "physical", "-o", tmp_path / "t.onnx")
+    assert "  training data, free run: rmse" in result.stdout
+
+
+def test_the_healthy_torque_balance_is_told(folder, tmp_path):
+    command = ("train", folder / "two.mcap", "--model", "physical", "--command-unit", "%", "-o", tmp_path / "t.onnx")
+    told = json.loads(fantwin(*command, "--json").stdout)
+    assert told["balance_source"] == ["physics"] * 2
+    low, high = sorted(told["balance_sigma"])
+    implied = PUBLISHED_PARAMETERS[0] * 3.0 * NOISE_RAD_S
+    assert (low, high) == (pytest.approx(implied, rel=0.1), pytest.approx(implied, rel=0.1))
+    line = f"  torque balance: healthy sigma {low:.4g} to {high:.4g} %; coefficients of 2 fan(s) by physics"
+    assert line in fantwin(*command).stdout.splitlines()
+
+
+def test_the_same_seed_gives_the_same_figures(folder, tmp_path):
+    def train(seed: int) -> dict:
+        arguments = ("--model", "neural-ode", "--iterations", 2, "--to", 15, "--seed", seed, "--json")
+        told = json.loads(fantwin("train", folder / "healthy.mcap", *arguments, "-o", tmp_path / "t.onnx").stdout)
+        del told["duration_s"]
+        return told
+
+    first = train(1)
+    assert train(1) == first
+    assert train(2)["rmse"] != first["rmse"]
+
+
+def test_each_fan_of_a_tray_is_evaluated_and_fans_can_be_chosen(folder, twin):
+    both = json.loads(fantwin("evaluate", twin, folder / "two.mcap", "--json").stdout)
+    one = json.loads(fantwin("evaluate", twin, folder / "two.mcap", "--fans", 1, "--json").stdout)
+    assert len(both["fans"]) == 2
+    assert one["fans"] == [both["fans"][1]]
+
+
+def test_what_is_damaged_in_a_recording_is_told(folder, twin, tmp_path):
+    whole = (folder / "healthy.mcap").read_bytes()
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(whole[:-100])
+    result = fantwin("evaluate", twin, torn, "--json")
+    assert json.loads(result.stdout)["samples"] == 4000
+    assert "torn.mcap: it breaks off" in result.stderr
+
+
+def test_what_cannot_be_done_is_told_in_one_line(folder, twin, tmp_path):
+    healthy, out = folder / "healthy.mcap", tmp_path / "t.onnx"
+    assert "in different units, rad/s" in said_instead("train", healthy, folder / "healthy-rpm.mcap", "-o", out)
+    assert "cannot read the recording" in said_instead("train", tmp_path / "nowhere.mcap", "-o", out)
+    assert "not a recording" in said_instead("evaluate", twin, twin)
+    assert "nowhere.onnx" in said_instead("evaluate", tmp_path / "nowhere.onnx", healthy)
+    assert "runs of [1, 2] fans are mixed" in said_instead("train", healthy, folder / "two.mcap", "-o", out)
+    (tmp_path / "file").touch()
+    unwritable = tmp_path / "file" / "t.onnx"
+    assert "cannot be made" in said_instead("train", healthy, "--model", "physical", "-o", unwritable)
+
+
+def test_nothing_is_overwritten_or_judged_by_mistake(folder, tmp_path):
+    healthy, physical = folder / "healthy.mcap", ("--model", "physical")
+    before = healthy.read_bytes()
+    assert "ends in .onnx" in said_instead("train", healthy, *physical, "-o", healthy)
+    assert healthy.read_bytes() == before
+    twin = tmp_path / "twin.onnx"
+    same = said_instead("train", healthy, "--validate", healthy, *physical, "-o", twin)
+    assert "judged by what it was learned from" in same
+    other_unit = said_instead("train", healthy, "--validate", folder / "healthy-rpm.mcap", *physical, "-o", twin)
+    assert "speeds in rpm, those to learn from in rad/s" in other_unit
+    assert not twin.exists()
+    parts = fantwin("train", healthy, "--to", 20, "--validate", healthy, "--validate-from", 20, *physical, "-o", twin)
+    assert parts.exit_code == 0, parts.output
+
+
+def test_outliers_are_left_out_alike_wherever_a_twin_is_judged(tmp_path):
+    run = published_run(7)
+    speed = run.speed_rad_s.copy()
+    speed[50::97] = 0.0
+    for name, part in (("learn", run.between(0.0, 25.0)), ("judge", run.between(25.0, 40.0))):
+        glitched = speed[:2500] if name == "learn" else speed[2500:]
+        record(tmp_path / f"{name}.mcap", Run(name, part.t_s, part.command, glitched))
+    twin, judge = tmp_path / "twin.onnx", tmp_path / "judge.mcap"
+    trained = fantwin(
+        "train", tmp_path / "learn.mcap", "--validate", judge, "--model", "physical", "-o", twin, "--json"
+    )
+    told = json.loads(trained.stdout)
+    evaluated = json.loads(fantwin("evaluate", twin, judge, "--json").stdout)
+    assert told["rmse"] == pytest.approx(evaluated["rmse"], rel=1e-6)
+    assert told["rmse"] < 1.05 * NOISE_RAD_S
+    assert any("of the speeds are outliers" in line for line in told["warnings"])
+    assert any("of the speeds are outliers" in line for line in evaluated["warnings"])
+
+
+def test_a_command_that_never_changes_is_told_in_one_line(tmp_path):
+    run = published_run(1, duration_s=5.0)
+    still = Run("still", run.t_s, np.full_like(run.command, 50.0), run.speed_rad_s)
+    path = record(tmp_path / "still.mcap", still)
+    assert "command" in said_instead("identify", path)
+
+
+@pytest.mark.parametrize("command", ["identify", "train", "evaluate"])
+def test_a_missing_extra_is_told_with_what_to_install(folder, twin, monkeypatch, command):
+    real_import = builtins.__import__
+
+    def without_the_extra(name: str, *arguments, **options):
+        if name.startswith("twin."):
+            raise ModuleNotFoundError("No module named 'onnx'", name="onnx")
+        return real_import(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without_the_extra)
+    arguments = {
+        "identify": (folder / "healthy.mcap",),
+        "train": (folder / "healthy.mcap", "-o", folder / "t.onnx"),
+        "evaluate": (twin, folder / "healthy.mcap"),
+    }[command]
+    assert said_instead(command, *arguments).endswith(".venv/bin/pip install -e '.[train]'")

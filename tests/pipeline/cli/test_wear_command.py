@@ -1,0 +1,186 @@
+"""`fantwin wear`: from recordings, and from a running site over a real bus."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.config.models import load_config
+from pipeline.recordings.writing import RecordingWriter
+from pipeline.runtime.runner import Runner
+from pipeline.runtime.stage import Core, Parts, Stage
+from schemas.messages import Header, Message, ScorerSnapshot
+from schemas.topics import tray_key
+from stages.scorer import ScorerConfig
+from tests.scoring.wear.test_wear_monitor import DAY_NS, GROWTH_PER_DAY, HEALTHY, LIMIT, WORN, core, live_through
+from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.running_chain import DEMO, SITE, TRAY
+from tests.support.scored_blocks import EPOCH_NS, note_of
+
+KEY = tray_key(SITE, TRAY, "snapshot")
+
+
+@pytest.fixture(scope="module")
+def notes() -> list[ScorerSnapshot]:
+    """What a scorer noted after three days and after six."""
+    worn, noted = core(), []
+    for number, (from_day, days) in enumerate(((0, 3), (3, 6))):
+        assert list(live_through(worn, days, from_day, swing=0.005)) == []
+        noted.append(replace(note_of(worn), header=Header("scorer-1", number, TRAY)))
+    return noted
+
+
+def recording(path: Path, notes: Sequence[ScorerSnapshot]) -> Path:
+    with RecordingWriter(path, {}) as writer:
+        for memory in notes:
+            writer.write_message(KEY, memory, memory.t_ns)
+    return path
+
+
+def rows(*words: object) -> dict[tuple[int, str], dict[str, Any]]:
+    done = fantwin("wear", *words, "--json")
+    assert done.exit_code == 0, done.exception
+    return {(row["fan"], row["parameter"]): row for row in json.loads(done.stdout)["wear"]}
+
+
+def test_a_recording_tells_what_wears_and_when_its_limit_is_reached(tmp_path, notes):
+    found = rows(recording(tmp_path / "r.mcap", notes))
+    assert sorted(found) == [(fan, name) for fan in (0, 1) for name in ("balance", "drag", "friction", "gain")]
+    balance = found[WORN, "balance"]
+    assert balance["t_ns"] == notes[-1].t_ns
+    assert balance["change"] == pytest.approx(6 * GROWTH_PER_DAY, rel=0.1)
+    assert balance["per_day"]["low"] < GROWTH_PER_DAY < balance["per_day"]["high"]
+    assert balance["limit"] == pytest.approx(LIMIT)
+    likely = (balance["reached_t_ns"]["likely"] - EPOCH_NS) / DAY_NS
+    assert likely == pytest.approx(LIMIT / GROWTH_PER_DAY, rel=0.1)
+    assert found[HEALTHY, "balance"]["reached_t_ns"] is None
+    assert found[HEALTHY, "balance"]["invalid_reason"]
+
+
+def test_parts_in_any_order_tell_what_was_known_last(tmp_path, notes):
+    first, second = (recording(tmp_path / f"{k}.mcap", [note]) for k, note in enumerate(notes))
+    assert rows(second, first) == rows(second)
+    assert rows(first) != rows(second)
+
+
+def test_people_are_shown_a_table(tmp_path, notes):
+    done = fantwin("wear", recording(tmp_path / "r.mcap", notes))
+    assert done.exit_code == 0
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith(f"wear of {TRAY} up to ")
+    (worn,) = [line for line in lines if line.lstrip().startswith("1  ")]
+    assert re.search(r"balance +\+0.3\d+ +\+0.0\d+ ± 0.0\d+ +in 6.\d days \(", worn)
+    assert not [line for line in lines if line.lstrip().startswith("drag") and "days" in line]
+    assert "balance, friction: command in %; drag, gain: % of healthy" in lines[-1]
+
+
+def never_quiet(note: ScorerSnapshot, *fans: int) -> ScorerSnapshot:
+    state = json.loads(note.state_json)
+    for fan in fans:
+        state["wear"]["fans"][fan]["t_ns"] = 0
+        for told in state["wear"]["fans"][fan]["parameters"].values():
+            series = told["series"]
+            told.clear()
+            told |= {"unit": "relative", "series": series}
+    return replace(note, state_json=json.dumps(state))
+
+
+def test_of_a_fan_that_was_never_quiet_nothing_is_shown(tmp_path, notes):
+    path = recording(tmp_path / "r.mcap", [never_quiet(notes[0], HEALTHY)])
+    assert {fan for fan, _ in rows(path)} == {WORN}
+    assert (
+        "nothing seen yet of fan 0: that takes one that is commissioned and then quiet" in fantwin("wear", path).stdout
+    )
+
+
+def test_where_no_fan_was_quiet_one_line_says_what_that_takes(tmp_path, notes):
+    path = recording(tmp_path / "r.mcap", [never_quiet(notes[0], HEALTHY, WORN)])
+    for words in ((), ("--json",)):
+        said = said_instead("wear", path, *words)
+        assert said.startswith(
+            f"nothing seen yet of any fan of {TRAY}: that takes one that is commissioned and then quiet"
+        )
+
+
+@pytest.mark.parametrize("state", ["{}", "no json", '{"wear": 3}', '{"wear": {"fans": [{}]}}'])
+def test_a_recording_without_wear_is_one_line(tmp_path, notes, state):
+    path = recording(tmp_path / "r.mcap", [replace(notes[0], state_json=state)])
+    assert said_instead("wear", path) == f"no wear in {path}: a scorer notes it each minute and at the end"
+
+
+def test_what_could_not_be_read_in_full_is_shown_as_far_as_it_is_known(tmp_path, notes):
+    path = recording(tmp_path / "r.mcap", notes[:1])
+    whole = path.read_bytes()
+    with RecordingWriter(tmp_path / "torn.mcap", {}) as writer:
+        writer.write_message(KEY, notes[0], notes[0].t_ns)
+        writer.flush()
+        torn = (tmp_path / "torn.mcap.active").read_bytes()
+    path.write_bytes(torn)
+    assert len(torn) < len(whole)
+    done = fantwin("wear", path, "--json")
+    assert done.exit_code == 3
+    assert json.loads(done.stdout)["wear"]
+    assert "it breaks off" in done.stderr
+
+
+class Noted(Core):
+    """Says what it was given."""
+
+    def __init__(self, notes: Sequence[ScorerSnapshot]) -> None:
+        self._notes = list(notes)
+
+    def step(self, item: object) -> Sequence[Message]:
+        return []
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        said, self._notes = self._notes, []
+        return said
+
+
+@pytest.fixture
+def site(endpoint: str, request: pytest.FixtureRequest, notes: list[ScorerSnapshot]) -> Iterator[tuple[object, ...]]:
+    """A scorer in a thread; the words that lead to its bus."""
+    core = Noted(notes if request.param else [])
+    stage = Stage(
+        name="scorer",
+        about="",
+        reads=("prediction", "request"),
+        writes=("snapshot",),
+        config=ScorerConfig,
+        build=lambda _context: Parts(core),
+    )
+    stop = threading.Event()
+    words = ("-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
+    runner = Runner(stage, load_config(DEMO / "demo.toml", [f"bus.endpoint='{endpoint}'"]), None, stop)
+    thread = threading.Thread(target=runner.run)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    thread.start()
+    yield words
+    stop.set()
+    thread.join(20)
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("site", [True], indirect=True)
+def test_a_running_site_tells_the_same(site, tmp_path, notes):
+    assert rows(*site) == rows(recording(tmp_path / "r.mcap", notes))
+
+
+@pytest.mark.parametrize("site", [False], indirect=True)
+def test_a_scorer_that_has_noted_nothing_yet_is_one_line(site):
+    assert said_instead("wear", *site) == "no scorer has noted anything so far: it does so each minute; ask again"
+
+
+def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, monkeypatch):
+    monkeypatch.setattr("pipeline.cli.watch.alarms._MEET_S", 0.3)
+    said = said_instead("wear", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
+    assert f"wear unknown: no scorer of site '{SITE}' answers at {endpoint}" in said

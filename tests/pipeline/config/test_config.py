@@ -1,0 +1,95 @@
+"""The configuration is checked before anything starts, and says what is wrong in one line."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.config.models import ConfigError, load_config, parse_config
+
+GOOD = """
+site = "lab"
+[[tray]]
+name = "a"
+fans = 8
+port = "/dev/ttyUSB0"
+[scorer]
+on_delay_s = 0.25
+"""
+
+
+def parse(text: str, *overrides: str):
+    return parse_config(text, Path("conf/fan.toml"), overrides)
+
+
+def test_a_good_file_gives_every_stage_its_section():
+    config = parse(GOOD)
+    assert config.site == "lab"
+    assert config.tray("a").fans == 8
+    assert config.sections["scorer"].model_dump()["on_delay_s"] == 0.25
+    assert set(config.sections) == {"acquisition", "resampler", "twin_integrator", "scorer", "recorder", "viewer"}
+    assert config.run_folder == Path("conf/runs")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (GOOD + "on_dealy_s = 1\n", ["scorer.on_dealy_s", "did you mean 'on_delay_s'"]),
+        (GOOD.replace("fans = 8", "fnas = 8"), ["tray.0.fnas", "did you mean 'fans'"]),
+        (GOOD.replace("[scorer]", "[scorrer]"), ["unknown key 'scorrer'", "did you mean 'scorer'"]),
+        (GOOD.replace("fans = 8", "fans = 99"), ["tray.0.fans = 99", "64"]),
+        (GOOD.replace("fans = 8\n", ""), ["'tray.0.fans' is missing"]),
+        (GOOD.replace('name = "a"', 'name = "health"'), ["reserved name"]),
+        ("site = 'x'\n", ["'tray' is missing"]),
+        ("site = \n", ["not valid TOML"]),
+        (GOOD.replace("0.25", "inf"), ["scorer.on_delay_s = inf", "finite"]),
+        (GOOD.replace("fans = 8", "fans = 8\nspeed_max = nan"), ["tray.0.speed_max = nan", "finite"]),
+        (GOOD + '[launcher]\nstages = ["scorr"]\n', ["unknown stage 'scorr'", "did you mean 'scorer'"]),
+        ("scorer = 3\n" + GOOD.replace("[scorer]\non_delay_s = 0.25", ""), ["'scorer' must be a section"]),
+    ],
+)
+def test_a_mistake_is_one_line_with_file_key_and_remedy(text, words):
+    with pytest.raises(ConfigError) as caught:
+        parse(text)
+    line = str(caught.value)
+    assert line.startswith("conf/fan.toml: ")
+    assert "\n" not in line
+    for word in words:
+        assert word in line
+
+
+def test_two_trays_of_one_name_are_refused():
+    with pytest.raises(ConfigError, match="same name"):
+        parse(GOOD + '[[tray]]\nname = "a"\nfans = 1\n')
+
+
+def test_overrides_set_nested_keys_and_keep_their_types():
+    config = parse(GOOD, "scorer.on_delay_s=2.5", "tray.0.port=/dev/ttyACM1", "bus.endpoint='tcp/127.0.0.1:1'")
+    assert config.sections["scorer"].model_dump()["on_delay_s"] == 2.5
+    assert config.tray("a").port == "/dev/ttyACM1"
+    assert config.bus.endpoint == "tcp/127.0.0.1:1"
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("on_delay", "KEY=VALUE"),
+        ("tray.4.port=x", "no such place"),
+        ("tray.².port=x", "no such place"),
+        ("run_folder='/tmp/it's here'", "not a TOML string"),
+    ],
+)
+def test_an_override_that_fits_nowhere_is_refused(override, words):
+    with pytest.raises(ConfigError, match=words):
+        parse(GOOD, override)
+
+
+def test_a_missing_file_is_one_line(tmp_path):
+    with pytest.raises(ConfigError, match="cannot read the configuration: No such file"):
+        load_config(tmp_path / "none.toml")
+
+
+def test_a_file_that_is_not_utf_8_is_one_line(tmp_path):
+    path = tmp_path / "fantwin.toml"
+    path.write_bytes('site = "Prüfstand"'.encode("latin-1"))
+    with pytest.raises(ConfigError, match=r"fantwin.toml: the configuration is not UTF-8 \(byte 10\)"):
+        load_config(path)

@@ -1,0 +1,205 @@
+"""pipeline.devices.device_clock: a drifting, wrapping device clock seen through a jittery line gives the time of the
+sample.
+
+Units: ns unless the name says us. A made-up device has a clock of its own; the truth is the host's time of the sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipeline.devices.device_clock import DRIFT_SPAN_NS, JUMP_NS, UINT32, DeviceClock, line_below
+from schemas.units import NS_PER_S
+
+EPOCH_NS = 1_700_000_000_000_000_000
+MS, US = 1_000_000, 1_000
+STEP_NS = 10 * MS
+LEAST_DELAY_NS = 300 * US
+
+
+@dataclass(frozen=True)
+class Line:
+    """What a device sent: its clock and the host's times of receipt, and what only the test knows: the true times."""
+
+    true_t_ns: NDArray[np.int64]
+    clock_us: NDArray[np.int64]
+    receive_t_ns: NDArray[np.int64]
+
+    def mapped(self, clock: DeviceClock | None = None) -> NDArray[np.int64]:
+        clock = clock or DeviceClock()
+        pairs = zip(self.clock_us.tolist(), self.receive_t_ns.tolist(), strict=True)
+        return np.array([clock.to_host_ns(us, t_ns) for us, t_ns in pairs])
+
+    def error_ns(self, clock: DeviceClock | None = None) -> NDArray[np.int64]:
+        """Against the truth plus the smallest delay, which nobody on this side can know."""
+        return self.mapped(clock) - self.true_t_ns - LEAST_DELAY_NS
+
+
+def sampled(
+    duration_s: float,
+    *,
+    drift: float = 0.0,
+    jitter_ms: float = 1.0,
+    stall_share: float = 0.0,
+    clock_starts_us: int = 0,
+    starts_ns: int = EPOCH_NS,
+    seed: int = 1,
+) -> Line:
+    """100 Hz; delays are exponential, some a 30 ms stall. A positive drift is a clock that runs slow."""
+    rng = np.random.default_rng(seed)
+    n = round(duration_s * 100)
+    true_t_ns = starts_ns + np.arange(n) * STEP_NS
+    clock_us = clock_starts_us + np.rint((true_t_ns - starts_ns) * (1 - drift) / US).astype(np.int64)
+    delay_ns = LEAST_DELAY_NS + rng.exponential(jitter_ms * MS, n) + 30 * MS * (rng.random(n) < stall_share)
+    receive_t_ns = np.maximum.accumulate(true_t_ns + delay_ns.astype(np.int64))
+    return Line(true_t_ns, clock_us % UINT32, receive_t_ns)
+
+
+def joined(*lines: Line) -> Line:
+    return Line(*(np.concatenate([getattr(line, name) for line in lines]) for name in Line.__dataclass_fields__))
+
+
+@pytest.mark.parametrize("drift", [200e-6, -200e-6, 5e-3])
+def test_a_drift_over_ten_minutes_leaves_a_small_error(drift: float) -> None:
+    clock = DeviceClock()
+    error_ns = sampled(600, drift=drift, jitter_ms=2.0, stall_share=0.02).error_ns(clock)
+    assert np.abs(error_ns[-30_000:]).max() < 100 * US
+    assert clock.drift == pytest.approx(drift / (1 - drift), abs=3e-6)  # per second of the device
+    assert clock.segments == 1
+
+
+def test_receive_time_alone_would_be_far_worse() -> None:
+    line = sampled(60, jitter_ms=2.0, stall_share=0.02)
+    assert np.abs(line.receive_t_ns - line.true_t_ns).max() > 30 * MS
+    assert np.abs(line.error_ns()).max() < 5 * MS
+
+
+def test_neighbours_keep_their_distance_to_some_ppm() -> None:
+    line = sampled(300, jitter_ms=2.0, stall_share=0.02)
+    stretch = np.diff(line.mapped()) / STEP_NS - 1
+    assert np.abs(stretch[6_000:]).max() < 60e-6  # two minutes of a better line arriving are over
+    assert np.abs(stretch).max() < 500e-6
+
+
+def test_a_better_line_is_approached_and_never_jumped_to() -> None:
+    late = Line(*(np.array([v]) for v in (EPOCH_NS, 0, EPOCH_NS + 400 * MS)))  # the first sample hung in a buffer
+    line = sampled(120, jitter_ms=0.1, starts_ns=EPOCH_NS + STEP_NS, clock_starts_us=10_000)
+    error_ns = joined(late, line).error_ns()
+    assert error_ns[1] > 390 * MS
+    assert np.abs(np.diff(error_ns)).max() <= 1.01 * STEP_NS * 0.01
+    assert np.abs(error_ns[-1_000:]).max() < 20 * MS
+
+
+def test_the_clock_wraps_unnoticed() -> None:
+    clock = DeviceClock()
+    error_ns = sampled(30, jitter_ms=0.1, clock_starts_us=UINT32 - 15_000_000).error_ns(clock)
+    assert clock.segments == 1
+    assert np.abs(error_ns).max() < 1 * MS
+
+
+@pytest.mark.parametrize("uptime_us", [5_000_000, 3_000_000_000])
+def test_a_device_that_restarts_begins_a_new_segment(uptime_us: int) -> None:
+    before = sampled(20, jitter_ms=0.1, clock_starts_us=uptime_us)
+    after = sampled(20, jitter_ms=0.1, starts_ns=EPOCH_NS + 25 * NS_PER_S)
+    clock = DeviceClock()
+    error_ns = joined(before, after).error_ns(clock)
+    assert clock.segments == 2
+    assert np.abs(error_ns).max() < 1 * MS
+
+
+def test_a_silence_in_which_the_clock_may_have_wrapped_begins_a_new_segment() -> None:
+    before = sampled(20, jitter_ms=0.1)
+    away_us = UINT32 + 30_000_000  # the clock looks as if half a minute had passed
+    after = sampled(20, jitter_ms=0.1, starts_ns=EPOCH_NS + away_us * US, clock_starts_us=away_us)
+    clock = DeviceClock()
+    assert np.abs(joined(before, after).error_ns(clock)).max() < 1 * MS
+    assert clock.segments == 2
+
+
+def test_a_silence_does_not_carry_a_correction_on() -> None:
+    late = Line(*(np.array([v]) for v in (EPOCH_NS, 0, EPOCH_NS + 400 * MS)))
+    before = sampled(5, jitter_ms=0.1, starts_ns=EPOCH_NS + STEP_NS, clock_starts_us=10_000)
+    after = sampled(5, jitter_ms=0.1, starts_ns=EPOCH_NS + 300 * NS_PER_S, clock_starts_us=300_000_000)
+    error_ns = joined(late, before, after).error_ns()
+    assert error_ns[501] - error_ns[500] < 0
+    assert error_ns[501] > error_ns[500] - 11 * MS  # one bucket's worth, not 300 s of it
+
+
+@pytest.mark.parametrize("set_by_s", [30, 3600, -3600])
+def test_a_host_clock_that_is_set_begins_a_new_segment(set_by_s: int) -> None:
+    line = sampled(60, jitter_ms=0.1)
+    shift_ns = np.where(np.arange(6000) >= 3000, set_by_s * NS_PER_S, 0)
+    moved = Line(line.true_t_ns + shift_ns, line.clock_us, line.receive_t_ns + shift_ns)
+    clock = DeviceClock()
+    error_ns = moved.error_ns(clock)
+    assert clock.segments == 2
+    assert np.abs(error_ns[-2_000:]).max() < 1 * MS
+
+
+def test_a_host_that_stalls_for_three_seconds_does_not_disturb_the_times() -> None:
+    line = sampled(60, jitter_ms=0.1)
+    stalled = (line.receive_t_ns > EPOCH_NS + 30 * NS_PER_S) & (line.receive_t_ns < EPOCH_NS + 33 * NS_PER_S)
+    receive_t_ns = np.where(stalled, EPOCH_NS + 33 * NS_PER_S, line.receive_t_ns)
+    clock = DeviceClock()
+    assert np.abs(Line(line.true_t_ns, line.clock_us, receive_t_ns).error_ns(clock)).max() < 1 * MS
+    assert clock.segments == 1
+
+
+def test_old_samples_that_come_again_change_nothing() -> None:
+    line = sampled(30, jitter_ms=0.1)
+    clock = DeviceClock()
+    times = line.mapped(clock)
+    old = Line(line.true_t_ns[-1500:], line.clock_us[-1500:], line.receive_t_ns[-1500:]).mapped(clock)
+    assert np.abs(old - times[-1500:]).max() < 100 * US
+    assert clock.segments == 1
+    assert clock.to_host_ns(int(line.clock_us[-1]) + 10_000, int(line.receive_t_ns[-1]) + STEP_NS) == pytest.approx(
+        int(times[-1]) + STEP_NS, abs=10 * US
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    drift=st.floats(-1e-3, 1e-3),
+    jitter_ms=st.floats(0.0, 5.0),
+    stall_share=st.floats(0.0, 0.2),
+    clock_starts_us=st.integers(0, UINT32 - 1),
+    seed=st.integers(0, 1000),
+)
+def test_times_rise_and_never_stray_beyond_the_delays(
+    drift: float, jitter_ms: float, stall_share: float, clock_starts_us: int, seed: int
+) -> None:
+    line = sampled(
+        20, drift=drift, jitter_ms=jitter_ms, stall_share=stall_share, clock_starts_us=clock_starts_us, seed=seed
+    )
+    clock = DeviceClock()
+    error_ns = line.error_ns(clock)
+    assert clock.segments == 1
+    assert (np.diff(line.mapped()) > 0).all()
+    first_delay_ns = line.receive_t_ns[0] - line.true_t_ns[0] - LEAST_DELAY_NS
+    assert np.abs(error_ns).max() <= first_delay_ns + 25 * MS
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 5 * NS_PER_S), st.integers(-50 * MS, 50 * MS)), min_size=2, max_size=60))
+def test_the_line_lies_below_all_points_and_touches_two(steps: list[tuple[int, int]]) -> None:
+    device_ns = np.cumsum([step for step, _ in steps])
+    device_ns = device_ns * max(1, -(-2 * DRIFT_SPAN_NS // int(device_ns[-1] - device_ns[0] + 1)))
+    points = [(int(x), y) for x, (_, y) in zip(device_ns, steps, strict=True)]
+    heights = [line_below(points, x, 0.0)[1] for x, _ in points]
+    above = [y - height for (_, y), height in zip(points, heights, strict=True)]
+    slope, _ = line_below(points, 0, 0.0)
+    if abs(slope) < 0.02:
+        assert min(above) > -1.0
+        assert sum(a < 1.0 for a in above) >= 2
+
+
+def test_a_jump_is_more_than_any_delay_that_is_tolerated() -> None:
+    clock = DeviceClock()
+    clock.to_host_ns(0, EPOCH_NS)
+    assert clock.to_host_ns(10_000, EPOCH_NS + STEP_NS + JUMP_NS // 2) == EPOCH_NS + STEP_NS

@@ -1,0 +1,264 @@
+"""The serial adapter on real pseudo-terminals: it waits, reads, writes, loses the device and finds it again."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+
+from pipeline.config.models import TrayConfig
+from pipeline.devices.byte_link import LinkDown, LinkUp, Received
+from pipeline.devices.serial_port import SerialPort
+from schemas.wire import CommandFrame, Decoder, Sample, encode
+from stages.acquisition import AcquisitionConfig, AcquisitionCore
+
+TIMEOUT_S = 20.0  # of a wait that normally ends at once
+T = TypeVar("T")
+
+
+class Device:
+    """The far end of a pseudo-terminal whose near end is found at `path` while it is plugged in."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._ends: tuple[int, int] | None = None
+
+    def plug_in(self) -> None:
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        self._ends = master, slave
+        self.path.symlink_to(os.ttyname(slave))
+
+    def unplug(self) -> None:
+        if self._ends:
+            self.path.unlink()
+            for end in self._ends:
+                os.close(end)
+            self._ends = None
+
+    def send(self, data: bytes) -> None:
+        assert self._ends
+        assert os.write(self._ends[0], data) == len(data)
+
+    def receive(self, size: int) -> bytes:
+        assert self._ends
+        data = b""
+        while len(data) < size:
+            data += os.read(self._ends[0], size - len(data))
+        return data
+
+
+class Items:
+    """What a line delivered, in order."""
+
+    def __init__(self) -> None:
+        self.queue: queue.Queue[LinkUp | LinkDown | Received] = queue.Queue()
+
+    def next(self, kind: type[T]) -> T:
+        item = self.queue.get(timeout=TIMEOUT_S)
+        assert isinstance(item, kind), item
+        return item
+
+    def bytes(self, size: int) -> bytes:
+        data = b""
+        while len(data) < size:
+            data += self.next(Received).data
+        return data
+
+    def skip_until(self, kind: type[T]) -> T:
+        while not isinstance(item := self.queue.get(timeout=TIMEOUT_S), kind):
+            pass
+        return item
+
+    def rest(self) -> list[LinkUp | LinkDown | Received]:
+        return [self.queue.get_nowait() for _ in range(self.queue.qsize())]
+
+
+@pytest.fixture
+def device(tmp_path: Path) -> Iterator[Device]:
+    device = Device(tmp_path / "ttyFAN")
+    yield device
+    device.unplug()
+
+
+@pytest.fixture
+def line(device: Device) -> Iterator[SerialPort]:
+    line = SerialPort(str(device.path), 115200)
+    yield line
+    line.stop()
+
+
+def test_bytes_come_with_the_host_s_time_after_word_that_the_line_is_up(device: Device, line: SerialPort) -> None:
+    device.plug_in()
+    items = Items()
+    line.start(items.queue.put)
+    assert items.next(LinkUp) == LinkUp(str(device.path))
+    before_ns = time.time_ns()
+    device.send(b"hello")
+    received = items.next(Received)
+    assert before_ns <= received.t_ns <= time.time_ns()
+    assert received.data + items.bytes(5 - len(received.data)) == b"hello"
+
+
+def test_every_byte_value_passes_unchanged_in_both_directions(device: Device, line: SerialPort) -> None:
+    device.plug_in()
+    items = Items()
+    line.start(items.queue.put)
+    items.next(LinkUp)
+    everything = bytes(range(256)) * 2
+    device.send(everything)
+    assert items.bytes(512) == everything
+    assert line.write(everything)
+    assert device.receive(512) == everything
+
+
+def test_a_port_that_is_not_there_yet_is_told_once_and_waited_for(device: Device, line: SerialPort) -> None:
+    items = Items()
+    line.start(items.queue.put)
+    assert items.next(LinkDown).reason == "no such port; waiting for it; check [[tray]] port"
+    assert not line.write(b"to nobody")
+    device.plug_in()
+    items.next(LinkUp)
+    device.send(b"here")
+    assert items.bytes(4) == b"here"
+
+
+def test_what_is_not_a_serial_port_is_told_and_waited_for(device: Device, line: SerialPort) -> None:
+    device.path.write_text("a file")
+    items = Items()
+    line.start(items.queue.put)
+    reason = items.next(LinkDown).reason
+    assert reason.startswith("cannot be opened (")
+    assert reason.endswith("check [[tray]] port and baud")
+    device.path.unlink()
+    assert items.next(LinkDown).reason.startswith("no such port"), "another reason is told too"
+    device.plug_in()
+    items.next(LinkUp)
+
+
+def test_a_port_in_use_is_told_and_taken_when_it_is_free(device: Device, line: SerialPort) -> None:
+    device.plug_in()
+    first, items = Items(), Items()
+    other = SerialPort(str(device.path), 115200)
+    other.start(first.queue.put)
+    first.next(LinkUp)
+    line.start(items.queue.put)
+    assert items.next(LinkDown).reason == "in use by another program; stop that one"
+    other.stop()
+    items.next(LinkUp)
+
+
+def test_a_device_may_vanish_and_return_more_than_once(device: Device, line: SerialPort) -> None:
+    items = Items()
+    device.plug_in()
+    line.start(items.queue.put)
+    items.next(LinkUp)
+    for turn in range(3):
+        device.send(b"turn %d" % turn)
+        assert items.bytes(6) == b"turn %d" % turn
+        device.unplug()
+        assert items.next(LinkDown).reason == "the device has gone; waiting for it to come back"
+        if turn == 1:
+            assert items.next(LinkDown).reason.startswith("no such port")
+        device.plug_in()
+        items.skip_until(LinkUp)
+
+
+def test_stop_delivers_what_had_arrived_and_then_nothing_more(device: Device) -> None:
+    device.plug_in()
+    items = Items()
+    line = SerialPort(str(device.path), 115200)
+    stopper = threading.Thread(target=line.stop)
+    data = os.urandom(3000)
+
+    def deliver(item: LinkUp | LinkDown | Received) -> None:
+        items.queue.put(item)
+        if isinstance(item, Received) and not stopper.ident:  # as a stage that is behind while it is told to stop
+            device.send(data)
+            stopper.start()
+            assert line._stopping.wait(TIMEOUT_S)
+
+    line.start(deliver)
+    items.next(LinkUp)
+    device.send(b"!")
+    items.next(Received)
+    assert items.bytes(len(data)) == data
+    stopper.join(TIMEOUT_S)
+    device.send(b"too late")
+    assert items.rest() == []
+    assert not line.write(b"too late")
+
+
+def test_stop_ends_although_the_device_never_pauses(device: Device) -> None:
+    device.plug_in()
+    line = SerialPort(str(device.path), 115200)
+    items = Items()
+
+    def deliver(item: LinkUp | LinkDown | Received) -> None:
+        items.queue.put(item)
+        device.send(b"and on")
+
+    line.start(deliver)
+    items.next(LinkUp)
+    items.next(Received)
+    line.stop()
+    assert items.rest()
+
+
+def test_stop_ends_a_line_that_never_came_up(line: SerialPort) -> None:
+    items = Items()
+    line.start(items.queue.put)
+    items.next(LinkDown)
+    line.stop()
+    assert items.rest() == []
+
+
+def test_a_device_that_takes_no_bytes_makes_write_say_so_instead_of_blocking(device: Device, line: SerialPort) -> None:
+    device.plug_in()
+    items = Items()
+    line.start(items.queue.put)
+    items.next(LinkUp)
+    assert not all(line.write(bytes(4096)) for _ in range(100)), "a terminal holds less than that"
+
+
+def test_samples_go_on_after_the_device_was_away_and_health_says_so_meanwhile(device: Device, line: SerialPort) -> None:
+    tray = TrayConfig(name="bench", fans=1, port=str(device.path))
+    core = AcquisitionCore(tray, AcquisitionConfig(), line, started_t_ns=time.time_ns())
+    items = Items()
+    sequences: list[int] = []
+
+    def sequence(number: int) -> bytes:
+        return encode("binary", Sample(number * 10_000, number, (0.5,), (100.0,)))
+
+    def step_until(wanted: int) -> None:
+        while wanted not in sequences:
+            sequences.extend(int(raw.device_sequence[0]) for raw in core.step(items.queue.get(timeout=TIMEOUT_S)))
+
+    device.plug_in()
+    line.start(items.queue.put)
+    core.step(items.next(LinkUp))
+    device.send(sequence(0) + sequence(1) + sequence(2)[:9])
+    step_until(1)
+    device.unplug()
+    while not core.problem():
+        core.step(items.queue.get(timeout=TIMEOUT_S))
+    assert core.problem().startswith(f"{device.path}: ")
+    device.plug_in()
+    while core.problem():
+        core.step(items.queue.get(timeout=TIMEOUT_S))
+    device.send(sequence(4)[9:] + sequence(5) + sequence(6))
+    step_until(6)
+    assert sequences == [0, 1, 5, 6]
+    counters = core.counters()
+    assert (counters["lost_on_line"], counters["line_up"], counters["resync"]) == (3, 2, 1)
+    assert "torn" not in counters
+    assert line.write(encode("binary", CommandFrame((0.25,))))
+    command = encode("binary", CommandFrame((0.25,)))
+    assert Decoder("binary", 1, "device").feed(device.receive(len(command))) == [CommandFrame((0.25,))]

@@ -1,0 +1,197 @@
+"""`fantwin up`: all stages from one file, stopped in the order of the data, or not started at all."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+from pipeline.config.models import load_config
+from pipeline.errors import UserError
+from pipeline.launch.launcher import Launcher, Outcome
+from pipeline.launch.processes import process_list
+from pipeline.recordings.reading import read_recording
+from schemas.messages import Grid, Prediction, Raw, Score
+from schemas.topics import alive_key, tray_key
+from tests.support.running_chain import DEMO, SITE, TRAY, Chain, eventually, fantwin, is_running, published, view_of
+
+
+@pytest.fixture
+def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
+    chain = Chain(tmp_path, endpoint, viewer=False)
+    try:
+        yield chain
+    finally:
+        chain.close()
+
+
+def samples(path: Path) -> Counter[str]:
+    """Samples of each topic, repeats not counted."""
+    times: dict[str, set[int]] = {}
+    for entry in read_recording(path):
+        message = entry.message
+        if isinstance(message, Raw):
+            times.setdefault("raw", set()).update(message.device_sequence.tolist())
+        elif isinstance(message, Grid | Prediction | Score):
+            times.setdefault(entry.topic, set()).update(message.t_ns.tolist())
+    return Counter({topic: len(found) for topic, found in times.items()})
+
+
+@pytest.mark.slow
+def test_ctrl_c_stops_in_order_and_everything_sent_is_recorded_and_scored(chain):
+    chain.start_tray()
+    up = chain.start_up()
+    with chain.watcher() as watcher:
+        eventually(lambda: published(view_of(watcher, "scorer")) > 200, "scores flow")
+    status = up.end(signal.SIGINT)  # while the tray is sending
+    assert chain.tray and chain.tray.end() == 0
+    account, sent = up.output(), chain.tray.output()
+    assert status == 0, up.lines
+    assert account == {
+        "run_folder": str(chain.folder),
+        "restarts": {},
+        "killed": [],
+        "failed": [],
+        "lost": dict.fromkeys(sorted(chain.stages), 0),
+    }
+    assert not any(map(is_running, chain.process_ids().values()))
+    (recording,) = chain.recordings()
+    found = samples(recording)
+    assert found["raw"] == sent["samples_sent"]
+    assert found["grid"] == found["prediction"] == found["score"] > 200
+    with recording.open("rb") as file:
+        summary = make_reader(file).get_summary()  # a plain reader, which wants a whole file
+    assert summary is not None
+    topics = {channel.topic for channel in summary.channels.values()}
+    assert {tray_key(SITE, TRAY, name) for name in ("raw", "grid", "prediction", "score", "twin")} <= topics
+
+
+@pytest.mark.slow
+def test_a_stage_that_cannot_start_ends_all_with_one_line(tmp_path, endpoint):
+    chain = Chain(tmp_path, endpoint, "tray.0.twin='none.onnx'", viewer=False)
+    try:
+        up = chain.start_up()
+        assert up.process.wait(60) == 1
+        up.kill()
+        errors = [line for line in up.lines if line.startswith("fantwin:")]
+        assert errors == [
+            f"fantwin: {DEMO}/none.onnx: cannot read the twin: No such file or directory; correct [[tray]] twin"
+        ]
+        assert "Traceback" not in "\n".join(up.lines)
+        started = chain.process_ids()
+        assert "twin_integrator" in started
+        assert not any(map(is_running, started.values()))
+    finally:
+        chain.close()
+
+
+def test_a_wrong_configuration_is_one_line_before_anything_starts(tmp_path, endpoint):
+    done = fantwin(*Chain(tmp_path, endpoint, "scorer.on_dealy_s=1").words("up"))
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "did you mean 'on_delay_s'" in done.stderr
+
+
+def test_the_process_list_has_one_acquisition_for_each_tray_in_the_order_of_the_data(tmp_path):
+    file = tmp_path / "two.toml"
+    trays = "".join(f'[[tray]]\nname = "{name}"\nfans = 2\n' for name in ("a", "b"))
+    file.write_text('[launcher]\nstages = ["scorer", "acquisition", "resampler"]\n' + trays)
+    assert [row.label for row in process_list(load_config(file))] == [
+        "acquisition/a",
+        "acquisition/b",
+        "resampler",
+        "scorer",
+    ]
+
+
+@pytest.mark.slow
+def test_told_to_stop_before_all_is_ready_it_starts_no_source(chain):
+    """The sources come last: what they would bring could go nowhere."""
+    stop = threading.Event()
+    said: list[str] = []
+
+    def say(line: str) -> None:
+        said.append(line)
+        if line.startswith("resampler: started"):
+            stop.set()
+
+    outcome = Launcher(load_config(DEMO / "demo.toml", chain.settings), chain.settings, say).run(stop)
+    assert outcome.killed == []
+    assert [line.split(":")[0] for line in said if ": started" in line] == [
+        "recorder",
+        "scorer",
+        "twin_integrator",
+        "resampler",
+    ]
+
+
+class LateBus:
+    """Who comes second meets the sessions of `site` so much later, by a clock that goes on while it waits."""
+
+    def __init__(self, site: str, after_s: float, *, came_second: bool = True) -> None:
+        self.came_second = came_second
+        self.now_s = 100.0
+        self._met_s = 100.0 + after_s
+        self._site = site
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def wait(self, seconds: float) -> bool:
+        """As an event that is never set."""
+        self.now_s += seconds
+        return False
+
+    def alive(self, _key: str) -> set[str]:
+        return {alive_key(self._site, "scorer", "all")} if self.now_s >= self._met_s else set()
+
+
+def refuse_a_second(bus: Any, monkeypatch: pytest.MonkeyPatch, mode: str = "peer") -> float:
+    """How long it took to find nobody."""
+    monkeypatch.setattr("pipeline.launch.launcher.time", bus)
+    config = load_config(DEMO / "demo.toml", [f"bus.mode='{mode}'"])
+    Launcher(config, (), lambda _line: None)._refuse_a_second(bus, bus)
+    return bus.now_s - 100.0
+
+
+def test_a_second_up_looks_out_for_ours_for_ten_seconds(monkeypatch):
+    with pytest.raises(UserError, match=r"site 'demo' already runs at \S+ \(scorer\): stop that"):
+        refuse_a_second(LateBus(SITE, after_s=9.0), monkeypatch)
+    assert refuse_a_second(LateBus(SITE, after_s=99.0), monkeypatch) == pytest.approx(10.0, abs=0.1)
+
+
+def test_once_another_site_is_met_ours_would_be_met_as_well(monkeypatch):
+    assert refuse_a_second(LateBus("other", after_s=1.0), monkeypatch) == pytest.approx(3.0, abs=0.1)
+    assert refuse_a_second(LateBus("", after_s=99.0), monkeypatch, mode="client") == pytest.approx(2.0, abs=0.1)
+
+
+def test_who_comes_first_waits_for_nobody(monkeypatch):
+    assert refuse_a_second(LateBus(SITE, after_s=1.0, came_second=False), monkeypatch) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("outcome", "code"),
+    [
+        (Outcome(), 0),
+        (Outcome(restarts={"scorer": 1}, lost={"scorer": 0}), 0),
+        (Outcome(lost={"scorer": 0, "resampler": 4}), 3),
+        (Outcome(killed=["viewer"], lost={"resampler": 4}), 1),
+    ],
+)
+def test_the_exit_code_says_whether_anything_was_lost(outcome, code):
+    assert outcome.exit_code == code
+
+
+def test_who_is_stopped_while_it_looks_looks_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus: Any = LateBus("elsewhere", 5.0)
+    monkeypatch.setattr("pipeline.launch.launcher.time", bus)
+    stop = threading.Event()
+    stop.set()
+    Launcher(load_config(DEMO / "demo.toml"), (), lambda _line: None)._refuse_a_second(bus, stop)
+    assert bus.now_s == 100.0

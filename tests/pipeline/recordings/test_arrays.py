@@ -1,0 +1,284 @@
+"""Recordings as arrays: every row of a topic once, as it was sent, in blocks that do not grow with the file."""
+
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.recordings import read_arrays
+from pipeline.recordings.arrays import WORDS, Arrays, Block, block_columns, read_topics
+from pipeline.recordings.order import Seen
+from pipeline.recordings.reading import RecordingError
+from pipeline.recordings.writing import RecordingWriter
+from schemas.messages import (
+    MESSAGE_TYPES,
+    Alarm,
+    Array,
+    Command,
+    Counter,
+    Grid,
+    Header,
+    Health,
+    InvalidReason,
+    Message,
+    ModelCard,
+    Raw,
+    Severity,
+    StageStatus,
+)
+from schemas.topics import health_key, tray_key
+from tests.support.score_data import made_up_tray
+
+
+def key_of(message: Message, site: str = "plant") -> str:
+    if isinstance(message, Health):
+        return health_key(site, message.stage, message.instance)
+    topic = {Raw: "raw", Grid: "grid", Alarm: "alarm", Command: "command", ModelCard: "twin"}.get(
+        type(message), "score"
+    )
+    return tray_key(site, message.header.tray, topic)
+
+
+def write(path: Path, messages: Iterable[Message], metadata: dict[str, str] | None = None, start: int = 1) -> Path:
+    with RecordingWriter(path, metadata or {"site": "plant"}, overwrite=True) as writer:
+        for number, message in enumerate(messages, start):
+            writer.write_message(key_of(message), message, number)
+    return path
+
+
+def raw(
+    sequence: int, *, samples: int = 10, fans: int = 2, tray: str = "tray1", producer: str = "a", clock: bool = True
+) -> Raw:
+    numbers = np.random.default_rng(sequence)
+    count = np.arange(samples if clock else 0)
+    return Raw(
+        header=Header(producer, sequence, tray),
+        fans=fans,
+        host_receive_t_ns=np.arange(samples) + sequence * samples,
+        device_clock_us=count,
+        device_sequence=count,
+        command=numbers.normal(size=(samples, fans)),
+        speed_rad_s=numbers.normal(size=(samples, fans)),
+    )
+
+
+def alarm(sequence: int) -> Alarm:
+    return Alarm(
+        header=Header("s", sequence, "tray1"),
+        fan=sequence,
+        active=sequence % 2 == 0,
+        severity=Severity.ALARM,
+        t_ns=70 + sequence,
+        onset_t_ns=50,
+        residual_rad_s=3.5,
+        limit_rad_s=2.0,
+        message=f"alarm {sequence}",
+    )
+
+
+def together(blocks: Iterable[Block], name: str) -> Array:
+    return np.concatenate([block[name] for block in blocks])
+
+
+def times(arrays: Arrays) -> list[int]:
+    return together(arrays, "host_receive_t_ns").tolist()
+
+
+def test_the_columns_are_those_of_the_messages(tmp_path):
+    scores, _ = made_up_tray(seconds=2, gap_s=(1.0, 1.5))
+    (block,) = read_arrays(write(tmp_path / "r.mcap", scores), "score")
+    assert (block.site, block.tray, block.topic, block.fans, len(block)) == ("plant", "tray1", "score", 3, 200)
+    assert list(block.columns) == list(block_columns(type(scores[0])))
+    assert next(iter(block.columns)) == "t_ns"
+    for name, column in block_columns(type(scores[0])).items():
+        if not column.once:
+            np.testing.assert_array_equal(block[name], np.concatenate([getattr(s, name) for s in scores]), name)
+            assert block[name].dtype == column.dtype
+    assert block["measured_speed_rad_s"].shape == (200, 3)
+    assert set(block["period_ns"]) == {scores[0].period_ns}
+    assert set(block["producer"]) == {"test"}
+    assert WORDS["invalid_reason"](block["invalid_reason"][120, 1]) == InvalidReason.GAP
+    assert np.isnan(block["measured_speed_rad_s"][120, 1])
+
+
+@pytest.mark.parametrize(("rows", "lengths"), [(1, [10] * 7), (20, [20, 20, 20, 10]), (25, [30, 30, 10]), (1000, [70])])
+def test_blocks_have_the_rows_asked_for_or_a_little_more(tmp_path, rows, lengths):
+    path = write(tmp_path / "r.mcap", (raw(n) for n in range(7)))
+    blocks = list(read_arrays(path, "raw", rows=rows))
+    assert [len(block) for block in blocks] == lengths
+    assert together(blocks, "host_receive_t_ns").tolist() == list(range(70))
+    np.testing.assert_array_equal(
+        together(blocks, "speed_rad_s"), np.concatenate([raw(n).speed_rad_s for n in range(7)])
+    )
+
+
+def test_trays_come_apart_and_one_can_be_chosen(tmp_path):
+    both = [raw(n, tray=tray, fans=fans) for n in range(5) for tray, fans in (("left", 2), ("right", 3))]
+    path = write(tmp_path / "r.mcap", both)
+    blocks = list(read_arrays(path, "raw", rows=20))
+    assert [(block.tray, block.fans, len(block)) for block in blocks] == [
+        ("left", 2, 20),
+        ("right", 3, 20),
+        ("left", 2, 20),
+        ("right", 3, 20),
+        ("left", 2, 10),
+        ("right", 3, 10),
+    ]
+    (right,) = read_arrays(path, "raw", tray="right")
+    np.testing.assert_array_equal(right["command"], np.concatenate([raw(n, fans=3).command for n in range(5)]))
+    assert list(read_arrays(path, "raw", tray="nobody")) == []
+
+
+def test_a_block_ends_where_the_form_of_the_messages_changes(tmp_path):
+    messages = [raw(0), raw(1, clock=False), raw(2, clock=False), raw(3, clock=False, fans=4)]
+    blocks = list(read_arrays(write(tmp_path / "r.mcap", messages), "raw"))
+    assert [(len(b), b.fans, len(b["device_clock_us"])) for b in blocks] == [(10, 2, 10), (20, 2, 0), (10, 4, 0)]
+
+
+def test_an_event_is_a_row(tmp_path):
+    nan = np.nan
+    path = write(
+        tmp_path / "r.mcap",
+        [
+            alarm(0),
+            Command(header=Header("c", 0, "tray1"), fans=2, t_ns=5, command=np.array([1, nan])),
+            ModelCard(
+                t_ns=6, twin="t", kind="hybrid", sha256="00", sigma_rad_s=np.ones(2), header=Header("t", 0, "tray1")
+            ),
+            alarm(1),
+        ],
+    )
+    (alarms,) = read_arrays(path, "alarm")
+    assert (len(alarms), alarms.fans) == (2, 0)
+    assert alarms.t_ns.tolist() == [70, 71]
+    assert alarms["fan"].tolist() == [0, 1]
+    assert alarms["active"].tolist() == [True, False]
+    assert alarms["message"].tolist() == ["alarm 0", "alarm 1"]
+    assert [WORDS["severity"](code).name for code in alarms["severity"]] == ["ALARM", "ALARM"]
+    (commands,) = read_arrays(path, "command")
+    np.testing.assert_array_equal(commands["command"], [[1, nan]])
+    assert commands["set_point_rad_s"].size == 0
+    (twins,) = read_arrays(path, "twin")
+    assert (twins.fans, twins["kind"].tolist(), twins["sigma_rad_s"].tolist()) == (2, ["hybrid"], [[1, 1]])
+
+
+def test_health_is_of_no_tray_and_comes_in_the_order_it_was_received(tmp_path):
+    healths = [
+        Health(
+            header=Header(stage, number, ""),
+            stage=stage,
+            instance="all",
+            status=StageStatus.OK,
+            t_ns=number,
+            uptime_s=1.0,
+            counters=(Counter(name="lost_frames", value=3),),
+        )
+        for number in range(2)
+        for stage in ("scorer", "resampler")
+    ]
+    (block,) = read_arrays(write(tmp_path / "r.mcap", healths), "health", tray="tray1")
+    assert (block.tray, block["stage"].tolist()) == ("", ["scorer", "resampler"] * 2)
+    assert "counters" not in block.columns
+
+
+def test_every_topic_can_be_told_apart_by_its_time():
+    for kind in MESSAGE_TYPES:
+        time, *others = block_columns(kind)
+        assert time == ("host_receive_t_ns" if kind is Raw else "t_ns")
+        assert others[-1] == "producer"
+
+
+def test_several_topics_are_read_in_one_go(tmp_path):
+    path = write(tmp_path / "r.mcap", [raw(0), alarm(0), raw(1)])
+    assert [(block.topic, len(block)) for block in read_topics([path], ("raw", "alarm"))] == [("raw", 20), ("alarm", 1)]
+
+
+def test_parts_are_one_recording_whatever_their_order_and_what_is_in_two_counts_once(tmp_path):
+    first = write(tmp_path / "z.mcap", (raw(n) for n in range(6)))
+    second = write(tmp_path / "a.mcap", (raw(n) for n in range(4, 9)), start=100)
+    third = write(tmp_path / "b.mcap", (raw(n, producer="b") for n in range(9, 11)), start=200)
+    arrays = read_arrays([third, second, first], "raw")
+    assert times(arrays) == [*range(90), *range(90, 110)]
+    assert arrays.duplicated == 2
+    assert times(read_arrays([first, first], "raw")) == list(range(60))
+
+
+def test_producers_and_keys_count_their_messages_apart(tmp_path):
+    messages = [raw(0, producer="a"), raw(0, producer="b"), raw(0, tray="other")]
+    arrays = read_arrays(write(tmp_path / "r.mcap", messages), "raw")
+    assert (sum(len(block) for block in arrays), arrays.duplicated) == (30, 0)
+
+
+@given(st.lists(st.integers(0, 30)))
+def test_a_sequence_number_is_new_once_in_any_order(sequences):
+    seen, known = Seen(), set()
+    for sequence in sequences:
+        assert seen.is_new(sequence) == (sequence not in known)
+        known.add(sequence)
+    assert len(seen._first) == sum(1 for sequence in known if sequence - 1 not in known)
+
+
+def test_what_is_a_recording_in_itself_is_no_part_of_another(tmp_path):
+    made = [write(tmp_path / f"{n}.mcap", [raw(0)], {"source": "table.csv"}) for n in (1, 2)]
+    with pytest.raises(RecordingError, match=r"1\.mcap: made by .* so no part of another"):
+        read_arrays(made, "raw")
+    assert times(read_arrays(made[0], "raw")) == list(range(10))
+
+
+def test_it_can_be_gone_through_again(tmp_path):
+    arrays = read_arrays(write(tmp_path / "r.mcap", [raw(0), raw(0), raw(1)]), "raw")
+    assert times(arrays) == times(arrays)
+    assert arrays.duplicated == 1
+
+
+def test_a_torn_part_is_read_up_to_where_it_tears_and_said_to_be(tmp_path):
+    whole = write(tmp_path / "whole.mcap", (raw(n) for n in range(900)))
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    after = write(tmp_path / "after.mcap", (raw(n) for n in range(900, 910)), start=5000)
+    arrays = read_arrays([torn, after], "raw")
+    found = times(arrays)
+    assert 0 < len(found) < 9000
+    assert found[-100:] == list(range(9000, 9100))
+    assert [line.split(":")[0] for line in arrays.damage] == [str(torn)]
+    assert "breaks off" in arrays.damage[0]
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path):
+    def peak(messages: int) -> int:
+        """Bytes at most while all blocks of a recording are gone through, one at a time."""
+        path = write(tmp_path / "r.mcap", (raw(n, samples=100, fans=16) for n in range(messages)))
+        tracemalloc.start()
+        rows = sum(len(block) for block in read_arrays(path, "raw", rows=500))
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert rows == 100 * messages
+        return most
+
+    peak(5)  # what is imported and cached on first use
+    short, long = peak(60), peak(360)
+    in_the_long_one = 360 * raw(0, samples=100, fans=16).speed_rad_s.nbytes * 2
+    assert long < 1.5 * short  # six times as many messages
+    assert long < in_the_long_one / 4
+
+
+def test_what_cannot_be_read_is_told_in_one_line(tmp_path):
+    path = write(tmp_path / "r.mcap", [raw(0)])
+    with pytest.raises(RecordingError, match=r"no topic is called 'scor'; known: raw, grid, prediction, score"):
+        read_arrays(path, "scor")
+    with pytest.raises(RecordingError, match=r"none\.mcap: cannot read the recording: No such file"):
+        read_arrays(tmp_path / "none.mcap", "raw")
+    with pytest.raises(RecordingError, match=r"none\.mcap: cannot read the recording: No such file"):
+        read_arrays([path, tmp_path / "none.mcap"], "raw")
+
+
+def test_stages_that_read_recordings_load_nothing_of_pandas_or_arrow():
+    program = "import sys, pipeline.recordings; print(*{'pandas', 'pyarrow', 'rerun', 'torch'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

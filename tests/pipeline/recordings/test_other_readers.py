@@ -1,0 +1,210 @@
+"""Recordings in other people's readers: whole ones with index and summary, torn ones as far as each reader goes."""
+
+import json
+import shutil
+import struct
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
+
+from pipeline.recordings.writing import ACTIVE_SUFFIX, RecordingWriter
+from schemas.messages import Alarm, Command, Header, Message, Raw, Score
+from tests.pipeline.recordings.test_arrays import alarm, key_of, raw
+from tests.support.score_data import made_up_tray
+
+METADATA = {"site": "plant", "trays": "tray1", "speed_unit": "rpm"}
+ATTACHMENTS = {"configuration.toml": b"site = 'plant'\n", "tray1.onnx": bytes(range(256)) * 40}
+START_NS = 1_700_000_000_000_000_000
+SCORE = "fantwin/plant/tray1/score"
+RAWS = 400
+
+RERUN = shutil.which("rerun", path=Path(sys.executable).parent)
+MCAP = shutil.which("mcap")
+needs_rerun = pytest.mark.skipif(RERUN is None, reason="the extra `view` is not installed")
+needs_mcap = pytest.mark.skipif(
+    MCAP is None, reason="the mcap command line (a Go program, on no package index) is not installed"
+)
+
+
+@dataclass(frozen=True)
+class Files:
+    """A whole recording, what a killed recorder left of it, and how many messages of each key are in each."""
+
+    whole: Path
+    torn: Path
+    in_whole: Counter[str]
+    in_torn: Counter[str]
+
+
+def messages() -> list[Message]:
+    scores, _ = made_up_tray(seconds=2, gap_s=(1.0, 1.5))
+    command = Command(header=Header("c", 0, "tray1"), fans=2, t_ns=5, command=np.array([0.5, np.nan]))
+    return [command, *(raw(n) for n in range(RAWS)), *scores, alarm(0), alarm(1)]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    folder = tmp_path_factory.mktemp("recordings")
+    sent = messages()
+    keys = [key_of(message) for message in sent]
+    with RecordingWriter(folder / "whole.mcap", METADATA, ATTACHMENTS, t_ns=START_NS) as writer:
+        for number, message in enumerate(sent):
+            writer.write_message(keys[number], message, START_NS + number)
+    with pytest.raises(KeyboardInterrupt), RecordingWriter(folder / "r.mcap", METADATA, ATTACHMENTS) as writer:
+        for number, message in enumerate(sent):
+            writer.write_message(keys[number], message, START_NS + number)
+            if number == RAWS + 10:
+                writer.flush()
+            if number == RAWS + 15:  # what is on the disk at this moment is what a kill -9 would leave
+                shutil.copy(folder / f"r.mcap{ACTIVE_SUFFIX}", folder / "torn.mcap")
+                raise KeyboardInterrupt
+    return Files(folder / "whole.mcap", folder / "torn.mcap", Counter(keys), Counter(keys[: RAWS + 11]))
+
+
+def run(*words: object, code: int = 0) -> str:
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stderr
+    return done.stdout
+
+
+# ---- the mcap library for Python
+
+
+def test_mcap_finds_index_statistics_attachments_and_metadata(files):
+    with files.whole.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        topics = {channel.id: channel.topic for channel in summary.channels.values()}
+        counts = {topics[number]: count for number, count in summary.statistics.channel_message_counts.items()}
+        assert counts == files.in_whole
+        assert summary.statistics.message_start_time == START_NS
+        assert summary.statistics.message_end_time == START_NS + files.in_whole.total() - 1
+        assert summary.statistics.chunk_count == len(summary.chunk_indexes) > 1
+        assert all(index.compression == "zstd" for index in summary.chunk_indexes)
+        assert {a.name: a.data for a in reader.iter_attachments()} == ATTACHMENTS
+        assert {m.name: m.metadata for m in reader.iter_metadata()}["fantwin"] == METADATA
+        assert {schema.encoding for schema in summary.schemas.values()} == {"protobuf"}
+
+
+def test_mcap_finds_one_topic_and_a_stretch_of_time_by_the_index(files):
+    first, last = START_NS + RAWS - 5, START_NS + RAWS + 5
+    with files.whole.open("rb") as file:
+        found = list(make_reader(file).iter_messages(topics=[SCORE], starting_at=first, ending_before=last))
+    assert [message.log_time - START_NS for _, _, message in found] == [RAWS + 1, RAWS + 2, RAWS + 3, RAWS + 4]
+    assert {channel.topic for _, channel, _ in found} == {SCORE}
+
+
+def test_mcap_reads_all_of_a_torn_file_that_reached_the_disk_before_it_says_that_it_is_torn(files):
+    found: Counter[str] = Counter()
+    with files.torn.open("rb") as file, pytest.raises((McapError, struct.error)):
+        for _, channel, _ in NonSeekingReader(file).iter_messages(log_time_order=False):
+            found[channel.topic] += 1
+    assert found == files.in_torn
+
+
+def test_mcap_finds_no_index_in_a_torn_file(files):
+    with files.torn.open("rb") as file, pytest.raises(McapError):
+        make_reader(file).get_summary()
+
+
+def test_checksums_of_all_records_hold(files):
+    with files.whole.open("rb") as file:
+        records = Counter(type(record).__name__ for record in StreamReader(file, validate_crcs=True).records)
+    assert records[McapMessage.__name__] == files.in_whole.total()
+
+
+# ---- protobuf, by the schema in the file
+
+
+READ_WITHOUT_US = """
+import json, sys
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+with open(sys.argv[1], "rb") as file:
+    for _, channel, message, proto in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+        if channel.topic.endswith(("/score", "/alarm")):
+            values = {name: list(getattr(proto, name)) for name in ("t_ns", "residual_rad_s", "state")
+                      if channel.topic.endswith("/score")} or {"t_ns": proto.t_ns, "message": proto.message}
+            print(json.dumps({"type": type(proto).DESCRIPTOR.full_name, "sequence": message.sequence, **values}))
+assert not {"schemas", "pipeline"} & set(sys.modules)
+"""
+
+
+def test_mcap_protobuf_support_decodes_without_our_code(files):
+    lines = [json.loads(line) for line in run(sys.executable, "-I", "-c", READ_WITHOUT_US, files.whole).splitlines()]
+    sent = [message for message in messages() if isinstance(message, Score | Alarm)]
+    assert len(lines) == len(sent)
+    for line, message in zip(lines, sent, strict=True):
+        assert (line["type"], line["sequence"]) == (f"fantwin.{type(message).__name__}", message.header.sequence)
+        if isinstance(message, Score):
+            assert line["t_ns"] == message.t_ns.tolist()
+            np.testing.assert_array_equal(line["residual_rad_s"], message.residual_rad_s.ravel())
+            assert line["state"] == message.state.ravel().tolist()
+        else:
+            assert (line["t_ns"], line["message"]) == (message.t_ns, message.message)
+
+
+# ---- the mcap command line
+
+
+@needs_mcap
+def test_the_mcap_command_line_finds_nothing_wrong(files):
+    assert str(files.in_whole.total()) in run(MCAP, "info", files.whole)
+    run(MCAP, "doctor", files.whole)
+
+
+# ---- Rerun
+
+
+def rerun_rows(path: Path) -> dict[str, list[dict[str, Any]]]:
+    """The messages in a file of Rerun's, by entity, as structures."""
+    from rerun.chunk import RrdReader  # noqa: PLC0415  the extra `view` may not be installed
+
+    found: dict[str, list[dict[str, Any]]] = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.startswith("fantwin.") and name.endswith(":message"):
+                found.setdefault(chunk.entity_path, []).extend(row[0] for row in batch.column(name).to_pylist())
+    return found
+
+
+@needs_rerun
+def test_rerun_finds_nothing_wrong_and_counts_the_same(files):
+    text = run(RERUN, "mcap", "check", files.whole)
+    assert "PROBLEM" not in text
+    assert sum(line.startswith("ok ") for line in text.splitlines()) == len(files.in_whole)
+    assert f"Messages                 {files.in_whole.total()}\n" in run(RERUN, "mcap", "info", files.whole)
+
+
+@needs_rerun
+def test_rerun_reads_every_message_with_its_fields(files, tmp_path):
+    run(RERUN, "mcap", "convert", files.whole, "--application-id", "fantwin", "-o", tmp_path / "r.rrd")
+    found = rerun_rows(tmp_path / "r.rrd")
+    assert {entity: len(rows) for entity, rows in found.items()} == {f"/{k}": n for k, n in files.in_whole.items()}
+    raws = sorted(found["/fantwin/plant/tray1/raw"], key=lambda row: row["header"]["sequence"])
+    for row, message in zip(raws, (m for m in messages() if isinstance(m, Raw)), strict=True):
+        assert row["host_receive_t_ns"] == message.host_receive_t_ns.tolist()
+        assert row["speed_rad_s"] == message.speed_rad_s.ravel().tolist()
+    states = {state["name"] for row in found[f"/{SCORE}"] for state in row["state"]}
+    assert {"FAN_STATE_NORMAL", "FAN_STATE_UNKNOWN"} <= states
+
+
+@needs_rerun
+def test_rerun_recovers_from_a_torn_file_what_reached_the_disk(files, tmp_path):
+    assert "PROBLEM" not in run(RERUN, "mcap", "check", "--recover", files.torn)
+    run(RERUN, "mcap", "convert", "--recover", files.torn, "--application-id", "fantwin", "-o", tmp_path / "r.rrd")
+    found = rerun_rows(tmp_path / "r.rrd")
+    assert {entity: len(rows) for entity, rows in found.items()} == {f"/{k}": n for k, n in files.in_torn.items()}

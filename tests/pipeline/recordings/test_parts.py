@@ -1,0 +1,241 @@
+"""The parts of a recording: their names, what they say of one another, and what a killed recorder has left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mcap.opcode import Opcode
+
+from pipeline.recordings.contents import contents_of
+from pipeline.recordings.disk import Disk, DiskError
+from pipeline.recordings.parts import RecordingParts
+from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from pipeline.recordings.records import RecordReader
+from pipeline.recordings.sequence_ledger import SequenceLedger
+from pipeline.recordings.writing import RecordingWriter
+from tests.pipeline.recordings.test_recordings import RAW_KEY, disk_of, kill_a_recorder, raw, sequences, write
+from tests.support.small_disk import unmount
+
+LINE = (RAW_KEY, "acquisition-1")
+
+
+def shelf(folder: Path, session: str = "s1") -> RecordingParts:
+    return RecordingParts(folder / "r.mcap", {"site": "plant"}, {"configuration.toml": b"site = 'plant'"}, session)
+
+
+def part(shelf: RecordingParts, numbers=(), ledger: SequenceLedger | None = None) -> RecordingWriter:
+    writer = shelf.begin(5_000_000_000, ledger or SequenceLedger(shelf.before), {})
+    for sequence in numbers:
+        writer.write_message(RAW_KEY, raw(sequence), sequence)
+    return writer
+
+
+def killed(writer: RecordingWriter) -> None:
+    """As if its process had been killed: what is in the unfinished chunk is lost."""
+    writer._file.close()
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_parts_are_numbered_and_say_which_went_before(tmp_path):
+    place = shelf(tmp_path)
+    ledger = SequenceLedger()
+    for first in (0, 10, 20):
+        part(place, range(first, first + 10), ledger).close()
+        ledger = ledger.following()
+    assert names(tmp_path) == ["r-2.mcap", "r-3.mcap", "r.mcap"]
+    said = [read_metadata(tmp_path / name).metadata for name in ("r.mcap", "r-2.mcap", "r-3.mcap")]
+    assert [(m["part"], m["session"], m.get("continues")) for m in said] == [
+        ("1", "s1", None),
+        ("2", "s1", "r.mcap"),
+        ("3", "s1", "r-2.mcap"),
+    ]
+    assert said[2]["started_t_ns"] == "5000000000"
+    assert contents_of(tmp_path / "r-3.mcap").before == {LINE: 20}
+
+
+def test_each_part_is_complete_in_itself(tmp_path):
+    place = shelf(tmp_path)
+    for _ in range(2):
+        part(place, [0]).close()
+    for name in ("r.mcap", "r-2.mcap"):
+        head = read_metadata(tmp_path / name)
+        assert head.metadata["site"] == "plant"
+        assert head.attachments == {"configuration.toml": b"site = 'plant'"}
+
+
+def test_an_open_part_is_called_active(tmp_path):
+    place = shelf(tmp_path)
+    part(place).close()
+    writer = part(place)
+    assert names(tmp_path) == ["r-2.mcap.active", "r.mcap"]
+    writer.close()
+
+
+def test_the_oldest_part_is_deleted_first_and_its_name_is_not_given_again(tmp_path):
+    place = shelf(tmp_path)
+    for _ in range(11):
+        part(place, [0]).close()
+    assert [place.delete_oldest() for _ in range(10)] == ["r.mcap", *(f"r-{n}.mcap" for n in range(2, 11))]
+    assert place.delete_oldest() == "r-11.mcap"
+    assert place.delete_oldest() is None
+    part(place).close()
+    assert names(tmp_path) == ["r-12.mcap"]
+
+
+def test_only_parts_of_this_recording_are_deleted(tmp_path):
+    write(tmp_path / "r.mcap", 3)  # an import, say
+    (tmp_path / "r-2.mcap").write_bytes(b"not ours")
+    RecordingParts(tmp_path / "r-3.mcap", {}, {}, "other").begin(0, SequenceLedger(), {}).close()
+    assert shelf(tmp_path).delete_oldest() is None
+    assert len(names(tmp_path)) == 3
+
+
+def test_the_part_that_is_open_is_not_deleted(tmp_path):
+    place = shelf(tmp_path)
+    writer = part(place)
+    assert place.delete_oldest() is None
+    writer.close()
+
+
+def test_a_new_recorder_takes_a_number_above_all_there_are(tmp_path):
+    for name in ("r.mcap", "r-7.mcap", "r-9.mcap.torn"):
+        (tmp_path / name).touch()
+    part(shelf(tmp_path)).close()
+    assert "r-10.mcap" in names(tmp_path)
+
+
+def test_what_a_killed_recorder_left_is_mended_and_gone_on_from(tmp_path):
+    kill_a_recorder(tmp_path / "r.mcap", flushed=40)
+    place = shelf(tmp_path, "s2")
+    assert [(recovery.path.name, recovery.found.messages) for recovery in place.mended] == [("r.mcap", 40)]
+    assert sequences(tmp_path / "r.mcap") == list(range(40))
+    assert read_recording(tmp_path / "r.mcap").damage == ""
+    assert contents_of(tmp_path / "r.mcap").damage == ()
+    assert names(tmp_path) == ["r.mcap"]
+
+
+def test_the_first_part_after_a_killed_recorder_continues_its_last(tmp_path):
+    killed_writer = part(shelf(tmp_path), range(40))
+    killed_writer.flush()
+    killed(killed_writer)
+    place = shelf(tmp_path, "s2")
+    assert place.before == {LINE: 40}
+    part(place, [45]).close()
+    head = read_metadata(tmp_path / "r-2.mcap").metadata
+    assert (head["session"], head["part"], head["continues"]) == ("s2", "1", "r.mcap")
+    assert contents_of(tmp_path / "r-2.mcap").accounts[LINE].missing == 5
+
+
+def test_a_recorder_killed_while_it_had_no_part_open_is_gone_on_from_too(tmp_path):
+    part(shelf(tmp_path), range(40)).close()  # it paused, and was killed
+    assert shelf(tmp_path, "s2").before == {LINE: 40}
+
+
+def test_a_recorder_that_ended_in_order_is_gone_on_from_as_well(tmp_path):
+    part(shelf(tmp_path), range(40)).close(has_ended=True)
+    place = shelf(tmp_path, "s2")
+    assert place.before == {LINE: 40}
+    part(place, [45]).close()
+    assert read_metadata(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
+    assert contents_of(tmp_path / "r-2.mcap").accounts[LINE].missing == 5
+
+
+def test_a_file_of_others_with_a_higher_number_does_not_hide_the_last_part(tmp_path):
+    part(shelf(tmp_path), range(40)).close()
+    write(tmp_path / "r-9.mcap", 3)
+    place = shelf(tmp_path, "s2")
+    assert place.before == {LINE: 40}
+    part(place).close()
+    assert read_metadata(tmp_path / "r-10.mcap").metadata["continues"] == "r.mcap"
+
+
+def damage_a_chunk(path: Path, number: int) -> None:
+    chunk = [record for record in RecordReader(path) if record.opcode == Opcode.CHUNK][number]
+    content = bytearray(path.read_bytes())
+    content[chunk.offset + chunk.length // 2] ^= 0xFF
+    path.write_bytes(content)
+
+
+def test_a_left_over_whose_only_chunk_is_damaged_is_put_aside_and_not_deleted(tmp_path):
+    kill_a_recorder(tmp_path / "r.mcap", flushed=5)
+    damage_a_chunk(tmp_path / "r.mcap.active", 0)
+    content = (tmp_path / "r.mcap.active").read_bytes()
+    assert shelf(tmp_path).unreadable == [tmp_path / "r.mcap.torn"]
+    assert (tmp_path / "r.mcap.torn").read_bytes() == content
+
+
+def test_a_damaged_left_over_that_a_full_disk_keeps_from_being_mended_is_gone_on_from(tmp_path):
+    writer = part(shelf(tmp_path), range(3000))
+    writer.flush()
+    killed(writer)
+    damage_a_chunk(tmp_path / "r.mcap.active", 1)
+    with disk_of(100):
+        place = shelf(tmp_path, "s2")
+    assert (place.unmended, place.unreadable, place.mended) == ([tmp_path / "r.mcap.active"], [], [])
+    assert place.before == {LINE: 3000}
+    part(place, [3000]).close()
+    assert read_metadata(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
+    assert shelf(tmp_path, "s3").mended[0].path == tmp_path / "r.mcap"
+
+
+def test_a_left_over_without_any_message_is_not_kept(tmp_path):
+    kill_a_recorder(tmp_path / "r.mcap", flushed=0)
+    assert shelf(tmp_path).mended == []
+    assert names(tmp_path) == []
+
+
+def test_a_recorder_killed_again_and_again_before_it_recorded_anything_still_goes_on_from_the_last_message(tmp_path):
+    kill_a_recorder(tmp_path / "r.mcap", flushed=0)
+    first = part(shelf(tmp_path), range(40))
+    first.flush()
+    killed(first)
+    for _ in range(3):
+        killed(part(shelf(tmp_path)))
+    assert shelf(tmp_path).before == {LINE: 40}
+
+
+def test_a_recording_that_is_being_written_is_not_touched(tmp_path):
+    writer = part(shelf(tmp_path), [0])
+    with pytest.raises(RecordingError, match="r.mcap.active: another recorder is writing it; stop it"):
+        shelf(tmp_path)
+    writer.close()
+    assert sequences(tmp_path / "r.mcap") == [0]
+
+
+@pytest.mark.parametrize("content", [b"something else", bytes(5000)])
+def test_a_left_over_that_is_no_recording_is_put_aside(tmp_path, content):
+    (tmp_path / "r.mcap.active").write_bytes(content)
+    place = shelf(tmp_path)
+    assert place.unreadable == [tmp_path / "r.mcap.torn"]
+    assert place.unreadable[0].read_bytes() == content
+    part(place).close()
+    assert names(tmp_path) == ["r-2.mcap", "r.mcap.torn"]
+
+
+def test_the_room_of_a_disk_is_what_is_left_on_it(small_disk):
+    disk = Disk(small_disk)
+    before = disk.free_bytes()
+    (small_disk / "file").write_bytes(bytes(1 << 20))
+    assert before - disk.free_bytes() == 1 << 20
+
+
+def test_the_place_of_a_disk_that_was_unmounted_is_not_taken_for_it(small_disk):
+    place = shelf(small_disk)
+    part(place, [0]).close()
+    unmount(small_disk)
+    for use in (place.free_bytes, lambda: part(place)):
+        with pytest.raises(DiskError, match="disk: the disk is no longer mounted; mount it again"):
+            use()
+    assert names(small_disk) == []
+
+
+def test_a_folder_that_is_taken_away_is_told(tmp_path):
+    (tmp_path / "runs").mkdir()
+    disk = Disk(tmp_path / "runs")
+    (tmp_path / "runs").rmdir()
+    with pytest.raises(DiskError, match="runs: the folder is gone"):
+        disk.free_bytes()

@@ -1,0 +1,377 @@
+"""Recovery: whatever was torn off or damaged, all whole chunks are there again, for every reader."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.decoder import DecoderFactory
+
+from pipeline.recordings.contents import contents_of, damage_of
+from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from pipeline.recordings.records import RECORD, RecordReader
+from pipeline.recordings.repair import mend, recover
+from pipeline.recordings.scan import scan
+from pipeline.recordings.sequence_ledger import StreamCounts
+from pipeline.recordings.writing import RecordingWriter
+from tests.pipeline.recordings.test_recordings import ALARM_KEY, RAW_KEY, alarm, disk_of, raw, write
+
+LINE = (RAW_KEY, "acquisition-1")
+NO_CHECK = [HealthCheck.function_scoped_fixture]
+
+
+def small(path: Path) -> Path:
+    """A recording of many small chunks, an attachment and two topics."""
+    with RecordingWriter(path, {"site": "plant"}, {"tray1.onnx": os.urandom(300)}) as writer:
+        for sequence in range(40):
+            writer.write_message(RAW_KEY, raw(sequence, samples=2), 1000 + sequence)
+            if sequence == 20:
+                writer.write_message(ALARM_KEY, alarm(0), 1000 + sequence)
+            if sequence % 5 == 4:
+                writer.flush()
+    return path
+
+
+def chunk_ends(path: Path) -> list[tuple[int, int]]:
+    """Where each chunk ends, and how many messages there are up to there."""
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        raw_only = [5 * (number + 1) + (number >= 4) for number in range(len(summary.chunk_indexes))]
+        ends = [chunk.chunk_start_offset + chunk.chunk_length for chunk in summary.chunk_indexes]
+        return list(zip(ends, raw_only, strict=True))
+
+
+def read_by_others(path: Path) -> list[tuple[str, int]]:
+    """All messages, by the library's own reader, which must find an index and every checksum right."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        found = [(channel.topic, message.sequence) for _, channel, message in reader.iter_messages()]
+        assert summary.statistics.message_count == len(found)
+        assert summary.statistics.chunk_count == len(summary.chunk_indexes)
+        assert summary.statistics.attachment_count == len(list(reader.iter_attachments()))
+        assert summary.statistics.metadata_count == len(list(reader.iter_metadata()))
+    with path.open("rb") as file:  # and one after the other, without the index
+        assert len([r for r in StreamReader(file, validate_crcs=True).records if type(r).__name__ == "Message"]) == len(
+            found
+        )
+    return found
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    return small(tmp_path_factory.mktemp("whole") / "r.mcap")
+
+
+SIZE = 15_000
+"""More than the file has: what is drawn beyond it is the whole file."""
+
+
+@settings(max_examples=150, suppress_health_check=NO_CHECK)
+@given(size=st.integers(0, SIZE))
+def test_a_file_torn_at_any_byte_is_whole_again_up_to_its_last_whole_chunk(tmp_path, whole, size):
+    content = whole.read_bytes()
+    torn, output = tmp_path / "torn.mcap", tmp_path / "out.mcap"
+    torn.write_bytes(content[:size])
+    output.unlink(missing_ok=True)
+    expected = max((messages for end, messages in chunk_ends(whole) if end <= size), default=0)
+    if not expected:
+        with pytest.raises(RecordingError, match="nothing can be recovered|not a recording"):
+            recover(torn, output)
+        assert not output.exists()
+        return
+    recover(torn, output)
+    assert read_by_others(output) == read_by_others(whole)[:expected]
+    assert read_metadata(output) == read_metadata(whole)
+    assert scan(output).is_whole
+    assert torn.read_bytes() == content[:size]
+
+
+@settings(max_examples=100, suppress_health_check=NO_CHECK)
+@given(size=st.integers(0, SIZE))
+def test_what_a_killed_recorder_has_left_is_mended_in_place_with_the_same_result(tmp_path, whole, size):
+    content = whole.read_bytes()
+    active, output = tmp_path / "a.mcap.active", tmp_path / "out.mcap"
+    for path in tmp_path.iterdir():
+        path.unlink()
+    active.write_bytes(content[:size])
+    mended = mend(active)
+    assert not active.exists()
+    (tmp_path / "torn.mcap").write_bytes(content[:size])
+    if mended is None:
+        assert not any(end <= size for end, _ in chunk_ends(whole))
+        return
+    recover(tmp_path / "torn.mcap", output)
+    assert mended.path.read_bytes() == output.read_bytes()
+    assert mended.path.name == "a.mcap"
+
+
+def test_a_kill_at_any_byte_of_mending_costs_nothing_either(tmp_path, whole):
+    """What a second kill leaves of a mended file is again torn, and is mended again."""
+    torn = whole.read_bytes()[: chunk_ends(whole)[5][0] + 7]
+    active = tmp_path / "r.mcap.active"
+    active.write_bytes(torn)
+    first = mend(active)
+    assert first is not None
+    mended = first.path.read_bytes()
+    for size in range(chunk_ends(whole)[5][0], len(mended), 37):
+        active.write_bytes(mended[:size])
+        again = mend(active)
+        assert again is not None
+        assert again.path.read_bytes() == mended
+        again.path.unlink()
+
+
+def test_in_place_the_torn_file_is_kept_beside_the_whole_one(tmp_path, whole):
+    torn = tmp_path / "r.mcap"
+    torn.write_bytes(whole.read_bytes()[:-300])
+    before = torn.read_bytes()
+    recovery = recover(torn)
+    assert (recovery.path, recovery.torn) == (torn, tmp_path / "r.mcap.torn")
+    assert recovery.torn is not None and recovery.torn.read_bytes() == before
+    assert len(read_by_others(torn)) == 41
+    torn.write_bytes(before)
+    assert recover(torn).torn == tmp_path / "r.mcap.torn-2"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["r.mcap", "r.mcap.torn", "r.mcap.torn-2"]
+
+
+def test_what_is_still_called_active_gets_the_name_of_a_recording(tmp_path, whole):
+    (tmp_path / "r.mcap").write_bytes(whole.read_bytes())
+    (tmp_path / "r.mcap.active").write_bytes(whole.read_bytes()[:-300])
+    recovery = recover(tmp_path / "r.mcap.active")
+    assert recovery.path == tmp_path / "r-2.mcap"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r-2.mcap", "r-2.mcap.torn", "r.mcap"]
+
+
+@pytest.mark.parametrize("less", [0, 300])
+@pytest.mark.parametrize("moment", range(6))
+def test_a_kill_at_any_moment_leaves_the_recording_under_a_name_that_is_looked_for(
+    tmp_path, whole, monkeypatch, less, moment
+):
+    active = tmp_path / "r.mcap.active"
+    active.write_bytes(whole.read_bytes()[: whole.stat().st_size - less])
+    done = 0
+
+    def or_killed(action):
+        def act(*args, **kwargs):
+            nonlocal done
+            if done == moment:
+                raise KeyboardInterrupt
+            done += 1
+            return action(*args, **kwargs)
+
+        return act
+
+    for owner, name in ((os, "link"), (Path, "rename"), (Path, "replace"), (Path, "unlink")):
+        monkeypatch.setattr(owner, name, or_killed(getattr(owner, name)))
+    with suppress(KeyboardInterrupt):
+        recover(active)
+    monkeypatch.undo()
+    found = [path for path in (tmp_path / "r.mcap", active) if path.exists()]
+    assert found
+    assert all(len(list(read_recording(path))) == 41 for path in found)
+
+
+def test_a_file_that_is_whole_is_left_alone_or_copied(tmp_path, whole):
+    path = tmp_path / "r.mcap"
+    path.write_bytes(whole.read_bytes())
+    inode = path.stat().st_ino
+    assert recover(path).found.is_whole
+    assert (path.stat().st_ino, sorted(p.name for p in tmp_path.iterdir())) == (inode, ["r.mcap"])
+    recover(path, tmp_path / "copy.mcap")
+    assert (tmp_path / "copy.mcap").read_bytes() == whole.read_bytes()
+
+
+def test_the_ledger_of_a_file_that_was_finished_but_for_its_index_is_kept(tmp_path):
+    with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
+        writer.write_message(RAW_KEY, raw(0), 1)
+        writer.ledger.note_duplicated(*LINE, 7)
+    path = writer.path
+    path.write_bytes(path.read_bytes()[:-40])
+    found = recover(path).found
+    assert found.is_ended
+    assert contents_of(path).accounts[LINE].duplicated == 7
+
+
+def test_holes_are_told_and_stand_in_the_new_ledger(tmp_path):
+    writer = RecordingWriter(tmp_path / "r.mcap", {})
+    for sequence in (0, 1, 5):
+        writer.write_message(RAW_KEY, raw(sequence), 1000 + sequence)
+    writer.flush()
+    writer._file.close()
+    recovery = recover(tmp_path / "r.mcap.active")
+    assert contents_of(recovery.path).accounts[LINE] == StreamCounts(3, 3, 0, 0, 5, 1000, 1005)
+
+
+@settings(max_examples=100, suppress_health_check=NO_CHECK)
+@example(at=0.0, value=0)
+@given(at=st.floats(0, 1), value=st.integers(0, 255))
+def test_a_changed_byte_anywhere_costs_its_record_only(tmp_path, whole, at, value):
+    content = bytearray(whole.read_bytes())
+    ends = chunk_ends(whole)
+    place = round(8 + at * (ends[-1][0] - 9))
+    content[place] = value
+    path, output = tmp_path / "r.mcap", tmp_path / "out.mcap"
+    path.write_bytes(content)
+    output.unlink(missing_ok=True)
+    recover(path, output)
+    messages = read_by_others(output)
+    assert len(messages) >= 41 - 6, "at most one chunk"
+    assert scan(output).is_whole or scan(output).nameless
+    assert {name for name, _ in messages} <= {RAW_KEY, ALARM_KEY, "lost/1"}
+
+
+@pytest.mark.parametrize("opcode", [Opcode.CHUNK, Opcode.MESSAGE_INDEX])
+@pytest.mark.parametrize("more", [1, 256, -256, 1024, 4096, 1 << 16])
+def test_a_damaged_length_costs_one_chunk_though_it_fits_into_the_file(tmp_path, opcode, more):
+    path = write(tmp_path / "r.mcap", 3000)
+    records = [record for record in RecordReader(path) if record.opcode == opcode]
+    content = bytearray(path.read_bytes())
+    before = scan(path).messages
+    place = records[2].offset
+    code, length = RECORD.unpack_from(content, place)
+    RECORD.pack_into(content, place, code, max(0, length + more))
+    path.write_bytes(content)
+    chunks = len(records)
+    found = recover(path).found
+    lost = before - found.messages
+    assert found.walk.damaged
+    assert (0 < lost < 2 * before / chunks) if opcode == Opcode.CHUNK else lost == 0
+    assert contents_of(path).accounts[LINE].missing == lost
+
+
+def test_after_a_damaged_length_the_next_whole_chunk_is_found(tmp_path, whole):
+    content = bytearray(whole.read_bytes())
+    with whole.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    third = summary.chunk_indexes[2].chunk_start_offset
+    content[third + 1 : third + 9] = b"\xff" * 8
+    path = tmp_path / "r.mcap"
+    path.write_bytes(content)
+    found = recover(path).found
+    assert len(read_by_others(path)) == 36
+    (stretch,) = found.walk.damaged
+    assert stretch == (third, summary.chunk_indexes[3].chunk_start_offset)
+    assert contents_of(path).accounts[LINE].missing == 5
+
+
+def test_a_sector_of_zeros_costs_the_chunks_it_touches(tmp_path):
+    path = write(tmp_path / "r.mcap", 1000)
+    content = bytearray(path.read_bytes())
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    starts = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
+    content[starts[2] - 2000 : starts[2] + 2096] = bytes(4096)
+    path.write_bytes(content)
+    found = recover(path).found
+    sequences = [entry.message.header.sequence for entry in read_recording(path, topics=("raw",))]
+    holes = sum(later - earlier - 1 for earlier, later in pairwise(sequences))
+    assert (sequences[0], sequences[-1]) == (0, 999)
+    assert 0 < holes == 1000 - len(sequences) == found.census.ledger.accounts[LINE].missing
+    assert scan(path).is_whole
+
+
+def test_a_channel_that_was_described_in_a_damaged_chunk_is_found_in_the_summary_or_kept_without_a_name(
+    tmp_path, whole
+):
+    content = bytearray(whole.read_bytes())
+    first = content.index(b"zstd") + 40
+    content[first] ^= 0xFF
+    path = tmp_path / "r.mcap"
+    path.write_bytes(content)
+    output = tmp_path / "described.mcap"
+    assert recover(path, output).found.nameless == 0
+    assert read_by_others(output) == read_by_others(whole)[5:]
+    path.write_bytes(content[:-100])
+    output = tmp_path / "nameless.mcap"
+    found = recover(path, output).found
+    assert found.nameless == 35
+    assert ("messages of channels without a name: 35") in damage_of(found)
+    assert [key for key, _ in read_by_others(output)].count("lost/1") == 35
+
+
+def test_a_damaged_attachment_is_left_out_and_told(tmp_path, whole):
+    content = bytearray(whole.read_bytes())
+    content[content.index(b"tray1.onnx") + 60] ^= 0xFF
+    path = tmp_path / "r.mcap"
+    path.write_bytes(content)
+    found = recover(path).found
+    assert damage_of(found)[-1] == "damaged attachments: 1"
+    assert read_metadata(path).attachments == {}
+    assert len(read_by_others(path)) == 41
+
+
+@pytest.mark.parametrize("room", [0, 100, 10_000])
+def test_a_disk_that_fills_during_recovery_leaves_everything_as_it_was(tmp_path, whole, room):
+    path = tmp_path / "r.mcap"
+    torn = whole.read_bytes()[:-300]
+    path.write_bytes(torn)
+    with disk_of(room), pytest.raises(RecordingError, match="r.mcap is left as it was; make room"):
+        recover(path)
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("r.mcap", torn)]
+
+
+def test_a_disk_that_is_full_costs_a_killed_recorder_s_file_only_its_index(tmp_path, whole):
+    active = tmp_path / "r.mcap.active"
+    active.write_bytes(whole.read_bytes()[: chunk_ends(whole)[4][0] + 100])
+    with disk_of(active.stat().st_size):
+        mended = mend(active)
+    assert mended is not None
+    assert len(list(read_recording(mended.path))) == 26
+    recover(mended.path)
+    assert len(read_by_others(mended.path)) == 26
+
+
+def test_a_file_that_is_being_written_is_not_touched(tmp_path):
+    with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
+        writer.write_message(RAW_KEY, raw(0), 0)
+        writer.flush()
+        with pytest.raises(RecordingError, match="a recorder is writing it; stop it first"):
+            recover(tmp_path / "r.mcap.active")
+
+
+def test_an_output_that_exists_is_not_overwritten(tmp_path, whole):
+    (tmp_path / "out.mcap").touch()
+    with pytest.raises(RecordingError, match="out.mcap: exists; name another file with -o"):
+        recover(whole, tmp_path / "out.mcap")
+
+
+@pytest.mark.parametrize(
+    ("chunked", "compression"),
+    [(True, CompressionType.ZSTD), (True, CompressionType.LZ4), (True, CompressionType.NONE), (False, None)],
+)
+def test_a_torn_file_of_others_is_mended_too(tmp_path, chunked, compression):
+    path = tmp_path / "r.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, 200, compression or CompressionType.NONE, use_chunking=chunked)
+        writer.start()
+        schema = writer.register_schema("Pose", "jsonschema", b"{}")
+        channel = writer.register_channel("/pose", "json", schema)
+        for number in range(100):
+            writer.add_message(channel, number, b'{"x": 1}', number)
+        writer.finish()
+    with path.open("rb") as file:
+        all_of_it = [message.log_time for _, _, message in make_reader(file).iter_messages()]
+    assert recover(path).found.is_whole
+    path.write_bytes(path.read_bytes()[:3000])
+    found = recover(path).found
+    assert found.census.others["/pose"].messages == found.messages > 20
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        assert summary.statistics.message_count == found.messages
+        assert [m.log_time for _, _, m in reader.iter_messages()] == all_of_it[: found.messages]

@@ -1,0 +1,87 @@
+"""pipeline.replay.offline.alarm_episodes: alarms from raised to cleared, over everything that is said of them in
+between."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from pipeline.replay.offline.alarm_episodes import Episode, compare_episodes, episodes
+from schemas.messages import Alarm, Diagnosis, Header, Severity, Transition
+
+DRAG, GAIN = Diagnosis(cause="drag_up", probability=0.6), Diagnosis(cause="gain_down", probability=0.9)
+
+
+def alarm(
+    t_ns: int, transition: Transition = Transition.RAISED, *, fan: int = 0, tray: str = "a", **more: Any
+) -> Alarm:
+    told: dict[str, Any] = {"active": transition != Transition.CLEARED, "severity": Severity.WARNING, "onset_t_ns": 5}
+    told |= {"residual_rad_s": float(t_ns), "limit_rad_s": 1.0, "message": transition.name.lower()}
+    return Alarm(header=Header("p", 0, tray), fan=fan, t_ns=t_ns, transition=transition, **told | more)
+
+
+def one(*alarms: Alarm) -> Episode:
+    (episode,) = episodes(alarms)
+    return episode
+
+
+def test_an_episode_goes_from_the_raise_to_the_clear_with_the_highest_severity_and_what_was_known_last() -> None:
+    episode = one(
+        alarm(10, causes=(DRAG,), torque_balance_command=3.0),
+        alarm(11, Transition.DIAGNOSED, causes=(GAIN, DRAG)),
+        alarm(12, Transition.SEVERITY, severity=Severity.ALARM),
+        alarm(13, Transition.ACKNOWLEDGED, request="o/1"),
+        alarm(20, Transition.CLEARED),
+    )
+    assert (episode.raised_ns, episode.cleared_ns, episode.onset_ns) == (10, 20, 5)
+    assert (episode.severity, episode.causes) == ("alarm", (GAIN, DRAG))
+    assert (episode.residual_rad_s, episode.torque_balance_command, episode.message) == (10.0, 3.0, "raised")
+
+
+def test_the_json_has_what_the_issue_asks_for() -> None:
+    told = json.loads(json.dumps(one(alarm(10, causes=(DRAG,))).as_json()))
+    assert told["cleared_ns"] is None
+    assert {"fan", "raised_ns", "cleared_ns", "severity", "residual", "causes"} <= set(told)
+    assert (told["causes"][0]["cause"], told["causes"][0]["probability"]) == ("drag_up", 0.6)
+
+
+def test_a_residual_that_nobody_knew_is_null_and_not_zero() -> None:
+    told = one(alarm(10, residual_rad_s=0.0, torque_balance_command=2.5)).as_json()
+    assert (told["residual"], told["torque_balance"]) == (None, 2.5)
+    told = one(alarm(10, residual_rad_s=-1e-9, torque_balance_command=0.0)).as_json()
+    assert (told["residual"], told["torque_balance"]) == (-1e-9, None)
+
+
+def test_what_is_told_again_after_a_restart_is_the_same_episode() -> None:
+    episode = one(alarm(10), alarm(10, Transition.REPUBLISHED), alarm(30, Transition.CLEARED))
+    assert (episode.raised_ns, episode.cleared_ns) == (10, 30)
+
+
+def test_a_scorer_without_a_memory_that_raises_it_again_goes_on_with_it() -> None:
+    episode = one(alarm(10), alarm(15, onset_t_ns=14), alarm(30, Transition.CLEARED, onset_t_ns=14))
+    assert (episode.raised_ns, episode.onset_ns, episode.cleared_ns) == (10, 5, 30)
+
+
+def test_what_is_said_of_an_alarm_that_is_not_active_begins_none() -> None:
+    quiet = {"active": False, "severity": Severity.NONE}
+    assert episodes([alarm(1, Transition.SHELVED, **quiet), alarm(2, Transition.REFUSED, **quiet)]) == []
+    found = episodes([alarm(10), alarm(20, Transition.CLEARED), alarm(25, Transition.ACKNOWLEDGED, active=False)])
+    assert len(found) == 1
+
+
+def test_fans_and_trays_are_kept_apart_and_told_by_time() -> None:
+    found = episodes([alarm(30), alarm(10, fan=1), alarm(20, tray="b"), alarm(40, Transition.CLEARED, fan=1)])
+    assert [(e.tray, e.fan, e.raised_ns, e.cleared_ns) for e in found] == [
+        ("a", 1, 10, 40),
+        ("b", 0, 20, None),
+        ("a", 0, 30, None),
+    ]
+
+
+def test_an_alarm_is_in_both_lists_where_the_same_fans_overlap() -> None:
+    before = episodes([alarm(10), alarm(20, Transition.CLEARED), alarm(50, onset_t_ns=45)])
+    now = episodes([alarm(12), alarm(30, Transition.CLEARED), alarm(11, fan=1)])
+    found = compare_episodes(now, before)
+    assert [e.fan for e in found.gained] == [1]
+    assert [e.raised_ns for e in found.kept] == [12]
+    assert [e.raised_ns for e in found.lost] == [50]

@@ -1,0 +1,71 @@
+"""The keys of a terminal, and that the terminal is given back as it was."""
+
+from __future__ import annotations
+
+import os
+import pty
+import sys
+import termios
+
+import pytest
+
+from pipeline.replay.live.keyboard import Key, KeyParser, Keys
+
+
+@pytest.mark.parametrize(
+    ("typed", "keys"),
+    [
+        (b" ", [Key.PAUSE]),
+        (b"s\x1b[C\x1bOC", [Key.STEP] * 3),
+        (b"\x1b[A\x1bOA", [Key.FASTER] * 2),
+        (b"\x1b[B\x1bOB", [Key.SLOWER] * 2),
+        (b"xyz\tq", [Key.QUIT]),
+        (b"\x1b[Dq", [Key.QUIT]),
+        (b"\x1b\x1b[A", [Key.FASTER]),
+    ],
+)
+def test_keys_and_both_manners_of_arrows_are_known_and_all_else_is_passed_over(typed, keys):
+    assert KeyParser().feed(typed) == keys
+
+
+def test_an_arrow_that_comes_in_pieces_is_one_key():
+    parser = KeyParser()
+    assert [parser.feed(bytes([byte])) for byte in b"\x1b[C"] == [[], [], [Key.STEP]]
+
+
+def test_without_a_terminal_there_are_no_keys(monkeypatch, tmp_path):
+    with (tmp_path / "input").open("w+") as no_terminal:
+        monkeypatch.setattr(sys, "stdin", no_terminal)
+        keys = Keys()
+        assert not keys.are_there
+        with keys:
+            assert keys.pressed() == []
+
+
+def test_keys_are_read_without_return_and_the_terminal_is_as_before_even_after_an_error(monkeypatch):
+    ours, theirs = pty.openpty()
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _descriptor: os.getpgrp())  # as if this test were in its foreground
+    with os.fdopen(theirs, "r") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        before = termios.tcgetattr(theirs)
+        keys = Keys()
+        assert keys.are_there
+        with pytest.raises(KeyboardInterrupt), keys:
+            os.write(ours, b" q")
+            assert not termios.tcgetattr(theirs)[3] & termios.ICANON
+            found: list[Key] = []
+            while len(found) < 2:
+                found += keys.pressed()
+            assert found == [Key.PAUSE, Key.QUIT]
+            raise KeyboardInterrupt
+        assert termios.tcgetattr(theirs) == before
+    os.close(ours)
+
+
+def test_in_the_background_of_a_terminal_there_are_no_keys(monkeypatch):
+    ours, theirs = pty.openpty()
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _descriptor: os.getpgrp() + 1)
+    with os.fdopen(theirs, "r") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        assert not Keys().are_there
+    os.close(ours)

@@ -1,0 +1,173 @@
+"""Who is on the bus with a replay: who must not be, who reads it, and what they lost."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import pytest
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+from pipeline.config.registry import load_stage
+from pipeline.replay.live.listeners import Listeners, Present, conflict
+from schemas.codec import encode, type_name
+from schemas.messages import Header, Health, Input, Output, StageStatus
+from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from tests.support.running_chain import eventually
+
+ALL = ("raw", "grid", "prediction", "score", "alarm", "command", "twin")
+GRID = tray_key("s", "a", "grid")
+PREDICTION = tray_key("s", "a", "prediction")
+
+
+def there(*labels: str) -> list[Present]:
+    return [Present(load_stage(name), instance or "all") for name, _, instance in (x.partition("/") for x in labels)]
+
+
+@pytest.mark.parametrize(
+    ("labels", "topics", "said"),
+    [
+        (["viewer", "recorder"], ALL, []),
+        ([], ALL, []),
+        (["acquisition/a"], ALL, ["acquisition/a", "commands", "not for the fans of today"]),
+        (["acquisition/other"], ("command",), ["acquisition/other", "commands"]),
+        (["acquisition/other", "resampler"], ("raw",), []),
+        (["acquisition/a", "resampler"], ("raw",), ["acquisition/a", "writes raw itself: stop it"]),
+        (["resampler", "scorer", "viewer"], ALL, ["resampler", "writes grid itself", "--from raw, or stop it"]),
+        (["resampler", "twin_integrator", "scorer", "viewer"], ("raw",), []),
+        (["twin_integrator", "scorer"], ("raw", "grid", "prediction"), ["writes prediction itself", "--from grid"]),
+        (["scorer", "viewer"], ALL, ["scorer", "writes score itself", "--from prediction"]),
+        (["scorer", "viewer"], ("prediction", "twin"), []),
+        (["resampler", "scorer"], ("raw", "request"), ["scorer", "recorded requests are not", "leave request out"]),
+        (["scorer", "viewer"], (*ALL, "request"), ["scorer", "writes score itself", "--from prediction"]),
+        (["viewer", "recorder"], (*ALL, "request"), []),
+        (["twin_integrator"], ("prediction", "twin"), ["writes prediction itself", "--from grid"]),
+    ],
+)
+def test_nothing_is_replayed_that_a_running_stage_writes_nor_what_was_asked_of_it_long_ago(labels, topics, said):
+    line = conflict(there(*labels), topics, {"a"}, "plant")
+    assert bool(line) == bool(said)
+    assert "\n" not in line
+    for words in said:
+        assert words in line
+
+
+class FakeStage:
+    """A stage on the bus that says what a test wants it to."""
+
+    def __init__(self, bus: Bus, stage: str) -> None:
+        self.stage = stage
+        self.producer = f"{stage}-1"
+        bus.declare_alive(alive_key("s", stage, "all"))
+        self.outlet = bus.outlet(health_key("s", stage, "all"), BY_NAME["health"], type_name(Health), self.producer)
+
+    def say(self, *inputs: Input, published: int = 0, lost: int = 0) -> None:
+        out = load_stage(self.stage).writes[:1]
+        health = Health(
+            header=Header(self.producer, self.outlet.published, ""),
+            stage=self.stage,
+            instance="all",
+            status=StageStatus.OK,
+            t_ns=self.outlet.published,
+            uptime_s=0.0,
+            inputs=inputs,
+            outputs=tuple(Output(key=tray_key("s", "a", name), published=published) for name in out),
+            lost=lost,
+        )
+        self.outlet.put(encode(health))
+
+
+def line(key: str, producer: str, received: int, first: int = 0, missing: int = 0) -> Input:
+    reached = first + received + missing
+    return Input(key=key, producer=producer, received=received, missing=missing, duplicated=0, next_sequence=reached)
+
+
+@pytest.fixture
+def sites(endpoint):
+    """The stages' side of a bus, and what a replay sees of it."""
+    config = BusConfig(endpoint=endpoint)
+    with Bus(config) as stages, Bus(config) as ours:
+        yield stages, Listeners(ours, "s")
+
+
+def settled(listeners: Listeners, stop: threading.Event, say) -> list[str]:
+    return listeners.settle("replay-1", {GRID: 100}, stop, say)
+
+
+def test_it_waits_until_those_who_are_there_have_said_how_they_are(sites):
+    bus, listeners = sites
+    stages = [FakeStage(bus, "twin_integrator"), FakeStage(bus, "viewer")]
+    eventually(lambda: len(listeners.present()) == 2, "their tokens are seen")
+    done = threading.Event()
+
+    def say_on() -> None:
+        while not done.wait(0.05):
+            for stage in stages:
+                stage.say(lost=7)
+
+    speaker = threading.Thread(target=say_on)
+    speaker.start()
+    listeners.meet(threading.Event())
+    done.set()
+    speaker.join()
+    assert listeners.readers(("grid",)) == ["twin_integrator"]
+    assert listeners.readers(("grid", "score")) == ["twin_integrator", "viewer"]
+    assert listeners.lost("replay-1", {}) == {}, "what was lost before is not this replay's"
+    stages[0].say(lost=9)
+    eventually(lambda: listeners.lost("replay-1", {}) == {"twin_integrator": 2}, "what is lost since is")
+
+
+def test_it_is_settled_when_all_has_been_taken_down_the_whole_chain(sites):
+    bus, listeners = sites
+    twin, scorer = FakeStage(bus, "twin_integrator"), FakeStage(bus, "scorer")
+    eventually(lambda: len(listeners.present()) == 2, "their tokens are seen")
+    steps = [
+        lambda: twin.say(line(GRID, "replay-1", 60), published=60),
+        lambda: twin.say(line(GRID, "replay-1", 100), published=100),
+        lambda: scorer.say(line(PREDICTION, twin.producer, 60)),
+        lambda: scorer.say(line(PREDICTION, twin.producer, 100)),
+    ]
+    behind_after: list[list[str]] = []
+    known = listeners._behind
+
+    def beat() -> None:
+        behind_after.append(known("replay-1", {GRID: 100}, {}))
+        if steps:
+            steps.pop(0)()
+
+    twin.say()
+    scorer.say()
+    eventually(lambda: len(listeners._views()) == 2, "both are known")
+    assert settled(listeners, threading.Event(), beat) == []
+    assert not steps, "not before the last of them has said it has all"
+
+
+def test_whoever_stops_changing_and_is_behind_is_named(sites, monkeypatch):
+    monkeypatch.setattr("pipeline.replay.live.listeners._PATIENCE_S", 0.2)
+    bus, listeners = sites
+    twin = FakeStage(bus, "twin_integrator")
+    twin.say(line(GRID, "replay-1", 99))
+    eventually(listeners._views, "it is known")
+    assert settled(listeners, threading.Event(), lambda: twin.say(line(GRID, "replay-1", 99))) == ["twin_integrator"]
+
+
+def test_what_was_sent_before_a_listener_heard_it_counts_as_lost_if_it_was_there_from_the_start(sites):
+    bus, listeners = sites
+    twin, recorder = FakeStage(bus, "twin_integrator"), FakeStage(bus, "recorder")
+    twin.say()
+    eventually(listeners._views, "it is known")
+    listeners._there_at_start = {twin.producer}
+    twin.say(line(GRID, "replay-1", 90, first=7, missing=3), lost=3)
+    recorder.say(line(GRID, "replay-1", 50, first=50))
+    eventually(lambda: len(listeners._views()) == 2, "both are known")
+    eventually(lambda: listeners.lost("replay-1", {GRID: 100}) == {"twin_integrator": 10}, "7 early, 3 missing")
+
+
+def test_another_replay_is_seen(sites):
+    bus, listeners = sites
+    assert not listeners.is_replaying()
+    bus.declare_alive(alive_key("s", "replay", "all"))
+    eventually(listeners.is_replaying, "it is seen")
+    assert listeners.present() == []
+    assert replace(there("viewer")[0], instance="x").label == "viewer/x"

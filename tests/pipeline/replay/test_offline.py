@@ -1,0 +1,468 @@
+"""Offline replay: the same decisions to the bit, whatever was killed; and it can tell when they are not the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from pipeline.recordings.writing import RecordingWriter
+from pipeline.replay.offline.alarm_episodes import episodes
+from pipeline.replay.offline.judging import CannotCompareError, JudgedTray, judge
+from pipeline.replay.offline.replay_input import open_replay_input
+from schemas import fan_pb2
+from schemas.messages import Action, Alarm, Score, Transition
+from tests.support.killed_site import CHAIN, Site
+from tests.support.twin_files import write_twin
+
+
+def verified(*paths: Path) -> JudgedTray:
+    with open_replay_input(paths, None, (), None) as material:
+        (tray,) = judge(material, None, verify=True)
+    assert tray.comparison
+    return tray
+
+
+def made_equal(tray: JudgedTray) -> int:
+    """How many samples were equal; none may differ."""
+    found = tray.comparison
+    assert found and found.is_equal, found
+    return found.equal
+
+
+def recorded(path: Path, topic: str) -> list[Any]:
+    return [entry.message for entry in read_recording(path, (topic,))]
+
+
+def changed(path: Path, out: Path, change) -> Path:
+    """A copy whose messages have gone through `change(entry) -> message or None`."""
+    head = read_metadata(path)
+    with RecordingWriter(out, head.metadata, head.attachments) as writer:
+        for entry in read_recording(path):
+            message = change(entry)
+            if message is not None:
+                writer.write_message(entry.key, message, entry.log_time_ns)
+    return out
+
+
+def test_a_run_that_nothing_disturbed_is_decided_the_same(tmp_path):
+    site = Site(tmp_path, seed=1)
+    site.run(600)
+    path = site.finished()
+    tray = verified(path)
+    assert made_equal(tray) == sum(len(score.t_ns) for score in recorded(path, "score")) > 550
+    assert tray.comparison and tray.comparison.alarms_equal == len(recorded(path, "alarm")) > 0
+    assert tray.plan.restarts == 0
+
+
+def test_samples_that_time_had_given_up_are_given_up_again(tmp_path):
+    site = Site(tmp_path, seed=2)
+    site.run(200)
+    site.fall_silent(1.5)
+    site.run(200)
+    tray = verified(site.finished())
+    assert tray.plan.resampler[0].passed, "the silence was long enough for the resampler to go on without samples"
+    assert tray.counts["lost_too_late"] > 0
+    assert made_equal(tray) > 400
+
+
+ASKED = (Action.ACKNOWLEDGE, Action.SHELVE, Action.COMMISSION, Action.OUT_OF_SERVICE)
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    seed=st.integers(0, 1000),
+    block_size=st.sampled_from([1, 1, 4]),
+    calibrated=st.booleans(),
+    remembers=st.sampled_from([True, True, False]),
+    events=st.lists(
+        st.tuples(st.integers(5, 150), st.sampled_from([*CHAIN, "scorer", "acquisition", "silence", "loss", *ASKED])),
+        min_size=1,
+        max_size=8,
+    ),
+)
+def test_whatever_was_killed_and_asked_for_and_when_the_same_is_decided(
+    tmp_path_factory, seed, block_size, calibrated, remembers, events
+):
+    site = Site(tmp_path_factory.mktemp("site"), seed, block_size, calibrated=calibrated, remembers=remembers)
+    for samples, event in events:
+        site.run(samples)
+        if isinstance(event, Action):
+            site.ask(event, fan=samples % 4 - 1, duration_s=float(samples % 2))
+        elif event == "acquisition":
+            site.restart_source()
+        elif event == "silence":
+            site.fall_silent(0.8)
+        elif event == "loss":
+            site.loses(1 + samples % 3)
+        else:
+            site.kill(event)
+    site.run(50)
+    path = site.finished()
+    assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
+
+
+def alarms_of(path: Path) -> list[Alarm]:
+    return recorded(path, "alarm")
+
+
+@pytest.mark.parametrize("block_size", [1, 4])
+def test_what_operators_asked_for_is_asked_for_again_at_the_same_samples(tmp_path, block_size):
+    site = Site(tmp_path, 1, block_size, calibrated=True)
+    site.run(210)
+    site.ask(Action.ACKNOWLEDGE, 0)
+    site.ask(Action.SHELVE, 0, duration_s=1.0)
+    site.run(30)
+    site.ask(Action.COMMISSION, 1)
+    site.run(400)
+    path = site.finished()
+    told = {alarm.transition for alarm in alarms_of(path)}
+    wanted = {Transition.RAISED, Transition.ACKNOWLEDGED, Transition.SHELVED, Transition.UNSHELVED, Transition.CLEARED}
+    assert {*wanted, Transition.COMMISSIONING} <= told
+    tray = verified(path)
+    assert made_equal(tray) > 550
+    assert tray.comparison and tray.comparison.alarms_equal == len(alarms_of(path))
+
+    def unasked(entry):
+        return None if entry.topic == "request" else entry.message
+
+    without = verified(changed(path, tmp_path / "unasked.mcap", unasked)).comparison
+    assert without and not without.is_equal, "the requests are what made the difference"
+
+
+def test_a_restarted_scorer_goes_on_from_what_it_remembers_and_so_does_a_replay(tmp_path):
+    site = Site(tmp_path, 1, calibrated=True)
+    site.run(210)
+    site.ask(Action.ACKNOWLEDGE, 0)
+    site.ask(Action.OUT_OF_SERVICE, 2)
+    site.run(5)
+    site.kill("scorer")
+    site.run(400)
+    path = site.finished()
+    alarms = alarms_of(path)
+    successor = next(alarm.header.producer for alarm in alarms if alarm.transition == Transition.REPUBLISHED)
+    restated = [alarm for alarm in alarms if alarm.transition == Transition.REPUBLISHED]
+    stood = {alarm.fan: (alarm.active, alarm.acknowledged, alarm.out_of_service) for alarm in restated}
+    assert stood[0] == (True, True, False)
+    assert stood[2][2]
+    assert len([alarm for alarm in alarms if alarm.request]) == 2, "what was answered is not answered again"
+    tray = verified(path)
+    assert made_equal(tray) > 550
+    assert tray.plan.snapshots.keys() == {successor}
+    assert tray.comparison and tray.comparison.alarms_equal == len(alarms)
+    found = episodes(tray.alarms)
+    assert found == episodes(alarms)
+    first = next(episode for episode in found if episode.fan == 0 and episode.onset_ns == restated[0].onset_t_ns)
+    raised = [a for a in alarms if a.transition == Transition.RAISED and a.fan == 0 and a.onset_t_ns == first.onset_ns]
+    assert len(raised) == 1 and raised[0].t_ns == first.raised_ns, "one alarm, over the restart"
+
+
+def test_without_the_memory_it_began_with_a_session_cannot_be_made_the_same(tmp_path):
+    site = Site(tmp_path, 1, calibrated=True)
+    site.run(210)
+    site.kill("scorer")
+    site.run(100)
+
+    def forgotten(entry):
+        return None if entry.topic == "snapshot" else entry.message
+
+    path = changed(site.finished(), tmp_path / "forgotten.mcap", forgotten)
+    with pytest.raises(CannotCompareError, match="begins in the middle of scorer"):
+        verified(path)
+
+
+def test_a_part_that_begins_with_a_restarted_scorer_still_needs_what_it_was_fed(tmp_path):
+    site = Site(tmp_path, 1, calibrated=True)
+    site.run(210)
+    site.records = False
+    site.run(20)
+    site.records = True
+    site.kill("scorer")
+    site.run(100)
+    with pytest.raises(CannotCompareError, match="lacks .* raw messages"):
+        verified(site.finished())
+
+
+def test_with_other_limits_a_session_goes_on_from_what_the_one_before_finds_now(tmp_path):
+    site = Site(tmp_path, 1, calibrated=True)
+    site.run(215)
+    site.kill("scorer")
+    site.run(100)
+    with open_replay_input([site.finished()], None, ("scorer.limit_factor=1000",), None) as material:
+        (tray,) = judge(material, None, verify=False)
+    assert any(alarm.transition == Transition.REPUBLISHED for alarm in tray.recorded_alarms)
+    assert tray.alarms == []
+    assert tray.counts["snapshots_of_another_twin"] == 0
+
+
+def test_with_another_twin_a_restart_costs_no_commissioning(tmp_path):
+    site = Site(tmp_path, 1, calibrated=True)
+    site.run(215)
+    site.kill("scorer")
+    site.run(100)
+    other = write_twin(tmp_path / "other.onnx", fans=1)
+    with open_replay_input([site.finished()], None, (), other) as material:
+        (tray,) = judge(material, None, verify=False)
+    assert tray.plan.restarts == 1
+    assert tray.counts["snapshots_of_another_twin"] == 0
+
+
+@pytest.mark.parametrize(("lacks", "is_planned"), [("command", False), ("torque_balance_command", True)])
+def test_a_recording_of_another_version_is_judged_from_its_raw_samples(tmp_path, lacks, is_planned):
+    site = Site(tmp_path, 1)
+    site.run(300)
+    with open_replay_input([site.finished()], None, (), None) as material:
+        packets = list(material.packets("tray1", ("grid", "prediction", "score", "raw")))
+        old = [p if p.topic.name != "prediction" else p._replace(payload=_without(lacks, p.payload)) for p in packets]
+        material.packets = lambda tray, topics: (p for p in old if p.topic.name in topics)  # type: ignore[method-assign]
+        plan, _ = material.survey("tray1")
+        (tray,) = judge(material, None, verify=False)
+    assert (plan is not None) == is_planned
+    assert tray.judged > 200
+
+
+def _without(column: str, payload: bytes) -> bytes:
+    prediction = fan_pb2.Prediction.FromString(payload)
+    prediction.ClearField(column)
+    return prediction.SerializeToString()
+
+
+def test_raw_messages_that_the_recorder_never_got_are_missed(tmp_path):
+    site = Site(tmp_path, seed=3)
+    site.run(150)
+    site.records = False
+    site.run(3)
+    site.records = True
+    site.run(150)
+    path = site.finished()
+    with pytest.raises(CannotCompareError, match="lacks 3 raw messages"):
+        verified(path)
+
+
+@pytest.mark.parametrize(("first", "last"), [(10, 10**9), (0, 280)], ids=["head", "tail"])
+def test_raw_messages_that_are_missing_at_the_ends_are_missed(tmp_path, first, last):
+    site = Site(tmp_path, seed=3)
+    site.run(300)
+
+    def without(entry):
+        return entry.message if entry.topic != "raw" or first <= entry.message.header.sequence < last else None
+
+    with pytest.raises(CannotCompareError, match="lacks .* raw messages"):
+        verified(changed(site.finished(), tmp_path / "without.mcap", without))
+
+
+def test_a_recording_without_raw_samples_is_never_equal(tmp_path):
+    site = Site(tmp_path, seed=3)
+    site.run(300)
+    no_raw = changed(site.finished(), tmp_path / "no.mcap", lambda e: None if e.topic == "raw" else e.message)
+    with pytest.raises(RecordingError, match="no raw samples"):
+        verified(no_raw)
+
+
+def test_what_a_killed_stage_sent_and_the_recorder_never_got_is_made_anew(tmp_path):
+    site = Site(tmp_path, seed=4)
+    site.run(150)
+    integrator = site.stages["twin_integrator"].producer
+    sent = site.stages["twin_integrator"].published["prediction"]
+    site.kill("twin_integrator")
+    site.run(150)
+
+    def lost(entry):
+        header = entry.message.header
+        is_last = entry.topic == "prediction" and header.producer == integrator and header.sequence >= sent - 3
+        return None if is_last else entry.message
+
+    path = changed(site.finished(), tmp_path / "lost.mcap", lost)
+    assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
+
+
+def test_an_alarm_after_the_last_recorded_score_is_no_difference(tmp_path):
+    site = Site(tmp_path, seed=1)
+    site.run(600)
+    path = site.finished()
+    raised = recorded(path, "alarm")[0]
+
+    def until_then(entry):
+        if entry.topic in ("grid", "prediction", "score"):
+            return entry.message if entry.message.t_ns[0] <= raised.t_ns else None
+        return None if entry.topic == "alarm" else entry.message
+
+    found = verified(changed(path, tmp_path / "cut.mcap", until_then)).comparison
+    assert found and found.is_equal and found.alarms_not_recorded > 0 and found.not_recorded > 0
+
+
+def test_grids_of_a_session_that_are_nowhere_leave_nothing_to_compare(tmp_path):
+    site = Site(tmp_path, seed=1)
+    site.run(300)
+    no_grid = changed(site.finished(), tmp_path / "no.mcap", lambda e: None if e.topic == "grid" else e.message)
+    with pytest.raises(CannotCompareError, match="nothing to compare with"):
+        verified(no_grid)
+    with open_replay_input([no_grid], None, (), None) as material:
+        (tray,) = judge(material, None, verify=False)
+    assert tray.judged > 200
+
+
+def test_what_never_came_to_the_resampler_is_not_made_up(tmp_path):
+    site = Site(tmp_path, seed=5, block_size=10)
+    site.run(205)
+    site.loses(3)
+    site.run(300)
+    path = site.finished()
+    assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
+
+
+def test_an_undecodable_alarm_costs_that_alarm_only(tmp_path):
+    site = Site(tmp_path, seed=1)
+    site.run(600)
+    path = site.finished()
+    alarms = recorded(path, "alarm")
+    with open_replay_input([path], None, (), None) as material:
+        packets = list(material.packets("tray1", ("grid", "prediction", "score", "alarm")))
+        first = next(n for n, packet in enumerate(packets) if packet.topic.name == "alarm")
+        packets[first] = packets[first]._replace(payload=b"\xff\xff")
+        material.packets = lambda tray, topics: iter(packets)  # type: ignore[method-assign]
+        plan, found = material.survey("tray1")
+    assert plan and len(found) == len(alarms) - 1
+    assert "cannot be decoded: 1" in next(iter(material.damage.values()))
+
+
+@pytest.mark.parametrize("topic", ["grid", "prediction"])
+def test_a_recording_that_lacks_what_lay_between_is_compared_all_the_same(tmp_path, topic):
+    site = Site(tmp_path, seed=4)
+    site.run(150)
+    site.kill("twin_integrator")
+    site.run(150)
+    holes = changed(
+        site.finished(),
+        tmp_path / "holes.mcap",
+        lambda entry: None if entry.topic == topic and 80 <= entry.message.header.sequence < 90 else entry.message,
+    )
+    assert made_equal(verified(holes)) > 290
+
+
+def test_one_bit_is_found_and_named(tmp_path):
+    site = Site(tmp_path, seed=5)
+    site.run(300)
+
+    def flip(entry):
+        if entry.topic != "score" or entry.message.header.sequence != 200:
+            return entry.message
+        residual = entry.message.residual_rad_s.copy()
+        residual[0, 1] = np.nextafter(residual[0, 1], np.inf)
+        return replace(entry.message, residual_rad_s=residual)
+
+    found = verified(changed(site.finished(), tmp_path / "flipped.mcap", flip)).comparison
+    assert found and not found.is_equal
+    assert (found.different, found.not_made, found.alarms_different) == (1, 0, 0)
+    (line,) = found.named
+    assert "fan 1: residual_rad_s" in line
+
+
+def test_an_alarm_that_was_never_raised_is_found(tmp_path):
+    site = Site(tmp_path, seed=1)
+    site.run(600)
+    path = site.finished()
+    first = next(alarm for alarm in recorded(path, "alarm") if isinstance(alarm, Alarm))
+
+    def without(entry):
+        return None if entry.topic == "alarm" and entry.message.header.sequence == 0 else entry.message
+
+    found = verified(changed(path, tmp_path / "without.mcap", without)).comparison
+    assert found and not found.is_equal and found.alarms_different == 1
+    assert first.message in found.named[0] and "none recorded" in found.named[0]
+
+
+def test_scores_that_nobody_made_are_found(tmp_path):
+    site = Site(tmp_path, seed=6)
+    site.run(200)
+
+    def later(entry):
+        if entry.topic != "score" or entry.message.header.sequence != 150:
+            return entry.message
+        return replace(entry.message, t_ns=entry.message.t_ns + 1)
+
+    found = verified(changed(site.finished(), tmp_path / "later.mcap", later)).comparison
+    assert found and found.not_made == 1 and found.not_recorded == 1
+
+
+def test_a_recording_without_scores_cannot_be_compared(tmp_path):
+    site = Site(tmp_path, seed=7)
+    site.run(100)
+    raw = changed(site.finished(), tmp_path / "raw.mcap", lambda entry: entry.message if entry.topic == "raw" else None)
+    with pytest.raises(CannotCompareError, match="nothing to compare with"):
+        verified(raw)
+
+
+def test_a_part_from_the_middle_cannot_be_compared_and_says_what_is_missing(tmp_path):
+    site = Site(tmp_path, seed=8)
+    site.run(400)
+    half = 200
+
+    def second_half(entry):
+        return entry.message if entry.message.header.sequence >= half else None
+
+    part = changed(site.finished(), tmp_path / "part.mcap", second_half)
+    with pytest.raises(CannotCompareError, match="the parts before it"):
+        verified(part)
+
+
+def test_parts_that_overlap_are_one_recording(tmp_path):
+    site = Site(tmp_path, seed=9)
+    site.run(200)
+    site.kill("scorer")
+    site.run(200)
+    path = site.finished()
+    first = changed(path, tmp_path / "1.mcap", lambda e: e.message if e.message.header.sequence < 220 else None)
+    second = changed(path, tmp_path / "2.mcap", lambda e: e.message if e.message.header.sequence >= 180 else None)
+    assert made_equal(verified(first, second)) >= 399
+
+
+def test_another_twin_is_a_what_if(tmp_path):
+    site = Site(tmp_path, seed=1)
+    site.run(600)
+    path = site.finished()
+    other = write_twin(tmp_path / "other.onnx", fans=1)
+    with open_replay_input([path], None, (), other) as material:
+        assert not material.is_as_recorded
+        (tray,) = judge(material, None, verify=False)
+    assert tray.samples == sum(len(score.t_ns) for score in recorded(path, "score"))
+    assert 1 not in {alarm.fan for alarm in tray.recorded_alarms}
+    assert {alarm.fan for alarm in tray.alarms} == {0, 1, 2}, "it is of another fan"
+
+
+def test_another_threshold_is_a_what_if(tmp_path):
+    site = Site(tmp_path, seed=1)
+    site.run(600)
+    with open_replay_input([site.finished()], None, ("scorer.alarm_sigmas=1000",), None) as material:
+        (tray,) = judge(material, None, verify=False)
+    assert tray.recorded_alarms and not tray.alarms
+
+
+def test_the_output_is_a_recording_that_is_decided_the_same(tmp_path):
+    site = Site(tmp_path, seed=1)
+    site.run(600)
+    site.kill("scorer")
+    site.run(100)
+    path, out = site.finished(), tmp_path / "out.mcap"
+    with open_replay_input([path], None, (), None) as material:
+        (tray,) = judge(material, out, verify=False)
+    raw = sum(len(message.host_receive_t_ns) for message in recorded(out, "raw"))
+    assert raw == sum(len(message.host_receive_t_ns) for message in recorded(path, "raw"))
+    scores = [score for score in recorded(out, "score") if isinstance(score, Score)]
+    assert len({t_ns for score in scores for t_ns in score.t_ns.tolist()}) == tray.samples
+    with open_replay_input([out], None, (), None) as material:
+        (again,) = judge(material, None, verify=False)
+    assert again.samples == tray.samples and material.is_as_recorded
+
+
+def test_the_golden_recording_is_decided_as_it_was():
+    tray = verified(Path(__file__).parents[2] / "support" / "data" / "golden.mcap")
+    assert tray.plan.restarts == 2, "two stages were killed while it was made"
+    assert made_equal(tray) > 400
+    assert tray.comparison and tray.comparison.alarms_equal >= 2

@@ -1,0 +1,224 @@
+"""A replay without a bus and without time: what goes out when, and what keys do to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from pipeline.recordings.reading import Entry
+from pipeline.replay.live.keyboard import Key
+from pipeline.replay.live.pace import Pace
+from pipeline.replay.live.player import BEAT_S, Player, Progress, Stopped
+from schemas.messages import Alarm, Severity, StageStatus
+from tests.support.replay_data import START_NS, STEP_NS, raw_of
+
+
+@dataclass
+class FakeTime:
+    """Passes only by waiting. `until_s`: when the end is asked for."""
+
+    s: float = 50.0
+    until_s: float = math.inf
+    waits: int = 0
+
+    def now_s(self) -> float:
+        return self.s
+
+    def wait(self, for_s: float) -> bool:
+        self.waits += 1
+        assert for_s <= BEAT_S
+        self.s = min(self.s + (max(for_s, 1e-9) if for_s else 0.0), self.until_s)  # never too little for a float
+        return self.s >= self.until_s
+
+
+@dataclass
+class Sent:
+    """Remembers what went out, and when."""
+
+    time: FakeTime
+    messages: list[tuple[float, str, int]] = field(default_factory=list)
+    clocks: list[tuple[float, int, float]] = field(default_factory=list)
+    healths: list[float] = field(default_factory=list)
+    cost_s: float = 0.0
+
+    def send(self, entry: Entry) -> None:
+        self.messages.append((round(self.time.s - 50.0, 6), entry.topic, entry.message.header.sequence))
+        self.time.s += self.cost_s
+
+    def tell_clock(self, t_ns: int, rate: float) -> None:
+        self.clocks.append((self.time.s - 50.0, t_ns - START_NS, rate))
+
+    def tell_health(self, status: StageStatus = StageStatus.OK, problem: str = "") -> None:
+        self.healths.append(self.time.s - 50.0)
+
+    def published(self) -> Mapping[str, int]:
+        return {}
+
+
+class Script:
+    """Keys at given moments, s since the start."""
+
+    def __init__(self, time: FakeTime, *presses: tuple[float, Key]) -> None:
+        self.time = time
+        self.presses = list(presses)
+
+    def __call__(self) -> list[Key]:
+        due = [key for at_s, key in self.presses if at_s <= self.time.s - 50.0 + 1e-9]
+        self.presses = self.presses[len(due) :]
+        return due
+
+
+def raws(count: int, period_ns: int = STEP_NS, samples: int = 1) -> list[tuple[int, Entry]]:
+    found = []
+    for k in range(count):
+        raw = raw_of(k * samples, 1, sequence=k, samples=samples)
+        log_ns = START_NS + ((k + 1) * samples - 1) * period_ns
+        found.append((0, Entry("fantwin/demo/tray1/raw", "raw", raw, log_ns)))
+    return found
+
+
+def alarm(log_ns: int, sequence: int) -> Entry:
+    said: dict[str, Any] = {"residual_rad_s": 0, "limit_rad_s": 0, "message": ""}
+    message = Alarm(fan=0, active=True, severity=Severity.ALARM, t_ns=log_ns, onset_t_ns=log_ns, **said)
+    return Entry("fantwin/demo/tray1/alarm", "alarm", message, log_ns)
+
+
+def play(
+    rounds: Sequence[tuple[int, Entry]],
+    rate: float = 1.0,
+    *,
+    paused: bool = False,
+    until_s: float = math.inf,
+    cost_s: float = 0.0,
+    look: Callable[[Progress], None] = lambda _progress: None,
+    keys: Sequence[tuple[float, Key]] = (),
+) -> tuple[Sent, Player]:
+    time = FakeTime(until_s=50.0 + until_s)
+    sent = Sent(time, cost_s=cost_s)
+    player = Player(sent, Pace(rate, paused=paused), time, keys=Script(time, *keys), look=look)
+    player.play(rounds)
+    return sent, player
+
+
+@pytest.mark.parametrize(("rate", "apart_s"), [(1.0, 0.01), (0.1, 0.1), (8.0, 0.00125), (math.inf, 0.0)])
+def test_messages_go_out_at_their_recorded_distances_over_the_rate(rate, apart_s):
+    sent, player = play(raws(300), rate)
+    assert [at_s for at_s, _, _ in sent.messages] == pytest.approx([k * apart_s for k in range(300)], abs=1e-6)
+    assert player.last_ns - player.first_ns == 299 * STEP_NS
+    assert player.ended_s - player.began_s == pytest.approx(299 * apart_s)
+
+
+def test_what_publishing_costs_does_not_add_up():
+    sent, _ = play(raws(300), cost_s=0.004)
+    assert sent.messages[-1][0] == pytest.approx(2.99)
+
+
+def test_twenty_times_a_second_it_is_told_what_time_it_is_and_once_a_second_how_it_is():
+    sent, _ = play(raws(301))
+    assert len(sent.clocks) == pytest.approx(3.0 / BEAT_S, abs=3)
+    for at_s, t_ns, rate in sent.clocks:
+        assert t_ns == pytest.approx(at_s * 1e9, abs=STEP_NS)
+        assert rate == 1.0
+    assert len(sent.healths) == 3 + 1 + 1  # once at the start, once at the end
+
+
+def test_the_time_is_told_before_the_first_message():
+    sent, _ = play(raws(3))
+    assert sent.clocks[0] == (0.0, 0, 1.0)
+    order: list[str] = []
+
+    class Ordered(Sent):
+        def send(self, entry: Entry) -> None:
+            order.append("message")
+
+        def tell_clock(self, t_ns: int, rate: float) -> None:
+            order.append("clock")
+
+    time = FakeTime()
+    Player(Ordered(time), Pace(math.inf), time).play(raws(3))
+    assert order[0] == "clock"
+
+
+def test_the_clock_waits_before_samples_that_are_still_to_come_however_late_their_message_was():
+    sent, _ = play(raws(5, samples=100))
+    oldest = [k * 100 * STEP_NS for k in range(5)]
+    for at_s, t_ns, _ in sent.clocks:
+        coming = [first for k, first in enumerate(oldest) if at_s < ((k + 1) * 100 - 1) / 100 - 0.99]
+        assert all(t_ns <= first for first in coming)
+    assert max(t_ns for _, t_ns, _ in sent.clocks) == oldest[-1]
+
+
+def test_the_clock_goes_on_through_a_silence_of_the_line():
+    silent = [*raws(10), (0, alarm(START_NS + 3 * 10**9, 0))]
+    sent, _ = play(silent)
+    assert [t_ns for at_s, t_ns, _ in sent.clocks if 1.0 < at_s < 2.0][-1] == pytest.approx(2e9, abs=6e7)
+
+
+def test_the_told_time_never_runs_back():
+    rounds = raws(4, samples=100)
+    rounds.insert(1, (0, alarm(START_NS + 1_500_000_000, 0)))  # told before samples that are older
+    sent, _ = play(rounds, keys=[(1.0, Key.FASTER), (1.2, Key.PAUSE), (1.5, Key.STEP), (1.6, Key.PAUSE)])
+    times = [t_ns for _, t_ns, _ in sent.clocks]
+    assert times == sorted(times)
+
+
+def test_a_pause_holds_everything_but_the_clock_and_health_and_is_no_recorded_time():
+    sent, player = play(raws(200), keys=[(0.5, Key.PAUSE), (60.5, Key.PAUSE)])
+    during = [message for message in sent.messages if 0.56 < message[0] < 60.5]
+    assert during == []
+    assert len([at_s for at_s in sent.healths if 0.5 < at_s < 60.5]) >= 55
+    standing = [(t_ns, rate) for at_s, t_ns, rate in sent.clocks if 0.6 < at_s < 60.4]
+    assert len(standing) > 1000
+    assert len(set(standing)) == 1
+    assert standing[0][1] == 0.0
+    assert player.ended_s - player.began_s == pytest.approx(61.99)
+    assert sent.messages[-1][2] == 199
+
+
+def test_a_step_is_one_message_of_the_first_topic_and_all_recorded_before_it():
+    rounds = raws(10)
+    rounds.insert(3, (0, alarm(START_NS + 2 * STEP_NS + 1, 0)))
+    sent, _ = play(
+        rounds, paused=True, keys=[(1, Key.STEP), (2, Key.STEP), (3, Key.STEP), (4, Key.STEP), (5, Key.PAUSE)]
+    )
+    by_second = [[topic for at_s, topic, _ in sent.messages if round(at_s) == second] for second in (1, 2, 3, 4)]
+    assert by_second == [["raw"], ["raw"], ["raw"], ["alarm", "raw"]]
+    told = [t_ns for at_s, t_ns, _ in sent.clocks if 4.1 < at_s < 4.9]
+    assert set(told) == {3 * STEP_NS}
+
+
+def test_after_a_step_it_goes_on_from_there():
+    sent, _ = play(raws(100), paused=True, keys=[(10.0, Key.STEP), (20.0, Key.PAUSE)])
+    assert [at_s for at_s, _, _ in sent.messages[:3]] == pytest.approx([10.0, 20.01, 20.02], abs=0.051)
+
+
+def test_up_and_down_double_and_halve_the_rate():
+    sent, _ = play(raws(400), keys=[(1.0, Key.FASTER), (2.0, Key.SLOWER)])
+    assert sent.messages[-1][0] == pytest.approx(2.99, abs=0.06)
+    assert {rate for _, _, rate in sent.clocks} == {1.0, 2.0}
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_the_end_is_at_once_when_it_is_asked_for(paused):
+    with pytest.raises(Stopped):
+        play(raws(1000), paused=paused, until_s=2.345)
+    with pytest.raises(Stopped):
+        play(raws(1000), paused=paused, keys=[(3.0, Key.QUIT)])
+
+
+def test_whoever_looks_sees_where_it_is_and_may_end_it_with_an_error():
+    seen: list[Progress] = []
+
+    def look(progress: Progress) -> None:
+        seen.append(progress)
+        if progress.messages > 100:
+            raise ValueError("enough")
+
+    with pytest.raises(ValueError, match="enough"):
+        play(raws(1000), look=look)
+    assert seen[-1].t_ns == pytest.approx(START_NS + 1_000_000_000, abs=1e8)
+    assert (seen[-1].rate, seen[-1].paused, seen[-1].round) == (1.0, False, 0)

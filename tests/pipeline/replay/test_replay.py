@@ -1,0 +1,99 @@
+"""`fantwin replay` as a command: what it refuses before anything is on a bus, and the line it shows."""
+
+from __future__ import annotations
+
+import math
+import sys
+from types import ModuleType
+
+import pytest
+
+from pipeline.cli.recordings.replay import status_line
+from pipeline.replay.live.player import Progress
+from pipeline.replay.live.recording_playback import RecordingPlayback
+from stages.resampler import ResamplerConfig, ResamplerCore
+from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.replay_data import START_NS, STEP_NS, write_raw
+
+
+@pytest.fixture
+def recording(tmp_path):
+    return write_raw(tmp_path / "r.mcap", 20)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--rate 0", "'0': give a number above 0, to 1e+06, or max"),
+        ("--rate 1e308", "give a number above 0"),
+        ("--start 1e300", "--start"),
+        ("--end 1e300", "--start"),
+        ("--rate -1", "give a number above 0"),
+        ("--rate inf", "give a number above 0"),
+        ("--rate nan", "give a number above 0"),
+        ("--rate quick", "give a number above 0"),
+        ("--topics health", "'health' is none of raw, grid"),
+        ("--topics clock", "'clock' is none of"),
+        ("--from score", "'score' is none of raw, grid, prediction"),
+        ("--from raw --topics raw", "not both"),
+        ("--start 5 --end 5", "--start < --end"),
+        ("--start -1", "--start < --end"),
+        ("--pause", "no terminal"),
+        ("--verify", "goes only with --offline"),
+        ("--twin t.onnx", "goes only with --offline"),
+        ("-o out.mcap", "goes only with --offline"),
+        ("--offline --rate 2", "--rate cannot go with --offline"),
+        ("--offline --loop", "--loop cannot go with --offline"),
+        ("--offline --pause", "--pause cannot go with --offline"),
+        ("--offline --topics raw", "--topics cannot go with --offline"),
+        ("--offline --from raw", "--from cannot go with --offline"),
+    ],
+)
+def test_what_makes_no_sense_is_wrong_usage(recording, words, said):
+    done = fantwin("replay", recording, *words.split())
+    assert done.exit_code == 2
+    assert said in " ".join(done.stderr.replace("│", " ").split())
+
+
+def test_a_tray_that_the_configuration_lacks_is_one_line(recording, tmp_path):
+    config = tmp_path / "c.toml"
+    config.write_text('[[tray]]\nname = "rig"\nfans = 8\n')
+    assert said_instead("replay", recording, "-c", config) == f"{config}: no tray called 'tray1'; known: rig"
+
+
+def test_deciding_again_is_handed_over_as_it_was_asked_for(recording, tmp_path, monkeypatch):
+    asked: dict[str, object] = {}
+    stand_in = ModuleType("pipeline.cli.recordings.replay_offline")
+    vars(stand_in)["run_offline"] = lambda files, **words: asked.update(words, files=files)
+    monkeypatch.setitem(sys.modules, "pipeline.cli.recordings.replay_offline", stand_in)
+    words = ["--offline", "--verify", "--twin", "t.onnx", "-o", "out.mcap", "--start", 1, "--set", "site=x", "--json"]
+    assert fantwin("replay", recording, *words).exit_code == 0
+    assert asked["files"] == [recording]
+    assert (asked["verify"], asked["json_output"], asked["from_s"], asked["to_s"]) == (True, True, 1.0, math.inf)
+    assert (str(asked["twin"]), str(asked["output"]), asked["overrides"]) == ("t.onnx", "out.mcap", ["site=x"])
+
+
+def test_the_line_tells_time_place_rate_and_messages():
+    progress = Progress(START_NS + 12_500_000_000, 4.0, paused=False, round=0, messages=12345)
+    line = status_line(progress, 12.5, 60.0)
+    for words in ("2023-11-14 22:13:32.500 UTC", "12.50 s of 60.00 s", "x 4 ", "12,345 sent", "space"):
+        assert words in line
+    later = Progress(START_NS, math.inf, paused=True, round=2, messages=0)
+    assert "round 3" in status_line(later, 12.5, 60.0)
+    assert "paused, as fast as it goes" in status_line(later, 12.5, None)
+
+
+def test_round_after_round_a_resampler_sees_a_device_that_restarts_and_loses_nothing(tmp_path):
+    core = ResamplerCore(8, ResamplerConfig())
+    reel = RecordingPlayback([write_raw(tmp_path / "long.mcap", 300)], ("raw",))
+    times: list[int] = []
+    for number, entry in reel.rounds():
+        if number == 3:
+            break
+        times += [int(t_ns) for grid in core.step(entry.message) for t_ns in grid.t_ns]  # pyright: ignore[reportArgumentType]
+    counters = core.counters()
+    assert counters["clock_restarts"] == 2
+    assert not {name: count for name, count in counters.items() if name.startswith("lost_") and count}
+    assert not counters.get("gaps")
+    assert times == list(range(START_NS, START_NS + len(times) * STEP_NS, STEP_NS))
+    assert len(times) >= 3 * 300 - 2

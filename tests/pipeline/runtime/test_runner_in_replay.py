@@ -1,0 +1,118 @@
+"""The runner while a recording is replayed: whose time it goes by, and what a device must not take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import Config
+from pipeline.runtime.stage import Context, Parts
+from schemas.codec import encode, type_name
+from schemas.messages import Clock, Command, Grid, Header, Health, Message, StageStatus
+from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from tests.pipeline.runtime.test_runner import TRAY_A, TRAY_B, Bench, Burst, Passer, config, toy
+from tests.support.running_chain import eventually
+
+__all__ = ["config"]  # a fixture
+
+
+class Ticker(Passer):
+    """Remembers the times of its ticks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ticks: list[int] = []
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        self.ticks.append(now_ns)
+        return []
+
+
+class Replay:
+    """A replay on the bus of a bench, as far as a stage sees it."""
+
+    def __init__(self, config: Config) -> None:
+        self.bus = Bus(config.bus)
+        self.bus.declare_alive(alive_key("s", "replay", "all"))
+        self.clock = self.bus.outlet(tray_key("s", TRAY_A, "clock"), BY_NAME["clock"], type_name(Clock), "replay-1")
+        self.health = self.bus.outlet(
+            health_key("s", "replay", "all"), BY_NAME["health"], type_name(Health), "replay-1"
+        )
+
+    def tell(self, t_ns: int, rate: float = 1.0) -> None:
+        header = Header("replay-1", self.clock.published, TRAY_A)
+        self.clock.put(encode(Clock(header=header, t_ns=t_ns, rate=rate)))
+
+    def stop(self) -> None:
+        header = Header("replay-1", self.health.published, "")
+        last = Health(header=header, stage="replay", instance="all", status=StageStatus.STOPPED, t_ns=0, uptime_s=0.0)
+        self.health.put(encode(last))
+
+
+@pytest.fixture
+def tickers(config):
+    """A bench whose cores remember their ticks, and the two cores."""
+    cores: dict[str, Ticker] = {}
+
+    def build(context: Context) -> Parts:
+        cores[context.tray.name] = Ticker()
+        return Parts(cores[context.tray.name])
+
+    bench = Bench(toy(build), config)
+    yield bench, cores[TRAY_A], cores[TRAY_B]
+    bench.end()
+
+
+@pytest.mark.parametrize("leave", [lambda replay: replay.stop(), lambda replay: replay.bus.close()])
+def test_ticks_bear_the_time_of_a_replay_until_it_leaves_however_it_does(config, tickers, leave):
+    _, core, other = tickers
+    replay = Replay(config)
+    try:
+        for t_ns in (1000, 2000):
+            eventually(lambda t_ns=t_ns: replay.tell(t_ns) or core.ticks[-1] == t_ns, "it ticks in recorded time")
+        assert other.ticks[-1] > 1e18, "the other tray is not replayed"
+        count = len(core.ticks)
+        eventually(lambda: len(core.ticks) > count + 3, "it goes on ticking")
+        assert set(core.ticks[count:]) == {2000}, "the time stands still while nothing new is told"
+        leave(replay)
+        eventually(lambda: core.ticks[-1] > 1e18, "the host's time is in force again")
+    finally:
+        replay.bus.close()
+
+
+def test_latency_is_told_in_the_time_of_the_replay_and_not_at_all_where_that_stands_still(config, tickers):
+    bench, core, _ = tickers
+    replay = Replay(config)
+    try:
+        eventually(lambda: replay.tell(10**9, rate=0.0) or core.ticks[-1] == 10**9, "the replay stands still")
+        bench.feed(TRAY_A, 1)
+        bench.next(Grid)
+        eventually(lambda: replay.tell(2 * 10**9, rate=0.001) or core.ticks[-1] == 2 * 10**9, "it goes on, slowly")
+        bench.feed(TRAY_A, 2 * 10**9 - 5_000_000)
+        bench.next(Grid)
+        health = bench.health_with(lambda h: h.latency_p99_ms > 0.0)
+    finally:
+        replay.bus.close()
+    assert 5.0 <= health.latency_p50_ms < 100.0, "a thousandth of what passed here, and 5 ms in the recording"
+
+
+def test_a_stage_with_a_device_takes_nothing_of_a_replay_and_keeps_the_hosts_time(config):
+    core = Ticker()
+    declared = {"process_per_tray": True, "name": "acquisition", "reads": ("command",)}
+    bench = Bench(toy(lambda _context: Parts(core, Burst([])), **declared), config, TRAY_A)
+    outlets = {
+        who: bench.bus.outlet(tray_key("s", TRAY_A, "command"), BY_NAME["command"], type_name(Command), who)
+        for who in ("replay-all-1", "command-1")
+    }
+    replay = Replay(config)
+    replay.tell(1000)
+    for who, outlet in outlets.items():
+        outlet.put(encode(Command(header=Header(who, 0, TRAY_A), fans=3 if who == "replay-all-1" else 1, t_ns=0)))
+    health = bench.health_with(lambda h: len(h.inputs) == 2)
+    replay.bus.close()
+    bench.end()
+    assert {c.name: c.value for c in health.counters}["refused_of_replay"] == 1
+    assert core.fans == 1
+    assert min(core.ticks) > 1e18

@@ -1,0 +1,164 @@
+"""Sequence accounting: every message once and in order, gaps asked for again, the rest counted."""
+
+from collections.abc import Iterable
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.runtime.sequence_tracker import SequenceTracker
+from schemas.envelope import Envelope
+from schemas.messages import Alarm, Header, Health, Output, Severity, StageStatus
+from schemas.topics import BY_NAME, tray_key
+
+KEY = tray_key("site", "tray", "alarm")
+
+
+def packet(sequence: int, producer: str = "p") -> Envelope:
+    header = Header(producer, sequence, "tray")
+    alarm = Alarm(
+        header=header,
+        fan=0,
+        active=True,
+        severity=Severity.ALARM,
+        t_ns=0,
+        onset_t_ns=0,
+        residual_rad_s=0,
+        limit_rad_s=0,
+        message="",
+    )
+    return Envelope(KEY, "alarm", b"", 0, alarm)
+
+
+class Producer:
+    """Remembers what was asked of it and answers from what it still keeps."""
+
+    def __init__(self, keeps: Iterable[int]) -> None:
+        self.keeps = set(keeps)
+        self.asked: list[tuple[int, int]] = []
+
+    def recover(self, _key: str, producer: str, first: int, last: int) -> list[Envelope]:
+        self.asked.append((first, last))
+        return [packet(s, producer) for s in sorted(self.keeps, reverse=True) if first <= s <= last]
+
+
+def sequences(packets: Iterable[Envelope]) -> list[int]:
+    return [p.message.header.sequence for p in packets]
+
+
+def health(published: int, producer: str = "p") -> Health:
+    return Health(
+        header=Header(producer, 0, ""),
+        stage="s",
+        instance="all",
+        status=StageStatus.OK,
+        t_ns=0,
+        uptime_s=0,
+        outputs=(Output(key=KEY, published=published),),
+    )
+
+
+def test_a_gap_is_filled_in_order_from_what_the_producer_keeps():
+    producer = Producer(range(10))
+    inlet = SequenceTracker(producer.recover)
+    assert sequences(inlet.accept(packet(0))) == [0]
+    assert sequences(inlet.accept(packet(4))) == [1, 2, 3, 4]
+    assert producer.asked == [(1, 3)]
+    (line,) = inlet.inputs()
+    assert (line.received, line.missing, line.duplicated, line.next_sequence) == (5, 0, 0, 5)
+
+
+def test_what_the_producer_no_longer_keeps_is_counted_missing():
+    inlet = SequenceTracker(Producer([2]).recover)
+    list(inlet.accept(packet(0)))
+    assert sequences(inlet.accept(packet(5))) == [2, 5]
+    (line,) = inlet.inputs()
+    assert (line.received, line.missing) == (3, 3)
+
+
+def test_a_message_that_comes_again_is_dropped_and_counted():
+    inlet = SequenceTracker(Producer([]).recover)
+    list(inlet.accept(packet(0)))
+    assert sequences(inlet.accept(packet(0))) == []
+    assert inlet.inputs()[0].duplicated == 1
+
+
+def test_a_late_joiner_gets_what_is_still_kept_and_counts_no_loss_for_what_is_history():
+    producer = Producer([98, 99])
+    inlet = SequenceTracker(producer.recover)
+    assert sequences(inlet.accept(packet(100))) == [98, 99, 100]
+    assert inlet.inputs()[0].missing == 0
+
+
+def test_a_late_joiner_asks_for_no_more_than_a_producer_keeps():
+    producer = Producer([])
+    list(SequenceTracker(producer.recover).accept(packet(10**6)))
+    history = BY_NAME["alarm"].history
+    assert producer.asked == [(10**6 - history, 10**6 - 1)]
+
+
+def test_a_new_session_of_a_producer_starts_its_own_sequence():
+    inlet = SequenceTracker(Producer([]).recover)
+    list(inlet.accept(packet(7, "old")))
+    assert sequences(inlet.accept(packet(0, "new"))) == [0]
+    assert all(line.duplicated == 0 for line in inlet.inputs())
+
+
+def test_of_many_producers_the_latest_are_known_by_name_and_the_others_counted_together():
+    inlet = SequenceTracker(Producer([]).recover)
+    list(inlet.accept(packet(0, "controller")))
+    for number in range(100):
+        list(inlet.accept(packet(0, f"operator-{number}")))
+        list(inlet.accept(packet(3, f"operator-{number}")))
+        assert sequences(inlet.accept(packet(number + 1, "controller"))) == [number + 1], "who speaks stays known"
+    *named, others = inlet.inputs()
+    assert {line.producer for line in named} == {"controller", *(f"operator-{number}" for number in range(37, 100))}
+    assert (others.producer, others.received, others.missing) == ("", 2 * 37, 2 * 37)
+    assert sum(line.received for line in inlet.inputs()) == 301
+
+
+def test_health_shows_a_last_message_that_never_came():
+    producer = Producer(range(3))
+    inlet = SequenceTracker(producer.recover)
+    list(inlet.accept(packet(0)))
+    assert sequences(inlet.reconcile(health(3), [KEY])) == [1, 2]
+    assert sequences(inlet.reconcile(health(3), [KEY])) == []
+
+
+def test_health_shows_a_first_message_that_never_came():
+    inlet = SequenceTracker(Producer([0]).recover)
+    assert sequences(inlet.reconcile(health(1), [KEY])) == [0]
+
+
+def test_of_a_producer_that_was_there_before_its_first_message_all_are_accounted_for():
+    inlet = SequenceTracker(Producer([]).recover)
+    assert sequences(inlet.reconcile(health(0), [KEY])) == []
+    assert sequences(inlet.accept(packet(3))) == [3]
+    (line,) = inlet.inputs()
+    assert (line.received, line.missing, line.next_sequence) == (1, 3, 4)
+
+
+def test_health_about_keys_that_are_not_read_is_ignored():
+    producer = Producer(range(3))
+    assert list(SequenceTracker(producer.recover).reconcile(health(3), ["another/key"])) == []
+    assert producer.asked == []
+
+
+def test_a_stage_that_may_drop_counts_and_asks_nobody():
+    inlet = SequenceTracker(None)
+    list(inlet.accept(packet(0)))
+    assert sequences(inlet.accept(packet(5))) == [5]
+    assert inlet.inputs()[0].missing == 4
+
+
+@given(
+    arriving=st.lists(st.integers(0, 60), max_size=80),
+    kept=st.sets(st.integers(0, 60)),
+)
+def test_whatever_arrives_each_message_comes_once_in_order_and_the_account_adds_up(arriving, kept):
+    inlet = SequenceTracker(Producer(kept).recover)
+    out = [s for sequence in arriving for s in sequences(inlet.accept(packet(sequence)))]
+    assert out == sorted(set(out))
+    if arriving:
+        (line,) = inlet.inputs()
+        assert line.received == len(out)
+        assert line.missing == line.next_sequence - out[0] - len(out)

@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+
+import matplotlib.image
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from typer.testing import CliRunner
+
+from pipeline.cli.main import app
+from pipeline.cli.recordings.plot import plot
+from pipeline.errors import UserError
+from pipeline.recordings.writing import RecordingWriter
+from pipeline.viewing import band_plot
+from pipeline.viewing.band_plot import Fault, plot_bands, plot_recording, read_trace
+from pipeline.viewing.trace import trace_of
+from schemas.messages import Alarm, Score
+from schemas.topics import tray_key
+from tests.support.score_data import START_NS, made_up_tray
+
+FAULT = Fault("covered-inlet", 2, START_NS + 8_000_000_000, START_NS + 14_000_000_000)
+
+
+def test_the_fans_with_alarms_and_one_healthy_fan_are_drawn(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(fans=5, faulty_fan=3)
+    assert plot_bands(trace_of("tray1", scores, "rpm"), tmp_path / "bands.png") == [0, 3]
+
+
+def test_without_alarms_one_fan_is_drawn(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(fans=5, faulty_fan=None)
+    assert plot_bands(trace_of("tray1", scores, "rpm"), tmp_path / "bands.png") == [0]
+
+
+def test_the_green_band_is_drawn_and_red_only_while_an_alarm_was_active(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(fans=3)
+    trace = trace_of("tray1", scores, "rad/s")
+    share = {}
+    for fan in (0, 2):
+        plot_bands(trace, tmp_path / "bands.png", fans=[fan])
+        share[fan] = {color: coverage(tmp_path / "bands.png", color) for color in (band_plot.BAND, ZONE_ON_WHITE)}
+    assert share[0][band_plot.BAND] > 0.02 and share[2][band_plot.BAND] > 0.02
+    assert share[2][ZONE_ON_WHITE] > 0.05
+    assert share[0][ZONE_ON_WHITE] < 0.005  # its key in the legend
+
+
+def test_title_axis_and_legend_name_everything_with_its_unit(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(fans=3)
+    trace = trace_of("tray1", scores, "rpm")
+    plot_bands(trace, tmp_path / "bands.svg", fans=[1, 2], faults=[FAULT])
+    figure = band_plot._figure(trace, [1, 2], [FAULT])
+    panels = figure.axes[::2]
+    assert [axes.get_ylabel() for axes in panels] == ["speed (rpm)", "speed (rpm)"]
+    assert panels[0].get_title(loc="left") == "fan 1   no alarm"
+    assert panels[1].get_title(loc="left") == "fan 2   covered inlet at 8.0 s, alarm 0.50 s later"
+    assert figure.axes[-1].get_xlabel() == "time since 2023-11-14 22:13:20 UTC (s)"
+    texts = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert texts[:5] == ["measured", "twin", "twin ± 2σ", "outside the band (1 in 20 when healthy)", "alarm active"]
+    assert set(texts[5:]) == {"true fault", "state: normal", "suspect", "alarm", "returning", "unknown: not judged"}
+    assert (tmp_path / "bands.svg").stat().st_size > 0
+
+
+def test_nothing_is_drawn_over_the_legend_or_the_title() -> None:
+    scores, _ = made_up_tray(fans=3)
+    figure = band_plot._figure(trace_of("tray1", scores, "rpm"), [0, 1, 2], [FAULT])
+    figure.draw_without_rendering()
+    lowest = min(legend.get_window_extent().y0 for legend in figure.legends)
+    highest = max(axes.get_tightbbox().y1 for axes in figure.axes)  # pyright: ignore[reportOptionalMemberAccess]
+    assert highest < lowest
+    first, second = (legend.get_window_extent() for legend in figure.legends)
+    assert second.y1 <= first.y0 + 2 and first.x1 < figure.bbox.width
+
+
+def test_no_line_is_drawn_across_missing_samples() -> None:
+    scores, _ = made_up_tray(fans=1, faulty_fan=None, gap_fan=None, block=10)
+    del scores[100:110]
+    trace = trace_of("tray1", scores, "rad/s")
+    panel = band_plot._figure(trace, [0], []).axes[0]
+    for line in panel.lines[:2]:
+        y = np.asarray(line.get_ydata(), float)
+        assert np.flatnonzero(np.isnan(y)).tolist() == [1000]
+
+
+def test_a_recording_in_two_parts_is_one_trace_in_order_of_time(tmp_path: Path) -> None:
+    scores, alarms = made_up_tray(seconds=4)
+    second = record(tmp_path / "b.mcap", scores[20:], alarms)
+    first = record(tmp_path / "a.mcap", scores[:20], [])
+    trace = read_trace([second, first], None, "rpm")
+    whole = trace_of("tray1", scores, "rpm")
+    assert trace.t_ns.tolist() == whole.t_ns.tolist()
+    np.testing.assert_array_equal(trace.measured, whole.measured)
+
+
+@pytest.mark.parametrize("metadata", [{"speed_unit": "rpm"}, {"speed_unit.tray1": "rpm"}])
+def test_speeds_are_in_the_unit_that_the_recording_names(tmp_path: Path, metadata: dict[str, str]) -> None:
+    scores, _ = made_up_tray(seconds=1)
+    path = record(tmp_path / "rec.mcap", scores, [], metadata)
+    assert read_trace([path], None, None).speed_unit == "rpm"
+    assert read_trace([path], None, "rad/s").speed_unit == "rad/s"
+
+
+def test_the_command_plots_a_recording_with_its_true_faults(tmp_path: Path) -> None:
+    scores, alarms = made_up_tray()
+    recording = record(tmp_path / "rec.mcap", scores, alarms)
+    truth = tmp_path / "truth.json"
+    truth.write_text(json.dumps({"faults": [vars(FAULT)]}))
+    app.command("plot")(plot)
+    app.command("other")(lambda: None)
+    output = tmp_path / "bands.png"
+    arguments = ["plot", str(recording), "-o", str(output), "--truth", str(truth), "--fans", "2", "--json"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == {"plot": str(output), "fans": [2]}
+    assert coverage(output, band_plot.FAULT) > 0.001
+
+
+def test_what_cannot_be_plotted_is_told_in_one_line(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(seconds=1)
+    others, _ = made_up_tray(seconds=1, tray="tray2")
+    both = record(tmp_path / "both.mcap", [*scores, *others], [])
+    empty = record(tmp_path / "empty.mcap", [], [])
+    output = tmp_path / "bands.png"
+    for said, call in {
+        "holds no scores": lambda: plot_recording([empty], output),
+        "say which with --tray: tray1, tray2": lambda: plot_recording([both], output),
+        "no tray called 'x'; there are tray1, tray2": lambda: plot_recording([both], output, tray="x"),
+        "has no fan 9": lambda: plot_recording([both], output, tray="tray1", fans=[9]),
+        "no account of faults": lambda: plot_recording([both], output, tray="tray1", truth=tmp_path / "none.json"),
+        "cannot write the plot": lambda: plot_recording([both], tmp_path / "bands.wrong", tray="tray1"),
+    }.items():
+        with pytest.raises(UserError, match=said) as caught:
+            call()
+        assert "\n" not in str(caught.value)
+    assert not output.exists()
+
+
+ZONE_ON_WHITE = tuple(1 - 0.6 * (1 - part) for part in to_rgb(band_plot.ZONE))
+
+
+def coverage(path: Path, color: str | tuple[float, ...]) -> float:
+    """The share of a picture that has a colour."""
+    pixels = matplotlib.image.imread(path)[..., :3]
+    return float((np.abs(pixels - np.array(to_rgb(color))).max(axis=-1) < 0.02).mean())  # pyright: ignore[reportArgumentType]
+
+
+def record(
+    path: Path, scores: Sequence[Score], alarms: Sequence[Alarm], metadata: Mapping[str, str] = MappingProxyType({})
+) -> Path:
+    with RecordingWriter(path, metadata) as writer:
+        for score in scores:
+            writer.write_message(tray_key("site", score.header.tray, "score"), score, int(score.t_ns[-1]))
+        for alarm in alarms:
+            writer.write_message(tray_key("site", alarm.header.tray, "alarm"), alarm, alarm.t_ns)
+    return path

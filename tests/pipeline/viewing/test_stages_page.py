@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+from pipeline.viewing.stages_page import CHANGES_SHOWN, SILENT_AFTER_NS, StagesPage, about
+from schemas.messages import Header, Health, ModelCard, StageStatus
+
+NOW_NS = 1_760_000_000_000_000_000  # 2025-10-09 08:53:20
+
+
+def health(
+    stage: str = "scorer",
+    instance: str = "all",
+    *,
+    status: StageStatus = StageStatus.OK,
+    lost: int = 0,
+    problem: str = "",
+) -> Health:
+    return Health(stage=stage, instance=instance, status=status, t_ns=NOW_NS, uptime_s=1.0, lost=lost, problem=problem)
+
+
+def page_of(*healths: Health) -> StagesPage:
+    page = StagesPage()
+    for one in healths:
+        page.note_health(one)
+    return page
+
+
+def section(text: str, title: str) -> list[str]:
+    """The lines under a title; none if there is no such title."""
+    parts = text.split("## ")
+    return next((part.splitlines()[2:] for part in parts if part.startswith(title)), [])
+
+
+def test_every_stage_has_one_row_with_what_it_said_last() -> None:
+    page = page_of(
+        health("scorer", status=StageStatus.STARTING),
+        health("acquisition", "tray1", lost=3),
+        health("scorer"),
+    )
+    assert [row for row in section(page.text(NOW_NS), "Stages now") if row][2:] == [
+        "| acquisition/tray1 | ok | **3** |",
+        "| scorer | ok | 0 |",
+    ]
+
+
+def test_what_is_wrong_is_told_until_it_is_well_again() -> None:
+    page = page_of(health(status=StageStatus.DEGRADED, problem="no port"))
+    assert section(page.text(NOW_NS), "What is wrong")[0] == "- **scorer**: no port"
+    page.note_health(health())
+    assert section(page.text(NOW_NS), "What is wrong") == []
+
+
+def test_a_stage_that_says_nothing_more_is_silent_unless_it_stopped_in_order() -> None:
+    page = page_of(health("scorer"), health("resampler", status=StageStatus.STOPPED))
+    assert "silent" not in page.text(NOW_NS)
+    assert "silent" not in page.text(NOW_NS + SILENT_AFTER_NS)
+    later = page.text(NOW_NS + SILENT_AFTER_NS + 1)
+    assert "| scorer | **silent** | 0 |" in later and "| resampler | **stopped** | 0 |" in later
+    page.note_health(health("scorer"))
+    assert "| scorer | ok | 0 |" in page.text(NOW_NS + SILENT_AFTER_NS + 1)
+
+
+def test_a_stage_on_a_host_whose_clock_is_wrong_is_not_silent() -> None:
+    assert "silent" not in page_of(health()).text(NOW_NS + 3600 * 10**9)
+
+
+def test_changes_are_told_newest_first_with_the_time_of_day_and_no_change_is_told_twice() -> None:
+    ill = health(status=StageStatus.DEGRADED, problem="no port")
+    page = page_of(health(), health(), ill, ill, health(lost=12))
+    assert [line for line in section(page.text(NOW_NS), "Last changes") if line] == [
+        "- 2025-10-09 08:53:20 scorer: ok, 12 lost",
+        "- 2025-10-09 08:53:20 scorer: degraded: no port",
+        "- 2025-10-09 08:53:20 scorer: ok",
+    ]
+
+
+def test_the_page_stays_short_however_much_is_said() -> None:
+    page = StagesPage()
+    for number in range(1000):
+        ill = health(status=StageStatus.DEGRADED, problem=f"problem {number} " + "x" * 10_000)
+        page.note_health(ill)
+    text = page.text(NOW_NS)
+    assert len([line for line in section(text, "Last changes") if line]) == CHANGES_SHOWN == 20
+    assert "problem 999" in text and "problem 979" not in text and len(text) < 6000
+
+
+def test_a_loss_that_grows_and_grows_changes_the_page_ever_more_rarely() -> None:
+    page = StagesPage()
+    texts: list[str] = []
+    for lost in range(1, 100_001):
+        if not texts or about(lost) != about(lost - 1):
+            page.note_health(health(lost=lost))
+            texts.append(page.text(NOW_NS))
+    assert len(texts) < 400
+    assert "| scorer | ok | **100,000** |" in texts[-1]
+    assert [about(count) for count in (0, 7, 99, 123, 128, 1_849)] == ["0", "7", "99", "120", "130", "1,800"]
+
+
+def test_what_stages_say_is_shown_as_it_is_and_never_as_markup() -> None:
+    page = page_of(health("twin_integrator", status=StageStatus.DEGRADED, problem="a | b\n# *c* [[tray]] `fans` <d>"))
+    text = page.text(NOW_NS)
+    assert r"a \| b \# \*c\* \[\[tray\]\] \`fans\` \<d\>" in text and r"| twin\_integrator |" in text
+
+
+def test_the_twin_in_force_is_told_for_every_tray() -> None:
+    page = page_of(health())
+    assert section(page.text(NOW_NS), "Twins in force") == []
+    for twin in ("old", "new"):
+        page.note_twin(
+            "tray1", ModelCard(header=Header("x", 0, "tray1"), t_ns=NOW_NS, twin=twin, kind="hybrid", sha256="")
+        )
+    assert section(page.text(NOW_NS), "Twins in force")[0] == "- tray1: new (hybrid), since 2025-10-09 08:53:20"

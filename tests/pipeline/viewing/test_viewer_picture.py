@@ -1,0 +1,161 @@
+"""The real Rerun viewer, without a display, opens what the viewer stage wrote."""
+
+from __future__ import annotations
+
+import json
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.cli.recordings.picture import picture
+from pipeline.errors import UserError
+from stages.viewer import PAGE_PERIOD_NS, build
+from tests.stages.test_viewer import LATER_NS, card, context, free_port, health, play
+from tests.support.running_chain import eventually
+from tests.support.score_data import made_up_tray
+
+pytestmark = pytest.mark.alone
+rerun_picture = pytest.importorskip("pipeline.viewing.rerun_picture", exc_type=ModuleNotFoundError)
+needs_a_driver = pytest.mark.skipif(
+    not rerun_picture.has_vulkan_driver(), reason="no Vulkan driver here: apt-get install mesa-vulkan-drivers"
+)
+
+
+@pytest.fixture(scope="module")
+def view_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twenty seconds of three fans, the last one with a fault, kept by the viewer stage."""
+    folder = tmp_path_factory.mktemp("view")
+    scores, alarms = made_up_tray(seconds=20)
+    core = build(context(folder, speed_unit="rpm")).core
+    play(core, scores)
+    for alarm in alarms:
+        core.step(alarm)
+    core.close()
+    return folder / "view.rrd"
+
+
+@pytest.mark.slow
+@needs_a_driver
+def test_the_viewer_draws_every_view_without_a_complaint(view_file: Path) -> None:
+    drawn = rerun_picture.draw_picture(view_file)
+    assert drawn.reports == {
+        "tray1 / fan 0 speed (rpm)": [],
+        "tray1 / fan 1 speed (rpm)": [],
+        "tray1 / fan 2 speed (rpm)": [],
+        "tray1 / state of each fan": [],
+        "tray1 / alarm log": [],
+    }
+
+
+@pytest.mark.slow
+@needs_a_driver
+def test_a_healthy_fan_shows_a_green_band_and_a_faulty_one_red_zones_too(view_file: Path) -> None:
+    healthy = colors(rerun_picture.draw_picture(view_file, view="fan 0").png)
+    faulty = colors(rerun_picture.draw_picture(view_file, view="fan 2").png)
+    assert healthy["band"] > 0.05 and faulty["band"] > 0.05
+    assert healthy["zone"] < 1e-3 and faulty["zone"] > 0.02
+    assert faulty["red points"] > 3 * healthy["red points"] > 0
+    assert healthy["measured"] > 0.002
+
+
+@pytest.mark.slow
+@needs_a_driver
+def test_the_lanes_show_normal_alarm_and_unknown_in_their_colors(view_file: Path) -> None:
+    lanes = colors(rerun_picture.draw_picture(view_file, view="state of each fan").png)
+    assert lanes["lane normal"] > 0.1 and lanes["lane alarm"] > 0.01 and lanes["lane unknown"] > 0.002
+
+
+@pytest.mark.slow
+@needs_a_driver
+def test_nothing_after_the_end_of_the_picture_is_drawn(view_file: Path) -> None:
+    before_the_fault = rerun_picture.draw_picture(view_file, fans=[2], at_s=7.5, view="fan 2")
+    assert colors(before_the_fault.png)["zone"] < 1e-3
+    assert colors(before_the_fault.png)["band"] > 0.02
+
+
+@pytest.mark.slow
+@needs_a_driver
+def test_the_command_writes_the_picture_and_says_what_it_shows(
+    view_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "view.png"
+    picture(view_file, output, fans="2", json_output=True)
+    said = json.loads(capsys.readouterr().out)
+    assert said["picture"] == str(output) and "tray1 / fan 2 speed (rpm)" in said["views"]
+    assert Image.open(output).width == 1920
+
+
+@pytest.mark.slow
+@needs_a_driver
+def test_a_live_viewer_follows_a_recording_of_long_ago_though_the_stages_speak_today(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(seconds=5)
+    port = free_port()
+    core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core
+    with rerun_picture._headless_viewer() as viewer:
+        viewer.open(f"rerun+http://127.0.0.1:{port}/proxy")
+        for number, item in enumerate((card(), health(), *scores, health(problem="something is wrong"))):
+            core.step(item)
+            core.tick(LATER_NS + number * PAGE_PERIOD_NS)
+        last_ns = int(scores[-1].t_ns[-1])
+        eventually(lambda: abs(shown_ns(viewer) - last_ns) < 1000, "the last sample is under the cursor")
+        assert {str(report) for view in viewer.get_state().views for report in view.reports} == set()
+        measured = next(view for view in viewer.get_state().views if "fan 0" in view.name)
+        assert colors(viewer.take_screenshot(measured.view_id))["band"] > 0.01
+    core.close()
+
+
+def test_without_a_driver_one_line_says_what_to_install(view_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerun_picture.sys, "platform", "linux")
+    monkeypatch.setenv("VK_DRIVER_FILES", "/nowhere/icd.json")
+    with pytest.raises(UserError, match="mesa-vulkan-drivers") as caught:
+        rerun_picture.draw_picture(view_file)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"tray": "x"}, "no tray called 'x'; there are tray1"),
+        ({"fans": [7]}, "tray1 has no fan 7; it has fans 0 to 2"),
+    ],
+)
+@needs_a_driver
+def test_what_is_not_in_the_file_is_told_in_one_line(view_file: Path, options: dict[str, object], said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        rerun_picture.draw_picture(view_file, **options)
+
+
+@needs_a_driver
+def test_a_file_that_is_no_view_is_told_in_one_line(tmp_path: Path) -> None:
+    for path, said in ((tmp_path / "none.rrd", "no such file"), (tmp_path / "wrong.rrd", "not a file of Rerun's")):
+        if said != "no such file":
+            path.write_bytes(b"not a view, and long enough to be read as a header")
+        with pytest.raises(UserError, match=said):
+            rerun_picture.draw_picture(path)
+
+
+def shown_ns(viewer: Any) -> int:
+    """Where the cursor of a viewer's one recording is; 0 if it shows nothing in time yet."""
+    return next((entry.current_time or 0 for entry in viewer.get_state().recordings), 0)
+
+
+def colors(png: bytes) -> dict[str, float]:
+    """The shares of a picture that have the colours of a band, a zone, points, a line and lanes."""
+    red, green, blue = np.asarray(Image.open(BytesIO(png)).convert("RGB")).astype(int).transpose(2, 0, 1)
+
+    def near(r: int, g: int, b: int, by: int = 12) -> float:
+        return float(((abs(red - r) < by) & (abs(green - g) < by) & (abs(blue - b) < by)).mean())
+
+    return {
+        "band": float(((green > 2 * red) & (green > 1.5 * blue) & (green > 60) & (green < 140)).mean()),
+        "zone": near(60, 24, 24),
+        "red points": near(255, 60, 60, by=25),
+        "measured": float(((red > 200) & (green > 200) & (blue > 200)).mean()),
+        "lane normal": near(32, 120, 62, by=16),
+        "lane alarm": near(178, 30, 30, by=16),
+        "lane unknown": near(95, 95, 95, by=16),
+    }

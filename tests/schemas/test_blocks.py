@@ -1,0 +1,132 @@
+"""schemas.blocks: messages joined and cut are the same samples."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.blocks import can_join, chosen, cut, join
+from schemas.codec import decode, encode
+from schemas.messages import Command, Grid, Header, Message, Prediction, Raw, Score, columns
+from tests.support.message_strategies import any_message, same
+
+OF_SAMPLES = (Raw, Grid, Prediction, Score)
+MESSAGES = st.sampled_from(OF_SAMPLES).flatmap(any_message)
+
+
+def equal(one: Message, other: Message) -> bool:
+    return all(same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+
+
+def times(message: Any) -> Any:
+    return message.host_receive_t_ns if isinstance(message, Raw) else message.t_ns
+
+
+def grid(samples: int, fans: int = 2, period_ns: int = 10) -> Grid:
+    values = np.arange(float(samples * fans)).reshape(samples, fans)
+    return Grid(
+        fans=fans,
+        period_ns=period_ns,
+        t_ns=np.arange(samples) * period_ns,
+        command=values,
+        speed_rad_s=-values,
+        valid=values > 1,
+        invalid_reason=np.zeros(values.shape, np.uint8),
+    )
+
+
+def raw(samples: int, clock: bool = True, sequence: bool = True) -> Raw:
+    numbers, nothing = np.arange(samples, dtype=np.uint32), np.zeros(0, np.uint32)
+    return Raw(
+        fans=1,
+        host_receive_t_ns=np.arange(samples),
+        device_clock_us=numbers if clock else nothing,
+        device_sequence=numbers if sequence else nothing,
+        command=np.zeros((samples, 1)),
+        speed_rad_s=np.zeros((samples, 1)),
+    )
+
+
+def prediction(twin: str = "t", sigma: float = 1.0) -> Prediction:
+    one = np.zeros((1, 1))
+    speeds = dict.fromkeys(("command", "measured_speed_rad_s", "predicted_speed_rad_s", "valid", "invalid_reason"), one)
+    return Prediction(
+        fans=1, period_ns=1, t_ns=np.zeros(1, np.int64), sigma_rad_s=np.array([sigma]), twin=twin, **speeds
+    )
+
+
+@given(MESSAGES, st.lists(st.integers(0, 5), max_size=3))
+def test_what_was_cut_is_joined_to_the_same_message(message: Any, marks: list[int]) -> None:
+    ends = sorted({0, len(times(message)), *(min(mark, len(times(message))) for mark in marks)})
+    parts = [cut(message, first, end) for first, end in pairwise(ends)] or [message]
+    assert equal(join(parts), message)
+
+
+@given(MESSAGES)
+def test_a_cut_message_goes_through_the_codec(message: Any) -> None:
+    half = cut(message, 0, len(times(message)) // 2)
+    assert equal(decode(type(half), encode(half)), half)
+
+
+def test_samples_are_joined_in_the_order_given_under_the_first_header() -> None:
+    first, second = replace(grid(2), header=Header("p", 7, "t")), replace(grid(3), header=Header("p", 8, "t"))
+    joined = join([second, first])
+    assert joined.header.sequence == 8
+    assert joined.t_ns.tolist() == [0, 10, 20, 0, 10]
+    assert {name: getattr(joined, name).dtype for name in columns(Grid)} == {
+        name: getattr(first, name).dtype for name in columns(Grid)
+    }
+
+
+def test_rows_are_counted_as_in_python() -> None:
+    part = cut(raw(5), 1, 3)
+    assert (part.host_receive_t_ns.tolist(), part.device_clock_us.tolist()) == ([1, 2], [1, 2])
+    assert cut(raw(5, clock=False), 1, 3).device_clock_us.tolist() == []
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (grid(1), raw(1)),
+        (grid(1, fans=2), grid(1, fans=3)),
+        (grid(1, period_ns=10), grid(1, period_ns=11)),
+        (raw(2), raw(2, clock=False)),
+        (raw(2, sequence=False), raw(2)),
+        (prediction(twin="a"), prediction(twin="b")),
+        (prediction(sigma=1.0), prediction(sigma=2.0)),
+        (Command(fans=1, t_ns=0), Command(fans=1, t_ns=0)),
+    ],
+)
+def test_messages_that_differ_in_more_than_their_samples_are_not_joined(one: Any, other: Any) -> None:
+    assert not can_join(one, other)
+    with pytest.raises(ValueError, match="message 1"):
+        join([one, other])
+
+
+def test_predictions_of_one_twin_are_joined_although_each_brings_its_own_sigma() -> None:
+    assert join([prediction(), prediction()]).sigma_rad_s.tolist() == [1.0]
+
+
+def test_some_samples_of_a_message_are_chosen() -> None:
+    some = chosen(raw(3, clock=False), np.array([True, False, True]))
+    assert (some.host_receive_t_ns.tolist(), some.device_sequence.tolist()) == ([0, 2], [0, 2])
+    assert (some.command.shape, some.device_clock_us.tolist()) == ((2, 1), [])
+
+
+def test_nothing_is_no_message() -> None:
+    with pytest.raises(ValueError, match="no messages"):
+        join([])
+
+
+@pytest.mark.parametrize(("first", "end"), [(-1, 1), (0, 3), (2, 1)])
+def test_rows_that_are_not_there_are_refused(first: int, end: int) -> None:
+    with pytest.raises(ValueError, match="Grid without samples"):
+        cut(grid(2), first, end)
+    with pytest.raises(ValueError, match="Command without samples"):
+        cut(Command(fans=1, t_ns=0), 0, 0)

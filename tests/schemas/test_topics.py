@@ -1,0 +1,64 @@
+"""The table of topics: complete, consistent, and invertible."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.config.registry import STAGES, load_stage
+from schemas.messages import MESSAGE_TYPES
+from schemas.topics import BY_NAME, RESERVED_TRAY_NAMES, TOPICS, alive_key, health_key, topic_of, tray_key
+
+CONTRACT = Path(__file__).parents[2] / "docs" / "reference" / "messages.md"
+
+
+def test_every_message_has_one_topic_and_every_topic_one_message():
+    assert [topic.message for topic in TOPICS] == list(MESSAGE_TYPES)
+    assert len(BY_NAME) == len(TOPICS)
+
+
+@pytest.mark.parametrize("topic", [t for t in TOPICS if t.name != "health"], ids=lambda t: t.name)
+def test_a_trays_key_leads_back_to_its_topic(topic):
+    assert topic_of(tray_key("plant", "tray1", topic.name)) is topic
+
+
+def test_the_key_of_a_health_leads_back_to_health():
+    assert topic_of(health_key("plant", "scorer", "all")) is BY_NAME["health"]
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "",
+        "fantwin",
+        "fantwin/plant/tray1/nothing",
+        "other/plant/tray1/raw",
+        "fantwin/plant/raw",
+        alive_key("p", "s", "i"),
+    ],
+)
+def test_a_foreign_key_is_no_topic(key):
+    with pytest.raises(KeyError):
+        topic_of(key)
+
+
+def test_a_tray_cannot_bear_a_name_that_keys_need():
+    assert health_key("s", "x", "y").split("/")[2] in RESERVED_TRAY_NAMES
+    assert alive_key("s", "x", "y").split("/")[2] in RESERVED_TRAY_NAMES
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_stage_reads_and_writes_topics_of_the_table(name):
+    stage = load_stage(name)
+    assert stage.name == name
+    assert set(stage.reads) | set(stage.writes) <= set(BY_NAME)
+
+
+def test_every_topic_that_is_to_be_recorded_is_read_by_the_recorder():
+    assert set(load_stage("recorder").reads) == {topic.name for topic in TOPICS if topic.recorded}
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda t: t.name)
+def test_a_topic_stands_in_the_contract(topic):
+    text = CONTRACT.read_text(encoding="utf-8")
+    assert f"`{topic.name}`" in text
+    assert topic.message.__name__ in text

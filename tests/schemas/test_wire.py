@@ -1,0 +1,277 @@
+"""The wire protocol: encoding and decoding are inverse, and every fault is named and costs only itself."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cobs import cobs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.wire import (
+    MAX_FRAME_BYTES,
+    CommandFrame,
+    Decoder,
+    Fault,
+    FaultKind,
+    Frame,
+    Protocol,
+    Sample,
+    SetPointFrame,
+    encode,
+)
+
+PROTOCOLS: tuple[Protocol, ...] = ("binary", "text")
+UINT32 = st.integers(0, 2**32 - 1)
+FLOAT32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
+READING = st.floats(width=32, allow_infinity=False)
+SAMPLE = Sample(1000, 7, (0.5, 0.25), (101.5, -3.0))
+SAMPLE_BINARY = encode("binary", SAMPLE)
+
+
+@st.composite
+def samples(draw: st.DrawFn, fans: int | None = None) -> Sample:
+    n = fans or draw(st.integers(1, 64))
+    column = lambda values: tuple(draw(st.lists(values, min_size=n, max_size=n)))  # noqa: E731
+    return Sample(draw(UINT32), draw(UINT32), column(FLOAT32), column(READING))
+
+
+def same(a: Frame | Fault, b: Frame | Fault) -> bool:
+    """Equality in which NaN equals NaN, to the last bit otherwise."""
+    return repr(a) == repr(b)
+
+
+def faults(found: list[Frame | Fault]) -> list[FaultKind]:
+    return [item.kind for item in found if isinstance(item, Fault)]
+
+
+def joined(protocol: Protocol, fans: int = 2, end: str = "host") -> Decoder:
+    """A decoder that has already found the beginning of a frame."""
+    decoder = Decoder(protocol, fans, "device" if end == "device" else "host")
+    assert decoder.feed(b"\0" if protocol == "binary" else b"\n") == []
+    return decoder
+
+
+def framed(payload: bytes) -> bytes:
+    return b"\0" + cobs.encode(payload + struct.pack("<I", zlib.crc32(payload))) + b"\0"
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@given(sample=samples())
+def test_a_sample_comes_back_exactly_as_it_was_sent(protocol: Protocol, sample: Sample) -> None:
+    (back,) = Decoder(protocol, len(sample.command)).feed(encode(protocol, sample))
+    assert same(back, sample)
+
+
+@given(data=st.lists(st.floats(width=32), min_size=1, max_size=64))
+def test_commands_and_set_points_come_back_exactly_in_binary(data: list[float]) -> None:
+    for frame in (CommandFrame(tuple(data)), SetPointFrame(tuple(data))):
+        (back,) = Decoder("binary", len(data), "device").feed(encode("binary", frame))
+        assert same(back, frame)
+
+
+@given(data=st.lists(st.floats(width=32), min_size=1, max_size=64))
+def test_commands_and_set_points_come_back_fan_by_fan_in_text(data: list[float]) -> None:
+    for frame in (CommandFrame(tuple(data)), SetPointFrame(tuple(data))):
+        merged = [math.nan] * len(data)
+        for line in Decoder("text", len(data), "device").feed(encode("text", frame)):
+            assert isinstance(line, type(frame))
+            values = line.command if isinstance(line, CommandFrame) else line.set_point
+            (fan,) = np.flatnonzero(~np.isnan(values))
+            merged[fan] = values[fan]
+        assert repr(merged) == repr(data)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@given(sample=samples(fans=2), cuts=st.lists(st.integers(0, 400), max_size=20))
+def test_how_the_stream_is_cut_makes_no_difference(protocol: Protocol, sample: Sample, cuts: list[int]) -> None:
+    good = encode(protocol, sample)
+    stream = b"fragment" + good + good + b"\xffnoise" + good + good[:9] + good + b"S 1 2\n\0\0#x\n" + good
+    whole = Decoder(protocol, 2).feed(stream)
+    decoder = Decoder(protocol, 2)
+    edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
+    pieces = [item for a, b in itertools.pairwise(edges) for item in decoder.feed(stream[a:b])]
+    assert [repr(item) for item in pieces] == [repr(item) for item in whole]
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_byte_by_byte_gives_the_same_even_where_a_piece_is_too_long(protocol: Protocol) -> None:
+    stream = encode(protocol, SAMPLE) + b"x" * 3 * MAX_FRAME_BYTES + encode(protocol, SAMPLE) * 2
+    whole = Decoder(protocol, 2).feed(stream)
+    decoder = Decoder(protocol, 2)
+    assert [item for byte in stream for item in decoder.feed(bytes([byte]))] == whole
+    assert whole == [SAMPLE, Fault(FaultKind.OVERSIZED, "more than 4096 bytes without an end"), SAMPLE, SAMPLE]
+
+
+@given(noise=st.binary(max_size=200).filter(lambda b: b"\0" not in b))
+def test_noise_before_a_binary_frame_never_costs_the_frame(noise: bytes) -> None:
+    assert joined("binary").feed(noise + SAMPLE_BINARY)[-1] == SAMPLE
+
+
+@given(noise=st.binary(max_size=200).filter(lambda b: b"\n" not in b and not b.startswith(b"#")))
+def test_noise_before_a_text_line_never_costs_the_line(noise: bytes) -> None:
+    assert joined("text").feed(noise + encode("text", SAMPLE))[-1] == SAMPLE
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("end", ["host", "device"])
+@given(data=st.lists(st.binary(max_size=300), max_size=10))
+def test_no_bytes_make_it_raise(protocol: Protocol, end: str, data: list[bytes]) -> None:
+    decoder = joined(protocol, end=end)
+    for piece in data:
+        decoder.feed(piece)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_it_holds_no_more_than_one_frame_of_an_endless_stream(protocol: Protocol) -> None:
+    decoder = Decoder(protocol, 2)
+    for _ in range(300):
+        decoder.feed(b"\x01" * 1000)
+        assert len(decoder._pending) <= MAX_FRAME_BYTES + 1
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_joining_in_the_middle_of_a_frame_is_not_a_fault(protocol: Protocol) -> None:
+    frame = encode(protocol, SAMPLE)
+    for cut in range(3, len(frame) - 1):
+        assert faults(Decoder(protocol, 2).feed(frame[cut:] + frame)) == [FaultKind.RESYNC], cut
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_after_a_reset_half_a_frame_is_forgotten(protocol: Protocol) -> None:
+    decoder, frame = joined(protocol), encode(protocol, SAMPLE)
+    assert decoder.feed(frame[:10]) == []
+    decoder.reset()
+    found = decoder.feed(frame[20:] + frame)
+    assert faults(found) == [FaultKind.RESYNC]
+    assert found[-1] == SAMPLE
+
+
+SAMPLE_PAYLOAD = cobs.decode(SAMPLE_BINARY.strip(b"\0"))[:-4]
+NAN, INFINITY = struct.pack("<f", math.nan), struct.pack("<f", math.inf)
+BINARY_FAULTS = {
+    "garbage": (b"\0\x05helo\0", FaultKind.TORN),
+    "noise of a frame's length": (b"\0" + cobs.encode(b"\x77" * 30) + b"\0", FaultKind.GARBAGE),
+    "ends early": (SAMPLE_BINARY[:-3] + b"\0", FaultKind.TORN),
+    "a byte missing": (b"\0" + cobs.encode(cobs.decode(SAMPLE_BINARY.strip(b"\0"))[:-1]) + b"\0", FaultKind.TORN),
+    "a bit flipped": (framed(SAMPLE_PAYLOAD)[:-3] + b"\x55" + framed(SAMPLE_PAYLOAD)[-2:], FaultKind.WRONG_CRC),
+    "a newer version": (framed(b"\x02" + SAMPLE_PAYLOAD[1:]), FaultKind.WRONG_VERSION),
+    "an unknown type": (framed(b"\x01\x09" + SAMPLE_PAYLOAD[2:]), FaultKind.WRONG_TYPE),
+    "a frame for the device": (encode("binary", CommandFrame((0.5, 0.5))), FaultKind.WRONG_TYPE),
+    "three fans": (encode("binary", Sample(1, 1, (0.5,) * 3, (1.0,) * 3)), FaultKind.WRONG_FAN_COUNT),
+    "fan count and length differ": (framed(SAMPLE_PAYLOAD[:10] + b"\x03" + SAMPLE_PAYLOAD[11:]), FaultKind.TORN),
+    "too long": (b"\0" + b"\x01" * (MAX_FRAME_BYTES + 1) + b"\0", FaultKind.OVERSIZED),
+    "NaN command": (framed(SAMPLE_PAYLOAD[:11] + NAN + SAMPLE_PAYLOAD[15:]), FaultKind.BAD_COMMAND),
+    "infinite command": (framed(SAMPLE_PAYLOAD[:11] + INFINITY + SAMPLE_PAYLOAD[15:]), FaultKind.BAD_COMMAND),
+}
+TEXT_FAULTS = {
+    "garbage": (b"hello\n", FaultKind.GARBAGE),
+    "not ASCII": (b"\xff\xfe\x01\n", FaultKind.GARBAGE),
+    "a word that begins with S": (b"Start\n", FaultKind.GARBAGE),
+    "ends early": (b"S 1000 7 0.5 101.5 0.25\n", FaultKind.TORN),
+    "no fans": (b"S 1000 7\n", FaultKind.TORN),
+    "a frame for the device": (b"C 0 0.5\n", FaultKind.WRONG_TYPE),
+    "one fan": (b"S 1000 7 0.5 101.5\n", FaultKind.WRONG_FAN_COUNT),
+    "too long": (b"S" + b" 1" * MAX_FRAME_BYTES + b"\n", FaultKind.OVERSIZED),
+    "a bad digit": (b"S 1000 7 0.5 1o1.5 0.25 -3\n", FaultKind.BAD_NUMBER),
+    "python's own spelling of numbers": (b"S 1000 7 0.5 1_0 0.25 -3\n", FaultKind.BAD_NUMBER),
+    "a clock of 33 bits": (b"S 4294967296 7 0.5 1 0.25 -3\n", FaultKind.BAD_NUMBER),
+    "a negative sequence": (b"S 1000 -7 0.5 1 0.25 -3\n", FaultKind.BAD_NUMBER),
+    "NaN command": (b"S 1000 7 nan 1 0.25 -3\n", FaultKind.BAD_COMMAND),
+    "no command": (b"S 1000 7 - 1 0.25 -3\n", FaultKind.BAD_COMMAND),
+    "infinite command": (b"S 1000 7 0.5 1 inf -3\n", FaultKind.BAD_COMMAND),
+}
+
+
+@pytest.mark.parametrize(
+    ("protocol", "bad", "kind"),
+    [
+        pytest.param(protocol, bad, kind, id=f"{protocol}: {name}")
+        for protocol, table in (("binary", BINARY_FAULTS), ("text", TEXT_FAULTS))
+        for name, (bad, kind) in table.items()
+    ],
+)
+def test_each_fault_has_its_kind_and_costs_no_other_frame(protocol: Protocol, bad: bytes, kind: FaultKind) -> None:
+    good = encode(protocol, SAMPLE)
+    found = joined(protocol).feed(good + bad + good)
+    assert found[0] == found[-1] == SAMPLE
+    assert kind in faults(found)
+    assert len([item for item in found if not isinstance(item, Fault)]) == 2
+
+
+def test_every_kind_of_fault_is_covered_by_an_example() -> None:
+    seen = {kind for table in (BINARY_FAULTS, TEXT_FAULTS) for _, kind in table.values()}
+    assert seen == set(FaultKind) - {FaultKind.RESYNC}
+
+
+@given(position=st.integers(0, 8 * len(SAMPLE_PAYLOAD) - 1))
+def test_the_checksum_finds_every_flipped_bit(position: int) -> None:
+    body = bytearray(SAMPLE_PAYLOAD + struct.pack("<I", zlib.crc32(SAMPLE_PAYLOAD)))
+    body[position // 8] ^= 1 << position % 8
+    found = joined("binary").feed(b"\0" + cobs.encode(bytes(body)) + b"\0")
+    assert len(found) == 1
+    assert isinstance(found[0], Fault)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (b"S 1 2 0.5 100 1 0\r\n", Sample(1, 2, (0.5, 1.0), (100.0, 0.0))),
+        (b"S\t1  2 .5 1e2 1. +0 \n", Sample(1, 2, (0.5, 1.0), (100.0, 0.0))),
+        (b"S - - 0.5 100 1 0\n", Sample(None, None, (0.5, 1.0), (100.0, 0.0))),
+        (b"S - 9 0.5 - 1 NAN\n", Sample(None, 9, (0.5, 1.0), (math.nan, math.nan))),
+        (b"S 1 2 0.5 ovf 1 -inf\n", Sample(1, 2, (0.5, 1.0), (math.inf, -math.inf))),
+        (b"S 1 2 0.5 1e60 1 0\n", Sample(1, 2, (0.5, 1.0), (math.inf, 0.0))),
+    ],
+)
+def test_text_takes_what_sketches_print(line: bytes, expected: Sample) -> None:
+    (found,) = joined("text").feed(line)
+    assert same(found, expected)
+
+
+def test_comments_and_empty_lines_are_nothing() -> None:
+    assert joined("text").feed(b"# fan tray, S 1 2 0.5 1 1 1\n\r\n   \n\n") == []
+    assert joined("binary").feed(b"\0\0\0") == []
+
+
+def test_a_person_can_type_commands() -> None:
+    found = joined("text", fans=3, end="device").feed(b"C 1 0.5\r\nP 2 120\nC 3 0.5\nC 1\n")
+    assert [repr(item) for item in found[:2]] == [
+        repr(CommandFrame((math.nan, 0.5, math.nan))),
+        repr(SetPointFrame((math.nan, math.nan, 120.0))),
+    ]
+    assert faults(found) == [FaultKind.WRONG_FAN_COUNT, FaultKind.TORN]
+
+
+@pytest.mark.parametrize(
+    ("protocol", "frame", "message"),
+    [
+        ("binary", Sample(None, 1, (0.5,), (1.0,)), "clock_us is missing"),
+        ("binary", Sample(1, None, (0.5,), (1.0,)), "sequence is missing"),
+        ("text", Sample(2**32, 1, (0.5,), (1.0,)), "does not fit 32 bits"),
+        ("binary", Sample(1, -1, (0.5,), (1.0,)), "does not fit 32 bits"),
+        ("text", Sample(1, 1, (0.5,), (1.0, 2.0)), "zip"),
+        ("binary", CommandFrame(()), "0 fans"),
+        ("binary", SetPointFrame((0.0,) * 65), "65 fans"),
+    ],
+)
+def test_what_cannot_be_sent_is_refused(protocol: Protocol, frame: Frame, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        encode(protocol, frame)
+
+
+def test_the_worked_examples_of_the_document_are_true() -> None:
+    document = (Path(__file__).parents[2] / "docs" / "reference" / "wire-protocol.md").read_text()
+    sample = Sample(1_000_000, 42, (0.5,), (100.0,))
+    assert encode("binary", sample).hex(" ") in document
+    assert encode("binary", CommandFrame((0.75, math.nan))).hex(" ") in document
+    assert encode("text", sample) == b"S 1000000 42 0.5 100.0\n"
+    assert encode("text", CommandFrame((math.nan, 0.5))) == b"C 1 0.5\n"
+    assert "S 1000000 42 0.5 100.0" in document
+    assert all(f"`{kind.value}`" in document for kind in FaultKind)

@@ -1,0 +1,93 @@
+"""scoring.alarms.alarm_text: one line for what happened, in the units of the tray."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from schemas.messages import Alarm, Diagnosis, Severity, Statistic, Transition
+from scoring.alarms.alarm_text import CAUSES, AlarmText
+from scoring.diagnosis.diagnosis import CANNOT_TELL, DROPOUT, STUCK
+from scoring.diagnosis.hypotheses import CAUSES as HYPOTHESES
+
+
+def line(
+    transition: Transition = Transition.RAISED, *, unit: str = "rad/s", invalid_reason: str = "", **more: Any
+) -> str:
+    told: dict[str, Any] = {
+        **{"fan": 2, "active": True, "severity": Severity.WARNING, "t_ns": 0, "onset_t_ns": 0, "message": ""},
+        **{"residual_rad_s": -71.2, "limit_rad_s": 8.0, "statistic": Statistic.SPEED_SMOOTHED, "score": 8.9},
+        **{"torque_balance_command": 12.34, "torque_balance_limit_command": 3.0},
+    }
+    return AlarmText(unit, "%").of(Alarm(transition=transition, **told | more), invalid_reason)
+
+
+BLOCKED = Diagnosis(cause="drag_up", probability=0.87, evidence="drag +62 % (95 %: 55 to 70)")
+NOT_YET = Diagnosis(cause="cannot_tell", probability=0.9, evidence="cannot tell yet: the command is not moving")
+
+
+def test_a_departure_of_the_speed_is_told_in_the_trays_unit() -> None:
+    assert line() == "fan 2: 71 rad/s below the twin (limit 8)"
+    assert line(unit="rpm", residual_rad_s=100.0) == "fan 2: 955 rpm above the twin (limit 76)"
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"statistic": Statistic.SPEED_DRIFT}, "71 rad/s below the twin (limit 8), for long"),
+        ({"statistic": Statistic.SPEED_VARIANCE_GROWTH}, "unsteady, 8.9 times the limit"),
+        ({"statistic": Statistic.BALANCE_VARIANCE_GROWTH}, "unsteady, 8.9 times the limit"),
+        ({"statistic": Statistic.BALANCE_SMOOTHED}, "takes 12 % more than a healthy one (limit 3)"),
+        (
+            {"statistic": Statistic.BALANCE_DRIFT, "torque_balance_command": -0.5},
+            "takes 0.5 % less than a healthy one (limit 3), for long",
+        ),
+        ({"statistic": Statistic.SENSOR}, "the tacho repeats one reading, or gives none"),
+    ],
+)
+def test_every_statistic_has_its_words(more: dict[str, Any], said: str) -> None:
+    assert line(**more) == f"fan 2: {said}"
+    assert line(Transition.SEVERITY, **more) == f"fan 2: {said}"
+
+
+def test_the_first_cause_is_named_with_its_probability_and_evidence_where_there_is_one() -> None:
+    known = "more drag (airflow blocked, filter clogged), 87 %: drag +62 % (95 %: 55 to 70)"
+    assert line(causes=(BLOCKED, NOT_YET)) == f"fan 2: 71 rad/s below the twin (limit 8); {known}"
+    assert line(Transition.DIAGNOSED, causes=(BLOCKED, NOT_YET)) == f"fan 2: {known}"
+    assert line(causes=(NOT_YET, BLOCKED)) == "fan 2: 71 rad/s below the twin (limit 8)"
+    assert line(Transition.DIAGNOSED, causes=(NOT_YET,)) == "fan 2: cannot tell yet: the command is not moving"
+    assert line(Transition.DIAGNOSED, causes=(replace(NOT_YET, evidence=""),)) == "fan 2: cannot tell yet"
+    assert line(Transition.DIAGNOSED) == "fan 2: cause unknown"
+
+
+def test_every_cause_that_can_be_found_has_words() -> None:
+    assert set(CAUSES) == {cause.name for cause in HYPOTHESES} | {CANNOT_TELL, STUCK, DROPOUT}
+
+
+@pytest.mark.parametrize("transition", [t for t in Transition if t != Transition.NONE])
+def test_every_transition_is_one_line_that_names_the_fan(transition: Transition) -> None:
+    told = line(transition, invalid_reason="it is active", causes=(BLOCKED,))
+    assert told.startswith("fan 2: ") and len(told) > len("fan 2: ") and "\n" not in told
+
+
+def test_after_a_restart_it_is_told_what_still_stands_and_what_does_not() -> None:
+    over: dict[str, Any] = {"active": False, "acknowledged": True, "confirmed": True}
+    quiet: dict[str, Any] = {"suppressed": True}
+    assert line(Transition.REPUBLISHED) == "fan 2: still stands"
+    assert line(Transition.REPUBLISHED, **over, **quiet) == "fan 2: still stands"
+    assert line(Transition.REPUBLISHED, **over) == "fan 2: stands no longer"
+
+
+def test_a_refusal_says_why() -> None:
+    assert line(Transition.REFUSED, invalid_reason="it is not latched") == "fan 2: refused: it is not latched"
+
+
+def test_a_twin_that_does_not_know_its_unit_says_so() -> None:
+    alarm = Alarm(
+        fan=0, active=True, severity=Severity.ALARM, t_ns=0, onset_t_ns=0, residual_rad_s=0.0, limit_rad_s=0.0,
+        message="", transition=Transition.RAISED, statistic=Statistic.BALANCE_SMOOTHED, torque_balance_command=2.0,
+        torque_balance_limit_command=1.0,
+    )  # fmt: skip
+    assert AlarmText("rpm", "").of(alarm) == "fan 0: takes 2 of command more than a healthy one (limit 1)"

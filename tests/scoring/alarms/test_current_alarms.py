@@ -1,0 +1,138 @@
+"""scoring.alarms.current_alarms: the messages of each fan reduced to how its alarm stands."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from typing import Any
+
+import pytest
+
+from schemas.messages import Alarm, Diagnosis, Header, Severity, Transition
+from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
+from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms
+
+_numbers = itertools.count()
+
+
+def alarm(
+    transition: Transition = Transition.RAISED, t_ns: int = 1, *, tray: str = "a", producer: str = "p", **more: Any
+) -> Alarm:
+    told: dict[str, Any] = {"fan": 0, "active": True, "severity": Severity.WARNING, "onset_t_ns": 1, "confirmed": True}
+    told |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": f"{transition.name} at {t_ns}"}
+    return Alarm(header=Header(producer, next(_numbers), tray), t_ns=t_ns, transition=transition, **told | more)
+
+
+def one(*messages: Alarm) -> CurrentAlarm:
+    (standing,) = current_alarms(messages)
+    return standing
+
+
+def test_the_newest_message_of_each_fan_says_how_it_stands_whatever_the_order():
+    told = [alarm(fan=1), alarm(), alarm(Transition.CLEARED, 5, active=False), alarm(tray="b", t_ns=9)]
+    for messages in itertools.permutations(told):
+        found = [(each.newest.header.tray, each.newest.fan, each.newest.active) for each in current_alarms(messages)]
+        assert found == [("a", 0, False), ("a", 1, True), ("b", 0, True)]
+
+
+@pytest.mark.parametrize(
+    ("transition", "more", "line"),
+    [
+        (Transition.RAISED, {}, "WARNING  a  RAISED at 1"),
+        (Transition.SEVERITY, {"severity": Severity.ALARM}, "ALARM  a  SEVERITY at 1"),
+        (Transition.RAISED, {"out_of_service": True}, "WARNING (kept quiet)  a  RAISED at 1"),
+        (Transition.CLEARED, {"active": False}, "cleared  a  CLEARED at 1"),
+        (
+            Transition.OUT_OF_SERVICE,
+            {"active": False, "out_of_service": True},
+            "out of service  a  OUT_OF_SERVICE at 1",
+        ),
+    ],
+)
+def test_a_log_says_what_happened_and_how_bad_it_is(transition, more, line):
+    assert one(alarm(transition, **more)).line() == line
+
+
+def test_of_messages_at_the_same_sample_the_one_sent_later_counts():
+    first, second = alarm(), alarm(Transition.ACKNOWLEDGED, acknowledged=True)
+    assert one(second, first).newest is second
+
+
+def test_of_several_scorers_the_one_that_spoke_last_counts_whatever_its_times():
+    before = alarm(t_ns=900, producer="killed")
+    again = alarm(Transition.REPUBLISHED, 900, producer="b")
+    taken_back = alarm(Transition.REPUBLISHED, 5, producer="b", active=False, severity=Severity.NONE, acknowledged=True)
+    after = alarm(t_ns=7, producer="c")
+    assert not one(before, taken_back, again).is_retained, "of one producer those that come late were sent before"
+    assert one(before, again, taken_back, after).newest is after
+
+
+def test_an_answer_takes_neither_message_nor_causes_away():
+    causes = (Diagnosis(cause="drag_up", probability=0.8),)
+    standing = one(
+        alarm(),
+        alarm(Transition.DIAGNOSED, 2, causes=causes),
+        alarm(Transition.ACKNOWLEDGED, 3, acknowledged=True, operator_name="Ann"),
+        alarm(Transition.REFUSED, 4, acknowledged=True, operator_name="Bob", message="it is acknowledged already"),
+    )
+    assert (standing.message, standing.causes, standing.acknowledged_by) == ("DIAGNOSED at 2", causes, "Ann")
+
+
+def test_a_new_occurrence_has_nothing_of_the_one_before():
+    causes = (Diagnosis(cause="drag_up", probability=0.8),)
+    standing = one(
+        alarm(causes=causes),
+        alarm(Transition.ACKNOWLEDGED, 2, acknowledged=True, operator_name="Ann"),
+        alarm(t_ns=9, onset_t_ns=8),
+    )
+    assert (standing.message, standing.causes, standing.acknowledged_by) == ("RAISED at 9", (), "")
+
+
+def test_who_acknowledged_is_known_from_what_a_restarted_scorer_tells_again():
+    standing = one(alarm(Transition.REPUBLISHED, acknowledged=True, operator_name="Ann"))
+    assert standing.acknowledged_by == "Ann"
+
+
+@pytest.mark.parametrize(
+    ("more", "retained", "presented"),
+    [
+        ({}, True, True),
+        ({"acknowledged": True}, True, True),
+        ({"active": False}, True, True),
+        ({"active": False, "acknowledged": True}, False, False),
+        ({"active": False, "acknowledged": True, "confirmed": False}, True, True),
+        ({"active": False, "acknowledged": True, "latched": True}, True, True),
+        ({"shelved_until_t_ns": 5}, True, False),
+        ({"suppressed": True}, True, False),
+        ({"out_of_service": True}, True, False),
+    ],
+    ids=str,
+)
+def test_what_is_retained_and_what_is_presented(more, retained, presented):
+    standing = one(alarm(**more))
+    assert (standing.is_retained, standing.is_presented) == (retained, presented)
+
+
+def test_states_in_words():
+    assert one(alarm()).words() == ["active", "unacknowledged"]
+    over = one(alarm(active=False, acknowledged=True, confirmed=False, latched=True))
+    assert over.words() == ["cleared", "acknowledged", "unconfirmed", "latched"]
+    quiet = one(alarm(shelved_until_t_ns=UNTIL_IT_CLEARS_T_NS, suppressed=True, out_of_service=True))
+    assert quiet.words()[2:] == ["shelved until it clears", "suppressed", "out of service"]
+    never = one(alarm(active=False, severity=Severity.NONE, acknowledged=True, suppressed=True))
+    assert never.words() == ["never raised", "suppressed"]
+
+
+def test_a_time_of_another_day_has_its_date():
+    now_ns = time.time_ns()
+    assert len(clock(now_ns)) == len("12:00:00")
+    assert len(clock(now_ns - 2 * 86_400_000_000_000)) == len("2020-01-01 12:00:00")
+
+
+def test_a_machine_gets_it_all_as_json():
+    standing = one(alarm(causes=(Diagnosis(cause="drag_up", probability=0.8),), shelved_until_t_ns=7))
+    shown = json.loads(json.dumps(standing.as_json()))
+    assert shown["causes"] == [{"cause": "drag_up", "probability": 0.8, "evidence": ""}]
+    assert (shown["severity"], shown["retained"], shown["presented"]) == ("warning", True, False)
+    assert shown["shelved_until_t_ns"] == 7

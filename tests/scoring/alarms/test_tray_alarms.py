@@ -1,0 +1,372 @@
+"""scoring.alarms.tray_alarms: the states of alarms, what operators may ask, and that nothing is forgotten."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.messages import Action, FanState, Severity, Transition
+from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, ConditionSettings
+from scoring.alarms.tray_alarms import BlockResult, Conditions
+
+STEP_NS = 10
+NORMAL, SUSPECT, ALARM, RETURNING = FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING
+RAISED, CLEARED, UNSHELVED = Transition.RAISED, Transition.CLEARED, Transition.UNSHELVED
+UP, MID, LOW, HIGH = 1.2, 0.8, 0.1, 1.6  # beyond the limit, between it and the return, returned, of severity ALARM
+
+
+def conditions_of(fans: int = 1, on_delay_ns: int = 50, off_delay_ns: int = 100, **more: Any) -> Conditions:
+    return Conditions(fans, ConditionSettings(on_delay_ns, off_delay_ns, **more))
+
+
+def at_once(**more: Any) -> Conditions:
+    return conditions_of(on_delay_ns=0, off_delay_ns=0, **more)
+
+
+def take(
+    conditions: Conditions, ratios: Sequence[float], valid: Sequence[bool] | None = None, first_t_ns: int = 0
+) -> BlockResult:
+    ratio = np.array(ratios, float)[:, None]
+    mask = np.ones(ratio.shape, np.bool_) if valid is None else np.array(valid)[:, None]
+    t_ns = first_t_ns + STEP_NS * np.arange(len(ratio))
+    return conditions.update(t_ns, STEP_NS, np.where(mask, ratio, np.nan), mask)
+
+
+def happened(course: BlockResult) -> list[tuple[int, Transition]]:
+    return [(change.row, change.transition) for change in course.changes]
+
+
+def states(conditions: Conditions, ratios: Sequence[float], valid: Sequence[bool] | None = None) -> list[int]:
+    return take(conditions, ratios, valid).state[:, 0].tolist()
+
+
+def asked(conditions: Conditions, action: Action, now_t_ns: int = 0, duration_ns: float = 0) -> tuple[Transition, str]:
+    ((_, transition, why),) = conditions.request(action, [0], now_t_ns, duration_ns, "Ann", "looked at it")
+    return transition, why
+
+
+def test_an_alarm_is_raised_exactly_when_the_on_delay_has_run_out():
+    course = take(conditions_of(), [LOW, LOW] + [UP] * 7)
+    assert course.state[:, 0].tolist() == [NORMAL] * 2 + [SUSPECT] * 5 + [ALARM] * 2
+    (change,) = course.changes
+    assert (change.row, change.fan, change.transition, change.standing.onset_t_ns) == (7, 0, RAISED, 2 * STEP_NS)
+
+
+def test_an_excursion_one_sample_too_short_raises_nothing_and_is_counted():
+    course = take(conditions_of(), [LOW] + [UP] * 5 + [LOW] + [UP] * 5 + [LOW])
+    assert (course.changes, course.too_short) == ([], 2)
+
+
+def test_the_limit_itself_is_not_exceeded_and_the_limit_of_return_itself_is_no_return():
+    assert states(at_once(), [1.0]) == [NORMAL]
+    assert states(at_once(), [UP, 0.75]) == [ALARM] * 2
+
+
+def test_an_alarm_is_cleared_exactly_when_the_off_delay_has_run_out():
+    course = take(conditions_of(), [UP] * 6 + [MID] * 20 + [LOW] * 12)
+    assert course.state[5:, 0].tolist() == [ALARM] * 21 + [RETURNING] * 10 + [NORMAL] * 2
+    assert happened(course) == [(5, RAISED), (36, CLEARED)]
+    assert [change.standing.onset_t_ns for change in course.changes] == [0, 0]
+
+
+def test_a_return_that_is_interrupted_begins_again():
+    ratios = [UP] * 6 + [LOW] * 10 + [MID] + [LOW] * 11
+    assert states(conditions_of(), ratios)[6:] == [RETURNING] * 10 + [ALARM] + [RETURNING] * 10 + [NORMAL]
+
+
+def test_samples_that_are_not_valid_stop_the_timers_and_end_nothing():
+    valid = [True] * 3 + [False] * 50 + [True] * 3
+    course = take(conditions_of(), [UP] * 56, valid)
+    assert course.state[:, 0].tolist() == [SUSPECT] * 3 + [FanState.UNKNOWN] * 50 + [SUSPECT] * 2 + [ALARM]
+    conditions = at_once()
+    take(conditions, [UP])
+    assert states(conditions, [LOW] * 9, [False] * 9) == [FanState.UNKNOWN] * 9
+    assert conditions.standing(0).active
+
+
+def test_severity_rises_at_its_ratio_and_does_not_fall_before_the_next_alarm():
+    course = take(at_once(), [UP, 1.5, UP, LOW, UP])
+    told = [(change.row, change.transition, change.standing.severity) for change in course.changes]
+    assert told == [
+        (0, RAISED, Severity.WARNING),
+        (1, Transition.SEVERITY, Severity.ALARM),
+        (3, CLEARED, Severity.ALARM),
+        (4, RAISED, Severity.WARNING),
+    ]
+
+
+def test_every_change_says_how_the_alarm_stood_at_its_own_row():
+    course = take(at_once(), [UP, LOW, UP])
+    assert [change.standing.active for change in course.changes] == [True, False, True]
+
+
+B1 = [  # table B.1 of Part 9: what happens, then Active, Acked, Confirmed, Retain
+    (UP, True, False, True, True),
+    (Action.ACKNOWLEDGE, True, True, False, True),
+    (LOW, False, True, False, True),
+    (Action.CONFIRM, False, True, True, False),
+    (UP, True, False, True, True),
+    (LOW, False, False, True, True),
+    (Action.ACKNOWLEDGE, False, True, False, True),
+    (Action.CONFIRM, False, True, True, False),
+]
+
+
+def test_acknowledging_and_confirming_follow_table_b1_of_part_9():
+    conditions = at_once(confirming=True)
+    now = conditions.standing(0)
+    assert (now.active, now.acknowledged, now.confirmed, now.retained) == (False, True, True, False)
+    for event, *expected in B1:
+        if isinstance(event, Action):
+            assert asked(conditions, event)[0] != Transition.REFUSED
+        else:
+            take(conditions, [event])
+        now = conditions.standing(0)
+        assert [now.active, now.acknowledged, now.confirmed, now.retained] == expected, event
+
+
+def test_without_confirming_an_acknowledged_alarm_is_done_once_it_has_cleared():
+    conditions = at_once()
+    take(conditions, [UP, LOW])
+    assert conditions.standing(0).retained
+    assert asked(conditions, Action.ACKNOWLEDGE) == (Transition.ACKNOWLEDGED, "")
+    now = conditions.standing(0)
+    assert (now.retained, now.acknowledged_by, now.comment) == (False, "Ann", "looked at it")
+    take(conditions, [UP])
+    now = conditions.standing(0)
+    assert (now.acknowledged, now.acknowledged_by) == (False, "")
+
+
+def test_a_new_excursion_that_is_not_yet_an_alarm_leaves_the_name_of_the_last_one_alone():
+    conditions = conditions_of(off_delay_ns=0)
+    take(conditions, [UP] * 6 + [LOW])
+    take(conditions, [UP], first_t_ns=1000)
+    assert (conditions.standing(0).onset_t_ns, conditions.standing(0).acknowledged) == (0, False)
+
+
+def test_a_latched_alarm_stays_until_it_is_reset_in_its_turn():
+    conditions = at_once(latching=True, confirming=True)
+    assert asked(conditions, Action.RESET)[1] == "it is not latched"
+    take(conditions, [UP])
+    assert asked(conditions, Action.RESET)[1] == "it is still active"
+    take(conditions, [LOW])
+    assert asked(conditions, Action.RESET)[1] == "it must be acknowledged first"
+    asked(conditions, Action.ACKNOWLEDGE)
+    assert asked(conditions, Action.RESET)[1] == "it must be confirmed first"
+    asked(conditions, Action.CONFIRM)
+    assert (conditions.standing(0).latched, conditions.standing(0).retained) == (True, True)
+    assert asked(conditions, Action.RESET) == (Transition.RESET, "")
+    assert not conditions.standing(0).retained
+
+
+@pytest.mark.parametrize(
+    ("before", "action", "why"),
+    [
+        ((), Action.ACKNOWLEDGE, "no alarm has been raised"),
+        ((UP, Action.ACKNOWLEDGE), Action.ACKNOWLEDGE, "it is acknowledged already"),
+        ((UP,), Action.CONFIRM, "it must be acknowledged first"),
+        ((UP, Action.ACKNOWLEDGE), Action.CONFIRM, "there is nothing to confirm"),
+        ((Action.SHELVE,), Action.SHELVE, "it is shelved until it clears already"),
+        ((), Action.UNSHELVE, "it is not shelved"),
+        ((Action.SUPPRESS,), Action.SUPPRESS, "it is suppressed already"),
+        ((), Action.UNSUPPRESS, "it is not suppressed"),
+        ((Action.OUT_OF_SERVICE,), Action.OUT_OF_SERVICE, "it is out of service already"),
+        ((), Action.IN_SERVICE, "it is in service already"),
+        ((), Action.NONE, "no action is named"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_plain_words_and_changes_nothing(before, action, why):
+    conditions = at_once()
+    for event in before:
+        if isinstance(event, Action):
+            assert asked(conditions, event)[0] != Transition.REFUSED
+        else:
+            take(conditions, [event])
+    kept = conditions.snapshot()
+    assert asked(conditions, action) == (Transition.REFUSED, why)
+    assert conditions.snapshot() == kept
+
+
+@pytest.mark.parametrize("duration_ns", [-1, math.nan, math.inf, 2**63 - 1])
+def test_a_time_that_no_shelving_can_have_is_refused(duration_ns):
+    refused = (Transition.REFUSED, "it cannot be shelved for such a time")
+    assert asked(at_once(), Action.SHELVE, now_t_ns=5, duration_ns=duration_ns) == refused
+
+
+@pytest.mark.parametrize("duration_ns", [math.nan, math.inf])
+def test_the_time_of_what_is_no_shelving_does_not_matter(duration_ns):
+    granted = (Transition.SUPPRESSED, "")
+    assert asked(at_once(), Action.SUPPRESS, now_t_ns=5, duration_ns=duration_ns) == granted
+
+
+def test_every_fan_asked_about_gets_exactly_one_answer():
+    conditions = conditions_of(fans=2)
+    answers = conditions.request(Action.SUPPRESS, [1, 0, 2, -3], 0)
+    assert [fan for fan, *_ in answers] == [1, 0, 2, -3]
+    assert [transition for _, transition, _ in answers] == [Transition.SUPPRESSED] * 2 + [Transition.REFUSED] * 2
+
+
+def test_a_timed_shelving_ends_with_the_first_sample_at_its_time_even_if_that_is_not_valid():
+    conditions = at_once()
+    asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=3 * STEP_NS)
+    course = take(conditions, [LOW] * 6, [True, True, True, False, False, True])
+    assert happened(course) == [(3, UNSHELVED)]
+    assert conditions.standing(0).shelved_until_t_ns == 0
+
+
+def test_a_shelved_alarm_is_evaluated_and_told_as_ever_and_not_presented():
+    conditions = at_once()
+    asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=4 * STEP_NS)
+    course = take(conditions, [LOW, LOW, UP, UP, UP])
+    assert happened(course) == [(2, RAISED), (4, UNSHELVED)]
+    assert [change.standing.quiet for change in course.changes] == [True, False]
+
+
+def test_an_alarm_raised_at_the_very_sample_at_which_a_shelving_ends_is_presented():
+    conditions = at_once()
+    asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=2 * STEP_NS)
+    course = take(conditions, [LOW, LOW, UP])
+    assert happened(course) == [(2, UNSHELVED), (2, RAISED)]
+    assert not course.changes[1].standing.quiet
+
+
+def test_shelving_again_sets_a_new_time():
+    conditions = at_once()
+    asked(conditions, Action.SHELVE, duration_ns=2 * STEP_NS)
+    assert asked(conditions, Action.SHELVE, duration_ns=4 * STEP_NS)[0] == Transition.SHELVED
+    assert happened(take(conditions, [LOW] * 6)) == [(4, UNSHELVED)]
+
+
+def test_a_shelving_without_a_time_ends_when_the_alarm_clears():
+    conditions = at_once()
+    asked(conditions, Action.SHELVE)
+    assert conditions.standing(0).shelved_until_t_ns == UNTIL_IT_CLEARS_T_NS
+    assert happened(take(conditions, [LOW, UP, LOW, UP])) == [(1, RAISED), (2, CLEARED), (2, UNSHELVED), (3, RAISED)]
+
+
+@pytest.mark.parametrize("action", [Action.SUPPRESS, Action.OUT_OF_SERVICE])
+def test_suppressed_or_out_of_service_hides_no_transition_and_presents_nothing(action):
+    conditions = at_once()
+    asked(conditions, action)
+    assert happened(take(conditions, [UP])) == [(0, RAISED)]
+    assert conditions.standing(0).retained and conditions.standing(0).quiet
+    back = Action.UNSUPPRESS if action == Action.SUPPRESS else Action.IN_SERVICE
+    asked(conditions, back)
+    assert conditions.standing(0).retained and not conditions.standing(0).quiet
+
+
+def test_commissioning_is_granted_and_leaves_the_alarm_as_it_is():
+    conditions = at_once()
+    take(conditions, [UP])
+    before = conditions.standing(0)
+    assert conditions.request(Action.COMMISSION, [0], 0) == [(0, Transition.COMMISSIONING, "")]
+    assert conditions.standing(0) == before
+
+
+# any history: samples of two fans with requests between them, by the row before which each is asked
+
+SAMPLES = 60
+RATIOS = st.sampled_from([LOW, MID, UP, HIGH, math.nan, math.inf])
+HISTORIES = st.fixed_dictionaries(
+    {
+        "ratio": st.lists(st.tuples(RATIOS, RATIOS), min_size=SAMPLES, max_size=SAMPLES),
+        "valid": st.lists(
+            st.tuples(st.sampled_from([True, True, False]), st.booleans()), min_size=SAMPLES, max_size=SAMPLES
+        ),
+        "requests": st.dictionaries(
+            st.integers(1, SAMPLES - 1),
+            st.tuples(st.sampled_from(Action), st.integers(0, 1), st.sampled_from([0, 35, 170])),
+            max_size=12,
+        ),
+    }
+)
+SETTINGS = st.builds(
+    ConditionSettings,
+    on_delay_ns=st.sampled_from([0, 20]),
+    off_delay_ns=st.sampled_from([0, 20]),
+    latching=st.booleans(),
+    confirming=st.booleans(),
+)
+CUTS = st.sets(st.integers(1, SAMPLES - 1))
+
+
+def played(conditions: Conditions, history: dict[str, Any], cuts: set[int], restart: ConditionSettings | None = None):
+    """Everything that comes of a history cut at `cuts`; with `restart`, by a new object after every block."""
+    ratio, valid = np.array(history["ratio"]), np.array(history["valid"])
+    states, changes, answers, too_short = [], [], [], 0
+    for first, last in pairwise(sorted({0, SAMPLES, *cuts, *history["requests"]})):
+        if first in history["requests"]:
+            action, fan, duration_ns = history["requests"][first]
+            answers += conditions.request(action, [fan], STEP_NS * (first - 1), duration_ns, "Ann")
+        rows = slice(first, last)
+        course = conditions.update(STEP_NS * np.arange(first, last), STEP_NS, ratio[rows], valid[rows])
+        states.append(course.state)
+        changes += [(first + c.row, c.fan, c.transition, c.standing) for c in course.changes]
+        too_short += course.too_short
+        if restart:
+            kept = json.loads(json.dumps(conditions.snapshot()))
+            conditions = Conditions(2, restart)
+            conditions.restore(kept)
+    return np.concatenate(states).tolist(), changes, answers, too_short, conditions.snapshot()
+
+
+@given(HISTORIES, SETTINGS, CUTS)
+@settings(max_examples=150, deadline=None)
+def test_the_blocks_make_no_difference(history, chosen, cuts):
+    whole = played(Conditions(2, chosen), history, set())
+    assert played(Conditions(2, chosen), history, cuts) == whole
+    assert played(Conditions(2, chosen), history, set(range(1, SAMPLES))) == whole
+
+
+@given(HISTORIES, SETTINGS, CUTS)
+@settings(max_examples=150, deadline=None)
+def test_going_on_from_a_snapshot_is_as_if_nothing_had_been(history, chosen, cuts):
+    whole = played(Conditions(2, chosen), history, cuts)
+    assert played(Conditions(2, chosen), history, cuts, restart=chosen) == whole
+
+
+@given(HISTORIES, SETTINGS)
+@settings(max_examples=100, deadline=None)
+def test_raised_and_cleared_take_turns_and_are_what_the_states_say(history, chosen):
+    state, changes, *_ = played(Conditions(2, chosen), history, set())
+    for fan in (0, 1):
+        turns = [t for _, its_fan, t, _ in changes if its_fan == fan and t in (RAISED, CLEARED)]
+        assert turns == [RAISED if i % 2 == 0 else CLEARED for i in range(len(turns))]
+        active = np.cumsum(
+            [
+                sum((t == RAISED) - (t == CLEARED) for row, its_fan, t, _ in changes if (row, its_fan) == (i, fan))
+                for i in range(SAMPLES)
+            ]
+        )
+        known = [(s[fan] in (ALARM, RETURNING), bool(a)) for s, a in zip(state, active, strict=True) if s[fan]]
+        assert all(said == counted for said, counted in known)
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [{}, {"fans": []}, {"fans": [{}]}, {"fans": 3}, {"fans": [{"state": 0}]}, {"fans": [{"state": "x"}]}],
+    ids=str,
+)
+def test_what_is_no_snapshot_is_refused_and_changes_nothing(kept):
+    conditions = at_once()
+    take(conditions, [UP])
+    before = conditions.snapshot()
+    with pytest.raises(ValueError, match="snapshot"):
+        conditions.restore(kept)
+    assert conditions.snapshot() == before
+
+
+@pytest.mark.parametrize(("field", "value"), [("lasted_ns", 2**70), ("severity", 9), ("onset_t_ns", None)])
+def test_a_snapshot_with_a_value_that_cannot_be_is_refused(field, value):
+    kept = at_once().snapshot()
+    kept["fans"][0][field] = value
+    with pytest.raises(ValueError, match="snapshot"):
+        at_once().restore(kept)

@@ -1,0 +1,72 @@
+"""scoring.baseline.fan_offsets: what each fan's residual is at each speed, told from days and from noise."""
+
+import numpy as np
+import pytest
+
+from scoring.baseline.fan_offsets import Cells, fan_offsets
+from scoring.limits import FanOffsets
+
+BINS, STEP_S = 6, 0.01
+CENTRES = np.arange(BINS) * 100.0 + 50.0
+
+
+def runs_of(own: np.ndarray, days: int, noise: float, seed: int = 1, seen: float = 1.0) -> list[Cells]:
+    """Runs of fans that are off by own (fans, bins), each day by another constant; bins seen by chance, for 20 s."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for _ in range(days):
+        count = np.where(rng.random(own.shape) < seen, 2000.0, 0.0)
+        of_day = rng.normal(0.0, 1.0, (len(own), 1))
+        made.append(Cells(range(len(own)), count, count * (own + of_day + rng.normal(0.0, noise, own.shape))))
+    return made
+
+
+def without_its_mean(table: np.ndarray) -> np.ndarray:
+    """What no baseline takes away."""
+    return table - table.mean(axis=1, keepdims=True)
+
+
+def found_of(runs: list[Cells]) -> np.ndarray:
+    found = fan_offsets(runs, CENTRES, STEP_S)
+    assert found is not None
+    return without_its_mean(np.array(found.offset_sigmas))
+
+
+def test_what_is_there_every_day_is_found_whatever_else_the_days_are() -> None:
+    own = without_its_mean(np.random.default_rng(2).normal(0.0, 1.0, (10, BINS)))
+    np.testing.assert_allclose(found_of(runs_of(own, 12, noise=0.0)), own, atol=1e-3)
+    error = found_of(runs_of(own, 24, noise=0.2, seen=0.5)) - own
+    assert np.sqrt(np.mean(error**2)) < 0.15
+
+
+def test_what_varies_from_day_to_day_alone_is_not_taken_for_the_fans() -> None:
+    alike = np.tile(np.linspace(-1.0, 1.0, BINS), (50, 1))
+    found = found_of(runs_of(alike, 12, noise=0.9))
+    assert np.sqrt(np.mean((found - alike) ** 2)) < 0.1, "means of twelve days are off by 0.26"
+
+
+def test_a_fan_never_seen_at_a_speed_is_there_as_the_others_are() -> None:
+    own = np.random.default_rng(3).normal(0.0, 0.3, (10, BINS)) + np.linspace(0.0, 3.0, BINS)
+    runs = [
+        Cells(run.known_as, np.where(np.arange(10)[:, np.newaxis] == 4, 0.0, run.count), run.total)
+        for run in runs_of(own, 12, noise=0.01)
+    ]
+    of_others = without_its_mean(np.delete(own, 4, axis=0)).mean(axis=0)
+    np.testing.assert_allclose(found_of(runs)[4], of_others, atol=0.02)
+
+
+@pytest.mark.parametrize(("fans", "days"), [(2, 20), (10, 11)])
+def test_of_few_fans_or_days_nothing_is_said(fans: int, days: int) -> None:
+    assert fan_offsets(runs_of(np.zeros((fans, BINS)), days, noise=1.0), CENTRES, STEP_S) is None
+
+
+def test_of_runs_that_were_nowhere_for_long_nothing_is_said() -> None:
+    short = [Cells(run.known_as, run.count / 20.0, run.total) for run in runs_of(np.zeros((5, BINS)), 12, noise=1.0)]
+    assert fan_offsets(short, CENTRES, STEP_S) is None
+
+
+def test_a_table_with_a_hole_is_refused() -> None:
+    with pytest.raises(ValueError, match="one value for each"):
+        FanOffsets(speeds_rad_s=(1.0, 2.0), offset_sigmas=((0.0, 0.0), (0.0,)))
+    with pytest.raises(ValueError, match="must rise"):
+        FanOffsets(speeds_rad_s=(2.0, 1.0), offset_sigmas=((0.0, 0.0),))

@@ -1,0 +1,200 @@
+"""The statistics of scoring: what each is by its definition, how often it fires on noise; cuts change nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scoring.detectors.cusum import LARGEST, ONE, Cusum
+from scoring.detectors.low_pass import LowPass
+from scoring.detectors.tacho import Sensor
+from scoring.detectors.variance_growth import Spread
+from tests.support.healthy_residuals import autoregressive
+
+STEP_S, STEP_NS = 0.01, 10_000_000
+FANS = 3
+Update = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def of_low_pass() -> Update:
+    low_pass = LowPass(FANS, 0.2)
+    return lambda x, valid: low_pass.update(x, valid, STEP_S)
+
+
+def of_cusum() -> Update:
+    cusum = Cusum(FANS, reference=0.25, cap=0.3)
+    return lambda x, valid: cusum.update(x, valid, STEP_S)
+
+
+def of_spread() -> Update:
+    spread = Spread(FANS, 0.2)
+    return lambda x, valid: spread.update(x, valid, STEP_S)
+
+
+def of_sensor() -> Update:
+    sensor = Sensor(FANS, stuck_limit_s=1.0, missing_limit=0.25)
+    return lambda x, valid: sensor.update(np.round(np.where(valid, x, np.nan)), ~valid, np.isfinite(x), STEP_NS)
+
+
+@pytest.mark.parametrize("make", [of_low_pass, of_cusum, of_spread, of_sensor])
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10_000), cuts=st.lists(st.integers(1, 119), max_size=8), share=st.sampled_from([0.0, 0.1, 0.9])
+)
+def test_cuts_and_samples_that_are_not_valid_change_no_bit(
+    make: Callable[[], Update], seed: int, cuts: list[int], share: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    x = rng.normal(0.4, 1.0, (120, FANS))
+    valid = rng.random(x.shape) >= share
+    valid[:, 1] = True
+    x = np.where(valid | (rng.random(x.shape) < 0.5), x, np.nan)
+    whole = make()(x, valid)
+    for edges in ([0, *sorted(set(cuts)), 120], range(121)):
+        update = make()
+        made = np.concatenate([update(x[a:b], valid[a:b]) for a, b in pairwise(edges)])
+        np.testing.assert_array_equal(made, whole)
+
+
+def test_the_low_pass_is_its_recursion_and_holds_where_nothing_is_valid() -> None:
+    x = np.random.default_rng(1).normal(size=(50, 1))
+    valid = np.ones((50, 1), np.bool_)
+    valid[10:20] = False
+    made = LowPass(1, 0.2).update(x, valid, STEP_S)
+    keep, y = math.exp(-STEP_S / 0.2), 0.0
+    for row in range(50):
+        y = keep * y + (1.0 - keep) * x[row, 0] if valid[row, 0] else y
+        assert made[row, 0] == pytest.approx(y, rel=1e-12)
+
+
+def test_a_low_pass_without_a_time_constant_passes_everything() -> None:
+    x = np.random.default_rng(1).normal(size=(50, 2))
+    np.testing.assert_array_equal(LowPass(2, 0.0).update(x, np.ones(x.shape, np.bool_), STEP_S), x)
+
+
+def test_the_cusum_is_its_recursion_up_to_its_cap_and_finds_both_signs() -> None:
+    x = np.random.default_rng(2).normal(0.0, 1.0, (500, 2)) + np.array([0.5, -0.5])
+    made = Cusum(2, reference=0.25, cap=0.5).update(x, np.ones(x.shape, np.bool_), STEP_S)
+    for fan in range(2):
+        up = down = 0.0
+        for row in range(500):
+            up = min(max(up + (x[row, fan] - 0.25) * STEP_S, 0.0), 0.5)
+            down = min(max(down + (-x[row, fan] - 0.25) * STEP_S, 0.0), 0.5)
+            assert made[row, fan] == pytest.approx(max(up, down), abs=500 / ONE)
+    assert made.max() == pytest.approx(0.5)
+
+
+def test_a_wild_number_counts_as_the_largest() -> None:
+    made = Cusum(1, reference=0.0, cap=math.inf).update(np.array([[1e300]]), np.array([[True]]), STEP_S)
+    assert made[0, 0] == pytest.approx(LARGEST * STEP_S)
+
+
+def average_run_length(z: np.ndarray, reference: float, limit: float) -> float:
+    """Of many streams, (n, streams), which must all end in an alarm."""
+    sums = Cusum(z.shape[1], reference, math.inf).update(z, np.ones(z.shape, np.bool_), 1.0)
+    beyond = sums > limit
+    assert beyond.any(axis=0).all()
+    return float((beyond.argmax(axis=0) + 1).mean())
+
+
+def test_on_white_noise_the_cusum_runs_as_long_as_the_textbook_says() -> None:
+    """Two-sided, k 0.5, h 5: 465 (Montgomery, Statistical Quality Control, table 9.3)."""
+    assert average_run_length(autoregressive(8000, 1500, 0.0, 3), 0.5, 5.0) == pytest.approx(465, rel=0.08)
+
+
+def test_a_residual_with_a_memory_makes_textbook_limits_worth_nothing() -> None:
+    memory = -1.0 / math.log(0.7)  # in samples: AR(1) of 0.7
+    assert average_run_length(autoregressive(3000, 1500, memory, 4, step_s=1.0), 0.5, 5.0) == pytest.approx(35, rel=0.1)
+
+
+@pytest.mark.parametrize(("shift", "expected"), [(1.0, 10.4), (2.0, 4.01)])
+def test_a_shift_is_found_as_fast_as_the_textbook_says(shift: float, expected: float) -> None:
+    z = autoregressive(400, 3000, 0.0, 5) + shift
+    assert average_run_length(z, 0.5, 5.0) == pytest.approx(expected, rel=0.05)
+
+
+def test_a_shift_below_the_reference_value_is_never_found() -> None:
+    z = np.full((100_000, 1), 0.49)
+    assert Cusum(1, 0.5, math.inf).update(z, np.ones(z.shape, np.bool_), STEP_S).max() == 0.0
+
+
+def test_the_spread_of_noise_is_its_deviation_and_doubles_with_it() -> None:
+    noise = np.random.default_rng(6).normal(size=(6000, 50))
+    valid = np.ones(noise.shape, np.bool_)
+    for scale in (1.0, 2.0):
+        made = Spread(50, 100.0).update(scale * noise, valid, STEP_S)
+        assert np.sqrt((made[1000:] ** 2).mean()) == pytest.approx(scale, rel=0.02)
+
+
+def test_the_spread_does_not_see_a_shift_that_the_low_pass_has_followed() -> None:
+    z = np.full((3000, 1), 7.0)
+    spread = Spread(1, 0.2).update(z, np.ones(z.shape, np.bool_), STEP_S)
+    assert spread.max() > 1.0  # it cannot know at once
+    assert spread[-1] < 1e-5
+
+
+def test_a_reading_that_repeats_itself_is_stuck_for_as_long_as_it_does() -> None:
+    speed = np.arange(1.0, 301.0)[:, np.newaxis]
+    speed[100:200] = speed[99]
+    sensor = Sensor(1, stuck_limit_s=0.5, missing_limit=0.25)
+    stuck_s = sensor.update(speed, np.zeros(speed.shape, np.bool_), np.ones(speed.shape, np.bool_), STEP_NS) * 0.5
+    assert stuck_s[:100].max() == 0.0
+    np.testing.assert_allclose(stuck_s[100:200, 0], STEP_S * np.arange(1, 101))
+    assert stuck_s[200:].max() == 0.0
+    assert sensor.longest_s == pytest.approx(1.0)  # within the block, not at its end only
+
+
+def test_a_fan_at_rest_and_a_silent_line_are_not_stuck() -> None:
+    alive = np.ones((300, 2), np.bool_)
+    speed = np.zeros((300, 2))
+    speed[:, 1] = 50.0
+    alive[50:250, 1] = False
+    made = Sensor(2, stuck_limit_s=0.6, missing_limit=0.25).update(speed, np.zeros_like(alive), alive, STEP_NS)
+    assert made.max() < 1.0
+
+
+def test_a_coarse_tacho_of_a_fan_that_moves_is_not_stuck_for_longer_than_its_steps() -> None:
+    speed = 100.0 + 20.0 * np.sin(0.5 * STEP_S * np.arange(6000))[:, np.newaxis]
+    coarse = np.round(speed / 0.5) * 0.5
+    sensor = Sensor(1, stuck_limit_s=2.0, missing_limit=0.25)
+    sensor.update(coarse, np.zeros(speed.shape, np.bool_), np.ones(speed.shape, np.bool_), STEP_NS)
+    assert 0.2 < sensor.longest_s < 1.0
+
+
+@pytest.mark.parametrize(("share", "alarms"), [(0.1, False), (0.6, True), (1.0, True)])
+def test_missing_readings_are_judged_by_their_share(share: float, alarms: bool) -> None:
+    rng = np.random.default_rng(7)
+    missing = rng.random((2000, 1)) < share
+    speed = np.where(missing, np.nan, 100.0 + rng.normal(size=missing.shape))
+    sensor = Sensor(1, stuck_limit_s=5.0, missing_limit=0.25)
+    made = sensor.update(speed, missing, np.ones(missing.shape, np.bool_), STEP_NS)
+    assert bool(made.max() > 1.0) is alarms
+    assert sensor.most_missing == pytest.approx(0.25 * made.max(), rel=0.05)
+
+
+def test_a_speed_that_is_no_number_is_no_reading_that_repeats_itself() -> None:
+    speed = np.full((500, 2), np.inf)
+    speed[:, 1] = np.nan
+    sensor = Sensor(2, stuck_limit_s=0.1, missing_limit=0.25)
+    assert sensor.update(speed, np.zeros(speed.shape, np.bool_), np.ones(speed.shape, np.bool_), STEP_NS).max() == 0.0
+    assert np.isnan(sensor.last).all()
+
+
+def test_some_fans_begin_anew_and_the_others_go_on() -> None:
+    x = np.random.default_rng(8).normal(0.5, 1.0, (200, 2))
+    valid = np.ones(x.shape, np.bool_)
+    first = np.array([True, False])
+    low_pass, cusum, spread = LowPass(2, 0.2), Cusum(2, 0.25, math.inf), Spread(2, 0.2)
+    for each in (low_pass, cusum, spread):
+        each.update(x, valid, STEP_S)
+        each.reset(first)
+    assert low_pass.value[0] == cusum.sums[:, 0].max() == spread.square.value[0] == 0.0
+    assert low_pass.value[1] != 0.0
+    assert cusum.sums[0, 1] > 0
+    assert spread.square.value[1] > 0.0

@@ -1,0 +1,164 @@
+"""scoring.diagnosis.diagnoser: when a fan is diagnosed, on which samples, and that blocks make no difference."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from schemas.messages import Transition
+from scoring.diagnosis.diagnoser import MOST_SAMPLES, Diagnoser
+from scoring.limits import summed_deviation
+from tests.support.scored_blocks import (
+    CALIBRATION,
+    NEEDED,
+    TWIN_SPEED,
+    balance_of_a_fan,
+    commissioned,
+    core_of,
+    feed,
+    prediction_of,
+)
+
+S = 1_000_000_000
+STEP_NS = 10_000_000
+EPOCH_NS = 1_700_000_000 * S
+Floats = NDArray[np.float64]
+
+
+def times(samples: int, first: int = 0) -> NDArray[np.int64]:
+    return EPOCH_NS + (first + np.arange(samples, dtype=np.int64)) * STEP_NS
+
+
+def loaded(samples: int, from_s: float, torque: float = 20.0, seed: int = 1) -> tuple[Floats, Floats]:
+    """Commands and speeds of a fan, (n, 1), at a held speed, that takes more from some time on."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(samples) * STEP_NS / 1e9
+    command = NEEDED + torque * (t_s >= from_s) + rng.normal(0, 0.1, samples)
+    return command[:, np.newaxis], (TWIN_SPEED + rng.normal(0, 0.3, samples))[:, np.newaxis]
+
+
+def fed(samples: int, block: int, from_s: float = 10.0, keep: slice = slice(None)) -> Diagnoser:
+    command, speed = (column[keep] for column in loaded(samples, from_s))
+    t_ns = times(samples)[keep]
+    diagnoser = Diagnoser([balance_of_a_fan()])
+    for k in range(0, len(t_ns), block):
+        rows = slice(k, k + block)
+        diagnoser.take(t_ns[rows], STEP_NS, command[rows], speed[rows], np.zeros_like(speed[rows]))
+    return diagnoser
+
+
+def test_what_takes_more_at_a_held_speed_is_found_to_do_so() -> None:
+    diagnoser = fed(1300, 100)
+    at = int(times(1300)[-1])
+    diagnoser.raised(0, at, EPOCH_NS + 10 * S)
+    causes = diagnoser.diagnose(0, at)
+    assert sum(cause.probability for cause in causes) == pytest.approx(1.0, abs=0.05)
+    probabilities = {cause.cause: cause.probability for cause in causes}
+    assert sum(probabilities.get(name, 0.0) for name in ("drag_down", "sensor_stuck", "sensor_dropout")) < 0.05
+    assert [cause.probability for cause in causes] == sorted((c.probability for c in causes), reverse=True)
+    assert all(cause.evidence for cause in causes)
+
+
+@pytest.mark.parametrize("keep", [slice(None), np.r_[0:600, 650:1300]], ids=["whole", "with a gap"])
+def test_blocks_of_any_size_are_diagnosed_the_same(keep) -> None:
+    found = []
+    for block in (1, 7, 512, 5000):
+        diagnoser = fed(1300, block, keep=keep)
+        diagnoser.raised(0, EPOCH_NS + 11 * S, EPOCH_NS + 10 * S)
+        found.append([diagnoser.diagnose(0, EPOCH_NS + at) for at in (12 * S, 13 * S - STEP_NS)])
+    assert all(each == found[0] for each in found)
+
+
+def test_only_the_last_seconds_are_looked_at_whatever_came_before() -> None:
+    whole, late = fed(11_000, 10, from_s=109.0), fed(11_000, 10, from_s=109.0, keep=slice(1400, None))
+    at = int(times(11_000)[-1])
+    for diagnoser in (whole, late):
+        diagnoser.raised(0, at, EPOCH_NS + 109 * S)
+    assert whole.diagnose(0, at) == late.diagnose(0, at)
+
+
+def test_what_is_the_fans_own_is_no_fault() -> None:
+    command, speed = loaded(1600, 0.0)
+    diagnoser = Diagnoser([balance_of_a_fan()])
+    diagnoser.take(times(1600), STEP_NS, command, speed, np.full_like(speed, 20.0))
+    diagnoser.raised(0, EPOCH_NS + 15 * S, EPOCH_NS + 14 * S)
+    assert diagnoser.diagnose(0, EPOCH_NS + 15 * S)[0].cause == "cannot_tell"
+
+
+def test_a_fan_is_diagnosed_again_after_twice_as_long_each_time_and_each_once() -> None:
+    for block in (1, 30, 2000):
+        diagnoser = Diagnoser([balance_of_a_fan()] * 2)
+        diagnoser.raised(1, EPOCH_NS, EPOCH_NS)
+        found = []
+        for k in range(0, 2000, block):
+            rows = times(min(block, 2000 - k), k)
+            found += [(k + row, fan) for row, fan in diagnoser.due(rows)]
+        assert found == [(100, 1), (200, 1), (400, 1), (800, 1), (1600, 1)]
+
+
+def test_once_it_is_cleared_it_is_not() -> None:
+    diagnoser = Diagnoser([balance_of_a_fan()])
+    diagnoser.raised(0, EPOCH_NS, EPOCH_NS)
+    assert diagnoser.due(times(200)) == [(100, 0)]
+    diagnoser.cleared(0)
+    assert diagnoser.due(times(2000, 200)) == []
+
+
+def test_times_that_fall_into_a_gap_are_one() -> None:
+    diagnoser = Diagnoser([balance_of_a_fan()])
+    diagnoser.raised(0, EPOCH_NS, EPOCH_NS)
+    assert diagnoser.due(times(10, 5000)) == [(0, 0)]
+
+
+def test_without_samples_there_is_nothing_to_tell() -> None:
+    assert fed(1, 1).diagnose(0, EPOCH_NS) == ()
+    assert fed(100, 100).diagnose(0, EPOCH_NS + 3600 * S) == ()
+
+
+def test_a_successor_goes_on_with_what_is_to_be_done() -> None:
+    diagnoser = fed(1300, 100)
+    diagnoser.raised(0, EPOCH_NS + 12 * S, EPOCH_NS + 10 * S)
+    successor = Diagnoser([balance_of_a_fan()])
+    successor.restore(json.loads(json.dumps(diagnoser.snapshot())))
+    assert successor.due(times(2000, 1200)) == diagnoser.due(times(2000, 1200))
+
+
+def test_a_very_fast_grid_costs_no_more_than_a_fast_one() -> None:
+    diagnoser = Diagnoser([balance_of_a_fan()])
+    t_ns = EPOCH_NS + np.arange(100, dtype=np.int64) * STEP_NS
+    column = np.full((100, 1), 50.0)
+    diagnoser.take(t_ns, 1, column, column, column)  # a step of a nanosecond, and samples that are far apart
+    assert diagnoser.diagnose(0, int(t_ns[-1])) == ()
+    fast_ns = EPOCH_NS + np.arange(3 * MOST_SAMPLES // 2, dtype=np.int64)
+    column = np.full((len(fast_ns), 1), 50.0)
+    diagnoser.take(fast_ns, 1, column, column, column)
+    assert diagnoser.diagnose(0, int(fast_ns[-1]))
+
+
+def test_what_is_the_fans_own_is_known_the_better_the_longer_it_was_seen() -> None:
+    command, speed = loaded(1600, 0.0, torque=2.0)
+    errors = []
+    for seconds in (1.0, 100.0):
+        diagnoser = Diagnoser([balance_of_a_fan()])
+        diagnoser.take(times(1600), STEP_NS, command, speed, np.zeros_like(speed), np.full_like(speed, seconds))
+        window = diagnoser.window(0, EPOCH_NS + 15 * S, EPOCH_NS + 14 * S)
+        assert window is not None
+        errors.append(window.offset_std_error)
+    fan = balance_of_a_fan()
+    assert errors[0] == pytest.approx(fan.sigma_command * summed_deviation(fan.autocorrelation_time_s, 0.01))
+    assert errors[1] == pytest.approx(errors[0] / 10.0)
+
+
+def test_a_silent_line_is_not_taken_for_a_tacho_that_drops_out() -> None:
+    core = commissioned(core_of(calibration=CALIBRATION))
+    rng = np.random.default_rng(2)
+    shift = np.full(500, 5.0) + rng.normal(0, 0.1, 500)
+    valid = np.ones(500, np.bool_)
+    valid[50:150] = False
+    _, alarms = feed(core, [prediction_of(rng.normal(0, 0.3, 500), valid, balance=shift)])
+    diagnosed = [alarm for alarm in alarms if alarm.transition == Transition.DIAGNOSED]
+    assert diagnosed
+    assert "sensor_dropout" not in {cause.cause for alarm in diagnosed for cause in alarm.causes}

@@ -1,0 +1,125 @@
+"""Trends per day with intervals that hold, in compressed time, and limits foretold only where they can be."""
+
+import numpy as np
+import pytest
+
+from scoring.wear.trend import CAPACITY, NS_PER_DAY, Reached, Trend, WearSeries, reached
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def series(
+    days: float, per_day: int, slope: float, seed: int, correlation: float = 0.0, error: float = 0.01
+) -> WearSeries:
+    """Points with noise of standard deviation `error`, correlated from one to the next."""
+    rng = np.random.default_rng(seed)
+    points = WearSeries()
+    noise = rng.normal()
+    for k in range(int(days * per_day)):
+        noise = correlation * noise + np.sqrt(1.0 - correlation**2) * rng.normal()
+        points.add(START_NS + round(k / per_day * NS_PER_DAY), slope * k / per_day + error * noise, error)
+    return points
+
+
+def trend_of(points: WearSeries) -> Trend:
+    trend = points.trend()
+    assert trend is not None
+    return trend
+
+
+def times_of(foretold: Reached) -> tuple[int, int, int]:
+    assert foretold.earliest_ns is not None and foretold.likely_ns is not None and foretold.latest_ns is not None
+    return foretold.earliest_ns, foretold.likely_ns, foretold.latest_ns
+
+
+@pytest.mark.parametrize(("correlation", "wrong"), [(0.0, 0.08), (0.5, 0.1), (0.8, 0.12)])
+def test_where_there_is_no_trend_one_is_found_about_as_rarely_as_declared(correlation, wrong) -> None:
+    trends = [series(10, 20, 0.0, seed, correlation).trend() for seed in range(200)]
+    told = [trend for trend in trends if trend is not None]  # what hangs together for long need not tell anything
+    assert len(told) > 190
+    assert np.mean([trend.significant for trend in told]) <= wrong
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+def test_the_interval_holds_the_true_slope(correlation) -> None:
+    trends = [trend_of(series(10, 20, 0.004, seed, correlation)) for seed in range(200)]
+    assert 0.88 <= np.mean([trend.low <= 0.004 <= trend.high for trend in trends]) <= 1.0
+
+
+def test_wear_over_thirty_days_is_found_and_its_limit_foretold() -> None:
+    points = series(30, 48, 0.002, 1, 0.5)
+    trend = trend_of(points)
+    assert trend.significant and trend.slope_per_day == pytest.approx(0.002, rel=0.1)
+    now_ns = START_NS + 30 * NS_PER_DAY
+    foretold = reached(trend, 0.1, now_ns)
+    days = [(t_ns - START_NS) / NS_PER_DAY for t_ns in times_of(foretold)]
+    assert days == sorted(days)
+    assert days[0] < 50.0 < days[2]
+    assert days[1] == pytest.approx(50.0, abs=4.0)
+
+
+def test_the_foretold_interval_holds_the_day_on_which_the_limit_is_reached() -> None:
+    held = []
+    for seed in range(100):
+        foretold = reached(trend_of(series(20, 24, 0.003, seed, 0.5)), 0.12, START_NS + 20 * NS_PER_DAY)
+        earliest_ns, _, latest_ns = times_of(foretold)
+        held.append(earliest_ns <= START_NS + 40 * NS_PER_DAY <= latest_ns)
+    assert np.mean(held) >= 0.88
+
+
+def test_a_limit_is_not_foretold_where_it_cannot_be() -> None:
+    now_ns = START_NS + 20 * NS_PER_DAY
+    rising = trend_of(series(20, 24, 0.003, 3))
+    assert "no trend" in reached(trend_of(series(20, 24, 0.0, 3)), 0.1, now_ns).invalid_reason
+    assert "moves away" in reached(rising, -0.1, now_ns).invalid_reason
+    assert "already reached" in reached(rising, 0.03, now_ns).invalid_reason
+    assert "times as far away" in reached(rising, 3.0, now_ns).invalid_reason
+    assert reached(rising, 0.1, now_ns).invalid_reason == ""
+
+
+def test_a_third_of_wild_points_does_not_carry_the_slope_away() -> None:
+    rng = np.random.default_rng(4)
+    points = WearSeries()
+    for k in range(200):
+        wild = 0.5 if rng.random() < 0.25 else 0.0
+        points.add(START_NS + k * NS_PER_DAY // 10, 0.002 * k / 10 + wild * rng.normal() + 0.01 * rng.normal(), 0.01)
+    assert trend_of(points).slope_per_day == pytest.approx(0.002, abs=0.0007)
+
+
+def test_memory_is_bounded_and_merging_keeps_the_trend() -> None:
+    points = series(100, 200, 0.001, 5)
+    assert len(points) <= CAPACITY
+    trend = trend_of(points)
+    assert trend.significant and trend.low <= 0.001 <= trend.high
+    assert trend.slope_per_day == pytest.approx(0.001, rel=0.02)
+    # What merged points claim as their errors is that of their means.
+    assert points.snapshot()["std_error"][0] < 0.2 * 0.01
+
+
+def test_few_points_tell_nothing() -> None:
+    assert WearSeries().trend() is None
+    assert series(1, 5, 0.1, 6).trend() is None
+
+
+def test_points_that_are_no_numbers_or_come_again_are_left_out() -> None:
+    points = WearSeries()
+    points.add(START_NS, 1.0, 0.1)
+    points.add(START_NS, 2.0, 0.1)
+    points.add(START_NS - 1, 2.0, 0.1)
+    points.add(START_NS + 1, np.nan, 0.1)
+    points.add(START_NS + 2, 1.0, 0.0)
+    assert points.snapshot()["value"].tolist() == [1.0]
+
+
+def test_a_restored_series_goes_on_as_if_nothing_had_happened() -> None:
+    straight, before = WearSeries(), WearSeries()
+    for k in range(900):
+        value = 0.001 * k + np.sin(k)
+        straight.add(START_NS + k * NS_PER_DAY, value, 0.1)
+        if k < 613:
+            before.add(START_NS + k * NS_PER_DAY, value, 0.1)
+    after = WearSeries.restore(before.snapshot())
+    for k in range(613, 900):
+        after.add(START_NS + k * NS_PER_DAY, 0.001 * k + np.sin(k), 0.1)
+    assert after.trend() == straight.trend()
+    assert all(np.array_equal(after.snapshot()[key], value) for key, value in straight.snapshot().items())

@@ -1,0 +1,324 @@
+"""scoring.wear.wear_monitor, through the scorer: days of bearing wear, of which 30 s of each hour are measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from schemas.blocks import cut
+from schemas.messages import Action, Alarm, Header, Prediction, ScorerSnapshot, Transition
+from scoring.detectors.torque_balance import BalanceModel, TorqueBalance
+from stages.scorer import ScorerCore
+from tests.support.scored_blocks import (
+    CALIBRATION,
+    EPOCH_NS,
+    SIGMA,
+    SIGMA_COMMAND,
+    TWIN_SPEED,
+    balance_of_a_fan,
+    core_of,
+    feed,
+    note_of,
+    request_of,
+)
+
+HOUR_NS = 3600 * 10**9
+DAY_NS = 24 * HOUR_NS
+STEP_NS = 20_000_000
+WORN, HEALTHY = 1, 0
+GROWTH_PER_DAY = 0.06
+"""of the friction, in units of the command"""
+DAY_AND_NIGHT = 0.02
+LIMIT = (1.0 + 0.5) * SIGMA_COMMAND
+"""the adaptation limit, and the reference value of the drift"""
+
+
+def burst(
+    hour: float,
+    growth_per_day: float = GROWTH_PER_DAY,
+    swing: float = DAY_AND_NIGHT,
+    seconds: float = 30.0,
+    speed: float | None = None,
+) -> Prediction:
+    """Of two fans whose speed is held, another one each hour; the second one's friction grows."""
+    rng = np.random.default_rng(round(hour * 4))
+    fan, n = balance_of_a_fan(), round(seconds * 1e9 / STEP_NS)
+    t_ns = EPOCH_NS + round(hour * HOUR_NS) + np.arange(n) * STEP_NS
+    twin_speed = TWIN_SPEED * rng.uniform(0.9, 1.1) if speed is None else speed
+    friction = swing * np.sin(2 * np.pi * hour / 24) + np.array([0.0, growth_per_day * hour / 24])
+    needed = fan.viscous * twin_speed + fan.drag * twin_speed**2 + fan.friction
+    command = np.broadcast_to(needed + friction, (n, 2))
+    measured = twin_speed + rng.normal(0.0, 0.3, (n, 2))
+    columns = {name: np.full(2, getattr(fan, name)) for name in ("inertia", "viscous", "drag", "friction", "lag_s")}
+    model = BalanceModel(
+        **columns,
+        filter_rate_per_s=fan.filter_rate_per_s,
+        lowest_speed_rad_s=np.full(2, fan.lowest_speed_rad_s),
+        highest_speed_rad_s=1000.0,
+    )
+    return Prediction(
+        header=Header("integrator-1", round(hour * 4), "tray1"),
+        fans=2,
+        period_ns=STEP_NS,
+        t_ns=t_ns,
+        command=command,
+        measured_speed_rad_s=measured,
+        predicted_speed_rad_s=np.full((n, 2), twin_speed),
+        sigma_rad_s=np.full(2, SIGMA),
+        valid=np.ones((n, 2), np.bool_),
+        invalid_reason=np.zeros((n, 2), np.uint8),
+        twin="t",
+        torque_balance_command=TorqueBalance(model).update(STEP_NS / 1e9, command, measured, np.ones((n, 2), np.bool_)),
+        torque_balance_sigma_command=np.full(2, SIGMA_COMMAND),
+    )
+
+
+def core() -> ScorerCore:
+    return core_of(2, calibration=CALIBRATION)
+
+
+def live_through(
+    core: ScorerCore, days: float, from_day: float = 0.0, every_hours: float = 1.0, **more: Any
+) -> Iterator[Alarm]:
+    for hour in np.arange(from_day * 24, days * 24, every_hours).tolist():
+        yield from (message for message in core.step(burst(hour, **more)) if isinstance(message, Alarm))
+
+
+def wear_of(memory: ScorerSnapshot) -> Any:
+    return json.loads(memory.state_json)["wear"]
+
+
+def worn(fan: int, parameter: str, core: ScorerCore) -> Any:
+    return wear_of(note_of(core))["fans"][fan]["parameters"][parameter]
+
+
+@pytest.fixture(scope="module")
+def after_eight_days() -> tuple[ScorerCore, list[Alarm]]:
+    eight = core()
+    return eight, list(live_through(eight, 8))
+
+
+def test_the_growth_of_friction_is_found_with_an_interval_that_holds_it(after_eight_days) -> None:
+    core, alarms = after_eight_days
+    assert alarms == []
+    fan = balance_of_a_fan()
+    truth = {
+        "balance": GROWTH_PER_DAY,
+        "friction": GROWTH_PER_DAY,
+        "drag": GROWTH_PER_DAY / (fan.drag * TWIN_SPEED**2),
+        "gain": -GROWTH_PER_DAY / 50.0,
+    }
+    for parameter, slope in truth.items():
+        found = worn(WORN, parameter, core)
+        per_day = found["per_day"]
+        assert per_day["value"] == pytest.approx(slope, rel=0.1), parameter
+        if parameter in ("balance", "friction"):  # growing friction is not quite a drag that grows
+            assert per_day["low"] < slope < per_day["high"], parameter
+        assert found["change"] == pytest.approx(8 * slope, rel=0.1), parameter
+
+
+def test_the_limit_is_foretold_where_its_alarm_then_comes(after_eight_days) -> None:
+    core, _ = after_eight_days
+    found = worn(WORN, "balance", core)
+    assert found["limit"] == pytest.approx(LIMIT)
+    times = found["reached_t_ns"]
+    days = [(times[name] - EPOCH_NS) / DAY_NS for name in ("earliest", "likely", "latest")]
+    assert days[0] < LIMIT / GROWTH_PER_DAY < days[2]
+    assert days[1] == pytest.approx(LIMIT / GROWTH_PER_DAY, rel=0.05)
+    assert days[2] - days[0] < 4.0
+    successor = restored(core)
+    raised = next(live_through(successor, 16, from_day=8))
+    assert (raised.fan, raised.transition) == (WORN, Transition.RAISED)
+    assert days[0] - 0.5 < (raised.t_ns - EPOCH_NS) / DAY_NS < days[2] + 0.5
+
+
+def test_while_the_baseline_may_go_no_further_the_line_goes_on(after_eight_days) -> None:
+    successor = restored(after_eight_days[0])
+    assert list(live_through(successor, 12, from_day=8)) == []
+    assert "baseline of fan 1 may drift no further" in successor.problem()
+    assert worn(WORN, "balance", successor)["per_day"]["value"] == pytest.approx(GROWTH_PER_DAY, rel=0.1)
+    assert worn(WORN, "balance", successor)["change"] == pytest.approx(12 * GROWTH_PER_DAY, rel=0.1)
+
+
+def test_a_healthy_fan_shows_no_wear(after_eight_days) -> None:
+    core, _ = after_eight_days
+    for parameter in ("balance", "friction", "drag", "gain"):
+        per_day = worn(HEALTHY, parameter, core)["per_day"]
+        assert per_day["low"] < 0.0 < per_day["high"], parameter
+    assert worn(HEALTHY, "balance", core)["reached_t_ns"] is None
+    assert "no trend" in worn(HEALTHY, "balance", core)["invalid_reason"]
+
+
+def test_what_is_near_is_told_in_health_and_alarms_nobody(after_eight_days) -> None:
+    core, _ = after_eight_days
+    assert core.problem() == "fan 1 wears: its balance reaches the limit in about 5 days (4 to 5); look at it"
+    assert list(live_through(restored(core), 8.5, from_day=8)) == []
+
+
+def test_what_is_far_away_is_not_told() -> None:
+    slow = core()
+    assert list(live_through(slow, 4, growth_per_day=0.04, swing=0.002)) == []
+    assert worn(WORN, "balance", slow)["reached_t_ns"] is not None
+    assert slow.problem() == ""
+
+
+def test_less_than_a_day_foretells_nothing() -> None:
+    young = core()
+    assert list(live_through(young, 0.9, every_hours=0.25, growth_per_day=0.1, swing=0.0)) == []
+    assert worn(WORN, "balance", young)["invalid_reason"] == "less than a day was seen"
+    assert young.problem() == ""
+
+
+def restored(core: ScorerCore) -> ScorerCore:
+    successor = core_of(2, calibration=CALIBRATION)
+    successor.restore(note_of(core))
+    return successor
+
+
+def test_a_restart_forgets_nothing_of_it(after_eight_days) -> None:
+    core, _ = after_eight_days
+    successor = restored(core)
+    assert wear_of(note_of(successor)) == wear_of(note_of(core))
+    assert successor.problem() == core.problem()
+    assert list(live_through(successor, 8.25, from_day=8)) == []
+    assert worn(WORN, "friction", successor)["series"]["t_ns"][-1] > worn(WORN, "friction", core)["series"]["t_ns"][-1]
+
+
+def test_a_memory_from_before_wear_was_watched_is_taken() -> None:
+    before = core()
+    list(live_through(before, 0.2))
+    memory = note_of(before)
+    state = json.loads(memory.state_json)
+    del state["wear"]
+    successor = core()
+    successor.restore(replace(memory, state_json=json.dumps(state)))
+    assert "snapshots_not_understood" not in successor.counters()
+    assert wear_of(note_of(successor)) == wear_of(note_of(core_after_one_sample()))
+
+
+def test_a_memory_from_before_disturbances_were_kept_is_taken(after_eight_days) -> None:
+    memory = note_of(after_eight_days[0])
+    state = json.loads(memory.state_json)
+    del state["wear"]["disturbed_t_ns"]
+    successor = core()
+    successor.restore(replace(memory, state_json=json.dumps(state)))
+    assert wear_of(note_of(successor)) == wear_of(memory)
+
+
+def core_after_one_sample() -> ScorerCore:
+    young = core()
+    young.step(cut(burst(0), 0, 1))
+    return young
+
+
+@pytest.mark.parametrize("broken", [{"fans": []}, {"tried": "x"}, {"fans": 3}])
+def test_what_is_no_wear_is_set_aside(broken) -> None:
+    memory = note_of(core_after_one_sample())
+    state = json.loads(memory.state_json)
+    state["wear"] |= broken
+    successor = core()
+    successor.restore(replace(memory, state_json=json.dumps(state)))
+    assert successor.counters()["snapshots_not_understood"] == 1
+
+
+def test_blocks_make_no_difference() -> None:
+    found = []
+    for block in (1, 37, 1500):
+        one = core()
+        for hour in (0, 1, 2):
+            for first in range(0, 1500, block):
+                one.step(cut(burst(hour), first, min(first + block, 1500)))
+        found.append(wear_of(note_of(one)))
+    assert len(found[0]["fans"][0]["parameters"]["drag"]["series"]["t_ns"]) == 3
+    assert found[1] == found[0] and found[2] == found[0]
+
+
+def test_a_fan_that_is_commissioned_anew_begins_anew(after_eight_days) -> None:
+    successor = restored(after_eight_days[0])
+    successor.step(request_of(Action.COMMISSION, WORN))
+    assert worn(WORN, "friction", successor)["series"]["t_ns"] == []
+    assert worn(HEALTHY, "friction", successor)["series"]["t_ns"] != []
+    assert successor.problem() == ""
+
+
+def test_of_a_fan_that_is_not_quiet_nothing_is_learnt() -> None:
+    one = core()
+    list(live_through(one, 0.3))
+    before = len(worn(WORN, "friction", one)["series"]["t_ns"])
+    for hour in range(8, 12):
+        list(one.step(burst(hour, growth_per_day=5.0)))
+    assert len(worn(WORN, "friction", one)["series"]["t_ns"]) == before
+    assert len(worn(HEALTHY, "friction", one)["series"]["t_ns"]) > before
+
+
+def first_point_s(fan: int, core: ScorerCore) -> float | None:
+    times = worn(fan, "friction", core)["series"]["t_ns"]
+    return (times[0] - EPOCH_NS) / 1e9 if times else None
+
+
+def test_a_fan_that_was_not_quiet_is_looked_at_once_that_is_out_of_sight() -> None:
+    one, block = core(), burst(0, seconds=60.0)
+    measured = block.measured_speed_rad_s.copy()
+    measured[435:520, WORN] = measured[434, WORN]  # more than half as long as a reading may repeat itself
+    one.step(replace(block, measured_speed_rad_s=measured))
+    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)
+
+
+def with_a_fault(first_s: int = 7) -> Prediction:
+    """Of the second fan, for 2 s: it takes 2 more of the command."""
+    block = burst(0, seconds=60.0)
+    more = np.zeros((len(block.t_ns), 2))
+    more[50 * first_s : 50 * (first_s + 2), WORN] = 2.0
+    return replace(block, command=block.command + more, torque_balance_command=block.torque_balance_command + more)
+
+
+def test_no_point_looks_back_on_a_fault_that_has_cleared() -> None:
+    one = core()
+    _, alarms = feed(one, [with_a_fault()])
+    cleared_s = [(alarm.t_ns - EPOCH_NS) / 1e9 for alarm in alarms if alarm.transition == Transition.CLEARED]
+    assert len(cleared_s) == 1 and 9.0 < cleared_s[0] < 15.0
+    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)
+    (friction,) = worn(WORN, "friction", one)["series"]["value"]
+    assert abs(friction) < 0.1, "nothing of the fault is in it"
+
+
+@pytest.mark.parametrize("first_s", [7, 11])
+@pytest.mark.parametrize("block", [1, 37, 512])
+def test_how_far_back_a_fault_is_does_not_depend_on_blocks(block: int, first_s: int) -> None:
+    whole, cut_up, faulty = core(), core(), with_a_fault(first_s)
+    feed(whole, [faulty])
+    feed(cut_up, [cut(faulty, first, min(first + block, 3000)) for first in range(0, 3000, block)])
+    assert wear_of(note_of(cut_up)) == wear_of(note_of(whole))
+
+
+def test_after_a_restart_it_is_known_how_far_back_a_fault_is() -> None:
+    killed, faulty = core(), with_a_fault()
+    feed(killed, [cut(faulty, 0, 1500)])
+    successor = restored(killed)
+    feed(successor, [cut(faulty, 1500, 3000)])
+    assert first_point_s(WORN, successor) == 50.0
+
+
+def test_no_point_looks_back_on_what_was_before_a_fan_was_commissioned_anew() -> None:
+    one, block = core(), burst(0, seconds=60.0)
+    feed(one, [cut(block, 0, 500), request_of(Action.COMMISSION, WORN), cut(block, 500, 3000)])
+    assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)
+
+
+def test_a_fan_that_stands_tells_nothing() -> None:
+    one = core()
+    for hour in range(6):
+        one.step(burst(hour, speed=10.0))
+    assert worn(WORN, "friction", one)["series"]["t_ns"] == []
+
+
+def test_a_twin_without_calibration_has_trends_and_no_limit() -> None:
+    one = core_of(2)
+    list(live_through(one, 1.5, swing=0.0))
+    assert worn(WORN, "balance", one)["invalid_reason"] == "the twin is not calibrated"
+    assert worn(WORN, "friction", one)["per_day"]["low"] > 0.0

@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+
+from simulation.excitation import PROFILES, Manual, Multisine, Prbs, Staircase, excitation
+from twin.errors import TwinError
+
+TIMES_S = np.arange(0.0, 130.0, 0.05)
+
+
+def played(profile: str, fans: int = 3, seed: int = 1) -> np.ndarray:
+    source = excitation(profile, fans, seed, low=0.2, high=0.8)
+    return np.array([source.command(t) for t in TIMES_S])
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_profile_stays_in_its_range_and_uses_most_of_it(profile: str) -> None:
+    commands = played(profile)
+    assert commands.shape == (len(TIMES_S), 3)
+    assert commands.min() >= 0.2
+    assert commands.max() <= 0.8
+    assert np.all(np.ptp(commands, axis=0) > 0.4)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_profile_is_the_same_for_the_same_seed_and_differs_for_another_and_between_fans(profile: str) -> None:
+    commands = played(profile)
+    assert np.array_equal(commands, played(profile))
+    assert not np.array_equal(commands, played(profile, seed=2))
+    assert not np.array_equal(commands[:, 0], commands[:, 1])
+
+
+@pytest.mark.parametrize("profile", ["manual", "multisine", "chirp"])
+def test_smooth_profiles_do_not_jump(profile: str) -> None:
+    # The steepest: a knob turned over the whole range in half a second; a sine of 2 Hz.
+    assert np.abs(np.diff(played(profile), axis=0)).max() <= 0.6 * 2 * np.pi * 2.0 * 0.05
+
+
+def test_a_staircase_holds_each_level_and_changes_by_one_step() -> None:
+    stairs = Staircase(1, seed=0, low=0.0, high=0.8, steps=8, hold_s=1.0)
+    levels = np.array([stairs.command(t + 0.5)[0] for t in range(16)])
+    assert np.allclose(np.abs(np.diff(levels)), 0.1)
+    assert set(np.round(levels, 6)) == set(np.round(np.linspace(0.0, 0.8, 9), 6))
+    assert stairs.command(3.01)[0] == stairs.command(3.99)[0]
+
+
+def test_a_prbs_has_maximum_length() -> None:
+    source = Prbs(1, seed=0, low=0.0, high=1.0, bit_s=1.0)
+    bits = np.array([source.command(t + 0.5)[0] for t in range(1023)])
+    assert bits.sum() == 512
+    signs = 2.0 * bits - 1.0
+    spectrum = np.abs(np.fft.fft(signs)) ** 2
+    assert np.allclose(spectrum[1:], 1024.0)  # flat: what the maximum length is wanted for
+
+
+def test_a_multisine_holds_its_harmonics_and_nothing_else() -> None:
+    source = Multisine(1, seed=3, low=0.0, high=1.0, period_s=50.0)
+    signal = np.array([source.command(t)[0] for t in np.arange(0.0, 50.0, 0.05)])
+    power = np.abs(np.fft.rfft(signal - signal.mean()))
+    assert set(np.argsort(power)[-10:]) == set(Multisine.HARMONICS)
+
+
+def test_manual_knobs_hold_still_most_of_the_time_and_the_period_closes_without_a_jump() -> None:
+    source = Manual(2, seed=4, low=0.1, high=0.9, period_s=120.0)
+    commands = np.array([source.command(t) for t in np.arange(0.0, 240.0, 0.01)])
+    steps = np.abs(np.diff(commands, axis=0))
+    assert np.mean(steps == 0.0) > 0.5
+    assert steps.max() < 0.9 / 0.5 * 0.0101
+    assert np.allclose(commands[:12000], commands[12000:])
+
+
+def test_an_unknown_profile_names_the_nearest() -> None:
+    with pytest.raises(TwinError, match="unknown profile 'chrip'; did you mean 'chirp'"):
+        excitation("chrip", 1, 0)
+
+
+def test_a_range_that_is_none_is_refused() -> None:
+    with pytest.raises(TwinError, match=r"commands from 0.5 to 0.5"):
+        excitation("manual", 1, 0, low=0.5, high=0.5)

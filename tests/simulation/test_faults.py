@@ -1,0 +1,144 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from simulation.faults import Fault, check_schedule, disturbance, parse_fault, tacho_trouble
+from simulation.plant import Tacho
+from simulation.tray import SimulatedTray, TraySettings
+from twin.errors import TwinError
+
+QUIET = TraySettings(fans=2, duration_s=12.0, profile="staircase", spread=0.0, jitter_us=0.0, tacho=Tacho(0.0, 0.0))
+
+
+def speeds(*faults: str, duty: float = 0.6) -> np.ndarray:
+    """(n, 2) speeds of two like fans at one duty, the first of them with the faults."""
+    tray = SimulatedTray(replace(QUIET, faults=tuple(map(parse_fault, faults))))
+    tray.command(np.full(2, duty))
+    rows = []
+    while tray.due_s() is not None:
+        rows.append(tray.take().speed_rad_s)
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "inlet:fan=0,start=5,stop=8,size=1.6",
+        "rotor:fan=0,start=5,stop=8,size=1.0",
+        "wear:fan=0,start=5,stop=8,size=1.0",
+        "supply:fan=0,start=5,stop=8,size=0.8",
+    ],
+)
+def test_what_brakes_a_fan_slows_it_and_its_neighbour_and_its_past_do_not_feel_it(fault: str) -> None:
+    run = speeds(fault)
+    lag = run[:, 1] - run[:, 0]
+    assert np.all(lag[:501] == 0.0)
+    assert lag[800] > 20.0
+    assert abs(lag[-1]) < 0.2 * lag[800]  # and when it is gone, the fan comes back
+
+
+def test_an_opened_inlet_and_a_raised_supply_speed_the_fan_up() -> None:
+    assert speeds("inlet:fan=0,size=0.7")[-1, 0] > speeds()[-1, 0] + 20.0
+    assert speeds("supply:fan=0,size=1.1")[-1, 0] > speeds()[-1, 0] + 20.0
+
+
+def test_the_size_orders_the_effect() -> None:
+    ends = [speeds(f"inlet:fan=0,size={size}")[-1, 0] for size in (1.0, 1.3, 1.6, 2.0)]
+    assert ends == sorted(ends, reverse=True)
+    assert ends[0] == speeds()[-1, 0]
+
+
+def test_a_braked_fan_that_stands_is_not_driven_backwards() -> None:
+    assert np.all(speeds("rotor:fan=0,size=20", duty=0.5)[:, 0] == 0.0)
+
+
+def test_wear_grows_slowly_from_nothing() -> None:
+    fault = parse_fault("wear:fan=1,start=10,stop=30,size=0.8")
+    assert [round(fault.size_at(t), 6) for t in (10.0, 15.0, 20.0, 30.0)] == [0.0, 0.2, 0.4, 0.8]
+
+
+def test_a_stuck_tacho_repeats_its_last_reading_and_lets_go() -> None:
+    run = speeds("tacho-stuck:fan=0,start=1,stop=3")
+    assert np.all(run[100:300, 0] == run[99, 0])
+    assert run[99, 0] != run[100, 1]
+    assert run[300, 0] == run[300, 1]
+
+
+def test_a_dropping_tacho_gives_no_reading_for_its_share_of_samples() -> None:
+    run = speeds("tacho-dropout:fan=0,start=2,stop=12,size=0.3")
+    missing = np.isnan(run)
+    assert missing[200:, 0].mean() == pytest.approx(0.3, abs=0.05)
+    assert not missing[:200].any()
+    assert not missing[:, 1].any()
+    there = ~missing[:, 0]
+    assert np.array_equal(run[there, 0], run[there, 1])  # the fan itself is well
+
+
+def test_a_dropping_tacho_without_a_size_gives_no_reading_at_all() -> None:
+    assert np.isnan(speeds("tacho-dropout:fan=0,start=2")[200:, 0]).all()
+
+
+def test_several_faults_of_one_fan_add_up() -> None:
+    faults = [parse_fault(t) for t in ("inlet:fan=0,size=2", "inlet:fan=0,size=3", "rotor:fan=0,size=1")]
+    felt = disturbance([*faults, parse_fault("rotor:fan=0,size=0.5")], 2, 1.0)
+    assert np.array_equal(np.asarray(felt.drag_factor), [6.0, 1.0])
+    assert np.array_equal(np.asarray(felt.brake_v), [1.5, 0.0])
+    assert not tacho_trouble(faults, 2, 1.0).stuck.any()
+
+
+def test_the_tray_tells_when_a_fault_really_began_and_ended() -> None:
+    fault = parse_fault("inlet:fan=0,start=1.003,stop=2.001")
+    tray = SimulatedTray(replace(QUIET, faults=(fault, parse_fault("rotor:fan=1,start=5"))))
+    assert tray.happened(0) == (None, None)
+    while (due_s := tray.due_s()) is not None and due_s < 4.0:
+        tray.take()
+    assert tray.happened(0) == (pytest.approx(1.01), pytest.approx(2.01))
+    assert tray.happened(1) == (None, None)
+
+
+def test_a_fault_is_read_from_the_command_line() -> None:
+    assert parse_fault("inlet:fan=2,start=10,stop=18,size=1.6") == Fault("inlet", 2, 10.0, 18.0, 1.6)
+    assert parse_fault("rotor:fan=0") == Fault("rotor", 0, 0.0, math.inf, 1.0)
+    assert parse_fault("tacho-stuck:fan=1,start=3") == Fault("tacho-stuck", 1, 3.0, math.inf, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("inlte:fan=2", "unknown kind 'inlte'; did you mean 'inlet'"),
+        ("fire:fan=2", "unknown kind 'fire'; known: inlet, rotor, wear"),
+        ("inlet:fna=2", "unknown key 'fna'; did you mean 'fan'"),
+        ("inlet:fan=2,sizes=1", "unknown key 'sizes'; did you mean 'size'"),
+        ("inlet", "say which fan"),
+        ("inlet:fan=two", "fan = 'two' is not a number"),
+        ("inlet:fan=-1", "fan must be a whole number"),
+        ("inlet:fan=1.5", "fan must be a whole number"),
+        ("inlet:fan=1,fan=2", "fan is given twice"),
+        ("inlet:fan=1,start=5,stop=4", "stop must come after start"),
+        ("inlet:fan=1,start=-1", "start must not be negative"),
+        ("inlet:fan=1,size=0", "give one from 0.01 on"),
+        ("tacho-dropout:fan=1,size=1.1", "give one from 0 to 1"),
+        ("tacho-stuck:fan=1,size=2", "has no size"),
+        ("rotor:fan=1,size=nan", "must be finite"),
+    ],
+)
+def test_a_wrong_fault_is_told_in_one_line_that_says_which_part(text: str, message: str) -> None:
+    with pytest.raises(TwinError, match=message) as caught:
+        parse_fault(text)
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("inlet:fan=2", "fan 2 is not there; the tray's are 0 to 1"),
+        ("inlet:fan=1,start=10", "start = 10 s is after the end at 10 s"),
+        ("wear:fan=1", "give stop=S"),
+    ],
+)
+def test_a_fault_that_does_not_fit_the_tray_is_refused(text: str, message: str) -> None:
+    with pytest.raises(TwinError, match=message):
+        check_schedule([parse_fault(text)], fans=2, duration_s=10.0)

@@ -1,0 +1,241 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from simulation.plant import (
+    DeviceClock,
+    Disturbance,
+    FanParameters,
+    PlantState,
+    Tacho,
+    advance,
+    at_rest,
+    drive,
+    fan,
+    friction_v,
+    tray_of_fans,
+)
+from simulation.tray import SimulatedTray, TraySettings
+from twin.errors import TwinError
+
+ONE = tray_of_fans(1, seed=0, spread=0.0)
+NO_FRICTION = dataclasses.replace(ONE, coulomb_v=np.zeros(1), breakaway_v=np.zeros(1))
+
+
+def settle(duty: float, parameters: FanParameters = ONE, disturbance: Disturbance | None = None) -> float:
+    state = advance(at_rest(1), np.array([duty]), 20.0, parameters, disturbance or Disturbance())
+    return float(state.speed_rad_s[0])
+
+
+def static_balance(duty: float, base: FanParameters) -> float:
+    """Speed at which drive equals drag and friction, found without integrating anything."""
+    alpha, C_D = float(base.alpha), float(base.C_D)
+    torque_v = 12.0 * float(drive(np.array(duty), base))
+
+    def excess(w: float) -> float:
+        return torque_v - alpha * w - C_D * w * w - float(friction_v(np.array(w), base))
+
+    root = brentq(excess, 50.0, 2000.0)
+    assert isinstance(root, float)
+    return root
+
+
+@pytest.mark.parametrize("duty", [0.2, 0.5, 1.0])
+def test_the_steady_speed_solves_the_static_balance(duty: float) -> None:
+    assert settle(duty) == pytest.approx(static_balance(duty, fan(ONE, 0)), abs=0.01)
+
+
+def test_at_full_duty_the_published_fan_turns_at_about_950_rad_s() -> None:
+    assert settle(1.0) == pytest.approx(950.0, rel=0.02)
+    assert settle(1.0, NO_FRICTION) == pytest.approx(951.506, abs=0.01)
+
+
+def test_a_turning_fan_follows_the_equation_of_motion() -> None:
+    base = fan(ONE, 0)
+
+    def motion(_t: float, x: np.ndarray) -> list[float]:
+        w, current = x
+        target = 12.0 * float(drive(np.array(0.7), base))
+        friction = float(friction_v(np.array(w), base))
+        return [(current - base.alpha * w - base.C_D * w * w - friction) / base.J, (target - current) / base.lag_s]
+
+    times = np.linspace(0.1, 3.0, 30)
+    exact = solve_ivp(motion, (0.0, 3.0), [100.0, 2.0], t_eval=times, rtol=1e-9, atol=1e-9).y[0]
+    state = PlantState(np.array([100.0]), np.array([2.0]))
+    found = []
+    for step in np.diff(times, prepend=0.0):
+        state = advance(state, np.array([0.7]), step, ONE)
+        found.append(state.speed_rad_s[0])
+    assert np.abs(np.array(found) - exact).max() < 0.05
+
+
+def test_the_speed_does_not_depend_on_how_often_it_is_sampled() -> None:
+    coarse = advance(at_rest(1), np.array([0.6]), 1.0, ONE)
+    fine = at_rest(1)
+    for _ in range(400):
+        fine = advance(fine, np.array([0.6]), 0.0025, ONE)
+    assert fine.speed_rad_s[0] == pytest.approx(coarse.speed_rad_s[0], abs=0.05)
+
+
+def just_enough_for(torque_v: float) -> float:
+    base = fan(ONE, 0)
+    dead, full = float(base.duty_dead), float(base.duty_full)
+    return dead + torque_v / 12.0 * (full - dead)
+
+
+def test_a_rotor_below_breakaway_stands_exactly_still_and_above_it_goes() -> None:
+    breakaway_v = float(fan(ONE, 0).breakaway_v)
+    assert settle(just_enough_for(0.98 * breakaway_v)) == 0.0
+    assert settle(just_enough_for(1.02 * breakaway_v)) > 1.0
+
+
+def test_a_turning_rotor_keeps_turning_below_breakaway_because_sliding_friction_is_smaller() -> None:
+    between = just_enough_for(0.9 * float(fan(ONE, 0).breakaway_v))
+    turning = PlantState(np.array([200.0]), np.array([0.0]))
+    assert settle(between) == 0.0
+    assert advance(turning, np.array([between]), 30.0, ONE).speed_rad_s[0] > 1.0
+
+
+def test_a_fan_switched_off_comes_to_rest_and_never_turns_backwards() -> None:
+    state = PlantState(np.array([300.0]), np.array([4.0]))
+    speeds = []
+    for _ in range(2000):
+        state = advance(state, np.zeros(1), 0.01, ONE, Disturbance(brake_v=np.array([0.5])))
+        speeds.append(state.speed_rad_s[0])
+    assert min(speeds) == 0.0
+    assert speeds[-1] == 0.0
+
+
+def test_the_drive_has_a_dead_zone_and_saturates() -> None:
+    base = fan(ONE, 0)
+    assert float(drive(np.array(base.duty_dead), base)) == 0.0
+    assert float(drive(np.array(base.duty_dead + 0.01), base)) > 0.0
+    assert float(drive(np.array(base.duty_full - 0.01), base)) < 1.0
+    assert float(drive(np.array(1.5), base)) == 1.0
+
+
+def test_the_current_lags_by_its_time_constant() -> None:
+    lag_s = float(fan(ONE, 0).lag_s)
+    state = advance(at_rest(1), np.ones(1), lag_s, ONE)
+    assert state.current_v[0] == pytest.approx(12.0 * (1.0 - np.exp(-1.0)), rel=1e-9)
+
+
+def test_fans_differ_by_the_spread_and_the_seed_says_how() -> None:
+    tray = tray_of_fans(2000, seed=3, spread=0.03)
+    assert np.std(tray.J) / 0.0148 == pytest.approx(0.03, rel=0.1)
+    assert np.mean(tray.C_D) == pytest.approx(5.4772e-6, rel=0.01)
+    assert np.abs(np.asarray(tray.alpha) / 0.0074 - 1.0).max() <= 0.09 + 1e-12
+    assert np.array_equal(tray.J, tray_of_fans(2000, seed=3, spread=0.03).J)
+    assert not np.array_equal(tray.J, tray_of_fans(2000, seed=4, spread=0.03).J)
+    assert np.all(tray_of_fans(5, seed=3, spread=0.0).J == 0.0148)
+
+
+def test_a_spread_that_could_turn_a_parameter_negative_is_refused() -> None:
+    with pytest.raises(TwinError, match=r"spread = 0\.5"):
+        tray_of_fans(2, seed=0, spread=0.5)
+
+
+def test_the_tacho_reads_in_steps_with_the_noise_it_was_given() -> None:
+    rng = np.random.default_rng(1)
+    readings = Tacho(noise_rad_s=4.0, step_rad_s=0.5).read(np.full(20_000, 500.0), rng)
+    assert np.all(readings % 0.5 == 0.0)
+    assert len(np.unique(readings)) > 20
+    assert readings.std() == pytest.approx(4.0, rel=0.03)
+    assert readings.mean() == pytest.approx(500.0, abs=0.1)
+
+
+def test_the_tacho_reads_zero_of_a_fan_that_stands_and_never_a_negative_speed() -> None:
+    rng = np.random.default_rng(1)
+    assert np.all(Tacho().read(np.zeros(100), rng) == 0.0)
+    slow = Tacho(noise_rad_s=4.0).read(np.full(1000, -3.0), rng)
+    assert slow.min() == 0.0
+    assert slow.max() > 0.0
+
+
+def test_the_device_clock_wraps_at_32_bits_and_drifts_as_told() -> None:
+    assert DeviceClock().at(4294.967295) == 2**32 - 1
+    assert DeviceClock().at(4294.967296) == 0
+    assert DeviceClock(drift_ppm=50.0).at(1000.0) == 1_000_050_000
+    assert DeviceClock(drift_ppm=-50.0).at(1000.0) == 999_950_000
+    assert DeviceClock(start_us=2**32 - 1).at(1e-6) == 0
+
+
+def samples_of(settings: TraySettings) -> list:
+    tray = SimulatedTray(settings)
+    samples = []
+    while tray.due_s() is not None:
+        samples.append(tray.take())
+    return samples
+
+
+def test_the_same_seed_gives_the_same_samples_and_another_gives_others() -> None:
+    one, same, other = (
+        np.array([s.speed_rad_s for s in samples_of(TraySettings(fans=3, seed=seed, duration_s=1.0))])
+        for seed in (5, 5, 6)
+    )
+    assert np.array_equal(one, same)
+    assert not np.array_equal(one, other)
+
+
+def test_the_same_fans_can_be_run_with_other_commands() -> None:
+    first, again, others = (
+        SimulatedTray(TraySettings(seed=seed, fans_seed=fans)) for seed, fans in ((1, 5), (2, 5), (1, 6))
+    )
+    assert np.array_equal(first.parameters.J, again.parameters.J)
+    assert not np.array_equal(first.parameters.J, others.parameters.J)
+    assert not np.array_equal(first.take().command, again.take().command)
+    assert np.array_equal(
+        SimulatedTray(TraySettings()).take().command, SimulatedTray(TraySettings(fans_seed=6)).take().command
+    )
+
+
+def test_a_lost_sample_takes_its_sequence_number_with_it() -> None:
+    samples = samples_of(TraySettings(fans=1, duration_s=20.0, lost=0.1))
+    assert [s.sequence for s in samples] == list(range(2000))
+    assert sum(s.lost for s in samples) == pytest.approx(200, abs=45)
+
+
+def test_sampling_times_scatter_by_the_jitter_around_a_schedule_that_does_not_drift() -> None:
+    samples = samples_of(TraySettings(fans=1, duration_s=20.0, jitter_us=500.0))
+    error_s = np.array([s.t_s for s in samples]) - np.arange(2000) / 100.0
+    assert error_s.std() == pytest.approx(500e-6, rel=0.1)
+    assert abs(error_s.mean()) < 50e-6
+    assert np.all(np.diff([s.t_s for s in samples]) > 0.0)
+
+
+def test_a_command_over_the_line_overrides_the_profile_of_its_fan_alone() -> None:
+    tray = SimulatedTray(TraySettings(fans=2, duration_s=60.0))
+    before = tray.take().command
+    tray.command(np.array([np.nan, 0.33]))
+    after = tray.take().command
+    assert after[1] == 0.33
+    assert after[0] == pytest.approx(before[0], abs=0.05)
+    tray.command(np.array([np.nan, 7.0]))
+    assert tray.take().command[1] == 1.0
+
+
+def test_a_fan_given_a_set_point_reaches_it_and_a_command_takes_it_back() -> None:
+    tray = SimulatedTray(TraySettings(fans=2, duration_s=60.0))
+    tray.set_point(np.array([400.0, np.nan]))
+    samples = [tray.take() for _ in range(2000)]
+    assert np.mean([s.speed_rad_s[0] for s in samples[1000:]]) == pytest.approx(400.0, abs=2.0)
+    tray.command(np.array([0.5, np.nan]))
+    assert tray.take().command[0] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (TraySettings(fans=65), "fans = 65; give one from 1 to 64"),
+        (TraySettings(rate_hz=0.0), "rate = 0"),
+        (TraySettings(lost=1.5), "lost = 1.5"),
+        (TraySettings(profile="manuel"), "unknown profile 'manuel'; did you mean 'manual'"),
+    ],
+)
+def test_a_setting_out_of_range_is_refused_in_one_line(settings: TraySettings, message: str) -> None:
+    with pytest.raises(TwinError, match=message) as caught:
+        SimulatedTray(settings)
+    assert "\n" not in str(caught.value)

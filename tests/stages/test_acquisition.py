@@ -1,0 +1,343 @@
+"""Acquisition: what the line brings becomes raw samples or is counted by kind; commands go back down the line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.config.models import TrayConfig
+from pipeline.devices.byte_link import LinkDown, LinkUp, Received
+from pipeline.devices.serial_port import SerialPort
+from pipeline.runtime.stage import Context, StageError
+from schemas.messages import Command, Raw
+from schemas.wire import CommandFrame, Decoder, Frame, Protocol, Sample, SetPointFrame, encode
+from stages.acquisition import STAGE, AcquisitionConfig, AcquisitionCore
+
+S = 1_000_000_000
+PROTOCOLS: tuple[Protocol, ...] = ("binary", "text")
+
+
+class FakeLine:
+    """Keeps what was written, and takes nothing while it is not `up`."""
+
+    def __init__(self) -> None:
+        self.up = True
+        self.written = b""
+
+    def write(self, data: bytes) -> bool:
+        self.written += data if self.up else b""
+        return self.up
+
+
+def make_core(line: FakeLine | None = None, block_size: int = 1, **tray: object) -> AcquisitionCore:
+    """A core of two fans, its line just opened at time 0."""
+    values: dict[str, object] = {"name": "bench", "fans": 2, "port": "/dev/ttyTEST"} | tray
+    config = AcquisitionConfig(block_size=block_size)
+    core = AcquisitionCore(TrayConfig.model_validate(values), config, line or FakeLine(), started_t_ns=0)
+    assert core.step(LinkUp("/dev/ttyTEST")) == []
+    return core
+
+
+def sample(sequence: int | None, clock_us: int | None = None, speed: float = 100.0, command: float = 0.5) -> Sample:
+    """A sample of two fans; the clock goes with the sequence unless told."""
+    if clock_us is None and sequence is not None:
+        clock_us = sequence * 10_000 % 2**32
+    return Sample(clock_us, sequence, (command, 0.25), (speed, 50.0))
+
+
+def feed(core: AcquisitionCore, frames: Iterable[Frame], protocol: Protocol = "binary", t_ns: int = S) -> list[Raw]:
+    return [raw for frame in frames for raw in core.step(Received(encode(protocol, frame), t_ns))]
+
+
+def feed_sequences(core: AcquisitionCore, sequences: Iterable[int]) -> list[int]:
+    """Feed samples of these sequence numbers; which ones came out."""
+    return [int(raw.device_sequence[0]) for raw in feed(core, map(sample, sequences))]
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_sample_becomes_a_raw_message_with_both_clocks(protocol: Protocol) -> None:
+    core = make_core(protocol=protocol)
+    (raw,) = feed(core, [sample(7, clock_us=123)], protocol, t_ns=5 * S)
+    assert raw.fans == 2
+    assert raw.host_receive_t_ns.tolist() == [5 * S]
+    assert raw.device_clock_us.tolist() == [123]
+    assert raw.device_sequence.tolist() == [7]
+    assert raw.command.tolist() == [[0.5, 0.25]]
+    assert raw.speed_rad_s.tolist() == [[100.0, 50.0]]
+    assert core.counters()["samples"] == 1
+
+
+def test_speed_in_rpm_on_the_line_is_rad_per_second_in_the_message() -> None:
+    (raw,) = feed(make_core(speed_unit="rpm"), [sample(0, speed=60.0)])
+    assert raw.speed_rad_s[0, 0] == pytest.approx(2 * math.pi, rel=1e-15)
+
+
+def test_samples_that_arrive_together_share_the_time_at_which_they_arrived() -> None:
+    core = make_core()
+    data = b"".join(encode("binary", sample(i)) for i in range(3))
+    assert core.step(Received(data[:10], S)) == []
+    messages = core.step(Received(data[10:], 2 * S))
+    assert [raw.host_receive_t_ns.tolist() for raw in messages] == [[2 * S]] * 3
+
+
+def test_a_block_holds_as_many_samples_as_asked_for_and_the_rest_comes_at_the_end() -> None:
+    core = make_core(block_size=4)
+    messages = feed(core, map(sample, range(10)))
+    assert [raw.device_sequence.tolist() for raw in messages] == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert messages[0].speed_rad_s.shape == (4, 2)
+    assert [raw.device_sequence.tolist() for raw in core.close()] == [[8, 9]]
+    assert core.close() == []
+
+
+def test_an_incomplete_block_waits_only_so_long() -> None:
+    core = make_core(block_size=4)
+    feed(core, [sample(0)], t_ns=S)
+    assert core.tick(S + S // 4) == []
+    assert [raw.device_sequence.tolist() for raw in core.tick(S + S // 2)] == [[0]]
+    assert core.tick(9 * S) == []
+
+
+def test_an_incomplete_block_is_handed_out_when_the_line_goes_down() -> None:
+    core = make_core(block_size=4)
+    feed(core, [sample(0)])
+    assert [raw.device_sequence.tolist() for raw in core.step(LinkDown("gone"))] == [[0]]
+
+
+def test_a_device_without_clock_and_sequence_has_empty_columns_and_loses_nothing() -> None:
+    core = make_core(protocol="text", block_size=3)
+    messages = feed(core, [sample(None), sample(None), sample(5), sample(6), sample(7)], "text")
+    assert [len(raw.host_receive_t_ns) for raw in messages] == [2, 3]
+    assert [len(raw.device_sequence) for raw in messages] == [0, 3]
+    assert [len(raw.device_clock_us) for raw in messages] == [0, 3]
+    assert core.counters().get("lost_on_line", 0) == 0
+
+
+def test_a_missing_reading_stays_missing_and_is_counted() -> None:
+    core = make_core()
+    (raw,) = feed(core, [sample(0, speed=math.nan)])
+    assert np.isnan(raw.speed_rad_s).tolist() == [[True, False]]
+    assert core.counters()["no_speed"] == 1
+
+
+@pytest.mark.parametrize("speed", [1001.0, -1001.0, math.inf, -math.inf])
+def test_an_absurd_speed_costs_that_fan_its_reading_and_nothing_else(speed: float) -> None:
+    core = make_core(speed_max=1000)
+    (raw,) = feed(core, [sample(0, speed=speed)])
+    assert np.isnan(raw.speed_rad_s).tolist() == [[True, False]]
+    assert raw.command.tolist() == [[0.5, 0.25]]
+    assert core.counters()["absurd_speed"] == 1
+    assert core.counters()["no_speed"] == 0
+
+
+def test_an_absurd_command_costs_the_sample_and_shows_as_a_loss() -> None:
+    core = make_core(command_max=0.9)
+    frames = [sample(0), sample(1, command=0.91), sample(2)]
+    assert [raw.device_sequence.tolist() for raw in feed(core, frames)] == [[0], [2]]
+    assert core.counters()["absurd_command"] == 1
+    assert core.counters()["lost_on_line"] == 1
+
+
+def test_the_largest_command_is_not_absurd_for_being_rounded_to_float32() -> None:
+    assert float(np.float32(0.1)) > 0.1
+    assert len(feed(make_core(command_max=0.5, command_min=-0.1), [sample(0, command=-0.1)])) == 1
+
+
+def test_missing_sequence_numbers_are_counted_as_lost() -> None:
+    core = make_core()
+    assert feed_sequences(core, [10, 11, 15, 16, 20]) == [10, 11, 15, 16, 20]
+    assert core.counters()["lost_on_line"] == 6
+
+
+def test_what_came_before_we_listened_is_not_lost() -> None:
+    core = make_core()
+    feed_sequences(core, [1_000_000])
+    assert core.counters().get("lost_on_line", 0) == 0
+
+
+def test_repeated_samples_are_dropped_and_counted() -> None:
+    core = make_core()
+    assert feed_sequences(core, [10, 11, 11, 11, 12, 10, 13]) == [10, 11, 12, 13]
+    assert core.counters()["repeated"] == 3
+    assert core.counters().get("lost_on_line", 0) == 0
+    assert core.counters().get("device_restarts", 0) == 0
+
+
+def test_the_sequence_may_wrap() -> None:
+    core = make_core()
+    top = 2**32 - 1
+    assert feed_sequences(core, [top - 1, top, 0, 1]) == [top - 1, top, 0, 1]
+    assert feed_sequences(core, [top, 0]) == [], "both are known"
+    assert core.counters().get("lost_on_line", 0) == 0
+    assert core.counters().get("device_restarts", 0) == 0
+
+
+def test_a_loss_across_the_wrap_is_counted_as_what_it_is() -> None:
+    core = make_core()
+    feed_sequences(core, [2**32 - 2, 3])
+    assert core.counters()["lost_on_line"] == 4
+
+
+def test_the_device_clock_may_wrap() -> None:
+    core = make_core()
+    frames = [sample(0, clock_us=2**32 - 5), sample(1, clock_us=9_995)]
+    assert [int(raw.device_clock_us[0]) for raw in feed(core, frames)] == [2**32 - 5, 9_995]
+
+
+@pytest.mark.parametrize("last", [100, 1_000_000, 3_000_000_000, 4_000_000_000])
+def test_a_device_that_begins_anew_is_not_a_loss_of_four_billion(last: int) -> None:
+    core = make_core()
+    assert feed_sequences(core, [last, last + 1, 0, 1, 2]) == [last, last + 1, 0, 1, 2]
+    assert core.counters()["device_restarts"] == 1
+    assert core.counters().get("lost_on_line", 0) == 0
+
+
+def test_a_device_that_begins_anew_right_after_its_start_is_not_taken_for_repeats() -> None:
+    core = make_core()
+    feed_sequences(core, [0, 1, 2])
+    core.step(LinkDown("reset"))
+    core.step(LinkUp("/dev/ttyTEST"))
+    assert feed_sequences(core, [0, 1, 2, 3]) == [0, 1, 2, 3]
+    assert core.counters()["device_restarts"] == 1
+
+
+def test_what_the_device_measured_while_the_line_was_down_is_counted_as_lost() -> None:
+    core = make_core()
+    feed_sequences(core, [0, 1, 2])
+    core.step(Received(encode("binary", sample(3))[:20], S))
+    core.step(LinkDown("gone"))
+    core.step(LinkUp("/dev/ttyTEST"))
+    core.step(Received(encode("binary", sample(7))[20:], S))
+    assert feed_sequences(core, [8]) == [8]
+    assert core.counters()["lost_on_line"] == 5
+    assert core.counters()["resync"] == 1
+    assert core.counters().get("torn", 0) == 0
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_faulty_frames_are_counted_by_kind_and_good_ones_go_on(protocol: Protocol) -> None:
+    core = make_core(protocol=protocol)
+    bad = b"\0\x05torn\0" if protocol == "binary" else b"what is this\n"
+    wrong = encode(protocol, Sample(1, 1, (0.5,), (1.0,)))
+    feed(core, [sample(0)], protocol)
+    core.step(Received(bad + wrong + encode(protocol, CommandFrame((0.5, math.nan))), S))
+    assert len(feed(core, [sample(1)], protocol)) == 1
+    counters = core.counters()
+    assert counters["torn" if protocol == "binary" else "garbage"] == 1
+    assert counters["wrong_fan_count"] == 1
+    assert counters["wrong_type"] == 1
+    assert counters["samples"] == 2
+
+
+def command(*values: float, set_point: tuple[float, ...] = (), fans: int = 2) -> Command:
+    return Command(fans=fans, t_ns=S, command=np.array(values), set_point_rad_s=np.array(set_point))
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_commands_and_set_points_go_down_the_line_in_the_tray_s_unit(protocol: Protocol) -> None:
+    line = FakeLine()
+    core = make_core(line, protocol=protocol, speed_unit="rpm")
+    core.step(command(0.75, math.nan, set_point=(math.nan, 2 * math.pi)))
+    found = Decoder(protocol, 2, "device").feed(line.written)
+    assert [repr(frame) for frame in found] == [
+        repr(CommandFrame((0.75, math.nan))),
+        repr(SetPointFrame((math.nan, 60.0))),
+    ]
+    assert core.counters()["sent_commands"] == 1
+
+
+@pytest.mark.parametrize(
+    "refused",
+    [
+        command(1.5, 0.5),
+        command(-0.1, 0.5),
+        command(math.inf, 0.5),
+        command(0.5, 0.5, set_point=(2000.0, 0.0)),
+        command(0.5, fans=1),
+        command(0.5, 0.5, 0.5, fans=3),
+    ],
+)
+def test_a_command_that_the_tray_cannot_carry_out_is_refused_as_a_whole_and_counted(refused: Command) -> None:
+    line = FakeLine()
+    core = make_core(line, speed_max=1000)
+    core.step(refused)
+    assert line.written == b""
+    assert core.counters()["refused_commands"] == 1
+
+
+def test_a_command_that_the_line_did_not_take_is_counted_as_lost() -> None:
+    line = FakeLine()
+    line.up = False
+    core = make_core(line)
+    core.step(command(0.5, 0.5))
+    assert core.counters()["lost_commands"] == 1
+
+
+def test_a_command_that_changes_nothing_is_not_sent() -> None:
+    line = FakeLine()
+    core = make_core(line)
+    core.step(command(math.nan, math.nan))
+    core.step(command())
+    assert (line.written, dict(core.counters())) == (b"", {"line_up": 1})
+
+
+def test_a_line_that_is_down_is_a_problem_until_it_is_up_and_sends() -> None:
+    core = make_core()
+    core.step(LinkDown("no such port; waiting for it; check [[tray]] port"))
+    assert core.problem() == "/dev/ttyTEST: no such port; waiting for it; check [[tray]] port"
+    core.step(LinkDown("not allowed"))
+    assert core.problem() == "/dev/ttyTEST: not allowed"
+    core.step(LinkUp("/dev/ttyTEST"))
+    assert core.problem() == ""
+    assert core.counters()["line_down"] == 1
+
+
+def test_a_silent_line_is_a_problem_after_two_seconds_and_not_before() -> None:
+    core = make_core()
+    feed(core, [sample(0)], t_ns=S)
+    core.tick(3 * S)
+    assert core.problem() == ""
+    core.tick(3 * S + 1)
+    assert core.problem().startswith("/dev/ttyTEST: nothing received for 2 s; is the device powered")
+    feed(core, [sample(1)], t_ns=4 * S)
+    assert core.problem() == ""
+
+
+def test_a_line_without_a_valid_frame_is_a_problem_that_says_what_to_check() -> None:
+    core = make_core()
+    for second in range(4):
+        core.tick(second * S)
+        core.step(Received(encode("binary", Sample(1, 1, (0.5,), (1.0,))), second * S))
+    problem = core.problem()
+    assert problem.startswith("no valid frame for 2 s on /dev/ttyTEST (last fault: wrong_fan_count, a frame of 1 fans")
+    assert "baud = 115200, protocol = 'binary' and fans = 2 of the [[tray]] right?" in problem
+
+
+def test_a_line_of_mostly_faulty_frames_is_a_problem_although_some_are_good() -> None:
+    core = make_core()
+    for i in range(30):
+        feed(core, [sample(i)])
+        core.step(Received(b"\0\x09aa\0" * 2, S))
+    assert core.problem().startswith("/dev/ttyTEST: most frames are faulty (last fault: torn")
+    feed(core, map(sample, range(30, 100)))
+    assert core.problem() == ""
+
+
+def context(port: str) -> Context:
+    tray = TrayConfig(name="bench", fans=2, port=port)
+    return Context("site", (tray,), AcquisitionConfig(), Path(), Path("runs"), started_t_ns=0)
+
+
+def test_a_tray_without_a_port_is_refused_in_one_line() -> None:
+    with pytest.raises(StageError, match=r'^\[\[tray\]\] bench: port is missing; add for example port = "/dev/tty'):
+        STAGE.build(context(""))
+
+
+def test_the_stage_is_built_with_the_serial_line_as_its_source() -> None:
+    parts = STAGE.build(context("/dev/ttyTEST"))
+    assert isinstance(parts.core, AcquisitionCore)
+    assert isinstance(parts.source, SerialPort)
+    assert STAGE.process_per_tray

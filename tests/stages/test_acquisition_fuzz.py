@@ -1,0 +1,235 @@
+"""Whatever comes down the line: acquisition never raises, holds little, loses no good frame and accounts for all."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.config.models import TrayConfig
+from pipeline.devices.byte_link import ByteLink, LinkDown, LinkUp, Received
+from schemas.messages import Raw
+from schemas.wire import (
+    MAX_FRAME_BYTES,
+    CommandFrame,
+    Decoder,
+    Fault,
+    FaultKind,
+    Protocol,
+    Sample,
+    SetPointFrame,
+    encode,
+)
+from stages.acquisition import AcquisitionConfig, AcquisitionCore
+
+FANS = 2
+PROTOCOLS: tuple[Protocol, ...] = ("binary", "text")
+DELIMITER = {"binary": b"\0", "text": b"\n"}
+FIRST_SEQUENCE = 2**32 - 32  # the sequence wraps within the pool
+
+
+class NoLine(ByteLink):
+    def write(self, data: bytes) -> bool:
+        raise AssertionError("nothing is sent in these tests")
+
+
+def make_core(protocol: Protocol, block_size: int = 1) -> AcquisitionCore:
+    tray = TrayConfig(name="bench", fans=FANS, port="/dev/ttyTEST", protocol=protocol)
+    core = AcquisitionCore(tray, AcquisitionConfig(block_size=block_size), NoLine(), started_t_ns=0)
+    core.step(LinkUp("/dev/ttyTEST"))
+    return core
+
+
+def make_pool(protocol: Protocol) -> list[tuple[Sample, bytes]]:
+    chance = random.Random(1)
+    pool = []
+    for i in range(64):
+        command = tuple(chance.randrange(1024) / 1024 for _ in range(FANS))
+        speed = tuple(chance.randrange(1 << 20) / 1024 for _ in range(FANS))
+        sample = Sample((2**32 - 100_000 + 10_000 * i) % 2**32, (FIRST_SEQUENCE + i) % 2**32, command, speed)
+        pool.append((sample, encode(protocol, sample)))
+    return pool
+
+
+def spoil(frame: bytes, chance: random.Random) -> bytes:
+    """A frame with one to three things done to it."""
+    data = bytearray(frame)
+    for _ in range(chance.randint(1, 3)):
+        at = chance.randrange(len(data)) if data else 0
+        what = chance.randrange(6)
+        if what == 0 and data:
+            data[at] ^= 1 << chance.randrange(8)
+        elif what == 1 and data:
+            data[at] = chance.choice(b"\0\n\r #-SCP\xff" + bytes([chance.randrange(256)]))
+        elif what == 2:
+            del data[at : at + chance.randint(1, 8)]
+        elif what == 3:
+            data[at:at] = chance.randbytes(chance.randint(1, 8))
+        elif what == 4:
+            del data[at:]
+        else:
+            data[at:at] = data[: chance.randint(1, 20)]
+    return bytes(data)
+
+
+WELL_FORMED_BUT_NOT_WANTED = (
+    CommandFrame((0.5,) * FANS),
+    SetPointFrame((10.0,) * FANS),
+    Sample(1, 1, (0.5,) * (FANS + 1), (1.0,) * (FANS + 1)),
+    Sample(1, 1, (0.5, float("nan")), (1.0, 1.0)),
+    Sample(1, 1, (0.5, 99.0), (1.0, 1.0)),
+)
+
+
+def noise(protocol: Protocol, chance: random.Random) -> bytes:
+    what = chance.randrange(20)
+    if what == 0:
+        return chance.randbytes(1) * (MAX_FRAME_BYTES + chance.randint(-1, 100))
+    if what == 1:
+        return b"# a comment\n"
+    if what < 7:
+        return encode(protocol, chance.choice(WELL_FORMED_BUT_NOT_WANTED))
+    return chance.randbytes(chance.randint(1, 40))
+
+
+def make_stream(
+    protocol: Protocol, pool: list[tuple[Sample, bytes]], chance: random.Random
+) -> tuple[bytes, list[Sample]]:
+    """A mutated stream, and the samples in it that nothing has touched, in order."""
+    stream, untouched = b"", []
+    start = chance.randrange(len(pool) - 6)
+    for sample, frame in pool[start : start + chance.randint(2, 6)]:
+        if chance.random() < 0.3:
+            stream += noise(protocol, chance)
+        what = chance.randrange(10)
+        if what < 6:
+            hidden = protocol == "text" and stream[stream.rfind(b"\n") + 1 :].startswith(b"#")
+            stream += frame  # after half a comment, a line of text is part of the comment
+            if not hidden:
+                untouched.append(sample)
+                stream += frame if what == 0 else b""  # comes twice
+        elif what < 9:
+            stream += spoil(frame, chance)
+    return stream, untouched
+
+
+def cut(stream: bytes, chance: random.Random) -> Iterator[bytes]:
+    at = 0
+    while at < len(stream):
+        size = chance.choice((1, 7, 40, len(stream)))
+        yield stream[at : at + size]
+        at += size
+
+
+def samples_of(messages: list[Raw]) -> list[Sample]:
+    return [
+        Sample(int(clock_us), int(sequence), tuple(command.tolist()), tuple(speed.tolist()))
+        for raw in messages
+        if len(raw.device_clock_us) and len(raw.device_sequence)
+        for clock_us, sequence, command, speed in zip(
+            raw.device_clock_us, raw.device_sequence, raw.command, raw.speed_rad_s, strict=True
+        )
+    ]
+
+
+def is_within(wanted: list[Sample], found: list[Sample]) -> bool:
+    """Whether `wanted` is a subsequence of `found`."""
+    rest = iter(found)
+    return all(sample in rest for sample in wanted)
+
+
+def outcomes_by_kind(protocol: Protocol, stream: bytes) -> Counter[str]:
+    """What one uncut pass of the decoder makes of a stream."""
+    found = Decoder(protocol, FANS).feed(stream)
+    return Counter(item.kind.value if isinstance(item, Fault) else "samples" for item in found)
+
+
+def check_one_stream(protocol: Protocol, pool: list[tuple[Sample, bytes]], chance: random.Random) -> None:
+    stream, untouched = make_stream(protocol, pool, chance)
+    core = make_core(protocol, block_size=chance.choice((1, 3)))
+    messages: list[Raw] = []
+    for data in cut(stream, chance):
+        messages += core.step(Received(data, 0))
+        assert len(core._decoder._pending) <= MAX_FRAME_BYTES + 1
+    messages += core.close()
+
+    counts = Counter(core.counters())
+    published = sum(len(raw.host_receive_t_ns) for raw in messages)
+    assert is_within(untouched, samples_of(messages)), "a frame that nothing touched has gone"
+    assert counts["bytes"] == len(stream)
+    assert counts["samples"] == published, "a sample was counted and not handed out, or the reverse"
+
+    outcomes = outcomes_by_kind(protocol, stream)
+    assert outcomes.pop("samples", 0) == counts["samples"] + counts["repeated"] + counts["absurd_command"]
+    assert outcomes == +Counter({kind.value: counts[kind.value] for kind in FaultKind}), "a fault has no count"
+    if protocol == "binary":  # a checksum: what comes out is true, so that the sequence must add up
+        pieces = stream.split(b"\0")[:-1]
+        good = counts["samples"] + counts["repeated"] + counts["absurd_command"]
+        assert outcomes.total() + good == sum(1 for piece in pieces if piece)
+        assert counts["device_restarts"] == 0
+        found = [(sample.sequence or 0) for sample in samples_of(messages)]
+        if found:
+            assert counts["samples"] + counts["lost_on_line"] == (found[-1] - found[0]) % 2**32 + 1
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_thousand_mutated_streams_are_accounted_for_to_the_last_frame(protocol: Protocol) -> None:
+    chance, pool = random.Random(20), make_pool(protocol)
+    for _ in range(1000):
+        check_one_stream(protocol, pool, chance)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_twenty_thousand_mutated_streams_are_accounted_for_to_the_last_frame(protocol: Protocol) -> None:
+    chance, pool = random.Random(21), make_pool(protocol)
+    for _ in range(10_000):
+        check_one_stream(protocol, pool, chance)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@given(pieces=st.lists(st.one_of(st.binary(max_size=64), st.none()), max_size=20))
+def test_no_bytes_and_no_loss_of_the_line_make_the_core_raise(protocol: Protocol, pieces: list[bytes | None]) -> None:
+    core = make_core(protocol)
+    for i, piece in enumerate(pieces):
+        if piece is None:
+            core.step(LinkDown("gone"))
+            core.step(LinkUp("/dev/ttyTEST"))
+        else:
+            core.step(Received(piece, i))
+        core.tick(i * 1_000_000_000)
+        assert isinstance(core.problem(), str)
+    core.close()
+
+
+@given(
+    numbers=st.lists(
+        st.one_of(
+            st.floats().map(repr), st.integers().map(str), st.sampled_from(["-", "nan", "ovf", "1e999", "", "x"])
+        ),
+        max_size=10,
+    )
+)
+def test_no_text_line_of_whatever_numbers_makes_the_core_raise(numbers: list[str]) -> None:
+    core = make_core("text")
+    for raw in core.step(Received(f"\nS {' '.join(numbers)}\n".encode(), 0)):
+        assert raw.speed_rad_s.shape == raw.command.shape == (1, FANS)
+
+
+def test_the_streams_hold_untouched_frames_and_every_kind_of_outcome() -> None:
+    for protocol in PROTOCOLS:
+        chance, pool = random.Random(22), make_pool(protocol)
+        kinds: Counter[str] = Counter()
+        untouched = 0
+        for _ in range(2000):
+            stream, good = make_stream(protocol, pool, chance)
+            kinds += outcomes_by_kind(protocol, stream)
+            untouched += len(good)
+        assert untouched > 3000
+        # A wrong version needs a true checksum: test_wire.py has it.
+        absent = {"wrong_version", "bad_number" if protocol == "binary" else "wrong_crc"}
+        assert set(kinds) == {"samples", *(kind.value for kind in FaultKind)} - absent

@@ -1,0 +1,135 @@
+"""Whatever decodes, no core raises on it: messages of the declared type with any values in them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipeline.config.models import TrayConfig
+from pipeline.runtime.stage import Core
+from pipeline.runtime.twin_file import TwinFile
+from schemas.codec import decode, encode
+from schemas.messages import (
+    Alarm,
+    Grid,
+    Header,
+    Health,
+    Message,
+    ModelCard,
+    Prediction,
+    Raw,
+    Request,
+    Score,
+    ScorerSnapshot,
+)
+from stages.resampler import ResamplerConfig, ResamplerCore
+from stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
+from stages.viewer import ViewerCore
+from tests.stages.test_viewer import FakeSink
+from tests.support.message_strategies import any_message
+from tests.support.scored_blocks import CALIBRATION, core_of, prediction_of
+from tests.support.twin_files import write_twin
+
+FANS = 2
+NO_SLOW_CHECK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+def sessions(*kinds: type[Message]) -> st.SearchStrategy[list[Message]]:
+    """Messages in a row, most of them of the tray's own number of fans, as they come off the bus."""
+    messages = st.one_of(*(any_message(kind, fans=st.sampled_from([FANS, FANS, FANS, 3])) for kind in kinds))
+    return st.lists(messages, max_size=6)
+
+
+def survives(core: Core, session: list[Message], tray: str = "tray1") -> None:
+    """Hand over a session as the runner does; what comes out can be encoded."""
+    out: list[Any] = []
+    with np.errstate(all="ignore"):
+        for number, message in enumerate(session):
+            stamped = replace(message, header=Header("p", number, tray))
+            out += core.step(decode(type(message), encode(stamped)))
+            out += core.tick(number * 50_000_000)
+            assert core.problem() is not None and core.counters() is not None
+        out += core.close()
+    for message in out:
+        encode(message)
+
+
+@NO_SLOW_CHECK
+@given(sessions(Raw))
+def test_the_resampler_takes_anything(session: list[Message]) -> None:
+    survives(ResamplerCore(FANS, ResamplerConfig()), session)
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory: pytest.TempPathFactory) -> TwinFile:
+    folder: Path = tmp_path_factory.mktemp("twin")
+    return TwinFile.load(write_twin(folder / "twin.onnx", fans=FANS), FANS)
+
+
+@NO_SLOW_CHECK
+@given(session=sessions(Grid))
+def test_the_twin_integrator_takes_anything(twin: TwinFile, session: list[Message]) -> None:
+    config = TwinIntegratorConfig(start_samples=1, warm_up_s=0.0)
+    survives(TwinIntegratorCore(twin, config, 0), session)
+
+
+LOW_LIMITS = CALIBRATION | {
+    "speed": {"step": 0.1, "drift": 0.1, "growth": 0.1, "spread": [1.0, 2.0], "speeds_rad_s": [0.0, 100.0],
+              "offset_sigmas": [0.0, 1.0], "baseline_sigmas": 0.0},
+    "balance": {"step": 0.1, "baseline_sigmas": 0.0},
+    "timing": {"baseline_s": 0.01, "on_delay_s": 0.0},
+}  # fmt: skip
+
+
+def judged_prediction(message: Message) -> Message:
+    """The same, in a row of samples that are taken at least: most of what may be wrong is refused by its flags."""
+    if not isinstance(message, Prediction):
+        return message
+    t_ns = np.sort(message.t_ns)
+    return replace(
+        message, t_ns=t_ns, valid=np.ones_like(message.valid), invalid_reason=np.zeros_like(message.invalid_reason)
+    )
+
+
+@NO_SLOW_CHECK
+@given(sessions(Prediction, Request), st.sampled_from([None, CALIBRATION, LOW_LIMITS]), st.booleans())
+def test_the_scorer_takes_anything(session: list[Message], calibration: Any, all_valid: bool) -> None:
+    core = core_of(FANS, "rpm", calibration=calibration, off_delay_s=0.0)
+    survives(core, [judged_prediction(message) for message in session] if all_valid else session)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.sampled_from([1, 1000, 10_000_000, 1_000_000_000]),
+    st.lists(st.tuples(st.floats(allow_nan=True), st.floats(allow_nan=True)), min_size=1, max_size=40),
+    st.integers(1, 40),
+)
+def test_a_fan_of_any_speed_and_command_is_diagnosed(period_ns: int, values: list, repeats: int) -> None:
+    core = core_of(1, calibration=LOW_LIMITS, off_delay_s=0.0)
+    samples = np.repeat(np.array(values), repeats, axis=0)
+    made = prediction_of(np.zeros(len(samples)), period_ns=period_ns)
+    wild = replace(
+        made, measured_speed_rad_s=samples[:, :1], command=samples[:, 1:], torque_balance_command=samples[:, 1:]
+    )
+    survives(core, [prediction_of(np.zeros(3), first=-9, period_ns=period_ns), wild])
+
+
+@settings(max_examples=60, deadline=None)
+@given(any_message(ScorerSnapshot))
+def test_the_scorer_begins_with_any_memory(memory: ScorerSnapshot) -> None:
+    core = core_of(FANS)
+    for kept in (memory, replace(memory, twin_sha256="twin")):
+        core.restore(kept)
+    survives(core, [prediction_of(np.zeros((3, FANS)))])
+
+
+@NO_SLOW_CHECK
+@given(sessions(Score, Alarm, ModelCard, Health), st.sampled_from(["tray1", "tray1", "elsewhere"]))
+def test_the_viewer_takes_anything(session: list[Message], tray: str) -> None:
+    survives(ViewerCore([TrayConfig(name="tray1", fans=FANS)], FakeSink()), session, tray)

@@ -1,0 +1,514 @@
+"""The recorder stage: everything of the table is kept, and a disk that refuses is told and counted."""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+import stages.recorder
+from pipeline.config.models import TrayConfig
+from pipeline.recordings.disk import DiskError
+from pipeline.recordings.reading import read_metadata, read_recording
+from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
+from pipeline.recordings.writing import Pending, RecordingWriter
+from pipeline.runtime.stage import Context, StageError
+from schemas.codec import encode
+from schemas.envelope import Envelope
+from schemas.messages import Header, Health, Input, Message, ModelCard, Raw, StageStatus
+from schemas.topics import TOPICS, health_key, topic_of, tray_key
+from stages.recorder import STAGE, Recorder, RecorderConfig
+from tests.support.message_strategies import any_message, same
+
+SECOND_NS = 1_000_000_000
+NOW_NS = 10 * SECOND_NS
+RAW_KEY = tray_key("plant", "tray1", "raw")
+
+
+def context(folder: Path, tray: TrayConfig | None = None, **config) -> Context:
+    return Context(
+        site="plant",
+        trays=(tray or TrayConfig(name="tray1", fans=2, speed_unit="rpm"),),
+        config=RecorderConfig(**config),
+        folder=folder,
+        run_folder=folder / "runs",
+        started_t_ns=1_800_000_000_250_000_000,
+        configuration_text="site = 'plant'\n",
+    )
+
+
+def packet(message: Message, topic: str, received_t_ns: int = 5) -> Envelope:
+    key = health_key("plant", "scorer", "all") if topic == "health" else tray_key("plant", "tray1", topic)
+    return Envelope(key, topic, encode(message), received_t_ns, message)
+
+
+def raw(sequence: int, samples: int = 1) -> Raw:
+    return Raw(
+        header=Header("acquisition-1", sequence, "tray1"),
+        fans=2,
+        host_receive_t_ns=np.full(samples, sequence),
+        command=np.ones((samples, 2)),
+        speed_rad_s=np.ones((samples, 2)),
+    )
+
+
+class Part:
+    """A stand-in for a part whose disk refuses after so many messages. `flush` puts them in the file for good."""
+
+    def __init__(self, disk: Disk, name: str, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> None:
+        self.path, self.t_ns, self.about, self.ledger = Path(name), t_ns, dict(about), ledger
+        self._disk = disk
+        self.written: Counter[str] = Counter()
+        self.pending: list[Pending] = []
+        self.content: list[Pending] = []
+        self.flushes = 0
+        self.closed = ""
+        self.size = 0
+
+    def write(self, key: str, payload: bytes, message: Message, log_time_ns: int) -> None:
+        self._touch()
+        self.pending.append(Pending(key, payload, message, log_time_ns))
+        if len(self.content) + len(self.pending) > self._disk.room:
+            self._refuse()
+
+    def flush(self) -> None:
+        self._touch()
+        if self._disk.refuses:
+            self._refuse()
+        for key, _, message, log_time_ns in self.pending:
+            self.ledger.note(key, message.header.producer, message.header.sequence, log_time_ns)
+        self.written.update(topic_of(pending.key).name for pending in self.pending)
+        self.size += sum(len(pending.payload) for pending in self.pending)
+        self.content += self.pending
+        self.pending = []
+        self.flushes += 1
+
+    def close(self, *, has_ended: bool = False) -> None:
+        self.flush()
+        self.closed = "at the end" if has_ended else "and goes on"
+
+    def _refuse(self) -> NoReturn:
+        self.closed = "early"
+        raise DiskError("r.mcap: cannot be written any more: No space left on device")
+
+    def _touch(self) -> None:
+        assert not self.closed, "nothing touches a part that has ended"
+
+
+class Disk:
+    """A stand-in for the place where parts begin."""
+
+    def __init__(self, before: dict[StreamId, int] | None = None) -> None:
+        self.before = before or {}
+        self.parts: list[Part] = []
+        self.free = 1 << 40
+        self.room = 1 << 40
+        self.refuses = False
+        self.oldest: list[str] = []
+        self.freed_by_each = 0
+        self.gone = ""
+
+    def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> Part:
+        if self.refuses:
+            raise DiskError("r.mcap: cannot be written: No space left on device")
+        self.parts.append(Part(self, f"r-{len(self.parts) + 1}.mcap", t_ns, ledger, about))
+        return self.parts[-1]
+
+    def free_bytes(self) -> int:
+        if self.gone:
+            raise DiskError(self.gone)
+        return self.free
+
+    def delete_oldest(self) -> str | None:
+        if not self.oldest:
+            return None
+        self.free += self.freed_by_each
+        return self.oldest.pop(0)
+
+
+def recorder(disk: Disk, **config) -> Recorder:
+    return Recorder(disk, RecorderConfig(**config), NOW_NS)
+
+
+def sequences(part: Part) -> list[int]:
+    return [pending.message.header.sequence for pending in part.content]
+
+
+def record(core: Recorder, numbers: Iterable[int]) -> None:
+    for sequence in numbers:
+        core.step(packet(raw(sequence), "raw", NOW_NS))
+
+
+def card(sequence: int) -> ModelCard:
+    return ModelCard(
+        header=Header("twin_integrator-1", sequence, "tray1"), t_ns=3, twin="demo", kind="hybrid", sha256="ab"
+    )
+
+
+def health_of(producer: str, duplicated: int, stage: str = "recorder") -> Health:
+    line = Input(key=RAW_KEY, producer="a", received=9, missing=0, duplicated=duplicated, next_sequence=9)
+    header = Header(producer, 0, "")
+    return Health(header=header, stage=stage, instance="all", status=StageStatus.OK, t_ns=1, uptime_s=1, inputs=(line,))
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.tuples(*(any_message(topic.message) for topic in TOPICS)))
+def test_every_topic_of_the_table_is_recorded_as_it_came(tmp_path_factory, messages):
+    run = context(tmp_path_factory.mktemp("recorder"))
+    core = STAGE.build(run).core
+    packets = [packet(m, topic.name, k + 1) for k, (m, topic) in enumerate(zip(messages, TOPICS, strict=True))]
+    for item in packets:
+        assert list(core.step(item)) == []
+    core.close()
+    entries = list(read_recording(run.run_folder / "recording.mcap"))
+    assert [(e.key, e.topic, e.log_time_ns) for e in entries] == [(p.key, p.topic, p.received_t_ns) for p in packets]
+    for entry, item in zip(entries, packets, strict=True):
+        assert same(encode(entry.message), item.payload)
+    counted = {f"recorded_{topic.name}": 1 for topic in TOPICS}
+    assert core.counters() == counted | {"lost_unwritten": 0, "parts": 1}
+
+
+def test_it_keeps_what_was_set_on_the_command_line(tmp_path):
+    STAGE.build(replace(context(tmp_path), overrides=("scorer.on_delay_s=1",))).core.close()
+    head = read_metadata(tmp_path / "runs" / "recording.mcap")
+    assert json.loads(head.metadata["overrides"]) == ["scorer.on_delay_s=1"]
+
+
+def test_it_keeps_the_configuration_and_the_twin(tmp_path):
+    (tmp_path / "twin.onnx").write_bytes(b"the twin")
+    tray = TrayConfig(name="tray1", fans=2, speed_unit="rpm", twin=Path("twin.onnx"))
+    STAGE.build(context(tmp_path, tray)).core.close()
+    head = read_metadata(tmp_path / "runs" / "recording.mcap")
+    assert head.attachments == {"configuration.toml": b"site = 'plant'\n", "tray1.onnx": b"the twin"}
+    assert head.speed_unit("tray1") == "rpm"
+    assert head.metadata["site"] == "plant"
+    assert head.metadata["trays"] == "tray1"
+    assert head.metadata["fans.tray1"] == "2"
+    assert head.metadata["started"] == "2027-01-15T08:00:00.250+00:00"
+    assert head.metadata["started_t_ns"] == "1800000000250000000"
+    assert len(head.metadata["twin_sha256.tray1"]) == 64
+
+
+def test_a_twin_that_cannot_be_read_does_not_keep_it_from_recording(tmp_path, caplog):
+    tray = TrayConfig(name="tray1", fans=2, twin=Path("nowhere.onnx"))
+    with caplog.at_level(logging.WARNING):
+        STAGE.build(context(tmp_path, tray)).core.close()
+    assert "nowhere.onnx: the twin is not in the recording: No such file" in caplog.text
+
+
+def test_it_says_under_which_name_the_recording_of_a_killed_recorder_is_kept(tmp_path, caplog):
+    run = context(tmp_path)
+    with RecordingWriter(run.run_folder / "recording.mcap", {}) as writer:
+        writer.write_message(tray_key("plant", "tray1", "raw"), raw(0), 1)
+    writer.path.rename(run.run_folder / "recording.mcap.active")
+    with caplog.at_level(logging.WARNING):
+        STAGE.build(run).core.close()
+    assert "a recorder had been killed; what it has recorded is kept as" in caplog.text
+    assert sorted(p.name for p in run.run_folder.iterdir()) == ["recording-2.mcap", "recording.mcap"]
+
+
+def test_a_place_that_cannot_be_written_is_told_in_one_line_at_the_start(tmp_path):
+    (tmp_path / "runs").touch()
+    with pytest.raises(StageError, match=r"recording\.mcap: cannot be written: .*; name another .*\(recorder\.file\)"):
+        STAGE.build(context(tmp_path))
+
+
+def test_the_file_can_be_named(tmp_path):
+    STAGE.build(context(tmp_path, file=Path("today") / "a.mcap")).core.close()
+    assert (tmp_path / "runs" / "today" / "a.mcap").exists()
+
+
+TICK_NS = SECOND_NS // 20
+
+
+def test_every_message_is_on_the_disk_a_second_after_it_was_received_and_not_at_every_tick():
+    disk = Disk()
+    core = recorder(disk)
+    for tick in range(200):
+        now_ns = NOW_NS + tick * TICK_NS
+        core.step(packet(raw(tick), "raw", now_ns - 1))
+        core.tick(now_ns)
+        assert all(now_ns + TICK_NS - pending.log_time_ns <= SECOND_NS for pending in disk.parts[0].pending)
+    assert disk.parts[0].flushes == 10
+
+
+def test_behind_a_backlog_it_flushes_more_often_but_not_at_every_tick():
+    disk = Disk()
+    core = recorder(disk)
+    for tick in range(40):
+        core.step(packet(raw(tick), "raw", NOW_NS - 5 * SECOND_NS))
+        core.tick(NOW_NS + tick * TICK_NS)
+    assert disk.parts[0].flushes == 8
+
+
+def test_a_clock_that_is_set_back_stops_neither_flushing_nor_looking_nor_parts():
+    disk = Disk()
+    core = recorder(disk, part_s=60.0)
+    core.step(packet(raw(0), "raw", NOW_NS))
+    core.tick(NOW_NS)
+    back_ns = NOW_NS - 3600 * SECOND_NS
+    core.tick(back_ns)
+    assert sequences(disk.parts[0]) == [0]
+    core.step(packet(raw(1), "raw", back_ns))
+    core.tick(back_ns + SECOND_NS)
+    assert sequences(disk.parts[0]) == [0, 1]
+    disk.free = 0
+    core.tick(back_ns + 2 * SECOND_NS)
+    assert core.problem()
+    disk.free = 1 << 40
+    core.tick(back_ns + 3 * SECOND_NS)
+    assert core.problem() == ""
+    core.tick(back_ns + 63 * SECOND_NS)
+    assert len(disk.parts) == 3
+
+
+def test_what_was_held_while_the_clock_was_set_back_is_flushed_in_time_too():
+    disk = Disk()
+    disk.free = 0
+    core = recorder(disk)
+    record(core, [0])
+    disk.free = 1 << 40
+    back_ns = NOW_NS - 3600 * SECOND_NS
+    for second in range(4):
+        core.tick(back_ns + second * SECOND_NS)
+    assert sequences(disk.parts[0]) == [0]
+
+
+def test_what_a_failed_flush_may_have_lost_is_recorded_again_in_the_next_part(tmp_path, monkeypatch):
+    run = context(tmp_path, min_free_bytes=0)
+    core, start_ns = STAGE.build(run).core, context(tmp_path).started_t_ns
+    sync, failures = os.fdatasync, iter([OSError(errno.EIO, "Input/output error")])
+
+    def fail_once(descriptor: int) -> None:
+        for error in failures:
+            raise error
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fdatasync", fail_once)
+    for second in range(4):
+        core.step(packet(raw(second), "raw", start_ns + second * SECOND_NS))
+        core.tick(start_ns + second * SECOND_NS)
+    core.close()
+    found = [
+        [entry.message.header.sequence for entry in read_recording(run.run_folder / name)]
+        for name in ("recording.mcap", "recording-2.mcap")
+    ]
+    assert found == [[], [0, 1, 2, 3]]
+    assert core.counters() == {"recorded_raw": 4, "lost_unwritten": 0, "parts": 2, "pauses": 1}
+
+
+def test_without_messages_there_is_nothing_to_flush():
+    disk = Disk()
+    core = recorder(disk)
+    for second in range(10):
+        core.tick(NOW_NS + second * SECOND_NS)
+    assert disk.parts[0].flushes == 0
+
+
+def test_a_disk_that_refuses_is_told_and_what_comes_meanwhile_is_kept_and_recorded_when_it_no_longer_does():
+    disk = Disk()
+    core = recorder(disk)
+    record(core, range(5))
+    core.tick(NOW_NS + SECOND_NS)
+    assert core.problem() == ""
+    disk.room, disk.refuses = 7, True
+    record(core, range(5, 20))
+    assert core.problem().startswith("NOTHING IS RECORDED: r.mcap: cannot be written any more: No space left")
+    core.tick(NOW_NS + 3 * SECOND_NS)
+    assert core.problem(), "it is still full"
+    disk.room, disk.refuses = 1000, False
+    core.tick(NOW_NS + 3 * SECOND_NS + SECOND_NS // 2)
+    assert core.problem(), "it looks once a second"
+    core.tick(NOW_NS + 4 * SECOND_NS)
+    assert core.problem() == ""
+    record(core, range(20, 22))
+    core.close()
+    first, second = disk.parts
+    assert sequences(first) + sequences(second) == list(range(22))
+    assert core.counters() == {"recorded_raw": 22, "lost_unwritten": 0, "parts": 2, "pauses": 1}
+
+
+def test_the_part_after_a_pause_tells_the_gap(caplog):
+    disk = Disk()
+    core = recorder(disk)
+    disk.gone = "/mnt: the disk is no longer mounted"
+    with caplog.at_level(logging.WARNING):
+        core.tick(NOW_NS + SECOND_NS)
+        disk.gone = ""
+        core.tick(NOW_NS + 5 * SECOND_NS)
+    assert disk.parts[0].closed == "and goes on", "nobody holds on to a file of a disk that is gone"
+    told = disk.parts[1].about
+    assert int(told["resumed_t_ns"]) - int(told["paused_t_ns"]) == 4 * SECOND_NS
+    assert told["paused_because"].startswith("/mnt: the disk is no longer mounted")
+    assert told["lost_in_pause"] == "0"
+    assert "nothing is recorded: /mnt: the disk is no longer mounted" in caplog.text
+    assert "recording goes on after 4.0 s; messages lost meanwhile: 0" in caplog.text
+
+
+def test_what_does_not_fit_into_memory_during_a_pause_is_lost_and_counted_the_oldest_first(monkeypatch):
+    monkeypatch.setattr(stages.recorder, "HELD_BYTES", 10 * len(encode(raw(100))))
+    disk = Disk()
+    core = recorder(disk)
+    record(core, range(100, 103))
+    disk.refuses = True
+    core.tick(NOW_NS + SECOND_NS)
+    record(core, range(103, 120))
+    disk.refuses = False
+    core.tick(NOW_NS + 2 * SECOND_NS)
+    core.close()
+    assert sequences(disk.parts[0]) == []
+    assert sequences(disk.parts[1]) == list(range(110, 120))
+    assert core.counters()["lost_unwritten"] == 10
+    assert disk.parts[1].about["lost_in_pause"] == "10"
+    assert disk.parts[1].ledger.accounts[RAW_KEY, "acquisition-1"].missing == 10
+
+
+def test_a_disk_that_refuses_the_last_chunk_is_counted_too():
+    disk = Disk()
+    core = recorder(disk)
+    record(core, range(3))
+    disk.refuses = True
+    core.close()
+    assert core.counters() == {"lost_unwritten": 3, "parts": 1, "pauses": 1}
+    assert core.problem()
+
+
+def test_with_too_little_room_it_pauses_and_the_part_is_ended_in_order():
+    disk = Disk()
+    core = recorder(disk, min_free_bytes=50_000_000)
+    record(core, range(3))
+    disk.free = 49_000_000
+    core.tick(NOW_NS + SECOND_NS)
+    assert disk.parts[0].closed == "and goes on"
+    assert core.problem().startswith("NOTHING IS RECORDED: 49.0 MB are free on the disk, and 50.0 MB must be")
+    assert core.counters() == {"recorded_raw": 3, "lost_unwritten": 0, "parts": 1, "pauses": 1}
+    disk.free = 50_000_001
+    core.tick(NOW_NS + 2 * SECOND_NS)
+    assert core.problem(), "so little more would be used up at once"
+    disk.free = 60_000_000
+    core.tick(NOW_NS + 3 * SECOND_NS)
+    assert core.problem() == ""
+    assert len(disk.parts) == 2
+
+
+def test_it_starts_and_waits_where_the_disk_is_full_already():
+    disk = Disk()
+    disk.free = 0
+    core = recorder(disk)
+    record(core, range(3))
+    assert core.problem().startswith("NOTHING IS RECORDED")
+    disk.free = 1 << 40
+    core.tick(NOW_NS + SECOND_NS)
+    core.close()
+    assert sequences(disk.parts[0]) == [0, 1, 2]
+
+
+def test_the_oldest_parts_go_one_at_a_time_if_they_may(caplog):
+    disk = Disk()
+    disk.oldest, disk.freed_by_each = ["r.mcap", "r-2.mcap", "r-3.mcap"], 10_000_000
+    core = recorder(disk, min_free_bytes=50_000_000, delete_oldest=True)
+    disk.free = 35_000_000
+    with caplog.at_level(logging.WARNING):
+        for second in range(1, 6):
+            core.tick(NOW_NS + second * SECOND_NS)
+    assert disk.oldest == ["r-3.mcap"]
+    assert core.counters()["parts_deleted"] == 2
+    assert "r-2.mcap: deleted, the oldest part" in caplog.text
+    assert core.problem() == ""
+
+
+def test_when_there_is_nothing_left_to_delete_it_pauses():
+    disk = Disk()
+    core = recorder(disk, delete_oldest=True)
+    disk.free = 1
+    core.tick(NOW_NS + SECOND_NS)
+    assert core.problem().startswith("NOTHING IS RECORDED")
+
+
+def test_a_part_that_is_large_enough_is_followed_by_the_next():
+    disk = Disk()
+    core = recorder(disk, part_bytes=1_000_000)
+    for sequence in range(30):
+        core.step(packet(raw(sequence, samples=5_000), "raw", NOW_NS))
+        core.tick(NOW_NS + sequence * SECOND_NS)
+    core.close()
+    assert len(disk.parts) > 3
+    assert all(1_000_000 <= part.size < 1_400_000 for part in disk.parts[:-1])
+    assert [number for part in disk.parts for number in sequences(part)] == list(range(30))
+    assert [part.closed for part in disk.parts] == ["and goes on"] * (len(disk.parts) - 1) + ["at the end"]
+
+
+def test_a_part_that_is_long_enough_is_followed_by_the_next():
+    disk = Disk()
+    core = recorder(disk, part_s=60.0)
+    for second in range(150):
+        core.tick(NOW_NS + second * SECOND_NS)
+    assert [(part.t_ns - NOW_NS) // SECOND_NS for part in disk.parts] == [0, 60, 120]
+
+
+def test_each_part_begins_with_the_last_card_of_each_twin():
+    disk = Disk()
+    core = recorder(disk, part_s=60.0)
+    for item in (card(0), card(1), raw(0)):
+        core.step(packet(item, "raw" if isinstance(item, Raw) else "twin", NOW_NS))
+    core.tick(NOW_NS + 60 * SECOND_NS)
+    record(core, [1])
+    core.close()
+    first, second = ([(type(p.message).__name__, p.message.header.sequence) for p in q.content] for q in disk.parts)
+    assert first == [("ModelCard", 0), ("ModelCard", 1), ("Raw", 0)]
+    assert second == [("ModelCard", 1), ("Raw", 1)]
+    assert disk.parts[1].content[0].log_time_ns == disk.parts[1].t_ns
+    assert (tray_key("plant", "tray1", "twin"), "twin_integrator-1") not in disk.parts[1].ledger.accounts
+
+
+def test_what_a_killed_recorder_has_recorded_already_is_not_recorded_again():
+    disk = Disk(before={(RAW_KEY, "acquisition-1"): 7})
+    core = recorder(disk)
+    record(core, range(5, 10))
+    core.close()
+    assert sequences(disk.parts[0]) == [7, 8, 9]
+    account = disk.parts[0].ledger.accounts[RAW_KEY, "acquisition-1"]
+    assert (account.messages, account.missing, account.duplicated) == (3, 0, 2)
+
+
+def test_what_was_lost_between_a_killed_recorder_and_the_next_is_in_the_ledger():
+    disk = Disk(before={(RAW_KEY, "acquisition-1"): 7})
+    core = recorder(disk)
+    record(core, range(10, 12))
+    core.close()
+    assert disk.parts[0].ledger.accounts[RAW_KEY, "acquisition-1"].missing == 3
+
+
+def test_what_the_bus_brought_twice_is_in_the_ledger_of_the_part_in_which_it_came():
+    disk = Disk()
+    core = recorder(disk, part_s=60.0)
+    for told in (health_of("recorder-1", 0), health_of("recorder-2", 50), health_of("recorder-1", 4)):
+        core.step(packet(told, "health", NOW_NS))
+    core.tick(NOW_NS + 60 * SECOND_NS)
+    core.step(packet(health_of("scorer-1", 70, stage="scorer"), "health", NOW_NS))
+    core.step(packet(health_of("recorder-1", 7), "health", NOW_NS))
+    core.close()
+    assert [part.ledger.accounts[RAW_KEY, "a"].duplicated for part in disk.parts] == [4, 3]
+
+
+@pytest.mark.parametrize("wrong", [{"part_bytes": 1000}, {"part_s": 0.5}, {"part_s": -1}, {"min_free_bytes": -1}])
+def test_limits_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValidationError):
+        RecorderConfig(**wrong)
+
+
+def test_doctor_says_when_the_disk_is_too_full(tmp_path):
+    (problem,) = STAGE.check(context(tmp_path, min_free_bytes=1 << 60))
+    assert "nothing is recorded below" in problem

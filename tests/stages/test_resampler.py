@@ -1,0 +1,454 @@
+"""stages.resampler: a uniform grid from irregular samples, and no more than the samples tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from schemas.messages import Grid, Header, InvalidReason, Raw
+from schemas.units import NS_PER_S
+from stages.resampler import ResamplerConfig, ResamplerCore
+
+EPOCH_NS = 1_700_000_000_000_000_000
+
+STEP_NS = 10_000_000
+NAN = float("nan")
+
+
+def at(*times_s: float) -> NDArray[np.int64]:
+    return EPOCH_NS + np.rint(np.array(times_s) * NS_PER_S).astype(np.int64)
+
+
+def raw(
+    t_ns: NDArray[np.int64], speed: NDArray[np.float64], command: NDArray[np.float64] | None = None, fans: int = 1
+) -> Raw:
+    """A message of a device without a clock. speed, command: (n,) of every fan, or (n, fans)."""
+    command = np.zeros(len(t_ns)) if command is None else command
+    columns = [
+        np.broadcast_to(np.asarray(c, float).reshape(len(t_ns), -1), (len(t_ns), fans)) for c in (command, speed)
+    ]
+    return Raw(fans=fans, host_receive_t_ns=t_ns, command=columns[0], speed_rad_s=columns[1])
+
+
+def split(message: Raw, size: int) -> Iterable[Raw]:
+    for k in range(0, len(message.host_receive_t_ns), size):
+        part = slice(k, k + size)
+        yield Raw(
+            fans=message.fans,
+            host_receive_t_ns=message.host_receive_t_ns[part],
+            device_clock_us=message.device_clock_us[part],
+            command=message.command[part],
+            speed_rad_s=message.speed_rad_s[part],
+        )
+
+
+def joined(grids: Iterable[Grid]) -> Grid:
+    grids = list(grids)
+    names = ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason")
+    columns: dict[str, Any] = {name: np.concatenate([getattr(grid, name) for grid in grids]) for name in names}
+    return Grid(fans=grids[0].fans, period_ns=grids[0].period_ns, **columns)
+
+
+def run(messages: Iterable[Raw], fans: int = 1, **config: float) -> tuple[Grid, ResamplerCore]:
+    core = ResamplerCore(fans, ResamplerConfig.model_validate(config))
+    grids = [grid for message in messages for grid in core.step(message)]
+    return joined([*grids, *core.close()]), core
+
+
+def assert_same(a: Grid, b: Grid) -> None:
+    for name in ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+def irregular(seconds: float, seed: int = 3, jitter_s: float = 0.004) -> NDArray[np.int64]:
+    rng = np.random.default_rng(seed)
+    times = np.arange(0.0, seconds, 0.01)
+    return at(*(times + rng.uniform(-jitter_s, jitter_s, len(times)) + jitter_s))
+
+
+def seconds_of(t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    return (t_ns - EPOCH_NS) / NS_PER_S
+
+
+def test_a_sine_is_interpolated_to_the_second_order_of_the_spacing() -> None:
+    omega, errors = 5.0, []
+    for spacing_s in (0.02, 0.01):
+        times_s = np.arange(0.0, 5.0, spacing_s) + 0.0013
+        grid, _ = run([raw(at(*times_s), np.sin(omega * times_s))], rate_hz=1000)
+        error = np.abs(grid.speed_rad_s[:, 0] - np.sin(omega * seconds_of(grid.t_ns))).max()
+        assert error <= (omega * spacing_s) ** 2 / 8 * 1.001  # the bound of linear interpolation
+        errors.append(error)
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)
+
+
+def test_the_grid_is_uniform_rises_and_lies_at_multiples_of_its_step() -> None:
+    t_ns = irregular(5)
+    grid, core = run([raw(t_ns, np.sin(seconds_of(t_ns)))])
+    assert grid.valid.all()
+    assert (grid.t_ns % STEP_NS == 0).all()
+    assert (np.diff(grid.t_ns) == STEP_NS).all()
+    assert t_ns[0] <= grid.t_ns[0] < t_ns[0] + STEP_NS
+    assert t_ns[-1] - STEP_NS < grid.t_ns[-1] <= t_ns[-1]
+    assert core.counters()["samples_in"] == len(t_ns)
+
+
+def test_the_command_is_that_of_the_last_sample_at_or_before() -> None:
+    grid, _ = run([raw(at(0.0, 0.02, 0.031, 0.05), np.zeros(4), np.array([1.0, 2.0, 3.0, 4.0]))])
+    assert grid.command[:, 0].tolist() == [1, 1, 2, 2, 3, 4]
+
+
+def test_a_grid_sample_leaves_with_the_first_raw_sample_at_or_after_it() -> None:
+    core = ResamplerCore(1, ResamplerConfig())
+    steps = [core.step(raw(at(t), np.zeros(1))) for t in (0.001, 0.009, 0.0101, 0.02)]
+    assert [[seconds_of(g.t_ns).round(3).tolist() for g in grids] for grids in steps] == [[], [], [[0.01]], [[0.02]]]
+
+
+def test_blocks_have_the_size_asked_for() -> None:
+    core = ResamplerCore(1, ResamplerConfig(block_size=7))
+    grids = core.step(raw(at(*np.arange(0.0, 0.2, 0.01)), np.zeros(20)))
+    assert [len(grid.t_ns) for grid in grids] == [7, 7]
+    assert [len(grid.t_ns) for grid in core.close()] == [6]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(-3 * STEP_NS, 12 * STEP_NS), min_size=1, max_size=80))
+def test_whatever_the_times_the_grid_rises_without_a_repeat_and_never_bridges_a_gap(steps: list[int]) -> None:
+    t_ns = EPOCH_NS + np.cumsum(steps)
+    core = ResamplerCore(1, ResamplerConfig())
+    grids = [*core.step(raw(t_ns, np.arange(0.0, len(t_ns)))), *core.close()]
+    if not grids:
+        return
+    grid = joined(grids)
+    assert (np.diff(grid.t_ns) == STEP_NS).all()
+    accepted = np.unique(np.maximum.accumulate(t_ns))
+    right = np.searchsorted(accepted, grid.t_ns)
+    spans = accepted[right] - accepted[np.maximum(right - 1, 0)]
+    bridged = (accepted[right] == grid.t_ns) | (spans <= ResamplerConfig().gap_limit_s * NS_PER_S)
+    np.testing.assert_array_equal(grid.valid[:, 0], bridged)
+    np.testing.assert_array_equal(np.isfinite(grid.speed_rad_s[:, 0]), bridged)
+
+
+def test_repeated_and_out_of_order_samples_are_dropped_and_counted() -> None:
+    grid, core = run([raw(at(0.0, 0.01, 0.01, 0.03, 0.02, 0.04), np.array([0.0, 1, 99, 3, 99, 4]))])
+    np.testing.assert_allclose(grid.speed_rad_s[:, 0], [0, 1, 2, 3, 4])
+    assert (core.counters()["repeated"], core.counters()["out_of_order"]) == (1, 1)
+
+
+def test_a_gap_is_said_to_be_one_while_the_command_stays_what_it_was() -> None:
+    grid, core = run([raw(at(0.0, 0.01, 0.2, 0.21), np.ones(4), np.array([1.0, 2.0, 3.0, 3.0]))])
+    assert (
+        grid.invalid_reason[:, 0].tolist()
+        == [InvalidReason.NONE] * 2 + [InvalidReason.GAP] * 18 + [InvalidReason.NONE] * 2
+    )
+    assert np.isnan(grid.speed_rad_s[2:20]).all()
+    assert (grid.command[2:20] == 2.0).all()
+    assert (core.counters()["gaps"], core.counters()["grid_samples_in_gaps"]) == (1, 18)
+
+
+def test_a_span_of_just_the_limit_is_bridged() -> None:
+    grid, core = run([raw(at(0.0, 0.1, 0.2001), np.zeros(3))])
+    assert grid.valid[:11].all()
+    assert not grid.valid[11:].any()
+    assert core.counters()["gaps"] == 1
+
+
+def test_a_long_silence_is_shown_for_a_while_and_then_the_grid_ends() -> None:
+    grid, core = run([raw(at(0.0, 3600.0, 3600.01), np.zeros(3))])
+    why = grid.invalid_reason[:, 0].tolist()
+    assert (
+        why == [InvalidReason.NONE] + [InvalidReason.GAP] * 50 + [InvalidReason.STALE] * 450 + [InvalidReason.NONE] * 2
+    )
+    assert seconds_of(grid.t_ns)[-2:].tolist() == [3600.0, 3600.01]
+    assert core.counters()["grid_samples_in_gaps"] == 359_999
+
+
+def _ticks(core: ResamplerCore, from_s: float, to_s: float, step_s: float = 0.05) -> list[Grid]:
+    return [grid for t in np.arange(from_s, to_s, step_s) for grid in core.tick(int(at(t)[0]))]
+
+
+def test_what_is_said_during_a_silence_is_what_a_replay_says_after_it() -> None:
+    messages = [raw(at(0.0, 0.01), np.ones(2)), raw(at(3.0, 3.01), np.ones(2))]
+    core = ResamplerCore(1, ResamplerConfig())
+    live = [*core.step(messages[0]), *_ticks(core, 0.01, 2.9)]
+    assert joined(live).invalid_reason[-1, 0] == InvalidReason.STALE
+    live += core.step(messages[1])
+    replayed, _ = run(messages)
+    assert_same(joined(live), replayed)
+
+
+def test_nothing_is_said_before_the_watermark_and_nothing_beyond_the_end() -> None:
+    core = ResamplerCore(1, ResamplerConfig())
+    core.step(raw(at(0.0), np.ones(1)))
+    assert _ticks(core, 0.0, 0.5) == []
+    assert core.problem() == ""
+    grid = joined(_ticks(core, 0.5, 60.0))
+    assert seconds_of(grid.t_ns[[0, -1]]).tolist() == [0.01, 5.0]
+    told = core.problem()
+    assert "acquisition" in told
+    _ticks(core, 60.0, 63.0)
+    assert core.problem() == told  # a state and no stopwatch: whoever tells changes must not tell it every second
+
+
+def test_a_host_that_stood_still_does_not_take_that_for_silence() -> None:
+    core = ResamplerCore(1, ResamplerConfig())
+    core.step(raw(at(0.0), np.ones(1)))
+    assert _ticks(core, 0.0, 0.2) == []
+    assert core.tick(int(at(30.0)[0])) == []
+    assert joined(core.step(raw(at(0.01, 0.02), np.ones(2)))).valid.all()
+
+
+def test_samples_that_come_end_a_silence() -> None:
+    core = ResamplerCore(1, ResamplerConfig())
+    core.step(raw(at(0.0), np.ones(1)))
+    assert _ticks(core, 0.0, 0.4) == []
+    core.step(raw(at(0.4), np.ones(1)))
+    assert _ticks(core, 0.4, 0.85) == []
+
+
+def test_a_block_that_is_not_full_leaves_at_the_watermark() -> None:
+    core = ResamplerCore(1, ResamplerConfig(block_size=50))
+    assert core.step(raw(at(0.0, 0.01), np.ones(2))) == []
+    assert joined(_ticks(core, 0.0, 0.56)).t_ns[:2].tolist() == at(0.0, 0.01).tolist()
+
+
+def test_a_sample_that_comes_after_its_time_was_given_up_is_lost_and_counted() -> None:
+    core = ResamplerCore(1, ResamplerConfig())
+    core.step(raw(at(0.0), np.ones(1)))
+    given_up = joined(_ticks(core, 0.0, 0.7))
+    grid = joined(core.step(raw(at(0.01, 0.5, 0.55), np.array([5.0, 6.0, 7.0]))))
+    assert core.counters()["lost_too_late"] == 1
+    assert grid.t_ns[0] == given_up.t_ns[-1] + STEP_NS
+
+
+def test_a_missing_reading_of_one_fan_is_interpolated_and_the_others_are_untouched() -> None:
+    speed = np.array([[0.0, 10.0], [1.0, NAN], [2.0, NAN], [3.0, 40.0]])
+    grid, _ = run([raw(at(0.0, 0.01, 0.02, 0.03), speed, fans=2)], fans=2)
+    np.testing.assert_allclose(grid.speed_rad_s, [[0, 10], [1, 20], [2, 30], [3, 40]])
+    assert grid.valid.all()
+
+
+def test_a_reading_missing_for_longer_than_the_limit_is_said_to_be_missing() -> None:
+    times_s = np.arange(31) / 100
+    speed = np.stack([times_s, np.where((times_s > 0.055) & (times_s < 0.195), NAN, 1.0)], axis=1)
+    grid, _ = run([raw(at(*times_s), speed, fans=2)], fans=2)
+    assert grid.valid[:, 0].all()
+    missing = np.flatnonzero(~grid.valid[:, 1])
+    assert missing.tolist() == list(range(6, 20))
+    assert (grid.invalid_reason[missing, 1] == InvalidReason.NO_SPEED).all()
+    assert np.isnan(grid.speed_rad_s[missing, 1]).all()
+
+
+def test_readings_too_far_apart_are_not_joined_though_the_line_was_never_silent() -> None:
+    speed = np.array([[0.0, 0.0], [6.0, NAN], [13.0, 13.0]])
+    grid, _ = run([raw(at(0.0, 0.06, 0.13), speed, fans=2)], fans=2)
+    assert grid.valid[:, 0].all()
+    assert grid.invalid_reason[:, 1].tolist() == [InvalidReason.NONE] + [InvalidReason.NO_SPEED] * 12 + [
+        InvalidReason.NONE
+    ]
+
+
+def test_a_tacho_that_fails_holds_up_the_others_for_the_gap_limit_once() -> None:
+    core = ResamplerCore(2, ResamplerConfig())
+    sizes = [
+        sum(len(g.t_ns) for g in core.step(raw(at(k / 100), np.array([[1.0, 1.0 if k < 10 else NAN]]), fans=2)))
+        for k in range(40)
+    ]
+    assert sizes == [1] * 10 + [0] * 10 + [11] + [1] * 19
+
+
+def test_what_waits_for_a_reading_leaves_when_the_stage_is_closed() -> None:
+    grid, _ = run([raw(at(0.0, 0.01), np.array([[1.0, 1.0], [1.0, NAN]]), fans=2)], fans=2)
+    assert grid.invalid_reason.tolist() == [
+        [InvalidReason.NONE, InvalidReason.NONE],
+        [InvalidReason.NONE, InvalidReason.NO_SPEED],
+    ]
+
+
+def test_a_fan_without_a_tacho_does_not_hold_up_the_others() -> None:
+    core = ResamplerCore(2, ResamplerConfig())
+    for k in range(50):
+        grids = core.step(raw(at(k / 100), np.array([[1.0, NAN]]), fans=2))
+        assert [seconds_of(g.t_ns).tolist() for g in grids] == [[k / 100]]
+        assert grids[0].invalid_reason.tolist() == [[InvalidReason.NONE, InvalidReason.NO_SPEED]]
+
+
+def _with_clock(
+    seconds: float, drift: float, seed: int
+) -> tuple[Raw, Callable[[NDArray[np.int64]], NDArray[np.float64]]]:
+    """A device whose clock drifts and wraps behind a jittery line, sampling a known speed."""
+    rng = np.random.default_rng(seed)
+    n = round(seconds * 100)
+    true_s = np.arange(n) / 100 + rng.uniform(0, 2e-3, n)
+    clock_us = (4_290_000_000 + true_s * 1e6 * (1 - drift)).astype(np.int64) % (1 << 32)
+    receive_t_ns = np.maximum.accumulate(at(*(true_s + rng.exponential(3e-3, n))))
+    kept = rng.random(n) > 0.01
+
+    def speed(t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        return 300 + 100 * np.sin(2 * seconds_of(t_ns))
+
+    message = Raw(
+        fans=1,
+        host_receive_t_ns=receive_t_ns[kept],
+        device_clock_us=clock_us.astype(np.uint32)[kept],
+        command=np.zeros((kept.sum(), 1)),
+        speed_rad_s=speed(at(*true_s))[kept, np.newaxis],
+    )
+    return message, speed
+
+
+def test_the_device_clock_gives_the_speed_that_receive_times_would_blur() -> None:
+    message, speed = _with_clock(60, drift=100e-6, seed=5)
+    grid, core = run(split(message, 10))
+    by_receipt, _ = run(
+        [raw(message.host_receive_t_ns, message.speed_rad_s[:, 0])],
+    )
+
+    def error(g: Grid) -> float:
+        return float(np.abs(g.speed_rad_s[1000:, 0] - speed(g.t_ns[1000:])).max())
+
+    assert grid.valid.all()
+    assert error(grid) < 0.3
+    assert error(by_receipt) > 1.5
+    assert core.counters()["clock_restarts"] == 0
+
+
+def test_a_restarted_resampler_lands_on_the_same_grid() -> None:
+    message, _ = _with_clock(40, drift=100e-6, seed=6)
+    whole, _ = run([message])
+    again, _ = run(list(split(message, 1000))[3:])
+    overlap = whole.t_ns[whole.t_ns >= again.t_ns[0]]
+    np.testing.assert_array_equal(again.t_ns[: len(overlap) - 1], overlap[: len(again.t_ns)][: len(overlap) - 1])
+    same = np.isin(whole.t_ns, again.t_ns)
+    later = np.isin(again.t_ns, whole.t_ns)
+    assert np.abs(whole.speed_rad_s[same] - again.speed_rad_s[later]).max() < 3.0
+
+
+def test_raw_messages_handed_over_again_change_nothing() -> None:
+    message, _ = _with_clock(20, drift=100e-6, seed=7)
+    parts = list(split(message, 100))
+    once, _ = run(parts)
+    twice, core = run([*parts[:15], *parts[2:15], *parts[15:]])
+    assert_same(twice, once)
+    assert core.counters()["clock_restarts"] == 0
+    assert core.counters()["repeated"] + core.counters()["out_of_order"] == sum(
+        len(p.host_receive_t_ns) for p in parts[2:15]
+    )
+
+
+def test_samples_of_another_number_of_fans_are_lost_and_said_to_be() -> None:
+    core = ResamplerCore(2, ResamplerConfig())
+    assert core.step(raw(at(0.0, 0.01), np.zeros(2), fans=3)) == []
+    assert core.counters()["lost_wrong_fan_count"] == 2
+    assert "fans = 2" in core.problem()
+
+
+def test_limits_in_the_wrong_order_are_refused() -> None:
+    with pytest.raises(ValidationError, match="must rise"):
+        ResamplerConfig(gap_limit_s=1.0, watermark_s=0.5)
+
+
+def sent(producer: str, first: int, count: int, start_s: float, clock: bool = True, clock_start_us: int = 0) -> Raw:
+    """Samples of one session of acquisition, numbered by the device from `first` on, 10 ms apart."""
+    times_s = start_s + np.arange(count) * 0.01
+    clock_us = (clock_start_us + np.rint(times_s * 1e6).astype(np.int64)) % 2**32
+    return replace(
+        raw(at(*times_s), np.zeros(count)),
+        header=Header(producer, 0, "t"),
+        device_clock_us=clock_us.astype(np.uint32) if clock else np.zeros(0, np.uint32),
+        device_sequence=((first + np.arange(count)) % 2**32).astype(np.uint32),
+    )
+
+
+@pytest.mark.parametrize("clock", [True, False])
+@pytest.mark.parametrize("first", [0, 2**32 - 53])
+def test_what_the_device_sent_while_acquisition_was_dead_is_counted_by_its_sequence(clock: bool, first: int) -> None:
+    _, core = run([sent("a", first, 50, 0.0, clock), sent("b", first + 97, 50, 0.97, clock)])
+    assert core.counters()["lost_between_sessions"] == 47
+
+
+@pytest.mark.parametrize(
+    ("name", "messages"),
+    [
+        ("goes on without a gap", [sent("a", 0, 50, 0.0), sent("b", 50, 50, 0.5)]),
+        ("brings some again", [sent("a", 0, 50, 0.0), sent("b", 40, 60, 0.4)]),
+        ("is the same session, which counts for itself", [sent("a", 0, 50, 0.0), sent("a", 60, 50, 0.6)]),
+        ("device began anew", [sent("a", 0, 50, 5.0), sent("b", 60, 50, 6.0, clock_start_us=-6_000_000)]),
+        ("device began anew, without a clock", [sent("a", 900, 50, 0.0, False), sent("b", 0, 50, 0.6, False)]),
+        ("first there is", [sent("b", 4000, 50, 0.0)]),
+    ],
+)
+def test_no_loss_is_counted_when_a_new_session(name: str, messages: list[Raw]) -> None:
+    _, core = run(messages)
+    assert core.counters().get("lost_between_sessions", 0) == 0, name
+
+
+def stamped(message: Raw, producer: str, sequence: int) -> Raw:
+    return replace(message, header=Header(producer, sequence, "tray1"))
+
+
+def moved(message: Raw, by_s: float) -> Raw:
+    return replace(message, host_receive_t_ns=message.host_receive_t_ns + round(by_s * NS_PER_S))
+
+
+@pytest.mark.parametrize("producer", ["a", "b"], ids=["running on", "acquisition restarted"])
+def test_a_clock_set_back_is_lost_and_said_until_it_has_caught_up(producer: str) -> None:
+    message = raw(at(0.0, 0.01), np.zeros(2))
+    core = ResamplerCore(1, ResamplerConfig())
+    core.step(stamped(message, "a", 0))
+    assert core.problem() == ""
+    core.step(stamped(moved(message, -3600), producer, 1))
+    core.step(stamped(moved(message, -3599), producer, 2))
+    assert core.counters()["lost_clock_set_back"] == 4
+    assert core.counters().get("out_of_order", 0) == 0
+    assert core.problem() == (
+        "the host's clock was set back by 3600 s, or a replay began anew: "
+        "samples are refused until it has caught up; restart the stages"
+    )
+    core.step(stamped(moved(message, 1), producer, 3))
+    assert core.problem() == ""
+
+
+def test_one_time_far_in_the_future_is_said_as_a_clock_set_back() -> None:
+    message = raw(at(0.0, 0.01), np.zeros(2))
+    core = ResamplerCore(1, ResamplerConfig())
+    for sequence, by_s in enumerate((0, 1e8, 1)):
+        core.step(stamped(moved(message, by_s), "a", sequence))
+    assert "set back by 99999999 s" in core.problem()
+
+
+def test_what_the_bus_hands_again_or_late_from_an_ended_session_is_no_clock_set_back() -> None:
+    message = raw(at(0.0, 0.01), np.zeros(2))
+    core = ResamplerCore(1, ResamplerConfig())
+    core.step(stamped(message, "a", 0))
+    core.step(stamped(moved(message, 5), "a", 2))
+    core.step(stamped(message, "a", 0))
+    core.step(stamped(moved(message, 10), "b", 0))
+    core.step(stamped(moved(message, 6), "a", 3))
+    assert core.problem() == ""
+    assert core.counters()["out_of_order"] == 4
+    assert "lost_clock_set_back" not in core.counters()
+
+
+def test_a_late_message_of_an_ended_session_counts_no_loss_between_sessions() -> None:
+    message = raw(at(0.0, 0.01), np.zeros(2))
+    core = ResamplerCore(1, ResamplerConfig())
+    for producer, sequence, by_s, first in (("a", 0, 0, 0), ("b", 0, 10, 10), ("a", 1, 1, 2), ("b", 1, 11, 12)):
+        numbered = replace(moved(message, by_s), device_sequence=np.array([first, first + 1], np.uint32))
+        core.step(stamped(numbered, producer, sequence))
+    assert core.counters()["lost_between_sessions"] == 8
+
+
+def test_another_number_of_fans_is_said_only_until_the_right_one_comes() -> None:
+    core = ResamplerCore(1, ResamplerConfig())
+    core.step(raw(at(0.0), np.zeros(1), fans=2))
+    assert "raw samples of 2 fans" in core.problem()
+    core.step(raw(at(0.01), np.zeros(1)))
+    assert core.problem() == ""

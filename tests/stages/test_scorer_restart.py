@@ -1,0 +1,348 @@
+"""stages.scorer, killed and begun anew: it forgets nothing, and mistakes what it remembers for nothing else."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.runtime.snapshot_store import SnapshotStore
+from schemas.blocks import cut
+from schemas.messages import Action, Alarm, FanState, Header, Prediction, Score, ScorerSnapshot, Transition, columns
+from scoring.alarms.current_alarms import CurrentAlarm, current_alarms
+from stages.scorer import ScorerCore
+from tests.stages.test_scorer import eventful_prediction
+from tests.support.scored_blocks import LIVELY, commissioned, core_of, feed, note_of, prediction_of, request_of
+
+HOUR = 360_000  # samples
+
+
+def core() -> ScorerCore:
+    return core_of(3, calibration=LIVELY, baseline_s=0.1, on_delay_s=0.03, off_delay_s=0.05)
+
+
+def bits(scores: Sequence[Score], from_t_ns: int = 0) -> dict[str, bytes]:
+    rows = [score.t_ns >= from_t_ns for score in scores]
+    return {
+        name: np.concatenate(
+            [getattr(s, name)[r] if shape != "fans" else getattr(s, name) for s, r in zip(scores, rows, strict=True)]
+        ).tobytes()
+        for name, (shape, _) in columns(Score).items()
+        if shape != "fans"
+    }
+
+
+def without_causes(alarms: Sequence[Alarm]) -> list[str]:
+    """A restarted scorer diagnoses with fewer samples."""
+    return [repr(replace(alarm, causes=(), message="")) for alarm in alarms]
+
+
+def eventful() -> Prediction:
+    """Faults of some tenths of a second that come again and again, of each fan another, and a gap."""
+    rng = np.random.default_rng(1)
+    k = np.arange(900)[:, np.newaxis]
+    residual = rng.normal(0, 1, (900, 3)) + np.where(k % 300 > 240, [40.0, 0.0, 0.0], 0.0)
+    extra = rng.normal(0, 0.1, (900, 3)) + np.where(k % 200 > 150, [0.0, 8.0, 0.0], 0.0)
+    valid = np.ones((900, 3), np.bool_)
+    valid[480:520, 2] = False
+    return prediction_of(residual, valid, balance=extra)
+
+
+STEPS_ALONE = LIVELY | {name: {"step": 4.0, "baseline_sigmas": 0.0} for name in ("speed", "balance")}
+
+
+@pytest.mark.parametrize("middle", [160, 255, 300, 360, 500])
+def test_a_scorer_that_goes_on_from_its_memory_is_one_that_never_stopped(middle: int) -> None:
+    whole = eventful()
+    first, second = cut(whole, 0, middle), cut(whole, middle, 900)
+
+    def core() -> ScorerCore:
+        return core_of(3, calibration=STEPS_ALONE, baseline_s=0.1, on_delay_s=0.03, off_delay_s=0.05)
+
+    ack = request_of(Action.ACKNOWLEDGE, -1)
+    with np.errstate(all="ignore"):
+        unbroken = core()
+        feed(unbroken, [first, ack])
+        expected, expected_alarms = feed(unbroken, [second])
+        killed = core()
+        feed(killed, [first, ack])
+        successor = core()
+        successor.restore(note_of(killed))
+        scores, alarms = feed(successor, [second])
+    assert {Transition.RAISED, Transition.CLEARED} <= {alarm.transition for alarm in expected_alarms}
+    assert bits(scores) == bits(expected)
+    assert without_causes(alarms) == without_causes(expected_alarms)
+    assert successor.problem() == unbroken.problem() or "not judged" in unbroken.problem()
+
+
+def test_after_a_kill_what_producers_still_keep_is_made_up_for(tmp_path: Path) -> None:
+    blocks = [cut(eventful_prediction(3, 900, 0.0), k, k + 10) for k in range(0, 900, 10)]
+    with np.errstate(all="ignore"):
+        unbroken, _ = feed(core(), blocks)
+        killed = core_of(
+            3, calibration=LIVELY, baseline_s=0.1, on_delay_s=0.03, snapshot_store=SnapshotStore(tmp_path / "m")
+        )
+        feed(killed, blocks[:60])
+        kept = SnapshotStore(tmp_path / "m").load()
+        assert kept
+        assert kept.t_ns < blocks[59].t_ns[-1], "it was not closed: the last alarm was the last note"
+        successor = core()
+        successor.restore(kept)
+        scores, _ = feed(successor, blocks[20:])
+    assert bits(scores, kept.t_ns + 1) == bits([s for s in unbroken if s.t_ns[-1] > kept.t_ns], kept.t_ns + 1)
+
+
+def test_every_alarm_and_answer_is_noted_before_it_is_told(tmp_path: Path) -> None:
+    snapshot_store = SnapshotStore(tmp_path / "m")
+    scorer = commissioned(core_of(snapshot_store=snapshot_store))
+
+    def noted() -> dict[str, Any]:
+        memory = SnapshotStore(tmp_path / "m").load()
+        assert memory
+        return json.loads(memory.state_json)["desk"]["told"]["0"]
+
+    _, alarms = feed(scorer, [prediction_of(np.full(100, 20.0))])
+    assert alarms and noted()["active"]
+    feed(scorer, [request_of(Action.SHELVE, duration_s=60.0)])
+    assert noted()["shelved_until_t_ns"] > 0
+
+
+def test_without_news_it_is_noted_each_minute() -> None:
+    scorer = core_of()
+    notes = [
+        message
+        for second in range(180)
+        for message in scorer.step(prediction_of(np.full(100, 0.1), first=100 * second))
+        if isinstance(message, ScorerSnapshot)
+    ]
+    assert [round((note.t_ns - notes[0].t_ns) / 1e9) for note in notes] == [0, 60, 120]
+
+
+def raised() -> ScorerCore:
+    """A fan with an acknowledged alarm, one that is shelved without one, one with nothing."""
+    scorer = commissioned(core_of(3), 3)
+    residual = np.zeros((100, 3))
+    residual[:, 0] = 20.0
+    feed(scorer, [prediction_of(residual)])
+    feed(scorer, [request_of(Action.ACKNOWLEDGE, 0, sequence=0, comment="ordered")])
+    feed(scorer, [request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)])
+    return scorer
+
+
+def test_a_restarted_scorer_tells_again_what_stands_and_who_acknowledged_it() -> None:
+    successor = core_of(3)
+    memory, *told = successor.restore(note_of(raised()))
+    assert isinstance(memory, ScorerSnapshot) and memory.restored
+    assert [(alarm.fan, alarm.transition) for alarm in told if isinstance(alarm, Alarm)] == [
+        (0, Transition.REPUBLISHED),
+        (1, Transition.REPUBLISHED),
+    ]
+    first, second = told
+    assert isinstance(first, Alarm) and isinstance(second, Alarm)
+    assert (first.active, first.acknowledged, first.operator_name, first.comment) == (True, True, "Ann", "ordered")
+    assert (second.active, second.shelved_until_t_ns > 0) == (False, True)
+    (score,), alarms = feed(successor, [prediction_of(np.full((10, 3), 20.0), first=100)])
+    assert alarms == [] and (score.state[:, 0] == FanState.ALARM).all()
+
+
+def test_a_successor_tells_of_it_at_once_and_once(tmp_path: Path) -> None:
+    snapshot_store = SnapshotStore(tmp_path / "m")
+    snapshot_store.keep(note_of(raised()))
+    successor = core_of(3, snapshot_store=snapshot_store)
+    assert [type(message) for message in successor.tick(0)] == [ScorerSnapshot, Alarm, Alarm]
+    assert [*successor.tick(0), *successor.step(prediction_of(np.zeros((1, 3)), first=100))][0].__class__ is Score
+
+
+def test_a_baseline_is_that_of_the_session_before() -> None:
+    scorer = core_of(smoothing_s=0.0)
+    feed(scorer, [prediction_of(np.full(1200, 3.0))])
+    successor = core_of(smoothing_s=0.0)
+    successor.restore(note_of(scorer))
+    (score,), _ = feed(successor, [prediction_of(np.full(50, 3.0), first=HOUR)])
+    assert score.valid.all(), "no commissioning"
+    np.testing.assert_allclose(score.speed_baseline_rad_s, 3.0, rtol=1e-5)
+
+
+def standing_of(told: Sequence[Any]) -> list[CurrentAlarm]:
+    """How the alarms stand for who has followed them from `raised` on."""
+    former = raised().restore(note_of(raised()))
+    messages = [*(("former", each) for each in former), *(("successor", each) for each in told)]
+    return current_alarms(
+        replace(message, header=Header(producer, number, "tray1"))
+        for number, (producer, message) in enumerate(messages)
+        if isinstance(message, Alarm)
+    )
+
+
+def test_of_another_twin_only_what_operators_keep_quiet_is_gone_on_from() -> None:
+    successor = core_of(3, sha256="another")
+    memory, *told = successor.restore(note_of(raised()))
+    assert isinstance(memory, ScorerSnapshot) and memory.restored
+    assert successor.counters()["snapshots_of_another_twin"] == 1
+    assert "the twin is another one" in successor.problem()
+    acknowledged, shelved = standing_of(told)
+    assert (acknowledged.is_retained, acknowledged.newest.message) == (False, "fan 0: stands no longer")
+    assert (shelved.is_quiet, shelved.newest.message) == (True, "fan 1: still stands")
+    assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
+    (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
+    assert (score.state == FanState.COMMISSIONING).all()
+    _, (unshelved,) = feed(successor, [request_of(Action.UNSHELVE, 1, sequence=2)])
+    assert unshelved.transition == Transition.UNSHELVED
+
+
+@pytest.mark.parametrize("of", ["judge", "wear"])
+def test_of_a_memory_in_an_older_form_what_operators_keep_quiet_is_gone_on_from(of: str) -> None:
+    memory = note_of(raised())
+    state = json.loads(memory.state_json)
+    state["wear"]["tried"] = 5
+    state[of].popitem()
+    successor = core_of(3)
+    first, *told = successor.restore(replace(memory, state_json=json.dumps(state)))
+    assert isinstance(first, ScorerSnapshot) and first.restored
+    assert successor.counters()["snapshots_not_understood"] == 1
+    assert "is understood in part" in successor.problem()
+    acknowledged, shelved = standing_of(told)
+    assert (acknowledged.is_retained, shelved.is_quiet) == (False, True)
+    assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
+    (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
+    assert (score.state == FanState.COMMISSIONING).all()
+    assert json.loads(note_of(successor).state_json)["wear"]["tried"] == 0, "wear begins anew"
+
+
+def test_what_was_set_aside_is_told_for_a_minute() -> None:
+    successor = core_of(3, sha256="another")
+    successor.restore(note_of(raised()))
+    feed(successor, [prediction_of(np.zeros((5999, 3)), first=100)])
+    assert "the twin is another one" in successor.problem()
+    feed(successor, [prediction_of(np.zeros((2, 3)), first=6099)])
+    assert successor.problem() == ""
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"judge": 1}',
+        '{"judge": {}, "desk": {}}',
+        '{"judge": null, "desk": 3, "fed_by": ""}',
+        "[" * 100_000,
+    ],
+)
+def test_a_memory_that_is_not_understood_is_set_aside_and_counted(state: str) -> None:
+    successor = core_of(3)
+    assert successor.restore(replace(note_of(raised()), state_json=state)) == []
+    assert successor.counters()["snapshots_not_understood"] == 1
+    assert "what was remembered is not understood" in successor.problem()
+    feed(successor, [prediction_of(np.zeros((200, 3)))])
+
+
+@pytest.mark.parametrize("where", ["told", "due", "onset_t_ns"])
+def test_a_memory_of_a_fan_that_is_not_there_is_not_understood(where: str) -> None:
+    memory = note_of(raised())
+    state = json.loads(memory.state_json)
+    fans = state["desk"]["told"] if where == "told" else state["desk"]["diagnoser"][where]
+    fans["99"] = next(iter(fans.values())) if where == "told" else {"due": [0], "onset_t_ns": 0}[where]
+    successor = core_of(3)
+    assert successor.restore(replace(memory, state_json=json.dumps(state))) == []
+    assert successor.counters()["snapshots_not_understood"] == 1
+
+
+def test_a_memory_of_another_number_of_fans_is_not_understood() -> None:
+    successor = core_of(1)
+    assert successor.restore(note_of(raised())) == []
+    assert successor.counters()["snapshots_not_understood"] == 1
+    (score,), _ = feed(successor, [prediction_of(np.zeros(50))])
+    assert (score.state == FanState.COMMISSIONING).all()
+
+
+def restored(first: int, producer: str) -> tuple[ScorerCore, list[Any]]:
+    """A successor of `raised`, which began at sample -1101 and ended at 100, and what it makes of its first block."""
+    successor = core_of(3)
+    successor.restore(note_of(raised()))
+    return successor, list(successor.step(prediction_of(np.zeros((20, 3)), first=first, producer=producer)))
+
+
+@pytest.mark.parametrize(
+    ("first", "producer", "is_anew"),
+    [
+        (50, "integrator-1", False),  # what it still keeps
+        (-HOUR, "integrator-1", False),  # at a slow rate that may be of long ago
+        (50, "integrator-2", False),  # it was killed as well, and takes again what it was given
+        (200, "integrator-2", False),
+        (-HOUR, "integrator-2", True),  # another recording is played
+        (-1101, "integrator-2", True),  # the same is played again
+    ],
+)
+def test_samples_of_another_story_are_judged_anew_and_those_kept_by_producers_are_not(first, producer, is_anew) -> None:
+    successor, messages = restored(first, producer)
+    assert successor.counters().get("snapshots_of_other_times", 0) == is_anew
+    scores = [message for message in messages if isinstance(message, Score)]
+    if is_anew:
+        assert (scores[0].state == FanState.COMMISSIONING).all()
+    else:
+        assert not scores or scores[0].t_ns[0] > prediction_of(np.zeros(1), first=99).t_ns[0]
+
+
+def test_an_alarm_of_another_story_stands_no_longer_whoever_told_it() -> None:
+    successor = core_of(3)
+    restated = successor.restore(note_of(raised()))
+    assert [each.is_retained or each.is_quiet for each in standing_of(restated)] == [True, True]
+    later = successor.step(prediction_of(np.zeros((20, 3)), first=-HOUR, producer="integrator-2"))
+    told = [message for message in later if isinstance(message, Alarm)]
+    assert [alarm.transition for alarm in told] == [Transition.REPUBLISHED] * 2
+    assert [each.is_retained or each.is_quiet for each in standing_of([*restated, *later])] == [False, False]
+    assert [each.is_retained or each.is_quiet for each in standing_of(later)] == [False, False], "nothing was restated"
+
+
+def test_only_what_comes_first_can_be_of_another_story() -> None:
+    successor, _ = restored(50, "integrator-1")
+    feed(successor, [prediction_of(np.zeros((20, 3)), first=-HOUR, producer="integrator-2")])
+    assert "snapshots_of_other_times" not in successor.counters()
+    assert successor.counters()["repeated"] == 40
+
+
+# requests that come again
+
+
+def test_a_request_that_was_answered_is_not_answered_again_after_a_restart() -> None:
+    scorer = raised()
+    successor = core_of(3)
+    successor.restore(note_of(scorer))
+    for sequence, action in enumerate((Action.ACKNOWLEDGE, Action.SHELVE)):
+        assert successor.step(request_of(action, sequence, sequence=sequence, duration_s=60.0)) == []
+    assert successor.counters()["requests_repeated"] == 2
+    _, (answer,) = feed(successor, [request_of(Action.UNSHELVE, 1, sequence=2)])
+    assert answer.transition == Transition.UNSHELVED
+    _, (other,) = feed(successor, [request_of(Action.SHELVE, 1, producer="operator-2", duration_s=9.0)])
+    assert other.transition == Transition.SHELVED
+
+
+def test_requests_are_remembered_of_the_latest_producers_only() -> None:
+    scorer = commissioned(core_of())
+    for number in range(100):
+        feed(scorer, [request_of(Action.SUPPRESS, producer=f"operator-{number}")])
+    known = json.loads(note_of(scorer).state_json)["desk"]["answered"]
+    assert list(known) == [f"operator-{number}" for number in range(36, 100)]
+
+
+def test_all_that_is_remembered_stays_small() -> None:
+    scorer = commissioned(core_of(8), 8)
+    with np.errstate(all="ignore"):
+        feed(scorer, [prediction_of(np.full((300, 8), 50.0))])
+    assert len(note_of(scorer).state_json) < 40_000
+
+
+def test_a_full_disk_is_told_and_stops_nothing(tmp_path: Path) -> None:
+    scorer = core_of(snapshot_store=SnapshotStore(tmp_path / "gone" / "m"))
+    (tmp_path / "gone").write_text("a file where there was a folder")
+    commissioned(scorer)
+    scores, _ = feed(scorer, [prediction_of(np.zeros(10))])
+    assert len(scores) == 1
+    assert "cannot keep baselines and alarms" in scorer.problem()

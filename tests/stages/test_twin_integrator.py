@@ -1,0 +1,431 @@
+"""stages.twin_integrator: a free run on the commands alone, however the grid is cut into messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.config.models import TrayConfig
+from pipeline.runtime.stage import Context, StageError
+from pipeline.runtime.twin_file import StateLayout, TwinFile
+from schemas.blocks import cut, join
+from schemas.messages import Grid, InvalidReason, ModelCard, Prediction
+from stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
+from tests.support.twin_files import PARAMETERS, SIGMA_RAD_S, small_hybrid, still_balance, write_twin
+from twin.models import physics
+from twin.models.integration import step_through
+from twin.models.lag import effective_command
+from twin.models.physics import LAG
+
+EPOCH_NS = 1_700_000_000_000_000_000
+STEP_NS = 10_000_000
+NAN = float("nan")
+Floats = NDArray[np.float64]
+
+
+def run_freely(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+    """The lag and the equation of motion themselves, sample by sample in NumPy."""
+    parameters = np.tile(PARAMETERS, (command.shape[1], 1))
+    acting, lagged = effective_command(command, step_s[:, np.newaxis], parameters[:, LAG], state[:, 1])
+    speed, last = step_through(lambda w, u: physics.acceleration(w, u, parameters), state[:, 0], acting, step_s)
+    return speed, np.column_stack((last, lagged))
+
+
+def physical_twin(fans: int = 1, kind: str = "physical") -> TwinFile:
+    def advance(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+        assert np.isfinite(state).all()
+        assert np.isfinite(command).all()
+        return run_freely(state, command, step_s)
+
+    return TwinFile(
+        name="fake",
+        kind=kind,
+        sha256="0",
+        card_json="{}",
+        layout=StateLayout(speed=1, command=1),
+        sigma_rad_s=np.full(fans, 3.0),
+        balance=still_balance(fans),
+        calibration=None,
+        command_range=(0.0, 100.0),
+        rate_hz=100.0,
+        advance=advance,
+    )
+
+
+def twin_with_friction(friction: float, fans: int = 1) -> TwinFile:
+    """Commands below it do not turn the rotor; the balance has no lag."""
+    twin = physical_twin(fans)
+    balance = replace(twin.balance, friction=np.full(fans, friction), lag_s=np.zeros(fans))
+    return replace(twin, balance=balance)
+
+
+def core_of(twin: TwinFile | None = None, **config: float) -> TwinIntegratorCore:
+    settings = TwinIntegratorConfig.model_validate({"start_samples": 1, "warm_up_s": 0.0, **config})
+    return TwinIntegratorCore(twin or physical_twin(), settings, EPOCH_NS)
+
+
+def grid_of(command: Floats, speed: Floats | None = None, *, first: int = 0, period_ns: int = STEP_NS) -> Grid:
+    """command, speed: (n, fans) or (n,). Without a speed the fans stand."""
+    command = command.reshape(len(command), -1)
+    speed = np.zeros_like(command) if speed is None else speed.reshape(len(command), -1)
+    valid = np.isfinite(speed)
+    return Grid(
+        fans=command.shape[1],
+        period_ns=period_ns,
+        t_ns=EPOCH_NS + (first + np.arange(len(command))) * period_ns,
+        command=command,
+        speed_rad_s=speed,
+        valid=valid,
+        invalid_reason=np.where(valid, InvalidReason.NONE, InvalidReason.NO_SPEED).astype(np.uint8),
+    )
+
+
+def silent(samples: int, first: int, command: float, why: InvalidReason = InvalidReason.GAP) -> Grid:
+    """What the resampler says while the line is silent: the command held, no speed."""
+    grid = grid_of(np.full(samples, command), np.full(samples, NAN), first=first)
+    grid.invalid_reason[:] = why
+    return grid
+
+
+def split(grid: Grid, size: int) -> list[Grid]:
+    samples = len(grid.t_ns)
+    return [cut(grid, k, min(k + size, samples)) for k in range(0, samples, size)]
+
+
+def feed(core: TwinIntegratorCore, grids: Iterable[Grid]) -> Prediction:
+    """All predictions of the grids, as one."""
+    found = [m for grid in grids for m in core.step(grid) if isinstance(m, Prediction)]
+    return join(found)
+
+
+def stairs(samples: int, fans: int = 1, seed: int = 2) -> Floats:
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(10, 90, (samples // 50 + 1, fans)), 50, axis=0)[:samples]
+
+
+def eventful_grid(fans: int) -> Grid:
+    """Steps, noise, a tacho that fails, a short silence, a long one, and a fan that first reads late."""
+    rng = np.random.default_rng(4)
+    grid = grid_of(stairs(900, fans), 100 + rng.normal(0, 3, (900, fans)))
+    invalid_reason = grid.invalid_reason.copy()
+    invalid_reason[:30, 0] = invalid_reason[200:260, 1] = InvalidReason.NO_SPEED
+    invalid_reason[300:330] = invalid_reason[500:600] = InvalidReason.GAP
+    valid = invalid_reason == InvalidReason.NONE
+    speed = np.where(valid, grid.speed_rad_s, NAN)
+    return Grid(
+        fans=fans,
+        period_ns=STEP_NS,
+        t_ns=grid.t_ns,
+        command=grid.command,
+        speed_rad_s=speed,
+        valid=valid,
+        invalid_reason=invalid_reason,
+    )
+
+
+@pytest.mark.parametrize("kind", ["physical", "hybrid"])
+@pytest.mark.parametrize("size", [1, 7, 50])
+def test_the_block_size_does_not_change_a_bit_of_the_prediction(tmp_path: Path, kind: str, size: int) -> None:
+    path = write_twin(tmp_path / "twin.onnx", small_hybrid() if kind == "hybrid" else None)
+    grid = eventful_grid(fans=3)
+    whole, blocks = (
+        feed(core_of(TwinFile.load(path, 3), start_samples=5, warm_up_s=1.0), grids)
+        for grids in ([grid], split(grid, size))
+    )
+    assert 500 < whole.valid.sum() < whole.valid.size
+    for name in ("t_ns", "predicted_speed_rad_s", "valid", "invalid_reason"):
+        np.testing.assert_array_equal(getattr(blocks, name), getattr(whole, name), err_msg=name)
+
+
+def test_the_grid_rate_changes_the_prediction_by_the_integration_error_only(tmp_path: Path) -> None:
+    """Of order four without a lag. With one of order two: the lagged command acts by its mean over each step."""
+
+    def difference_rad_s(lag_s: float, every: int) -> float:
+        path = write_twin(tmp_path / "twin.onnx", small_hybrid(), parameters=[[*PARAMETERS[:LAG], lag_s]])
+        twin = TwinFile.load(path, 1)
+        fast = feed(core_of(twin), [grid_of(command)]).predicted_speed_rad_s
+        slow = feed(core_of(twin), [grid_of(command[::every], period_ns=every * STEP_NS)]).predicted_speed_rad_s
+        assert np.ptp(fast) > 100
+        return float(np.abs(fast[::every] - slow).max())
+
+    command = stairs(2000)
+    assert 0 < difference_rad_s(0.0, 2) < 1e-4
+    lagged = difference_rad_s(0.05, 2)
+    assert 0 < lagged < 0.01 * SIGMA_RAD_S
+    # What the two grids differ by goes with step^2: 5^2 - 1 to 2^2 - 1.
+    assert difference_rad_s(0.05, 5) / lagged == pytest.approx(24 / 3, rel=0.1)
+
+
+def test_the_prediction_is_never_corrected_by_what_is_measured() -> None:
+    command = stairs(500)
+    measured = np.zeros(500)
+    other = measured.copy()
+    other[1:] += 500 * np.random.default_rng(1).normal(size=499)
+    other[100:200] = NAN
+    a, b = (feed(core_of(), [grid_of(command, speed)]) for speed in (measured, other))
+    np.testing.assert_array_equal(a.predicted_speed_rad_s, b.predicted_speed_rad_s)
+    assert (b.invalid_reason[100:200] == InvalidReason.NO_SPEED).all()
+    assert b.valid[200:].all()
+
+
+def test_the_free_run_is_the_model_run_from_the_mean_of_the_first_readings() -> None:
+    speed = np.array([NAN, 10.0, 20.0, 60.0, 0.0, 0.0])
+    command = np.array([5.0, 5.0, 5.0, 40.0, 41.0, 42.0])
+    prediction = feed(core_of(start_samples=3), [grid_of(command, speed)])
+    predicted = prediction.predicted_speed_rad_s[:, 0]
+    expected, _ = run_freely(np.array([[30.0, 40.0]]), command[3:, np.newaxis], np.full(3, 0.01))
+    assert np.isnan(predicted[:3]).all()
+    np.testing.assert_allclose(predicted[3:], expected[:, 0], rtol=1e-12)
+    assert (
+        prediction.invalid_reason[:, 0].tolist()
+        == [InvalidReason.NO_SPEED] + [InvalidReason.WARMING_UP] * 2 + [InvalidReason.NONE] * 3
+    )
+
+
+def test_a_free_run_is_not_judged_while_it_warms_up() -> None:
+    prediction = feed(core_of(warm_up_s=0.5, start_samples=2), [grid_of(stairs(100))])
+    assert prediction.invalid_reason[:, 0].tolist() == [InvalidReason.WARMING_UP] * 51 + [InvalidReason.NONE] * 49
+
+
+def test_a_short_silence_is_run_through_on_the_held_command() -> None:
+    command = np.concatenate([np.full(100, 40.0), np.full(50, 40.0), np.full(100, 70.0)])
+    without = feed(core_of(), [grid_of(command)])
+    core = core_of()
+    grids = [grid_of(command[:100]), silent(50, 100, 40.0), grid_of(command[150:], first=150)]
+    prediction = feed(core, grids)
+    np.testing.assert_array_equal(prediction.predicted_speed_rad_s, without.predicted_speed_rad_s)
+    assert (prediction.invalid_reason[100:150] == InvalidReason.GAP).all()
+    assert prediction.valid[150:].all()
+    assert core.counters()["free_runs"] == 1
+
+
+def test_a_long_silence_ends_the_free_run_and_a_new_one_begins_when_the_line_returns() -> None:
+    core = core_of(warm_up_s=0.1)
+    grids = [
+        grid_of(np.full(100, 40.0)),
+        silent(52, 100, 40.0),
+        grid_of(np.full(50, 40.0), np.full(50, 7.0), first=152),
+    ]
+    prediction = feed(core, grids)
+    assert np.isfinite(prediction.predicted_speed_rad_s[150])  # until here the last command was held for 0.5 s
+    assert np.isnan(prediction.predicted_speed_rad_s[151])
+    assert prediction.predicted_speed_rad_s[152] == 7.0
+    assert prediction.invalid_reason[152:, 0].tolist() == [InvalidReason.WARMING_UP] * 10 + [InvalidReason.NONE] * 40
+    assert core.counters()["free_runs"] == 2
+
+
+def test_lost_grid_samples_are_counted_and_run_through() -> None:
+    grid = grid_of(np.full(300, 40.0))
+    whole = feed(core_of(), [grid])
+    core = core_of()
+    holed = feed(core, [cut(grid, 0, 100), cut(grid, 120, 300)])
+    assert core.counters()["lost_grid_samples"] == 20
+    np.testing.assert_allclose(holed.predicted_speed_rad_s[100:], whole.predicted_speed_rad_s[120:], rtol=1e-12)
+
+
+def test_a_large_loss_starts_the_free_run_anew() -> None:
+    core = core_of()
+    feed(core, [grid_of(np.full(100, 40.0)), grid_of(np.full(100, 40.0), np.full(100, 7.0), first=200)])
+    assert core.counters()["lost_grid_samples"] == 100
+    assert core.counters()["free_runs"] == 2
+
+
+def test_a_jump_that_the_resampler_announced_is_no_loss() -> None:
+    core = core_of()
+    later = grid_of(np.full(100, 40.0), first=1_000_000)
+    feed(core, [grid_of(np.full(100, 40.0)), silent(500, 100, 40.0, InvalidReason.STALE), later])
+    assert "lost_grid_samples" not in core.counters()
+    assert core.counters()["free_runs"] == 2
+
+
+def test_samples_that_were_seen_are_dropped_and_counted() -> None:
+    grid = grid_of(stairs(300))
+    whole = feed(core_of(), [grid])
+    core = core_of()
+    again = feed(core, [cut(grid, 0, 200), cut(grid, 50, 150), cut(grid, 150, 300)])
+    assert core.counters()["repeated"] == 150
+    np.testing.assert_array_equal(again.t_ns, whole.t_ns)
+    np.testing.assert_allclose(again.predicted_speed_rad_s, whole.predicted_speed_rad_s, rtol=1e-12)
+
+
+def test_a_command_outside_what_the_twin_was_made_from_is_not_judged() -> None:
+    core = core_of()
+    prediction = feed(core, [grid_of(np.array([40.0, 104.9, 105.1, -5.1, -4.9]))])
+    out = InvalidReason.OUT_OF_RANGE
+    assert prediction.invalid_reason[:, 0].tolist() == [
+        InvalidReason.NONE,
+        InvalidReason.NONE,
+        out,
+        out,
+        InvalidReason.NONE,
+    ]
+    assert core.counters()["not_predicted_out_of_range"] == 2
+
+
+def why_not_of(command: list[float], **config: float) -> list[int]:
+    core = core_of(twin_with_friction(10.0), warm_up_s=0.03, **config)
+    return feed(core, [grid_of(np.array([40.0] * 5 + command))]).invalid_reason[5:, 0].tolist()
+
+
+@pytest.mark.parametrize("out", [9.9, 0.0, -50.0, 105.1, 1e6])
+def test_after_a_command_out_of_range_or_too_small_to_turn_the_rotor_the_twin_must_settle(out: float) -> None:
+    beyond, young, good = InvalidReason.OUT_OF_RANGE, InvalidReason.WARMING_UP, InvalidReason.NONE
+    assert why_not_of([out, out, 40.0, 10.0, 40.0, 40.0]) == [beyond, beyond, young, young, good, good]
+
+
+def test_after_a_command_that_is_not_known_it_need_not() -> None:
+    assert why_not_of([NAN, 40.0, np.inf, 40.0]) == [InvalidReason.OUT_OF_RANGE, InvalidReason.NONE] * 2
+
+
+def test_it_must_settle_over_the_end_of_a_block_as_well() -> None:
+    core = core_of(twin_with_friction(10.0), warm_up_s=0.03)
+    grid = grid_of(np.array([40.0] * 5 + [0.0] + [40.0] * 4))
+    assert feed(core, split(grid, 6)).valid[:, 0].tolist() == [False] * 3 + [True] * 2 + [False] * 3 + [True] * 2
+
+
+def test_a_friction_amidst_the_commands_of_a_fan_that_was_held_at_one_speed_is_no_dead_zone() -> None:
+    held = replace(twin_with_friction(25.6), command_range=(24.5, 27.3))
+    prediction = feed(core_of(held), [grid_of(np.full(100, 25.0), np.full(100, 31.0))])
+    assert prediction.valid.all()
+    assert np.isfinite(prediction.torque_balance_command[40:]).all()
+
+
+def test_without_friction_a_small_or_reversed_command_is_as_good_as_any() -> None:
+    reversing = replace(physical_twin(), command_range=(-100.0, 100.0))
+    assert feed(core_of(reversing), [grid_of(np.array([40.0, 0.0, -50.0, -104.0]))]).valid.all()
+
+
+def test_an_unknown_command_of_one_fan_never_reaches_the_graph_and_leaves_the_other_alone() -> None:
+    command = np.full((200, 2), 40.0)
+    whole = feed(core_of(physical_twin(2)), [grid_of(command)])
+    command[100:170, 0] = NAN
+    prediction = feed(core_of(physical_twin(2)), [grid_of(command)])
+    np.testing.assert_array_equal(prediction.predicted_speed_rad_s[:, 1], whole.predicted_speed_rad_s[:, 1])
+    assert not prediction.valid[100:170, 0].any()
+    assert np.isnan(prediction.predicted_speed_rad_s[151:170, 0]).all()
+
+
+def test_a_twin_that_diverges_is_not_judged_and_is_started_anew() -> None:
+    twin = physical_twin()
+    unstable = TwinFile(**{**vars(twin), "advance": lambda s, c, h: (np.where(c > 50, np.inf, c), s)})
+    core = core_of(unstable)
+    prediction = feed(core, split(grid_of(np.array([40.0, 40.0, 60.0, 40.0, 40.0])), 1))
+    out = InvalidReason.OUT_OF_RANGE
+    assert prediction.invalid_reason[:, 0].tolist() == [
+        InvalidReason.NONE,
+        InvalidReason.NONE,
+        out,
+        InvalidReason.NONE,
+        InvalidReason.NONE,
+    ]
+    assert (core.counters()["diverged"], core.counters()["free_runs"]) == (1, 2)
+
+
+def test_a_fan_whose_twin_diverged_never_feeds_the_graph_what_is_no_number() -> None:
+    def advance(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+        assert np.isfinite(state).all()
+        speed = np.where(command > 50, np.inf, command)
+        return speed, np.column_stack((speed[-1], command[-1]))
+
+    core = core_of(TwinFile(**{**vars(physical_twin(2)), "advance": advance}), start_samples=2)
+    command = np.full((20, 2), 40.0)
+    command[5, 0] = 60.0
+    prediction = feed(core, split(grid_of(command), 1))
+    assert prediction.valid[2:, 1].all()
+    assert prediction.invalid_reason[4:9, 0].tolist() == [0, InvalidReason.OUT_OF_RANGE, InvalidReason.WARMING_UP, 0, 0]
+
+
+def test_readings_from_before_a_silence_do_not_start_a_free_run_after_it() -> None:
+    after = grid_of(np.full(5, 40.0), np.full(5, 7.0), first=104)
+    prediction = feed(core_of(start_samples=5), [grid_of(np.full(4, 40.0)), silent(100, 4, 40.0), after])
+    assert np.isnan(prediction.predicted_speed_rad_s[:-1]).all()
+    assert prediction.predicted_speed_rad_s[-1] == pytest.approx(7.0)
+
+
+def test_a_discrete_twin_at_another_rate_says_so_and_judges_nothing() -> None:
+    core = core_of(physical_twin(kind="narx"))
+    prediction = feed(core, [grid_of(stairs(20), period_ns=2 * STEP_NS)])
+    assert (prediction.invalid_reason == InvalidReason.NO_TWIN).all()
+    assert "rate_hz = 100" in core.problem()
+    assert feed(core_of(physical_twin(kind="narx")), [grid_of(stairs(20))]).valid.all()
+
+
+def test_the_whole_block_of_all_fans_is_one_run_of_the_graph() -> None:
+    twin, shapes = physical_twin(4), []
+
+    def counted(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+        shapes.append(command.shape)
+        return twin.advance(state, command, step_s)
+
+    core = core_of(TwinFile(**{**vars(twin), "advance": counted}))
+    core.step(grid_of(stairs(50, 4)))
+    core.step(grid_of(stairs(50, 4), first=50))
+    assert shapes == [(50, 4), (50, 4)]
+
+
+def test_the_card_is_published_once() -> None:
+    core = core_of()
+    first = [*core.tick(0), *core.step(grid_of(stairs(5))), *core.tick(1)]
+    assert [type(m) for m in first] == [ModelCard, Prediction]
+    assert isinstance(first[0], ModelCard)
+    assert (first[0].twin, first[0].t_ns) == ("fake", EPOCH_NS)
+    replayed = core_of().step(grid_of(stairs(5)))
+    assert [type(m) for m in replayed] == [ModelCard, Prediction]
+
+
+def test_what_was_measured_goes_through_untouched() -> None:
+    speed = np.random.default_rng(0).normal(size=(20, 1))
+    prediction = feed(core_of(), [grid_of(stairs(20), speed)])
+    np.testing.assert_array_equal(prediction.measured_speed_rad_s, speed)
+    np.testing.assert_array_equal(prediction.sigma_rad_s, [3.0])
+
+
+def test_another_number_of_fans_is_lost_and_said_to_be() -> None:
+    core = core_of()
+    core.step(grid_of(stairs(5, 2)))
+    assert core.counters()["lost_wrong_fan_count"] == 5
+    assert "fans = 1" in core.problem()
+
+
+def _context(folder: Path, twin: Path | None) -> Context:
+    tray = TrayConfig(name="tray1", fans=2, twin=twin)
+    return Context("site", (tray,), TwinIntegratorConfig(), folder, folder, EPOCH_NS)
+
+
+def test_a_tray_without_a_twin_is_told_what_to_set(tmp_path: Path) -> None:
+    with pytest.raises(StageError, match=r'tray tray1 has no twin: set \[\[tray\]\] twin = "FILE.onnx"'):
+        STAGE.build(_context(tmp_path, None))
+
+
+def test_the_twin_is_found_beside_the_configuration(tmp_path: Path) -> None:
+    write_twin(tmp_path / "twin.onnx")
+    assert STAGE.build(_context(tmp_path, Path("twin.onnx"))).core.tick(0)
+
+
+def test_a_bridge_of_absurdly_many_samples_is_not_run() -> None:
+    steps: list[int] = []
+    twin = physical_twin()
+
+    def counted(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+        steps.append(len(command))
+        return np.zeros(command.shape), state
+
+    core = core_of(replace(twin, advance=counted))
+    grid = grid_of(np.zeros(2), period_ns=1)
+    grid.t_ns[1] = grid.t_ns[0] + 300_000_000  # within hold_limit_s
+    core.step(grid)
+    assert sum(steps) <= 4
+    assert core.counters()["free_runs"] == 2
+
+
+def test_a_problem_is_said_only_until_a_grid_comes_that_fits() -> None:
+    core = core_of()
+    core.step(grid_of(np.zeros((1, 2))))
+    assert "grid of 2 fans" in core.problem()
+    core.step(grid_of(np.zeros(1)))
+    assert core.problem() == ""

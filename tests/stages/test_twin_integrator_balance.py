@@ -1,0 +1,144 @@
+"""stages.twin_integrator: the torque balance beside the prediction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from schemas.blocks import cut
+from schemas.messages import Grid, InvalidReason
+from tests.stages.test_twin_integrator import (
+    NAN,
+    PARAMETERS,
+    STEP_NS,
+    Floats,
+    core_of,
+    feed,
+    grid_of,
+    physical_twin,
+    run_freely,
+    silent,
+    split,
+    stairs,
+    twin_with_friction,
+)
+from tests.support.twin_files import SIGMA_COMMAND
+
+SETTLES = 31
+"""samples until it is there: a third of a second"""
+
+
+def healthy(samples: int = 400, extra: float = 0.0) -> Grid:
+    """A fan as the twin's card has it, on stairs; `extra` is given on top of what it needs, in the later half."""
+    command = stairs(samples) + 20.0
+    start = np.array([[100.0, command[0, 0]]])
+    speed, _ = run_freely(start, command, np.full(samples, STEP_NS / 1e9))
+    command = command + extra * (np.arange(samples) >= samples // 2)[:, np.newaxis]
+    return grid_of(command, speed)
+
+
+def balance(grids: list[Grid], friction: float = 0.0) -> Floats:
+    twin = twin_with_friction(friction) if friction else physical_twin()
+    return feed(core_of(twin), grids).torque_balance_command[:, 0]
+
+
+def test_a_healthy_fan_needs_what_it_is_given() -> None:
+    found = balance([healthy()])
+    assert np.isnan(found[: SETTLES - 1]).all() and np.isfinite(found[SETTLES:]).all()
+    assert np.abs(found[SETTLES:]).max() < 0.3
+
+
+def test_what_is_given_on_top_is_the_balance() -> None:
+    found = balance([healthy(extra=5.0)])
+    assert found[-1] == pytest.approx(5.0, abs=0.3)
+
+
+def test_it_carries_the_healthy_deviation_of_each_fan() -> None:
+    prediction = feed(core_of(physical_twin(2)), [grid_of(stairs(5, 2))])
+    assert prediction.torque_balance_sigma_command.tolist() == [SIGMA_COMMAND] * 2
+
+
+@pytest.mark.parametrize("size", [1, 7, 50])
+def test_it_is_the_same_to_the_bit_however_the_grid_is_cut(size: int) -> None:
+    grid = healthy(extra=5.0)
+    assert balance(split(grid, size)).tobytes() == balance([grid]).tobytes()
+
+
+def where_known(found: Floats) -> list[int]:
+    """First and last sample of each stretch in which it is there."""
+    edges = np.flatnonzero(np.diff(np.isfinite(found).astype(int), prepend=0, append=0))
+    return [int(edge) for edge in edges]
+
+
+def test_after_missing_samples_it_begins_anew() -> None:
+    grid = healthy()
+    first, second = cut(grid, 0, 225), cut(grid, 225, 400)  # in the middle of a stair: the lag has settled
+    jumped = replace(second, t_ns=second.t_ns + 10 * STEP_NS)
+    one_block = replace(grid, t_ns=np.concatenate((first.t_ns, jumped.t_ns)))
+    for grids in ([first, jumped], [one_block], split(one_block, 1)):
+        found = balance(grids)
+        begins, ends, again, end = where_known(found)
+        assert (ends, end) == (225, 400)
+        assert again - 225 == begins == SETTLES
+        assert np.abs(found[again:]).max() < 0.3
+
+
+def test_one_sample_of_another_length_is_no_gap() -> None:
+    grid = healthy()
+    grid.t_ns[200:] += STEP_NS // 3
+    assert where_known(balance([grid])) == [SETTLES, 400]
+
+
+def test_without_a_reading_or_a_command_there_is_none_and_it_begins_anew() -> None:
+    for column in ("speed_rad_s", "command"):
+        grid = healthy()
+        getattr(grid, column)[200] = NAN
+        found = balance([grid])
+        assert where_known(found) == [SETTLES, 200, 201 + SETTLES, 400]
+
+
+def test_a_silent_line_has_none() -> None:
+    found = balance([healthy(200), silent(50, 200, 40.0), silent(50, 250, 40.0, InvalidReason.STALE)])
+    assert where_known(found) == [SETTLES, 200]
+
+
+def test_a_drive_that_is_off_is_another_machine() -> None:
+    grid = healthy()
+    grid.command[200:220] = 1.0
+    found = balance([grid], friction=5.0)
+    begins, ends, again, end = where_known(found)
+    assert (begins, ends, end) == (SETTLES, 200, 400)
+    assert again >= 220 + SETTLES
+
+
+def test_at_another_rate_of_the_grid_it_begins_anew() -> None:
+    first = healthy(200)
+    second = grid_of(np.full(200, 40.0), np.full(200, 100.0), first=1000, period_ns=2 * STEP_NS)
+    core = core_of()
+    assert where_known(feed(core, [first]).torque_balance_command[:, 0]) == [SETTLES, 200]
+    assert where_known(feed(core, [second]).torque_balance_command[:, 0]) == [(SETTLES + 1) // 2, 200]
+
+
+def test_it_needs_no_free_run() -> None:
+    twin = physical_twin(kind="narx")
+    prediction = feed(core_of(replace(twin, rate_hz=50.0)), [healthy()])
+    assert not prediction.valid.any()
+    assert (prediction.invalid_reason == InvalidReason.NO_TWIN).all()
+    assert np.isfinite(prediction.torque_balance_command[SETTLES:]).all()
+
+
+def test_far_above_the_speeds_it_was_made_from_nobody_knows_what_a_fan_needs() -> None:
+    twin = replace(physical_twin(), card_json='{"speed_range_rad_s": [0, 200]}')
+    fast = grid_of(np.full(100, 60.0), np.full(100, 301.0))
+    slower = grid_of(np.full(100, 60.0), np.full(100, 299.0))
+    assert np.isnan(feed(core_of(twin), [fast]).torque_balance_command).all()
+    assert np.isfinite(feed(core_of(twin), [slower]).torque_balance_command[SETTLES:]).all()
+
+
+def test_the_fan_of_these_tests_is_the_one_of_the_card() -> None:
+    balance = physical_twin().balance
+    assert [float(balance.inertia[0]), float(balance.viscous[0]), float(balance.drag[0])] == pytest.approx(
+        PARAMETERS[:3]
+    )

@@ -1,0 +1,503 @@
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import textwrap
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.config.models import TrayConfig
+from pipeline.runtime.stage import Context, Core, StageError
+from pipeline.viewing.trace import Trace
+from schemas.messages import (
+    Alarm,
+    FanState,
+    Header,
+    Health,
+    InvalidReason,
+    ModelCard,
+    Score,
+    Severity,
+    StageStatus,
+    Transition,
+)
+from schemas.units import RAD_S_PER_UNIT
+from stages.viewer import (
+    FLUSH_PERIOD_NS,
+    PAGE_PERIOD_NS,
+    REPEAT_STATES_NS,
+    SAMPLES_HELD,
+    ViewerConfig,
+    ViewerCore,
+    alarm_line,
+    build,
+)
+from tests.support.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
+
+LATER_NS = START_NS + 400 * 86_400 * 1_000_000_000  # the host's time while what was recorded at START_NS is replayed
+
+
+@dataclass
+class FakeSink:
+    """Remembers what it was handed."""
+
+    traces: list[Trace] = field(default_factory=list)
+    states: list[tuple[str, int, list[int], list[str]]] = field(default_factory=list)
+    lines: list[tuple[str, int, str, str]] = field(default_factory=list)
+    pages: list[str] = field(default_factory=list)
+    flushed: int = 0
+    closed: bool = False
+
+    def draw(self, trace: Trace) -> None:
+        self.traces.append(trace)
+
+    def change_states(self, tray: str, fan: int, t_ns: Any, names: Sequence[str]) -> None:
+        self.states.append((tray, fan, t_ns.tolist(), list(names)))
+
+    def log(self, tray: str, t_ns: int, level: str, text: str) -> None:
+        self.lines.append((tray, t_ns, level, text))
+
+    def show_stages(self, page: str) -> None:
+        self.pages.append(page)
+
+    def flush(self) -> None:
+        self.flushed = len(self.traces)
+
+    def close(self) -> None:
+        self.closed = True
+
+    def lane(self, fan: int) -> list[tuple[float, str]]:
+        """A fan's lane: (s since the start, state)."""
+        return [
+            ((t - START_NS) / 1e9, name)
+            for _, of, times, names in self.states
+            if of == fan
+            for t, name in zip(times, names, strict=True)
+        ]
+
+
+def core_of(sink: FakeSink, fans: int = 3, **tray: Any) -> ViewerCore:
+    return ViewerCore([TrayConfig(name="tray1", fans=fans, **tray)], sink)
+
+
+def play(core: Core, scores: Sequence[Score]) -> None:
+    """Hand over scores with a tick after each, as the runner does."""
+    for score in scores:
+        core.step(score)
+        core.tick(int(score.t_ns[-1]))
+
+
+@pytest.mark.parametrize(
+    ("more", "level", "text"),
+    [
+        ({"transition": Transition.RAISED}, "WARN", "warning raised: so"),
+        ({"transition": Transition.REPUBLISHED, "severity": Severity.ALARM}, "ERROR", "alarm restated: so"),
+        ({"transition": Transition.CLEARED, "active": False}, "INFO", "cleared: so"),
+        (
+            {"transition": Transition.REPUBLISHED, "active": False, "severity": Severity.NONE, "suppressed": True},
+            "INFO",
+            "restated (never raised, suppressed): so",
+        ),
+    ],
+)
+def test_the_log_says_what_happened_to_an_alarm_and_how_bad_it_is(more: dict[str, Any], level: str, text: str) -> None:
+    told = {"fan": 0, "active": True, "severity": Severity.WARNING, "t_ns": 1, "onset_t_ns": 1, "acknowledged": True}
+    told |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "so", "confirmed": True}
+    assert alarm_line(Alarm(**told | more)) == (level, text)
+
+
+def test_samples_are_drawn_twice_a_second_and_none_is_left_out_or_drawn_twice() -> None:
+    sink = FakeSink()
+    scores, _ = made_up_tray(seconds=10, block=5)
+    core = core_of(sink)
+    play(core, scores)
+    drawn_before_close = len(sink.traces)
+    core.close()
+    assert FLUSH_PERIOD_NS == 500_000_000
+    assert drawn_before_close in (20, 21)
+    assert sink.closed and sink.flushed == len(sink.traces)
+    times = np.concatenate([trace.t_ns for trace in sink.traces])
+    assert times.tolist() == np.concatenate([score.t_ns for score in scores]).tolist()
+    assert core.counters()["samples_drawn"] == 1000
+
+
+def test_without_ticks_no_more_than_a_bound_is_held() -> None:
+    sink = FakeSink()
+    scores, _ = made_up_tray(seconds=100, fans=1, block=64, gap_fan=None, faulty_fan=None)
+    core = core_of(sink, fans=1)
+    for score in scores:
+        core.step(score)
+    assert [len(trace.t_ns) for trace in sink.traces] == [SAMPLES_HELD, SAMPLES_HELD]
+
+
+def test_a_lane_follows_the_states_to_the_sample_and_says_why_a_state_is_unknown() -> None:
+    sink = FakeSink()
+    scores, _ = made_up_tray(seconds=4, fans=2, faulty_fan=0, fault_s=(1.0, 2.0), gap_fan=1, gap_s=(2.5, 3.0))
+    play(core_of(sink, fans=2), scores)
+    assert sink.lane(0) == [(0, "normal"), (1, "suspect"), (1.5, "alarm"), (2, "returning"), (2.5, "normal")]
+    assert sink.lane(1) == [(0, "normal"), (2.5, "unknown: gap"), (3, "normal")]
+
+
+def test_a_change_of_reason_is_a_change_of_state() -> None:
+    sink = FakeSink()
+    (score,), _ = made_up_tray(seconds=0.1, fans=1, faulty_fan=None, gap_fan=None)
+    state = np.full((10, 1), FanState.UNKNOWN, np.uint8)
+    invalid_reason = np.array([[InvalidReason.WARMING_UP]] * 4 + [[InvalidReason.SATURATED]] * 6, np.uint8)
+    core = core_of(sink, fans=1)
+    core.step(changed(score, state=state, invalid_reason=invalid_reason, valid=np.zeros((10, 1), bool)))
+    core.close()
+    assert sink.lane(0) == [(0, "unknown: warming up"), (0.04, "unknown: saturated")]
+
+
+def test_a_steady_state_is_told_again_for_viewers_that_join_late() -> None:
+    sink = FakeSink()
+    scores, _ = made_up_tray(seconds=16, fans=1, faulty_fan=None, gap_fan=None)
+    play(core_of(sink, fans=1), scores)
+    times = [t for t, _ in sink.lane(0)]
+    assert len(times) == 4
+    assert (np.diff(times)[1:] * 1e9 >= REPEAT_STATES_NS).all()
+
+
+def test_what_is_not_judged_has_no_band_and_is_never_outside_it() -> None:
+    sink = FakeSink()
+    scores, _ = made_up_tray(seconds=4, fans=2, faulty_fan=None, gap_fan=1, gap_s=(1.0, 2.0))
+    lying = [changed(score, outside=np.ones_like(score.outside)) for score in scores]
+    core = core_of(sink, fans=2)
+    play(core, lying)
+    core.close()
+    predicted = np.concatenate([trace.predicted for trace in sink.traces])
+    outside = np.concatenate([trace.outside for trace in sink.traces])
+    gap = slice(100, 200)
+    assert np.isnan(predicted[gap, 1]).all() and np.isfinite(predicted[gap, 0]).all()
+    assert np.isfinite(np.delete(predicted[:, 1], np.arange(100, 200))).all()
+    assert not outside[gap, 1].any() and outside[gap, 0].all()
+
+
+def test_speeds_are_shown_in_the_unit_of_the_tray() -> None:
+    sink = FakeSink()
+    scores, alarms = made_up_tray(seconds=1, gap_fan=None, faulty_fan=2, fault_s=(0.0, 1.0))
+    core = core_of(sink, speed_unit="rpm")
+    core.step(scores[0])
+    core.step(alarms[0])
+    core.close()
+    rpm = 60 / (2 * np.pi)
+    np.testing.assert_allclose(sink.traces[0].measured, scores[0].measured_speed_rad_s * rpm)
+    np.testing.assert_allclose(sink.traces[0].half_width, 2 * SIGMA * rpm)
+    assert alarms[0].message in sink.lines[0][3]
+
+
+def test_alarms_go_to_the_log_of_their_tray_at_the_samples_time() -> None:
+    sink = FakeSink()
+    _, alarms = made_up_tray()
+    core = core_of(sink)
+    for alarm in alarms:
+        core.step(alarm)
+    assert [line[:3] for line in sink.lines] == [
+        ("tray1", alarms[0].t_ns, "ERROR"),
+        ("tray1", alarms[1].t_ns, "INFO"),
+    ]
+    assert "alarm raised" in sink.lines[0][3] and "cleared" in sink.lines[1][3]
+
+
+def test_what_the_stages_and_the_twin_say_is_a_page_that_is_replaced_when_it_changes() -> None:
+    sink = FakeSink()
+    core = core_of(sink)
+    core.step(health())
+    core.tick(LATER_NS)
+    core.step(health())
+    core.tick(LATER_NS + PAGE_PERIOD_NS)
+    assert len(sink.pages) == 1
+    core.step(card())
+    core.step(health(problem="the port is gone"))
+    core.tick(LATER_NS + 2 * PAGE_PERIOD_NS)
+    assert len(sink.pages) == 2 and sink.lines == []
+    assert "f40" not in sink.pages[0] and "f40" in sink.pages[1] and "the port is gone" in sink.pages[1]
+
+
+def test_pages_that_change_all_the_time_are_shown_now_and_then_and_the_last_one_always() -> None:
+    sink = FakeSink()
+    core = core_of(sink)
+    for tenth in range(200):
+        core.step(health(problem=f"problem {tenth}"))
+        core.tick(LATER_NS + tenth * 100_000_000)
+    assert PAGE_PERIOD_NS == 5_000_000_000 and len(sink.pages) == 4
+    core.close()
+    assert len(sink.pages) == 5 and "problem 199" in sink.pages[-1]
+
+
+def test_scores_that_do_not_fit_the_configuration_are_counted_and_told() -> None:
+    sink = FakeSink()
+    core = core_of(sink, fans=4)
+    scores, _ = made_up_tray(seconds=1, fans=3)
+    assert core.problem() == ""
+    play(core, scores)
+    core.close()
+    assert sink.traces == []
+    assert core.counters()["wrong_fan_count"] == len(scores)
+    assert "fans" in core.problem()
+
+
+def test_without_the_extra_the_stage_loads_and_building_it_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    for name in [name for name in sys.modules if name.startswith("pipeline.rerun")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(StageError, match=r"pip install -e '\.\[view\]'"):
+        build(context(tmp_path))
+
+
+def test_importing_the_stage_does_not_import_rerun() -> None:
+    code = "import sys, stages.viewer; sys.exit('rerun' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp_path: Path) -> None:
+    scores, alarms = made_up_tray(seconds=20)
+    core = build(context(tmp_path, speed_unit="rpm")).core
+    for item in (*scores, *alarms):
+        core.step(item)
+        core.tick(item.t_ns if isinstance(item.t_ns, int) else int(item.t_ns[-1]))
+    core.close()
+    rows = rows_of(tmp_path / "view.rrd")
+    speed = rows["/tray1/fan_2/speed"]
+    assert [t for t, _ in speed] == np.concatenate([score.t_ns for score in scores]).tolist()
+    measured, predicted = np.array([row["Measurements:values"] for _, row in speed]).T
+    rpm = 1 / RAD_S_PER_UNIT["rpm"]
+    np.testing.assert_allclose(measured, np.concatenate([s.measured_speed_rad_s[:, 2] for s in scores]) * rpm)
+    np.testing.assert_allclose(predicted, np.concatenate([s.predicted_speed_rad_s[:, 2] for s in scores]) * rpm)
+    np.testing.assert_allclose([row["Measurements:variances"][1] for _, row in speed], (2 * SIGMA * rpm) ** 2)
+    assert styles_of(tmp_path / "view.rrd", "/tray1/fan_2/speed", "Measurements:names") == [
+        "measured (rpm)",
+        "twin ± 2σ (rpm)",
+    ]
+    outside = np.concatenate([score.outside[:, 2] for score in scores])
+    assert len(rows["/tray1/fan_2/outside"]) == np.count_nonzero(outside)
+    states = [row["StateChange:state"][0] for _, row in rows["/tray1/state/fan_2"]]
+    assert [name for name, _ in groupby(states)] == ["normal", "suspect", "alarm", "returning", "normal"]
+    assert [row["TextLog:level"][0] for _, row in rows["/tray1/log"]] == ["ERROR", "INFO"]
+
+
+def test_a_recording_of_long_ago_is_all_there_is_in_time_whatever_the_stages_say_today(tmp_path: Path) -> None:
+    scores, alarms = made_up_tray(seconds=2)
+    core = build(context(tmp_path)).core
+    for number, item in enumerate((health(), card(), *scores, *alarms, health(lost=3, problem="two | *lines*"))):
+        core.step(item)
+        core.tick(LATER_NS + number * FLUSH_PERIOD_NS)
+    core.close()
+    rows = rows_of(tmp_path / "view.rrd")
+    times = [t_ns for entity in rows.values() for t_ns, _ in entity]
+    assert min(times) == int(scores[0].t_ns[0])
+    assert max(times) == max(int(scores[-1].t_ns[-1]), *(alarm.t_ns for alarm in alarms))
+    page = pages_of(tmp_path / "view.rrd")[-1]
+    assert "| scorer | **degraded** | **3** |" in page
+    assert r"- **scorer**: two \| \*lines\*" in page and "f40" in page
+
+
+def test_an_alarm_zone_lies_beyond_the_band_on_both_sides_and_ends_with_the_alarm(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(seconds=20, fault_s=(8.0, 14.0))
+    core = build(context(tmp_path)).core
+    play(core, scores)
+    core.close()
+    rows = rows_of(tmp_path / "view.rrd")
+    zone = rows["/tray1/fan_2/alarm_zone"]
+    predicted = dict(rows["/tray1/fan_2/speed"])
+    red = [(t, row) for t, row in zone if np.isfinite(row["Measurements:values"]).all()]
+    assert [(t - START_NS) / 1e9 for t, _ in (red[0], red[-1])] == [8.5, 14.5 - STEP_NS / 1e9]
+    assert np.isnan(zone[-1][1]["Measurements:values"]).all()
+    for t, row in red:
+        (above, below), (variance, _) = row["Measurements:values"], row["Measurements:variances"]
+        middle = predicted[t]["Measurements:values"][1]
+        assert above - np.sqrt(variance) == pytest.approx(middle + 2 * SIGMA)
+        assert below + np.sqrt(variance) == pytest.approx(middle - 2 * SIGMA)
+    assert "/tray1/fan_0/alarm_zone" not in rows
+
+
+def test_a_zone_that_fills_a_flush_to_its_end_is_ended_by_the_next_one(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(seconds=0.3, fans=1, faulty_fan=None, gap_fan=None)
+    in_alarm = np.full((10, 1), FanState.ALARM, np.uint8)
+    core = build(context(tmp_path, fans=1)).core
+    for number, score in enumerate((changed(scores[0], state=in_alarm), *scores[1:])):
+        core.step(score)
+        core.tick((number + 1) * FLUSH_PERIOD_NS)
+    core.close()
+    zone = rows_of(tmp_path / "view.rrd")["/tray1/fan_0/alarm_zone"]
+    drawn = [bool(np.isfinite(row["Measurements:values"]).all()) for _, row in zone]
+    assert drawn == [True] * 10 + [False] * 10
+
+
+def test_samples_that_are_not_judged_leave_a_hole_in_measured_and_are_kept_apart_in_grey(tmp_path: Path) -> None:
+    (score,), _ = made_up_tray(seconds=0.2, fans=1, block=20, faulty_fan=None, gap_fan=None)
+    valid = np.ones((20, 1), bool)
+    valid[5:10] = False
+    core = build(context(tmp_path, fans=1)).core
+    core.step(changed(score, valid=valid))
+    core.close()
+    rows = rows_of(tmp_path / "view.rrd")
+    judged = np.array([row["Measurements:values"][0] for _, row in rows["/tray1/fan_0/speed"]])
+    grey = np.array([row["Scalars:scalars"][0] for _, row in rows["/tray1/fan_0/not_judged"]])
+    assert np.isfinite(judged).tolist() == valid[:, 0].tolist()
+    np.testing.assert_array_equal(grey[5:10], score.measured_speed_rad_s[5:10, 0])
+    assert np.isnan(np.delete(grey, np.arange(5, 10))).all()
+
+
+def test_a_view_that_exists_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "view.rrd").write_bytes(b"earlier")
+    for _ in range(2):
+        build(context(tmp_path)).core.close()
+    assert (tmp_path / "view.rrd").read_bytes() == b"earlier"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["view-2.rrd", "view-3.rrd", "view.rrd"]
+
+
+def test_a_file_that_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(StageError, match="cannot write the view") as caught:
+        build(context(tmp_path, file="file/view.rrd"))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["grpc_port", "web_port"])
+def test_a_taken_port_is_told_in_one_line_and_no_file_is_begun(tmp_path: Path, key: str) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        ports = {"grpc_port": free_port(), "web_port": 0, key: taken.getsockname()[1]}
+        with pytest.raises(StageError, match=rf"viewer\.{key}: port \d+ .* is taken") as caught:
+            build(context(tmp_path, serve=True, **ports))
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.alone
+def test_live_viewers_are_served_on_the_loopback_only(tmp_path: Path) -> None:
+    port = free_port()
+    core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core
+    with socket.create_connection(("127.0.0.1", port), timeout=5):
+        listening = Path("/proc/net/tcp")
+        if listening.exists():
+            locals_ = [line.split()[1] for line in listening.read_text().splitlines()[1:] if line.split()[3] == "0A"]
+            assert f"0100007F:{port:04X}" in locals_
+            assert f"00000000:{port:04X}" not in locals_
+    core.close()
+
+
+def test_a_killed_viewer_leaves_a_file_that_opens_and_holds_what_was_flushed(tmp_path: Path) -> None:
+    code = """
+    import sys
+    from pathlib import Path
+    from tests.support.score_data import made_up_tray
+    from tests.stages.test_viewer import context, play
+    from stages.viewer import build
+    core = build(context(Path(sys.argv[1]))).core
+    play(core, made_up_tray(seconds=20)[0])
+    print("played", flush=True)
+    sys.stdin.read()
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code), str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )
+    assert process.stdout is not None and process.stdin is not None
+    assert process.stdout.readline() == b"played\n"
+    process.kill()
+    process.communicate()
+    rows = rows_of(tmp_path / "view.rrd")
+    assert len(rows["/tray1/fan_0/speed"]) >= 1900
+    assert styles_of(tmp_path / "view.rrd", "/tray1/fan_0/speed", "Measurements:names")[0] == "measured (rad/s)"
+
+
+def context(folder: Path, *, fans: int = 3, speed_unit: Any = "rad/s", serve: bool = False, **config: Any) -> Context:
+    return Context(
+        site="site",
+        trays=(TrayConfig(name="tray1", fans=fans, speed_unit=speed_unit),),
+        config=ViewerConfig(serve=serve, **config),
+        folder=folder,
+        run_folder=folder,
+        started_t_ns=START_NS,
+    )
+
+
+def changed(score: Score, **columns: Any) -> Score:
+    return Score(**{**vars(score), **columns})
+
+
+def card() -> ModelCard:
+    return ModelCard(header=Header("x", 0, "tray1"), t_ns=LATER_NS, twin="f40", kind="hybrid", sha256="")
+
+
+def health(lost: int = 0, problem: str = "") -> Health:
+    status = StageStatus.DEGRADED if problem else StageStatus.OK
+    return Health(
+        stage="scorer", instance="all", status=status, t_ns=START_NS, uptime_s=1.0, lost=lost, problem=problem
+    )
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def chunks_of(path: Path) -> list[Any]:
+    reader: Callable[[Path], Any] = pytest.importorskip("rerun.chunk").RrdReader
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*no footer")
+        return list(reader(path).stream())
+
+
+def rows_of(path: Path) -> dict[str, list[tuple[int, dict[str, Any]]]]:
+    """Entity -> (time in ns, component -> values) in order of time."""
+    rows: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+    for chunk in chunks_of(path):
+        if chunk.is_static:
+            continue
+        table = chunk.to_record_batch()
+        times = np.asarray(table.column("time")).astype(np.int64)
+        names = [name for name in table.schema.names if ":" in name]
+        for index, t_ns in enumerate(times.tolist()):
+            row = {name: table.column(name)[index].as_py() for name in names}
+            rows.setdefault(chunk.entity_path, []).append((t_ns, row))
+    return {path: sorted(of, key=lambda row: row[0]) for path, of in rows.items()}
+
+
+def pages_of(path: Path) -> list[str]:
+    """The pages on the stages in the order in which they were shown."""
+    chunks = [chunk for chunk in chunks_of(path) if chunk.entity_path == "/stages"]
+    assert all(chunk.is_static for chunk in chunks)
+    return [text[0] for chunk in chunks for text in chunk.to_record_batch().column("TextDocument:text").to_pylist()]
+
+
+def styles_of(path: Path, entity: str, component: str) -> list[str]:
+    (chunk,) = (chunk for chunk in chunks_of(path) if chunk.is_static and chunk.entity_path == entity)
+    return chunk.to_record_batch().column(component)[0].as_py()
+
+
+def test_messages_of_a_tray_that_is_not_configured_are_counted_and_ignored() -> None:
+    sink = FakeSink()
+    core = core_of(sink)
+    scores, alarms = made_up_tray(tray="elsewhere", seconds=1)
+    for message in (*scores, *alarms):
+        core.step(message)
+    core.close()
+    assert core.counters()["unknown_tray"] == len(scores) + len(alarms) > 2
+    assert not sink.traces and not sink.lines
+
+
+def test_scores_of_another_number_of_fans_are_told_only_until_the_right_ones_come() -> None:
+    core = core_of(FakeSink(), fans=3)
+    core.step(made_up_tray(fans=2, seconds=1, faulty_fan=None)[0][0])
+    assert core.problem() == "scores of 2 fans, [[tray]] tray1 says fans = 3: correct `fans`"
+    core.step(made_up_tray(fans=3, seconds=1)[0][0])
+    assert core.problem() == ""

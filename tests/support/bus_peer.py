@@ -1,0 +1,70 @@
+"""A process on the bus for tests: `publish COUNT` or `collect COUNT`, told and heard over standard streams.
+
+publish: puts COUNT alarms as fast as it can, prints "published", then one more for every line it is told.
+collect: puts what comes in sequence, prints the sequence numbers when it has COUNT of them.
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import time
+from functools import partial
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+from pipeline.runtime.sequence_tracker import SequenceTracker
+from schemas.codec import decode, encode, type_name
+from schemas.envelope import Envelope
+from schemas.messages import Alarm, Header, Severity
+from schemas.topics import BY_NAME, tray_key
+
+pause = partial(time.sleep, 0.001)
+KEY = tray_key("site", "tray", "alarm")
+TOPIC = BY_NAME["alarm"]
+
+
+def publish(bus: Bus, count: int) -> None:
+    outlet = bus.outlet(KEY, TOPIC, type_name(Alarm), "peer")
+    for sequence in range(count):
+        outlet.put(encode(alarm(sequence)))
+    print("published", flush=True)
+    for sequence, _ in enumerate(sys.stdin, start=count):
+        outlet.put(encode(alarm(sequence)))
+
+
+def alarm(sequence: int) -> Alarm:
+    return Alarm(
+        header=Header("peer", sequence, "tray"),
+        fan=0,
+        active=True,
+        severity=Severity.ALARM,
+        t_ns=sequence,
+        onset_t_ns=0,
+        residual_rad_s=0,
+        limit_rad_s=0,
+        message="x" * 200,
+    )
+
+
+def collect(bus: Bus, count: int) -> None:
+    inbox: queue.Queue[bytes] = queue.Queue()
+
+    def packet(payload: bytes) -> Envelope:
+        return Envelope(KEY, "alarm", payload, 0, decode(Alarm, payload))
+
+    inlet = SequenceTracker(
+        lambda key, who, first, last: [packet(found) for _, found in bus.recover(key, who, first, last, pause)]
+    )
+    bus.subscribe(KEY, lambda _key, payload: inbox.put(payload))
+    print("ready", flush=True)
+    got: list[int] = []
+    while len(got) < count:
+        got += [due.message.header.sequence for due in inlet.accept(packet(inbox.get(timeout=20)))]
+    print(" ".join(map(str, got)), flush=True)
+
+
+if __name__ == "__main__":
+    role, endpoint, number = sys.argv[1], sys.argv[2], int(sys.argv[3])
+    with Bus(BusConfig(endpoint=endpoint)) as the_bus:
+        (publish if role == "publish" else collect)(the_bus, number)

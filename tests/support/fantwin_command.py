@@ -1,0 +1,25 @@
+"""Commands of `fantwin` called in this process, as the command line calls them."""
+
+from importlib import import_module
+
+import typer
+from typer.testing import CliRunner, Result
+
+from pipeline.cli.main import COMMANDS
+from pipeline.errors import UserError
+
+
+def fantwin(name: str, *arguments: object) -> Result:
+    """Run a command; the result has its exit code, standard output and exception."""
+    module, _ = COMMANDS[name]
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command(name)(getattr(import_module(f"pipeline.cli.{module}"), module.rpartition(".")[2]))
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def said_instead(name: str, *arguments: object) -> str:
+    """The one line of a command that could not be done."""
+    error = fantwin(name, *arguments).exception
+    assert isinstance(error, UserError), error
+    assert "\n" not in str(error)
+    return str(error)

@@ -1,0 +1,200 @@
+"""A recorder that is killed again and again under load, and what is found afterwards held against what was sent."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mcap.reader import make_reader
+
+from pipeline.recordings.contents import Contents, contents_of
+from pipeline.recordings.reading import RecordingError, read_recording
+from pipeline.recordings.scan import scan
+from schemas.messages import StageStatus
+from schemas.topics import health_key
+from tests.support.recorder_feed import PRODUCER, SITE
+from tests.support.running_chain import DEADLINE_S, FANTWIN, eventually
+
+FLUSH_S = 1.0
+
+
+@dataclass
+class Outcome:
+    """What became of a recording."""
+
+    kills: int
+    parts: int = 0
+    unreadable: list[str] = field(default_factory=list)
+    """parts that the official reader cannot read by their index"""
+    sent: int = 0
+    recorded: int = 0
+    """different messages in all parts"""
+    repeated: int = 0
+    """messages that are in a part or in two more than once"""
+    missing: int = 0
+    """sent after the first that was recorded, and in no part"""
+    counted_missing: int = 0
+    """the same by the ledgers"""
+    kills_of_recording: int = 0
+    """kills of a recorder that had started and caught up with what the bus held"""
+    oldest_s: float = 0.0
+    """of those missing that such a kill has cost: the age of the oldest at the kill"""
+    newest_s: float = 0.0
+    """at such a kill: how long ago the newest message in the file had been received"""
+
+
+@dataclass(frozen=True)
+class _Killed:
+    """A recorder that had caught up with the bus: what it recorded from when to when, ns, and what was due, by key."""
+
+    first_ns: int
+    at_ns: int
+    due: dict[str, int]
+    newest_ns: int
+
+
+class Kills:
+    """A feed, and a recorder that is killed."""
+
+    def __init__(self, folder: Path, endpoint: str, trays: int, fans: int, history: int) -> None:
+        """history: how many messages the feed keeps for a recorder that comes back."""
+        self._folder = folder
+        self._config = folder / "fantwin.toml"
+        tables = "".join(f'[[tray]]\nname = "tray{number + 1}"\nfans = {fans}\n' for number in range(trays))
+        self._config.write_text(
+            f'site = "{SITE}"\nrun_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n'
+            f"[recorder]\nflush_interval_s = {FLUSH_S}\n{tables}"
+        )
+        self._sent = folder / "sent.json"
+        words = [sys.executable, str(Path(__file__).with_name("recorder_feed.py"))]
+        words += [endpoint, str(trays), str(fans), str(history), str(self._sent)]
+        root = str(Path(__file__).parents[2])
+        self._feed = subprocess.Popen(
+            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": root}
+        )
+        self._recorder: subprocess.Popen[bytes] | None = None
+        self._started_ns = 0
+        self._killed: list[_Killed] = []
+        self._heard("feeding")
+
+    def run(self, kills: int, seed: int, progress: Callable[[int], None] = lambda _: None) -> Outcome:
+        """Kill it so many times, at random, and let the last one end in order."""
+        chance = random.Random(seed)
+        self._start()
+        eventually(self._has_caught_up, "the recorder records")
+        for number in range(kills):
+            time.sleep(chance.uniform(0.0, 4.0))  # whatever it does then, starting and mending included
+            self._kill()
+            self._start()
+            progress(number + 1)
+        eventually(self._has_caught_up, "the recorder has caught up")
+        assert self._feed.stdin and self._recorder
+        self._feed.stdin.close()
+        self._heard("fed")
+        self._recorder.send_signal(signal.SIGINT)
+        status = self._recorder.wait(DEADLINE_S)
+        assert status in (0, 3), (status, (self._folder / "recorder.log").read_text()[-2000:])
+        return self._outcome(kills)
+
+    def close(self) -> None:
+        for process in (self._recorder, self._feed):
+            if process and process.poll() is None:
+                process.kill()
+                process.wait()
+
+    @property
+    def _runs(self) -> Path:
+        return self._folder / "runs"
+
+    def _heard(self, word: str) -> None:
+        assert self._feed.stdout
+        assert self._feed.stdout.readline().strip() == word
+
+    def _start(self) -> None:
+        self._started_ns = time.time_ns()
+        self._recorder = subprocess.Popen(
+            [*FANTWIN, "run", "recorder", "-c", str(self._config)],
+            stdin=subprocess.DEVNULL,
+            stderr=(self._folder / "recorder.log").open("ab"),
+            cwd=Path(__file__).parents[2],
+        )
+
+    def _kill(self) -> None:
+        assert self._recorder
+        at_ns = time.time_ns()
+        assert self._recorder.poll() is None, (self._folder / "recorder.log").read_text()
+        self._recorder.kill()
+        self._recorder.wait()
+        for active in self._runs.glob("*.active"):
+            if active.stat().st_size < 8:
+                continue
+            found = scan(active)
+            ledger = found.census.ledger
+            due = {key: ledger.next[key, producer] for key, producer in ledger.accounts if producer == PRODUCER}
+            own = found.census.healths.get(health_key(SITE, "recorder", "all"))
+            has_caught_up = own is not None and own.status == StageStatus.OK
+            if has_caught_up and found.index.first_ns is not None:
+                self._killed.append(_Killed(found.index.first_ns, at_ns, due, found.index.last_ns))
+
+    def _has_caught_up(self) -> bool:
+        """The recorder that runs now has put into its file what was sent in the last two seconds."""
+        for active in self._runs.glob("*.active"):
+            try:
+                index = scan(active).index
+            except RecordingError:  # it has only just been created
+                continue
+            if index.first_ns and index.first_ns > self._started_ns:
+                return time.time_ns() - index.last_ns < 2e9
+        return False
+
+    def _parts(self) -> list[Path]:
+        return sorted(self._runs.glob("*.mcap"), key=lambda path: int((re.findall(r"-(\d+)\.", path.name) or [1])[0]))
+
+    def _outcome(self, kills: int) -> Outcome:
+        outcome = Outcome(kills)
+        sent_ns: dict[str, list[int]] = json.loads(self._sent.read_text())
+        contents: list[Contents] = []
+        found: dict[str, list[int]] = {key: [] for key in sent_ns}
+        for path in self._parts():
+            outcome.parts += 1
+            if not _is_readable(path):
+                outcome.unreadable.append(path.name)
+            contents.append(contents_of(path))
+            for entry in read_recording(path, topics=("raw", "grid", "prediction", "score")):
+                found[entry.key].append(entry.message.header.sequence)
+        for key, times in sent_ns.items():
+            recorded = set(found[key])
+            outcome.sent += len(times)
+            outcome.recorded += len(recorded)
+            outcome.repeated += len(found[key]) - len(recorded)
+            missing = [n for n in range(min(recorded, default=len(times)), len(times)) if n not in recorded]
+            outcome.missing += len(missing)
+            for killed in self._killed:
+                due = killed.due.get(key, len(times))
+                in_memory = [n for n in missing if n >= due and killed.first_ns <= times[n] <= killed.at_ns]
+                if in_memory:
+                    outcome.oldest_s = max(outcome.oldest_s, (killed.at_ns - times[in_memory[0]]) / 1e9)
+        outcome.counted_missing = sum(
+            account.missing for part in contents for (key, _), account in part.accounts.items() if key in sent_ns
+        )
+        outcome.kills_of_recording = len(self._killed)
+        outcome.newest_s = max(((killed.at_ns - killed.newest_ns) / 1e9 for killed in self._killed), default=0.0)
+        return outcome
+
+
+def _is_readable(path: Path) -> bool:
+    """By the official reader: with an index, all messages, all checksums right."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        if summary is None or summary.statistics is None:
+            return False
+        return summary.statistics.message_count == sum(1 for _ in reader.iter_messages())

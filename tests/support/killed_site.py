@@ -1,0 +1,248 @@
+"""A site without processes or a bus: sources and stage cores stepped as the runner does, killed and begun anew at will.
+
+What it records says what each session was fed, as the real thing does, but in a moment and the same at every run.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.config.models import Config, load_config
+from pipeline.config.registry import load_stage
+from pipeline.recordings.writing import RecordingWriter
+from pipeline.runtime.stage import Context, Core
+from pipeline.runtime.twin_file import TwinFile
+from schemas.messages import Action, Header, InputPosition, Message, Raw, Request
+from schemas.topics import TOPICS, tray_key
+from tests.support.twin_files import small_hybrid, write_twin
+
+SITE, TRAY, FANS = "plant", "tray1", 3
+CHAIN = ("resampler", "twin_integrator", "scorer")
+CALIBRATION = {
+    "speed": {"step": 2.0, "drift": 8.0, "growth": 4.0},
+    "balance": {"step": 4.0, "drift": 20.0, "growth": 6.0},
+    "missing_share": 0.5,
+    "timing": {"smoothing_s": 0.2, "baseline_s": 0.2, "adaptation_s": 5.0, "on_delay_s": 0.1},
+}
+"""limits of no particular fan, such that alarms come and go"""
+EPOCH_NS = 1_800_000_000_000_000_000
+TICK_NS = 50_000_000
+TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
+
+CONFIGURATION = f"""
+site = "{SITE}"
+[[tray]]
+name = "{TRAY}"
+fans = {FANS}
+command_max = 100.0
+twin = "twin.onnx"
+[resampler]
+block_size = %d
+[twin_integrator]
+warm_up_s = 0.5
+[scorer]
+baseline_s = 0.2
+alarm_sigmas = 1.0
+on_delay_s = 0.1
+off_delay_s = 0.2
+"""
+
+
+@dataclass
+class Session:
+    """One life of a stage: its core, and what it keeps for those who missed it."""
+
+    producer: str
+    core: Core | None
+    published: dict[str, int] = field(default_factory=dict)
+    kept: deque[tuple[str, Message]] = field(default_factory=lambda: deque(maxlen=200))
+    position: InputPosition | None = None
+
+
+class Stages:
+    """Three stages of one tray, and a recording of all that goes between them."""
+
+    def __init__(self, config: Config, path: Path, started_t_ns: int, *, remembers: bool = True) -> None:
+        (tray,) = config.trays
+        assert tray.twin
+        self.config = config
+        self.remembers = remembers
+        self.tray = tray.name
+        self.now_ns = started_t_ns
+        metadata = {
+            "site": config.site,
+            "trays": tray.name,
+            "started_t_ns": str(started_t_ns),
+            f"speed_unit.{tray.name}": tray.speed_unit,
+        }
+        twin = (config.folder / tray.twin).read_bytes()
+        attachments = {"configuration.toml": config.text.encode(), f"{tray.name}.onnx": twin}
+        self.writer = RecordingWriter(path, metadata, attachments, t_ns=started_t_ns, overwrite=True)
+        self.records = True
+        self.lost_on_the_bus = 0
+        """raw messages that will be recorded and never come to the resampler"""
+        self._lives = 0
+        self._ticked_ns = started_t_ns
+        self.source = Session("acquisition-0", None)
+        self.operator = Session("operator-0", None)
+        self.stages = {stage: self._begin(stage) for stage in CHAIN}
+
+    def take(self, raw: Raw) -> None:
+        """What acquisition would publish next."""
+        self._publish(self.source, raw, None)
+
+    def ask(self, action: Action, fan: int = -1, duration_s: float = 0.0) -> None:
+        """What an operator asks for."""
+        name = f"{action.name.lower()} by Ann"
+        self._publish(
+            self.operator,
+            Request(t_ns=self.now_ns, action=action, fan=fan, duration_s=duration_s, operator_name=name),
+            None,
+        )
+
+    def tick(self) -> None:
+        """Let time pass for the stages, up to `now_ns`."""
+        while self.now_ns - self._ticked_ns >= TICK_NS:
+            self._ticked_ns += TICK_NS
+            for stage in CHAIN:
+                self._put_out(stage, self._core(stage).tick(self._ticked_ns), from_timer=True)
+
+    def kill(self, stage: str) -> None:
+        """kill -9: what the core held is gone; its successor takes again what is still kept, topic after topic."""
+        self.stages[stage] = self._begin(stage)
+        feeding = self.source if stage == "resampler" else self.stages[CHAIN[CHAIN.index(stage) - 1]]
+        kept = (*feeding.kept, *self.operator.kept)
+        for read in sorted(load_stage(stage).reads):
+            for topic, message in kept:
+                if topic == read:
+                    self._step(stage, topic, message)
+
+    def loses(self, messages: int) -> None:
+        """The next raw messages never come to the resampler."""
+        self.lost_on_the_bus = messages
+
+    def restart_source(self) -> None:
+        """Acquisition is killed, and its successor begins with nothing."""
+        self._lives += 1
+        self.source = Session(f"acquisition-{self._lives}", None)
+
+    def end(self) -> None:
+        """Stop in order."""
+        for stage in CHAIN:
+            self._put_out(stage, self._core(stage).close(), from_timer=True)
+        self.writer.close()
+
+    def _begin(self, stage: str) -> Session:
+        self._lives += 1
+        context = Context(
+            site=self.config.site,
+            trays=self.config.trays,
+            config=self.config.sections[stage],
+            folder=self.config.folder,
+            run_folder=self.config.folder,
+            started_t_ns=self.now_ns,
+            snapshot_folder=self.config.folder if self.remembers else None,
+        )
+        return Session(f"{stage}-{self._lives}", load_stage(stage).build(context).core)
+
+    def _core(self, stage: str) -> Core:
+        core = self.stages[stage].core
+        assert core
+        return core
+
+    def _step(self, stage: str, topic: str, message: Message) -> None:
+        session = self.stages[stage]
+        if topic == load_stage(stage).reads[0]:
+            session.position = InputPosition.after(session.position, topic, message.header)
+        self._put_out(stage, self._core(stage).step(message), from_timer=False)
+
+    def _put_out(self, stage: str, messages: Sequence[Message], from_timer: bool) -> None:
+        session = self.stages[stage]
+        position = replace(session.position, from_timer=from_timer) if session.position else None
+        for message in messages:
+            self._publish(session, message, position)
+
+    def _publish(self, session: Session, message: Message, position: InputPosition | None) -> None:
+        topic = TOPIC_OF[type(message)]
+        sequence = session.published.get(topic, 0)
+        session.published[topic] = sequence + 1
+        stamped: Any = replace(message, header=Header(session.producer, sequence, self.tray, position))
+        session.kept.append((topic, stamped))
+        if self.records:
+            self.writer.write_message(tray_key(self.config.site, self.tray, topic), stamped, self.now_ns)
+        if topic == "raw" and self.lost_on_the_bus:
+            self.lost_on_the_bus -= 1
+            return
+        reader = next((name for name in CHAIN if topic in load_stage(name).reads), None)
+        if reader:
+            self._step(reader, topic, stamped)
+
+
+class Site(Stages):
+    """A tray of three fans and its stages."""
+
+    def __init__(
+        self, folder: Path, seed: int, block_size: int = 1, *, calibrated: bool = False, remembers: bool = True
+    ) -> None:
+        """remembers: whether a scorer that begins anew finds what the one before has kept."""
+        card = {"calibration": CALIBRATION} if calibrated else {}
+        write_twin(folder / "twin.onnx", small_hybrid(), fans=FANS, **card)
+        (folder / "site.toml").write_text(CONFIGURATION % block_size)
+        self.path = folder / "recording.mcap"
+        super().__init__(load_config(folder / "site.toml"), self.path, EPOCH_NS, remembers=remembers)
+        self.rng = np.random.default_rng(seed)
+        self._device_us = 0
+        self._device_sequence = 0
+        self._healthy = TwinFile.load(folder / "twin.onnx", FANS)
+        self._state = self._healthy.initial_state(np.full(FANS, 100.0), np.full(FANS, 50.0))
+
+    def run(self, samples: int) -> None:
+        """Raw samples as they come: with jitter, without some readings, now and then two in one piece."""
+        waiting: list[Raw] = []
+        for _ in range(samples):
+            self.now_ns += int(self.rng.integers(8_000_000, 12_000_000))
+            waiting.append(self._raw())
+            if self.rng.random() < 0.03:
+                continue  # held back; it comes together with the next one
+            for raw in waiting:
+                self.take(raw)
+            waiting = []
+            self.tick()
+
+    def fall_silent(self, seconds: float) -> None:
+        """Nothing comes for a while; then half of what was measured comes, too late for some of the grid."""
+        late: list[Raw] = []
+        for _ in range(int(seconds * 100)):
+            self.now_ns += 10_000_000
+            late.append(self._raw())
+            self.tick()
+        for raw in late[len(late) // 2 :]:
+            self.take(raw)
+
+    def finished(self) -> Path:
+        """Stop in order; the recording."""
+        self.end()
+        return self.path
+
+    def _raw(self) -> Raw:
+        self._device_us += 10_000
+        self._device_sequence += 1
+        command = 50.0 + 40.0 * np.sin(self._device_sequence / 150.0 + np.arange(FANS))
+        healthy, self._state = self._healthy.advance(self._state, command[np.newaxis], np.full(1, 0.01))
+        speed = healthy[0] + self.rng.normal(0.0, 3.0, FANS)
+        speed[0] += 20.0 * (150 < self._device_sequence % 400 < 220)  # a fault that comes and goes
+        speed[self.rng.random(FANS) < 0.01] = np.nan
+        return Raw(
+            fans=FANS,
+            host_receive_t_ns=np.array([self.now_ns], np.int64),
+            device_clock_us=np.array([self._device_us % 2**32], np.uint32),
+            device_sequence=np.array([self._device_sequence], np.uint32),
+            command=command[np.newaxis],
+            speed_rad_s=speed[np.newaxis],
+        )

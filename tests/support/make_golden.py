@@ -1,0 +1,104 @@
+"""Makes tests/data/golden.mcap anew: python tests/make_golden.py
+
+A real site watches a simulated tray of two fans for some ten seconds; one inlet is covered and set free, its alarm is
+acknowledged, the other fan's is shelved, and the twin integrator and the scorer are killed on the way, so that the
+scorer goes on from its memory. The twin is a physical one, which needs no function whose last bit depends on the
+machine, and its alarms are calibrated. Make it anew only when what the stages decide is meant to change, and say why
+in the commit.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+import tempfile
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parent)]
+
+from pipeline.recordings.reading import read_metadata, read_recording  # noqa: E402
+from pipeline.recordings.writing import RecordingWriter  # noqa: E402
+from tests.support.running_chain import TRAY, Chain, eventually, fantwin, published, view_of  # noqa: E402
+
+GOLDEN = Path(__file__).parent / "data" / "golden.mcap"
+FANS, FAULTY = 2, 1
+CONFIGURATION = f"""
+site = "demo"
+[[tray]]
+name = "{TRAY}"
+fans = {FANS}
+speed_unit = "rpm"
+speed_max = 20000
+twin = "twin.onnx"
+[resampler]
+rate_hz = 50
+[twin_integrator]
+warm_up_s = 1.0
+[scorer]
+on_delay_s = 0.3
+off_delay_s = 0.5
+adaptation_s = 10.0
+"""
+
+
+def main() -> None:
+    """Train, run, kill, keep."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        healthy = folder / "healthy.mcap"
+        run(
+            "simulate", "--fans", FANS, "--rate", 50, "--profile", "multisine", "--duration", 60, "--recording", healthy
+        )
+        run("train", healthy, "--model", "physical", "--name", "golden", "-o", folder / "twin.onnx")
+        run("calibrate", folder / "twin.onnx", healthy, "--false-alarms-per-day", 24, "--extrapolate")
+        (folder / "golden.toml").write_text(CONFIGURATION)
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        chain = Chain(folder, endpoint, viewer=False, configuration=folder / "golden.toml")
+        try:
+            record(chain)
+        finally:
+            chain.close()
+        (recording,) = chain.recordings()
+        keep(recording)
+    print(f"{GOLDEN}: {GOLDEN.stat().st_size} bytes")
+
+
+def record(chain: Chain) -> None:
+    """Some ten seconds with a fault and two deaths."""
+    tray = chain.start_tray(
+        "--fans", str(FANS), "--rate", "50", "--fault", f"inlet:fan={FAULTY},start=3,stop=6,size=2.0"
+    )
+    up = chain.start_up()
+    with chain.watcher() as watcher:
+        eventually(lambda: published(view_of(watcher, "scorer")) > 100, "scores flow")
+        chain.kill(watcher, "twin_integrator")
+        eventually(lambda: any(alarm.fan == FAULTY and alarm.active for alarm in watcher.alarms()), "it is raised")
+        run(*chain.words("alarms"), "ack", TRAY, FAULTY, "--operator", "Ann")
+        run(*chain.words("alarms"), "shelve", TRAY, 1 - FAULTY, "--for", "1m", "--operator", "Bob")
+        chain.kill(watcher, "scorer")
+        eventually(lambda: not any(alarm.active for alarm in watcher.alarms()), "it is cleared")
+    assert tray.end() == 0
+    assert up.end() == 0, up.output()
+
+
+def keep(recording: Path) -> None:
+    """What is decided and of what, without what tells of the machine: health, ports and folders."""
+    head = read_metadata(recording)
+    metadata = {key: value for key, value in head.metadata.items() if key != "overrides"}
+    GOLDEN.parent.mkdir(exist_ok=True)
+    with RecordingWriter(GOLDEN, metadata, head.attachments, overwrite=True) as writer:
+        for entry in read_recording(recording):
+            if entry.topic != "health":
+                writer.write_message(entry.key, entry.message, entry.log_time_ns)
+
+
+def run(*words: object) -> None:
+    """A command that must succeed."""
+    told = fantwin(*words, timeout_s=600)
+    assert told.returncode == 0, told.stderr
+
+
+if __name__ == "__main__":
+    main()

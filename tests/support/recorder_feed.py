@@ -1,0 +1,112 @@
+"""A process on the bus that sends what trays of fans would, at 100 Hz, and knows what it has sent.
+
+Words: ENDPOINT TRAYS FANS HISTORY FILE. Each tray has raw, grid, prediction and score messages of one sample. It keeps
+the last HISTORY messages of each for whoever missed them. When its standard input closes it ends like a stage, and
+writes to FILE, for each key, at which time (ns since 1970) each message was sent: the place is the sequence number.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+from schemas.codec import encode, type_name
+from schemas.messages import Grid, Header, Health, Message, Output, Prediction, Raw, Score, StageStatus
+from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+
+SITE, PRODUCER, STAGE = "kills", "feed-1", "feed"
+STEP_S = 0.01
+TOPICS = ("raw", "grid", "prediction", "score")
+
+
+def messages(fans: int, number: int) -> dict[str, Message]:
+    """One sample of a tray, that does not compress."""
+    speed = np.random.default_rng(number).normal(100.0, 3.0, (1, fans))
+    t_ns, ones, zeros = np.array([time.time_ns()]), np.ones((1, fans), np.bool_), np.zeros((1, fans), np.uint8)
+    common: dict[str, Any] = {"fans": fans, "period_ns": 10_000_000, "t_ns": t_ns, "command": np.full((1, fans), 0.6)}
+    judged: dict[str, Any] = {**common, "valid": ones, "invalid_reason": zeros, "measured_speed_rad_s": speed}
+    return {
+        "raw": Raw(fans=fans, host_receive_t_ns=t_ns, command=common["command"], speed_rad_s=speed),
+        "grid": Grid(**common, speed_rad_s=speed, valid=ones, invalid_reason=zeros),
+        "prediction": Prediction(
+            **judged,
+            predicted_speed_rad_s=speed * 1.01,
+            sigma_rad_s=np.full(fans, 3.0),
+            torque_balance_command=speed * 1e-4,
+            torque_balance_sigma_command=np.full(fans, 0.01),
+        ),
+        "score": Score(
+            **judged,
+            predicted_speed_rad_s=speed * 1.01,
+            lower_bound_rad_s=speed * 0.95,
+            upper_bound_rad_s=speed * 1.05,
+            band_variance=np.full((1, fans), 36.0),
+            residual_rad_s=speed * 0.01,
+            smoothed_residual_rad_s=speed * 0.007,
+            outside=~ones,
+            state=zeros + 1,
+            torque_balance_command=speed * 1e-4,
+            speed_baseline_rad_s=speed * 0.0,
+            balance_baseline_command=speed * 0.0,
+            score=speed * 1e-3,
+            statistic=zeros + 1,
+        ),
+    }
+
+
+def main(endpoint: str, trays: int, fans: int, history: int, file: Path) -> None:
+    stop = threading.Event()
+    threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
+    sent_ns: dict[str, list[int]] = {}
+    with Bus(BusConfig(endpoint=endpoint)) as bus:
+        outlets = {}
+        for tray in (f"tray{number + 1}" for number in range(trays)):
+            for name in TOPICS:
+                topic = replace(BY_NAME[name], history=history)
+                key = tray_key(SITE, tray, name)
+                outlets[tray, name] = bus.outlet(key, topic, type_name(topic.message), PRODUCER)
+                sent_ns[key] = []
+        own = bus.outlet(health_key(SITE, STAGE, "all"), BY_NAME["health"], type_name(Health), PRODUCER)
+        bus.declare_alive(alive_key(SITE, STAGE, "all"))
+
+        def put_health(status: StageStatus) -> None:
+            health = Health(
+                header=Header(PRODUCER, own.published, ""),
+                stage=STAGE,
+                instance="all",
+                status=status,
+                t_ns=time.time_ns(),
+                uptime_s=0.0,
+                outputs=tuple(Output(key=outlet.key, published=outlet.published) for outlet in outlets.values()),
+            )
+            own.put(encode(health))
+
+        print("feeding", flush=True)
+        began_s, number = time.monotonic(), 0
+        while not stop.wait(max(0.0, began_s + number * STEP_S - time.monotonic())):
+            made = messages(fans, number)
+            for (tray, name), outlet in outlets.items():
+                stamped = replace(made[name], header=Header(PRODUCER, outlet.published, tray))
+                sent_ns[outlet.key].append(time.time_ns())
+                outlet.put(encode(stamped))
+            if number % 100 == 0:
+                put_health(StageStatus.OK)
+            number += 1
+        put_health(StageStatus.STOPPED)
+        file.write_text(json.dumps(sent_ns))
+        print("fed", flush=True)
+        sys.stdin.close()
+        threading.Event().wait(2.0)  # somebody may still ask for what they missed
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]), Path(sys.argv[5]))

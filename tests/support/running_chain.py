@@ -1,0 +1,202 @@
+"""A whole chain for tests: a simulated tray, `fantwin up`, and a watcher, in processes that end with the test."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+from pipeline.launch.watcher import StageView, Watcher
+
+DEMO = Path(__file__).parents[2] / "pipeline" / "demo"
+SITE, TRAY, FANS = "demo", "tray1", 8
+FANTWIN = (sys.executable, "-P", "-m", "pipeline")
+DEADLINE_S = 60.0  # far beyond what anything takes, so that a slow machine fails no test
+
+
+def fantwin(*words: object, timeout_s: float = DEADLINE_S) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    return subprocess.run(
+        [*FANTWIN, *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+        stdin=subprocess.DEVNULL,
+    )
+
+
+def eventually(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S) -> Any:
+    """The first true answer of `condition`."""
+    until_s = time.monotonic() + deadline_s
+    pause = threading.Event()
+    while not (answer := condition()):
+        assert time.monotonic() < until_s, f"in {deadline_s:.0f} s it did not come to pass that {what}"
+        pause.wait(0.02)
+    return answer
+
+
+def is_running(process_id: int) -> bool:
+    """Whether there is such a process and it is no zombie."""
+    try:
+        return Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+class Running:
+    """A `fantwin` command in a process of its own, and the lines it writes to standard error."""
+
+    def __init__(self, words: Iterable[object]) -> None:
+        self.process = subprocess.Popen(
+            [*FANTWIN, *map(str, words)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self.lines: list[str] = []
+        self._output: queue.Queue[str] = queue.Queue()
+        self._readers = [
+            threading.Thread(target=self._read_errors, daemon=True),
+            threading.Thread(target=lambda: self._output.put(self.process.stdout.read()), daemon=True),  # type: ignore[union-attr]
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def _read_errors(self) -> None:
+        assert self.process.stderr
+        for line in self.process.stderr:
+            self.lines.append(line.rstrip())
+
+    def line_with(self, words: str) -> str:
+        """The first line that holds these words; waits for it, or for the end of the process."""
+
+        def found() -> str | None:
+            line = next((line for line in self.lines if words in line), None)
+            assert line or self.process.poll() is None, f"ended without saying {words!r}: {self.lines}"
+            return line
+
+        return eventually(found, f"it says {words!r}")
+
+    def end(self, number: int = signal.SIGINT) -> int:
+        """Send a signal and wait for the end; the exit status."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        return self.process.wait(DEADLINE_S)
+
+    def output(self) -> Any:
+        """What it printed, as JSON; it must have ended."""
+        return json.loads(self._output.get(timeout=DEADLINE_S))
+
+    def kill(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        for reader in self._readers:
+            reader.join(DEADLINE_S)
+
+
+class Chain:
+    """A tray that sends until told to stop, all stages judging it, and a watcher on their bus."""
+
+    def __init__(
+        self,
+        folder: Path,
+        endpoint: str,
+        *settings: str,
+        viewer: bool = True,
+        configuration: Path = DEMO / "demo.toml",
+    ) -> None:
+        self.folder = folder
+        self.configuration = configuration
+        self.endpoint = endpoint
+        self.port = folder / "tray"
+        stages = ["acquisition", "resampler", "twin_integrator", "scorer", "recorder", *(["viewer"] if viewer else [])]
+        self.settings = [
+            *(f"run_folder='{folder}'", f"tray.0.port='{self.port}'", f"bus.endpoint='{endpoint}'"),
+            *("viewer.serve=false", f"launcher.stages={json.dumps(stages)}", *settings),
+        ]
+        self.stages = [f"acquisition/{TRAY}", *stages[1:]]
+        self.tray: Running | None = None
+        self.up: Running | None = None
+
+    def words(self, command: str) -> list[str]:
+        return [command, "-c", str(self.configuration), *(w for s in self.settings for w in ("--set", s))]
+
+    def start_tray(self, *words: str) -> Running:
+        truth = self.folder / "truth.json"
+        self.tray = Running(
+            [
+                *("simulate", "--fans", FANS, "--speed-unit", "rpm", "--link", self.port, "--truth", truth),
+                *("--wait-for-reader", "--json", *words),
+            ]
+        )
+        self.tray.line_with("fans on")
+        return self.tray
+
+    def start_up(self) -> Running:
+        self.up = Running([*self.words("up"), "--json"])
+        return self.up
+
+    @contextmanager
+    def watcher(self) -> Iterator[Watcher]:
+        with Bus(BusConfig(endpoint=self.endpoint), listens=False) as bus:
+            yield Watcher(bus, SITE)
+
+    def process_ids(self) -> dict[str, int]:
+        """Of every process that `up` says it has started last."""
+        assert self.up
+        found = (re.match(r"(\S+): started, process (\d+)", line) for line in self.up.lines)
+        return {match[1]: int(match[2]) for match in found if match}
+
+    def kill(self, watcher: Watcher, label: str) -> float:
+        """kill -9 of a stage; how long until its successor was on the bus, s."""
+        old = self.process_ids()[label]
+        began_s = time.monotonic()
+        os.kill(old, signal.SIGKILL)
+
+        def is_back() -> bool:
+            view = view_of(watcher, label)
+            return view is not None and view.alive and view.health.process_id != old
+
+        eventually(is_back, f"{label} is back")
+        return time.monotonic() - began_s
+
+    def recordings(self) -> list[Path]:
+        return sorted(self.folder.glob("recording*.mcap"))
+
+    def close(self) -> None:
+        for running in (self.up, self.tray):
+            if running:
+                running.kill()
+        for process_id in self.process_ids().values() if self.up else ():
+            if is_running(process_id):
+                os.kill(process_id, signal.SIGKILL)
+
+
+def view_of(watcher: Watcher, label: str) -> StageView | None:
+    """What a watcher knows of a stage."""
+    stage, _, tray = label.partition("/")
+    return next((v for v in watcher.stages() if v.health.stage == stage and v.health.instance == (tray or "all")), None)
+
+
+def published(view: StageView | None) -> int:
+    return sum(output.published for output in view.health.outputs) if view else 0
+
+
+def received(view: StageView | None) -> int:
+    return sum(line.received for line in view.health.inputs) if view else 0

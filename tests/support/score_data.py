@@ -1,0 +1,98 @@
+"""Scores of a made-up tray: sines of speed, a seeded noise, one fan with a fault, one with a gap."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from schemas.messages import Alarm, FanState, Header, InvalidReason, Score, Severity, Statistic, Transition
+
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 10_000_000
+SIGMA = 4.0
+
+
+def made_up_tray(
+    *,
+    tray: str = "tray1",
+    fans: int = 3,
+    seconds: float = 20.0,
+    block: int = 10,
+    faulty_fan: int | None = 2,
+    fault_s: tuple[float, float] = (8.0, 14.0),
+    gap_fan: int | None = 1,
+    gap_s: tuple[float, float] = (10.0, 11.5),
+) -> tuple[list[Score], list[Alarm]]:
+    """Scores in blocks of `block` samples, and the alarms that go with them."""
+    t_s = np.arange(round(seconds * 1e9 / STEP_NS)) * STEP_NS / 1e9
+    predicted = 300 + 40 * np.sin(0.5 * t_s[:, None] + np.arange(fans))
+    measured = predicted + np.random.default_rng(7).normal(0, SIGMA, predicted.shape)
+    state = np.full(predicted.shape, FanState.NORMAL, np.uint8)
+    invalid_reason = np.zeros(predicted.shape, np.uint8)
+    alarms = []
+    if faulty_fan is not None:
+        start, stop = fault_s
+        measured[(t_s >= start) & (t_s < stop), faulty_fan] -= 30
+        for from_s, to_s, what in (
+            (start, start + 0.5, FanState.SUSPECT),
+            (start + 0.5, stop, FanState.ALARM),
+            (stop, stop + 0.5, FanState.RETURNING),
+        ):
+            state[(t_s >= from_s) & (t_s < to_s), faulty_fan] = what
+        for at_s, active in ((start + 0.5, True), (stop + 0.5, False)):
+            alarms.append(_alarm(tray, faulty_fan, at_s, start, active))
+    if gap_fan is not None:
+        gap = (t_s >= gap_s[0]) & (t_s < gap_s[1])
+        measured[gap, gap_fan] = np.nan
+        state[gap, gap_fan], invalid_reason[gap, gap_fan] = FanState.UNKNOWN, InvalidReason.GAP
+    valid = state != FanState.UNKNOWN
+    residual = measured - predicted
+    columns = {
+        "command": np.full(predicted.shape, 0.5),
+        "measured_speed_rad_s": measured,
+        "predicted_speed_rad_s": predicted,
+        "lower_bound_rad_s": predicted - 2 * SIGMA,
+        "upper_bound_rad_s": predicted + 2 * SIGMA,
+        "band_variance": np.full(predicted.shape, (2 * SIGMA) ** 2),
+        "residual_rad_s": residual,
+        "smoothed_residual_rad_s": residual,
+        "outside": np.abs(np.nan_to_num(residual)) > 2 * SIGMA,
+        "state": state,
+        "valid": valid,
+        "invalid_reason": invalid_reason,
+        "torque_balance_command": np.where(np.isfinite(measured), -residual / 100, np.nan),
+        "speed_baseline_rad_s": np.zeros(predicted.shape),
+        "balance_baseline_command": np.zeros(predicted.shape),
+        "score": np.abs(residual) / (2 * SIGMA),
+        "statistic": np.where(valid, Statistic.SPEED_SMOOTHED, Statistic.NONE).astype(np.uint8),
+    }
+    t_ns = START_NS + np.arange(len(t_s)) * STEP_NS
+    scores = [
+        Score(
+            header=Header("test", number, tray),
+            fans=fans,
+            period_ns=STEP_NS,
+            t_ns=t_ns[first : first + block],
+            **{name: column[first : first + block] for name, column in columns.items()},
+        )
+        for number, first in enumerate(range(0, len(t_s), block))
+    ]
+    return scores, alarms
+
+
+def _alarm(tray: str, fan: int, at_s: float, onset_s: float, active: bool) -> Alarm:
+    return Alarm(
+        header=Header("test", 0, tray),
+        fan=fan,
+        active=active,
+        severity=Severity.ALARM,
+        t_ns=START_NS + round(at_s * 1e9),
+        onset_t_ns=START_NS + round(onset_s * 1e9),
+        residual_rad_s=-30.0 if active else -1.0,
+        limit_rad_s=2 * SIGMA,
+        message="slower than its twin" if active else "back in the band",
+        transition=Transition.RAISED if active else Transition.CLEARED,
+        statistic=Statistic.SPEED_SMOOTHED,
+        score=3.75 if active else 0.1,
+        torque_balance_command=0.3 if active else 0.01,
+        confirmed=True,
+    )

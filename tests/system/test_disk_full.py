@@ -1,0 +1,197 @@
+"""A real disk that fills, or goes: earlier parts stay intact, recording goes on when it can, and the gap is told."""
+
+from __future__ import annotations
+
+import re
+from itertools import count, pairwise
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from pipeline.recordings.contents import contents_of
+from pipeline.recordings.reading import read_metadata, read_recording
+from pipeline.recordings.scan import scan
+from stages.recorder import ROOM_TO_RESUME, STAGE, Recorder
+from tests.pipeline.recordings.test_recordings import raw
+from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, packet
+from tests.support.small_disk import SIZE_BYTES, mount, unmount
+
+LINE = (RAW_KEY, "acquisition-1")
+
+
+class Run:
+    """A recorder that is fed 50 incompressible messages, about 100 kB, a second."""
+
+    def __init__(self, folder: Path, **config) -> None:
+        self.folder = folder / "runs"
+        self.numbers = count()
+        self.seconds = count(1)
+        self.begin(folder, **config)
+
+    def begin(self, folder: Path, **config) -> None:
+        core = STAGE.build(context(folder, **config)).core
+        assert isinstance(core, Recorder)
+        self.core = core
+
+    def second(self) -> None:
+        now_ns = 1_800_000_000_250_000_000 + next(self.seconds) * SECOND_NS
+        for _ in range(50):
+            self.core.step(packet(raw(next(self.numbers), samples=100), "raw", now_ns))
+        self.core.tick(now_ns)
+
+    @property
+    def sent(self) -> int:
+        return int(re.findall(r"\d+", repr(self.numbers))[0])
+
+    def parts(self) -> list[Path]:
+        def number(path: Path) -> int:
+            return int((re.findall(r"-(\d+)\.mcap$", path.name) or ["1"])[0])
+
+        return sorted(self.folder.glob("*.mcap"), key=number)
+
+    def sequences(self) -> list[int]:
+        return [entry.message.header.sequence for path in self.parts() for entry in read_recording(path)]
+
+
+def assert_readable(path: Path) -> None:
+    """By others, with every checksum right."""
+    with path.open("rb") as file:
+        for _ in make_reader(file, validate_crcs=True).iter_messages():
+            pass
+    assert read_recording(path).damage == ""
+
+
+def until(happens, run: Run) -> None:
+    for _ in range(200):
+        if happens():
+            return
+        run.second()
+    raise AssertionError("it never happened")
+
+
+def test_a_disk_that_fills_costs_nothing_that_memory_can_hold(small_disk, caplog):
+    run = Run(small_disk, min_free_bytes=0, part_bytes=1_000_000)
+    until(lambda: len(run.parts()) == 3, run)
+    before = {path: path.read_bytes() for path in run.parts()}
+    ballast = small_disk / "ballast"
+    ballast.write_bytes(bytes(SIZE_BYTES - 3_900_000))
+    until(run.core.problem, run)
+    assert re.search(
+        r"nothing is recorded: .*recording-\d.mcap: cannot be written any more: No space left", caplog.text
+    )
+    for _ in range(5):
+        run.second()
+    assert run.core.problem(), "there is still no room"
+    assert {path: path.read_bytes() for path in before} == before, "earlier parts are intact"
+    for path in run.parts():
+        assert_readable(path)
+    ballast.unlink()
+    until(lambda: not run.core.problem(), run)
+    run.core.close()
+    assert run.core.counters()["lost_unwritten"] == 0
+    assert run.sequences() == list(range(run.sent))
+    assert not list(run.folder.glob("*.active"))
+    (told,) = [head for head in (read_metadata(path).metadata for path in run.parts()) if "paused_t_ns" in head]
+    assert int(told["resumed_t_ns"]) - int(told["paused_t_ns"]) >= 5 * SECOND_NS
+    assert "No space left on device" in told["paused_because"]
+    for path in run.parts():
+        assert_readable(path)
+
+
+def test_what_memory_cannot_hold_is_missing_in_the_ledger_message_by_message(small_disk, monkeypatch):
+    monkeypatch.setattr("stages.recorder.HELD_BYTES", 400_000)
+    run = Run(small_disk, min_free_bytes=3_000_000)
+    until(run.core.problem, run)
+    assert "MB are free on the disk, and 3.0 MB must be" in run.core.problem()
+    for _ in range(10):
+        run.second()
+    for path in run.parts():
+        path.unlink()
+    until(lambda: not run.core.problem(), run)
+    run.core.close()
+    (part,) = run.parts()
+    found = [entry.message.header.sequence for entry in read_recording(part)]
+    holes = sum(later - earlier - 1 for earlier, later in pairwise(found))
+    contents = contents_of(part)
+    lost = run.core.counters()["lost_unwritten"]
+    assert contents.accounts[LINE].missing == holes + (found[0] - contents.before[LINE]) == lost > 0
+    assert contents.metadata["lost_in_pause"] == str(lost)
+    assert found[-1] == run.sent - 1
+
+
+def test_the_disk_stays_bounded_where_the_oldest_parts_may_go(small_disk):
+    run = Run(small_disk, min_free_bytes=3_000_000, part_bytes=1_000_000, delete_oldest=True)
+    for _ in range(300):  # 30 MB, on a disk of 8
+        run.second()
+        assert run.core.problem() == ""
+    run.core.close()
+    assert run.core.counters()["parts_deleted"] > 10
+    sequences = run.sequences()
+    assert sequences == list(range(sequences[0], run.sent)), "the newest, without a gap"
+    assert sequences[0] > 1000
+    assert sum(path.stat().st_size for path in run.parts()) < SIZE_BYTES - 3_000_000 + 1_200_000
+    for path in run.parts():
+        assert_readable(path)
+        assert scan(path).is_whole
+
+
+def test_a_disk_that_is_taken_away_is_waited_for_and_its_place_is_not_written_on(small_disk):
+    run = Run(small_disk, min_free_bytes=0)
+    for _ in range(3):
+        run.second()
+    unmount(small_disk)
+    until(run.core.problem, run)
+    first_held = run.sent - 50
+    assert "disk: the disk is no longer mounted; mount it again" in run.core.problem()
+    for _ in range(3):
+        run.second()
+    assert list(small_disk.iterdir()) == []
+    assert mount(small_disk)
+    (small_disk / "runs").mkdir()
+    until(lambda: not run.core.problem(), run)
+    run.core.close()
+    (part,) = run.parts()
+    assert part.name == "recording-2.mcap"
+    assert read_metadata(part).metadata["continues"] == "recording.mcap"
+    sequences = run.sequences()
+    assert first_held - 50 <= sequences[0] <= first_held + 50
+    assert sequences == list(range(sequences[0], run.sent))
+
+
+def test_a_recorder_starts_on_a_full_disk_and_waits(small_disk):
+    ballast = small_disk / "ballast"
+    ballast.write_bytes(bytes(SIZE_BYTES - 8192))
+    run = Run(small_disk, min_free_bytes=0)
+    for _ in range(3):
+        run.second()
+    assert run.core.problem().startswith("NOTHING IS RECORDED")
+    ballast.unlink()
+    until(lambda: not run.core.problem(), run)
+    run.core.close()
+    assert run.sequences() == list(range(run.sent))
+
+
+def test_a_recorder_killed_on_a_full_disk_is_followed_by_one_that_waits_and_loses_no_part(small_disk):
+    run = Run(small_disk, min_free_bytes=0)
+    for _ in range(5):
+        run.second()
+    part = run.core._part
+    assert part is not None
+    part.flush()
+    part._file.close()  # type: ignore[attr-defined]  as kill -9 does
+    recorded = part.written["raw"]
+    with (small_disk / "ballast").open("wb", buffering=0) as ballast, pytest.raises(OSError, match="No space"):
+        while True:
+            ballast.write(bytes(4096))
+    run.begin(small_disk, min_free_bytes=0)
+    assert run.core.problem()
+    assert len(run.sequences()) == recorded
+    (small_disk / "ballast").unlink()
+    until(lambda: not run.core.problem(), run)
+    run.core.close()
+    assert run.sequences() == [*range(recorded), *range(250, run.sent)]
+
+
+def test_there_must_be_more_room_than_the_least_before_it_goes_on():
+    assert ROOM_TO_RESUME > 200_000, "or it would pause again at once, part after part"

@@ -1,0 +1,307 @@
+"""`fantwin replay` on a bus: real stages in processes take all of it, at any rate, and decide as if it were today."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import queue
+import signal
+import subprocess
+import termios
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+from pipeline.launch.watcher import Watcher
+from pipeline.recordings.reading import read_recording
+from pipeline.recordings.writing import RecordingWriter
+from schemas.codec import decode
+from schemas.messages import Clock, Grid, Header, Health, Message, ModelCard, StageStatus
+from schemas.topics import health_key, tray_key
+from tests.support.replay_data import START_NS, STEP_NS, write_raw
+from tests.support.running_chain import DEADLINE_S, FANTWIN, SITE, TRAY, Chain, Running, eventually, fantwin, view_of
+from tests.support.score_data import made_up_tray
+
+WORKING = ["resampler", "twin_integrator", "scorer", "recorder"]
+
+
+class Site:
+    """Stages of the demo's site, and what is heard on their bus."""
+
+    def __init__(self, folder: Path, endpoint: str) -> None:
+        self.chain = Chain(folder, endpoint, viewer=False)
+        self.heard: dict[type[Message], queue.Queue[Message]] = {kind: queue.Queue() for kind in (Grid, Clock, Health)}
+        self.bus = Bus(BusConfig(endpoint=endpoint))
+        self.watcher = Watcher(self.bus, SITE)
+        self.running: list[Running] = []
+        for topic, kind in (("grid", Grid), ("clock", Clock)):
+            self.bus.subscribe(tray_key(SITE, TRAY, topic), lambda _key, data, kind=kind: self.hear(kind, data))
+        self.bus.subscribe(health_key(SITE, "replay", "all"), lambda _key, data: self.hear(Health, data))
+
+    def hear(self, kind: type[Message], data: bytes) -> None:
+        self.heard[kind].put(decode(kind, data))
+
+    def start(self, label: str) -> Running:
+        running = Running(["run", label.split("/", maxsplit=1)[0], *self.chain.words("run")[1:], "--json"])
+        self.running.append(running)
+
+        def is_there() -> bool:
+            assert running.process.poll() is None, running.lines
+            view = view_of(self.watcher, label)
+            return view is not None and view.alive
+
+        eventually(is_there, f"{label} is there")
+        return running
+
+    def words(self, *words: object) -> list[object]:
+        return ["replay", *words, *self.chain.words("")[1:]]
+
+    def replay(self, *words: object) -> subprocess.CompletedProcess[str]:
+        return fantwin(*self.words(*words))
+
+    def next(self, kind: type[Message]) -> Any:
+        return self.heard[kind].get(timeout=DEADLINE_S)
+
+    def grids_until(self, t_ns: int) -> list[Grid]:
+        grids = [self.next(Grid)]
+        while grids[-1].t_ns[-1] < t_ns:
+            grids.append(self.next(Grid))
+        return grids
+
+    def close(self) -> None:
+        self.bus.close()
+        for running in self.running:
+            running.kill()
+        self.chain.close()
+
+
+@pytest.fixture
+def site(tmp_path, endpoint) -> Iterator[Site]:
+    site = Site(tmp_path, endpoint)
+    yield site
+    site.close()
+
+
+class Terminal:
+    """`fantwin replay` at a terminal of its own."""
+
+    def __init__(self, words: list[object]) -> None:
+        self.ours, theirs = pty.openpty()
+        self.before = termios.tcgetattr(theirs)
+        self.process = subprocess.Popen(
+            [*FANTWIN, *map(str, words)],
+            stdin=theirs,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)),  # noqa: PLW1509  its controlling terminal
+        )
+        self.theirs = theirs
+
+    def press(self, keys: bytes) -> None:
+        os.write(self.ours, keys)
+
+    def end(self) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=DEADLINE_S)
+        return self.process.returncode, out, err
+
+    def is_restored(self) -> bool:
+        return termios.tcgetattr(self.theirs) == self.before
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.communicate()
+        os.close(self.ours)
+        os.close(self.theirs)
+
+
+@pytest.fixture
+def terminals() -> Iterator[list[Terminal]]:
+    opened: list[Terminal] = []
+    yield opened
+    for terminal in opened:
+        terminal.close()
+
+
+def columns(grids: list[Grid]) -> dict[str, np.ndarray]:
+    names = ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason")
+    return {name: np.concatenate([getattr(grid, name) for grid in grids]) for name in names}
+
+
+@pytest.mark.slow
+def test_at_full_speed_the_stages_take_every_message_and_decide_every_sample(tmp_path, endpoint):
+    recording = write_raw(tmp_path / "source.mcap", 3000)
+    chain = Chain(tmp_path, endpoint, f"launcher.stages={json.dumps(WORKING)}", viewer=False)
+    try:
+        up = chain.start_up()
+        with chain.watcher() as watcher:
+            eventually(lambda: {v.health.stage for v in watcher.stages() if v.alive} == set(WORKING), "all are there")
+        done = fantwin("replay", recording, "--rate", "max", "--from", "raw", "--json", *chain.words("")[1:])
+        status, account = up.end(), up.output()
+    finally:
+        chain.close()
+    told = json.loads(done.stdout)
+    assert done.returncode == 0, (told, done.stderr)
+    assert told["messages"] == {"raw": 3000}
+    assert (told["lost"], told["behind"], told["stopped"]) == ({}, [], False)
+    assert set(told["listeners"]) == {"recorder", "resampler"}
+    assert status == 0, account
+    entries = list(read_recording(tmp_path / "recording.mcap"))
+    found = {
+        topic: [e.message for e in entries if e.topic == topic] for topic in ("raw", "grid", "prediction", "score")
+    }
+    assert [raw.header.sequence for raw in found["raw"]] == list(range(3000))
+    assert {raw.header.producer.startswith("replay-") for raw in found["raw"]} == {True}
+    last_ns = START_NS + 2999 * STEP_NS
+    for topic in ("grid", "prediction", "score"):
+        times = [t for m in found[topic] for t in m.t_ns.tolist() if t <= last_ns]  # type: ignore[union-attr]
+        assert times == list(range(START_NS, last_ns + 1, STEP_NS)), topic
+
+
+@pytest.mark.slow
+def test_a_replay_paused_for_longer_than_the_watermark_gives_the_same_grid(tmp_path, endpoint, terminals):
+    recording = write_raw(tmp_path / "source.mcap", 500, missing=range(200, 300))
+    until_ns = START_NS + 499 * STEP_NS
+    found: list[dict[str, np.ndarray]] = []
+    for run in ("whole", "paused"):
+        site = Site(tmp_path / run, endpoint)
+        try:
+            site.start("resampler")
+            if run == "whole":
+                done = site.replay(recording, "--rate", "max", "--from", "raw")
+                assert done.returncode == 0, (done.stdout, done.stderr)
+            else:
+                terminals.append(Terminal(site.words(recording, "--from", "raw", "--rate", 8, "--json")))
+                while site.next(Clock).t_ns < START_NS + 10**9:
+                    pass
+                terminals[0].press(b" ")
+                while site.next(Clock).rate:
+                    pass
+                paused = [site.next(Clock) for _ in range(30)]  # 20 a second
+                assert {(clock.t_ns, clock.rate) for clock in paused} == {(paused[0].t_ns, 0.0)}
+                terminals[0].press(b" ")
+                status, out, err = terminals[0].end()
+                assert status == 0, (out, err)
+                assert json.loads(out)["rate"] == pytest.approx(8.0, rel=0.5)
+            found.append(columns(site.grids_until(until_ns)))
+        finally:
+            site.close()
+    for name, column in found[0].items():
+        np.testing.assert_array_equal(column[:500], found[1][name][:500], name)
+    assert (found[0]["invalid_reason"][210:290] > 0).all(), "the gap is there"
+    assert found[0]["valid"][:199].all()
+
+
+def test_at_a_terminal_it_steps_and_quits_and_gives_the_terminal_back(site, tmp_path, terminals):
+    recording = write_raw(tmp_path / "source.mcap", 500)
+    terminal = Terminal(site.words(recording, "--pause", "--json"))
+    terminals.append(terminal)
+    clock = site.next(Clock)
+    assert (clock.t_ns, clock.rate) == (START_NS, 0.0)
+    for step in range(1, 4):
+        terminal.press(b"s" if step % 2 else b"\x1b[C")
+        while (t_ns := site.next(Clock).t_ns) < START_NS + (step - 1) * STEP_NS + 2_000_000:
+            pass
+        assert t_ns == START_NS + (step - 1) * STEP_NS + 2_000_000
+    assert not terminal.is_restored()
+    terminal.press(b"q")
+    status, out, err = terminal.end()
+    assert status == 0, err
+    assert terminal.is_restored()
+    told = json.loads(out)
+    assert told["stopped"]
+    assert told["messages"] == {"raw": 3}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_at_once_in_order_and_gives_the_terminal_back(site, tmp_path, terminals, number):
+    recording = write_raw(tmp_path / "source.mcap", 500)
+    terminal = Terminal(site.words(recording, "--rate", 0.01))
+    terminals.append(terminal)
+    while not site.next(Health).outputs:
+        pass
+    assert not terminal.is_restored()
+    terminal.process.send_signal(number)
+    status, _, err = terminal.end()
+    assert status == 0, err
+    assert terminal.is_restored()
+    while (last := site.next(Health)).status != StageStatus.STOPPED:
+        pass
+    assert last.outputs[0].key == tray_key(SITE, TRAY, "raw")
+
+
+def test_the_viewer_draws_every_score_of_a_replay(site, tmp_path):
+    pytest.importorskip("rerun")
+    scores, alarms = made_up_tray(seconds=20, fans=8)
+    with RecordingWriter(tmp_path / "source.mcap", {"trays": TRAY}) as writer:
+        card = ModelCard(header=Header("t", 0, TRAY), t_ns=0, twin="f40", kind="hybrid", sha256="")
+        writer.write_message(tray_key("elsewhere", TRAY, "twin"), card, int(scores[0].t_ns[0]))
+        for topic, messages in (("score", scores), ("alarm", alarms)):
+            for sequence, message in enumerate(messages):
+                stamped = type(message)(**{**vars(message), "header": Header("scorer-1", sequence, TRAY)})
+                t_ns = message.t_ns if isinstance(message.t_ns, int) else int(message.t_ns[-1])
+                writer.write_message(tray_key("elsewhere", TRAY, topic), stamped, t_ns)
+    viewer = site.start("viewer")
+    done = site.replay(tmp_path / "source.mcap", "--rate", 50, "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["listeners"] == ["viewer"]
+    assert viewer.end() == 0
+    counters = viewer.output()["counters"]
+    assert counters["samples_drawn"] == sum(len(score.t_ns) for score in scores)
+    assert "dropped" not in counters
+
+
+def test_beside_a_stage_that_writes_the_same_it_is_refused_and_says_from_where_to_replay(site, tmp_path):
+    recording = write_raw(tmp_path / "source.mcap", 100)
+    site.start("resampler")
+    refused = site.replay(recording)
+    assert refused.returncode == 1
+    said = "resampler of site 'demo' is running and writes grid itself: replay with --from raw, or stop it"
+    assert refused.stderr == f"fantwin: {said}\n"
+    assert all(q.empty() for q in site.heard.values()), "nothing was published, not even health"
+    assert site.replay(recording, "--from", "raw", "--rate", "max").returncode == 0
+
+
+def test_a_stage_that_comes_later_and_writes_the_same_ends_the_replay(site, tmp_path):
+    replay = Running(site.words(write_raw(tmp_path / "source.mcap", 3000), "--topics", "raw,command"))
+    site.running.append(replay)
+    site.next(Clock)
+    site.start(f"acquisition/{TRAY}")
+    assert replay.process.wait(DEADLINE_S) == 1
+    assert "recorded commands are not for the fans of today" in replay.lines[-1]
+
+
+def test_it_says_when_nobody_listens_and_where_it_looked(tmp_path, endpoint):
+    recording = write_raw(tmp_path / "source.mcap", 10)
+    done = fantwin("replay", recording, "--rate", "max", "--set", f"bus.endpoint={endpoint}", "--json")
+    assert done.returncode == 0
+    assert done.stderr.startswith(f"nobody on site 'demo' at {endpoint} reads ")
+    assert done.stderr.endswith("; publishing all the same\n")
+    assert json.loads(done.stdout)["messages"] == {"raw": 10}
+
+
+def test_what_could_not_be_read_is_told_and_the_exit_code_says_so(tmp_path, endpoint):
+    whole = write_raw(tmp_path / "whole.mcap", 2000)
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    done = fantwin("replay", torn, "--rate", "max", "--set", f"bus.endpoint={endpoint}", "--json")
+    assert done.returncode == 3
+    assert "torn.mcap" in done.stderr
+    told = json.loads(done.stdout)
+    assert told["damage"]
+    assert 0 < told["messages"]["raw"] < 2000
+
+
+def test_topics_that_the_recording_does_not_have_are_one_line(tmp_path, endpoint):
+    recording = write_raw(tmp_path / "source.mcap", 10)
+    done = fantwin("replay", recording, "--from", "grid", "--set", f"bus.endpoint={endpoint}")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == f"fantwin: {recording}: there is no grid in it, or not in that stretch"

@@ -1,0 +1,183 @@
+"""Runs on other grids, and what twins make of them."""
+
+import numpy as np
+import pytest
+
+from tests.support import fan_data
+from twin.build import train_twin
+from twin.errors import TwinError
+from twin.evaluation.accuracy import evaluate_model
+from twin.evaluation.resampling import Grid, irregular, on_grid, resampled
+from twin.models.hybrid import UNITS, Hybrid
+from twin.models.model import TwinModel
+from twin.models.narx import INPUTS, ORDER, Narx
+from twin.models.narx import UNITS as NARX_UNITS
+from twin.models.network import Scaling, TanhNetwork
+from twin.models.physical import PhysicalModel
+from twin.models.physics import PARAMETER_NAMES
+from twin.runs import Array, Run
+
+OTHER_GRIDS: tuple[Grid, ...] = (20.0, 50.0, 200.0, "irregular")
+NOISE = fan_data.NOISE_RAD_S
+
+
+def impulse(run: Run, stop_s: float) -> Array:
+    """(fans,) integral of the held command up to a time."""
+    edges = np.append(run.t_s, run.t_s[-1] + run.step_s[-1])
+    held_s = np.clip(np.diff(np.minimum(edges, stop_s)), 0.0, None)
+    return held_s @ run.command
+
+
+@pytest.mark.parametrize("rate_hz", [7.0, 20.0, 50.0, 100.0, 130.0, 200.0])
+def test_no_impulse_of_the_command_is_lost_on_another_rate(rate_hz: float) -> None:
+    run = fan_data.published_run(1, 10.0, fans=2)
+    other = resampled(run, rate_hz)
+    assert np.diff(other.t_s) == pytest.approx(1.0 / rate_hz)
+    for stop_s in other.t_s[[1, 5, len(other.t_s) // 2, -1]]:
+        assert impulse(other, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
+
+
+def test_no_impulse_is_lost_on_irregular_steps_of_an_irregular_run() -> None:
+    rng = np.random.default_rng(2)
+    run = Run("jittered", np.cumsum(rng.uniform(0.005, 0.02, 500)), rng.uniform(0, 100, 500), rng.normal(size=500))
+    thin = irregular(run, seed=3)
+    for stop_s in thin.t_s[[1, 50, -1]]:
+        assert impulse(thin, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
+
+
+def test_speeds_are_the_measured_ones_wherever_the_grids_meet() -> None:
+    run = fan_data.published_run(3, 10.0)
+    assert resampled(run, 50.0).speed_rad_s == pytest.approx(run.speed_rad_s[::2])
+    double = resampled(run, 200.0)
+    assert double.speed_rad_s[::2] == pytest.approx(run.speed_rad_s)
+    assert np.isnan(double.speed_rad_s[1::2]).all()
+    same = resampled(run, 100.0)
+    np.testing.assert_array_equal(same.speed_rad_s, run.speed_rad_s)
+    np.testing.assert_allclose(same.command, run.command, rtol=1e-9)
+
+
+def test_irregular_steps_are_one_to_three_of_the_runs_own_and_the_same_for_the_same_seed() -> None:
+    run = fan_data.published_run(4, 10.0)
+    thin = irregular(run, seed=1)
+    steps = np.rint(np.diff(thin.t_s) * fan_data.RATE_HZ)
+    assert [np.mean(steps == k) for k in (1, 2, 3)] == pytest.approx([1 / 3] * 3, abs=0.07)
+    np.testing.assert_array_equal(thin.speed_rad_s[:, 0], run.speed_rad_s[np.isin(run.t_s, thin.t_s), 0])
+    np.testing.assert_array_equal(irregular(run, seed=1).t_s, thin.t_s)
+    assert irregular(run, seed=2).samples != thin.samples or np.any(irregular(run, seed=2).t_s != thin.t_s)
+
+
+def test_where_the_grids_hardly_meet_speeds_lie_between_their_neighbours_and_gaps_stay_gaps() -> None:
+    # A step of 16.1 ms against one of 20 ms: they meet in one time out of 161.
+    t_s = np.arange(400, dtype=np.float64) * 0.0161
+    speed = 3.0 + 2.0 * t_s
+    speed[100] = speed[200:203] = np.nan
+    other = resampled(Run("line", t_s, np.ones(400), speed), 50.0)
+    known = np.isfinite(other.speed_rad_s[:, 0])
+    assert other.speed_rad_s[known, 0] == pytest.approx(3.0 + 2.0 * other.t_s[known])
+    in_gap = (other.t_s > t_s[199] + 1e-9) & (other.t_s < t_s[203] - 1e-9)
+    np.testing.assert_array_equal(~known, in_gap)
+
+
+def test_lost_samples_stay_lost_but_an_uneven_run_is_interpolated() -> None:
+    run = fan_data.published_run(3, 10.0)
+    kept = np.random.default_rng(4).random(run.samples) > 0.2
+    kept[0] = True
+    lossy = resampled(Run("lossy", run.t_s[kept], run.command[kept], run.speed_rad_s[kept]), 50.0)
+    np.testing.assert_array_equal(np.isfinite(lossy.speed_rad_s[:, 0]), kept[: 2 * lossy.samples : 2])
+    # Steps of 10 and 15 ms: a third of the times at 100 Hz would meet samples, and not just any third.
+    t_s = np.cumsum(np.random.default_rng(5).choice([0.010, 0.015], 400))
+    uneven = resampled(Run("uneven", t_s, np.ones(400), 3.0 + 2.0 * t_s), 100.0)
+    assert uneven.speed_rad_s[:, 0] == pytest.approx(3.0 + 2.0 * uneven.t_s)
+
+
+def test_long_gaps_are_left_out_and_short_stretches_too() -> None:
+    run = fan_data.published_run(5, 10.0)
+    later = run.t_s + np.where(run.t_s > 5.0, 60.0, 0.0) + np.where(run.t_s > 9.95, 60.0, 0.0)
+    pieces = on_grid([Run("gapped", later, run.command, run.speed_rad_s)], 10.0)
+    assert [piece.samples for piece in pieces] == [51, 50]
+    assert len(on_grid([run, run], "irregular")) == 2
+
+
+def test_what_cannot_be_resampled_is_refused_in_one_line() -> None:
+    run = fan_data.published_run(6, 1.0)
+    with pytest.raises(TwinError, match="a rate of 0.0 Hz; give a positive number"):
+        resampled(run, 0.0)
+    with pytest.raises(TwinError, match="0.99 s are shorter than one step at 1 Hz"):
+        resampled(run, 1.0)
+    with pytest.raises(TwinError, match="no run is long enough to be judged at 0.5 Hz"):
+        on_grid([run], 0.5)
+    with pytest.raises(TwinError, match="no run is long enough to be judged at irregular steps"):
+        on_grid([run.rows(0, 3)], "irregular")
+
+
+def parameters_of(**values: float) -> Array:
+    return np.array([[values.get(name, 0.0) for name in PARAMETER_NAMES]])
+
+
+PUBLISHED = dict(zip(("J", "alpha", "C_D"), fan_data.PUBLISHED_PARAMETERS.tolist(), strict=True))
+LINEAR = {"J": 0.15, "alpha": 0.3}
+
+
+def simulated(model: TwinModel, parameters: Array, seed: int = 8) -> Run:
+    """40 s at 100 Hz of a fan that is as the model says, integrated in steps of 1 ms, with noise."""
+    rng = np.random.default_rng(seed)
+    command = fan_data.stairs(rng, 4000, 1)
+    start = model.state_layout.initial_state(np.zeros(1), command[0])
+    speed, _ = model.advance(start, np.repeat(command, 10, axis=0), np.full(40_000, 0.001), parameters)
+    noisy = speed[::10] + rng.normal(0.0, NOISE, command.shape)
+    return Run("simulated", np.arange(4000) / fan_data.RATE_HZ, command, noisy)
+
+
+def errors_in_noise(model: TwinModel, parameters: Array, run: Run) -> dict[str, float]:
+    """Free-run error over the noise on the run's own grid and on the others."""
+    runs = {"own": [run]} | {str(grid): on_grid([run], grid) for grid in OTHER_GRIDS}
+    sigma = np.array([NOISE])
+    return {name: evaluate_model(model, parameters, sigma, on).pooled.rmse_rad_s / NOISE for name, on in runs.items()}
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.05])
+def test_a_physical_twin_is_as_good_on_every_grid(lag_s: float) -> None:
+    parameters = parameters_of(**PUBLISHED, lag_s=lag_s)
+    # 800 samples at 20 Hz: their root mean square scatters by 2.5 %.
+    for error in errors_in_noise(PhysicalModel(), parameters, simulated(PhysicalModel(), parameters)).values():
+        assert error == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.parametrize("inputs", [("speed", "command"), ("speed",)])
+def test_a_hybrid_is_as_good_on_every_grid(inputs: tuple[str, ...]) -> None:
+    parameters = parameters_of(**PUBLISHED)
+    untrained = TanhNetwork.zero(UNITS, inputs, Scaling(50.0, 50.0, 50.0, 50.0, 100.0))
+    weights = np.random.default_rng(1).normal(0.0, 0.7, untrained.parameter_count)
+    hybrid = Hybrid(untrained.with_theta(weights))
+    run = simulated(hybrid, parameters)
+    for error in errors_in_noise(hybrid, parameters, run).values():
+        assert error == pytest.approx(1.0, abs=0.06)
+    # The network matters: physics alone are far off.
+    assert errors_in_noise(PhysicalModel(), parameters, run)["own"] > 2.0
+
+
+def test_narx_knows_no_step_and_holds_on_no_other_grid_however_good_it_is_on_its_own() -> None:
+    parameters = parameters_of(**LINEAR)
+    run = simulated(PhysicalModel(), parameters)
+    narx = exact_narx_of_the_linear_fan()
+    errors = errors_in_noise(narx, parameters, run)
+    assert errors.pop("own") == pytest.approx(1.0, abs=0.03)
+    assert min(errors.values()) > 3.0
+    assert max(errors_in_noise(PhysicalModel(), parameters, run).values()) < 1.06
+
+
+def exact_narx_of_the_linear_fan() -> Narx:
+    """w[k+1] = a w[k] + b u[k] at 100 Hz, by one unit of which only the linear part is reached."""
+    a = np.exp(-LINEAR["alpha"] / LINEAR["J"] / fan_data.RATE_HZ)
+    small = 1e-6
+    rows = np.zeros((INPUTS + 2, NARX_UNITS))
+    rows[0, 0], rows[ORDER, 0], rows[-1, 0] = small * a, small * (1.0 - a) / LINEAR["alpha"], 1.0 / small
+    return Narx(np.append(rows.ravel(), 0.0), Scaling(0.0, 1.0, 0.0, 1.0, 1.0))
+
+
+@pytest.mark.slow
+def test_a_trained_hybrid_holds_on_grids_that_it_was_not_trained_on() -> None:
+    twin = train_twin([fan_data.rough_run(1, 30.0)], [], "hybrid", name="hybrid", max_iterations=8)
+    held_out = fan_data.rough_run(2, 30.0)
+    errors = errors_in_noise(twin.model, twin.parameters, held_out)
+    assert max(errors.values()) < 1.1 * errors["own"] < 2.0

@@ -1,0 +1,245 @@
+"""The residual analysis against residuals whose correlation is known. Many repetitions: the bounds are statements."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from tests.support import fan_data
+from twin.errors import TwinError
+from twin.evaluation.accuracy import free_run_residuals
+from twin.evaluation.residual_analysis import ResidualAnalysis, analyse_residual, healthy_residual
+from twin.models.physical import PhysicalModel
+from twin.models.physics import PARAMETER_NAMES
+from twin.runs import Array, Run
+
+STEP_S = 0.01
+SAMPLES = 4000
+
+
+def times(samples: int) -> Array:
+    return np.arange(samples, dtype=np.float64) * STEP_S
+
+
+def pieces_of(command: Array, lengths: Sequence[int] | None = None) -> list[Run]:
+    ends = np.cumsum(lengths if lengths else [len(command)])
+    parts = np.split(command, ends[:-1])
+    return [Run("piece", times(len(part)), part, np.zeros(len(part))) for part in parts]
+
+
+def analysed(residual: Array, command: Array, lengths: Sequence[int] | None = None) -> ResidualAnalysis:
+    return analyse_residual(residual[:, np.newaxis], pieces_of(command, lengths), settling_s=0.0)[0]
+
+
+def white(rng: np.random.Generator) -> Array:
+    return rng.normal(size=SAMPLES)
+
+
+def slow(rng: np.random.Generator) -> Array:
+    """Autocorrelation exp(-t / 0.5 s)."""
+    drawn = rng.normal(size=SAMPLES + 1000)
+    return np.asarray(signal.lfilter([1.0], [1.0, -np.exp(-STEP_S / 0.5)], drawn))[1000:]
+
+
+def oscillating(rng: np.random.Generator) -> Array:
+    """A resonance at 1 Hz."""
+    pole = 0.98 * np.exp(2j * np.pi * STEP_S)
+    drawn = rng.normal(size=SAMPLES + 1000)
+    return np.asarray(signal.lfilter([1.0], np.poly([pole, pole.conj()]).real, drawn))[1000:]
+
+
+def stairs(rng: np.random.Generator) -> Array:
+    return fan_data.stairs(rng, SAMPLES, 1)[:, 0]
+
+
+def binary(rng: np.random.Generator) -> Array:
+    return np.repeat(rng.integers(0, 2, SAMPLES // 10).astype(float), 10)
+
+
+def test_white_noise_leaves_the_95_percent_bound_at_5_percent_of_the_lags() -> None:
+    rng = np.random.default_rng(1)
+    analyses = [analysed(white(rng), stairs(rng)) for _ in range(60)]
+    assert analyses[0].lags_s[[0, -1]].tolist() == pytest.approx([STEP_S, 5.0])
+    outside = [np.abs(analysis.autocorrelation) > analysis.bound_95 for analysis in analyses]
+    assert np.mean(outside) == pytest.approx(0.05, abs=0.01)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.4])
+def test_the_whiteness_test_rejects_as_much_white_noise_as_it_says(missing: float) -> None:
+    rng = np.random.default_rng(2)
+    p = []
+    for _ in range(400):
+        residual = np.where(rng.random(SAMPLES) < missing, np.nan, white(rng))
+        p.append(analysed(residual, np.zeros(SAMPLES)).ljung_box_p)
+    # three standard deviations of a share of 400
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.033)
+    assert np.mean(np.array(p) < 0.5) == pytest.approx(0.5, abs=0.075)
+
+
+def test_little_autocorrelation_is_found_and_no_more_than_that() -> None:
+    rng = np.random.default_rng(3)
+    drawn = white(rng)
+    residual = drawn + 0.1 * np.roll(drawn, 1)
+    assert analysed(residual, stairs(rng)).white is False
+    assert analysed(drawn, stairs(rng)).white
+
+
+@pytest.mark.parametrize("command", [stairs, binary])
+@pytest.mark.parametrize("residual", [white, slow, oscillating])
+def test_unrelated_signals_leave_the_cross_bound_at_5_percent_of_the_lags(
+    residual: Callable[[np.random.Generator], Array], command: Callable[[np.random.Generator], Array]
+) -> None:
+    rng = np.random.default_rng(4)
+    outside, largest = [], []
+    for _ in range(80):
+        analysis = analysed(residual(rng), command(rng))
+        outside.append(np.mean(np.abs(analysis.cross_correlation) > analysis.cross_bound_95))
+        largest.append(abs(analysis.cross_over_bound))
+    assert np.mean(outside) == pytest.approx(0.05, abs=0.02)
+    assert np.mean(np.array(largest) > 2.0) < 0.1
+
+
+def test_a_bound_for_white_signals_would_be_wrong_for_slow_ones() -> None:
+    rng = np.random.default_rng(4)
+    outside = []
+    for _ in range(40):
+        analysis = analysed(slow(rng), stairs(rng))
+        outside.append(np.mean(np.abs(analysis.cross_correlation) > 1.96 / np.sqrt(SAMPLES)))
+    assert np.mean(outside) > 0.5
+
+
+@pytest.mark.parametrize("gain", [0.3, -0.3])
+def test_what_follows_the_command_is_seen_at_its_lag_with_its_sign(gain: float) -> None:
+    rng = np.random.default_rng(5)
+    command = rng.normal(size=SAMPLES)
+    analysis = analysed(white(rng) + gain * np.roll(command, 25), command)
+    assert analysis.cross_peak_lag_s == pytest.approx(0.25)
+    assert analysis.cross_over_bound * gain > 0.0
+    assert abs(analysis.cross_over_bound) > 5.0
+    peak = analysis.cross_correlation[np.argmin(np.abs(analysis.cross_lags_s - 0.25))]
+    assert peak == pytest.approx(gain / np.hypot(1.0, gain), abs=0.05)
+
+
+def test_a_command_that_answers_the_residual_shows_at_a_negative_lag() -> None:
+    rng = np.random.default_rng(6)
+    residual = white(rng)
+    analysis = analysed(residual, 0.5 * np.roll(residual, 10) + rng.normal(size=SAMPLES))
+    assert analysis.cross_lags_s[np.argmax(analysis.cross_correlation)] == pytest.approx(-0.10)
+    assert abs(analysis.cross_over_bound) < 2.0
+
+
+def test_a_model_too_weak_or_too_slow_is_seen_in_its_residual() -> None:
+    run = fan_data.published_run(7)
+
+    def judged(**wrong: float) -> ResidualAnalysis:
+        true = dict(zip(PARAMETER_NAMES, fan_data.PUBLISHED_PARAMETERS.tolist(), strict=False)) | {"lag_s": 0.0}
+        parameters = np.array([[(true | wrong)[name] for name in PARAMETER_NAMES]])
+        return analyse_residual(free_run_residuals(PhysicalModel(), parameters, [run]), [run])[0]
+
+    good, draggy, heavy = judged(), judged(C_D=0.0027), judged(J=0.18)
+    assert good.white
+    assert abs(good.cross_over_bound) < 2.0
+    assert draggy.white is False
+    assert draggy.cross_over_bound > 2.0
+    # A fan with less drag than its model is above it.
+    assert draggy.mean_rad_s > 3.0 > abs(good.mean_rad_s)
+    assert heavy.white is False
+    # A heavy model is late: the fan is ahead of it after each step of the command, and not for long.
+    assert 0.0 < heavy.cross_peak_lag_s < 0.5
+    assert heavy.cross_over_bound > 2.0
+
+
+def test_the_error_of_the_start_is_not_held_against_the_model() -> None:
+    rng = np.random.default_rng(14)
+    start = 10.0 * np.exp(-times(SAMPLES) / 0.4)
+    residual, (run,) = (white(rng) + start)[:, np.newaxis], pieces_of(stairs(rng))
+    assert analyse_residual(residual, [run])[0].white
+    assert analyse_residual(residual, [run], settling_s=0.0)[0].white is False
+    assert healthy_residual(residual, [run]).sigma_rad_s == pytest.approx((1.0,), rel=0.03)
+    assert analyse_residual(residual[:200], [run.rows(0, 200)])[0].samples == 100
+    residual[3] = np.inf
+    assert np.isnan(analyse_residual(residual, [run])[0].ljung_box_p)
+
+
+def test_runs_are_not_joined_across_their_ends() -> None:
+    # In each run the residual has its own level: joined, the jumps between runs would count as lagged products.
+    rng = np.random.default_rng(8)
+    lengths = [1000, 1000, 1000, 1000]
+    residual, command = white(rng), white(rng)
+    analysis = analysed(residual, command, lengths)
+    centred = residual - residual.mean()
+    parts = np.split(centred, 4)
+    lag = 7
+    expected = np.sum([part[lag:] @ part[:-lag] for part in parts]) / (4 * (1000 - lag)) / centred.var()
+    assert analysis.autocorrelation[lag - 1] == pytest.approx(expected, rel=1e-9)
+    driven = np.split((command - command.mean()) / command.std(), 4)
+    pairs = zip(parts, driven, strict=True)
+    crossed = np.sum([part[lag:] @ drive[:-lag] for part, drive in pairs]) / (4 * (1000 - lag)) / centred.std()
+    assert analysis.cross_correlation[len(analysis.lags_s) + lag] == pytest.approx(crossed, rel=1e-9)
+
+
+def test_a_gap_within_a_run_is_time_in_which_nothing_was_measured() -> None:
+    rng = np.random.default_rng(9)
+    residual = slow(rng)
+    kept = rng.random(SAMPLES) < 0.7
+    run = Run("lossy", times(SAMPLES)[kept], np.zeros(kept.sum()), residual[kept])
+    lossy = analyse_residual(residual[kept, np.newaxis], [run], settling_s=0.0)[0]
+    marked = analysed(np.where(kept, residual, np.nan), np.zeros(SAMPLES))
+    common = slice(0, 400)
+    np.testing.assert_allclose(lossy.autocorrelation[common], marked.autocorrelation[common], atol=1e-3)
+    assert lossy.ljung_box_p == pytest.approx(marked.ljung_box_p)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.5])
+@pytest.mark.parametrize("residual", [white, slow])
+def test_independent_samples_say_how_far_the_mean_scatters(
+    residual: Callable[[np.random.Generator], Array], missing: float
+) -> None:
+    rng = np.random.default_rng(10)
+    drawn = [np.where(rng.random(SAMPLES) < missing, np.nan, residual(rng)) for _ in range(200)]
+    told = [np.nanstd(one) / np.sqrt(analysed(one, np.zeros(SAMPLES)).independent_samples) for one in drawn]
+    assert np.mean(told) == pytest.approx(np.std([np.nanmean(one) for one in drawn]), rel=0.2)
+
+
+def test_the_autocorrelation_time_is_that_of_an_exponential_with_and_without_lost_samples() -> None:
+    rng = np.random.default_rng(11)
+    for missing in (np.zeros(SAMPLES, dtype=bool), rng.random(SAMPLES) < 0.5, np.arange(SAMPLES) % 2 == 1):
+        times = [
+            analysed(np.where(missing, np.nan, slow(rng)), np.zeros(SAMPLES)).autocorrelation_time_s for _ in range(60)
+        ]
+        assert np.mean(times) == pytest.approx(0.5, rel=0.15)
+
+
+def test_the_card_holds_the_tails_of_the_healthy_residual() -> None:
+    rng = np.random.default_rng(12)
+    residual = np.column_stack((3.0 * rng.normal(size=100_000), rng.normal(size=100_000)))
+    residual[::7, 0] = np.nan
+    run = Run("long", times(100_000), np.zeros((100_000, 2)), residual)
+    card = healthy_residual(residual, [run])
+    assert card.sigma_rad_s == pytest.approx((3.0, 1.0), rel=0.02)
+    assert card.quantiles_sigma[0] == pytest.approx((1.96, 2.576, 3.291), rel=0.03)
+    assert card.max_sigma[1] == pytest.approx(np.abs(residual[:, 1]).max() / card.sigma_rad_s[1])
+    assert card.autocorrelation_time_s == pytest.approx((STEP_S / 2, STEP_S / 2), rel=0.2)
+    assert card.independent_samples[1] == pytest.approx(100_000, rel=0.2)
+
+
+def test_where_nothing_can_be_said_nothing_is() -> None:
+    diverged = np.r_[np.zeros(SAMPLES - 1), np.inf]
+    never_measured = np.full(SAMPLES, np.nan)
+    for residual in (diverged, never_measured, np.ones(SAMPLES)):
+        analysis = analysed(residual, np.zeros(SAMPLES))
+        assert np.isnan(analysis.ljung_box_p)
+        assert analysis.white is None
+        assert np.isnan(analysis.autocorrelation).all()
+        assert np.isnan(analysis.cross_over_bound)
+    still = analysed(white(np.random.default_rng(13)), np.ones(SAMPLES))
+    assert np.isnan(still.cross_bound_95)
+    assert np.isnan(still.cross_peak_lag_s)
+    assert still.white
+    assert np.isnan(healthy_residual(never_measured[:, np.newaxis], pieces_of(np.zeros(SAMPLES))).max_sigma[0])
+
+
+def test_a_residual_of_other_runs_is_refused() -> None:
+    with pytest.raises(TwinError, match="residual of 10 samples, runs of 4000"):
+        analyse_residual(np.zeros((10, 1)), pieces_of(np.zeros(SAMPLES)))

@@ -1,0 +1,274 @@
+"""The exported file against the model in numpy and in torch, and files that are not one."""
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import helper
+
+from tests.support import fan_data
+from tests.twin.models.test_models import ALL_MODELS, random_network
+from twin.build import TrainedTwin, evaluate, train_twin
+from twin.errors import TwinError
+from twin.export.card import CARD_KEY, Card, DataCard
+from twin.export.onnx_export import export_onnx
+from twin.export.onnx_twin import INPUTS, OUTPUTS, OnnxTwin
+from twin.fitting.torch_reference import torch_free_run
+from twin.models.hybrid import Hybrid
+from twin.models.lag import effective_command
+from twin.models.model import Model, NetworkOde
+from twin.models.neural_ode import NeuralOde
+from twin.models.physical import PhysicalModel
+from twin.models.physics import LAG
+
+MINUTE = 6000
+CREATED = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+@pytest.fixture(scope="module")
+def trained() -> TrainedTwin:
+    run = fan_data.published_run(1, 20.0, fans=2)
+    data = [DataCard("bench.csv", "ab" * 32, run.fans, run.samples)]
+    return train_twin([run], [], "physical", name="bench", command_unit="%", data=data, created=CREATED)
+
+
+def saved(model: Model, card: Card, folder: Path) -> OnnxTwin:
+    fields = json.loads(card.to_json())
+    fields |= {"kind": model.kind, "n_state": model.state_layout.size}
+    fields["state_layout"] = {"speed": model.state_layout.speed, "command": model.state_layout.command}
+    path = folder / f"{model.kind}.onnx"
+    path.write_bytes(export_onnx(model, Card.from_json(json.dumps(fields))))
+    return OnnxTwin(path)
+
+
+EVERY_MODEL = [*ALL_MODELS, Hybrid(random_network(10, ("speed",)))]
+every_model = pytest.mark.parametrize("model", EVERY_MODEL, ids=["physical", "neural-ode", "hybrid", "narx", "speed"])
+FANS = 4
+
+
+def fleet(lag_s: float) -> np.ndarray:
+    """(4, 4) parameters of fans that differ in everything; the second never has a lag, the last a small one."""
+    scale = np.linspace(0.8, 1.3, FANS)[:, np.newaxis] ** np.array([1.0, -1.0, 2.0, 1.0])
+    return scale * np.array([*fan_data.PUBLISHED_PARAMETERS, 0.0]) + lag_s * np.outer(
+        [1.0, 0.0, 20.0, 1e-3], [0, 0, 0, 1]
+    )
+
+
+def minute_of_commands() -> tuple[np.ndarray, np.ndarray]:
+    """A minute for four fans at uneven steps, some of them tiny or zero."""
+    rng = np.random.default_rng(9)
+    step_s = rng.uniform(0.008, 0.012, MINUTE)
+    step_s[100:110], step_s[2000] = 1e-7, 0.0
+    return fan_data.stairs(rng, MINUTE, FANS), step_s
+
+
+def state_of(model: Model, command: np.ndarray) -> np.ndarray:
+    """Fans that turn, one of them backwards, after another command than the first one here."""
+    return model.state_layout.initial_state(np.array([20.0, 90.0, 0.0, -40.0]), command[0] + 30.0)
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.05])
+@every_model
+def test_the_file_runs_a_minute_in_two_blocks_as_numpy_does_in_one(
+    model: Model, lag_s: float, trained: TrainedTwin, tmp_path: Path
+) -> None:
+    command, step_s = minute_of_commands()
+    twin = saved(model, trained.card, tmp_path)
+    state, parameters = state_of(model, command), fleet(lag_s)
+    expected, expected_state = model.advance(state, command, step_s, parameters)
+    first, middle = twin.advance(state, command[:777], step_s[:777], parameters)
+    second, last = twin.advance(middle, command[777:], step_s[777:], parameters)
+    assert np.ptp(expected, axis=0).min() > 50.0
+    np.testing.assert_allclose(np.concatenate((first, second)), expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(last, expected_state, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [Hybrid(random_network(10)), Hybrid(random_network(10, ("speed",))), NeuralOde(random_network(20))],
+    ids=["hybrid", "hybrid on speed alone", "neural-ode"],
+)
+def test_the_file_runs_a_minute_as_torch_does(model: NetworkOde, trained: TrainedTwin, tmp_path: Path) -> None:
+    command, step_s = minute_of_commands()
+    state, parameters = state_of(model, command), fleet(0.05)
+    acting, _ = effective_command(command, step_s[:, np.newaxis], parameters[:, LAG], state[:, 1])
+    with torch.no_grad():
+        arrays = (model.network.theta, parameters, state[:, 0], acting, step_s)
+        expected = torch_free_run(model, *(torch.from_numpy(array) for array in arrays)).numpy()
+    speed, _ = saved(model, trained.card, tmp_path).advance(state, command, step_s, parameters)
+    np.testing.assert_allclose(speed, expected, rtol=1e-5)
+
+
+@every_model
+def test_the_numbers_do_not_depend_on_how_a_run_is_cut_into_blocks(
+    model: Model, trained: TrainedTwin, tmp_path: Path
+) -> None:
+    command, step_s = (values[:300] for values in minute_of_commands())
+    twin, parameters = saved(model, trained.card, tmp_path), fleet(0.05)
+    start = state_of(model, command)
+    whole, last = twin.advance(start, command, step_s, parameters)
+    for size in (1, 7, 299):
+        parts, state = [], start
+        for first in range(0, 300, size):
+            block = slice(first, first + size)
+            speed, state = twin.advance(state, command[block], step_s[block], parameters)
+            parts.append(speed)
+        np.testing.assert_array_equal(np.concatenate(parts), whole)
+        np.testing.assert_array_equal(state, last)
+
+
+@pytest.mark.parametrize("model", [PhysicalModel(), Hybrid(random_network(10))], ids=["physical", "hybrid"])
+def test_without_a_lag_the_command_itself_acts_to_the_last_bit(
+    model: Model, trained: TrainedTwin, tmp_path: Path
+) -> None:
+    command, step_s = (values[:300] for values in minute_of_commands())
+    command[::3] = 0.0
+    twin, parameters = saved(model, trained.card, tmp_path), fleet(0.0)
+    speed = np.full(FANS, 50.0)
+    runs = [
+        twin.advance(np.column_stack((speed, lagged)), command, step_s, parameters)
+        for lagged in (command[0], -command[0] / 3.0)
+    ]
+    np.testing.assert_array_equal(runs[0][0], runs[1][0])
+    np.testing.assert_array_equal(runs[0][1][:, 1], command[-1])
+
+
+def test_a_step_of_zero_leaves_every_fan_where_it_is(trained: TrainedTwin, tmp_path: Path) -> None:
+    twin, parameters = saved(ALL_MODELS[2], trained.card, tmp_path), fleet(0.05)
+    state = np.array([[20.0, 5.0], [90.0, 6.0], [0.0, 7.0], [-40.0, 8.0]])
+    speed, after = twin.advance(state, np.full((3, FANS), 70.0), np.zeros(3), parameters)
+    np.testing.assert_array_equal(speed, np.tile(state[:, 0], (3, 1)))
+    lags = parameters[:, LAG] > 0.0
+    np.testing.assert_array_equal(after[lags], state[lags])
+    np.testing.assert_array_equal(after[~lags], [[90.0, 70.0]])
+
+
+@every_model
+def test_a_step_of_the_model_is_few_nodes(model: Model, trained: TrainedTwin, tmp_path: Path) -> None:
+    graph = onnx.load(saved(model, trained.card, tmp_path).path).graph
+    scan = next(node for node in graph.node if node.op_type == "Scan")
+    body = next(attribute.g for attribute in scan.attribute if attribute.name == "body")
+    most = {"physical": 37, "neural-ode": 29, "hybrid": 51, "narx": 13}
+    assert len(body.node) <= most[model.kind]
+    assert len(graph.node) <= 14
+
+
+def test_the_graph_keeps_the_contract(trained: TrainedTwin, tmp_path: Path) -> None:
+    graph = onnx.load(trained.save(tmp_path / "twin.onnx")).graph
+
+    def shapes(values) -> dict[str, list[str | int]]:
+        return {
+            value.name: [axis.dim_param or axis.dim_value for axis in value.type.tensor_type.shape.dim]
+            for value in values
+        }
+
+    assert shapes(graph.input) == {
+        "state": ["fans", 2],
+        "command": ["n", "fans"],
+        "step_s": ["n"],
+        "parameters": ["fans", 4],
+    }
+    assert shapes(graph.output) == {"speed_rad_s": ["n", "fans"], "state_out": ["fans", 2]}
+
+
+def test_the_card_travels_in_the_file(trained: TrainedTwin, tmp_path: Path) -> None:
+    card = OnnxTwin(trained.save(tmp_path / "twin.onnx")).card
+    assert card == trained.card
+    assert card.created == "2026-01-01T00:00:00+00:00"
+    assert card.command_unit == "%"
+    assert card.training.data[0].sha256 == "ab" * 32
+    assert card.rate_hz == pytest.approx(100.0)
+    assert card.calibration is None
+    calibrated = replace(card, calibration={"false_alarms_per_day": 1.0, "limits": [3.0, None]})
+    assert Card.from_json(calibrated.to_json()) == calibrated
+    np.testing.assert_array_equal(card.parameters, trained.parameters)
+
+
+def test_evaluating_the_file_is_evaluating_the_twin(trained: TrainedTwin, tmp_path: Path) -> None:
+    run = fan_data.published_run(2, 10.0, fans=2)
+    from_file, from_memory = evaluate(trained.save(tmp_path / "twin.onnx"), [run]), evaluate(trained, [run])
+    assert from_file.pooled.rmse_rad_s == pytest.approx(from_memory.pooled.rmse_rad_s, rel=1e-9)
+    assert from_file.pooled.one_step_rmse_rad_s == pytest.approx(from_memory.pooled.one_step_rmse_rad_s, rel=1e-9)
+
+
+def test_the_same_model_and_card_give_the_same_bytes(trained: TrainedTwin) -> None:
+    assert export_onnx(trained.model, trained.card) == export_onnx(trained.model, trained.card)
+
+
+def foreign_model(path: Path) -> None:
+    value = helper.make_tensor_value_info("x", onnx.TensorProto.DOUBLE, ["n"])
+    out = helper.make_tensor_value_info("y", onnx.TensorProto.DOUBLE, ["n"])
+    graph = helper.make_graph([helper.make_node("Abs", ["x"], ["y"])], "abs", [value], [out])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(TwinError) as caught:
+        OnnxTwin(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_file_that_is_not_a_twin_is_refused_in_one_line(tmp_path: Path) -> None:
+    text, foreign = tmp_path / "notes.txt", tmp_path / "abs.onnx"
+    text.write_text("not a model")
+    foreign_model(foreign)
+    assert "no such file" in refusal(tmp_path / "absent.onnx")
+    assert "not an ONNX file" in refusal(text)
+    assert "not a fantwin twin" in refusal(foreign)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"format_version": 99}, "format_version 99"),
+        ({"format_version": 1}, "format_version 1, this program reads 3"),
+        ({"state_layout": {"speed": 1, "command": 0}, "n_state": 1}, r"the card says (fans, 1)"),
+        ({"n_state": 3}, "n_state or parameters"),
+        ({"parameters": [[0.1, 0.1, 0.1, 0.0]]}, "n_state or parameters"),
+        ({"parameter_names": ["J", "alpha", "C_D"]}, r"the card says (fans, 3)"),
+    ],
+)
+def test_a_card_that_does_not_fit_the_graph_is_refused_in_one_line(
+    trained: TrainedTwin, tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
+    path = trained.save(tmp_path / "twin.onnx")
+    file = onnx.load(path)
+    helper.set_model_props(file, {CARD_KEY: json.dumps(json.loads(trained.card.to_json()) | changes)})
+    onnx.save(file, path)
+    assert words in refusal(path)
+
+
+def test_a_graph_of_single_precision_is_refused(trained: TrainedTwin, tmp_path: Path) -> None:
+    path = tmp_path / "single.onnx"
+    names = [*INPUTS, *OUTPUTS]
+    values = {name: helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["a", "b"]) for name in names}
+    nodes = [helper.make_node("Identity", [start], [end]) for start, end in zip(INPUTS, OUTPUTS, strict=False)]
+    graph = helper.make_graph(nodes, "g", [values[n] for n in INPUTS], [values[n] for n in OUTPUTS])
+    file = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    helper.set_model_props(file, {CARD_KEY: trained.card.to_json()})
+    onnx.save(file, path)
+    assert "must be float64" in refusal(path)
+
+
+def test_a_truncated_file_is_refused_wherever_it_was_cut(trained: TrainedTwin, tmp_path: Path) -> None:
+    whole, path = trained.save(tmp_path / "twin.onnx").read_bytes(), tmp_path / "cut.onnx"
+    for length in np.linspace(0, len(whole) - 1, 60).astype(int):
+        path.write_bytes(whole[:length])
+        refusal(path)
+
+
+def test_a_card_with_a_field_missing_or_wrong_names_it(trained: TrainedTwin) -> None:
+    fields = json.loads(trained.card.to_json())
+    with pytest.raises(TwinError, match="rate_hz is wrong"):
+        Card.from_json(json.dumps(fields | {"rate_hz": "fast"}))
+    del fields["fans"]
+    with pytest.raises(TwinError, match="fans is wrong: Field required"):
+        Card.from_json(json.dumps(fields))

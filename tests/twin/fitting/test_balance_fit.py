@@ -1,0 +1,211 @@
+"""twin.fitting.balance_fit: coefficients are those of the fan, the better candidate is chosen, sigma is that of
+noise."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.recordings.runs import read_runs
+from simulation import published_fan
+from simulation.plant import FanParameters, advance, at_rest
+from tests.support.fan_data import NOISE_RAD_S
+from tests.support.fantwin_command import fantwin
+from twin.errors import TwinError
+from twin.evaluation.resampling import resampled
+from twin.export.onnx_twin import OnnxTwin
+from twin.fitting.balance import FILTER_RATE_PER_S, torque_balance
+from twin.fitting.balance_fit import BalanceFit, fit_balance
+from twin.fitting.identification import Identification, identify
+from twin.runs import Array, Run
+
+PLANT = FanParameters(stribeck_rad_s=1.0)
+DUTY_PER_V = (PLANT.duty_full - PLANT.duty_dead) / PLANT.supply_v
+TRUTH = (
+    np.array([PLANT.J, PLANT.alpha, PLANT.C_D, PLANT.coulomb_v + PLANT.duty_dead / DUTY_PER_V], dtype=np.float64)
+    * DUTY_PER_V
+)
+"""Of PLANT, in duty: friction and the dead zone of its bridge are one."""
+
+
+@pytest.fixture(scope="module")
+def published() -> tuple[Run, Identification]:
+    run = published_fan.published_training(1).run
+    return run, identify([run])
+
+
+@pytest.fixture(scope="module")
+def plants() -> tuple[Run, Identification]:
+    """24 times the fan PLANT, each on its own command and with its own noise; identified once."""
+    fans, noise_rad_s = 24, 4.0
+    duty = published_fan.random_stairs(3, 40.0, fans, 0.05, 1.0)
+    state, speeds = at_rest(fans), []
+    for held in duty:
+        speeds.append(state.speed_rad_s)
+        state = advance(state, held, 0.01, PLANT)
+    noise = np.random.default_rng(4).normal(0.0, noise_rad_s, (len(duty), fans))
+    run = Run("plants", np.arange(len(duty)) / 100.0, duty, np.array(speeds) + noise)
+    one = identify([run.fan(0)])
+    many = {
+        "parameters": np.repeat(one.parameters, fans, axis=0),
+        "covariance": np.repeat(one.covariance, fans, axis=0),
+    }
+    return run, replace(one, **many, top_speed_rad_s=np.repeat(one.top_speed_rad_s, fans))
+
+
+def within_run(run: Run, fit: BalanceFit) -> Array:
+    """(n, fans) balance of a run about its mean, without its first second."""
+    balance = torque_balance(run.command, run.speed_rad_s, run.median_step_s, fit.coefficients, fit.lag_s)
+    settled = balance[round(1.0 / run.median_step_s) :]
+    return settled - np.nanmean(settled, axis=0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("make", [published_fan.published_training, published_fan.published_test])
+def test_where_the_physics_are_the_whole_truth_they_are_kept(make, seed) -> None:
+    run = make(seed).run
+    identification = identify([run])
+    fit = fit_balance([run], [], identification)
+    assert fit.sources == ("physics",)
+    np.testing.assert_array_equal(fit.coefficients[:, :3], identification.parameters[:, :3])
+    np.testing.assert_array_equal(fit.std_errors[:, :3], identification.standard_errors[:, :3])
+    assert abs(fit.coefficients[0, 3]) < 4.0 * fit.std_errors[0, 3]
+
+
+def test_sigma_is_what_the_noise_of_the_tacho_makes(published) -> None:
+    run, identification = published
+    fit = fit_balance([run], [], identification)
+    assert fit.sigma_command[0] == pytest.approx(fit.coefficients[0, 0] * FILTER_RATE_PER_S * NOISE_RAD_S, rel=0.08)
+    assert 0.005 <= fit.autocorrelation_time_s[0] < 0.1
+    assert fit.lowest_speed_rad_s[0] == pytest.approx(0.05 * np.quantile(run.speed_rad_s, 0.99))
+
+
+def test_where_there_is_friction_least_squares_find_it_and_the_rest(plants) -> None:
+    run, identification = plants
+    fit = fit_balance([run], [], identification)
+    assert fit.sources.count("least-squares") > 0.9 * run.fans
+    found = fit.coefficients.mean(axis=0)
+    np.testing.assert_allclose(found[:3], TRUTH[:3], rtol=0.03)
+    assert found[3] == pytest.approx(TRUTH[3], abs=0.005), "half a per cent of the full command"
+
+
+def test_standard_errors_are_about_the_scatter_from_recording_to_recording(plants) -> None:
+    run, identification = plants
+    fit = fit_balance([run], [], identification)
+    chosen = np.array(fit.sources) == "least-squares"
+    scatter = fit.coefficients[chosen].std(axis=0, ddof=1)
+    ratio = np.sqrt(np.mean(fit.std_errors[chosen] ** 2, axis=0)) / scatter
+    assert np.all((ratio > 0.6) & (ratio < 2.5)), ratio
+
+
+def test_what_a_fan_needs_is_known_better_than_any_one_of_its_coefficients(plants) -> None:
+    run, identification = plants
+    fit = fit_balance([run], [], identification)
+    chosen = np.array(fit.sources) == "least-squares"
+    speed_rad_s = float(np.median(run.speed_rad_s))
+    terms = np.array([0.0, speed_rad_s, speed_rad_s**2, 1.0])
+    needed = fit.coefficients[chosen] @ terms
+    known = np.sqrt(np.mean(np.einsum("i,fij,j->f", terms, fit.covariance[chosen], terms)))
+    one_by_one = np.sqrt(np.mean(np.square(fit.std_errors[chosen] * terms).sum(axis=1)))
+    assert 0.6 < known / needed.std(ddof=1) < 2.5
+    assert one_by_one > 4.0 * known
+
+
+def test_friction_makes_good_what_the_physics_are_wrong_by(published) -> None:
+    run, identification = published
+    fit = fit_balance([run], [], identification)
+    assert fit.sources == ("physics",)
+    speed_rad_s = float(np.mean(run.speed_rad_s[np.isfinite(run.speed_rad_s)]))
+    square = float(np.mean(run.speed_rad_s[np.isfinite(run.speed_rad_s)] ** 2))
+    terms = np.array([0.0, speed_rad_s, square, 1.0])
+    of_need = np.sqrt(terms @ fit.covariance[0] @ terms)
+    assert of_need < 0.5 * np.sqrt(np.square(fit.std_errors[0] * terms).sum())
+    np.testing.assert_allclose(fit.covariance[0], fit.covariance[0].T)
+    assert np.linalg.eigvalsh(fit.covariance[0] / np.outer(fit.std_errors[0], fit.std_errors[0])).min() > -1e-9
+
+
+def test_held_out_runs_judge_and_teach_nothing(published) -> None:
+    run, identification = published
+    other = published_fan.published_test(5).run
+    alone, judged = fit_balance([run], [], identification), fit_balance([run], [other], identification)
+    np.testing.assert_array_equal(judged.coefficients, alone.coefficients)
+    assert judged.sigma_command[0] != alone.sigma_command[0]
+    assert judged.sigma_command[0] == pytest.approx(within_run(other, judged).std(), rel=0.02)
+
+
+def test_what_differs_from_run_to_run_is_no_part_of_sigma(published) -> None:
+    run, identification = published
+    thirds = [replace(run.rows(first, first + 1200), name=str(first)) for first in (400, 1600, 2800)]
+    shifted = [replace(part, command=part.command + 5.0 * k) for k, part in enumerate(thirds)]
+    as_they_are, apart = (fit_balance(thirds, runs, identification) for runs in (thirds, shifted))
+    np.testing.assert_allclose(apart.sigma_command, as_they_are.sigma_command, rtol=1e-9)
+    np.testing.assert_allclose(apart.autocorrelation_time_s, as_they_are.autocorrelation_time_s, rtol=1e-6)
+
+
+def test_a_fan_that_is_held_or_braked_to_a_stop_teaches_nothing_then(published) -> None:
+    run, identification = published
+    speed = run.speed_rad_s.copy()
+    speed[2000:2500] = 0.0
+    stopped, free = (fit_balance([r], [], identification) for r in (replace(run, speed_rad_s=speed), run))
+    assert stopped.sources == free.sources
+    np.testing.assert_allclose(stopped.sigma_command, free.sigma_command, rtol=0.05)
+
+
+def test_a_few_missing_speeds_are_bridged(published) -> None:
+    run, identification = published
+    speed = run.speed_rad_s.copy()
+    speed[np.random.default_rng(1).random(run.samples) < 0.05] = np.nan
+    fit, whole = (fit_balance([r], [], identification) for r in (replace(run, speed_rad_s=speed), run))
+    np.testing.assert_allclose(fit.sigma_command, whole.sigma_command, rtol=0.05)
+
+
+def test_damping_is_never_negative_where_runs_are_at_few_speeds() -> None:
+    levels = [published_fan.rough_run(seed, 12.0, low=60.0).run for seed in range(5)]
+    fit = fit_balance(levels, [], identify(levels))
+    assert np.all(fit.coefficients[:, :3] >= 0.0)
+
+
+def test_runs_too_short_are_refused_in_one_line(published) -> None:
+    run, identification = published
+    with pytest.raises(TwinError, match=r"fan 0: no run in which it turns for more than 1 s on end") as caught:
+        fit_balance([run.between(10.0, 10.9)], [], identification)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.data
+def test_on_rosa_healthy_runs_lie_still_and_faults_stand_out(measured_data, tmp_path) -> None:
+    """A rotor with dry friction under a speed loop: what the physics say of it is absurd."""
+
+    def imported(name: str) -> Path:
+        recording = tmp_path / f"{name}.mcap"
+        columns = ("--time", "Time:ms", "--command", "Shaft Control Effort", "--speed", "Actual Speed:rpm")
+        assert fantwin("import", measured_data / "rosa" / f"{name}.csv", *columns, "-o", recording).exit_code == 0
+        return recording
+
+    learned = [imported(f"healthy_{k}") for k in (44, 98, 103, 110, 120)]
+    told = fantwin("train", *learned, "--model", "physical", "--command-unit", "%", "-o", tmp_path / "t.onnx")
+    assert "torque balance: healthy sigma 0.2" in told.stdout
+    of_card = OnnxTwin(tmp_path / "t.onnx").card.balance
+    assert of_card.source == ("least-squares",)
+    assert 0.1 < of_card.sigma_command[0] < 0.3
+    coefficients = np.column_stack((of_card.inertia, of_card.viscous, of_card.drag, of_card.friction))
+    assert 4.0 < of_card.friction[0] < 8.0
+
+    two = fantwin("train", *learned[2:4], "--model", "physical", "-o", tmp_path / "two.onnx", "--json")
+    assert json.loads(two.stdout)["balance_source"] == ["least-squares"], "no noise makes a J so large"
+
+    def seconds(name: str) -> tuple[Array, Array]:
+        """Balance from the second second on: its samples, and their mean in each second."""
+        (recorded,) = read_runs(imported(name)).runs
+        run = Run(name, recorded.t_s, recorded.command, recorded.speed_rad_s)
+        grid = resampled(run, 100.0)
+        balance = torque_balance(grid.command, grid.speed_rad_s, 0.01, coefficients, np.array(of_card.lag_s))[100:, 0]
+        return balance, balance[: len(balance) // 100 * 100].reshape(-1, 100).mean(axis=1)
+
+    for name in ("healthy_105", "healthy_113", "healthy_118"):
+        assert 0.1 < np.nanstd(seconds(name)[0]) < 0.3, name
+    for name in ("lateral_203", "lateral_230", "vibration_305"):
+        _, by_second = seconds(name)
+        assert by_second.max() - by_second[[0, -1]].min() > 4.0, name

@@ -1,0 +1,48 @@
+"""A network is used where it predicts recordings left out, and left away where it does not."""
+
+import numpy as np
+import pytest
+
+from tests.support import fan_data
+from twin.fitting.cross_validation import chosen_spread, simplest_of_the_best
+from twin.fitting.identification import identify
+from twin.fitting.training import GRID_SPREAD, data_scaling
+from twin.models.hybrid import Hybrid
+from twin.models.network import TanhNetwork
+from twin.runs import Run
+
+
+def untrained(runs: list[Run]) -> Hybrid:
+    return Hybrid(TanhNetwork.zero(10, ("speed", "command"), data_scaling(runs, identify(runs))))
+
+
+@pytest.mark.slow
+def test_a_fan_that_the_physics_describe_gets_no_network_and_a_rough_one_does() -> None:
+    plain = [fan_data.published_run(seed, 20.0) for seed in (1, 2, 3, 4)]
+    rough = [fan_data.rough_run(seed, 20.0) for seed in (1, 2, 3, 4)]
+    assert chosen_spread(untrained(plain), plain, seed=0, physics="refined") == 0.0
+    assert chosen_spread(untrained(rough), rough, seed=0, physics="refined") > 0.0
+
+
+def test_a_recording_without_speeds_does_not_count() -> None:
+    run = fan_data.rough_run(1, 10.0)
+    blind = Run("blind", run.t_s, run.command, np.full_like(run.speed_rad_s, np.nan))
+    assert chosen_spread(untrained([run]), [run, blind], seed=0, physics="refined") == GRID_SPREAD
+
+
+def test_a_single_recording_gives_no_choice() -> None:
+    runs = [fan_data.rough_run(1, 10.0)]
+    assert chosen_spread(untrained(runs), runs, seed=0, physics="refined") == GRID_SPREAD
+
+
+@pytest.mark.parametrize(
+    ("losses", "chosen"),
+    [
+        ([[5.0, 5.0, 5.0], [4.0, 4.1, 3.9]], 1),
+        ([[5.0, 5.0, 5.0], [4.0, 6.0, 4.9]], 0),
+        ([[5.0, 5.0, 5.0], [4.0, np.inf, 4.0]], 0),
+        ([[np.inf, 9.0, 9.0], [4.0, 4.0, 4.0]], 1),
+    ],
+)
+def test_the_simplest_within_one_standard_error_of_the_best_is_chosen(losses: list, chosen: int) -> None:
+    assert simplest_of_the_best(np.array(losses)) == chosen

@@ -1,0 +1,140 @@
+"""Parameters recovered, in any units, or refused."""
+
+import numpy as np
+import pytest
+
+from simulation.published_fan import published_fan
+from tests.support import fan_data
+from twin.errors import TwinError
+from twin.fitting.filtering import filter_between_samples
+from twin.fitting.identification import Identification, filtering_operator, identify
+from twin.runs import Run
+
+
+@pytest.fixture(scope="module")
+def published() -> tuple[Run, Identification]:
+    run = fan_data.published_run(seed=11, duration_s=40.0, fans=8)
+    return run, identify([run])
+
+
+def test_the_published_fan_is_recovered_within_its_confidence_intervals(published) -> None:
+    _, found = published
+    low, high = found.interval_95[..., 0], found.interval_95[..., 1]
+    truth = np.array([*fan_data.PUBLISHED_PARAMETERS, 0.0])
+    inside = (low <= truth) & (high >= truth)
+    assert inside.mean() >= 0.85
+    np.testing.assert_allclose(found.parameters[:, 0], 0.15, rtol=0.02)
+    np.testing.assert_allclose(found.parameters[:, 2], 0.0025, rtol=0.01)
+    assert found.warnings == ()
+
+
+@pytest.mark.slow
+def test_95_percent_intervals_hold_the_truth_in_95_percent_of_recordings() -> None:
+    runs = [fan_data.published_run(seed, duration_s=15.0, fans=20) for seed in range(100, 115)]
+    found = [identify([run]) for run in runs]
+    low, high = (np.concatenate([one.interval_95[:, :3, side] for one in found]) for side in (0, 1))
+    inside = (low <= fan_data.PUBLISHED_PARAMETERS) & (high >= fan_data.PUBLISHED_PARAMETERS)
+    # 300 recordings tell a share of 95 % to 1.3 %
+    assert np.all(np.abs(inside.mean(axis=0) - 0.95) < 0.035), inside.mean(axis=0)
+
+
+def test_short_pieces_beside_a_long_run_do_not_widen_the_intervals() -> None:
+    whole = fan_data.published_run(4, 60.0)
+    pieces = [fan_data.published_run(seed, 1.5) for seed in range(50, 80)]
+    alone, with_pieces = identify([whole]), identify([whole, *pieces])
+    assert np.all(with_pieces.standard_errors[0, :3] < 1.3 * alone.standard_errors[0, :3])
+
+
+def test_a_fan_that_physics_alone_do_not_describe_is_told(published) -> None:
+    assert published[1].misfits == ()
+    found = identify([fan_data.rough_run(1, 40.0)])
+    assert "the physical model misses the speed" in found.misfits[0]
+
+
+def test_a_lag_is_found_where_there_is_one_and_none_where_there_is_none(published) -> None:
+    run, without = published
+    assert np.count_nonzero(without.parameters[:, 3]) == 0
+    lagging = published_fan(run.command, 0, "lagging", lag_s=0.03).run
+    found = identify([lagging])
+    np.testing.assert_allclose(found.parameters[:, 3], 0.03, atol=0.004)
+    assert np.all(np.abs(found.parameters[:, 3] - 0.03) < 4.0 * found.standard_errors[:, 3])
+    np.testing.assert_allclose(found.parameters[:, 0], 0.15, rtol=0.02)
+    published_model = identify([lagging], with_lag=False)
+    assert np.all(published_model.parameters[:, 3] == 0.0)
+    assert np.all(published_model.rmse_rad_s > found.rmse_rad_s)
+
+
+def test_the_free_run_error_of_the_published_fan_is_its_noise(published) -> None:
+    _, found = published
+    np.testing.assert_allclose(found.rmse_rad_s, fan_data.NOISE_RAD_S, rtol=0.03)
+
+
+def test_standard_errors_predict_the_scatter_over_repeated_recordings() -> None:
+    found = [identify([fan_data.published_run(seed, duration_s=15.0, fans=8)]) for seed in (1, 2)]
+    parameters = np.concatenate([one.parameters for one in found])
+    claimed = np.concatenate([one.standard_errors for one in found]).mean(axis=0)
+    ratio = parameters[:, :3].std(axis=0, ddof=1) / claimed[:3]
+    assert np.all((ratio > 0.5) & (ratio < 2.0)), ratio
+
+
+def test_the_filtering_operator_is_exact_without_noise() -> None:
+    command = fan_data.stairs(np.random.default_rng(3), 2000, 1)
+    simulated = published_fan(command, 0, "noisy")
+    run = Run("without noise", simulated.run.t_s, command, simulated.true_speed_rad_s)
+    np.testing.assert_allclose(filtering_operator([run], 0, 2.0)[:3], fan_data.PUBLISHED_PARAMETERS, rtol=5e-3)
+
+
+def test_the_filter_of_a_ramp_is_its_closed_form_over_irregular_steps() -> None:
+    t_s = np.cumsum(np.random.default_rng(2).uniform(1e-4, 0.3, 40))
+    t_s -= t_s[0]
+    filtered = filter_between_samples(t_s[:-1, None], t_s[1:, None], np.diff(t_s), 1.7)
+    np.testing.assert_allclose(filtered[:, 0], t_s / 1.7 - (1.0 - np.exp(-1.7 * t_s)) / 1.7**2, atol=1e-12)
+
+
+def test_units_of_command_and_speed_do_not_matter(published) -> None:
+    run, found = published
+    scaled = identify([Run("counts", run.t_s, run.command * 655.35, run.speed_rad_s * 0.1)])
+    factors = np.array([6553.5, 6553.5, 65535.0, 1.0])
+    np.testing.assert_allclose(scaled.parameters, found.parameters * factors, rtol=1e-3)
+
+
+@pytest.mark.parametrize("stretch", [0.1, 60.0], ids=["23 ms", "14 s"])
+def test_a_fan_ten_times_faster_or_sixty_times_slower_is_recovered(published, stretch: float) -> None:
+    run, _ = published
+    found = identify([Run("stretched", run.t_s * stretch, run.command, run.speed_rad_s)])
+    np.testing.assert_allclose(found.parameters[:, 0], 0.15 * stretch, rtol=0.02)
+
+
+def test_missing_and_jittered_samples_do_not_bias(published) -> None:
+    run, _ = published
+    rng = np.random.default_rng(8)
+    keep = np.sort(rng.choice(run.samples, run.samples * 4 // 5, replace=False))
+    speed = run.speed_rad_s.copy()
+    speed[rng.random(speed.shape) < 0.2] = np.nan
+    found = identify([Run("lossy", run.t_s[keep], run.command[keep], speed[keep])])
+    np.testing.assert_allclose(found.parameters[:, 2], 0.0025, rtol=0.03)
+    np.testing.assert_allclose(found.parameters[:, 0], 0.15, rtol=0.08)
+
+
+def test_a_command_that_never_changes_is_refused() -> None:
+    rng = np.random.default_rng(1)
+    run = Run("constant", np.arange(500) / 100.0, np.full(500, 50.0), 140.0 + rng.normal(size=500))
+    with pytest.raises(TwinError, match="fan 0: the command never changes; record steps"):
+        identify([run])
+
+
+def test_swapped_columns_of_a_dead_sensor_are_refused() -> None:
+    command = fan_data.stairs(np.random.default_rng(3), 500, 1)
+    t_s = np.arange(500) / 100.0
+    with pytest.raises(TwinError, match="speed never changes"):
+        identify([Run("stuck", t_s, command, np.full_like(command, 3.0))])
+    with pytest.raises(TwinError, match="fewer than ten measured speeds"):
+        identify([Run("dead", t_s, command, np.full_like(command, np.nan))])
+
+
+def test_two_nearby_levels_are_warned_about() -> None:
+    rng = np.random.default_rng(4)
+    command = np.where(rng.random(10) < 0.5, 50.0, 51.0).repeat(100)[:, None]
+    run = published_fan(command, 4, "two levels").run
+    found = identify([run.between(2.0, 10.0)])
+    assert any("poorly determined" in line or "negative" in line for line in found.warnings)

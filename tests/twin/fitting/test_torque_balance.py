@@ -1,0 +1,80 @@
+"""twin.fitting.balance: the balance is what its recursion says, knows a fault's torque, and differentiates no noise."""
+
+import numpy as np
+import pytest
+
+from twin.fitting.balance import FILTER_RATE_PER_S, torque_balance
+
+COEFFICIENTS = np.array([[0.15, 0.012, 0.0025, 4.0], [0.3, 0.2, 0.001, -2.0]])
+LAG_S = np.array([0.05, 0.0])
+STEP_S = 0.01
+
+
+def wandering(samples: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Commands and speeds of two fans that have nothing to do with each other."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0.0, 100.0, (samples, 2)), 150.0 + 50.0 * rng.normal(size=(samples, 2))
+
+
+def needed_at(speed: float, fan: int) -> float:
+    _, viscous, drag, friction = COEFFICIENTS[fan]
+    return viscous * speed + drag * speed * abs(speed) + friction
+
+
+def test_it_is_the_recursion_sample_by_sample() -> None:
+    command, speed = wandering(300)
+    balance = torque_balance(command, speed, STEP_S, COEFFICIENTS, LAG_S)
+    a = np.exp(-FILTER_RATE_PER_S * STEP_S)
+    for fan, (lag_s, (inertia, viscous, drag, friction)) in enumerate(zip(LAG_S, COEFFICIENTS, strict=True)):
+        f, lagged = 0.0, command[0, fan]
+        for k in range(299):
+            left = np.exp(-STEP_S / lag_s) if lag_s else 0.0
+            mean_left = (1.0 - left) * lag_s / STEP_S
+            acting = command[k, fan] + (lagged - command[k, fan]) * mean_left
+            lagged = command[k, fan] + (lagged - command[k, fan]) * left
+            middle, rise = speed[k : k + 2, fan].mean(), (speed[k + 1, fan] - speed[k, fan]) / STEP_S
+            x = acting - inertia * rise - viscous * middle - drag * middle * abs(middle) - friction
+            f = a * f + (1.0 - a) * x
+            assert balance[k + 1, fan] == pytest.approx(f / (1.0 - a ** (k + 1)), rel=1e-9)
+    assert np.isnan(balance[0]).all()
+
+
+def test_a_steady_fan_that_takes_more_shows_it_from_its_first_step_on() -> None:
+    speed = np.tile([100.0, -80.0], (50, 1))
+    command = np.tile([needed_at(100.0, 0) + 1.5, needed_at(-80.0, 1) - 0.5], (50, 1))
+    balance = torque_balance(command, speed, STEP_S, COEFFICIENTS, LAG_S)
+    np.testing.assert_allclose(balance[1:], np.tile([1.5, -0.5], (49, 1)), rtol=1e-9)
+
+
+def test_a_torque_that_sets_in_shows_as_the_filter_lets_it() -> None:
+    speed = np.full((400, 2), 100.0)
+    command = np.full((400, 2), [needed_at(100.0, 0), needed_at(100.0, 1)])
+    command[200:, 1] += 2.0
+    balance = torque_balance(command, speed, STEP_S, COEFFICIENTS, LAG_S)
+    since_s = STEP_S * np.arange(200)
+    expected = 2.0 * (1.0 - np.exp(-FILTER_RATE_PER_S * since_s))
+    np.testing.assert_allclose(balance[200:, 1], expected, atol=0.01)
+    np.testing.assert_allclose(balance[1:, 0], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 100.0, 400.0])
+def test_tacho_noise_comes_out_as_inertia_times_lambda_times_noise_whatever_the_rate(rate_hz: float) -> None:
+    noise_rad_s = 3.0
+    speed = 100.0 + np.random.default_rng(2).normal(0.0, noise_rad_s, (round(60 * rate_hz), 2))
+    balance = torque_balance(np.zeros_like(speed), speed, 1.0 / rate_hz, COEFFICIENTS, LAG_S)
+    settled = balance[round(rate_hz) :]
+    implied = COEFFICIENTS[:, 0] * FILTER_RATE_PER_S * noise_rad_s
+    np.testing.assert_allclose(settled.std(axis=0), implied, rtol=0.1)
+
+
+def test_after_an_unknown_speed_the_filter_starts_anew_and_the_other_fan_goes_on() -> None:
+    command, speed = wandering(200)
+    whole = torque_balance(command, speed, STEP_S, COEFFICIENTS, LAG_S)
+    broken = speed.copy()
+    broken[80:90, 1] = np.nan
+    balance = torque_balance(command, broken, STEP_S, COEFFICIENTS, LAG_S)
+    np.testing.assert_array_equal(balance[:, 0], whole[:, 0])
+    assert np.isnan(balance[80:91, 1]).all()
+    assert np.isfinite(np.delete(balance[1:, 1], slice(79, 90))).all()
+    from_there = torque_balance(command[90:], speed[90:], STEP_S, COEFFICIENTS, LAG_S)
+    np.testing.assert_allclose(balance[91:, 1], from_there[1:, 1], rtol=1e-9)

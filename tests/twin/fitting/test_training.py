@@ -1,0 +1,164 @@
+"""Training reaches the noise, repeats itself, and withstands bad samples."""
+
+import numpy as np
+import pytest
+
+from tests.support import fan_data
+from twin.build import TrainedTwin, evaluate, train_twin
+from twin.errors import TwinError
+from twin.fitting.identification import identify
+from twin.fitting.outliers import without_outliers
+from twin.fitting.torch_reference import train_adam
+from twin.fitting.training import data_scaling
+from twin.models.hybrid import Hybrid
+from twin.models.network import TanhNetwork
+from twin.runs import Run
+
+
+@pytest.fixture(scope="module")
+def rough() -> tuple[Run, Run, Run]:
+    return fan_data.rough_run(1, 160.0).between(0.0, 120.0), fan_data.rough_run(2, 20.0), fan_data.rough_run(3, 30.0)
+
+
+@pytest.fixture(scope="module")
+def part(rough) -> Run:
+    """As much of the first as most need."""
+    return rough[0].between(0.0, 80.0)
+
+
+@pytest.fixture(scope="module")
+def hybrid(rough, part) -> TrainedTwin:
+    return train_twin([part], [rough[1]], "hybrid", name="hybrid", max_iterations=30)
+
+
+def times_noise(twin: TrainedTwin, run: Run) -> float:
+    return evaluate(twin, [run]).pooled.rmse_rad_s / fan_data.NOISE_RAD_S
+
+
+def test_the_hybrid_comes_to_the_noise_where_the_physics_stay_far_from_it(rough, part, hybrid: TrainedTwin) -> None:
+    physical = train_twin([part], [rough[1]], "physical", name="physical")
+    assert times_noise(physical, rough[2]) > 1.5
+    assert times_noise(hybrid, rough[2]) < 1.05
+
+
+def test_any_seed_finds_the_way_to_the_noise(part) -> None:
+    errors = [
+        times_noise(train_twin([part], [], "hybrid", name="x", seed=seed, max_iterations=45), part) for seed in range(4)
+    ]
+    assert max(errors) < 1.02, errors
+
+
+def test_fixed_physics_stay_as_identified_and_refined_ones_move(rough) -> None:
+    fixed, refined = (
+        train_twin([rough[1]], [], "hybrid", name="x", physics=physics, max_iterations=30)
+        for physics in ("fixed", "refined")
+    )
+    np.testing.assert_allclose(fixed.parameters, fixed.identification.parameters, rtol=1e-12)
+    assert np.all(refined.parameters[:, :3] != refined.identification.parameters[:, :3])
+    assert (fixed.card.training.physics, refined.card.training.physics) == ("fixed", "refined")
+
+
+@pytest.mark.slow
+def test_the_neural_ode_comes_to_the_noise_without_physics(rough, part) -> None:
+    twin = train_twin([part], [], "neural-ode", name="neural")
+    assert times_noise(twin, part) < 1.02
+    assert times_noise(twin, rough[2]) < 1.1
+
+
+@pytest.mark.slow
+def test_fans_that_differ_share_one_network_and_keep_their_own_physics() -> None:
+    tray, test = fan_data.rough_run(1, 30.0, fans=4), fan_data.rough_run(3, 30.0, fans=4)
+    together = train_twin([tray], [], "hybrid", name="tray")
+    assert np.ptp(together.parameters[:, 0]) > 0.1 * together.parameters[:, 0].mean()
+    assert times_noise(together, test) < 1.1
+
+
+def test_several_recordings_teach_more_than_one(rough) -> None:
+    parts = [rough[0].between(0.0, 12.0), rough[0].between(30.0, 42.0), rough[0].between(60.0, 72.0)]
+    one, all_three = (train_twin(runs, [], "hybrid", name="x", max_iterations=40) for runs in (parts[:1], parts))
+    assert times_noise(all_three, rough[2]) < times_noise(one, rough[2])
+
+
+def test_irregular_samples_are_as_good_as_regular_ones(rough) -> None:
+    rng = np.random.default_rng(3)
+    keep = np.sort(rng.choice(rough[0].samples, rough[0].samples * 2 // 3, replace=False))
+    run = rough[0]
+    thinned = Run("irregular", run.t_s[keep], _mean_command(run, keep), run.speed_rad_s[keep])
+    twin = train_twin([thinned], [], "hybrid", name="x", max_iterations=60)
+    assert times_noise(twin, rough[2]) < 1.1
+
+
+def _mean_command(run: Run, keep: np.ndarray) -> np.ndarray:
+    """The mean of the held command from each kept sample to the next."""
+    return np.add.reduceat(run.command, keep, axis=0) / np.diff(keep, append=run.samples)[:, None]
+
+
+def test_tacho_dropouts_and_outliers_hardly_matter(rough, part) -> None:
+    rng = np.random.default_rng(6)
+    speed = part.speed_rad_s.copy()
+    speed[rng.random(speed.shape) < 0.1] = np.nan
+    speed[rng.random(speed.shape) < 0.03] = 0.0
+    speed[rng.random(speed.shape) < 0.01] *= 2.0
+    dirty, _ = without_outliers(Run("dirty", part.t_s, part.command, speed))
+    twin = train_twin([dirty], [], "hybrid", name="dirty", max_iterations=60)
+    assert times_noise(twin, rough[2]) < 1.1
+
+
+def test_a_fan_that_was_not_measured_in_the_held_out_run_is_refused(rough) -> None:
+    run = fan_data.published_run(1, 15.0, fans=2)
+    speed = run.speed_rad_s.copy()
+    speed[:, 1] = np.nan
+    with pytest.raises(TwinError, match="fan 1: no measured speed in the held-out runs"):
+        train_twin([run], [Run("blind", run.t_s, run.command, speed)], "physical", name="x")
+
+
+def test_where_no_data_speak_the_hybrid_keeps_to_its_physics(rough) -> None:
+    """Trained on the upper half of the commands alone, run from rest through the lower half."""
+    upper = fan_data.rough_run(5, 60.0, low=50.0)
+    twin, physical = (train_twin([upper], [], kind, name="x") for kind in ("hybrid", "physical"))
+    assert times_noise(twin, rough[2]) < 1.5 * times_noise(physical, rough[2])
+
+
+def test_the_same_seed_gives_the_same_model_and_another_seed_another(rough) -> None:
+    def weights(seed: int) -> np.ndarray:
+        twin = train_twin([rough[1].between(0.0, 10.0)], [], "hybrid", name="x", seed=seed, max_iterations=3)
+        assert isinstance(twin.model, Hybrid)
+        return twin.model.network.theta
+
+    np.testing.assert_array_equal(weights(4), weights(4))
+    assert not np.array_equal(weights(4), weights(5))
+
+
+def test_progress_is_told_after_every_step_taken(rough) -> None:
+    told: list[tuple[int, int, float]] = []
+    short = rough[1].between(0.0, 10.0)
+    train_twin([short], [], "hybrid", name="x", max_iterations=5, progress=lambda *values: told.append(values))
+    done = [values[0] for values in told]
+    assert done == sorted(set(done))
+    assert done[-1] <= told[-1][1]
+    assert all(rmse > 0.0 for _, _, rmse in told)
+
+
+def test_adam_lowers_the_free_run_error_from_the_physics_on(rough) -> None:
+    short = rough[0].between(0.0, 4.0)
+    found = identify([short])
+    network = TanhNetwork.zero(10, ("speed", "command"), data_scaling([short], found))
+    theta = np.random.default_rng(0).normal(scale=0.5, size=network.parameter_count)
+    theta[-11:] = 0.0
+    told: list[float] = []
+    start = Hybrid(network.with_theta(theta))
+    train_adam(start, [short], found, max_iterations=15, progress=lambda _done, _total, rmse: told.append(rmse))
+    assert told[-1] < 0.97 * told[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"kind": "oracle"}, "kind 'oracle' is unknown; use one of physical, narx"),
+        ({"kind": "narx", "trainer": "adam"}, "cannot train the narx model"),
+        ({"kind": "hybrid", "trainer": "luck"}, "trainer 'luck' is unknown"),
+    ],
+)
+def test_an_impossible_request_is_refused_in_one_line(rough, options: dict, words: str) -> None:
+    with pytest.raises(TwinError, match=words):
+        train_twin([rough[1]], [], name="x", **options)

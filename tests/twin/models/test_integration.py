@@ -1,0 +1,106 @@
+"""The integrator's order, its equality with steps, and the exactness of its derivatives."""
+
+import numpy as np
+import pytest
+
+from twin.models import integration
+from twin.models.integration import free_run, free_run_sensitivities, step_through
+from twin.models.lag import effective_command, effective_command_by_lag
+from twin.models.right_hand_side import FanEquation
+
+PARAMETERS = np.array([[0.15, 0.012, 0.0025, 0.0]])
+
+
+def right_hand_side(parameters: np.ndarray) -> FanEquation:
+    return FanEquation(parameters, None)
+
+
+def speed_after(duration_s: float, steps: int) -> float:
+    command, step_s = np.full((steps, 1), 60.0), np.full(steps, duration_s / steps)
+    _, final = free_run(right_hand_side(PARAMETERS), np.array([10.0]), command, step_s)
+    return float(final[0])
+
+
+def test_halving_the_step_divides_the_error_by_sixteen() -> None:
+    exact = speed_after(0.8, 8192)
+    errors = [abs(speed_after(0.8, steps) - exact) for steps in (32, 64, 128)]
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    np.testing.assert_allclose(orders, 4.0, atol=0.25)
+
+
+def test_each_speed_is_the_one_before_its_own_command_acts() -> None:
+    command = np.array([[0.0], [100.0], [100.0]])
+    speed, final = free_run(right_hand_side(PARAMETERS), np.zeros(1), command, np.full(3, 0.01))
+    assert speed[0, 0] == 0.0
+    assert speed[1, 0] == 0.0
+    assert 0.0 < speed[2, 0] < final[0]
+
+
+def test_a_step_of_zero_leaves_the_speed_where_it_is() -> None:
+    speed, final = free_run(right_hand_side(PARAMETERS), np.array([7.0]), np.full((3, 1), 50.0), np.zeros(3))
+    np.testing.assert_array_equal(speed[:, 0], 7.0)
+    assert final[0] == 7.0
+
+
+@pytest.mark.parametrize("guess", ["none", "far", "near"])
+def test_a_free_run_solved_at_once_is_the_one_stepped_through(guess: str) -> None:
+    rng = np.random.default_rng(7)
+    parameters = np.repeat(PARAMETERS, 3, axis=0)
+    command = rng.uniform(0.0, 90.0, (40, 3)).repeat(25, axis=0)
+    step_s = rng.uniform(0.002, 0.03, command.shape)
+    equation, start = right_hand_side(parameters), np.array([0.0, 40.0, 150.0])
+    stepped, end = step_through(equation.acceleration, start, command, step_s)
+    guesses = {"none": None, "far": rng.uniform(-300.0, 300.0, command.shape), "near": stepped + 1.0}
+    speed, final = free_run(equation, start, command, step_s, guesses[guess])
+    np.testing.assert_allclose(speed, stepped, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(final, end, rtol=1e-12)
+
+
+def test_a_runaway_beside_it_does_not_spoil_a_fan() -> None:
+    parameters = np.array([PARAMETERS[0], [0.15, -3.0, 0.0, 0.0]])
+    command, step_s = np.full((150, 2), 60.0), np.full(150, 0.01)
+    speed, _ = free_run(right_hand_side(parameters), np.array([5.0, 5.0]), command, step_s)
+    alone, _ = free_run(right_hand_side(parameters[:1]), np.array([5.0]), command[:, :1], step_s)
+    assert speed[-1, 1] > 1e10
+    np.testing.assert_allclose(speed[:, 0], alone[:, 0], rtol=1e-10)
+
+
+def test_windows_join_without_a_seam(monkeypatch) -> None:
+    command = np.random.default_rng(2).uniform(0.0, 90.0, (300, 1))
+    whole, _ = free_run(right_hand_side(PARAMETERS), np.zeros(1), command, np.full(300, 0.01))
+    monkeypatch.setattr(integration, "MAX_WINDOW", 70)
+    np.testing.assert_allclose(
+        free_run(right_hand_side(PARAMETERS), np.zeros(1), command, np.full(300, 0.01))[0], whole, rtol=1e-12
+    )
+
+
+def test_a_model_that_runs_away_gives_infinities_like_its_steps() -> None:
+    runaway = right_hand_side(np.array([[0.15, -1.0, -0.01, 0.0]]))
+    command, step_s = np.full((500, 1), 50.0), np.full(500, 0.01)
+    with np.errstate(over="ignore", invalid="ignore"):
+        stepped, _ = step_through(runaway.acceleration, np.array([10.0]), command, step_s)
+    speed, final = free_run(runaway, np.array([10.0]), command, step_s)
+    assert not np.isfinite(final[0])
+    finite = np.abs(stepped) < 1e6
+    assert 10 < finite.sum() < 490
+    np.testing.assert_allclose(speed[finite], stepped[finite], rtol=1e-9)
+
+
+def test_sensitivities_agree_with_finite_differences_over_irregular_steps() -> None:
+    rng = np.random.default_rng(5)
+    command, step_s = rng.uniform(0.0, 90.0, (60, 1)), rng.uniform(0.002, 0.03, (60, 1))
+    before = np.array([20.0])
+
+    def run(values: np.ndarray) -> np.ndarray:
+        acting, _ = effective_command(command, step_s, values[3:4], before)
+        return free_run(right_hand_side(values[None, :4]), values[4:], acting, step_s)[0]
+
+    point = np.array([*PARAMETERS[0, :3], 0.015, 30.0])
+    acting, _ = effective_command(command, step_s, point[3:4], before)
+    by_lag = effective_command_by_lag(command, step_s, point[3:4], before)
+    exact = free_run_sensitivities(right_hand_side(point[None, :4]), run(point), acting, step_s, by_lag)
+    for index, size in enumerate(point):
+        move = np.zeros(len(point))
+        move[index] = 1e-5 * size
+        numeric = (run(point + move) - run(point - move)) / (2e-5 * size)
+        np.testing.assert_allclose(exact[:, :, index], numeric, rtol=1e-5, atol=1e-6 * np.abs(numeric).max())

@@ -1,0 +1,104 @@
+"""The four models: their sizes, their derivatives, their state."""
+
+import numpy as np
+import pytest
+
+from tests.support import fan_data
+from twin.errors import TwinError
+from twin.models.hybrid import Hybrid
+from twin.models.narx import PARAMETER_COUNT, Narx
+from twin.models.network import Scaling, TanhNetwork
+from twin.models.neural_ode import NeuralOde
+from twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
+from twin.models.state import StateLayout
+
+SCALING = Scaling(80.0, 90.0, 50.0, 50.0, 300.0)
+PARAMETERS = np.tile([*fan_data.PUBLISHED_PARAMETERS, 0.02], (2, 1))
+
+
+def random_network(units: int, inputs: tuple[str, ...] = ("speed", "command")) -> TanhNetwork:
+    network = TanhNetwork.zero(units, inputs, SCALING)
+    return network.with_theta(np.random.default_rng(units).normal(scale=0.3, size=network.parameter_count))
+
+
+def random_narx() -> Narx:
+    return Narx(np.random.default_rng(1).normal(scale=0.1, size=PARAMETER_COUNT), SCALING)
+
+
+ALL_MODELS = [PhysicalModel(), NeuralOde(random_network(20)), Hybrid(random_network(10)), random_narx()]
+
+
+def test_parameter_counts_are_those_of_the_layers() -> None:
+    assert random_network(20).parameter_count == 81
+    assert random_network(10).parameter_count + 3 == 44
+    assert random_network(10, ("speed",)).parameter_count + 3 == 34
+    assert PARAMETER_COUNT == 1151
+
+
+@pytest.mark.parametrize("inputs", [("speed", "command"), ("speed",)])
+def test_the_network_is_differentiated_exactly(inputs: tuple[str, ...]) -> None:
+    network = random_network(10, inputs)
+    rhs = Hybrid(network).equation(PARAMETERS)
+    speed, command = np.array([30.0, 150.0]), np.array([10.0, 80.0])
+    value, by_speed, by_command, by_theta = rhs.linearise(speed, command)
+    np.testing.assert_allclose(value, rhs.acceleration(speed, command), rtol=1e-13)
+    for whole, cheap in zip((value, by_speed), rhs.slope(speed, command), strict=True):
+        np.testing.assert_allclose(cheap, whole, rtol=1e-12)
+    along = (rhs.acceleration(speed, command + 1e-4) - rhs.acceleration(speed, command - 1e-4)) / 2e-4
+    np.testing.assert_allclose(by_command, along, rtol=1e-6)
+    slope = (rhs.acceleration(speed + 1e-4, command) - rhs.acceleration(speed - 1e-4, command)) / 2e-4
+    np.testing.assert_allclose(by_speed, slope, rtol=1e-6)
+    for index in range(network.parameter_count):
+        move = np.zeros(network.parameter_count)
+        move[index] = 1e-5
+        up, down = (network.with_theta(network.theta + sign * move).acceleration(speed, command) for sign in (1, -1))
+        np.testing.assert_allclose(by_theta[:, index], (up - down) / 2e-5, rtol=1e-6, atol=1e-6)
+
+
+def test_physical_weights_are_the_scaled_ones_in_other_units() -> None:
+    network = random_network(10)
+    weights, bias, output, constant = network.physical_weights()
+    speed, command = np.array([12.0, 140.0]), np.array([3.0, 99.0])
+    by_hand = np.tanh(np.column_stack((speed, command)) @ weights + bias) @ output + constant
+    np.testing.assert_allclose(by_hand, network.acceleration(speed, command), rtol=1e-12)
+
+
+def test_a_hybrid_with_a_silent_network_is_the_physical_model() -> None:
+    command, step_s = np.full((50, 2), 60.0), np.full(50, 0.01)
+    silent = Hybrid(TanhNetwork.zero(10, ("speed", "command"), SCALING))
+    state = np.zeros((2, 2))
+    np.testing.assert_array_equal(
+        silent.advance(state, command, step_s, PARAMETERS)[0],
+        PhysicalModel().advance(state, command, step_s, PARAMETERS)[0],
+    )
+
+
+@pytest.mark.parametrize("model", ALL_MODELS, ids=lambda model: model.kind)
+def test_two_blocks_with_the_state_carried_are_one_block(model) -> None:
+    command = np.random.default_rng(0).uniform(0.0, 100.0, (60, 2))
+    step_s = np.full(60, 0.01)
+    state = model.state_layout.initial_state(np.array([50.0, 60.0]), command[0])
+    whole, whole_state = model.advance(state, command, step_s, PARAMETERS)
+    first, middle = model.advance(state, command[:23], step_s[:23], PARAMETERS)
+    second, last = model.advance(middle, command[23:], step_s[23:], PARAMETERS)
+    np.testing.assert_allclose(np.concatenate((first, second)), whole, rtol=1e-12)
+    np.testing.assert_allclose(last, whole_state, rtol=1e-12)
+
+
+def test_an_initial_state_repeats_the_measured_speed_and_the_command() -> None:
+    state = StateLayout(2, 3).initial_state(np.array([5.0, 6.0]), np.array([1.0, 2.0]))
+    np.testing.assert_array_equal(state, [[5, 5, 1, 1, 1], [6, 6, 2, 2, 2]])
+
+
+def test_the_fitted_unknowns_are_inverted_and_make_any_parameters_stable() -> None:
+    top = np.array([180.0, 180.0])
+    np.testing.assert_allclose(physical_parameters(fitted_unknowns(PARAMETERS, top), top), PARAMETERS, rtol=1e-12)
+    unstable = np.array([[0.1, 0.5, -0.01, 0.0], [0.1, -0.2, 0.004, 0.01]])
+    stable = physical_parameters(fitted_unknowns(unstable, top), top)
+    assert np.all(stable[:, 1] > 0.0)
+    assert np.all(stable[:, 1] + 2.0 * stable[:, 2] * top > 0.0)
+
+
+def test_a_network_of_the_wrong_size_is_refused() -> None:
+    with pytest.raises(TwinError, match=r"10 units need \(41,\)"):
+        TanhNetwork(10, ("speed", "command"), SCALING, np.zeros(44))

@@ -1,0 +1,233 @@
+"""NARX: sized as published, differentiated exactly, and a competitor in its free run."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.support import fan_data
+from twin.errors import TwinError
+from twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
+from twin.fitting.narx_fit import free_run_sensitivities
+from twin.fitting.narx_stability import forgets_its_start
+from twin.fitting.narx_start import first_order_filter, starting_weights
+from twin.fitting.narx_training import BLOCKS, draw_stretches, leave_out, leave_out_blocks, train_narx
+from twin.models.narx import ORDER, PARAMETER_COUNT, Narx, regressor_rows
+from twin.models.network import Scaling
+from twin.models.physics import PARAMETER_NAMES
+from twin.runs import Array, Run
+
+SCALING = Scaling(90.0, 100.0, 50.0, 50.0, 300.0)
+
+
+def random_narx(size: float = 0.1) -> Narx:
+    return Narx(np.random.default_rng(1).normal(scale=size, size=PARAMETER_COUNT), SCALING)
+
+
+def advanced(model: Narx, state: Array, command: Array) -> tuple[Array, Array]:
+    return model.advance(state, command, np.full(len(command), 0.01), np.ones((len(state), len(PARAMETER_NAMES))))
+
+
+def free_run_rmse_rad_s(model: Narx, run: Run) -> float:
+    parameters = np.ones((run.fans, len(PARAMETER_NAMES)))
+    return pooled_rmse_rad_s(free_run_residuals(model, parameters, evaluation_pieces([run])))
+
+
+def trained(run: Run, seed: int = 0, max_iterations: int = 25) -> Narx:
+    return train_narx([run], [], SCALING, seed=seed, max_iterations=max_iterations)[0]
+
+
+def filter_start(time_constant: float, rng: np.random.Generator) -> tuple[Array, float]:
+    """Starting weights on the noisy response of a low-pass filter to stairs, and their time constant."""
+    command = fan_data.stairs(rng, 4000, 1, -1.0, 1.0)[:, 0]
+    clean = np.empty(4000)
+    clean[0], kept = command[0], np.exp(-1.0 / time_constant)
+    for k in range(3999):
+        clean[k + 1] = kept * clean[k] + (1.0 - kept) * (0.8 * command[k] + 0.1)
+    noisy = clean + rng.normal(scale=0.1, size=4000)
+    noisy[rng.random(4000) < 0.3] = np.nan
+    return starting_weights([command], [noisy], rng)
+
+
+@pytest.fixture(scope="module")
+def published() -> tuple[Run, Narx]:
+    run = fan_data.published_run(1, 40.0)
+    return run, trained(run)
+
+
+def test_it_has_the_weights_of_its_layers() -> None:
+    assert PARAMETER_COUNT == 50 * (10 + 11) + 50 + 50 + 1 == 1151
+
+
+def test_the_next_speed_is_the_layer_of_past_speeds_and_commands_newest_first() -> None:
+    model, rng = random_narx(), np.random.default_rng(2)
+    state, command = rng.uniform(0.0, 100.0, (2, 2 * ORDER)), rng.uniform(0.0, 100.0, (1, 2))
+    weights, bias, output, constant = model.physical_weights()
+    inputs = np.column_stack((state[:, :ORDER], command[0], state[:, ORDER:]))
+    expected = np.tanh(inputs @ weights + bias) @ output + constant
+    speed, following = advanced(model, state, command)
+    np.testing.assert_array_equal(speed[0], state[:, 0])
+    np.testing.assert_allclose(following[:, 0], expected, rtol=1e-12)
+
+
+def test_the_state_after_a_run_holds_newest_speeds_first_then_newest_commands() -> None:
+    command = np.arange(1.0, 31.0)[:, None]
+    speed, state = advanced(random_narx(), np.zeros((1, 2 * ORDER)), command)
+    np.testing.assert_array_equal(state[0, 1:ORDER], speed[:-ORDER:-1, 0])
+    np.testing.assert_array_equal(state[0, ORDER:], command[: -ORDER - 1 : -1, 0])
+
+
+def test_one_sample_at_a_time_gives_the_same_bits_as_one_block() -> None:
+    model, command = random_narx(), np.random.default_rng(0).uniform(0.0, 100.0, (25, 3))
+    state = model.state_layout.initial_state(np.array([5.0, 50.0, 90.0]), command[0])
+    whole, last = advanced(model, state, command)
+    for k in range(25):
+        speed, state = advanced(model, state, command[k : k + 1])
+        np.testing.assert_array_equal(speed[0], whole[k])
+    np.testing.assert_array_equal(state, last)
+
+
+def test_the_free_run_is_differentiated_exactly_by_every_weight() -> None:
+    model = random_narx(0.3)
+    command = fan_data.stairs(np.random.default_rng(4), 120, 1)
+
+    def run(theta: Array) -> Array:
+        state = model.state_layout.initial_state(np.array([20.0]), command[0])
+        return advanced(replace(model, theta=theta), state, command)[0][:, 0]
+
+    by_theta = free_run_sensitivities(model, run(model.theta), command[:, 0])
+    for index in range(0, PARAMETER_COUNT, 7):
+        move = np.zeros(PARAMETER_COUNT)
+        move[index] = 1e-5
+        slope = (run(model.theta + move) - run(model.theta - move)) / 2e-5
+        np.testing.assert_allclose(by_theta[index], slope, rtol=1e-5, atol=1e-5)
+
+
+def test_regressors_before_the_first_sample_repeat_it() -> None:
+    rows = regressor_rows(np.arange(1.0, 31.0), np.arange(101.0, 131.0))
+    np.testing.assert_array_equal(rows[0], [1.0] * ORDER + [101.0] * (ORDER + 1))
+    np.testing.assert_array_equal(rows[20], [*range(21, 11, -1), *range(121, 110, -1)])
+
+
+def test_the_start_finds_gain_offset_and_time_constant_through_noise_and_gaps() -> None:
+    theta, time_constant = filter_start(30.0, np.random.default_rng(3))
+    # The grid of time constants is spaced by a quarter.
+    assert 30.0 / 1.3 < time_constant < 30.0 * 1.3
+    model = Narx(theta, Scaling(0.0, 1.0, 0.0, 1.0, 1.0))
+    for level in (-0.5, 0.0, 0.7):
+        state = model.state_layout.initial_state(np.zeros(1), np.array([level]))
+        settled = advanced(model, state, np.full((600, 1), level))[0][-1, 0]
+        assert settled == pytest.approx(0.8 * level + 0.1, abs=0.15)
+
+
+def test_the_filter_is_linear_in_present_speed_and_command_alone() -> None:
+    rng = np.random.default_rng(5)
+    command = rng.uniform(-1.0, 1.0, 500)
+    linear, smooth = first_order_filter([command], [rng.normal(size=500)])
+    assert set(np.flatnonzero(linear)) <= {0, ORDER, 21}
+    rows = regressor_rows(smooth[0], command)[:-1]
+    np.testing.assert_allclose(rows @ linear[:-1] + linear[-1], smooth[0][1:], atol=1e-12)
+
+
+def test_a_recursion_with_two_steady_states_is_not_trusted() -> None:
+    def one_unit(feedback: float) -> Narx:
+        # w' = 2 tanh(feedback w + 0.1 u): two steady states without a command where 2 * feedback exceeds one.
+        theta = np.zeros((23, 50))
+        theta[0, 0], theta[ORDER, 0], theta[-1, 0] = feedback, 0.1, 2.0
+        return Narx(np.append(theta.ravel(), 0.0), SCALING)
+
+    assert forgets_its_start(one_unit(0.3), 10.0)
+    assert not forgets_its_start(one_unit(1.0), 10.0)
+
+
+def test_a_recursion_that_leaves_the_range_of_speeds_is_not_trusted() -> None:
+    constant = np.zeros(PARAMETER_COUNT)
+    constant[-1] = 3.0
+    assert not forgets_its_start(Narx(constant, SCALING), 10.0)
+
+
+def test_left_out_blocks_are_a_fourth_and_the_two_parts_share_only_the_start() -> None:
+    run = fan_data.published_run(3, 10.0, fans=2)
+    (kept,), (judged,) = leave_out_blocks([run])
+    out = np.isnan(kept.speed_rad_s)
+    assert np.mean(out) == pytest.approx(0.25, abs=1.0 / BLOCKS)
+    shared = np.isfinite(kept.speed_rad_s) & np.isfinite(judged.speed_rad_s)
+    np.testing.assert_array_equal(np.flatnonzero(shared.all(axis=1)), range(5))
+    assert np.all(np.isfinite(judged.speed_rad_s[out]))
+
+
+def test_of_several_runs_each_is_left_out_once() -> None:
+    runs = [replace(fan_data.published_run(seed, 2.0), name=str(seed)) for seed in range(5)]
+    folds = leave_out(runs)
+    assert sorted(run.name for _, judged in folds for run in judged) == ["0", "1", "2", "3", "4"]
+    assert all({run.name for run in kept}.isdisjoint(run.name for run in judged) for kept, judged in folds)
+
+
+def test_of_long_recordings_only_so_many_samples_are_drawn() -> None:
+    runs = [fan_data.published_run(1, 20.0, fans=2)] * 6
+    drawn = draw_stretches(runs, np.random.default_rng(0))
+    assert 15_000 <= sum(run.samples for run in drawn) <= 16_000
+    assert all(run.fans == 1 for run in drawn)
+
+
+@pytest.mark.slow
+def test_its_free_run_comes_near_the_noise_on_commands_it_never_saw(published: tuple[Run, Narx]) -> None:
+    for seed in (11, 12):
+        test = fan_data.published_run(seed, 80.0)
+        assert free_run_rmse_rad_s(published[1], test) < 1.05 * fan_data.NOISE_RAD_S
+
+
+@pytest.mark.slow
+def test_it_forgets_its_start_after_training(published: tuple[Run, Narx]) -> None:
+    assert forgets_its_start(published[1], 25.0)
+
+
+@pytest.mark.slow
+def test_missing_speeds_and_outliers_hardly_matter(published: tuple[Run, Narx]) -> None:
+    clean, rng = published[0].between(0.0, 40.0), np.random.default_rng(6)
+    speed = clean.speed_rad_s.copy()
+    # With three in ten missing, hardly any ten past speeds in a row are all measured.
+    speed[rng.random(speed.shape) < 0.3] = np.nan
+    speed[rng.random(speed.shape) < 0.01] *= 1.5
+    dirty = trained(replace(clean, speed_rad_s=speed))
+    assert free_run_rmse_rad_s(dirty, fan_data.published_run(11, 80.0)) < 1.1 * fan_data.NOISE_RAD_S
+
+
+@pytest.mark.slow
+def test_it_learns_beside_held_out_runs_and_tells_its_progress() -> None:
+    told: list[tuple[int, int, float]] = []
+    run, held_out = fan_data.published_run(7, 20.0, fans=2), fan_data.published_run(8, 10.0, fans=2)
+    model, iterations = train_narx(
+        [run], [held_out], SCALING, seed=0, max_iterations=12, progress=lambda *values: told.append(values)
+    )
+    assert [done for done, _, _ in told] == list(range(1, iterations + 1))
+    assert all(total == 12 and rmse > 0.0 for _, total, rmse in told)
+    assert free_run_rmse_rad_s(model, held_out) < 1.3 * fan_data.NOISE_RAD_S
+
+
+def test_weights_that_are_not_trusted_give_way_to_those_of_a_firmer_prior(monkeypatch: pytest.MonkeyPatch) -> None:
+    probed: list[Array] = []
+
+    def trusts_the_second(model: Narx, _time_constant_samples: float) -> bool:
+        probed.append(model.theta)
+        return len(probed) == 2
+
+    monkeypatch.setattr("twin.fitting.narx_training.forgets_its_start", trusts_the_second)
+    model = trained(fan_data.published_run(9, 8.0), max_iterations=30)
+    assert len(probed) == 2
+    np.testing.assert_array_equal(model.theta, probed[1])
+    assert not np.array_equal(probed[0], probed[1])
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_seed_others() -> None:
+    run = fan_data.published_run(9, 8.0)
+    first, again, other = (trained(run, seed, 3).theta for seed in (4, 4, 5))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_runs_without_speeds_are_refused_in_one_line() -> None:
+    run = fan_data.published_run(1, 1.0)
+    empty = replace(run, speed_rad_s=np.full_like(run.speed_rad_s, np.nan))
+    with pytest.raises(TwinError, match="two measured speeds"):
+        trained(empty)

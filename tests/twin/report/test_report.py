@@ -1,0 +1,431 @@
+"""`fantwin report`: one page, right in its figures, whole without the network, readable on a phone."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from simulation.excitation import Staircase
+from simulation.plant import FanParameters, Tacho, advance, at_rest
+from simulation.published_fan import published_fan
+from tests.pipeline.cli.test_train_commands import record
+from tests.support.browser import seen_in_browser
+from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run
+from tests.support.fantwin_command import fantwin, said_instead
+from twin.export.card import DataCard
+from twin.export.onnx_twin import OnnxTwin
+from twin.fitting.identification import identify
+from twin.models.physical import PhysicalModel
+from twin.models.physics import PARAMETER_NAMES
+from twin.report.content import Content, SpeedUnit, report_content
+from twin.report.figures import error_over_speed, histogram
+from twin.report.page import MOST_FANS_DRAWN, drawn_fans, report_page, shown
+from twin.report.speed_bins import speed_bins
+from twin.report.steady_states import static_curve
+from twin.report.timeline import broken_at, kept_samples, timeline
+from twin.report.verdict import judge
+from twin.runs import Run
+
+SECTIONS = ["verdict", "figures", "parameters", "fan-0", "meaning", "card"]
+TITLES = [
+    "Fit and error over time",
+    "Around the largest error",
+    "Histogram of the error",
+    "Whiteness",
+    "Cross-correlation with the command",
+    "Static curve",
+    "Error over speed",
+]
+COLUMNS = ["rmse", "sigma", "max_error", "r2", "coverage_2_sigma", "one_step_rmse", "samples", "rmse_in_sigma"]
+RAD_S = SpeedUnit("rad/s", 1.0)
+SMALLEST_TEXT_UNITS = 8.5 * 0.88
+"""Height of the smallest text of a figure in the units of its viewBox (points)."""
+
+
+class Page(HTMLParser):
+    """What a page holds: ids, references, section ids, captions, machine-readable numbers by table row."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.references: list[str] = []
+        self.tags: set[str] = set()
+        self.sections: list[str] = []
+        self.numbers: dict[str, list[float]] = {}
+        self.text = ""
+        self._row = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.tags.add(tag)
+        if given.get("id"):
+            self.ids.append(str(given["id"]))
+        self.references += [str(given[name]) for name in ("src", "href", "xlink:href", "srcset") if name in given]
+        if tag == "section":
+            self.sections.append(str(given["id"]))
+        if tag == "tr":
+            self._row = given.get("id") or ""
+        if tag == "data":
+            self.numbers.setdefault(self._row, []).append(float(str(given["value"])))
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings of published fans, and the twins of one and of two."""
+    path = tmp_path_factory.mktemp("report")
+    record(path / "healthy.mcap", published_run(1, 30.0), unit="rpm")
+    record(path / "held-out.mcap", published_run(2, 30.0), unit="rpm")
+    record(path / "two.mcap", published_run(3, 30.0, fans=2))
+    record(path / "three.mcap", published_run(4, 5.0, fans=3))
+    common = ("--model", "physical", "--command-unit", "%")
+    for name, validate in (("healthy", ("--validate", path / "held-out.mcap")), ("two", ())):
+        made = fantwin("train", path / f"{name}.mcap", *validate, *common, "-o", path / f"{name}.onnx")
+        assert made.exit_code == 0, made.output
+    return path
+
+
+@pytest.fixture(scope="module")
+def twin(folder: Path) -> OnnxTwin:
+    return OnnxTwin(folder / "healthy.onnx")
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path) -> str:
+    result = fantwin("report", folder / "healthy.onnx", folder / "held-out.mcap", "-o", folder / "page.html")
+    assert result.exit_code == 0, result.output
+    return (folder / "page.html").read_text(encoding="utf-8")
+
+
+def content_of(twin: OnnxTwin, *runs: Run, unit: SpeedUnit = RAD_S) -> Content:
+    return report_content(twin, runs, [DataCard("runs.mcap", "0" * 64, runs[0].fans, runs[0].samples)], unit)
+
+
+def with_speed(run: Run, speed_rad_s: np.ndarray) -> Run:
+    return Run(run.name, run.t_s, run.command, speed_rad_s)
+
+
+def test_the_page_holds_every_section_and_every_figure(page):
+    parsed = Page(page)
+    assert parsed.sections == SECTIONS
+    assert [title for title in TITLES if title in parsed.text] == TITLES
+    assert page.count("<svg ") == len(TITLES) + 1  # time is drawn twice: for wide screens and for phones
+    for said in ("physical twin of 1 fan", "held-out data", "95%", "sha256"):
+        assert said in parsed.text
+
+
+def test_the_figures_are_those_of_evaluate(folder, page):
+    evaluated = json.loads(fantwin("evaluate", folder / "healthy.onnx", folder / "held-out.mcap", "--json").stdout)
+    shown = dict(zip(COLUMNS, Page(page).numbers["row-0"], strict=True))
+    for figure in ("rmse", "max_error", "r2", "coverage_2_sigma", "one_step_rmse", "samples"):
+        assert shown[figure] == pytest.approx(evaluated[figure], rel=1e-12), figure
+    assert shown["rmse_in_sigma"] == pytest.approx(shown["rmse"] / shown["sigma"])
+
+
+def test_the_parameters_and_their_intervals_are_those_of_identify(folder, page, twin):
+    (identified,) = json.loads(fantwin("identify", folder / "healthy.mcap", "--json").stdout)["fans"]
+    content = content_of(twin, published_run(2, 10.0))
+    for parameter in content.fans[0].parameters[:3]:
+        assert parameter.value == pytest.approx(identified[parameter.name])
+        assert (parameter.low, parameter.high) == pytest.approx(identified[f"{parameter.name}_95"])
+        assert f"{parameter.low:.4g} to {parameter.high:.4g}" in Page(page).text
+
+
+def test_the_page_needs_nothing_but_itself(page):
+    parsed = Page(page)
+    assert not parsed.tags & {"script", "link", "iframe", "img", "object", "embed"}
+    assert all(reference.startswith("#") for reference in parsed.references)
+    assert not re.search(r"url\((?!#)|@import", page)
+
+
+def test_ids_are_told_once_and_every_reference_has_its_target(folder):
+    fantwin("report", folder / "two.onnx", folder / "two.mcap", "-o", folder / "two.html")
+    text = (folder / "two.html").read_text(encoding="utf-8")
+    parsed = Page(text)
+    assert len(parsed.ids) == len(set(parsed.ids))
+    targets = {reference[1:] for reference in parsed.references} | set(re.findall(r"url\(#([^)]*)\)", text))
+    assert targets <= set(parsed.ids)
+    assert parsed.sections == ["verdict", "figures", "parameters", "fan-0", "fan-1", "meaning", "card"]
+    assert set(parsed.numbers) > {"pooled", "row-0", "row-1"}
+
+
+def test_machines_are_told_the_same(folder, page):
+    arguments = (folder / "healthy.onnx", folder / "held-out.mcap", "-o", folder / "again.html", "--json")
+    told = json.loads(fantwin("report", *arguments).stdout)
+    evaluated = json.loads(fantwin("evaluate", *arguments[:2], "--json").stdout)
+    figures = ("rmse", "max_error", "r2", "coverage_2_sigma", "one_step_rmse", "samples")
+    assert told["speed_unit"] == evaluated["speed_unit"]
+    for figure in figures:
+        assert told[figure] == evaluated[figure]
+        assert told["fans"][0][figure] == evaluated["fans"][0][figure]
+    assert (told["verdict"], told["fans"][0]["fan"]) == ("as declared", 0)
+    assert told["bytes"] == (folder / "again.html").stat().st_size
+    assert (folder / "again.html").read_text() == page
+
+
+def test_a_healthy_fan_is_followed_as_declared_and_without_a_warning(twin):
+    judged = judge(content_of(twin, published_run(5, 30.0)))
+    assert (judged.level, judged.warnings) == ("as declared", ())
+    assert judged.headline == "The twin follows this fan as closely as its card says."
+
+
+def test_a_fan_that_runs_slow_is_not_followed_and_the_page_says_by_how_much(twin):
+    healthy = published_run(5, 30.0)
+    content = content_of(twin, with_speed(healthy, 0.9 * healthy.speed_rad_s))
+    judged = judge(content)
+    assert judged.level == "not followed"
+    assert f"rmse {content.fans[0].rmse_in_sigma:.2f} times the declared sigma" in judged.headline
+    assert any("on average faster or slower" in line for line in judged.warnings)
+    assert "train it on them" in Page(report_page(content)).text
+
+
+def test_the_worst_fan_decides_and_is_named(twin):
+    healthy = published_run(6, 20.0, fans=3)
+    slow = healthy.speed_rad_s * np.array([1.0, 0.85, 1.0])
+    judged = judge(content_of(twin, with_speed(healthy, slow)))
+    assert "does not follow fan 1: rmse" in judged.headline
+    assert "A twin of one fan judges 3: fans differ, and so may what they leave." in judged.warnings
+
+
+def test_what_lessens_the_figures_is_told(twin):
+    run = published_run(7, 20.0)
+    trained_on = DataCard("healthy.mcap", twin.card.training.data[0].sha256, 1, run.samples)
+    assert "flatter" in judge(report_content(twin, [run], [trained_on], RAD_S)).warnings[0]
+    beyond = Run("beyond", run.t_s, run.command + 40.0, run.speed_rad_s)
+    assert any("outside the trained range" in line for line in judge(content_of(twin, beyond)).warnings)
+    speed = run.speed_rad_s.copy()
+    speed[::4] = np.nan
+    assert any("speeds are missing" in line for line in judge(content_of(twin, with_speed(run, speed))).warnings)
+
+
+def test_a_free_run_that_diverges_is_told_and_still_drawn(twin):
+    content = content_of(twin, published_run(8, 5.0))
+    (fan,) = content.fans
+    nowhere = np.full_like(fan.error_rad_s, np.nan)
+    figures = replace(fan.figures, rmse_rad_s=np.inf, max_error_rad_s=np.inf, r2=-np.inf)
+    gone = replace(
+        fan, figures=figures, predicted_rad_s=nowhere, error_rad_s=np.full_like(nowhere, np.inf), by_speed=()
+    )
+    lost = replace(content, fans=(gone,), evaluation=replace(content.evaluation, per_fan=(figures,), pooled=figures))
+    assert judge(lost).headline == "The twin does not follow this fan: rmse without limit."
+    assert "This fan: the free run diverges." in judge(lost).warnings
+    assert Page(report_page(lost)).numbers["row-0"][0] == np.inf
+
+
+def test_of_many_fans_the_worst_are_drawn(twin):
+    many = published_run(9, 4.0, fans=MOST_FANS_DRAWN + 3)
+    speed = many.speed_rad_s.copy()
+    speed[:, -1] *= 0.7
+    content = content_of(twin, with_speed(many, speed))
+    drawn = drawn_fans(content.fans)
+    assert len(drawn) == MOST_FANS_DRAWN
+    assert drawn[-1].number == many.fans - 1
+    left_out = [fan.rmse_in_sigma for fan in content.fans if fan not in drawn]
+    assert max(left_out) <= min(fan.rmse_in_sigma for fan in drawn)
+
+
+@given(spike=st.integers(0, 19_999), columns=st.integers(10, 500), missing=st.integers(0, 10_000))
+def test_a_thinned_line_keeps_every_spike_and_breaks_where_nothing_was_measured(spike, columns, missing):
+    t_s = np.arange(20_000) / 100.0
+    values = np.sin(t_s)
+    values[missing : missing + 6000] = np.nan
+    values[spike] = 50.0
+    kept = kept_samples(t_s, [values], columns)
+    assert spike in kept
+    assert np.isnan(values[kept]).any()
+    assert len(kept) <= 2 * columns + 2 or len(kept) == len(t_s)
+    assert np.all(np.diff(kept) > 0)
+
+
+def test_gaps_stay_open_and_long_ones_are_shortened():
+    run = published_run(1, 30.0)
+    t_s = run.t_s + np.where(run.t_s > 10.0, 3600.0, 0.0) + np.where(run.t_s > 20.0, 0.5, 0.0)
+    pieces = Run("night", t_s, run.command, run.speed_rad_s).split_at_gaps()
+    line = timeline(pieces)
+    assert [gap.shortened for gap in line.gaps] == [True, False]
+    assert [round(gap.lasted_s, 2) for gap in line.gaps] == [3600.01, 0.51]
+    assert line.t_s[-1] < 1.2 * run.duration_s
+    assert np.all(np.diff(line.t_s) > 0.0)
+    assert not line.keeps_the_clock
+    (drawn,) = broken_at(line.starts, np.arange(run.samples), run.speed_rad_s[:, 0])
+    assert np.flatnonzero(np.isnan(drawn)).tolist() == [line.starts[1], line.starts[2] + 1]
+
+
+def test_recordings_follow_one_another_and_one_alone_keeps_its_clock():
+    first, second = published_run(1, 10.0), published_run(2, 10.0)
+    both = timeline([first.rows(500, 1000), second])
+    assert [name for _, name in both.recordings] == ["published 1", "published 2"]
+    assert both.t_s[0] == 0.0
+    alone = timeline([first.rows(500, 1000)])
+    assert alone.keeps_the_clock
+    assert alone.t_s[0] == 5.0
+
+
+def test_the_static_curve_is_where_torque_and_load_meet():
+    hold = np.repeat([20.0, 80.0, 50.0], 1500)
+    run = published_run(1, 45.0)
+    parameters = np.zeros(len(PARAMETER_NAMES))
+    parameters[:3] = PUBLISHED_PARAMETERS[:3]
+    model, state = PhysicalModel(), PhysicalModel().state_layout.initial_state(np.zeros(1), hold[:1])
+    speed, _ = model.advance(state, hold[:, None], np.full(len(hold), 0.01), parameters[None])
+    held = Run("holds", run.t_s, hold, speed)
+    curve = static_curve(model, parameters, [held], 0, 100.0, 180.0)
+    viscous, drag = PUBLISHED_PARAMETERS[1:3]
+
+    def load(speed_rad_s: np.ndarray) -> np.ndarray:
+        return viscous * speed_rad_s + drag * speed_rad_s**2
+
+    np.testing.assert_allclose(load(curve.twin[:, 1]), curve.twin[:, 0], rtol=1e-6)
+    np.testing.assert_array_equal(curve.measured[:, 0], [20.0, 80.0, 50.0])
+    np.testing.assert_allclose(load(curve.measured[:, 1]), curve.measured[:, 0], rtol=0.01)
+    shaken = Run("never held", run.t_s, hold + np.sin(run.t_s), speed)
+    assert len(static_curve(model, parameters, [shaken], 0, 100.0, 180.0).measured) == 0
+
+
+def test_a_staircase_of_two_and_a_half_seconds_a_step_tells_the_static_curve_of_the_simulated_tray():
+    profile, rng = Staircase(1, 1, 0.1, 0.95, hold_s=2.5), np.random.default_rng(1)
+    plant, tacho, state = FanParameters(), Tacho(), at_rest(1)
+    command = np.stack([profile.command(k / 100.0) for k in range(6000)])
+    speed = np.empty_like(command)
+    for k, duty in enumerate(command):
+        speed[k] = tacho.read(state.speed_rad_s, rng)
+        state = advance(state, duty, 0.01, plant)
+    run, top_rad_s = Run("staircase", np.arange(6000) / 100.0, command, speed), float(speed.max())
+    curve = static_curve(PhysicalModel(), identify([run]).parameters[0], [run], 0, 100.0, top_rad_s)
+    assert len(curve.holds) == 24
+    assert len(curve.measured) > 8
+    for duty, measured in curve.measured:
+        settled = at_rest(1)
+        for _ in range(2000):
+            settled = advance(settled, np.array([duty]), 0.01, plant)
+        assert measured == pytest.approx(settled.speed_rad_s[0], abs=0.02 * top_rad_s)
+
+
+def test_the_page_says_why_no_measured_point_is_on_the_static_curve(twin):
+    run = published_run(1, 10.0)
+    hasty = published_fan(np.where(np.arange(1000) // 10 % 2, 20.0, 80.0)[:, np.newaxis], 1, "hasty").run
+    never = report_page(content_of(twin, hasty))
+    assert re.search(r"the one that came nearest lasted 0\.\d+ s and needed \d", Page(never).text)
+    moving = Run("ramp", run.t_s, 10.0 * run.t_s, run.speed_rad_s)
+    assert "The command never held still" in Page(report_page(content_of(twin, moving))).text
+
+
+def test_a_band_that_is_too_wide_and_figures_of_few_errors_are_told(twin):
+    run = published_run(5, 30.0)
+    assert judge(content_of(twin, run)).warnings == ()
+    content = content_of(twin, run)
+    wide = replace(content, fans=(replace(content.fans[0], sigma_rad_s=2.0 * content.fans[0].sigma_rad_s),))
+    (line,) = judge(wide).warnings
+    assert line.startswith("This fan: the card's sigma is over 1.5 times what the errors scatter by")
+    assert judge(wide).level == "as declared"
+    (line,) = judge(content_of(twin, run.between(0.0, 0.9))).warnings
+    assert re.search(r"errors worth \d+ independent ones tell their rmse to 1\d% only", line)
+    healthy = replace(twin.card.healthy, independent_samples=(8.0,))
+    of_few = SimpleNamespace(card=replace(twin.card, healthy=healthy), path=twin.path)
+    (line,) = judge(replace(content, twin=cast("OnnxTwin", of_few))).warnings
+    assert "worth 8 independent ones: its sigma may be off by 25%" in line
+
+
+@pytest.mark.parametrize(
+    ("value", "form", "said"),
+    [
+        (38.449, ".4g", "38.45"),
+        (123456.7, ".4g", "123457"),
+        (3.2e9, ".4g", "3.2e+09"),
+        (-4.56e12, ".5f", "-4.56e+12"),
+        (120_000_000, ",d", "120,000,000"),
+        (np.inf, ".4g", "infinite"),
+        (None, ".1%", "undefined"),
+    ],
+)
+def test_numbers_are_whole_and_have_an_exponent_only_beyond_reason(value, form, said):
+    assert shown(value, form) == said
+
+
+def test_ticks_of_small_figures_leave_room_for_large_speeds(twin):
+    content = content_of(twin, published_run(2, 10.0), unit=SpeedUnit("rpm", np.pi / 30.0 / 50.0))
+    for drawn in (error_over_speed(content, content.fans[0]), histogram(content, content.fans[0])):
+        assert 2 <= len(re.findall(r'id="[^"]*-xtick_\d+"', drawn)) <= 6
+
+
+def test_errors_are_gathered_by_speed_and_few_samples_make_no_point():
+    rng = np.random.default_rng(1)
+    speed = rng.uniform(0.0, 100.0, 20_000)
+    error = rng.normal(np.where(speed < 50.0, 4.0, 0.0), 1.0)
+    speed[0], speed[1] = 300.0, np.nan
+    bins = speed_bins(speed, error)
+    assert len(bins) == 7  # of 20 up to 300 rad/s: those that reach below 100
+    for part in bins:
+        if not 45.0 < part.middle_rad_s < 55.0:
+            assert part.mean_rad_s == pytest.approx(4.0 if part.middle_rad_s < 50.0 else 0.0, abs=0.15)
+            assert part.std_rad_s == pytest.approx(1.0, abs=0.1)
+    assert speed_bins(np.full(5, np.nan), np.zeros(5)) == ()
+
+
+def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
+    twin, held_out = folder / "healthy.onnx", folder / "held-out.mcap"
+    assert "is of fans 0, 1, the runs of 0, 1, 2" in said_instead("report", folder / "two.onnx", folder / "three.mcap")
+    assert "no such file" in said_instead("report", tmp_path / "nowhere.onnx", held_out)
+    assert "not an ONNX file" in said_instead("report", held_out, held_out)
+    assert "cannot read the recording" in said_instead("report", twin, tmp_path / "nowhere.mcap")
+    (tmp_path / "file").touch()
+    assert "cannot be made" in said_instead("report", twin, held_out, "-o", tmp_path / "file" / "page.html")
+    assert "name a file that ends in .html" in said_instead("report", twin, held_out, "-o", tmp_path)
+    (tmp_path / "folder.html").mkdir()
+    assert "cannot be written" in said_instead("report", twin, held_out, "-o", tmp_path / "folder.html")
+
+
+@pytest.mark.parametrize(("command", "missing"), [("report", "jinja2"), ("report", "matplotlib"), ("compare", "onnx")])
+def test_a_missing_extra_is_told_with_what_to_install(folder, tmp_path, command, missing):
+    code = f"import sys; sys.modules[{missing!r}] = None; from pipeline.cli.main import main; main()"
+    given = [folder / "healthy.onnx"] * (command == "report") + [folder / "held-out.mcap"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, command, *given], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 1
+    assert done.stderr.strip().endswith(".venv/bin/pip install -e '.[train]'")
+    assert done.stderr.count("\n") == 1
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("width_px", [390, 1280])
+def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(page, tmp_path, width_px):
+    seen = seen_in_browser(page, width_px, tmp_path)
+    assert seen["needs"] <= seen["width"] <= width_px
+    assert seen["fetched"] == []
+    assert seen["background"] == "rgb(255, 255, 255)"
+    assert [figure["title"] for figure in seen["figures"]] == TITLES
+    for figure in seen["figures"]:
+        ((left, top, width, height),) = [svg["box"] for svg in figure["svgs"]]
+        _, caption_top, _, caption_height = figure["caption"]
+        assert width > 250
+        assert height > 180
+        assert left >= 0
+        assert left + width <= seen["width"]
+        assert top >= caption_top + caption_height
+        assert SMALLEST_TEXT_UNITS * figure["svgs"][0]["px_per_unit"] > 8.5, figure["title"]
+    for left, _, width, _ in seen["tables"]:
+        assert left + width <= seen["width"]
+
+
+@pytest.mark.parametrize("width_px", [900, 1280])
+def test_on_a_desk_no_table_has_to_be_scrolled(twin, tmp_path, width_px):
+    content = content_of(twin, published_run(2, 10.0), unit=SpeedUnit("rpm", np.pi / 30.0))
+    refined = tuple(replace(parameter, in_force=1.1 * parameter.value) for parameter in content.fans[0].parameters)
+    page = report_page(replace(content, fans=(replace(content.fans[0], parameters=refined),)))
+    seen = seen_in_browser(page, width_px, tmp_path)
+    for (_, _, width, _), needed in zip(seen["tables"], seen["needed"], strict=True):
+        assert needed <= np.ceil(width)

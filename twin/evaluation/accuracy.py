@@ -1,0 +1,217 @@
+"""How well a model follows measured runs.
+
+The figures that count are those of the free run: it starts from the first five measured speeds, as a deployed twin
+does, and is driven by the commands alone. Runs are split at long gaps and restarted after them. The one-step error,
+from measured speeds to the next one, is given beside it and says little.
+Missing samples count nowhere. RMSE, maximum error and R2 are equations (32) to (34) of Peng and Chen, the band of two
+sigma (35) and (36).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.errors import TwinError
+from twin.models.model import TwinModel
+from twin.runs import STARTING_SAMPLES, Array, Run, common_fans, starting_speed_rad_s
+
+Flags = NDArray[np.bool_]
+
+START_ITERATIONS = 3
+START_NUDGE = 1e-4
+FORGOTTEN = 0.01
+"""squared sensitivity below which the first measured speeds come too late to tell the speed at the start"""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Free-run figures in rad/s (r2 and coverage without unit), and the one-step error beside them.
+
+    Infinite where the free run diverged; NaN where nothing was measured, and r2 where the speed never changed.
+    coverage_2_sigma: the share of samples within two healthy standard deviations of the free run.
+    """
+
+    rmse_rad_s: float
+    max_error_rad_s: float
+    r2: float
+    one_step_rmse_rad_s: float
+    coverage_2_sigma: float
+    samples: int
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Figures of each fan, and of all fans' samples together."""
+
+    per_fan: tuple[Figures, ...]
+    pooled: Figures
+
+
+def evaluate_model(model: TwinModel, parameters: Array, sigma_rad_s: Array, runs: Sequence[Run]) -> Evaluation:
+    """Evaluate on runs. parameters: (fans, 4). sigma_rad_s: (fans,) healthy standard deviation of the free run."""
+    pieces = evaluation_pieces(runs)
+    speed = np.concatenate([piece.speed_rad_s for piece in pieces])
+    residual = free_run_residuals(model, parameters, pieces)
+    one_step = one_step_residuals(model, parameters, pieces)
+    within = np.abs(residual) <= 2.0 * sigma_rad_s
+    measured = np.isfinite(speed)
+    spread = np.where(measured, speed - _column_mean(speed), 0.0) ** 2
+    per_fan = tuple(
+        _figures(measured[:, fan], residual[:, fan], one_step[:, fan], within[:, fan], spread[:, fan])
+        for fan in range(speed.shape[1])
+    )
+    return Evaluation(per_fan, _figures(measured, residual, one_step, within, spread))
+
+
+def evaluation_pieces(runs: Sequence[Run]) -> list[Run]:
+    """The runs split at their long gaps. Raises TwinError when there is nothing to evaluate."""
+    common_fans(runs)
+    pieces = [piece for run in runs for piece in run.split_at_gaps()]
+    if not pieces:
+        raise TwinError("the runs hold nothing but gaps; give runs with two samples in a row or more")
+    return pieces
+
+
+def free_run_speeds(model: TwinModel, parameters: Array, piece: Run) -> Array:
+    """(n, fans) speeds from the measured start and the commands alone; not finite where the free run diverged."""
+    state = _starting_state(model, parameters, piece)
+    return model.advance(state, piece.command, piece.step_s, parameters)[0]
+
+
+def free_run_residuals(model: TwinModel, parameters: Array, pieces: Sequence[Run]) -> Array:
+    """(samples, fans) measured minus free run over pieces one after the other: NaN missing, infinite diverged."""
+    return np.concatenate([_residual(piece.speed_rad_s, free_run_speeds(model, parameters, piece)) for piece in pieces])
+
+
+def healthy_sigma_rad_s(residual: Array) -> Array:
+    """(fans,) root mean square of the healthy free-run residual (samples, fans): the band is centred on the twin."""
+    count = np.maximum(np.isfinite(residual).sum(axis=0), 1)
+    with np.errstate(over="ignore"):
+        return np.sqrt(np.nansum(residual**2, axis=0) / count)
+
+
+def pooled_rmse_rad_s(residual: Array) -> float:
+    """Root mean square over all measured samples of a residual (samples, fans)."""
+    with np.errstate(over="ignore"):
+        return float(np.sqrt(np.nanmean(residual**2)))
+
+
+def one_step_residuals(model: TwinModel, parameters: Array, pieces: Sequence[Run]) -> Array:
+    """(samples, fans) measured minus the prediction from the measured speeds up to the sample before.
+
+    The commands before count as they do in a free run. NaN where the speeds that a prediction needs are not measured.
+    """
+    return np.concatenate([_one_step_residual(model, parameters, piece) for piece in pieces])
+
+
+def _starting_state(model: TwinModel, parameters: Array, piece: Run) -> Array:
+    """The state whose free run is nearest, in least squares, to the first five measured speeds of each fan.
+
+    Their mean is the speed in their midst: a fan that gathers speed would start too fast, the more so the wider its
+    samples lie apart.
+    """
+    measured = np.isfinite(piece.speed_rad_s)
+    early = measured & (np.cumsum(measured, axis=0) <= STARTING_SAMPLES)
+    rows = slice(0, int(np.flatnonzero(early.any(axis=1)).max(initial=0)) + 1)
+
+    def beginning(speed_rad_s: Array) -> Array:
+        state = model.state_layout.initial_state(speed_rad_s, piece.command[0])
+        predicted, _ = model.advance(state, piece.command[rows], piece.step_s[rows], parameters)
+        return np.where(early[rows], predicted, 0.0)
+
+    known = np.where(early, piece.speed_rad_s, 0.0)[rows]
+    start = np.nan_to_num(starting_speed_rad_s(piece.speed_rad_s))
+    nudge = START_NUDGE * (1.0 + np.abs(start))
+    for _ in range(START_ITERATIONS):
+        predicted = beginning(start)
+        with np.errstate(invalid="ignore", over="ignore"):
+            by_start = (beginning(start + nudge) - predicted) / nudge
+            slope, square = np.sum(by_start * (known - predicted), axis=0), np.sum(by_start**2, axis=0)
+            correction = slope / (square + FORGOTTEN)
+        start = np.where(np.isfinite(correction), start + correction, start)
+    return model.state_layout.initial_state(start, piece.command[0])
+
+
+def _one_step_residual(model: TwinModel, parameters: Array, piece: Run) -> Array:
+    """one_step_residuals of one piece.
+
+    What the state holds of the commands does not depend on the speeds: it is carried along, and at each sample the
+    measured speeds take the place of the predicted ones. The piece is cut into as many stretches as each has samples;
+    their starting states come from running it once, and then all stretches advance side by side, as if they were fans.
+    """
+    layout, samples = model.state_layout, piece.samples
+    measured = np.isfinite(piece.speed_rad_s)
+    # A missing speed cannot stand in a state; what is predicted from the zero in its place is taken out again.
+    speed = np.where(measured, piece.speed_rad_s, 0.0)
+    length = math.isqrt(samples)
+    starts = np.arange(0, samples, length)
+    state = layout.initial_state(speed[0], piece.command[0])
+    starting_states = []
+    for first in starts:
+        starting_states.append(state)
+        block = slice(first, first + length)
+        _, state = model.advance(state, piece.command[block], piece.step_s[block], parameters)
+        # A diverging free run must not carry its speeds on.
+        state = np.where(np.isfinite(state), state, 0.0)
+    states = np.stack(starting_states)
+    predicted = np.full_like(speed, np.nan)
+    for offset in range(length):
+        k = starts[starts + offset < samples - 1] + offset
+        states = states[: len(k)]
+        for back in range(layout.speed):
+            states[:, :, back] = speed[np.maximum(k - back, 0)]
+        states = _advance_side_by_side(model, states, piece.command[k], piece.step_s[k], parameters)
+        predicted[k + 1] = states[:, :, 0]
+    predicted[: layout.speed] = np.nan
+    for back in range(1, layout.speed + 1):
+        predicted[back:][~measured[:-back]] = np.nan
+    return piece.speed_rad_s - predicted
+
+
+def _advance_side_by_side(model: TwinModel, states: Array, command: Array, step_s: Array, parameters: Array) -> Array:
+    """(stretches, fans, n_state) states one step later. command: (stretches, fans). step_s: (stretches,).
+
+    A block has one step for all its fans, so that stretches advance together whose steps are equal, to the nanosecond
+    in which times are recorded.
+    """
+    following = np.empty_like(states)
+    period_ns = np.rint(1e9 * step_s)
+    for step in np.unique(period_ns):
+        same = period_ns == step
+        count = int(np.count_nonzero(same))
+        together = states[same].reshape(-1, states.shape[-1])
+        everyone = np.tile(parameters, (count, 1))
+        _, ends = model.advance(together, command[same].reshape(1, -1), step_s[same][:1], everyone)
+        following[same] = ends.reshape(count, *states.shape[1:])
+    return following
+
+
+def _residual(measured: Array, predicted: Array) -> Array:
+    diverged = np.isfinite(measured) & ~np.isfinite(predicted)
+    return np.where(diverged, np.inf, measured - predicted)
+
+
+def _figures(measured: Flags, residual: Array, one_step: Array, within: Flags, spread: Array) -> Figures:
+    samples = int(np.count_nonzero(measured))
+    if samples == 0:
+        return Figures(np.nan, np.nan, np.nan, np.nan, np.nan, 0)
+    total, errors = float(spread.sum()), np.where(measured, residual, 0.0)
+    with np.errstate(over="ignore"):
+        squares = float(np.sum(errors**2))
+    steps = one_step[np.isfinite(one_step)]
+    return Figures(
+        rmse_rad_s=float(np.sqrt(squares / samples)),
+        max_error_rad_s=float(np.abs(errors).max()),
+        r2=1.0 - squares / total if total > 0.0 else np.nan,
+        one_step_rmse_rad_s=float(np.sqrt(np.mean(steps**2))) if steps.size else np.nan,
+        coverage_2_sigma=float(np.count_nonzero(within & measured) / samples),
+        samples=samples,
+    )
+
+
+def _column_mean(speed_rad_s: Array) -> Array:
+    measured = np.isfinite(speed_rad_s)
+    return np.where(measured, speed_rad_s, 0.0).sum(axis=0) / np.maximum(measured.sum(axis=0), 1)

@@ -1,0 +1,135 @@
+"""Several models trained on the same recordings and judged on the same others."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from twin.build import TrainedTwin, evaluate, train_twin
+from twin.errors import TwinError
+from twin.evaluation.accuracy import Evaluation, evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
+from twin.export.card import DataCard
+from twin.fitting.training import Progress
+from twin.models.model import Kind
+from twin.models.physics import LAG
+from twin.runs import Run
+
+Source = Literal["test", "held-out", "training"]
+"""Which data a figure is of. test: seen by nobody. held-out: not fitted, but training stopped by them, and sigma is
+theirs. training: fitted, which flatters."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model to train: what it is called, its kind, and what its network sees."""
+
+    name: str
+    kind: Kind
+    said: str
+    network_inputs: tuple[str, ...] = ("speed", "command")
+
+
+CANDIDATES = (
+    Candidate("physical", "physical", "physical"),
+    Candidate("narx", "narx", "NARX"),
+    Candidate("neural-ode", "neural-ode", "neural ODE"),
+    Candidate("hybrid", "hybrid", "hybrid [w, tau]"),
+    Candidate("hybrid-w", "hybrid", "hybrid [w]", network_inputs=("speed",)),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """A candidate once trained. twin is None where it could not be, and invalid_reason says why, in a line.
+
+    training_rmse_rad_s: free run over the training runs. held_out, test: None without such runs.
+    """
+
+    candidate: Candidate
+    twin: TrainedTwin | None = None
+    invalid_reason: str = ""
+    training_rmse_rad_s: float = np.nan
+    training: Evaluation | None = None
+    held_out: Evaluation | None = None
+    test: Evaluation | None = None
+
+    @property
+    def judged(self) -> Evaluation | None:
+        """Its figures over the data that least of its making depended on."""
+        return self.test or self.held_out or self.training
+
+    @property
+    def physical_parameters(self) -> int:
+        """How many of a fan's own parameters the model uses; a lag of zero is none."""
+        if self.twin is None or self.candidate.kind == "narx":
+            return 0
+        lag = int(np.any(self.twin.parameters[:, LAG] != 0.0))
+        return lag if self.candidate.kind == "neural-ode" else LAG + lag
+
+
+def source_of(validation_runs: Sequence[Run], test_runs: Sequence[Run]) -> Source:
+    """The data that candidates are judged by: the test runs, or else the held-out ones, or else the training runs."""
+    return "test" if test_runs else "held-out" if validation_runs else "training"
+
+
+def contend(
+    candidate: Candidate,
+    runs: Sequence[Run],
+    validation_runs: Sequence[Run],
+    test_runs: Sequence[Run],
+    *,
+    seed: int = 0,
+    max_iterations: int | None = None,
+    command_unit: str = "",
+    fan_numbers: Sequence[int] | None = None,
+    data: Sequence[DataCard] = (),
+    validation_data: Sequence[DataCard] = (),
+    progress: Progress | None = None,
+) -> Contender:
+    """Train one candidate and judge it. Arguments as of build.train_twin; test_runs take no part in training.
+
+    A candidate that cannot be trained on runs that others can be trained on is a result, and not an error.
+    """
+    try:
+        trained = train_twin(
+            runs,
+            validation_runs,
+            candidate.kind,
+            name=candidate.said,
+            seed=seed,
+            max_iterations=max_iterations,
+            network_inputs=candidate.network_inputs,
+            command_unit=command_unit,
+            fan_numbers=fan_numbers,
+            data=data,
+            validation_data=validation_data,
+            progress=progress,
+        )
+    except TwinError as error:
+        return Contender(candidate, invalid_reason=str(error))
+    residual = free_run_residuals(trained.model, trained.parameters, evaluation_pieces(runs))
+    return Contender(
+        candidate,
+        trained,
+        training_rmse_rad_s=pooled_rmse_rad_s(residual),
+        training=None if validation_runs else trained.validation,
+        held_out=trained.validation if validation_runs else None,
+        test=evaluate(trained, test_runs, fan_numbers) if test_runs else None,
+    )
+
+
+def best(contenders: Sequence[Contender]) -> Contender:
+    """The one with the smallest free-run rmse over the data they are judged by.
+
+    Raises TwinError when none could be trained: the reason of the first is that of all.
+    """
+    able = [contender for contender in contenders if contender.judged is not None]
+    if not able:
+        raise TwinError(contenders[0].invalid_reason)
+
+    def rmse(contender: Contender) -> float:
+        assert contender.judged is not None
+        return contender.judged.pooled.rmse_rad_s
+
+    return min(able, key=rmse)

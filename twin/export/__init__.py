@@ -1,0 +1,1 @@
+"""The twin as one ONNX file with its card."""

@@ -1,0 +1,24 @@
+"""A twin file with the calibration of its alarms in its card: the graph stays, byte for byte of its weights."""
+
+import json
+from typing import Any
+
+import onnx
+
+from twin.errors import TwinError
+from twin.export.card import CARD_KEY
+
+
+def with_calibration(content: bytes, calibration: dict[str, Any]) -> bytes:
+    """The same ONNX file with another calibration in its card.
+
+    Raises:
+        TwinError: it is no twin.
+    """
+    model = onnx.load_model_from_string(content)
+    for entry in model.metadata_props:
+        if entry.key == CARD_KEY:
+            card = json.loads(entry.value)
+            entry.value = json.dumps(card | {"calibration": calibration}, allow_nan=False)
+            return model.SerializeToString()
+    raise TwinError(f"an ONNX file, but not a twin: it has no {CARD_KEY}")

@@ -1,0 +1,222 @@
+"""The coefficients of the torque balance (twin.fitting.balance), learned from healthy runs, and how it moves when all
+is well.
+
+There are two candidates for each fan. *physics*: J, alpha, C_D and lag_s of the identification, and the friction by
+least squares. A noisy tacho does not bias them, but the physics know no dry friction, and a speed loop can spoil them.
+*least-squares*: all four coefficients by least squares on the filtered balance, none of the first three below zero;
+the lag is that of the physics. It knows friction and bears a loop, but noise in the speeds makes its inertia too small.
+
+Both are judged by the *spread*: the standard deviation of the balance about the mean of each run. (Constant
+differences between runs are for commissioning to take away.) Least squares is cross-validated: each group of samples
+is judged by coefficients of the others. The physics are judged as they are, for their friction cannot change a spread.
+A group is a run, or a part of one where runs are few. Held-out runs have no say in this; sigma is their spread.
+
+The smaller spread is better, but least squares gains some of it by its very bias: where noise takes the share 1 - r
+from its inertia, it takes at most the share 1 - sqrt(r) from the spread (r is the reliability ratio of Fuller,
+Measurement Error Models, 1987, section 1.1). So least squares is chosen where it gains more than that, its spread
+being below that of the physics times sqrt(r), r = inertia / J but within 1/2 and 1: a J of twice the inertia or more
+is not explained by noise.
+
+A fan that stands, starts or stops is left out, and so is the first second of each stretch. Errors are those of the
+identification where coefficients come from there, otherwise of the jackknife over the groups, which allows for errors
+that are correlated within a group and for runs that differ.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d
+from scipy.optimize import lsq_linear
+
+from twin.errors import TwinError
+from twin.evaluation.resampling import resampled
+from twin.evaluation.residual_analysis import analyse_residual
+from twin.fitting.balance import COEFFICIENTS, FILTER_RATE_PER_S, Source, balance_of, filtered_terms
+from twin.fitting.identification import Identification
+from twin.models.physics import LAG
+from twin.runs import GAP_IN_MEDIAN_STEPS, Array, Run
+
+LOWEST_SHARE_OF_TOP = 0.05
+SETTLING_S = 3.0 / FILTER_RATE_PER_S
+ENOUGH_RUNS, GROUPS = 4, 8
+LEAST_RELIABILITY = 0.5
+INERTIA, FRICTION = COEFFICIENTS.index("inertia"), COEFFICIENTS.index("friction")
+LEAST_COEFFICIENTS = (0.0, 0.0, 0.0, -np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class BalanceFit:
+    """The torque balance of each fan, in units of the command.
+
+    coefficients: (fans, 4) in the order of balance.COEFFICIENTS. covariance: (fans, 4, 4) of their errors, zero where a
+    coefficient stays at its bound whatever is left out. The others are (fans,): lag_s, sigma_command (the healthy
+    spread within a run), autocorrelation_time_s (as in residual_analysis; the filter's own where the runs are too short
+    to tell), lowest_speed_rad_s (below it the balance means nothing), sources (which candidate).
+    """
+
+    coefficients: Array
+    covariance: Array
+    lag_s: Array
+    sigma_command: Array
+    autocorrelation_time_s: Array
+    lowest_speed_rad_s: Array
+    sources: tuple[Source, ...]
+
+    @property
+    def std_errors(self) -> Array:
+        """(fans, 4)"""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Stretch:
+    """A gap-free part of a run on its grid, and the terms of its balance (n, fans, 5), NaN where they do not count."""
+
+    run: int
+    grid: Run
+    terms: Array
+
+    def counted(self, fan: int) -> Array:
+        """(m, 5) terms of a fan that count."""
+        terms = self.terms[:, fan]
+        return terms[np.isfinite(terms[:, 0])]
+
+
+def fit_balance(runs: Sequence[Run], held_out: Sequence[Run], identification: Identification) -> BalanceFit:
+    """Learn and choose by the runs; sigma is that of the held-out ones, or of the same where there are none.
+
+    Raises TwinError where a fan never turns long enough, or its balance never moves.
+    """
+    lag_s = identification.parameters[:, LAG]
+    lowest_speed_rad_s = LOWEST_SHARE_OF_TOP * identification.top_speed_rad_s
+    learned = _stretches(runs, lag_s, lowest_speed_rad_s)
+    judged = _stretches(held_out, lag_s, lowest_speed_rad_s) or learned
+    fans = range(len(lag_s))
+    chosen = [_choose(learned, identification, fan) for fan in fans]
+    coefficients = np.array([coefficients for coefficients, _, _ in chosen])
+    sigma = np.array([_spread([balance_of(run, coefficients[fan]) for run in _by_run(judged, fan)]) for fan in fans])
+    if not np.all(sigma > 0.0):
+        raise TwinError(f"fan {np.argmin(sigma > 0.0)}: its torque balance never moves; check the speed column")
+    return BalanceFit(
+        coefficients=coefficients,
+        covariance=np.array([covariance for _, covariance, _ in chosen]),
+        lag_s=lag_s,
+        sigma_command=sigma,
+        autocorrelation_time_s=np.array([_autocorrelation_time_s(judged, coefficients[fan], fan) for fan in fans]),
+        lowest_speed_rad_s=lowest_speed_rad_s,
+        sources=tuple(source for _, _, source in chosen),
+    )
+
+
+def _stretches(runs: Sequence[Run], lag_s: Array, lowest_speed_rad_s: Array) -> list[_Stretch]:
+    """All stretches of the runs, each run at its own rate. Missing speeds are bridged where a command would be."""
+    found: list[_Stretch] = []
+    for index, run in enumerate(runs):
+        rate_hz = 1.0 / run.median_step_s
+        for piece in run.split_at_gaps():
+            if piece.duration_s * rate_hz < 1.0:
+                continue
+            grid = resampled(piece, rate_hz)
+            speed = np.column_stack([_bridged(of_fan) for of_fan in grid.speed_rad_s.T])
+            terms, weight = filtered_terms(grid.command, speed, 1.0 / rate_hz, lag_s)
+            standing = np.abs(speed) < lowest_speed_rad_s
+            reach = round(SETTLING_S * rate_hz)
+            near_standstill = maximum_filter1d(standing.astype(np.int8), 2 * reach + 1, axis=0, mode="nearest") > 0
+            settled = weight >= 1.0 - np.exp(-FILTER_RATE_PER_S * SETTLING_S)
+            counts = settled & ~near_standstill
+            found.append(_Stretch(index, grid, np.where(counts[..., np.newaxis], terms, np.nan)))
+    return found
+
+
+def _bridged(speed_rad_s: Array) -> Array:
+    """(n,) one fan's speeds on a grid, linear across short gaps, NaN in long ones."""
+    known = np.flatnonzero(np.isfinite(speed_rad_s))
+    if len(known) < 2:
+        return np.full_like(speed_rad_s, np.nan)
+    at = np.arange(len(speed_rad_s))
+    after = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
+    short = known[after] - known[after - 1] <= GAP_IN_MEDIAN_STEPS
+    between = np.interp(at, known, speed_rad_s[known], left=np.nan, right=np.nan)
+    return np.where(short, between, speed_rad_s)
+
+
+def _choose(learned: Sequence[_Stretch], identification: Identification, fan: int) -> tuple[Array, Array, Source]:
+    """(4,) coefficients of a fan, the (4, 4) covariance of their errors, and which candidate they are."""
+    runs = _by_run(learned, fan)
+    parts = 1 if len(runs) >= ENOUGH_RUNS else -(-GROUPS // len(runs))
+    groups = [np.array_split(run, parts) for run in runs]
+    # A triangle of five rows says of a group all that least squares ask.
+    triangles = [np.linalg.qr(group).R for of_run in groups for group in of_run]
+    free = _least_squares(triangles)
+    without = [_least_squares([other for other in triangles if other is not left_out]) for left_out in triangles]
+    physics, of_physics = _physics([group for of_run in groups for group in of_run], identification, fan)
+    of_others = iter(without)
+    spread = _spread([np.concatenate([balance_of(group, next(of_others)) for group in of_run]) for of_run in groups])
+    spread_of_physics = _spread([balance_of(run, physics) for run in runs])
+    reliability = np.clip(free[INERTIA] / physics[INERTIA], LEAST_RELIABILITY, 1.0)
+    if spread < spread_of_physics * np.sqrt(reliability):
+        return free, _jackknife(np.array(without)), "least-squares"
+    return physics, of_physics, "physics"
+
+
+def _physics(groups: Sequence[Array], identification: Identification, fan: int) -> tuple[Array, Array]:
+    """(4,) identified coefficients with the friction that is left, and the (4, 4) covariance of their errors.
+
+    What the identified ones are wrong by, the friction makes good on the mean.
+    """
+    own = np.append(identification.parameters[fan, :LAG], 0.0)
+    samples = np.array([len(group) for group in groups])
+    total = np.array([balance_of(group, own).sum() for group in groups])
+    without = (total.sum() - total) / (samples.sum() - samples)
+    own[FRICTION] = total.sum() / samples.sum()
+    makes_good = np.vstack((np.eye(LAG), -np.concatenate(groups)[:, 1 : 1 + LAG].mean(axis=0)))
+    covariance = makes_good @ identification.covariance[fan, :LAG, :LAG] @ makes_good.T
+    covariance[FRICTION, FRICTION] += _jackknife(without[:, np.newaxis]).item()
+    return own, covariance
+
+
+def _least_squares(triangles: Sequence[Array]) -> Array:
+    """(4,) coefficients that leave the least balance."""
+    stacked = np.concatenate(triangles)
+    scale = np.linalg.norm(stacked[:, 1:], axis=0) + np.finfo(float).tiny
+    return lsq_linear(stacked[:, 1:] / scale, stacked[:, 0], (LEAST_COEFFICIENTS, np.inf), method="bvls").x / scale
+
+
+def _jackknife(without: Array) -> Array:
+    """(k, k) covariance of the errors, from the estimates (groups, k) that leave out one group each."""
+    apart = without - without.mean(axis=0)
+    return (len(without) - 1) / len(without) * apart.T @ apart
+
+
+def _by_run(stretches: Sequence[_Stretch], fan: int) -> list[Array]:
+    """(m, 5) terms of a fan that count, for each run that has some. Raises TwinError where there are too few."""
+    of_runs: dict[int, list[Array]] = {}
+    for stretch in stretches:
+        of_runs.setdefault(stretch.run, []).append(stretch.counted(fan))
+    runs = [run for parts in of_runs.values() if len(run := np.concatenate(parts)) >= GROUPS]
+    if not runs:
+        raise TwinError(
+            f"fan {fan}: no run in which it turns for more than {SETTLING_S:g} s on end, which its torque balance "
+            "needs; give a longer one"
+        )
+    return runs
+
+
+def _spread(balances: Sequence[Array]) -> float:
+    """Standard deviation within runs, over all their samples."""
+    return float(np.sqrt(np.mean(np.concatenate([balance - balance.mean() for balance in balances]) ** 2)))
+
+
+def _autocorrelation_time_s(stretches: Sequence[_Stretch], coefficients: Array, fan: int) -> float:
+    balances = [balance_of(stretch.terms[:, fan], coefficients) for stretch in stretches]
+    of_run = np.repeat([stretch.run for stretch in stretches], [len(balance) for balance in balances])
+    balance = np.concatenate(balances)
+    counted = np.isfinite(balance)
+    samples = np.maximum(np.bincount(of_run[counted], minlength=of_run[-1] + 1), 1)
+    mean = np.bincount(of_run[counted], balance[counted], minlength=of_run[-1] + 1) / samples
+    within = (balance - mean[of_run])[:, np.newaxis]
+    pieces = [stretch.grid.fan(fan) for stretch in stretches]
+    (analysis,) = analyse_residual(within, pieces, settling_s=0.0)
+    time_s = analysis.autocorrelation_time_s
+    return time_s if np.isfinite(time_s) else 1.0 / FILTER_RATE_PER_S

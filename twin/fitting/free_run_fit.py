@@ -1,0 +1,380 @@
+"""Levenberg-Marquardt on the free-run error, with exact sensitivities.
+
+Minimises the sum of a pseudo-Huber loss of (measured - free run) / scale over every measured sample. Unknown are
+
+    the weights of a network, shared by all fans,
+    each fan's own physics (twin.models.physical: ln J, two ln dampings, lag), and
+    the initial speed of each trajectory.
+
+The scale is a robust spread of each fan's residual, so that outliers count linearly and fans of different noise count
+alike. Initial speeds meet the other unknowns only in their own trajectory, and physics only in their own fan: both
+are eliminated from the normal equations (Schur complements), so that a thousand trajectories and a hundred fans cost
+no more than their own integration. More, Numerical Analysis, LNM 630 (1978), for the damping by the diagonal.
+
+Without shared weights every fan is damped, accepted and stopped by itself, as if it were fitted alone.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.fitting.trajectories import Trajectories
+from twin.models.integration import free_run, free_run_sensitivities
+from twin.models.lag import effective_command, effective_command_by_lag
+from twin.models.model import OdeModel
+from twin.models.network import TanhNetwork
+from twin.models.physical import PhysicalModel, parameters_by_unknowns, physical_parameters
+from twin.models.physics import LAG, PARAMETER_NAMES
+from twin.models.right_hand_side import FanEquation
+from twin.runs import Array
+
+Flags = NDArray[np.bool_]
+
+HUBER_DELTA = 3.0
+NORMAL_90_PERCENT = 1.645
+SCALE_ROUNDS = 2
+MAX_CHUNK_NUMBERS = 4_000_000
+DAMPING_DOWN, DAMPING_UP = 3.0, 4.0
+FIRST_DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e9
+HELD = 1e12
+
+ALL_FREE = np.ones(len(PARAMETER_NAMES), dtype=bool)
+NONE_FREE = np.zeros(len(PARAMETER_NAMES), dtype=bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """weights: (P,), empty without a network. own: (fans, 4), see twin.models.physical. initial_speed_rad_s:
+    (batch,)."""
+
+    weights: Array
+    own: Array
+    initial_speed_rad_s: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Quadratic pulls, in units of squared scaled residuals: weights towards zero, own unknowns towards own_mean.
+
+    own: (4,). own_mean: (fans, 4). network: pulls the network's acceleration towards what it should be where no data
+    say otherwise, or None.
+    """
+
+    weights: float
+    own: Array
+    own_mean: Array
+    network: "NetworkPrior | None" = None
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkPrior:
+    """Virtual observations of the network: at speed_rad_s and command (k,) it gives acceleration_rad_s2 (k,).
+
+    weight: of each, 1 / (its standard deviation in rad/s^2)^2.
+    """
+
+    speed_rad_s: Array
+    command: Array
+    acceleration_rad_s2: Array
+    weight: float
+
+    def cost(self, network: TanhNetwork) -> float:
+        """Half the weighted sum of squares."""
+        error = self.acceleration_rad_s2 - network.acceleration(self.speed_rad_s, self.command)
+        return 0.5 * self.weight * float(error @ error)
+
+    def normal_equations(self, network: TanhNetwork) -> tuple[Array, Array]:
+        """Their share of the Hessian (P, P) and of the downhill direction (P,)."""
+        value, _, _, by_theta = network.linearise(self.speed_rad_s, self.command)
+        return self.weight * by_theta.T @ by_theta, self.weight * by_theta.T @ (self.acceleration_rad_s2 - value)
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A candidate: its free run and residual (n, batch), zero where missing, and its cost (fans,) without the prior."""
+
+    unknowns: Unknowns
+    speed_rad_s: Array
+    residual: Array
+    cost: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRunFit:
+    """The solution. rmse_rad_s over all samples. scale_rad_s: (fans,)."""
+
+    point: Point
+    rmse_rad_s: float
+    scale_rad_s: Array
+    iterations: int
+
+
+IterationDone = Callable[[int, Unknowns, float], bool]
+"""Called with iteration, unknowns and rmse in rad/s after each accepted step; true stops the fit."""
+
+
+def fit_free_run(
+    model: OdeModel,
+    own: Array,
+    top_speed_rad_s: Array,
+    trajectories: Trajectories,
+    *,
+    free: Flags,
+    prior: Prior,
+    max_iterations: int,
+    tolerance: float = 1e-5,
+    estimate_initial_speed: bool = True,
+    iteration_done: IterationDone | None = None,
+) -> FreeRunFit:
+    """Fit the weights of the model, where it has any, starting from its own, and the free ones of the own unknowns.
+
+    own: (fans, 4) to start from. top_speed_rad_s: (fans,). free: (4,) or (fans, 4).
+    estimate_initial_speed: otherwise the first measured speeds stand, as they do in service; an unstable equilibrium
+    cannot then hide behind an initial speed that happens to balance on it. It stops when a step lowers the cost by
+    less than tolerance, relative, or when none lowers it.
+    """
+    problem = FreeRunProblem(model, trajectories, top_speed_rad_s, free, prior, estimate_initial_speed)
+    weights = np.zeros(0) if isinstance(model, PhysicalModel) else model.network.theta
+    start = Unknowns(weights, own, trajectories.starting_speed_rad_s())
+    point = problem.evaluate(start, trajectories.interpolated_speed_rad_s())
+    iteration = 0
+    for _ in range(SCALE_ROUNDS):
+        problem.scale_rad_s = robust_scale(point.residual, trajectories)
+        point = problem.evaluate(point.unknowns, point.speed_rad_s)
+        point, iteration, stopped = _descend(problem, point, iteration, max_iterations, tolerance, iteration_done)
+        if stopped:
+            break
+    return FreeRunFit(point, problem.rmse_rad_s(point), problem.scale_rad_s, iteration)
+
+
+def _descend(
+    problem: "FreeRunProblem",
+    point: Point,
+    iteration: int,
+    max_iterations: int,
+    tolerance: float,
+    iteration_done: IterationDone | None,
+) -> tuple[Point, int, bool]:
+    """To the next minimum, one scale throughout. Returns whether it was stopped, too."""
+    groups = problem.groups
+    damping = np.full(groups, FIRST_DAMPING)
+    cost = problem.total(point)
+    active = np.isfinite(cost)
+    normal: tuple[Array, Array] | None = None
+    while iteration < max_iterations and np.any(active):
+        iteration += 1
+        normal = problem.normal_equations(point) if normal is None else normal
+        trial = problem.evaluate(problem.step(point, *normal, damping), point.speed_rad_s)
+        trial_cost = problem.total(trial)
+        better = active & (trial_cost < cost)
+        gain = np.zeros(groups)
+        gain[better] = (cost[better] - trial_cost[better]) / cost[better]
+        damping = np.where(better, np.maximum(damping / DAMPING_DOWN, SMALLEST_DAMPING), damping * DAMPING_UP)
+        active &= ~(better & (gain < tolerance)) & (damping < LARGEST_DAMPING)
+        if not np.any(better):
+            continue
+        point, cost, normal = problem.merge(point, trial, better), np.where(better, trial_cost, cost), None
+        if iteration_done is not None and iteration_done(iteration, point.unknowns, problem.rmse_rad_s(point)):
+            return point, iteration, True
+    return point, iteration, iteration >= max_iterations
+
+
+class FreeRunProblem:
+    """The sum of losses and its normal equations for one set of trajectories."""
+
+    def __init__(
+        self,
+        model: OdeModel,
+        trajectories: Trajectories,
+        top_speed_rad_s: Array,
+        free: Flags,
+        prior: Prior,
+        estimate_initial_speed: bool = True,
+    ) -> None:
+        self.model = model
+        self.trajectories = trajectories
+        self.top_speed_rad_s = top_speed_rad_s
+        self.free = free
+        self.prior = prior
+        self.estimate_initial_speed = estimate_initial_speed
+        self.fans = len(top_speed_rad_s)
+        self.weights = 0 if isinstance(model, PhysicalModel) else model.network.parameter_count
+        self.groups = 1 if self.weights else self.fans
+        self.group_of_fan = np.zeros(self.fans, dtype=np.intp) if self.weights else np.arange(self.fans)
+        self.scale_rad_s = np.ones(self.fans)
+
+    def evaluate(self, unknowns: Unknowns, guess_rad_s: Array) -> Point:
+        """The free run of these unknowns. guess_rad_s: (n, batch), speeds nearby."""
+        data = self.trajectories
+        equation, command = self.equation(unknowns, slice(None))
+        guess = np.where(np.isfinite(guess_rad_s), guess_rad_s, 0.0)
+        speed, _ = free_run(equation, unknowns.initial_speed_rad_s, command, data.step_s, guess)
+        scale = self.scale_rad_s[data.fan]
+        with np.errstate(over="ignore", invalid="ignore"):
+            residual = np.where(data.measured, data.speed_rad_s - speed, 0.0)
+            loss = HUBER_DELTA**2 * (np.hypot(1.0, residual / (HUBER_DELTA * scale)) - 1.0)
+            cost = np.bincount(data.fan, loss.sum(axis=0), self.fans).astype(np.float64)
+        cost[~np.isfinite(cost)] = np.inf
+        return Point(unknowns, speed, residual, cost)
+
+    def equation(self, unknowns: Unknowns, part: slice) -> tuple[FanEquation, Array]:
+        """The equation of some trajectories, and the command that acts on them (n, batch)."""
+        data = self.trajectories
+        parameters = self.parameters(unknowns)[data.fan[part]]
+        model = self.model if isinstance(self.model, PhysicalModel) else self.model.with_theta(unknowns.weights)
+        command, _ = effective_command(
+            data.command[:, part], data.step_s[:, part], parameters[:, LAG], data.command_before[part]
+        )
+        return model.equation(parameters), command
+
+    def parameters(self, unknowns: Unknowns) -> Array:
+        """(fans, 4) physical parameters."""
+        return physical_parameters(unknowns.own, self.top_speed_rad_s)
+
+    def total(self, point: Point) -> Array:
+        """(groups,) cost with the prior."""
+        own = 0.5 * np.sum(self.prior.own * (point.unknowns.own - self.prior.own_mean) ** 2, axis=1)
+        total = np.bincount(self.group_of_fan, point.cost + own, self.groups).astype(np.float64)
+        weights = point.unknowns.weights
+        if self.prior.network is not None:
+            total = total + self.prior.network.cost(self._network(weights))
+        return total + 0.5 * self.prior.weights * float(weights @ weights)
+
+    def normal_equations(self, point: Point) -> tuple[Array, Array]:
+        """Per trajectory the weighted S^T S (batch, M, M) and S^T residual (batch, M): weights, own, initial speed."""
+        data = self.trajectories
+        steps, batch = data.command.shape
+        size = self.weights + len(PARAMETER_NAMES) + 1
+        squares, gradient = np.empty((batch, size, size)), np.empty((batch, size))
+        width = max(1, MAX_CHUNK_NUMBERS // (steps * size))
+        for first in range(0, batch, width):
+            part = slice(first, first + width)
+            sensitivity = self.sensitivities(point, part).transpose(1, 0, 2)
+            scale = self.scale_rad_s[data.fan[part]]
+            weight = self.sample_weights(point.residual[:, part], part) / scale**2
+            weighted = sensitivity * weight.T[:, :, np.newaxis]
+            squares[part] = weighted.transpose(0, 2, 1) @ sensitivity
+            gradient[part] = np.einsum("bnp,nb->bp", weighted, point.residual[:, part])
+        return squares, gradient
+
+    def sample_weights(self, residual: Array, part: slice) -> Array:
+        """(n, batch) the pseudo-Huber loss's weight of each sample: 1 for small residuals, 0 where missing."""
+        data = self.trajectories
+        scaled = residual / self.scale_rad_s[data.fan[part]]
+        return np.where(data.measured[:, part], 1.0 / np.hypot(1.0, scaled / HUBER_DELTA), 0.0)
+
+    def sensitivities(self, point: Point, part: slice) -> Array:
+        """(n, batch, M) derivatives of the free run by weights, own unknowns and initial speed."""
+        data = self.trajectories
+        fan, step_s = data.fan[part], data.step_s[:, part]
+        parameters = self.parameters(point.unknowns)[fan]
+        equation, command = self.equation(point.unknowns, part)
+        by_lag = effective_command_by_lag(data.command[:, part], step_s, parameters[:, LAG], data.command_before[part])
+        raw = free_run_sensitivities(equation, point.speed_rad_s[:, part], command, step_s, by_lag)
+        by_parameters = np.zeros((*command.shape, len(PARAMETER_NAMES)))
+        by_parameters[..., LAG] = raw[..., -2]
+        if equation.parameters is not None:
+            by_parameters[..., :LAG] = raw[..., self.weights : -2]
+        chain = parameters_by_unknowns(point.unknowns.own, self.top_speed_rad_s)[fan]
+        by_own = np.einsum("nbp,bpq->nbq", by_parameters, chain)
+        return np.concatenate((raw[..., : self.weights], by_own, raw[..., -1:]), axis=-1)
+
+    def step(self, point: Point, squares: Array, gradient: Array, damping: Array) -> Unknowns:
+        """The damped Gauss-Newton step: initial speeds eliminated first, then each fan's physics, then the weights."""
+        fan_of, unknowns = self.trajectories.fan, point.unknowns
+        damping_of_fan = damping[self.group_of_fan]
+        # An initial speed that is not estimated is one of infinite curvature: it takes no share and does not move.
+        known = 1.0 if self.estimate_initial_speed else np.inf
+        by_initial = known * squares[:, -1, -1] * (1.0 + damping_of_fan[fan_of])
+        coupling = squares[:, :-1, -1] / by_initial[:, np.newaxis]
+        reduced = np.zeros((self.fans, *squares[0, :-1, :-1].shape))
+        downhill = np.zeros((self.fans, reduced.shape[-1]))
+        diagonal = np.zeros_like(downhill)
+        np.add.at(reduced, fan_of, squares[:, :-1, :-1] - coupling[:, :, None] * squares[:, None, :-1, -1])
+        np.add.at(downhill, fan_of, gradient[:, :-1] - coupling * gradient[:, -1:])
+        np.add.at(diagonal, fan_of, np.diagonal(squares[:, :-1, :-1], axis1=1, axis2=2))
+
+        weights, own = slice(self.weights), slice(self.weights, None)
+        pivot = self._own_pivot(unknowns, reduced[:, own, own], downhill[:, own], diagonal[:, own], damping_of_fan)
+        downhill[:, own] -= self.prior.own * (unknowns.own - self.prior.own_mean)
+        shared = np.linalg.solve(pivot, np.concatenate((reduced[:, own, weights], downhill[:, own, None]), axis=-1))
+        share, alone = shared[..., :-1], shared[..., -1]
+        move = np.zeros(self.weights)
+        if self.weights:
+            of_weights = diagonal[:, weights].sum(axis=0)
+            hessian = np.sum(reduced[:, weights, weights] - reduced[:, weights, own] @ share, axis=0)
+            slope = np.sum(downhill[:, weights] - np.einsum("fwo,fo->fw", reduced[:, weights, own], alone), axis=0)
+            if self.prior.network is not None:
+                squares_of_prior, slope_of_prior = self.prior.network.normal_equations(self._network(unknowns.weights))
+                hessian += squares_of_prior
+                slope += slope_of_prior
+            floor = 1e-12 * of_weights.max() + np.finfo(float).tiny
+            hessian[np.diag_indices(self.weights)] += damping[0] * of_weights + self.prior.weights + floor
+            move = np.linalg.solve(hessian, slope - self.prior.weights * unknowns.weights)
+        own_move = np.where(self.free, alone - share @ move, 0.0)
+        whole = np.concatenate((np.broadcast_to(move, (self.fans, self.weights)), own_move), axis=1)
+        initial_move = gradient[:, -1] / by_initial - np.sum(coupling * whole[fan_of], axis=1)
+        new_own = unknowns.own + own_move
+        new_own[:, LAG] = np.maximum(new_own[:, LAG], 0.0)
+        return Unknowns(unknowns.weights + move, new_own, unknowns.initial_speed_rad_s + initial_move)
+
+    def _network(self, weights: Array) -> TanhNetwork:
+        assert not isinstance(self.model, PhysicalModel), "a prior on a network needs a network"
+        return self.model.network.with_theta(weights)
+
+    def _own_pivot(self, unknowns: Unknowns, reduced: Array, downhill: Array, diagonal: Array, damping: Array) -> Array:
+        """(fans, 4, 4) the damped curvature of the own unknowns; those that are held get one beyond all measure."""
+        held = np.broadcast_to(~self.free, diagonal.shape).copy()
+        # A lag of zero that would fall further stays where it is.
+        held[:, LAG] |= (unknowns.own[:, LAG] <= 0.0) & (downhill[:, LAG] <= 0.0)
+        largest = diagonal.max(axis=1, keepdims=True) + 1.0
+        # An unknown without any effect still needs a pivot: the floor keeps the system solvable and the step zero.
+        ridge = damping[:, None] * diagonal + self.prior.own + 1e-12 * largest + np.where(held, HELD * largest, 0.0)
+        pivot = reduced.copy()
+        pivot[:, np.arange(len(PARAMETER_NAMES)), np.arange(len(PARAMETER_NAMES))] += ridge
+        return pivot
+
+    def merge(self, old: Point, new: Point, take_new: Flags) -> Point:
+        """The new point for the groups that take it, the old one for the others."""
+        if np.all(take_new):
+            return new
+        fan = take_new[self.group_of_fan]
+        column = fan[self.trajectories.fan]
+        unknowns = Unknowns(
+            weights=new.unknowns.weights,
+            own=np.where(fan[:, np.newaxis], new.unknowns.own, old.unknowns.own),
+            initial_speed_rad_s=np.where(column, new.unknowns.initial_speed_rad_s, old.unknowns.initial_speed_rad_s),
+        )
+        return replace(
+            new,
+            unknowns=unknowns,
+            speed_rad_s=np.where(column, new.speed_rad_s, old.speed_rad_s),
+            residual=np.where(column, new.residual, old.residual),
+            cost=np.where(fan, new.cost, old.cost),
+        )
+
+    def rmse_rad_s(self, point: Point) -> float:
+        """Root mean square of the residual over all measured samples."""
+        with np.errstate(over="ignore"):
+            return float(np.sqrt(np.sum(point.residual**2) / np.count_nonzero(self.trajectories.measured)))
+
+
+def robust_scale(residual: Array, trajectories: Trajectories) -> Array:
+    """(fans,) standard deviation of a normal residual with the same 90th percentile of magnitude.
+
+    One sample in ten may be an outlier. Never below a millionth of the fan's speed range, nor above that range, which
+    it is where the free run diverged.
+    """
+    fans = int(trajectories.fan.max()) + 1
+    scale = np.ones(fans)
+    for fan in np.unique(trajectories.fan):
+        columns = trajectories.fan == fan
+        measured = trajectories.measured[:, columns]
+        magnitude = np.abs(residual[:, columns][measured])
+        span = float(np.ptp(trajectories.speed_rad_s[:, columns][measured]))
+        # A magnitude beyond the range says nothing more, and may be infinite.
+        spread = float(np.quantile(np.fmin(magnitude, span), 0.9)) / NORMAL_90_PERCENT
+        scale[fan] = max(spread, 1e-6 * span, np.finfo(float).tiny)
+    return scale

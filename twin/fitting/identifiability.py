@@ -1,0 +1,294 @@
+"""What a recording cannot tell about a fan, why, and what to record instead.
+
+Whether a parameter is told comes from the covariance of the estimates; why not comes from the data. Two things the
+covariance cannot see are looked for in the data alone: a recording that hardly excites the fan, and a controller that
+feeds the noise of the speed back into the command. Under such feedback the direct approach, which fits command to
+speed as if there were no loop, is biased unless its noise model is right, and ours, white noise on the speed, is not
+once the load fluctuates too (Ljung, System Identification, second edition, section 13.4).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from twin.models.physics import PARAMETER_NAMES
+from twin.runs import Array, Run
+
+J, ALPHA, C_D, LAG_S = (PARAMETER_NAMES.index(name) for name in ("J", "alpha", "C_D", "lag_s"))
+
+# The half width of a 95 % interval in standard errors, for words; the intervals themselves are identification's.
+REACH = 2.0
+# The inertia cannot be zero, so that its interval holds zero is no measure: this share of it is.
+UNCERTAIN_INERTIA = 0.25
+# alpha and C_D of a fan run from standstill to top speed correlate by -0.96 to -0.98, from two thirds of it by -0.99.
+TRADE_OFF_CORRELATION = -0.99
+NARROW_SPEED_RANGE = 0.35
+# So many standard errors from zero, a drag coefficient is told even where the two trade off.
+WELL_TOLD = 10.0
+# Of the damping at one end of the speeds to that at the other; the fit keeps both positive (twin.models.physical).
+EDGE = 1e-3
+# Noise estimates scatter by some percent.
+MISFIT = 1.1
+TOP_SPEED_QUANTILE = 0.99
+
+FEWEST_STEPS, FEWEST_LEVELS = 3, 3
+LEVELS_PER_RANGE = 10
+SMALL_COMMAND_RANGE = 0.1
+SMALL_SPEED_RANGE_IN_NOISE = 5.0
+
+LAGS = 5
+"""samples of the past that a command may follow from"""
+FEWEST_MOVES = 50
+"""of the command, to judge by; a controller makes them within seconds"""
+FALSE_ALARM_PROBABILITY = 1e-3
+FEEDBACK_SHARE = 0.05
+"""of the command's movement; excitation from outside that is twenty times stronger makes feedback harmless"""
+LARGEST_MOVE = 5.0
+"""in median ones; what is larger is a step of the set-point and counts as this"""
+
+MORE_OF = {
+    ALPHA: "record longer, with steps at low speed, where friction outweighs drag",
+    C_D: "record steps at higher speed (a rotor without blades has none)",
+}
+
+
+def identifiability_warnings(runs: Sequence[Run], parameters: Array, covariance: Array) -> tuple[str, ...]:
+    """One line for each thing that the runs cannot tell of each fan; none when all is well.
+
+    parameters: (fans, 4) in the order of PARAMETER_NAMES. covariance: (fans, 4, 4), zero for a parameter that was held.
+    """
+    pieces = [piece for run in runs for piece in run.split_at_gaps()]
+    return tuple(
+        f"fan {fan}: {line}"
+        for fan in range(len(parameters))
+        for line in (
+            *_poor_excitation(pieces, fan),
+            *_feedback(pieces, fan),
+            *_inertia(pieces, fan, parameters[fan], covariance[fan]),
+            *_drag(pieces, fan, parameters[fan], covariance[fan]),
+            *_lag(pieces, parameters[fan], covariance[fan]),
+        )
+    )
+
+
+def misfit_warnings(pieces: Sequence[Run], rmse_rad_s: Array) -> tuple[str, ...]:
+    """One line for each fan whose free run stays clear of its noise. rmse_rad_s: (fans,). pieces: without gaps."""
+    return tuple(
+        f"fan {fan}: the physical model misses the speed by {rmse:.3g} rad/s, of which noise explains {noise:.3g}: "
+        "friction, dead zone or drive bend its parameters, and their intervals, which hold for the equation as it is, "
+        "are too narrow; a hybrid learns the difference"
+        for fan, rmse in enumerate(rmse_rad_s)
+        if rmse > MISFIT * (noise := _noise(pieces, fan)) > 0.0
+    )
+
+
+def feedback_share(pieces: Sequence[Run], fan: int) -> float:
+    """How much of the command's movement follows from the past noise of the measured speed; 0 where none is seen.
+
+    The test of Granger for feedback (Caines and Chan, IEEE Transactions on Automatic Control 20, 1975): what of the
+    speed its own past and that of the command do not predict is noise; a command given from outside does not follow
+    from past noise, beyond what it follows from its own past. Only samples at which the command moves are looked at,
+    and the share must be significant by an F test and worth a warning by its size: the physics that the linear
+    prediction lacks leave traces of the command in the noise, but small ones.
+
+    The noise of the sample at which the command was given counts only where the command moves against it. The other
+    sign is a speed measured a little later than its command. pieces: without gaps.
+    """
+    long_enough = [piece for piece in pieces if piece.samples > 4 * LAGS]
+    if not long_enough:
+        return 0.0
+    signals = [(piece.command[:, fan], piece.speed_rad_s[:, fan]) for piece in long_enough]
+    predictors = [_predictors(command, speed_rad_s) for command, speed_rad_s in signals]
+    noise = np.split(
+        _residual(np.concatenate(predictors), np.concatenate([speed_rad_s[LAGS:] for _, speed_rad_s in signals]))[0],
+        np.cumsum([len(part) for part in predictors])[:-1],
+    )
+    move = np.concatenate([np.diff(command)[2 * LAGS - 1 :] for command, _ in signals])
+    own_past = np.concatenate([_past(command)[LAGS:] for command, _ in signals])
+    noise_now = np.concatenate([part[LAGS:] for part in noise])
+    noise_before = np.concatenate([_past(part) for part in noise])
+
+    used = (move != 0.0) & np.isfinite(noise_now) & np.all(np.isfinite(noise_before), axis=1)
+    if np.count_nonzero(used) < FEWEST_MOVES:
+        return 0.0
+    move = _without_outliers(move[used])
+    own_past = np.column_stack((np.ones(len(move)), own_past[used]))
+    everything_before = np.column_stack((own_past, noise_before[used]))
+    alone, rank_alone = _residual(own_past, move)
+    informed, rank_informed = _residual(everything_before, move)
+    new = _residual(everything_before, noise_now[used])[0]
+    if new @ informed < 0.0:
+        informed, rank_informed = _residual(np.column_stack((everything_before, noise_now[used])), move)
+    explained, unexplained = alone @ alone - informed @ informed, informed @ informed
+    extra, free = rank_informed - rank_alone, len(move) - rank_informed
+    share = float(explained / (move @ move))
+    if extra <= 0 or free <= 0 or share < FEEDBACK_SHARE:
+        return 0.0
+    probability = f_distribution.sf((explained / extra) / (unexplained / free), extra, free)
+    return share if probability < FALSE_ALARM_PROBABILITY else 0.0
+
+
+def _poor_excitation(pieces: Sequence[Run], fan: int) -> list[str]:
+    command = np.concatenate([piece.command[:, fan] for piece in pieces])
+    command_range, largest = float(np.ptp(command)), float(np.abs(command).max())
+    low, high = _speed_range(pieces, fan)
+    noise = _noise(pieces, fan)
+    steps = _steps(pieces, fan)
+    levels = len(np.unique(_levels(command, command)))
+    reasons = []
+    if command_range < SMALL_COMMAND_RANGE * largest:
+        reasons.append(f"the command moves by {command_range / largest:.1%} of its largest value only")
+    if steps < FEWEST_STEPS:
+        reasons.append(f"the command changes {steps} time(s) only")
+    if levels < FEWEST_LEVELS:
+        reasons.append(f"the command has {levels} level(s) only")
+    if high - low < SMALL_SPEED_RANGE_IN_NOISE * noise:
+        reasons.append(f"the speed moves by {high - low:.3g} rad/s, hardly more than its noise of {noise:.2g} rad/s")
+    if not reasons:
+        return []
+    return [
+        f"little excitation: {', and '.join(reasons)}; J, alpha and C_D rest on that alone: "
+        "record steps between three or more levels, from low to full command"
+    ]
+
+
+def _feedback(pieces: Sequence[Run], fan: int) -> list[str]:
+    share = feedback_share(pieces, fan)
+    if share == 0.0:
+        return []
+    return [
+        f"closed loop: {share:.0%} of the command's movement follows the noise of the measured speed; J and lag_s, "
+        "and at a single set-point alpha and C_D too, may be wrong by more than their intervals say: record with the "
+        "controller off, in steps between several commands, or at least in steps between several set-points"
+    ]
+
+
+def _inertia(pieces: Sequence[Run], fan: int, parameters: Array, covariance: Array) -> list[str]:
+    inertia, error = parameters[J], np.sqrt(covariance[J, J])
+    if error <= UNCERTAIN_INERTIA * inertia:
+        return []
+    low, high = _speed_range(pieces, fan)
+    return [
+        f"J is poorly determined ({inertia:.3g} ± {REACH * error:.2g}): it shows in transients alone, and too few "
+        f"stand out; the speed moves by {high - low:.3g} rad/s, its noise is {_noise(pieces, fan):.2g} rad/s and "
+        f"samples are {_step_s(pieces):.2g} s apart: record more and larger steps, several samples in each transient"
+    ]
+
+
+def _drag(pieces: Sequence[Run], fan: int, parameters: Array, covariance: Array) -> list[str]:
+    """alpha and C_D: they trade off; or one has the wrong sign, or is not told from zero."""
+    low, high = _speed_range(pieces, fan)
+    viscous, drag, errors = parameters[ALPHA], parameters[C_D], np.sqrt(np.diag(covariance))
+    told = viscous > REACH * errors[ALPHA] and drag > REACH * errors[C_D]
+    well_told = viscous > WELL_TOLD * errors[ALPHA] and drag > WELL_TOLD * errors[C_D]
+    product = errors[ALPHA] * errors[C_D]
+    correlation = covariance[ALPHA, C_D] / product if product > 0.0 else 0.0
+    on_edge = _on_edge(pieces, fan, parameters)
+    narrow = high - low < NARROW_SPEED_RANGE * high
+    if narrow and (on_edge or (correlation < TRADE_OFF_CORRELATION and not well_told)):
+        return [
+            f"alpha and C_D cannot be told apart: the speed keeps between {low:.3g} and {high:.3g} rad/s; "
+            f"{_determined(low, high, parameters, covariance)}; record speeds from a third of the largest up to it"
+        ]
+    if told and not on_edge:
+        return []
+    lines = []
+    for which in (ALPHA, C_D):
+        name, value, reach = PARAMETER_NAMES[which], parameters[which], REACH * errors[which]
+        if value + reach < 0.0:
+            lines.append(
+                f"{name} is negative ({value:.3g} ± {reach:.2g}): the physical model does not describe this data "
+                "(friction, dead zone or offset, for which it has no term); do not trust it outside the recorded "
+                "speeds; a hybrid learns the difference"
+            )
+        elif on_edge and which == ALPHA and drag > 0.0:
+            lines.append(f"{name} is not told from zero (the fit drove it there): {MORE_OF[which]}")
+        elif value - reach <= 0.0:
+            lines.append(f"{name} is not told from zero ({value:.3g} ± {reach:.2g}): {MORE_OF[which]}")
+    return lines
+
+
+def _on_edge(pieces: Sequence[Run], fan: int, parameters: Array) -> bool:
+    """Whether the fit has run into the edge of the stable models, no damping at rest or none at top speed.
+
+    The covariance there is that of a parameter that can no longer move.
+    """
+    top = np.nanquantile(np.abs(np.concatenate([piece.speed_rad_s[:, fan] for piece in pieces])), TOP_SPEED_QUANTILE)
+    damping = parameters[ALPHA], parameters[ALPHA] + 2.0 * parameters[C_D] * top
+    return bool(min(damping) < EDGE * max(damping))
+
+
+def _determined(low_rad_s: float, high_rad_s: float, parameters: Array, covariance: Array) -> str:
+    """The sum of alpha and C_D that is known best: their torque per speed at the speed that cancels the covariance."""
+    variance = covariance[C_D, C_D]
+    speed = -covariance[ALPHA, C_D] / variance if variance > 0.0 else np.nan
+    if not low_rad_s <= speed <= high_rad_s:
+        return "not even alpha + C_D w is known"
+    direction = np.zeros(len(parameters))
+    direction[[ALPHA, C_D]] = 1.0, speed
+    reach = REACH * np.sqrt(max(float(direction @ covariance @ direction), 0.0))
+    return f"what is known is alpha + C_D w = {direction @ parameters:.4g} ± {reach:.1g} at w = {speed:.3g} rad/s"
+
+
+def _lag(pieces: Sequence[Run], parameters: Array, covariance: Array) -> list[str]:
+    lag_s, reach_s, step_s = parameters[LAG_S], REACH * np.sqrt(covariance[LAG_S, LAG_S]), _step_s(pieces)
+    if reach_s == 0.0 or lag_s > max(reach_s, step_s):
+        return []
+    return [
+        f"lag_s ({1e3 * lag_s:.3g} ± {1e3 * reach_s:.2g} ms) is not told by samples every {1e3 * step_s:.3g} ms: "
+        "no lag, a delay, and clocks of command and speed that differ look the same; record with several samples in a "
+        "lag, or take it as the twin's and not as the fan's"
+    ]
+
+
+def _predictors(command: Array, speed_rad_s: Array) -> Array:
+    """(n - LAGS, 2 LAGS + 2) what the next speed is predicted from; the squared speed stands for the drag."""
+    speeds = _past(speed_rad_s)
+    return np.column_stack((np.ones(len(speeds)), speeds, speeds[:, 0] * np.abs(speeds[:, 0]), _past(command)))
+
+
+def _past(signal: Array) -> Array:
+    """(n - LAGS, LAGS) the samples before each, the latest first."""
+    return np.lib.stride_tricks.sliding_window_view(signal[:-1], LAGS)[:, ::-1]
+
+
+def _residual(regressors: Array, target: Array) -> tuple[Array, int]:
+    """What least squares leaves of target (n,), NaN where a value is missing, and the rank of regressors (n, P)."""
+    whole = np.isfinite(target) & np.all(np.isfinite(regressors), axis=1)
+    size = np.linalg.norm(regressors[whole], axis=0) + np.finfo(float).tiny
+    coefficients, _, rank, _ = np.linalg.lstsq(regressors[whole] / size, target[whole], rcond=1e-10)
+    return target - regressors @ (coefficients / size), int(rank)
+
+
+def _without_outliers(move: Array) -> Array:
+    reach = LARGEST_MOVE * np.median(np.abs(move))
+    return np.clip(move, -reach, reach)
+
+
+def _levels(command: Array, all_commands: Array) -> Array:
+    """(n,) which tenth of the range of all commands each one is nearest to."""
+    return np.rint((command - all_commands.min()) / (np.ptp(all_commands) / LEVELS_PER_RANGE))
+
+
+def _steps(pieces: Sequence[Run], fan: int) -> int:
+    """How often the command goes from one tenth of its range to another."""
+    command = np.concatenate([piece.command[:, fan] for piece in pieces])
+    return sum(int(np.count_nonzero(np.diff(_levels(piece.command[:, fan], command)))) for piece in pieces)
+
+
+def _speed_range(pieces: Sequence[Run], fan: int) -> tuple[float, float]:
+    """The speeds, whatever their direction, that a fan is below for 5 % and for 95 % of the samples, in rad/s."""
+    low, high = np.nanquantile(np.abs(np.concatenate([piece.speed_rad_s[:, fan] for piece in pieces])), (0.05, 0.95))
+    return float(low), float(high)
+
+
+def _noise(pieces: Sequence[Run], fan: int) -> float:
+    """Robust standard deviation of white noise with the second differences of the speed, in rad/s."""
+    bends = np.concatenate([np.diff(piece.speed_rad_s[:, fan], 2) for piece in pieces])
+    bends = bends[np.isfinite(bends)]
+    return float(1.4826 * np.median(np.abs(bends)) / np.sqrt(6.0)) if bends.size else 0.0
+
+
+def _step_s(pieces: Sequence[Run]) -> float:
+    return float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces])))

@@ -1,0 +1,292 @@
+"""The physical parameters of each fan, with their confidence intervals.
+
+First the filtering operator (twin.fitting.filtering): least squares for a = alpha / J, a_N = C_D / J and b = 1 / J,
+equations
+(11) to (20) of Peng and Chen. Its one free choice, lambda, is made by the data: of a ladder of values, the largest
+whose parameters run freely nearly as well as the best's. A small lambda lives on slow drift, a large one on the
+response to the command, which is what has to be learned.
+
+Least squares on noisy regressors is biased, so that result only starts the refinement, a fit of the free run itself
+(twin.fitting.free_run_fit). The inertia stays anchored to the start: under closed-loop control the speed hardly
+moves, and a
+model so slow that it keeps its initial speed would otherwise be the best of all.
+
+The lag of the command (twin.models.lag) is estimated with the rest and kept only where it is larger than its
+uncertainty;
+otherwise it is zero, and the model is the published one of three parameters.
+
+Covariances come from the jackknife over blocks of time, linearised: leaving out block b moves the estimate by
+-(H - H_b)^-1 g_b, with g_b the summed score and H_b the curvature of that block. Unlike the plain inverse Hessian it
+stays honest when the residual is correlated in time, which it is whenever the physics are not the whole truth, and
+unlike the sandwich of raw scores when a few transients tell most of what is known. Efron and Stein, Annals of
+Statistics 9 (1981).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student_t
+
+from twin.errors import TwinError
+from twin.fitting.filtering import filtered_regression
+from twin.fitting.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, fit_free_run
+from twin.fitting.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings, misfit_warnings
+from twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
+from twin.models import physics
+from twin.models.integration import free_run
+from twin.models.physical import PhysicalModel, fitted_unknowns, parameters_by_unknowns, physical_parameters
+from twin.models.physics import LAG, PARAMETER_NAMES
+from twin.models.right_hand_side import FanEquation
+from twin.runs import Array, Run, common_fans
+
+LAMBDA_LADDER = 9
+STRETCH_TIME_CONSTANTS = 10.0
+MAX_ITERATIONS = 60
+BLOCKS = 40
+# A lag counts from this many standard errors on: one fan in a thousand without any is then said to have some.
+LAG_IN_STANDARD_ERRORS = 3.3
+# Data that excite a fan hold ten or more units of information about ln J per sample, a hundred times this anchor.
+ANCHOR_PER_SAMPLE = 0.1
+NEARLY_BEST = 1.25
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """Physical parameters per fan, in the order of physics.PARAMETER_NAMES.
+
+    parameters, standard_errors: (fans, 4). covariance: (fans, 4, 4), degrees_of_freedom: (fans, 4) that it has.
+    interval_95: (fans, 4, 2). A lag that was not found is zero, and so is its uncertainty. lambda_per_s, rmse_rad_s,
+    time_constant_s, top_speed_rad_s: (fans,); the time constant is taken at the median speed. iterations: those of the
+    refinement. warnings: one line each, empty when all is well. misfits: one line for each fan that physics alone do
+    not describe, which is what a hybrid is for.
+    """
+
+    parameters: Array
+    covariance: Array
+    degrees_of_freedom: Array
+    lambda_per_s: Array
+    rmse_rad_s: Array
+    time_constant_s: Array
+    top_speed_rad_s: Array
+    iterations: int
+    warnings: tuple[str, ...]
+    misfits: tuple[str, ...]
+
+    @property
+    def standard_errors(self) -> Array:
+        """(fans, 4)"""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    @property
+    def interval_95(self) -> Array:
+        """(fans, 4, 2), of the t distribution with the degrees of freedom of each."""
+        reach = student_t.ppf(0.975, self.degrees_of_freedom) * self.standard_errors
+        return np.stack((self.parameters - reach, self.parameters + reach), axis=-1)
+
+
+def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
+    """Identify every fan of the runs. Raises TwinError when the data cannot tell the parameters.
+
+    with_lag: false holds the lag at zero, which is the published model.
+    """
+    fans = common_fans(runs)
+    pieces = [piece for run in runs for piece in run.split_at_gaps()]
+    for fan in range(fans):
+        require_excitation(pieces, fan)
+    top_speed = np.array([_top_speed_rad_s(_pooled(pieces, fan)[1]) for fan in range(fans)])
+    start, lambda_per_s = _filtered_start(pieces, top_speed)
+    speed = np.array([np.nanmedian(_pooled(pieces, fan)[1]) for fan in range(fans)])
+    longest_s = float(np.max(_positive(physics.time_constant_s(speed, start), pieces)))
+    step_s = min(piece.median_step_s for piece in pieces)
+    trajectories = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, STRETCH_TIME_CONSTANTS))
+    free = np.tile(ALL_FREE, (fans, 1))
+    free[:, LAG] = with_lag
+    fit, covariance, freedom = _refine(start, free, top_speed, trajectories)
+    lag_s = physical_parameters(fit.point.unknowns.own, top_speed)[:, LAG]
+    unseen = free[:, LAG] & (lag_s <= LAG_IN_STANDARD_ERRORS * np.sqrt(covariance[:, LAG, LAG]))
+    iterations = fit.iterations
+    if np.any(unseen):
+        free[:, LAG] &= ~unseen
+        without = physical_parameters(fit.point.unknowns.own, top_speed)
+        without[unseen, LAG] = 0.0
+        fit, covariance, freedom = _refine(without, free, top_speed, trajectories, start)
+        iterations += fit.iterations
+    parameters = physical_parameters(fit.point.unknowns.own, top_speed)
+    rmse_rad_s = _rmse_rad_s(fit, trajectories, fans)
+    return Identification(
+        parameters=parameters,
+        covariance=covariance,
+        degrees_of_freedom=freedom,
+        lambda_per_s=lambda_per_s,
+        rmse_rad_s=rmse_rad_s,
+        time_constant_s=_positive(physics.time_constant_s(speed, parameters), pieces),
+        top_speed_rad_s=top_speed,
+        iterations=iterations,
+        warnings=identifiability_warnings(runs, parameters, covariance),
+        misfits=misfit_warnings(pieces, rmse_rad_s),
+    )
+
+
+def filtering_operator(runs: Sequence[Run], fan: int, lambda_per_s: float) -> Array:
+    """(4,) J, alpha, C_D of one fan by the filtering operator alone, lag 0; NaN when the command does not drive it."""
+    parts = [
+        filtered_regression(run.t_s, run.speed_rad_s[:, fan], run.command[:, fan], _physical_basis, lambda_per_s)
+        for run in runs
+        if np.isfinite(run.speed_rad_s[:, fan]).sum() >= 2
+    ]
+    target = np.concatenate([part[0] for part in parts])
+    regressors = np.concatenate([part[1] for part in parts])
+    size = np.linalg.norm(regressors, axis=0) + np.finfo(float).tiny
+    viscous_rate, drag_rate, gain = np.linalg.lstsq(regressors / size, target, rcond=None)[0] / size
+    if not gain > 0.0:
+        return np.full(len(PARAMETER_NAMES), np.nan)
+    return np.array([1.0 / gain, viscous_rate / gain, drag_rate / gain, 0.0])
+
+
+def require_excitation(runs: Sequence[Run], fan: int) -> None:
+    """Raise TwinError when a fan's command or speed never changes, or its speed was never measured."""
+    command, speed_rad_s = _pooled(runs, fan)
+    if np.isfinite(speed_rad_s).sum() < 10:
+        raise TwinError(f"fan {fan}: fewer than ten measured speeds; check the speed column")
+    if np.ptp(command) <= 1e-9 * np.abs(command).max():
+        raise TwinError(f"fan {fan}: the command never changes; record steps between three levels or more")
+    if np.nanmax(speed_rad_s) == np.nanmin(speed_rad_s):
+        raise TwinError(f"fan {fan}: the speed never changes while the command does; check the sensor or the column")
+
+
+def _filtered_start(pieces: Sequence[Run], top_speed_rad_s: Array) -> tuple[Array, Array]:
+    """(fans, 4) parameters and (fans,) lambda: the largest rung that is nearly the best."""
+    fans = len(top_speed_rad_s)
+    longest_s = max(piece.duration_s for piece in pieces)
+    step_s = min(piece.median_step_s for piece in pieces)
+    ladder = np.geomspace(4.0 / longest_s, 0.5 / step_s, LAMBDA_LADDER)
+    candidates = np.array([[filtering_operator(pieces, fan, rung) for fan in range(fans)] for rung in ladder])
+    trajectories = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, 1.0))
+    candidates = np.array([_stable(candidate, top_speed_rad_s) for candidate in candidates])
+    errors = np.array([_free_run_errors(candidate, trajectories) for candidate in candidates])
+    smallest = errors.min(axis=0)
+    for fan in np.flatnonzero(~np.isfinite(smallest)):
+        raise TwinError(f"fan {fan}: the speed does not follow the command; check which columns are command and speed")
+    best = LAMBDA_LADDER - 1 - np.argmax((errors <= NEARLY_BEST * smallest)[::-1], axis=0)
+    return candidates[best, np.arange(fans)], ladder[best]
+
+
+def _stable(parameters: Array, top_speed_rad_s: Array) -> Array:
+    """The parameters (fans, 4) with their damping made positive up to the top speed."""
+    return physical_parameters(fitted_unknowns(parameters, top_speed_rad_s), top_speed_rad_s)
+
+
+def _free_run_errors(parameters: Array, trajectories: Trajectories) -> Array:
+    """(fans,) mean absolute free-run error in rad/s, the published loss; infinite when it does not exist."""
+    equation = FanEquation(parameters[trajectories.fan], None)
+    initial, guess = trajectories.starting_speed_rad_s(), trajectories.interpolated_speed_rad_s()
+    speed, _ = free_run(equation, initial, trajectories.command, trajectories.step_s, guess)
+    measured = trajectories.measured
+    error = np.where(measured, np.abs(trajectories.speed_rad_s - speed), 0.0).sum(axis=0)
+    fans = len(parameters)
+    mean = np.bincount(trajectories.fan, error, fans) / np.bincount(trajectories.fan, measured.sum(axis=0), fans)
+    return np.where(np.isfinite(mean), mean, np.inf)
+
+
+def _refine(
+    start: Array,
+    free: NDArray[np.bool_],
+    top_speed_rad_s: Array,
+    trajectories: Trajectories,
+    anchor: Array | None = None,
+) -> tuple[FreeRunFit, Array, Array]:
+    """The fit of the free run from parameters (fans, 4), and what _covariance says of it."""
+    fans = len(start)
+    own = fitted_unknowns(start, top_speed_rad_s)
+    pull = inertia_anchor(np.count_nonzero(trajectories.measured) / fans)
+    prior = Prior(0.0, pull, own if anchor is None else fitted_unknowns(anchor, top_speed_rad_s))
+    fit = fit_free_run(
+        PhysicalModel(), own, top_speed_rad_s, trajectories, free=free, prior=prior, max_iterations=MAX_ITERATIONS
+    )
+    return fit, *_covariance(fit, free, top_speed_rad_s, trajectories, prior)
+
+
+def inertia_anchor(samples: float) -> Array:
+    """(4,) precision with which the own unknowns of a fan with so many samples are held to where they started."""
+    pull = np.zeros(len(PARAMETER_NAMES))
+    pull[0] = ANCHOR_PER_SAMPLE * samples
+    return pull
+
+
+def _covariance(
+    fit: FreeRunFit, free: NDArray[np.bool_], top_speed_rad_s: Array, trajectories: Trajectories, prior: Prior
+) -> tuple[Array, Array]:
+    """Covariance (fans, 4, 4) of J, alpha, C_D, lag_s by the block jackknife, zero where one is held, and its degrees
+    of freedom (fans, 4).
+
+    Few where few blocks tell most: the variance of a sum of squares d_b^2 of normal moves is 2/3 of sum d_b^4, and a
+    chi-square with that variance has 3 (sum d_b^2)^2 / sum d_b^4 of them (Satterthwaite, Biometrics Bulletin 2, 1946).
+    """
+    problem = FreeRunProblem(PhysicalModel(), trajectories, top_speed_rad_s, free, prior)
+    problem.scale_rad_s = fit.scale_rad_s
+    everything = slice(None)
+    sensitivity = problem.sensitivities(fit.point, everything)
+    weight = problem.sample_weights(fit.point.residual, everything)
+    by_initial = sensitivity[:, :, -1:]
+    weighted_initial = weight[:, :, np.newaxis] * by_initial
+    overlap = np.sum(weighted_initial * sensitivity[:, :, :-1], axis=0) / np.sum(weighted_initial * by_initial, axis=0)
+    slopes_of_all = sensitivity[:, :, :-1] - by_initial * overlap
+    chain = parameters_by_unknowns(fit.point.unknowns.own, top_speed_rad_s)
+    covariance = np.zeros((len(chain), len(PARAMETER_NAMES), len(PARAMETER_NAMES)))
+    freedom = np.full((len(chain), len(PARAMETER_NAMES)), BLOCKS - 1.0)
+    for fan in range(len(chain)):
+        columns, known = trajectories.fan == fan, np.flatnonzero(free[fan])
+        # Stretches one after the other, so that a block is a piece of time.
+        slopes = slopes_of_all[:, columns].transpose(1, 0, 2).reshape(-1, len(PARAMETER_NAMES))[:, known]
+        weights, residual = weight[:, columns].T.ravel(), fit.point.residual[:, columns].T.ravel()
+        # Padding and missing samples tell nothing: a block is a share of what was measured.
+        told = weights > 0.0
+        slopes, weights, residual = slopes[told], weights[told], residual[told]
+        scores = slopes * (weights * residual)[:, np.newaxis]
+        # The second derivative of the pseudo-Huber loss, where a step of the fit makes do with its secant.
+        weighted = slopes * weights[:, np.newaxis] ** 3
+        bounds = np.linspace(0, len(slopes), BLOCKS + 1).astype(int)
+        blocks = [slice(first, last) for first, last in pairwise(bounds)]
+        curvatures = np.array([slopes[block].T @ weighted[block] for block in blocks])
+        rest = curvatures.sum(axis=0) - curvatures
+        if not np.all(np.isfinite(rest)):
+            raise TwinError(f"fan {fan}: the free run of its physical model overflows; record open-loop steps")
+        moves = np.einsum("bpq,bq->bp", np.linalg.pinv(rest), [scores[block].sum(axis=0) for block in blocks])
+        moves = (moves - moves.mean(axis=0)) @ chain[fan][:, known].T
+        covariance[fan] = (BLOCKS - 1) / BLOCKS * moves.T @ moves
+        fourth = np.sum(moves**4, axis=0)
+        known = fourth > 0.0
+        freedom[fan, known] = np.clip(3.0 * np.sum(moves**2, axis=0)[known] ** 2 / fourth[known], 2.0, BLOCKS - 1)
+    return covariance, freedom
+
+
+def _rmse_rad_s(fit: FreeRunFit, trajectories: Trajectories, fans: int) -> Array:
+    """(fans,) root mean square of the free-run residual."""
+    squares = np.bincount(trajectories.fan, np.sum(fit.point.residual**2, axis=0), fans)
+    return np.sqrt(squares / np.bincount(trajectories.fan, trajectories.measured.sum(axis=0), fans))
+
+
+def _physical_basis(speed_rad_s: Array, command: Array) -> Array:
+    return np.column_stack((-speed_rad_s, -speed_rad_s * np.abs(speed_rad_s), command))
+
+
+def _top_speed_rad_s(speed_rad_s: Array) -> float:
+    """A speed that the fan reaches; the largest one where it hardly ever turns."""
+    magnitude = np.abs(speed_rad_s)
+    return float(np.nanquantile(magnitude, TOP_SPEED_QUANTILE)) or float(np.nanmax(magnitude))
+
+
+def _pooled(runs: Sequence[Run], fan: int) -> tuple[Array, Array]:
+    return (
+        np.concatenate([run.command[:, fan] for run in runs]),
+        np.concatenate([run.speed_rad_s[:, fan] for run in runs]),
+    )
+
+
+def _positive(time_constant_s: Array, pieces: Sequence[Run]) -> Array:
+    """Time constants, replaced by the longest run where the model has none, and never longer than that."""
+    longest_s = max(piece.duration_s for piece in pieces)
+    return np.where(time_constant_s > 0.0, np.minimum(time_constant_s, longest_s), longest_s)

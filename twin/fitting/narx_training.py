@@ -1,0 +1,177 @@
+"""Training of the NARX network: from the best linear filter to as much curvature as unseen speeds confirm.
+
+Fitting each next sample from measured ones (series-parallel, the published way) is biased by the noise in its own
+regressors, and a good one-step error promises little about the free run. So the free run itself is fitted (parallel
+training: Narendra and Parthasarathy, IEEE Transactions on Neural Networks 1, 1990):
+
+1. The start is a layer that acts as the best first-order filter of the data (twin.fitting.narx_start).
+2. Its 1151 weights are held to the start by a prior, those of old samples more firmly than those of recent ones. The
+   prior is firm at first and relaxed tenfold at a time, each fit starting from the one before (twin.fitting.narx_fit).
+3. Each precision of the prior is judged by the free run over speeds that its fit does not see: those of the held-out
+   runs; where none are given, those of whole runs left out in turn; of a single run, those of blocks left out. Relaxing
+   ends where it no longer helps.
+4. All speeds of the training runs are fitted at the precision chosen, or at the next firmer one whose free run forgets
+   its start (twin.fitting.narx_stability); the firmest, where none does.
+
+A fit costs by the sample: of long recordings, stretches of MAX_SAMPLES in all are drawn at random.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from twin.errors import TwinError
+from twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
+from twin.fitting.narx_fit import OutputErrorFit
+from twin.fitting.narx_stability import forgets_its_start
+from twin.fitting.narx_start import lag_scale, starting_weights
+from twin.fitting.training import Progress
+from twin.models.narx import Narx
+from twin.models.network import Scaling
+from twin.models.physics import PARAMETER_NAMES
+from twin.runs import STARTING_SAMPLES, Array, Run
+
+MAX_SAMPLES, DRAWN_STRETCHES = 16_000, 16
+PRIOR_PRECISIONS = (1e5, 1e4, 1e3, 1e2, 1e1, 1e0)
+# A looser prior must lower the error by this share: what is less is chance, and a firm one is safer on new commands.
+NEEDED_GAIN = 0.002
+ITERATIONS_A_PRECISION = 20
+# Of all iterations; the rest are for the fit at the precision chosen.
+CHOOSING_SHARE = 0.6
+FOLDS = 3
+BLOCKS, LEFT_OUT_EVERY = 20, 4
+
+
+def train_narx(
+    runs: Sequence[Run],
+    validation_runs: Sequence[Run],
+    scaling: Scaling,
+    *,
+    seed: int,
+    max_iterations: int,
+    progress: Progress | None = None,
+) -> tuple[Narx, int]:
+    """The trained network and the iterations taken. validation_runs: held out of the fit, they choose the prior.
+
+    Raises TwinError when no stretch of the runs holds two measured speeds.
+    """
+    rng = np.random.default_rng(seed)
+    pieces = evaluation_pieces(runs)
+    stretches = draw_stretches(pieces, rng)
+    start, time_constant = starting_weights(
+        [(stretch.command[:, 0] - scaling.command_offset) / scaling.command_scale for stretch in stretches],
+        [(stretch.speed_rad_s[:, 0] - scaling.speed_offset_rad_s) / scaling.speed_scale_rad_s for stretch in stretches],
+        rng,
+    )
+    count = _Count(max_iterations, progress)
+    parted = [(pieces, evaluation_pieces(validation_runs))] if validation_runs else leave_out(runs)
+    folds = [_Fold(*parts, start, scaling, rng) for parts in parted]
+    chosen = _relax_prior(folds, count, round(CHOOSING_SHARE * max_iterations))
+    whole = OutputErrorFit(stretches, scaling, start, lag_scale() ** -2)
+    model = Narx(start, scaling)
+    for precision, theta in reversed(chosen):
+        limit = min(max_iterations - count.iterations, ITERATIONS_A_PRECISION)
+        model = Narx(whole.minimise(theta, precision, limit, count.iteration_done), scaling)
+        if forgets_its_start(model, time_constant):
+            break
+    return model, count.iterations
+
+
+def draw_stretches(pieces: Sequence[Run], rng: np.random.Generator) -> list[Run]:
+    """Runs of one fan each: all of them, or random parts of MAX_SAMPLES in all. Raises TwinError when nothing is left.
+
+    Parts start from their first measured speeds, as a deployed twin does.
+    """
+    single = [piece.fan(index) for piece in pieces for index in range(piece.fans)]
+    if sum(run.samples for run in single) > MAX_SAMPLES:
+        samples = MAX_SAMPLES // DRAWN_STRETCHES
+        single = [run.rows(first, last) for run in single for first, last in run.equal_parts(samples)]
+        single = [single[index] for index in rng.permutation(len(single))]
+    usable = [run for run in single if np.isfinite(run.speed_rad_s).sum() >= 2]
+    if not usable:
+        raise TwinError("no stretch of the runs holds two measured speeds; NARX has nothing to learn from")
+    room = np.cumsum([run.samples for run in usable]) <= MAX_SAMPLES
+    return [run for run, fits in zip(usable, room, strict=True) if fits]
+
+
+def leave_out(runs: Sequence[Run]) -> list[tuple[list[Run], list[Run]]]:
+    """Pieces to fit and pieces to judge by: three folds of whole runs, as many as there are runs, or blocks of one."""
+    folds = min(len(runs), FOLDS)
+    if folds == 1:
+        return [leave_out_blocks(evaluation_pieces(runs))]
+    return [
+        (
+            evaluation_pieces([run for index, run in enumerate(runs) if index % folds != fold]),
+            evaluation_pieces([run for index, run in enumerate(runs) if index % folds == fold]),
+        )
+        for fold in range(folds)
+    ]
+
+
+def leave_out_blocks(pieces: Sequence[Run]) -> tuple[list[Run], list[Run]]:
+    """The pieces twice: without the speeds of every fourth of twenty blocks, and with those alone.
+
+    The commands stay, so both are free runs over the whole. The second keeps the speeds that a free run starts from.
+    """
+    kept, left_out = [], []
+    for piece in pieces:
+        count = np.cumsum(np.isfinite(piece.speed_rad_s), axis=0)
+        block = (count - 1) * BLOCKS // np.maximum(count[-1], 1)
+        out = block % LEFT_OUT_EVERY == LEFT_OUT_EVERY // 2
+        kept.append(replace(piece, speed_rad_s=np.where(out, np.nan, piece.speed_rad_s)))
+        judged = out | (count <= STARTING_SAMPLES)
+        left_out.append(replace(piece, speed_rad_s=np.where(judged, piece.speed_rad_s, np.nan)))
+    return kept, left_out
+
+
+class _Fold:
+    """A fit to some speeds, judged by others."""
+
+    def __init__(
+        self, fitted: Sequence[Run], judged: Sequence[Run], start: Array, scaling: Scaling, rng: np.random.Generator
+    ) -> None:
+        self.fit = OutputErrorFit(draw_stretches(fitted, rng), scaling, start, lag_scale() ** -2)
+        self.judged = judged
+        self.theta = start
+
+    def residual(self) -> Array:
+        """(m,) measured minus free run, in rad/s, of the judged speeds."""
+        unused = np.ones((self.judged[0].fans, len(PARAMETER_NAMES)))
+        return free_run_residuals(Narx(self.theta, self.fit.scaling), unused, self.judged).ravel()
+
+
+@dataclass
+class _Count:
+    """Counts the iterations of all fits together."""
+
+    max_iterations: int
+    progress: Progress | None
+    iterations: int = 0
+
+    def iteration_done(self, rmse_rad_s: float) -> None:
+        """See narx_fit.IterationDone."""
+        self.iterations += 1
+        if self.progress is not None:
+            self.progress(self.iterations, self.max_iterations, rmse_rad_s)
+
+
+def _relax_prior(folds: Sequence[_Fold], count: _Count, max_iterations: int) -> list[tuple[float, Array]]:
+    """Precisions of the prior, from the firmest to the best one, each with the weights (1151,) of the first fold.
+
+    Fits at one precision after the other, until one brings nothing better.
+    """
+    better: list[tuple[float, Array]] = []
+    best_rmse_rad_s = np.inf
+    for precision in PRIOR_PRECISIONS:
+        for index, fold in enumerate(folds):
+            share = (max_iterations - count.iterations) // (len(folds) - index)
+            fold.theta = fold.fit.minimise(
+                fold.theta, precision, min(share, ITERATIONS_A_PRECISION), count.iteration_done
+            )
+        rmse_rad_s = pooled_rmse_rad_s(np.concatenate([fold.residual() for fold in folds]))
+        if rmse_rad_s >= (1.0 - NEEDED_GAIN) * best_rmse_rad_s:
+            break
+        better.append((precision, folds[0].theta))
+        best_rmse_rad_s = rmse_rad_s
+    return better

@@ -1,0 +1,1 @@
+"""The models of a fan: one kind a file."""

@@ -1,0 +1,73 @@
+"""w' = physics + network, either of which may be missing: the equation of all models that are continuous in time.
+
+Physical model: physics alone, equation (11) of Peng and Chen. Neural ODE: the network alone, (28). Hybrid: both, (31).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.models import physics
+from twin.models.integration import free_run
+from twin.models.lag import effective_command
+from twin.models.network import TanhNetwork
+from twin.runs import Array
+
+
+@dataclass(frozen=True, eq=False)
+class FanEquation:
+    """The right-hand side of a batch of fans. parameters: (batch, 4) or None without physics.
+
+    linearise gives the derivatives by the network's weights and then by J, alpha and C_D, as far as there are any.
+    """
+
+    parameters: Array | None
+    network: TanhNetwork | None
+
+    def acceleration(self, speed_rad_s: Array, command: Array) -> Array:
+        """(..., batch) in rad/s^2."""
+        if self.network is None:
+            return physics.acceleration(speed_rad_s, command, self._physics)
+        learned = self.network.acceleration(speed_rad_s, command)
+        if self.parameters is None:
+            return learned
+        return learned + physics.acceleration(speed_rad_s, command, self.parameters)
+
+    def slope(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array]:
+        """See integration.RightHandSide."""
+        if self.network is None:
+            known = physics.acceleration(speed_rad_s, command, self._physics)
+            return known, physics.acceleration_by_speed(speed_rad_s, self._physics)
+        learned, by_speed = self.network.slope(speed_rad_s, command)
+        if self.parameters is None:
+            return learned, by_speed
+        return (
+            learned + physics.acceleration(speed_rad_s, command, self.parameters),
+            by_speed + physics.acceleration_by_speed(speed_rad_s, self.parameters),
+        )
+
+    def linearise(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array, Array]:
+        """See integration.Linearised."""
+        value = by_speed = by_command = np.zeros_like(speed_rad_s)
+        by_theta = []
+        if self.network is not None:
+            value, by_speed, by_command, by_weights = self.network.linearise(speed_rad_s, command)
+            by_theta.append(by_weights)
+        if self.parameters is not None:
+            value = value + physics.acceleration(speed_rad_s, command, self.parameters)
+            by_speed = by_speed + physics.acceleration_by_speed(speed_rad_s, self.parameters)
+            by_command = by_command + 1.0 / self.parameters[:, 0]
+            by_theta.append(physics.acceleration_by_parameters(speed_rad_s, command, self.parameters))
+        return value, by_speed, by_command, by_theta[0] if len(by_theta) == 1 else np.concatenate(by_theta, axis=-1)
+
+    @property
+    def _physics(self) -> Array:
+        assert self.parameters is not None, "an equation needs physics or a network"
+        return self.parameters
+
+
+def advance(equation: FanEquation, state: Array, command: Array, step_s: Array, lag_s: Array) -> tuple[Array, Array]:
+    """Free run from a state (fans, 2) of speed and lagged command; see models.TwinModel. lag_s: (fans,)."""
+    acting, lagged = effective_command(command, step_s[:, np.newaxis], lag_s, state[:, 1])
+    speed_rad_s, final = free_run(equation, state[:, 0], acting, step_s)
+    return speed_rad_s, np.column_stack((final, lagged))
