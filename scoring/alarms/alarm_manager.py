@@ -19,6 +19,7 @@ from schemas.messages import (
     Transition,
 )
 from schemas.units import NS_PER_S
+from scoring.alarms.alarm_flags import is_listed
 from scoring.alarms.alarm_state import AlarmState, ConditionSettings
 from scoring.alarms.alarm_text import AlarmText
 from scoring.alarms.tray_alarms import AlarmEvent, Conditions
@@ -140,8 +141,7 @@ class AlarmManager:
 
     def _concerning(self) -> list[int]:
         """Fans whose alarm is retained, or kept quiet."""
-        standing = {fan: self._conditions.standing(fan) for fan in sorted(self._told)}
-        return [fan for fan, now in standing.items() if now.retained or now.quiet]
+        return [fan for fan in sorted(self._told) if is_listed(self._conditions.standing(fan))]
 
     def _restated(self, fan: int) -> Alarm:
         now = self._conditions.standing(fan)

@@ -2,7 +2,7 @@
 
 Names and rules are those of OPC UA Part 9 (OPC 10000-9, release 1.05.03): ActiveState with OnDelay and OffDelay
 (5.8.2), AckedState and ConfirmedState of one occurrence (4.3, 5.7; the rows of table B.1 are a test), LatchedState and
-Reset (4.8, 5.8.5), shelving by time or once (5.8.17), suppressed (5.8.8), out of service (5.8.12), Retain (5.5.2).
+Reset (4.8, 5.8.5), shelving by time or once (5.8.17), suppressed (5.8.8), out of service (5.8.12).
 Only the present occurrence is kept, no branches of former ones (as in B.1.2). See docs/reference/alarms.md.
 """
 
@@ -18,7 +18,7 @@ from schemas.messages import Action, FanState, Severity, Transition
 
 NORMAL, SUSPECT, ALARM, RETURNING = map(int, (FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING))
 UNTIL_IT_CLEARS_T_NS = 2**63 - 1
-"""`shelved_until_t_ns` of an alarm that is shelved once: until it clears or is unshelved."""
+"""`shelved_until_t_ns` of a one-shot shelving: until the alarm clears or is unshelved."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +57,6 @@ class AlarmState:
     acknowledged_by: str = ""
     comment: str = ""
     """Of the last request that had one and was granted."""
-
-    @property
-    def retained(self) -> bool:
-        """Whether it still concerns somebody (Retain, 5.5.2)."""
-        return self.active or self.latched or not (self.acknowledged and self.confirmed)
-
-    @property
-    def quiet(self) -> bool:
-        """Whether somebody has asked for silence (SuppressedOrShelved, 5.8.2)."""
-        return bool(self.shelved_until_t_ns) or self.suppressed or self.out_of_service
 
 
 class Condition:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import pi
 
 from schemas.messages import Alarm, Statistic, Transition
+from scoring.alarms.alarm_flags import is_listed
 
 RAD_S_PER_RPM = 2.0 * pi / 60.0
 CANNOT_TELL = "cannot_tell"
@@ -51,7 +52,7 @@ class AlarmText:
         if alarm.transition in (Transition.RAISED, Transition.SEVERITY):
             return f"{fan}: {self._departure(alarm)}{self._cause_if_known(alarm)}"
         if alarm.transition == Transition.REPUBLISHED:
-            return f"{fan}: {'still stands' if _stands(alarm) else 'stands no longer'}"
+            return f"{fan}: {'still stands' if is_listed(alarm) else 'stands no longer'}"
         return f"{fan}: {PLAIN[alarm.transition]}"
 
     def _departure(self, alarm: Alarm) -> str:
@@ -84,12 +85,6 @@ class AlarmText:
     def _speed(self, speed_rad_s: float) -> str:
         speed = speed_rad_s / RAD_S_PER_RPM if self._speed_unit == "rpm" else speed_rad_s
         return f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
-
-
-def _stands(alarm: Alarm) -> bool:
-    """Whether there is an alarm, or one that is to come is kept quiet."""
-    retained = alarm.active or alarm.latched or not (alarm.acknowledged and alarm.confirmed)
-    return retained or bool(alarm.shelved_until_t_ns) or alarm.suppressed or alarm.out_of_service
 
 
 def _drifts(alarm: Alarm) -> str:

@@ -12,6 +12,7 @@ from datetime import datetime
 from typing import Any
 
 from schemas.messages import Alarm, Diagnosis, Severity, Transition
+from scoring.alarms.alarm_flags import is_presented, is_retained, is_silenced
 from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 
 _ABOUT_THE_FAN = {
@@ -34,29 +35,12 @@ class CurrentAlarm:
     causes: tuple[Diagnosis, ...]
     acknowledged_by: str
 
-    @property
-    def is_retained(self) -> bool:
-        """Whether it still concerns somebody: Retain of OPC UA Part 9."""
-        alarm = self.newest
-        return alarm.active or alarm.latched or not (alarm.acknowledged and alarm.confirmed)
-
-    @property
-    def is_quiet(self) -> bool:
-        """Whether somebody has asked for silence: shelved, suppressed or out of service."""
-        return bool(self.newest.shelved_until_t_ns) or self.newest.suppressed or self.newest.out_of_service
-
-    @property
-    def is_presented(self) -> bool:
-        """Whether it is to be put before an operator."""
-        return self.is_retained and not self.is_quiet
-
     def line(self) -> str:
         """What happened last, for a log: nobody is called for what an operator keeps quiet."""
         alarm = self.newest
         word = alarm.severity.name if alarm.active else alarm.transition.name.lower().replace("_", " ")
-        return (
-            f"{word}{' (kept quiet)' if alarm.active and self.is_quiet else ''}  {alarm.header.tray}  {alarm.message}"
-        )
+        silenced = " (silenced)" if alarm.active and is_silenced(alarm) else ""
+        return f"{word}{silenced}  {alarm.header.tray}  {alarm.message}"
 
     def words(self) -> list[str]:
         """The states that it is in."""
@@ -89,8 +73,8 @@ class CurrentAlarm:
             "shelved_until_t_ns": alarm.shelved_until_t_ns,
             "suppressed": alarm.suppressed,
             "out_of_service": alarm.out_of_service,
-            "retained": self.is_retained,
-            "presented": self.is_presented,
+            "retained": is_retained(alarm),
+            "presented": is_presented(alarm),
             "onset_t_ns": alarm.onset_t_ns,
             "t_ns": alarm.t_ns,
             "message": self.message,

@@ -14,6 +14,7 @@ import pytest
 from pipeline.runtime.snapshot_store import SnapshotStore
 from schemas.blocks import cut
 from schemas.messages import Action, Alarm, FanState, Header, Prediction, Score, ScorerSnapshot, Transition, columns
+from scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
 from scoring.alarms.current_alarms import CurrentAlarm, current_alarms
 from stages.scorer import ScorerCore
 from tests.stages.test_scorer import eventful_prediction
@@ -186,8 +187,8 @@ def test_of_another_twin_only_what_operators_keep_quiet_is_gone_on_from() -> Non
     assert successor.counters()["snapshots_of_another_twin"] == 1
     assert "the twin is another one" in successor.problem()
     acknowledged, shelved = standing_of(told)
-    assert (acknowledged.is_retained, acknowledged.newest.message) == (False, "fan 0: stands no longer")
-    assert (shelved.is_quiet, shelved.newest.message) == (True, "fan 1: still stands")
+    assert (is_retained(acknowledged.newest), acknowledged.newest.message) == (False, "fan 0: stands no longer")
+    assert (is_silenced(shelved.newest), shelved.newest.message) == (True, "fan 1: still stands")
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
     assert (score.state == FanState.COMMISSIONING).all()
@@ -207,7 +208,7 @@ def test_of_a_memory_in_an_older_form_what_operators_keep_quiet_is_gone_on_from(
     assert successor.counters()["snapshots_not_understood"] == 1
     assert "is understood in part" in successor.problem()
     acknowledged, shelved = standing_of(told)
-    assert (acknowledged.is_retained, shelved.is_quiet) == (False, True)
+    assert (is_retained(acknowledged.newest), is_silenced(shelved.newest)) == (False, True)
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
     assert (score.state == FanState.COMMISSIONING).all()
@@ -293,12 +294,12 @@ def test_samples_of_another_story_are_judged_anew_and_those_kept_by_producers_ar
 def test_an_alarm_of_another_story_stands_no_longer_whoever_told_it() -> None:
     successor = core_of(3)
     restated = successor.restore(note_of(raised()))
-    assert [each.is_retained or each.is_quiet for each in standing_of(restated)] == [True, True]
+    assert [is_listed(each.newest) for each in standing_of(restated)] == [True, True]
     later = successor.step(prediction_of(np.zeros((20, 3)), first=-HOUR, producer="integrator-2"))
     told = [message for message in later if isinstance(message, Alarm)]
     assert [alarm.transition for alarm in told] == [Transition.REPUBLISHED] * 2
-    assert [each.is_retained or each.is_quiet for each in standing_of([*restated, *later])] == [False, False]
-    assert [each.is_retained or each.is_quiet for each in standing_of(later)] == [False, False], "nothing was restated"
+    assert [is_listed(each.newest) for each in standing_of([*restated, *later])] == [False, False]
+    assert [is_listed(each.newest) for each in standing_of(later)] == [False, False], "nothing was restated"
 
 
 def test_only_what_comes_first_can_be_of_another_story() -> None:

@@ -27,6 +27,7 @@ from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
 from schemas.messages import Action, Alarm, Diagnosis, Request, Severity, Transition, newest_t_ns
 from schemas.topics import alive_key, tray_key
+from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.alarm_text import CANNOT_TELL, CAUSES
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, until
 
@@ -117,9 +118,7 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
     known: list[Alarm] = []
     for _, payload in bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_LOOK_S)):
         _decoded(payload, known.append)
-    found = [
-        each for each in current_alarms(sorted(known, key=newest_t_ns)) if show_all or each.is_retained or each.is_quiet
-    ]
+    found = [each for each in current_alarms(sorted(known, key=newest_t_ns)) if show_all or is_listed(each.newest)]
     console = Console(soft_wrap=True, highlight=False)
     if json_output:
         typer.echo(json.dumps({"alarms": [each.as_json() for each in found]}))
@@ -234,7 +233,7 @@ def standing_lines(standing: CurrentAlarm) -> Text:
     alarm = standing.newest
     by = f" by {standing.acknowledged_by}" if standing.acknowledged_by else ""
     words = [f"{word}{by}" if word == "acknowledged" else word for word in standing.words()]
-    style = _STYLES[alarm.severity] if standing.is_presented else "dim"
+    style = _STYLES[alarm.severity] if is_presented(alarm) else "dim"
     text = Text.assemble((f"{_name(alarm)}  {alarm.severity.name:7}", style), f"  {', '.join(words)}")
     if alarm.severity != Severity.NONE:
         text.append(f"  since {clock(alarm.onset_t_ns)} ({_age(time.time_ns() - alarm.onset_t_ns)})")

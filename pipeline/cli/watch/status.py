@@ -21,6 +21,7 @@ from pipeline.errors import UserError
 from pipeline.launch.watcher import StageView, Watcher
 from pipeline.runtime.signals import stop_on_signals
 from schemas.messages import Severity, StageStatus
+from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.current_alarms import CurrentAlarm, clock
 
 _STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
@@ -88,7 +89,7 @@ def stage_table(watcher: Watcher, config: Config) -> Group:
         table.add_row(name, _state(view), f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}", *latency, lost)
         if health.problem and view.alive:
             problems.append(Text(f"{name}: {health.problem}", style="red"))
-    alarms = [_alarm_line(each) for each in watcher.standing() if each.is_retained or each.is_quiet]
+    alarms = [_alarm_line(each) for each in watcher.standing() if is_listed(each.newest)]
     if not any(view.alive and view.health.stage == "scorer" for view in views):
         alarms.append(Text("alarms unknown: no scorer is alive", style="red"))
     return Group(*([table] if views else []), *problems, *(alarms or [Text("no alarms", style="green")]))
@@ -108,7 +109,7 @@ def _alarm_line(standing: CurrentAlarm) -> Text:
     alarm = standing.newest
     style = _STYLES[alarm.severity] if alarm.active else "green"
     text = Text.assemble(
-        (f"{clock(alarm.t_ns)}  {alarm.severity.name:7}", style if standing.is_presented else "dim"),
+        (f"{clock(alarm.t_ns)}  {alarm.severity.name:7}", style if is_presented(alarm) else "dim"),
         f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(standing.words())}",
     )
     about = standing.message.removeprefix(f"fan {alarm.fan}: ")

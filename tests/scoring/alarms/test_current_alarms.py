@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from schemas.messages import Alarm, Diagnosis, Header, Severity, Transition
+from scoring.alarms.alarm_flags import is_retained
 from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms
 
@@ -41,7 +42,7 @@ def test_the_newest_message_of_each_fan_says_how_it_stands_whatever_the_order():
     [
         (Transition.RAISED, {}, "WARNING  a  RAISED at 1"),
         (Transition.SEVERITY, {"severity": Severity.ALARM}, "ALARM  a  SEVERITY at 1"),
-        (Transition.RAISED, {"out_of_service": True}, "WARNING (kept quiet)  a  RAISED at 1"),
+        (Transition.RAISED, {"out_of_service": True}, "WARNING (silenced)  a  RAISED at 1"),
         (Transition.CLEARED, {"active": False}, "cleared  a  CLEARED at 1"),
         (
             Transition.OUT_OF_SERVICE,
@@ -64,7 +65,9 @@ def test_of_several_scorers_the_one_that_spoke_last_counts_whatever_its_times():
     again = alarm(Transition.REPUBLISHED, 900, producer="b")
     taken_back = alarm(Transition.REPUBLISHED, 5, producer="b", active=False, severity=Severity.NONE, acknowledged=True)
     after = alarm(t_ns=7, producer="c")
-    assert not one(before, taken_back, again).is_retained, "of one producer those that come late were sent before"
+    assert not is_retained(one(before, taken_back, again).newest), (
+        "of one producer those that come late were sent before"
+    )
     assert one(before, again, taken_back, after).newest is after
 
 
@@ -92,26 +95,6 @@ def test_a_new_occurrence_has_nothing_of_the_one_before():
 def test_who_acknowledged_is_known_from_what_a_restarted_scorer_tells_again():
     standing = one(alarm(Transition.REPUBLISHED, acknowledged=True, operator_name="Ann"))
     assert standing.acknowledged_by == "Ann"
-
-
-@pytest.mark.parametrize(
-    ("more", "retained", "presented"),
-    [
-        ({}, True, True),
-        ({"acknowledged": True}, True, True),
-        ({"active": False}, True, True),
-        ({"active": False, "acknowledged": True}, False, False),
-        ({"active": False, "acknowledged": True, "confirmed": False}, True, True),
-        ({"active": False, "acknowledged": True, "latched": True}, True, True),
-        ({"shelved_until_t_ns": 5}, True, False),
-        ({"suppressed": True}, True, False),
-        ({"out_of_service": True}, True, False),
-    ],
-    ids=str,
-)
-def test_what_is_retained_and_what_is_presented(more, retained, presented):
-    standing = one(alarm(**more))
-    assert (standing.is_retained, standing.is_presented) == (retained, presented)
 
 
 def test_states_in_words():

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.messages import Action, FanState, Severity, Transition
+from scoring.alarms.alarm_flags import is_retained, is_silenced
 from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, ConditionSettings
 from scoring.alarms.tray_alarms import BlockResult, Conditions
 
@@ -123,23 +124,23 @@ B1 = [  # table B.1 of Part 9: what happens, then Active, Acked, Confirmed, Reta
 def test_acknowledging_and_confirming_follow_table_b1_of_part_9():
     conditions = at_once(confirming=True)
     now = conditions.standing(0)
-    assert (now.active, now.acknowledged, now.confirmed, now.retained) == (False, True, True, False)
+    assert (now.active, now.acknowledged, now.confirmed, is_retained(now)) == (False, True, True, False)
     for event, *expected in B1:
         if isinstance(event, Action):
             assert asked(conditions, event)[0] != Transition.REFUSED
         else:
             take(conditions, [event])
         now = conditions.standing(0)
-        assert [now.active, now.acknowledged, now.confirmed, now.retained] == expected, event
+        assert [now.active, now.acknowledged, now.confirmed, is_retained(now)] == expected, event
 
 
 def test_without_confirming_an_acknowledged_alarm_is_done_once_it_has_cleared():
     conditions = at_once()
     take(conditions, [UP, LOW])
-    assert conditions.standing(0).retained
+    assert is_retained(conditions.standing(0))
     assert asked(conditions, Action.ACKNOWLEDGE) == (Transition.ACKNOWLEDGED, "")
     now = conditions.standing(0)
-    assert (now.retained, now.acknowledged_by, now.comment) == (False, "Ann", "looked at it")
+    assert (is_retained(now), now.acknowledged_by, now.comment) == (False, "Ann", "looked at it")
     take(conditions, [UP])
     now = conditions.standing(0)
     assert (now.acknowledged, now.acknowledged_by) == (False, "")
@@ -162,9 +163,9 @@ def test_a_latched_alarm_stays_until_it_is_reset_in_its_turn():
     asked(conditions, Action.ACKNOWLEDGE)
     assert asked(conditions, Action.RESET)[1] == "it must be confirmed first"
     asked(conditions, Action.CONFIRM)
-    assert (conditions.standing(0).latched, conditions.standing(0).retained) == (True, True)
+    assert (conditions.standing(0).latched, is_retained(conditions.standing(0))) == (True, True)
     assert asked(conditions, Action.RESET) == (Transition.RESET, "")
-    assert not conditions.standing(0).retained
+    assert not is_retained(conditions.standing(0))
 
 
 @pytest.mark.parametrize(
@@ -227,7 +228,7 @@ def test_a_shelved_alarm_is_evaluated_and_told_as_ever_and_not_presented():
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=4 * STEP_NS)
     course = take(conditions, [LOW, LOW, UP, UP, UP])
     assert happened(course) == [(2, RAISED), (4, UNSHELVED)]
-    assert [change.standing.quiet for change in course.changes] == [True, False]
+    assert [is_silenced(change.standing) for change in course.changes] == [True, False]
 
 
 def test_an_alarm_raised_at_the_very_sample_at_which_a_shelving_ends_is_presented():
@@ -235,7 +236,7 @@ def test_an_alarm_raised_at_the_very_sample_at_which_a_shelving_ends_is_presente
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=2 * STEP_NS)
     course = take(conditions, [LOW, LOW, UP])
     assert happened(course) == [(2, UNSHELVED), (2, RAISED)]
-    assert not course.changes[1].standing.quiet
+    assert not is_silenced(course.changes[1].standing)
 
 
 def test_shelving_again_sets_a_new_time():
@@ -257,10 +258,10 @@ def test_suppressed_or_out_of_service_hides_no_transition_and_presents_nothing(a
     conditions = at_once()
     asked(conditions, action)
     assert happened(take(conditions, [UP])) == [(0, RAISED)]
-    assert conditions.standing(0).retained and conditions.standing(0).quiet
+    assert is_retained(conditions.standing(0)) and is_silenced(conditions.standing(0))
     back = Action.UNSUPPRESS if action == Action.SUPPRESS else Action.IN_SERVICE
     asked(conditions, back)
-    assert conditions.standing(0).retained and not conditions.standing(0).quiet
+    assert is_retained(conditions.standing(0)) and not is_silenced(conditions.standing(0))
 
 
 def test_commissioning_is_granted_and_leaves_the_alarm_as_it_is():

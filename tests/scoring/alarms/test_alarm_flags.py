@@ -1,0 +1,43 @@
+"""scoring.alarms.alarm_flags: retained, silenced, presented and listed, for a scorer's state and for a message."""
+
+from __future__ import annotations
+
+import pytest
+
+from schemas.messages import Alarm, Severity
+from scoring.alarms.alarm_flags import is_listed, is_presented, is_retained, is_silenced
+from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, AlarmState
+
+ACTIVE = {"active": True, "acknowledged": False, "confirmed": True}
+OVER = {"active": False, "acknowledged": True, "confirmed": True}
+
+
+@pytest.mark.parametrize(
+    ("flags", "retained", "silenced"),
+    [
+        (ACTIVE, True, False),
+        (ACTIVE | {"acknowledged": True}, True, False),
+        (ACTIVE | {"active": False}, True, False),
+        (OVER, False, False),
+        (OVER | {"confirmed": False}, True, False),
+        (OVER | {"latched": True}, True, False),
+        (OVER | {"suppressed": True}, False, True),
+        (ACTIVE | {"shelved_until_t_ns": 5}, True, True),
+        (ACTIVE | {"shelved_until_t_ns": UNTIL_IT_CLEARS_T_NS}, True, True),
+        (ACTIVE | {"suppressed": True}, True, True),
+        (ACTIVE | {"out_of_service": True}, True, True),
+    ],
+    ids=str,
+)
+def test_a_state_and_its_message_are_retained_silenced_presented_and_listed_alike(flags, retained, silenced):
+    message = Alarm(
+        fan=0, severity=Severity.ALARM, t_ns=1, onset_t_ns=1, residual_rad_s=0.0, limit_rad_s=0.0, message="", **flags
+    )
+    for alarm in (AlarmState(**flags), message):
+        assert (is_retained(alarm), is_silenced(alarm)) == (retained, silenced)
+        assert is_presented(alarm) == (retained and not silenced)
+        assert is_listed(alarm) == (retained or silenced)
+
+
+def test_an_alarm_that_was_never_raised_is_on_no_list():
+    assert not is_listed(AlarmState())
