@@ -1,22 +1,23 @@
-"""The account of a site: what has been lost, over all sessions of its stages, from the last health of each.
+"""What a site has lost, over all sessions of its stages, computed from the last health of each session.
 
-A stage counts what it misses while it lives. Two things no stage can see from inside, and both show when the accounts
-of all sessions are laid side by side:
+A stage counts what it misses while it runs. Two kinds of loss no stage can see by itself; comparing the healths of all
+sessions shows them:
 
-* what a producer that was killed had still sent to one consumer and not to another;
-* what was published while a consumer that was killed was away, and was no longer kept when it came back.
+* a producer was killed, and a message had reached one consumer and not another;
+* a consumer was killed, and a message published meanwhile was no longer kept when the consumer came back.
 
-A killed consumer's last health is up to a second old, so where it counts here, it counts what was lost at most.
+A killed consumer's last health is up to a second old, so the second count is an upper bound.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from itertools import pairwise
+from itertools import chain, pairwise
 
 from pipeline.config.registry import STAGES, load_stage
-from schemas.messages import Health, Input, StageStatus
+from schemas.messages import Health, StageStatus
+from schemas.streams import StreamId, input_streams, output_streams
 
 
 def losses(healths: Iterable[Health]) -> dict[str, int]:
@@ -25,10 +26,10 @@ def losses(healths: Iterable[Health]) -> dict[str, int]:
     sessions: dict[str, list[Health]] = {}
     for health in ordered:
         sessions.setdefault(label(health), []).append(health)
-    sent = _sent_by_the_dead(sessions)
+    published = _published_by_replaced(sessions)
     return {
-        name: sum(health.lost for health in mine) + _never_came(mine, sent) + _while_away(mine)
-        for name, mine in sessions.items()
+        name: sum(health.lost for health in own) + _never_arrived(own, published) + _while_away(own)
+        for name, own in sessions.items()
     }
 
 
@@ -37,44 +38,37 @@ def label(health: Health) -> str:
     return health.stage if health.instance == "all" else f"{health.stage}/{health.instance}"
 
 
-def _sent_by_the_dead(sessions: dict[str, list[Health]]) -> Counter[tuple[str, str]]:
-    """(key, producer) -> how many messages are known to have been published by sessions that others have followed."""
-    dead = {health.header.producer for mine in sessions.values() for health in mine[:-1]}
-    sent: Counter[tuple[str, str]] = Counter()
-    for health in (health for mine in sessions.values() for health in mine):
-        said = [((output.key, health.header.producer), output.published) for output in health.outputs]
-        said += [((line.key, line.producer), line.next_sequence) for line in health.inputs]
-        for stream, count in said:
-            if stream[1] in dead:
-                sent[stream] = max(sent[stream], count)
-    return sent
+def _published_by_replaced(sessions: dict[str, list[Health]]) -> Counter[StreamId]:
+    """How many messages are known to have been published on each stream of a session that was followed by another."""
+    replaced = {health.header.producer for own in sessions.values() for health in own[:-1]}
+    published: Counter[StreamId] = Counter()
+    for health in chain.from_iterable(sessions.values()):
+        received = {stream: state.next_sequence or 0 for stream, state in input_streams(health).items()}
+        for stream, count in chain(output_streams(health).items(), received.items()):
+            if stream[1] in replaced:
+                published[stream] = max(published[stream], count)
+    return published
 
 
-def _never_came(mine: list[Health], sent: Counter[tuple[str, str]]) -> int:
-    """Messages of dead producers that others have had: known for certain once this stage has ended in order."""
-    if mine[-1].status != StageStatus.STOPPED:
+def _never_arrived(own: list[Health], published: Counter[StreamId]) -> int:
+    """Messages of replaced producers that others received. Known for certain only once this stage has stopped."""
+    if own[-1].status != StageStatus.STOPPED:
         return 0
-    reached: Counter[tuple[str, str]] = Counter()
-    for line in (line for health in mine for line in health.inputs):
-        reached[line.key, line.producer] = max(reached[line.key, line.producer], line.next_sequence)
-    return sum(max(0, sent[stream] - count) for stream, count in reached.items() if stream in sent)
+    received: Counter[StreamId] = Counter()
+    for stream, state in chain.from_iterable(input_streams(health).items() for health in own):
+        received[stream] = max(received[stream], state.next_sequence or 0)
+    return sum(max(0, published[stream] - count) for stream, count in received.items() if stream in published)
 
 
-def _while_away(mine: list[Health]) -> int:
-    """Messages that came too early for a session and too late for the one before it, which was killed."""
-    if mine[-1].stage in STAGES and load_stage(mine[-1].stage).may_drop:
+def _while_away(own: list[Health]) -> int:
+    """Messages between the last that a killed session had and the first that its successor had."""
+    killed = [(before, after) for before, after in pairwise(own) if before.status != StageStatus.STOPPED]
+    if not killed or (own[-1].stage in STAGES and load_stage(own[-1].stage).may_drop):
         return 0
     lost = 0
-    for before, after in pairwise(mine):
-        if before.status == StageStatus.STOPPED:
-            continue
-        reached = {(line.key, line.producer): line.next_sequence for line in before.inputs}
-        lost += sum(
-            max(0, _first_sequence(line) - reached.get((line.key, line.producer), line.next_sequence))
-            for line in after.inputs
-        )
+    for before, after in killed:
+        had = input_streams(before)
+        for stream, state in input_streams(after).items():
+            if stream in had:
+                lost += max(0, state.first_sequence - (had[stream].next_sequence or 0))
     return lost
-
-
-def _first_sequence(line: Input) -> int:
-    return line.next_sequence - line.received - line.missing

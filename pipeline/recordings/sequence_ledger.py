@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import TypeAlias
 
 from schemas.messages import Health
+from schemas.streams import StreamId, StreamState, output_streams
 from schemas.topics import topic_of
 
 LEDGER_NAME = "fantwin.ledger"
@@ -21,9 +21,6 @@ RECOVERED = "recovered"
 """its entry that says what was lost, or may have been, in a file that was mended"""
 BEFORE_NAME = "fantwin.before"
 """the one, before the first message, that says with which number each producer should go on"""
-
-StreamId: TypeAlias = tuple[str, str]
-"""Key and producer."""
 
 
 @dataclass(slots=True)
@@ -50,15 +47,14 @@ class SequenceLedger:
     def __init__(self, before: Mapping[StreamId, int] | None = None) -> None:
         """before: with which sequence number each producer should go on, where parts have gone before."""
         self.accounts: dict[StreamId, StreamCounts] = {}
-        self.next: dict[StreamId, int] = dict(before or {})
-        """the sequence number each producer should go on with"""
+        self._streams = {stream: StreamState(sequence) for stream, sequence in (before or {}).items()}
         self._published: dict[StreamId, int] = {}
 
     def note(self, key: str, producer: str, sequence: int, log_time_ns: int) -> None:
         """A message was recorded. A twin's card is written again at the start of each part, and counts once."""
         line = (key, producer)
-        due = self.next.get(line)
-        if due is not None and sequence < due and key.endswith("/twin"):
+        state = self._state(line)
+        if state.is_duplicate(sequence) and key.endswith("/twin"):
             return
         account = self.accounts.get(line)
         if account is None:
@@ -70,42 +66,55 @@ class SequenceLedger:
             account.first_ns = log_time_ns
         if account.last_ns is None or log_time_ns > account.last_ns:
             account.last_ns = log_time_ns
-        if due is not None and sequence < due:
-            account.duplicated += 1
-            return
-        if due is not None:
-            account.missing += sequence - due
-        account.last_sequence = sequence
-        self.next[line] = sequence + 1
+        if state.accept(sequence):
+            account.last_sequence = sequence
+        account.missing, account.duplicated = state.missing, state.duplicated
+
+    @property
+    def next(self) -> dict[StreamId, int]:
+        """The sequence number each producer should go on with."""
+        streams = self._streams.items()
+        return {stream: state.next_sequence for stream, state in streams if state.next_sequence is not None}
 
     def note_health(self, health: Health) -> None:
         """A health was recorded: it says how much its stage had published by then."""
-        for output in health.outputs:
-            line = (output.key, health.header.producer)
-            self._published[line] = output.published
-            if output.published == 0 and _is_recorded(output.key):
-                self.next.setdefault(line, 0)  # from its first message on, each is recorded or missing
+        for stream, published in output_streams(health).items():
+            self._published[stream] = published
+            if published == 0 and _is_recorded(stream[0]):
+                self._state(stream).skip_to(0)  # from its first message on, each is recorded or missing
 
     def lose(self, key: str, producer: str, sequence: int) -> None:
         """A message came that is not going to be recorded: a hole, as soon as a later one is, or else at the end."""
         line = (key, producer)
-        self.next.setdefault(line, sequence)
+        state = self._state(line)
+        if state.next_sequence is None:
+            state.skip_to(sequence)
         self._published[line] = max(sequence + 1, self._published.get(line, 0))
 
     def note_duplicated(self, key: str, producer: str, count: int = 1) -> None:
         """Messages came again and were not recorded again."""
-        self.accounts.setdefault((key, producer), StreamCounts()).duplicated += count
+        state = self._state((key, producer))
+        state.duplicated += count
+        self.accounts.setdefault((key, producer), StreamCounts()).duplicated = state.duplicated
 
     def unrecorded(self) -> dict[StreamId, int]:
         """How many messages are known to have been published after the last one recorded, above all by healths."""
-        behind = {line: published - self.next.get(line, published) for line, published in self._published.items()}
+        due = self.next
+        behind = {line: published - due.get(line, published) for line, published in self._published.items()}
         return {line: count for line, count in behind.items() if count > 0}
 
     def settle(self) -> None:
         """The session is over: what was published and has not come is missing."""
-        for line, count in self.unrecorded().items():
-            self.accounts.setdefault(line, StreamCounts()).missing += count
-            self.next[line] += count
+        for line in self.unrecorded():
+            state = self._state(line)
+            state.skip_to(self._published[line])
+            self.accounts.setdefault(line, StreamCounts()).missing = state.missing
+
+    def _state(self, stream: StreamId) -> StreamState:
+        state = self._streams.get(stream)
+        if state is None:
+            state = self._streams[stream] = StreamState()
+        return state
 
     def following(self) -> SequenceLedger:
         """An empty one for the part after this."""

@@ -9,15 +9,9 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from schemas.messages import Counter, Health, Input, Message, Output, StageStatus, newest_t_ns
+from schemas.streams import stage_losses
 
-LOSS_PREFIX = "lost_"
 _LATENCIES_KEPT = 2000
-
-
-def lost(inputs: Iterable[Input], counters: Mapping[str, int], *, may_drop: bool) -> int:
-    """How much a stage has lost: missing messages, unless it may drop, and counters that begin with `lost_`."""
-    counted = sum(value for name, value in counters.items() if name.startswith(LOSS_PREFIX))
-    return counted if may_drop else sum(line.missing for line in inputs) + counted
 
 
 class HealthBook:
@@ -63,6 +57,6 @@ class HealthBook:
             counters=tuple(Counter(name=name, value=value) for name, value in sorted(counters.items())),
             latency_p50_ms=float(p50),
             latency_p99_ms=float(p99),
-            lost=lost(inputs, counters, may_drop=self._may_drop),
+            lost=stage_losses(inputs, counters, may_drop=self._may_drop),
             process_id=os.getpid(),
         )

@@ -20,12 +20,13 @@ from pipeline.bus.session import Bus, Publisher
 from pipeline.config.models import Config
 from pipeline.errors import UserError
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
-from pipeline.runtime.health import HealthBook, lost
+from pipeline.runtime.health import HealthBook
 from pipeline.runtime.sequence_tracker import SequenceTracker
 from pipeline.runtime.stage import Context, Parts, Stage
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, InputPosition, Message, Output, StageStatus
+from schemas.streams import stage_losses
 from schemas.topics import BY_NAME, TOPICS, alive_key, health_key, topic_of, tray_key
 
 INBOX_SIZE = 4096
@@ -363,7 +364,7 @@ class Runner:
         return counters
 
     def _lost(self) -> int:
-        return lost(self._tracker.inputs(), self._counters(), may_drop=self.stage.may_drop)
+        return stage_losses(self._tracker.inputs(), self._counters(), may_drop=self.stage.may_drop)
 
     def _publish_health(self, status: StageStatus) -> Health:
         health = self._health.make(

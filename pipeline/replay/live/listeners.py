@@ -15,6 +15,7 @@ from pipeline.launch.watcher import StageView, Watcher
 from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.stage import Stage
 from schemas.messages import Health
+from schemas.streams import StreamId, input_streams, output_streams
 from schemas.topics import alive_key
 
 FROM: dict[str, tuple[str, ...]] = {"raw": ("raw",), "grid": ("grid",), "prediction": ("prediction", "twin")}
@@ -143,16 +144,17 @@ class Listeners:
         lost = Counter({name: count - self._before.get(name, 0) for name, count in now.items()})
         for view in self._views():
             if view.health.header.producer in self._there_at_start and not load_stage(view.health.stage).may_drop:
-                for line in view.health.inputs:
-                    if line.producer == producer and line.key in published:
-                        lost[label(view.health)] += line.next_sequence - line.received - line.missing
+                for (key, of), state in input_streams(view.health).items():
+                    if of == producer and key in published:
+                        lost[label(view.health)] += state.first_sequence
         return {name: count for name, count in lost.items() if count > 0}
 
     def _behind(self, producer: str, published: Mapping[str, int], old: Mapping[str, int]) -> list[str]:
         """Who has not yet said, in a health newer than the `old` ones, that it has all that its producers have sent."""
         healths = [view.health for view in self._views()]
         sent = {(key, producer): count for key, count in published.items()}
-        sent |= {(out.key, each.header.producer): out.published for each in healths for out in each.outputs}
+        for each in healths:
+            sent |= output_streams(each)
         return [
             label(each)
             for each in healths
@@ -166,5 +168,5 @@ class Listeners:
         (self._alive.add if alive else self._alive.discard)(key)
 
 
-def _lacks(health: Health, sent: Mapping[tuple[str, str], int]) -> bool:
-    return any(line.next_sequence < sent.get((line.key, line.producer), 0) for line in health.inputs)
+def _lacks(health: Health, sent: Mapping[StreamId, int]) -> bool:
+    return any((state.next_sequence or 0) < sent.get(stream, 0) for stream, state in input_streams(health).items())

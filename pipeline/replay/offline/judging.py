@@ -22,10 +22,10 @@ from pipeline.replay.offline.verify import (
     compare_scores,
     note_not_made,
 )
-from pipeline.runtime.health import LOSS_PREFIX
 from schemas.blocks import cut
 from schemas.codec import CodecError
 from schemas.messages import Alarm, Grid, Header, Message, Prediction, Raw, Request, Score, newest_t_ns
+from schemas.streams import LOSS_PREFIX
 from schemas.topics import TOPICS, tray_key
 
 Progress = Callable[[str, int], None]

@@ -1,0 +1,70 @@
+"""Sequence accounting: received, missing and duplicated messages of a stream add up."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.messages import Header, Health, Input, Output, StageStatus
+from schemas.streams import StreamState, input_streams, output_streams, stage_losses
+
+
+def test_messages_before_the_first_one_seen_are_history_and_not_missing():
+    state = StreamState()
+    assert state.accept(500)
+    assert (state.received, state.missing, state.first_sequence, state.next_sequence) == (1, 0, 500, 501)
+
+
+def test_a_gap_counts_as_missing():
+    state = StreamState()
+    assert [state.accept(sequence) for sequence in (0, 1, 5)] == [True] * 3
+    assert (state.received, state.missing, state.next_sequence) == (3, 3, 6)
+
+
+def test_a_message_that_comes_again_counts_as_duplicated_only():
+    state = StreamState()
+    assert [state.accept(sequence) for sequence in (0, 1, 0)] == [True, True, False]
+    assert (state.received, state.missing, state.duplicated) == (2, 0, 1)
+
+
+def test_skipping_counts_what_never_came_once_it_is_known_to_be_published():
+    state = StreamState()
+    assert state.skip_to(3) == 0, "nothing was known of the stream: this is history"
+    assert state.skip_to(5) == 2
+    assert state.skip_to(4) == 0
+    assert (state.missing, state.next_sequence, state.first_sequence) == (2, 5, 3)
+
+
+@given(st.lists(st.integers(0, 60), min_size=1))
+def test_received_and_missing_add_up_to_the_numbers_from_the_first_to_the_last(sequences: list[int]):
+    state = StreamState()
+    accepted = [sequence for sequence in sequences if state.accept(sequence)]
+    assert accepted == sorted(set(accepted))
+    assert (state.first_sequence, state.next_sequence) == (accepted[0], accepted[-1] + 1)
+    assert state.received == len(accepted)
+    assert state.duplicated == len(sequences) - len(accepted)
+
+
+def test_health_carries_the_states_of_inputs_and_the_counts_of_outputs():
+    state = StreamState()
+    for sequence in (2, 4, 4):
+        state.accept(sequence)
+    health = Health(
+        header=Header("p", 0, ""),
+        stage="resampler",
+        instance="all",
+        status=StageStatus.OK,
+        t_ns=0,
+        uptime_s=0.0,
+        inputs=(state.as_input(("in", "q")),),
+        outputs=(Output(key="out", published=7),),
+    )
+    assert input_streams(health) == {("in", "q"): state}
+    assert output_streams(health) == {("out", "p"): 7}
+
+
+def test_a_stage_that_may_drop_loses_only_what_its_loss_counters_say():
+    inputs = [Input(key="k", producer="p", received=1, missing=3, duplicated=0, next_sequence=4)]
+    counters = {"lost_undecodable": 2, "dropped": 9}
+    assert stage_losses(inputs, counters, may_drop=False) == 5
+    assert stage_losses(inputs, counters, may_drop=True) == 2
