@@ -461,8 +461,26 @@ def test_the_output_is_a_recording_that_is_decided_the_same(tmp_path):
     assert again.samples == tray.samples and material.is_as_recorded
 
 
+DATA = Path(__file__).parents[2] / "support" / "data"
+
+
 def test_the_golden_recording_is_decided_as_it_was():
-    tray = verified(Path(__file__).parents[2] / "support" / "data" / "golden.mcap")
+    tray = verified(DATA / "golden.mcap")
     assert tray.plan.restarts == 2, "two stages were killed while it was made"
     assert made_equal(tray) > 400
     assert tray.comparison and tray.comparison.alarms_equal >= 2
+
+
+def test_a_snapshot_in_an_older_recording_is_restored_and_its_replay_is_equal():
+    """golden-restart.mcap was recorded when snapshots had other JSON keys. An active alarm was acknowledged, a fan
+    shelved and another one out of service when its scorer was killed and restored from such a snapshot."""
+    tray = verified(DATA / "golden-restart.mcap")
+    assert len(tray.plan.snapshots) == 1 and tray.plan.restarts == 1
+    assert made_equal(tray) == 293
+    assert tray.comparison and tray.comparison.alarms_equal == 9
+    restored = [alarm for alarm in tray.alarms if alarm.transition == Transition.REPUBLISHED]
+    operators = {
+        alarm.fan: (alarm.acknowledged, alarm.shelved_until_t_ns > 0, alarm.out_of_service) for alarm in restored
+    }
+    assert operators == {0: (True, False, False), 1: (False, True, False), 2: (True, False, True)}
+    assert not tray.counts["snapshots_of_another_twin"] and not tray.counts["snapshots_not_understood"]
