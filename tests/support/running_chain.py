@@ -59,21 +59,21 @@ def is_running(process_id: int) -> bool:
 class Running:
     """A `fantwin` command in a process of its own, and the lines it writes to standard error."""
 
-    def __init__(self, words: Iterable[object]) -> None:
+    def __init__(self, words: Iterable[object], stdout: int = subprocess.PIPE) -> None:
+        """stdout: a file descriptor to write to, such as a terminal; a pipe for `output` where it is not given."""
         self.process = subprocess.Popen(
             [*FANTWIN, *map(str, words)],
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
+            stdout=stdout,
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
         )
         self.lines: list[str] = []
         self._output: queue.Queue[str] = queue.Queue()
-        self._readers = [
-            threading.Thread(target=self._read_errors, daemon=True),
-            threading.Thread(target=lambda: self._output.put(self.process.stdout.read()), daemon=True),  # type: ignore[union-attr]
-        ]
+        self._readers = [threading.Thread(target=self._read_errors, daemon=True)]
+        if (pipe := self.process.stdout) is not None:
+            self._readers.append(threading.Thread(target=lambda: self._output.put(pipe.read()), daemon=True))
         for reader in self._readers:
             reader.start()
 

@@ -1,4 +1,4 @@
-"""`fantwin demo`: a simulated tray, the whole pipeline, two faults, and an account of what happened."""
+"""`fantwin demo`: a simulated tray, the whole pipeline, two faults, and a report of what was found."""
 
 from __future__ import annotations
 
@@ -28,8 +28,10 @@ from pipeline.cli.watch.demo_screen import DemoScreen
 from pipeline.config.models import Config, load_config
 from pipeline.errors import UserError
 from pipeline.runtime.signals import stop_on_signals
+from schemas.units import NS_PER_S
 
 DEMO_FOLDER = Path(__file__).parents[2] / "demo"
+FANTWIN = (sys.executable, "-P", "-m", "pipeline")
 DURATION_S = 34.0
 FAULTS = (
     ("inlet", "fan=2,start=8,stop=14,size=1.8"),
@@ -41,13 +43,13 @@ _STOP_TIMEOUT_S = 60.0
 
 
 def demo(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for what it makes.")] = Path("runs/demo"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the files it writes.")] = Path("runs/demo"),
     seed: Annotated[int, typer.Option(help="Seed of the simulated tray's commands and noise.")] = 7,
     json_output: JsonOption = False,
 ) -> None:
-    """Run a simulated tray of eight fans through the whole pipeline, cover one inlet, disturb one rotor.
+    """Run a simulated tray of eight fans through the whole pipeline; cover one inlet, disturb one rotor.
 
-    Exit code 1 when a fault was missed, a healthy fan alarmed, or anything was lost.
+    Exit code 1 if a fault was missed, a healthy fan raised an alarm, or anything was lost.
 
     Example: fantwin demo -o runs/demo
     """
@@ -68,13 +70,13 @@ def demo(
     (out / "summary.json").write_text(summary.to_json() + "\n", encoding="utf-8")
     if json_output:
         typer.echo(summary.to_json())
-    _tell(summary, out, time.monotonic() - started_s, console)
+    _print_report(summary, out, time.monotonic() - started_s, console)
     if summary.problems:
         raise typer.Exit(1)
 
 
 def _clear(out: Path) -> None:
-    """Remove what an earlier demo made, and nothing else."""
+    """Remove the files of an earlier demo, and nothing else."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         for pattern in OUTPUTS:
@@ -93,7 +95,11 @@ def _free_port() -> int:
 
 
 def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Console) -> dict[str, int]:
-    """Run tray and pipeline to the end of the schedule; what each stage says it has lost."""
+    """Run tray and pipeline to the end of the schedule; returns the losses that each stage reports, without zeros.
+
+    Raises:
+        UserError: it was interrupted, did not start, failed, or did not stop in time.
+    """
     stop = threading.Event()
     stop_on_signals(stop)
     tray = config.trays[0]
@@ -111,25 +117,28 @@ def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Co
         _child(up, stdout=subprocess.PIPE, stderr=log) as pipeline,
         Bus(config.bus, listens=False) as bus,
     ):
-        console.print(f"simulated tray of {tray.fans} fans; six stages start as processes of their own")
+        console.print(f"simulated tray of {tray.fans} fans; starting six stages, each as a process of its own")
         _watch(config, bus, device, pipeline, stop, console)
         if pipeline.poll() is None:
             pipeline.send_signal(signal.SIGINT)
-        answer, _ = pipeline.communicate(timeout=_STOP_TIMEOUT_S)
+        try:
+            answer, _ = pipeline.communicate(timeout=_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired as error:
+            raise UserError(f"the pipeline did not stop within {_STOP_TIMEOUT_S:g} s; see {out / 'up.log'}") from error
     if stop.is_set():
         raise UserError(f"stopped before the end of the schedule; what was recorded is in {out}")
     if device.returncode or pipeline.returncode not in (0, 3):
         raise UserError(
-            f"the pipeline did not run to its end: {_last_line(out / 'up.log')} (all of it in {out / 'up.log'})"
+            f"the pipeline did not run to its end: {_last_line(out / 'up.log')} (full log: {out / 'up.log'})"
         )
     return {name: count for name, count in json.loads(answer)["lost"].items() if count}
 
 
 @contextmanager
 def _child(arguments: list[str], **streams: object) -> Iterator[subprocess.Popen[str]]:
-    """A `fantwin` command in a process (group) of its own, ended whatever happens."""
+    """A `fantwin` command in a process and session of its own; it has ended on exit, killed if it does not stop."""
     process = subprocess.Popen(
-        [sys.executable, "-P", "-m", "pipeline", *arguments],
+        [*FANTWIN, *arguments],
         stdin=subprocess.DEVNULL,
         text=True,
         start_new_session=True,
@@ -144,6 +153,7 @@ def _child(arguments: list[str], **streams: object) -> Iterator[subprocess.Popen
                 process.wait(_STOP_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
+                process.wait()
 
 
 def _watch(
@@ -154,10 +164,10 @@ def _watch(
     stop: threading.Event,
     console: Console,
 ) -> None:
-    """Show what happens until the tray has sent its last sample, or something ends too early."""
+    """Show what happens until the tray has sent its last sample, or a process ends too early."""
     screen = DemoScreen(config, bus)
-    began_s = time.monotonic()
-    deadline_s = began_s + _START_TIMEOUT_S
+    started_s = time.monotonic()
+    deadline_s = started_s + _START_TIMEOUT_S
     next_line_s = 0.0
     live = Live(console=console, refresh_per_second=4, transient=True) if console.is_terminal else None
     if live:
@@ -168,9 +178,11 @@ def _watch(
                 live.update(screen.render())
             elif time.monotonic() >= next_line_s:
                 next_line_s = time.monotonic() + 4.0
-                console.print(f"{time.monotonic() - began_s:5.0f} s  {screen.line()}")
+                console.print(f"{time.monotonic() - started_s:5.0f} s  {screen.line()}")
             if not screen.has_score and time.monotonic() > deadline_s:
-                raise UserError(f"no score came in {_START_TIMEOUT_S:.0f} s; see up.log, and `fantwin doctor`")
+                raise UserError(
+                    f"no score arrived within {_START_TIMEOUT_S:.0f} s; see up.log, and run `fantwin doctor`"
+                )
     finally:
         if live:
             live.stop()
@@ -185,17 +197,17 @@ def _draw(out: Path, console: Console) -> None:
 
 def _last_line(path: Path) -> str:
     lines = path.read_text(encoding="utf-8").strip().splitlines()
-    return lines[-1] if lines else "it said nothing"
+    return lines[-1] if lines else "no output"
 
 
-def _tell(summary: Summary, out: Path, took_s: float, console: Console) -> None:
+def _print_report(summary: Summary, out: Path, took_s: float, console: Console) -> None:
     table = Table("fault", title="what happened, seconds since the first sample", title_justify="left", box=SIMPLE_HEAD)
     for column in ("fan", "start", "alarm", "delay", "removed", "cleared"):
         table.add_column(column, justify="right")
     table.add_column("probable cause")
     for fault in summary.faults:
         times = (fault.start_ns, fault.alarm_ns, None, fault.stop_ns, fault.cleared_ns)
-        cells = ["missed" if t is None else f"{(t - summary.start_ns) / 1e9:.2f}" for t in times]
+        cells = ["missed" if t is None else f"{(t - summary.start_ns) / NS_PER_S:.2f}" for t in times]
         cells[2] = "" if fault.delay_s is None else f"{fault.delay_s:.2f}"
         cause = f"{fault.cause.replace('_', ' ')}, {fault.probability:.0%}" if fault.cause else ""
         table.add_row(fault.kind, str(fault.fan), *cells, cause)
@@ -208,7 +220,7 @@ def _tell(summary: Summary, out: Path, took_s: float, console: Console) -> None:
         f"{took_s:.0f} s in all"
     )
     shown, programs = (Path(os.path.relpath(path)) for path in (out, Path(sys.executable).parent))
-    console.print(f"all of it in {shown / 'summary.json'} and {shown / 'recording.mcap'}")
-    console.print(f"look at {shown / 'bands.png'}, or over time: {programs / 'rerun'} {shown / 'view.rrd'}")
+    console.print(f"results: {shown / 'summary.json'} and {shown / 'recording.mcap'}")
+    console.print(f"picture: {shown / 'bands.png'}; interactive: {programs / 'rerun'} {shown / 'view.rrd'}")
     for problem in summary.problems:
-        console.print(f"[bold red]NOT AS IT MUST BE:[/bold red] {problem}")
+        console.print(f"[bold red]PROBLEM:[/bold red] {problem}")

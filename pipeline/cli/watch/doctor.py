@@ -1,14 +1,15 @@
-"""`fantwin doctor`: what is wrong with an installation or a configuration, and what to do about it."""
+"""`fantwin doctor`: problems of an installation or a configuration, each with what to do about it."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import sys
 import time
 from collections.abc import Iterator
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Annotated
 
@@ -22,9 +23,8 @@ from pipeline.launch.processes import process_list
 from pipeline.optional_dependencies import how_to_install
 from pipeline.runtime.stage import Context
 
-_NEEDED = ("eclipse-zenoh", "numpy", "onnxruntime", "mcap", "protobuf", "pydantic", "pyserial", "cobs")
-_EXTRAS = {"view": ("rerun-sdk", "matplotlib"), "train": ("torch", "onnx", "scipy")}
-_LITTLE_DISK_BYTES = 1 << 30
+_DEVELOPMENT_EXTRAS = {"dev", "bench"}  # used by tests and benches only
+_MIN_FREE_BYTES = 1 << 30
 
 
 def doctor(
@@ -32,9 +32,9 @@ def doctor(
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Tell what is wrong with the installation, and with a configuration if one is given.
+    """Check the installation, and a configuration if one is given.
 
-    Exit code 1 when something must be mended.
+    Exit code 1 if there is a problem to fix.
 
     Example: fantwin doctor -c fantwin.toml
     """
@@ -45,7 +45,7 @@ def doctor(
         typer.echo(json.dumps({"ok": not problems, "problems": problems, "good": good}))
     else:
         console = Console(soft_wrap=True, highlight=False)
-        for mark, style, lines in (("ok  ", "green", good), ("MEND", "bold red", problems)):
+        for mark, style, lines in (("ok  ", "green", good), ("FIX ", "bold red", problems)):
             for line in lines:
                 console.print(f"[{style}]{mark}[/{style}] ", end="")
                 console.print(line, markup=False)
@@ -54,17 +54,9 @@ def doctor(
 
 
 def _findings(config: Path | None, overrides: list[str] | None) -> Iterator[tuple[bool, str]]:
-    """(fine or not, one line) for everything looked at."""
+    """(in order or not, one line) for each check."""
     yield True, f"Python {sys.version.split()[0]}"
-    for name in _NEEDED:
-        found = _version(name)
-        yield bool(found), f"{name} {found}" if found else f"{name} is not installed; {how_to_install()}"
-    for extra, names in _EXTRAS.items():
-        missing = [name for name in names if not _version(name)]
-        line = f"extra {extra!r}: " + (
-            f"not installed ({', '.join(missing)}); {how_to_install(extra)}" if missing else "installed"
-        )
-        yield True, line
+    yield from _check_packages()
     if config is None:
         return
     try:
@@ -77,17 +69,41 @@ def _findings(config: Path | None, overrides: list[str] | None) -> Iterator[tupl
     yield from _check_stages(settings)
 
 
+def _check_packages() -> Iterator[tuple[bool, str]]:
+    """Every package that fantwin's own metadata requires; one that only an extra requires may be missing."""
+    try:
+        requirements = requires("fantwin") or []
+    except PackageNotFoundError:
+        yield False, f"fantwin is not installed; {how_to_install()}"
+        return
+    extras: dict[str, list[str]] = {}
+    for requirement in requirements:
+        name = re.split(r"[^A-Za-z0-9._-]", requirement)[0]
+        if extra := re.search(r"\bextra\s*==\s*['\"]([^'\"]+)", requirement):
+            extras.setdefault(extra[1], []).append(name)
+        else:
+            installed = _version(name)
+            yield (
+                bool(installed),
+                f"{name} {installed}" if installed else f"{name} is not installed; {how_to_install()}",
+            )
+    for extra, names in extras.items():
+        if extra in _DEVELOPMENT_EXTRAS:
+            continue
+        missing = [name for name in names if not _version(name)]
+        state = f"not installed ({', '.join(missing)}); {how_to_install(extra)}" if missing else "installed"
+        yield True, f"extra {extra!r}: {state}"
+
+
 def _check_run_folder(folder: Path) -> Iterator[tuple[bool, str]]:
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-        yield False, f"run_folder {folder}: {existing} is no folder this user may write in; name another"
+        yield False, f"run_folder {folder}: {existing} is not a folder this user may write to; name another"
         return
     free = shutil.disk_usage(existing).free
-    enough = free > _LITTLE_DISK_BYTES
-    yield (
-        enough,
-        f"run_folder {folder}: {free / 1e9:.1f} GB free" + ("" if enough else "; make room or name another folder"),
-    )
+    enough = free > _MIN_FREE_BYTES
+    advice = "" if enough else "; make room or name another folder"
+    yield enough, f"run_folder {folder}: {free / 1e9:.1f} GB free{advice}"
 
 
 def _check_stages(config: Config) -> Iterator[tuple[bool, str]]:
@@ -115,6 +131,7 @@ def _check_stages(config: Config) -> Iterator[tuple[bool, str]]:
 
 
 def _version(package: str) -> str:
+    """The installed version; empty if the package is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

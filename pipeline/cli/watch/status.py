@@ -1,8 +1,9 @@
-"""`fantwin status`: what every stage does, live."""
+"""`fantwin status`: stages, rates, losses and alarms; live on a terminal, printed once elsewhere."""
 
 from __future__ import annotations
 
 import json
+import sys
 import threading
 import time
 from typing import Annotated
@@ -21,22 +22,25 @@ from pipeline.errors import UserError
 from pipeline.launch.watcher import StageView, Watcher
 from pipeline.runtime.signals import stop_on_signals
 from schemas.messages import Severity, StageStatus
+from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.current_alarms import CurrentAlarm, clock
 
 _STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
-_LISTEN_S = 2.5  # two healths of every stage, so that there are rates
+_LISTEN_S = 2.5  # two health messages of every stage, which give rates
+_SILENT_AFTER_S = 5.0
 
 
 def status(
     config: ConfigOption = DEFAULT_CONFIG,
-    once: Annotated[bool, typer.Option("--once", help="Print once and exit instead of staying live.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Print once and exit, on a terminal too.")] = False,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Show stages, rates, latency, losses and alarms of a running site.
 
-    Exit code 1 when no stage answers, 3 when one says it has lost something.
+    Stays live on a terminal, until Ctrl-C. Into a pipe or a file it prints once and exits.
+    Exit code 1 if no stage answers, 3 if a stage has lost something.
 
     Example: fantwin status -c fantwin.toml --once
     """
@@ -45,10 +49,10 @@ def status(
     stop_on_signals(stop)
     with Bus(settings.bus, listens=False) as bus:
         watcher = Watcher(bus, settings.site)
-        if once or json_output:
+        if once or json_output or not sys.stdout.isatty():
             stop.wait(_LISTEN_S)
             watcher.ask_for_past_alarms()
-            _require_someone(watcher, settings)
+            _require_a_stage(watcher, settings)
             if json_output:
                 typer.echo(json.dumps(as_json(watcher)))
             else:
@@ -58,27 +62,27 @@ def status(
             with Live(console=Console(), refresh_per_second=4) as live:
                 while not stop.wait(0.25):
                     live.update(stage_table(watcher, settings))
-            _require_someone(watcher, settings)
+            _require_a_stage(watcher, settings)
         if any(watcher.losses().values()):
             raise typer.Exit(3)
 
 
-def _require_someone(watcher: Watcher, config: Config) -> None:
+def _require_a_stage(watcher: Watcher, config: Config) -> None:
     if not watcher.stages():
-        raise UserError(f"{_nobody(config)}; is `fantwin up -c {config.path}` running?")
+        raise UserError(f"{_no_stage(config)}; is `fantwin up -c {config.path}` running?")
 
 
-def _nobody(config: Config) -> str:
+def _no_stage(config: Config) -> str:
     return f"no stage of site {config.site!r} answers at {config.bus.endpoint}"
 
 
 def stage_table(watcher: Watcher, config: Config) -> Group:
-    """What a person is shown: a row for each stage, what is wrong, and the alarms."""
+    """The page for people: a row for each stage, then problems, then alarms."""
     table = Table("stage", "state", title="stages", title_justify="left", box=SIMPLE_HEAD)
     for column in ("in /s", "out /s", "p50 ms", "p99 ms", "lost"):
         table.add_column(column, justify="right")
     views = watcher.stages()
-    problems = [] if any(view.alive for view in views) else [Text(_nobody(config), style="red")]
+    problems = [] if any(view.alive for view in views) else [Text(_no_stage(config), style="red")]
     for view in views:
         health = view.health
         name = health.stage if health.instance == "all" else f"{health.stage}/{health.instance}"
@@ -99,28 +103,28 @@ def _state(view: StageView) -> Text:
     if not view.alive:
         stopped = view.health.status == StageStatus.STOPPED
         return Text("stopped" if stopped else "gone", style="yellow" if stopped else "red")
-    if time.time_ns() - view.health.t_ns > 5e9:
+    if time.time_ns() - view.health.t_ns > _SILENT_AFTER_S * NS_PER_S:
         return Text("silent", style="red")
     styles = {StageStatus.STARTING: "yellow", StageStatus.OK: "green", StageStatus.DEGRADED: "red"}
     return Text(view.health.status.name.lower(), style=styles.get(view.health.status, "yellow"))
 
 
-def _alarm_line(standing: CurrentAlarm) -> Text:
-    alarm = standing.newest
+def _alarm_line(current: CurrentAlarm) -> Text:
+    alarm = current.newest
     style = _STYLES[alarm.severity] if alarm.active else "green"
     text = Text.assemble(
         (f"{clock(alarm.t_ns)}  {alarm.severity.name:7}", style if is_presented(alarm) else "dim"),
-        f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(standing.words())}",
+        f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(current.words())}",
     )
-    about = standing.message.removeprefix(f"fan {alarm.fan}: ")
-    if standing.causes:
-        first = standing.causes[0]
+    about = current.message.removeprefix(f"fan {alarm.fan}: ")
+    if current.causes:
+        first = current.causes[0]
         text.append(f", {first.cause} {100 * first.probability:.0f} %")
     return text.append(f"; {about}") if about else text
 
 
 def as_json(watcher: Watcher) -> dict[str, object]:
-    """What a machine is shown."""
+    """The same for machines (`--json`)."""
     return {
         "stages": [
             {
@@ -138,5 +142,5 @@ def as_json(watcher: Watcher) -> dict[str, object]:
             }
             for view in watcher.stages()
         ],
-        "alarms": [standing.as_json() for standing in watcher.standing()],
+        "alarms": [current.as_json() for current in watcher.standing()],
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import subprocess
@@ -13,11 +14,12 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from PIL import Image
+from rich.console import Console
 
-from pipeline.cli.watch.demo import DEMO_FOLDER, demo
+from pipeline.cli.watch.demo import DEMO_FOLDER, _run, demo
 from pipeline.config.models import Config, load_config
 from pipeline.errors import UserError
-from tests.support.running_chain import fantwin
+from tests.support.running_chain import fantwin, is_running
 
 
 @pytest.mark.slow
@@ -88,6 +90,33 @@ def test_a_folder_with_an_apostrophe_is_a_folder_like_any_other(tmp_path, monkey
     with pytest.raises(UserError, match="far enough"):
         demo(out)
     assert (seen[0].run_folder, seen[0].trays[0].port) == (out, str(out / "tray"))
+
+
+STUBBORN = """
+import os, signal, sys, time
+from pathlib import Path
+here = Path(sys.argv[1])
+if sys.argv[2] == "simulate":
+    while not (here / "up").exists():
+        time.sleep(0.01)
+else:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    (here / "new").write_text(str(os.getpid()))
+    (here / "new").rename(here / "up")
+    while True:
+        time.sleep(1.0)
+"""
+
+
+def test_a_pipeline_that_does_not_stop_is_one_line_and_is_killed(tmp_path, endpoint, monkeypatch):
+    monkeypatch.setattr("pipeline.cli.watch.demo.FANTWIN", (sys.executable, "-c", STUBBORN, str(tmp_path)))
+    monkeypatch.setattr("pipeline.cli.watch.demo._STOP_TIMEOUT_S", 0.2)
+    overrides = [f"bus.endpoint='{endpoint}'", f"tray.0.port='{tmp_path / 'tray'}'"]
+    config = load_config(DEMO_FOLDER / "demo.toml", overrides)
+    with pytest.raises(UserError, match=r"did not stop within 0\.2 s.*up\.log"):
+        _run(config, overrides, tmp_path, 7, Console(file=io.StringIO()))
+    assert not is_running(int((tmp_path / "up").read_text()))
 
 
 def test_a_folder_that_cannot_be_used_is_one_line(tmp_path):

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import tomllib
 import tty
 from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
@@ -56,7 +59,7 @@ def test_a_configuration_in_order_can_start(capsys, tmp_path, port):
         ("tray.0.twin='none.onnx'", ["twin_integrator", "none.onnx: cannot read the twin", "correct [[tray]] twin"]),
         ("tray.0.twin='demo.toml'", ["twin_integrator", "not an ONNX file"]),
         ("tray.0.fans=3", ["twin_integrator", "a twin of 8 fans", "choose a twin that fits"]),
-        ("run_folder='/etc/hostname/x'", ["run_folder /etc/hostname/x", "no folder this user may write in"]),
+        ("run_folder='/etc/hostname/x'", ["run_folder /etc/hostname/x", "not a folder this user may write to"]),
         ("scorer.on_dealy_s=1", ["scorer.on_dealy_s", "did you mean 'on_delay_s'"]),
     ],
 )
@@ -76,25 +79,53 @@ def test_a_missing_configuration_is_a_problem_and_no_crash(capsys, tmp_path):
     assert "cannot read the configuration" in found["problems"][0]
 
 
-def test_what_is_not_installed_is_a_problem_and_a_missing_extra_is_not(capsys, monkeypatch):
+PROJECT = tomllib.loads((DEMO.parents[1] / "pyproject.toml").read_text())["project"]
+NEEDED = [re.split("[<>=]", requirement)[0] for requirement in PROJECT["dependencies"]]
+
+
+@pytest.mark.parametrize("missing", NEEDED)
+def test_each_package_that_fantwin_needs_is_a_problem_when_it_is_missing(capsys, monkeypatch, missing):
     versions = module._version
-    monkeypatch.setattr(module, "_version", lambda name: "" if name in ("pyserial", "torch") else versions(name))
+    monkeypatch.setattr(module, "_version", lambda name: "" if name == missing else versions(name))
     code, found = examine(capsys)
     assert code == 1
-    assert found["problems"] == ["pyserial is not installed; in the checkout: .venv/bin/pip install -e '.'"]
+    assert found["problems"] == [f"{missing} is not installed; in the checkout: .venv/bin/pip install -e '.'"]
+
+
+def test_a_package_of_an_extra_that_is_missing_is_no_problem(capsys, monkeypatch):
+    versions = module._version
+    monkeypatch.setattr(module, "_version", lambda name: "" if name == "torch" else versions(name))
+    code, found = examine(capsys)
+    assert (code, found["problems"]) == (0, [])
     assert "extra 'train': not installed (torch); in the checkout: .venv/bin/pip install -e '.[train]'" in found["good"]
 
 
+def test_the_extras_that_add_features_are_listed_and_those_of_developers_are_not(capsys):
+    _, found = examine(capsys)
+    listed = {line.split("'")[1] for line in found["good"] if line.startswith("extra ")}
+    assert listed == set(PROJECT["optional-dependencies"]) - {"dev", "bench"}
+
+
+def test_running_from_files_without_an_installation_is_a_problem(capsys, monkeypatch):
+    def not_installed(name: str) -> list[str]:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(module, "requires", not_installed)
+    code, found = examine(capsys)
+    assert code == 1
+    assert found["problems"] == ["fantwin is not installed; in the checkout: .venv/bin/pip install -e '.'"]
+
+
 def test_little_disk_is_a_problem(capsys, tmp_path, port, monkeypatch):
-    monkeypatch.setattr(module, "_LITTLE_DISK_BYTES", 1 << 62)
+    monkeypatch.setattr(module, "_MIN_FREE_BYTES", 1 << 62)
     code, found = examine(capsys, DEMO / "demo.toml", f"tray.0.port='{port}'", f"run_folder='{tmp_path}'")
     assert code == 1
     assert "make room" in found["problems"][0]
 
 
-def test_people_are_told_too_and_what_must_be_mended_stands_out(capsys):
+def test_for_people_problems_stand_out_from_what_is_in_order(capsys):
     with pytest.raises(typer.Exit):
         doctor(DEMO / "demo.toml", ["tray.0.port='/dev/none'"])
     out = capsys.readouterr().out
-    assert "MEND acquisition/tray1: /dev/none" in out
+    assert "FIX  acquisition/tray1: /dev/none" in out
     assert "ok   scorer: can start" in out

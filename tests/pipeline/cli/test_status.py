@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import re
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -218,8 +222,48 @@ def test_where_nothing_runs_there_is_no_empty_table_and_no_good_news(endpoint):
     assert "no alarms" not in text
 
 
-def test_the_live_view_that_saw_nobody_ends_with_the_line(endpoint):
-    live = Running(["status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'"])
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Callable[[], str], int]]:
+    """A pseudo-terminal: the text written to it so far, without colours, and the side that a process writes to."""
+    monkeypatch.setenv("TERM", "xterm")
+    master, slave = os.openpty()
+    written: list[bytes] = []
+
+    def read() -> None:
+        with suppress(OSError):  # raised once nobody holds the other side
+            while chunk := os.read(master, 4096):
+                written.append(chunk)
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    yield lambda: re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", b"".join(written).decode(errors="replace")), slave
+    os.close(slave)
+    reader.join(10.0)
+    os.close(master)
+
+
+def test_on_a_terminal_the_view_stays_live_until_it_is_stopped(site, terminal):
+    written, slave = terminal
+    live = Running(
+        ["status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{site.buses[0]._config.endpoint}'"], stdout=slave
+    )
+
+    def shows(lost: int) -> bool:
+        now = time.time_ns()
+        site.health.put(encode(replace(HEALTH, t_ns=now, lost=lost, header=Header("scorer-all-1", now, ""))))
+        return f" {lost} " in written()
+
+    try:
+        eventually(lambda: shows(7), "the first health is shown")
+        eventually(lambda: shows(4321), "a later health is shown in its place")
+        assert live.end() == 3
+    finally:
+        live.kill()
+
+
+def test_on_a_terminal_a_live_view_that_found_no_stage_says_so_at_the_end(endpoint, terminal):
+    _, slave = terminal
+    live = Running(["status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'"], stdout=slave)
     with Bus(BusConfig(endpoint=endpoint)) as bus:
         eventually(bus._session.info.peers_zid, "the live view has come")
         assert live.end() == 1
@@ -227,11 +271,11 @@ def test_the_live_view_that_saw_nobody_ends_with_the_line(endpoint):
     live.kill()
 
 
-def test_the_command_shows_a_running_site_once_and_exits_3_if_something_was_lost(site):
+def test_into_a_pipe_a_running_site_is_shown_once_and_a_loss_is_exit_code_3(site):
     done: list = []
     words = ("status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{site.buses[0]._config.endpoint}'")
     threads = [
-        threading.Thread(target=lambda w=w: done.append(fantwin(*words, *w))) for w in (("--json",), ("--once",))
+        threading.Thread(target=lambda w=w: done.append(fantwin(*words, *w))) for w in (("--json",), ("--once",), ())
     ]
     for thread in threads:
         thread.start()
@@ -241,12 +285,13 @@ def test_the_command_shows_a_running_site_once_and_exits_3_if_something_was_lost
         site.health.put(encode(replace(HEALTH, t_ns=HEALTH.t_ns + number)))
         threads[0].join(0.05)
         threads[1].join(0.05)
-    assert [answer.returncode for answer in done] == [3, 3], done
+    assert [answer.returncode for answer in done] == [3, 3, 3], done
     assert all("scorer" in answer.stdout for answer in done)
 
 
-def test_the_command_says_where_it_found_nobody(endpoint):
-    done = fantwin("status", "-c", DEMO / "demo.toml", "--once", "--set", f"bus.endpoint='{endpoint}'")
+@pytest.mark.parametrize("words", [(), ("--once",)], ids=str)
+def test_into_a_pipe_a_site_without_stages_is_one_line_and_exit_code_1(endpoint, words):
+    done = fantwin("status", "-c", DEMO / "demo.toml", *words, "--set", f"bus.endpoint='{endpoint}'")
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert f"no stage of site 'demo' answers at {endpoint}" in done.stderr
