@@ -22,6 +22,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pipeline.devices.device_clock import UINT32, DeviceClock
+from pipeline.devices.device_sequence import LARGEST_GAP
 from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig
 from schemas.blocks import cut, join
 from schemas.messages import Array, Grid, InvalidReason, Raw
@@ -31,7 +32,6 @@ LONGEST_TICK_NS = 100_000_000  # a longer pause between ticks is the host's own,
 LONG_AGO_NS = -(1 << 62)
 SET_BACK_NS = NS_PER_S  # a new sample so much older than the newest: the host's clock was set back
 GAP, STALE, NO_SPEED = (np.uint8(why) for why in (InvalidReason.GAP, InvalidReason.STALE, InvalidReason.NO_SPEED))
-LARGEST_GAP = 1 << 24  # samples; a larger step of the device's sequence is a device that began anew
 
 
 class ResamplerConfig(StageConfig):

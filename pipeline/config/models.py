@@ -14,9 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from pipeline.config.registry import STAGES, load_stage
+from pipeline.devices.sample_source import SourceConfig
+from pipeline.devices.source_kinds import parse_source
 from pipeline.errors import UserError
 from schemas.topics import RESERVED_TRAY_NAMES
 from schemas.units import SpeedUnit
@@ -66,18 +68,39 @@ class LauncherConfig(_Section):
 
 
 class TrayConfig(_Section):
-    """One tray of fans on one serial line."""
+    """One tray of fans whose samples come from one source.
+
+    `port`, `baud` and `protocol` written directly in [[tray]] are the short form of
+    `source = { kind = "serial", port = ..., baud = ..., protocol = ... }`.
+    """
+
+    short_form_keys: ClassVar[tuple[str, ...]] = ("port", "baud", "protocol")
 
     name: Name
-    fans: int = Field(ge=1, le=64, description="how many fans the line carries")
-    port: str = Field(default="", description="serial port, for example /dev/ttyUSB0; needed by acquisition only")
-    baud: int = Field(default=115200, gt=0)
-    protocol: Literal["binary", "text"] = "binary"
-    speed_unit: SpeedUnit = Field(default="rad/s", description="unit of speed on the line and in what people are shown")
-    speed_max: float = Field(default=1e5, gt=0, description="a speed beyond this, in speed_unit, is absurd and refused")
+    fans: int = Field(ge=1, le=64, description="how many fans every sample has")
+    source: Annotated[SourceConfig, BeforeValidator(parse_source)] = Field(
+        default={"kind": "serial"}, validate_default=True, description="where samples come from; used by acquisition"
+    )
+    speed_unit: SpeedUnit = Field(default="rad/s", description="unit of speed at the source and in what is displayed")
+    speed_max: float = Field(default=1e5, gt=0, description="a speed beyond this, in speed_unit, is refused")
     command_min: float = Field(default=0.0, description="smallest command the device may send or be sent")
     command_max: float = Field(default=1.0, description="largest command the device may send or be sent")
     twin: Path | None = Field(default=None, description="ONNX file of the healthy twin")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_short_form(cls, values: Any) -> Any:
+        """Turn `port = ...` into a serial source: short to write, and all that older configurations have."""
+        if not isinstance(values, dict):
+            return values
+        short = {key: value for key, value in values.items() if key in cls.short_form_keys}
+        if not short:
+            return values
+        if "source" in values:
+            keys = ", ".join(short)
+            raise ValueError(f"{keys} and source are both given; put {keys} into source = {{ ... }}")
+        others = {key: value for key, value in values.items() if key not in short}
+        return {**others, "source": {"kind": "serial", **short}}
 
     @field_validator("name")
     @classmethod
@@ -229,7 +252,7 @@ def _keys_at(model: type[BaseModel], location: Iterable[int | str]) -> list[str]
     here: Any = model
     for part in location:
         here = here.model_fields[part].annotation if isinstance(part, str) else get_args(here)[0]
-    return list(here.model_fields)
+    return [*here.model_fields, *getattr(here, "short_form_keys", ())]
 
 
 def _nearest(word: str, known: Iterable[str]) -> str:

@@ -1,4 +1,4 @@
-"""Acquisition: what the line brings becomes raw samples or is counted by kind; commands go back down the line."""
+"""Acquisition: input becomes raw samples or is counted by kind; commands go back to the device."""
 
 from __future__ import annotations
 
@@ -10,35 +10,27 @@ import numpy as np
 import pytest
 
 from pipeline.config.models import TrayConfig
-from pipeline.devices.byte_link import LinkDown, LinkUp, Received
-from pipeline.devices.serial_port import SerialPort
+from pipeline.devices.sample_source import LinkDown, LinkUp
+from pipeline.devices.serial_config import SerialConfig
+from pipeline.devices.serial_port import ReceivedBytes
+from pipeline.devices.serial_source import SerialSource
 from pipeline.runtime.stage import Context, StageError
 from schemas.messages import Command, Raw
+from schemas.units import NS_PER_S
 from schemas.wire import CommandFrame, Decoder, Frame, Protocol, Sample, SetPointFrame, encode
 from stages.acquisition import STAGE, AcquisitionConfig, AcquisitionCore
+from tests.support.serial_core import FakeLink, SerialCore
 
-S = 1_000_000_000
+S = NS_PER_S
 PROTOCOLS: tuple[Protocol, ...] = ("binary", "text")
 
 
-class FakeLine:
-    """Keeps what was written, and takes nothing while it is not `up`."""
-
-    def __init__(self) -> None:
-        self.up = True
-        self.written = b""
-
-    def write(self, data: bytes) -> bool:
-        self.written += data if self.up else b""
-        return self.up
-
-
-def make_core(line: FakeLine | None = None, block_size: int = 1, **tray: object) -> AcquisitionCore:
-    """A core of two fans, its line just opened at time 0."""
+def make_core(link: FakeLink | None = None, block_size: int = 1, **tray: object) -> SerialCore:
+    """A core of two fans, its line opened at time 0."""
     values: dict[str, object] = {"name": "bench", "fans": 2, "port": "/dev/ttyTEST"} | tray
     config = AcquisitionConfig(block_size=block_size)
-    core = AcquisitionCore(TrayConfig.model_validate(values), config, line or FakeLine(), started_t_ns=0)
-    assert core.step(LinkUp("/dev/ttyTEST")) == []
+    core = SerialCore(TrayConfig.model_validate(values), config, link or FakeLink())
+    assert core.step(LinkUp()) == []
     return core
 
 
@@ -49,11 +41,11 @@ def sample(sequence: int | None, clock_us: int | None = None, speed: float = 100
     return Sample(clock_us, sequence, (command, 0.25), (speed, 50.0))
 
 
-def feed(core: AcquisitionCore, frames: Iterable[Frame], protocol: Protocol = "binary", t_ns: int = S) -> list[Raw]:
-    return [raw for frame in frames for raw in core.step(Received(encode(protocol, frame), t_ns))]
+def feed(core: SerialCore, frames: Iterable[Frame], protocol: Protocol = "binary", t_ns: int = S) -> list[Raw]:
+    return [raw for frame in frames for raw in core.step(ReceivedBytes(encode(protocol, frame), t_ns))]
 
 
-def feed_sequences(core: AcquisitionCore, sequences: Iterable[int]) -> list[int]:
+def feed_sequences(core: SerialCore, sequences: Iterable[int]) -> list[int]:
     """Feed samples of these sequence numbers; which ones came out."""
     return [int(raw.device_sequence[0]) for raw in feed(core, map(sample, sequences))]
 
@@ -79,8 +71,8 @@ def test_speed_in_rpm_on_the_line_is_rad_per_second_in_the_message() -> None:
 def test_samples_that_arrive_together_share_the_time_at_which_they_arrived() -> None:
     core = make_core()
     data = b"".join(encode("binary", sample(i)) for i in range(3))
-    assert core.step(Received(data[:10], S)) == []
-    messages = core.step(Received(data[10:], 2 * S))
+    assert core.step(ReceivedBytes(data[:10], S)) == []
+    messages = core.step(ReceivedBytes(data[10:], 2 * S))
     assert [raw.host_receive_t_ns.tolist() for raw in messages] == [[2 * S]] * 3
 
 
@@ -199,7 +191,7 @@ def test_a_device_that_begins_anew_right_after_its_start_is_not_taken_for_repeat
     core = make_core()
     feed_sequences(core, [0, 1, 2])
     core.step(LinkDown("reset"))
-    core.step(LinkUp("/dev/ttyTEST"))
+    core.step(LinkUp())
     assert feed_sequences(core, [0, 1, 2, 3]) == [0, 1, 2, 3]
     assert core.counters()["device_restarts"] == 1
 
@@ -207,10 +199,10 @@ def test_a_device_that_begins_anew_right_after_its_start_is_not_taken_for_repeat
 def test_what_the_device_measured_while_the_line_was_down_is_counted_as_lost() -> None:
     core = make_core()
     feed_sequences(core, [0, 1, 2])
-    core.step(Received(encode("binary", sample(3))[:20], S))
+    core.step(ReceivedBytes(encode("binary", sample(3))[:20], S))
     core.step(LinkDown("gone"))
-    core.step(LinkUp("/dev/ttyTEST"))
-    core.step(Received(encode("binary", sample(7))[20:], S))
+    core.step(LinkUp())
+    core.step(ReceivedBytes(encode("binary", sample(7))[20:], S))
     assert feed_sequences(core, [8]) == [8]
     assert core.counters()["lost_on_line"] == 5
     assert core.counters()["resync"] == 1
@@ -223,7 +215,7 @@ def test_faulty_frames_are_counted_by_kind_and_good_ones_go_on(protocol: Protoco
     bad = b"\0\x05torn\0" if protocol == "binary" else b"what is this\n"
     wrong = encode(protocol, Sample(1, 1, (0.5,), (1.0,)))
     feed(core, [sample(0)], protocol)
-    core.step(Received(bad + wrong + encode(protocol, CommandFrame((0.5, math.nan))), S))
+    core.step(ReceivedBytes(bad + wrong + encode(protocol, CommandFrame((0.5, math.nan))), S))
     assert len(feed(core, [sample(1)], protocol)) == 1
     counters = core.counters()
     assert counters["torn" if protocol == "binary" else "garbage"] == 1
@@ -238,10 +230,10 @@ def command(*values: float, set_point: tuple[float, ...] = (), fans: int = 2) ->
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_commands_and_set_points_go_down_the_line_in_the_tray_s_unit(protocol: Protocol) -> None:
-    line = FakeLine()
-    core = make_core(line, protocol=protocol, speed_unit="rpm")
+    link = FakeLink()
+    core = make_core(link, protocol=protocol, speed_unit="rpm")
     core.step(command(0.75, math.nan, set_point=(math.nan, 2 * math.pi)))
-    found = Decoder(protocol, 2, "device").feed(line.written)
+    found = Decoder(protocol, 2, "device").feed(link.written)
     assert [repr(frame) for frame in found] == [
         repr(CommandFrame((0.75, math.nan))),
         repr(SetPointFrame((math.nan, 60.0))),
@@ -261,27 +253,27 @@ def test_commands_and_set_points_go_down_the_line_in_the_tray_s_unit(protocol: P
     ],
 )
 def test_a_command_that_the_tray_cannot_carry_out_is_refused_as_a_whole_and_counted(refused: Command) -> None:
-    line = FakeLine()
-    core = make_core(line, speed_max=1000)
+    link = FakeLink()
+    core = make_core(link, speed_max=1000)
     core.step(refused)
-    assert line.written == b""
+    assert link.written == b""
     assert core.counters()["refused_commands"] == 1
 
 
 def test_a_command_that_the_line_did_not_take_is_counted_as_lost() -> None:
-    line = FakeLine()
-    line.up = False
-    core = make_core(line)
+    link = FakeLink()
+    link.up = False
+    core = make_core(link)
     core.step(command(0.5, 0.5))
     assert core.counters()["lost_commands"] == 1
 
 
 def test_a_command_that_changes_nothing_is_not_sent() -> None:
-    line = FakeLine()
-    core = make_core(line)
+    link = FakeLink()
+    core = make_core(link)
     core.step(command(math.nan, math.nan))
     core.step(command())
-    assert (line.written, dict(core.counters())) == (b"", {"line_up": 1})
+    assert (link.written, dict(core.counters())) == (b"", {"line_up": 1})
 
 
 def test_a_line_that_is_down_is_a_problem_until_it_is_up_and_sends() -> None:
@@ -290,7 +282,7 @@ def test_a_line_that_is_down_is_a_problem_until_it_is_up_and_sends() -> None:
     assert core.problem() == "/dev/ttyTEST: no such port; waiting for it; check [[tray]] port"
     core.step(LinkDown("not allowed"))
     assert core.problem() == "/dev/ttyTEST: not allowed"
-    core.step(LinkUp("/dev/ttyTEST"))
+    core.step(LinkUp())
     assert core.problem() == ""
     assert core.counters()["line_down"] == 1
 
@@ -310,24 +302,24 @@ def test_a_line_without_a_valid_frame_is_a_problem_that_says_what_to_check() -> 
     core = make_core()
     for second in range(4):
         core.tick(second * S)
-        core.step(Received(encode("binary", Sample(1, 1, (0.5,), (1.0,))), second * S))
+        core.step(ReceivedBytes(encode("binary", Sample(1, 1, (0.5,), (1.0,))), second * S))
     problem = core.problem()
-    assert problem.startswith("no valid frame for 2 s on /dev/ttyTEST (last fault: wrong_fan_count, a frame of 1 fans")
-    assert "baud = 115200, protocol = 'binary' and fans = 2 of the [[tray]] right?" in problem
+    assert problem.startswith("/dev/ttyTEST: no valid sample for 2 s (last fault: wrong_fan_count, a frame of 1 fans")
+    assert problem.endswith("check baud = 115200, protocol = 'binary', fans = 2 of the [[tray]]")
 
 
 def test_a_line_of_mostly_faulty_frames_is_a_problem_although_some_are_good() -> None:
     core = make_core()
     for i in range(30):
         feed(core, [sample(i)])
-        core.step(Received(b"\0\x09aa\0" * 2, S))
-    assert core.problem().startswith("/dev/ttyTEST: most frames are faulty (last fault: torn")
+        core.step(ReceivedBytes(b"\0\x09aa\0" * 2, S))
+    assert core.problem().startswith("/dev/ttyTEST: most input is faulty (last fault: torn")
     feed(core, map(sample, range(30, 100)))
     assert core.problem() == ""
 
 
 def context(port: str) -> Context:
-    tray = TrayConfig(name="bench", fans=2, port=port)
+    tray = TrayConfig(name="bench", fans=2, source=SerialConfig(port=port))
     return Context("site", (tray,), AcquisitionConfig(), Path(), Path("runs"), started_t_ns=0)
 
 
@@ -339,5 +331,5 @@ def test_a_tray_without_a_port_is_refused_in_one_line() -> None:
 def test_the_stage_is_built_with_the_serial_line_as_its_source() -> None:
     parts = STAGE.build(context("/dev/ttyTEST"))
     assert isinstance(parts.core, AcquisitionCore)
-    assert isinstance(parts.source, SerialPort)
+    assert isinstance(parts.source, SerialSource)
     assert STAGE.process_per_tray

@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config.models import TrayConfig
-from pipeline.devices.byte_link import ByteLink, LinkDown, LinkUp, Received
+from pipeline.devices.sample_source import LinkDown, LinkUp
+from pipeline.devices.serial_config import SerialConfig
+from pipeline.devices.serial_port import ReceivedBytes
 from schemas.messages import Raw
 from schemas.wire import (
     MAX_FRAME_BYTES,
@@ -24,7 +26,8 @@ from schemas.wire import (
     SetPointFrame,
     encode,
 )
-from stages.acquisition import AcquisitionConfig, AcquisitionCore
+from stages.acquisition import AcquisitionConfig
+from tests.support.serial_core import FakeLink, SerialCore
 
 FANS = 2
 PROTOCOLS: tuple[Protocol, ...] = ("binary", "text")
@@ -32,15 +35,15 @@ DELIMITER = {"binary": b"\0", "text": b"\n"}
 FIRST_SEQUENCE = 2**32 - 32  # the sequence wraps within the pool
 
 
-class NoLine(ByteLink):
+class NoLink(FakeLink):
     def write(self, data: bytes) -> bool:
         raise AssertionError("nothing is sent in these tests")
 
 
-def make_core(protocol: Protocol, block_size: int = 1) -> AcquisitionCore:
-    tray = TrayConfig(name="bench", fans=FANS, port="/dev/ttyTEST", protocol=protocol)
-    core = AcquisitionCore(tray, AcquisitionConfig(block_size=block_size), NoLine(), started_t_ns=0)
-    core.step(LinkUp("/dev/ttyTEST"))
+def make_core(protocol: Protocol, block_size: int = 1) -> SerialCore:
+    tray = TrayConfig(name="bench", fans=FANS, source=SerialConfig(port="/dev/ttyTEST", protocol=protocol))
+    core = SerialCore(tray, AcquisitionConfig(block_size=block_size), NoLink())
+    core.step(LinkUp())
     return core
 
 
@@ -153,8 +156,8 @@ def check_one_stream(protocol: Protocol, pool: list[tuple[Sample, bytes]], chanc
     core = make_core(protocol, block_size=chance.choice((1, 3)))
     messages: list[Raw] = []
     for data in cut(stream, chance):
-        messages += core.step(Received(data, 0))
-        assert len(core._decoder._pending) <= MAX_FRAME_BYTES + 1
+        messages += core.step(ReceivedBytes(data, 0))
+        assert len(core.source._decoder._pending) <= MAX_FRAME_BYTES + 1
     messages += core.close()
 
     counts = Counter(core.counters())
@@ -198,9 +201,9 @@ def test_no_bytes_and_no_loss_of_the_line_make_the_core_raise(protocol: Protocol
     for i, piece in enumerate(pieces):
         if piece is None:
             core.step(LinkDown("gone"))
-            core.step(LinkUp("/dev/ttyTEST"))
+            core.step(LinkUp())
         else:
-            core.step(Received(piece, i))
+            core.step(ReceivedBytes(piece, i))
         core.tick(i * 1_000_000_000)
         assert isinstance(core.problem(), str)
     core.close()
@@ -216,7 +219,7 @@ def test_no_bytes_and_no_loss_of_the_line_make_the_core_raise(protocol: Protocol
 )
 def test_no_text_line_of_whatever_numbers_makes_the_core_raise(numbers: list[str]) -> None:
     core = make_core("text")
-    for raw in core.step(Received(f"\nS {' '.join(numbers)}\n".encode(), 0)):
+    for raw in core.step(ReceivedBytes(f"\nS {' '.join(numbers)}\n".encode(), 0)):
         assert raw.speed_rad_s.shape == raw.command.shape == (1, FANS)
 
 

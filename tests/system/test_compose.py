@@ -15,6 +15,7 @@ from pipeline.cli import main as command_line
 from pipeline.cli.main import COMMANDS
 from pipeline.config.models import load_config
 from pipeline.config.registry import STAGES, load_stage
+from pipeline.devices.serial_config import SerialConfig
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = (ROOT / "compose.yaml").read_text(encoding="utf-8")
@@ -72,7 +73,8 @@ def test_the_configuration_fits_the_services():
     (tray,) = config.trays
     simulate = next(words for words in fantwin_commands("acquisition") if words[0] == "simulate")
     told = dict(pairwise(simulate))
-    assert (told["--fans"], told["--link"], told["--speed-unit"]) == (str(tray.fans), tray.port, tray.speed_unit)
+    assert isinstance(tray.source, SerialConfig)
+    assert (told["--fans"], told["--link"], told["--speed-unit"]) == (str(tray.fans), tray.source.port, tray.speed_unit)
     assert f"runs:{config.run_folder}" in SERVICES["recorder"]
     assert f"runs:{config.run_folder}" in SERVICES["viewer"]
     assert tray.twin is not None

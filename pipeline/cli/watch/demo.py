@@ -105,7 +105,7 @@ def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Co
     tray = config.trays[0]
     simulate = [
         *("simulate", "--fans", str(tray.fans), "--profile", "manual", "--seed", str(seed)),
-        *("--duration", str(DURATION_S), "--speed-unit", tray.speed_unit, "--link", tray.port),
+        *("--duration", str(DURATION_S), "--speed-unit", tray.speed_unit, "--link", str(out / "tray")),
         *("--truth", str(out / "truth.json"), "--wait-for-reader"),
     ]
     for kind, settings in FAULTS:

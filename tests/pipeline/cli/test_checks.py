@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config.models import TrayConfig
+from pipeline.devices.serial_source import SerialSource
 from pipeline.runtime.stage import Context
 from stages import acquisition, recorder, twin_integrator, viewer
 from tests.support.twin_files import write_twin
 
 
 def context(folder: Path, config: Any, **tray: Any) -> Context:
-    trays = (TrayConfig(name="tray1", fans=1, **tray),)
+    trays = (TrayConfig.model_validate({"name": "tray1", "fans": 1, **tray}),)
     return Context(site="s", trays=trays, config=config, folder=folder, run_folder=folder / "run", started_t_ns=0)
 
 
@@ -32,7 +33,7 @@ def test_the_port_is_found_beside_the_configuration(tmp_path, monkeypatch):
     here = context(tmp_path, acquisition.AcquisitionConfig(), port="line")
     assert acquisition.check(here) == []
     source = acquisition.build(here).source
-    assert source is not None and vars(source)["_name"] == str(tmp_path / "line")
+    assert isinstance(source, SerialSource) and source._path == tmp_path / "line"
     (problem,) = acquisition.check(context(tmp_path, acquisition.AcquisitionConfig(), port="none"))
     assert f"{tmp_path / 'none'}: no such port" in problem
 

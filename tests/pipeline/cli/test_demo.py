@@ -18,6 +18,7 @@ from rich.console import Console
 
 from pipeline.cli.watch.demo import DEMO_FOLDER, _run, demo
 from pipeline.config.models import Config, load_config
+from pipeline.devices.serial_config import SerialConfig
 from pipeline.errors import UserError
 from tests.support.running_chain import fantwin, is_running
 
@@ -89,7 +90,7 @@ def test_a_folder_with_an_apostrophe_is_a_folder_like_any_other(tmp_path, monkey
     out = tmp_path / 'o\'clock "demo"'
     with pytest.raises(UserError, match="far enough"):
         demo(out)
-    assert (seen[0].run_folder, seen[0].trays[0].port) == (out, str(out / "tray"))
+    assert (seen[0].run_folder, seen[0].trays[0].source) == (out, SerialConfig(port=str(out / "tray")))
 
 
 STUBBORN = """

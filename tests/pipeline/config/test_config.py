@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.config.models import ConfigError, load_config, parse_config
+from pipeline.devices.serial_config import SerialConfig
 
 GOOD = """
 site = "lab"
@@ -65,7 +66,7 @@ def test_two_trays_of_one_name_are_refused():
 def test_overrides_set_nested_keys_and_keep_their_types():
     config = parse(GOOD, "scorer.on_delay_s=2.5", "tray.0.port=/dev/ttyACM1", "bus.endpoint='tcp/127.0.0.1:1'")
     assert config.sections["scorer"].model_dump()["on_delay_s"] == 2.5
-    assert config.tray("a").port == "/dev/ttyACM1"
+    assert config.tray("a").source == SerialConfig(port="/dev/ttyACM1")
     assert config.bus.endpoint == "tcp/127.0.0.1:1"
 
 

@@ -14,10 +14,12 @@ from typing import TypeVar
 import pytest
 
 from pipeline.config.models import TrayConfig
-from pipeline.devices.byte_link import LinkDown, LinkUp, Received
-from pipeline.devices.serial_port import SerialPort
+from pipeline.devices.sample_source import LinkDown, LinkUp
+from pipeline.devices.serial_config import SerialConfig
+from pipeline.devices.serial_port import ReceivedBytes, SerialPort
 from schemas.wire import CommandFrame, Decoder, Sample, encode
-from stages.acquisition import AcquisitionConfig, AcquisitionCore
+from stages.acquisition import AcquisitionConfig
+from tests.support.serial_core import SerialCore
 
 TIMEOUT_S = 20.0  # of a wait that normally ends at once
 T = TypeVar("T")
@@ -59,7 +61,7 @@ class Items:
     """What a line delivered, in order."""
 
     def __init__(self) -> None:
-        self.queue: queue.Queue[LinkUp | LinkDown | Received] = queue.Queue()
+        self.queue: queue.Queue[LinkUp | LinkDown | ReceivedBytes] = queue.Queue()
 
     def next(self, kind: type[T]) -> T:
         item = self.queue.get(timeout=TIMEOUT_S)
@@ -69,7 +71,7 @@ class Items:
     def bytes(self, size: int) -> bytes:
         data = b""
         while len(data) < size:
-            data += self.next(Received).data
+            data += self.next(ReceivedBytes).data
         return data
 
     def skip_until(self, kind: type[T]) -> T:
@@ -77,7 +79,7 @@ class Items:
             pass
         return item
 
-    def rest(self) -> list[LinkUp | LinkDown | Received]:
+    def rest(self) -> list[LinkUp | LinkDown | ReceivedBytes]:
         return [self.queue.get_nowait() for _ in range(self.queue.qsize())]
 
 
@@ -99,11 +101,11 @@ def test_bytes_come_with_the_host_s_time_after_word_that_the_line_is_up(device: 
     device.plug_in()
     items = Items()
     line.start(items.queue.put)
-    assert items.next(LinkUp) == LinkUp(str(device.path))
+    assert items.next(LinkUp) == LinkUp()
     before_ns = time.time_ns()
     device.send(b"hello")
-    received = items.next(Received)
-    assert before_ns <= received.t_ns <= time.time_ns()
+    received = items.next(ReceivedBytes)
+    assert before_ns <= received.received_t_ns <= time.time_ns()
     assert received.data + items.bytes(5 - len(received.data)) == b"hello"
 
 
@@ -164,7 +166,7 @@ def test_a_device_may_vanish_and_return_more_than_once(device: Device, line: Ser
         device.send(b"turn %d" % turn)
         assert items.bytes(6) == b"turn %d" % turn
         device.unplug()
-        assert items.next(LinkDown).reason == "the device has gone; waiting for it to come back"
+        assert items.next(LinkDown).reason == "the device was disconnected; waiting for it to come back"
         if turn == 1:
             assert items.next(LinkDown).reason.startswith("no such port")
         device.plug_in()
@@ -178,9 +180,9 @@ def test_stop_delivers_what_had_arrived_and_then_nothing_more(device: Device) ->
     stopper = threading.Thread(target=line.stop)
     data = os.urandom(3000)
 
-    def deliver(item: LinkUp | LinkDown | Received) -> None:
+    def deliver(item: LinkUp | LinkDown | ReceivedBytes) -> None:
         items.queue.put(item)
-        if isinstance(item, Received) and not stopper.ident:  # as a stage that is behind while it is told to stop
+        if isinstance(item, ReceivedBytes) and not stopper.ident:  # as a stage that is behind while it is told to stop
             device.send(data)
             stopper.start()
             assert line._stopping.wait(TIMEOUT_S)
@@ -188,7 +190,7 @@ def test_stop_delivers_what_had_arrived_and_then_nothing_more(device: Device) ->
     line.start(deliver)
     items.next(LinkUp)
     device.send(b"!")
-    items.next(Received)
+    items.next(ReceivedBytes)
     assert items.bytes(len(data)) == data
     stopper.join(TIMEOUT_S)
     device.send(b"too late")
@@ -201,13 +203,13 @@ def test_stop_ends_although_the_device_never_pauses(device: Device) -> None:
     line = SerialPort(str(device.path), 115200)
     items = Items()
 
-    def deliver(item: LinkUp | LinkDown | Received) -> None:
+    def deliver(item: LinkUp | LinkDown | ReceivedBytes) -> None:
         items.queue.put(item)
         device.send(b"and on")
 
     line.start(deliver)
     items.next(LinkUp)
-    items.next(Received)
+    items.next(ReceivedBytes)
     line.stop()
     assert items.rest()
 
@@ -229,8 +231,8 @@ def test_a_device_that_takes_no_bytes_makes_write_say_so_instead_of_blocking(dev
 
 
 def test_samples_go_on_after_the_device_was_away_and_health_says_so_meanwhile(device: Device, line: SerialPort) -> None:
-    tray = TrayConfig(name="bench", fans=1, port=str(device.path))
-    core = AcquisitionCore(tray, AcquisitionConfig(), line, started_t_ns=time.time_ns())
+    tray = TrayConfig(name="bench", fans=1, source=SerialConfig(port=str(device.path)))
+    core = SerialCore(tray, AcquisitionConfig(), line, started_t_ns=time.time_ns())
     items = Items()
     sequences: list[int] = []
 

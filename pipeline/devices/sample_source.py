@@ -1,0 +1,122 @@
+"""What a source of samples is: where the readings of one tray come from and its commands go to.
+
+A source delivers readings as the device gives them, in the units of its tray. Everything else is shared by all sources
+and lives in stages/acquisition.py: range checks, unit conversion, message blocks, losses by sequence number.
+
+To add a source, write one file with a `SourceConfig` and a `SampleSource`, and add its row to
+pipeline/devices/source_kinds.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeAlias
+
+from pydantic import BaseModel
+
+
+class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
+    """Base of every kind's settings, `source = { kind = "...", ... }` of a [[tray]]: frozen, unknown keys refused."""
+
+    kind: str
+
+
+@dataclass(frozen=True, slots=True)
+class SourceContext:
+    """What a source has to know of its tray."""
+
+    fans: int
+    speed_unit: str
+    """unit of `Reading.speed`: rad/s or rpm"""
+    folder: Path
+    """relative paths of the configuration start here"""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One sample of all fans of a tray, one value per fan.
+
+    A source without a device clock gives no `clock_us`: the sample's time is then its time of receipt. Without a
+    `sequence`, losses between device and host cannot be seen.
+    """
+
+    command: tuple[float, ...]
+    """in the tray's command unit"""
+    speed: tuple[float, ...]
+    """in the tray's speed unit; NaN where there is no reading"""
+    clock_us: int | None = None
+    """device clock at the time of measurement, modulo 2^32"""
+    sequence: int | None = None
+    """number of the sample, modulo 2^32"""
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """Input that is not a reading. `kind` is the name of the counter it is counted under."""
+
+    kind: str
+    detail: str
+    harmless: bool = False
+    """True if it says nothing about the quality of the connection"""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingBatch:
+    """What arrived at one time. It may be empty: a source also reports input that completes no reading."""
+
+    received_t_ns: int
+    """host time, ns since the epoch"""
+    items: Sequence[Reading | Rejected]
+    byte_count: int = 0
+    """bytes received, where the source counts them"""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkUp:
+    """The source is connected. The device may have been restarted since the last reading."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkDown:
+    """The source is not connected; `reason` says why and what to do, in one line."""
+
+    reason: str
+
+
+SourceEvent: TypeAlias = ReadingBatch | LinkUp | LinkDown
+
+
+class SampleSource(Protocol):
+    """An open source. It is built as `Source(config, context)`, which raises `UserError` if a setting is missing."""
+
+    @property
+    def name(self) -> str:
+        """What people call the connection, for example its port."""
+        ...
+
+    @property
+    def settings_to_check(self) -> str:
+        """The settings to look at when no valid reading arrives, for example `baud = 115200`; may be empty."""
+        ...
+
+    def start(self, deliver: Callable[[SourceEvent], None]) -> None:
+        """Begin to deliver from a thread of its own; `deliver` blocks while the stage is behind."""
+        ...
+
+    def stop(self) -> None:
+        """Deliver what has already arrived, then end."""
+        ...
+
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
+        """Send to the device; False if it was not sent. Never blocks for long, never raises.
+
+        command: in the tray's command unit; set_point: in its speed unit. Each has one value per fan, where NaN leaves
+        the fan as it is, or is empty.
+        """
+        ...
+
+    def check(self) -> list[str]:
+        """What would keep the source from connecting now, one line each."""
+        ...

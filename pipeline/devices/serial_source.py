@@ -1,0 +1,99 @@
+"""The serial line as a source of samples: the wire protocol of docs/reference/wire-protocol.md on a serial port."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from typing import Protocol
+
+from pipeline.devices.sample_source import (
+    LinkDown,
+    LinkUp,
+    Reading,
+    ReadingBatch,
+    Rejected,
+    SourceContext,
+    SourceEvent,
+)
+from pipeline.devices.serial_config import SerialConfig
+from pipeline.devices.serial_port import ReceivedBytes, SerialPort
+from pipeline.errors import UserError
+from schemas import wire
+
+
+class ByteLink(Protocol):
+    """Carries bytes both ways and knows no protocol. `SerialPort` says what each method does."""
+
+    def start(self, deliver: Callable[[LinkUp | LinkDown | ReceivedBytes], None]) -> None: ...  # noqa: D102
+    def stop(self) -> None: ...  # noqa: D102
+    def write(self, data: bytes) -> bool: ...  # noqa: D102
+
+
+class SerialSource:
+    """A `SampleSource`. Frames are decoded in the thread that reads the port."""
+
+    def __init__(self, config: SerialConfig, context: SourceContext, link: ByteLink | None = None) -> None:
+        """The port is not opened yet; a test may give another `link`.
+
+        Raises:
+            UserError: no port is given.
+        """
+        if not config.port:
+            raise UserError('port is missing; add for example port = "/dev/ttyUSB0"')
+        self._path = context.folder / config.port
+        self._config = config
+        self._link = link or SerialPort(str(self._path), config.baud)
+        self._decoder = wire.Decoder(config.protocol, context.fans)
+
+    @property
+    def name(self) -> str:
+        """The port as the configuration names it."""
+        return self._config.port
+
+    @property
+    def settings_to_check(self) -> str:
+        """What may differ between the two ends of the line."""
+        return f"baud = {self._config.baud}, protocol = {self._config.protocol!r}"
+
+    def start(self, deliver: Callable[[SourceEvent], None]) -> None:
+        """Open and read the port in a thread of its own."""
+        self._link.start(lambda item: deliver(self.decode(item)))
+
+    def stop(self) -> None:
+        """Deliver what has already arrived, then end."""
+        self._link.stop()
+
+    def decode(self, item: LinkUp | LinkDown | ReceivedBytes) -> SourceEvent:
+        """The readings that these bytes complete. Pieces of the stream that are not frames are `Rejected`."""
+        if not isinstance(item, ReceivedBytes):
+            self._decoder.reset()
+            return item
+        found = tuple(map(_reading_of, self._decoder.feed(item.data)))
+        return ReadingBatch(item.received_t_ns, found, len(item.data))
+
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
+        """Write one frame for commands and one for set-points, where a value is given."""
+        frames = ((command, wire.CommandFrame(command)), (set_point, wire.SetPointFrame(set_point)))
+        return self._link.write(
+            b"".join(
+                wire.encode(self._config.protocol, frame)
+                for values, frame in frames
+                if not all(map(math.isnan, values))
+            )
+        )
+
+    def check(self) -> list[str]:
+        """Whether the port exists and may be opened."""
+        if not self._path.exists():
+            return [f"{self._path}: no such port; connect the device, or correct [[tray]] port"]
+        if not os.access(self._path, os.R_OK | os.W_OK):
+            return [f"{self._path}: may not be read and written by this user; join its group (often dialout)"]
+        return []
+
+
+def _reading_of(found: wire.Frame | wire.Fault) -> Reading | Rejected:
+    if isinstance(found, wire.Sample):
+        return Reading(found.command, found.speed, found.clock_us, found.sequence)
+    assert isinstance(found, wire.Fault), "the decoder of a host gives samples and faults only"
+    return Rejected(found.kind.value, found.detail, harmless=found.kind is wire.FaultKind.RESYNC)

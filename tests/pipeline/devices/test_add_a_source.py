@@ -1,0 +1,163 @@
+"""A source of samples is one file and one row: a toy one runs through acquisition, and nothing else knows of it."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.config.models import ConfigError, load_config, parse_config
+from pipeline.devices.sample_source import SourceEvent
+from pipeline.devices.serial_config import SerialConfig
+from pipeline.devices.source_kinds import SOURCE_KINDS, SourceKind
+from pipeline.runtime.stage import Context, Parts
+from schemas.messages import Command, Raw
+from stages.acquisition import STAGE
+from tests.support.toy_source import ToyConfig, ToySource
+
+CONFIGURATION = """
+[[tray]]
+name = "bench"
+fans = 2
+speed_unit = "rpm"
+speed_max = 1000
+source = { kind = "toy", speeds = [60.0, 2000.0, 120.0] }
+[acquisition]
+block_size = 3
+"""
+
+
+@pytest.fixture(autouse=True)
+def _toy_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = SourceKind("tests.support.toy_source:ToyConfig", "tests.support.toy_source:ToySource")
+    monkeypatch.setitem(SOURCE_KINDS, "toy", row)
+
+
+def context(text: str = CONFIGURATION) -> Context:
+    config = parse_config(text, Path("fantwin.toml"))
+    return Context("site", config.trays, config.sections["acquisition"], Path(), Path("runs"), started_t_ns=0)
+
+
+def built(text: str = CONFIGURATION) -> tuple[Parts, ToySource]:
+    parts = STAGE.build(context(text))
+    assert isinstance(parts.source, ToySource)
+    return parts, parts.source
+
+
+def test_the_configuration_of_a_new_kind_is_checked_by_its_own_model() -> None:
+    (tray,) = parse_config(CONFIGURATION, Path("fantwin.toml")).trays
+    assert tray.source == ToyConfig(speeds=(60.0, 2000.0, 120.0))
+    with pytest.raises(ConfigError, match=r"tray.0.source.speeds.1 = 'fast': input should be a valid number"):
+        parse_config(CONFIGURATION.replace("2000.0", '"fast"'), Path("fantwin.toml"))
+
+
+def test_a_new_source_shares_range_checks_units_blocks_and_loss_counting() -> None:
+    parts, source = built()
+    events: list[SourceEvent] = []
+    source.start(events.append)
+    (raw,) = (message for event in events for message in parts.core.step(event))
+    assert isinstance(raw, Raw)
+    expected = np.array([[2 * math.pi] * 2, [math.nan] * 2, [4 * math.pi] * 2])
+    np.testing.assert_allclose(raw.speed_rad_s, expected, rtol=1e-15)
+    assert raw.device_sequence.tolist() == [0, 2, 4]
+    assert raw.device_clock_us.tolist() == []
+    counts = parts.core.counters()
+    assert (counts["samples"], counts["absurd_speed"], counts["lost_on_line"]) == (3, 2, 2)
+    parts.core.tick(10_000_000_000)
+    assert parts.core.problem().startswith("toy: nothing received for 2 s")
+
+
+def test_commands_reach_a_new_source_in_the_unit_of_its_tray() -> None:
+    parts, source = built()
+    parts.core.step(Command(fans=2, t_ns=0, command=np.array([0.25, math.nan]), set_point_rad_s=np.array([])))
+    parts.core.step(Command(fans=2, t_ns=0, command=np.array([]), set_point_rad_s=np.array([2 * math.pi, 0.0])))
+    parts.core.step(Command(fans=2, t_ns=0, command=np.array([2.0, 0.0]), set_point_rad_s=np.array([])))
+    (first, _), (_, second) = source.sent
+    assert first[0] == 0.25 and math.isnan(first[1])
+    assert second == pytest.approx((60.0, 0.0))
+    assert parts.core.counters()["refused_commands"] == 1
+
+
+def test_a_reading_with_another_number_of_fans_is_refused_and_counted() -> None:
+    parts, _ = built()
+    _, other = built(CONFIGURATION.replace("fans = 2", "fans = 3"))
+    events: list[SourceEvent] = []
+    other.start(events.append)
+    assert [message for event in events for message in parts.core.step(event)] == []
+    assert parts.core.counters()["wrong_fan_count"] == 3
+
+
+def test_doctor_asks_the_source_what_would_keep_it_from_connecting() -> None:
+    assert STAGE.check(context()) == []
+    assert STAGE.check(context(CONFIGURATION.replace("60.0, 2000.0, 120.0", ""))) == ["toy: no speeds given"]
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ('{ kind = "toi" }', "unknown kind 'toi'; known: serial, toy"),
+        ("{ port = 3 }", "write source = { kind ="),
+        ('"serial"', "write source = { kind ="),
+        ('{ kind = "toy" }', "'tray.0.source.speeds' is missing"),
+        ('{ kind = "toy", speed = 1 }', "unknown key 'speed' of kind 'toy'; known: kind, speeds"),
+        ('{ kind = "serial", baud = 0 }', "tray.0.source.baud = 0"),
+    ],
+)
+def test_a_mistake_in_the_source_is_one_line_with_the_remedy(source: str, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_config(f'[[tray]]\nname = "a"\nfans = 1\nsource = {source}\n', Path("fantwin.toml"))
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+TRAY = '[[tray]]\nname = "a"\nfans = 1\n'
+
+
+def test_port_baud_and_protocol_in_the_tray_are_the_short_form_of_a_serial_source() -> None:
+    short = parse_config(TRAY + 'port = "/dev/ttyUSB0"\nbaud = 9600\nprotocol = "text"\n', Path("fantwin.toml"))
+    keys = 'kind = "serial", port = "/dev/ttyUSB0", baud = 9600, protocol = "text"'
+    long = parse_config(TRAY + f"source = {{ {keys} }}\n", Path("fantwin.toml"))
+    assert short.trays == long.trays
+    assert short.trays[0].source == SerialConfig(port="/dev/ttyUSB0", baud=9600, protocol="text")
+
+
+def test_a_tray_without_source_is_one_whose_serial_port_is_not_named_yet() -> None:
+    assert parse_config(TRAY, Path("fantwin.toml")).trays[0].source == SerialConfig()
+
+
+@pytest.mark.parametrize("override", ["tray.0.port=/dev/ttyACM1", "tray.0.source.port=/dev/ttyACM1"])
+def test_the_port_can_be_set_on_the_command_line_in_the_form_of_the_file(override: str) -> None:
+    form = 'port = "/dev/ttyUSB0"' if override.startswith("tray.0.port") else 'source = { kind = "serial" }'
+    config = parse_config(TRAY + form, Path("fantwin.toml"), [override])
+    assert config.trays[0].source == SerialConfig(port="/dev/ttyACM1")
+
+
+def test_short_form_and_source_together_are_refused() -> None:
+    text = TRAY + 'port = "/dev/ttyUSB0"\nsource = { kind = "toy", speeds = [] }\n'
+    with pytest.raises(ConfigError, match="port and source are both given; put port into source"):
+        parse_config(text, Path("fantwin.toml"))
+
+
+def test_a_misspelt_key_of_the_short_form_is_found() -> None:
+    with pytest.raises(ConfigError, match=r"unknown key 'tray.0.prot'; did you mean 'port'\?"):
+        parse_config(TRAY + 'prot = "/dev/ttyUSB0"\n', Path("fantwin.toml"))
+
+
+def test_the_configuration_of_a_golden_recording_still_loads() -> None:
+    config = load_config(Path(__file__).parents[3] / "pipeline" / "demo" / "demo.toml")
+    assert config.trays[0].source == SerialConfig(port="/tmp/tray")
+
+
+def test_reading_a_configuration_imports_no_serial_library() -> None:
+    code = """
+import sys
+from pathlib import Path
+from pipeline.config.models import TrayConfig
+TrayConfig.model_validate({"name": "a", "fans": 1, "port": "/dev/ttyUSB0"})
+assert "serial" not in sys.modules and "schemas.wire" not in sys.modules, "a process opens no port it does not read"
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[3])

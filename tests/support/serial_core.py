@@ -1,0 +1,46 @@
+"""An acquisition core behind a serial source, fed with the bytes of the line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from pipeline.config.models import TrayConfig
+from pipeline.devices.sample_source import LinkDown, LinkUp, SourceContext
+from pipeline.devices.serial_config import SerialConfig
+from pipeline.devices.serial_port import ReceivedBytes
+from pipeline.devices.serial_source import ByteLink, SerialSource
+from schemas.messages import Raw
+from stages.acquisition import AcquisitionConfig, AcquisitionCore, Item
+
+
+class FakeLink:
+    """Stores what was written, and takes nothing while it is not `up`."""
+
+    def __init__(self) -> None:
+        self.up = True
+        self.written = b""
+
+    def start(self, deliver: Callable[[LinkUp | LinkDown | ReceivedBytes], None]) -> None:
+        raise AssertionError("tests hand the bytes to the core themselves")
+
+    def stop(self) -> None:
+        raise AssertionError("never started")
+
+    def write(self, data: bytes) -> bool:
+        self.written += data if self.up else b""
+        return self.up
+
+
+class SerialCore(AcquisitionCore):
+    """Decodes bytes as the serial source does before it hands them to the core."""
+
+    def __init__(self, tray: TrayConfig, config: AcquisitionConfig, link: ByteLink, started_t_ns: int = 0) -> None:
+        assert isinstance(tray.source, SerialConfig)
+        self.source = SerialSource(tray.source, SourceContext(tray.fans, tray.speed_unit, Path()), link)
+        super().__init__(tray, config, self.source, started_t_ns)
+
+    def step(self, item: Item | ReceivedBytes) -> list[Raw]:
+        if isinstance(item, ReceivedBytes | LinkUp | LinkDown):
+            return super().step(self.source.decode(item))
+        return super().step(item)

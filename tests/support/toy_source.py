@@ -1,0 +1,43 @@
+"""A whole source of samples in one file, as a new one would be written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+from pipeline.devices.sample_source import LinkUp, Reading, ReadingBatch, SourceConfig, SourceContext, SourceEvent
+from schemas.units import NS_PER_S
+
+
+class ToyConfig(SourceConfig, frozen=True):
+    """`source = { kind = "toy", speeds = [...] }`."""
+
+    kind: Literal["toy"] = "toy"
+    speeds: tuple[float, ...]
+
+
+class ToySource:
+    """Delivers one reading a second, each with the next of the given speeds for every fan; accepts every command."""
+
+    name = "toy"
+    settings_to_check = "speeds"
+
+    def __init__(self, config: ToyConfig, context: SourceContext) -> None:
+        self._config, self._fans = config, context.fans
+        self.sent: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
+
+    def start(self, deliver: Callable[[SourceEvent], None]) -> None:
+        deliver(LinkUp())
+        for number, speed in enumerate(self._config.speeds):
+            reading = Reading((0.5,) * self._fans, (speed,) * self._fans, sequence=2 * number)
+            deliver(ReadingBatch((number + 1) * NS_PER_S, (reading,)))
+
+    def stop(self) -> None:
+        pass
+
+    def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
+        self.sent.append((command, set_point))
+        return True
+
+    def check(self) -> list[str]:
+        return [] if self._config.speeds else ["toy: no speeds given"]
