@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import signal
 import threading
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.reader import make_reader
 
 from pipeline.config.models import load_config
 from pipeline.errors import UserError
 from pipeline.launch.launcher import Launcher, Outcome
 from pipeline.launch.processes import process_list
-from pipeline.recordings.reading import read_recording
-from schemas.messages import Grid, Prediction, Raw, Score
-from schemas.topics import alive_key, tray_key
-from tests.support.running_chain import DEMO, SITE, TRAY, Chain, eventually, fantwin, is_running, published, view_of
+from schemas.topics import alive_key
+from tests.support.running_chain import DEMO, SITE, Chain, fantwin
 
 
 @pytest.fixture
@@ -27,66 +22,6 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
     chain = Chain(tmp_path, endpoint, viewer=False)
     try:
         yield chain
-    finally:
-        chain.close()
-
-
-def samples(path: Path) -> Counter[str]:
-    """Samples of each topic, repeats not counted."""
-    times: dict[str, set[int]] = {}
-    for entry in read_recording(path):
-        message = entry.message
-        if isinstance(message, Raw):
-            times.setdefault("raw", set()).update(message.device_sequence.tolist())
-        elif isinstance(message, Grid | Prediction | Score):
-            times.setdefault(entry.topic, set()).update(message.t_ns.tolist())
-    return Counter({topic: len(found) for topic, found in times.items()})
-
-
-@pytest.mark.slow
-def test_ctrl_c_stops_in_order_and_everything_sent_is_recorded_and_scored(chain):
-    chain.start_tray()
-    up = chain.start_up()
-    with chain.watcher() as watcher:
-        eventually(lambda: published(view_of(watcher, "scorer")) > 200, "scores flow")
-    status = up.end(signal.SIGINT)  # while the tray is sending
-    assert chain.tray and chain.tray.end() == 0
-    account, sent = up.output(), chain.tray.output()
-    assert status == 0, up.lines
-    assert account == {
-        "run_folder": str(chain.folder),
-        "restarts": {},
-        "killed": [],
-        "failed": [],
-        "lost": dict.fromkeys(sorted(chain.stages), 0),
-    }
-    assert not any(map(is_running, chain.process_ids().values()))
-    (recording,) = chain.recordings()
-    found = samples(recording)
-    assert found["raw"] == sent["samples_sent"]
-    assert found["grid"] == found["prediction"] == found["score"] > 200
-    with recording.open("rb") as file:
-        summary = make_reader(file).get_summary()  # a plain reader, which wants a whole file
-    assert summary is not None
-    topics = {channel.topic for channel in summary.channels.values()}
-    assert {tray_key(SITE, TRAY, name) for name in ("raw", "grid", "prediction", "score", "twin")} <= topics
-
-
-@pytest.mark.slow
-def test_a_stage_that_cannot_start_ends_all_with_one_line(tmp_path, endpoint):
-    chain = Chain(tmp_path, endpoint, "tray.0.twin='none.onnx'", viewer=False)
-    try:
-        up = chain.start_up()
-        assert up.process.wait(60) == 1
-        up.kill()
-        errors = [line for line in up.lines if line.startswith("fantwin:")]
-        assert errors == [
-            f"fantwin: {DEMO}/none.onnx: cannot read the twin: No such file or directory; correct [[tray]] twin"
-        ]
-        assert "Traceback" not in "\n".join(up.lines)
-        started = chain.process_ids()
-        assert "twin_integrator" in started
-        assert not any(map(is_running, started.values()))
     finally:
         chain.close()
 

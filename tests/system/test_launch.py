@@ -1,0 +1,177 @@
+"""`fantwin up` as processes: however it ends, all that was sent is recorded and scored."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+from pipeline.recordings.reading import read_recording
+from schemas.codec import decode
+from schemas.messages import Raw
+from schemas.topics import tray_key
+from tests.support.running_chain import (
+    DEMO,
+    SITE,
+    TRAY,
+    Chain,
+    Running,
+    eventually,
+    fantwin,
+    is_running,
+    published,
+    view_of,
+)
+
+pytestmark = pytest.mark.slow
+MANY = 100  # scores: the chain has come to run evenly
+
+
+@pytest.fixture
+def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
+    chain = Chain(tmp_path, endpoint, "launcher.restart_delay_s=60", "launcher.restart_delay_max_s=60", viewer=False)
+    try:
+        yield chain
+    finally:
+        chain.close()
+
+
+def start(chain: Chain) -> Running:
+    """The tray and all stages; scores flow."""
+    chain.start_tray()
+    up = chain.start_up()
+    with chain.watcher() as watcher:
+        eventually(lambda: published(view_of(watcher, "scorer")) > MANY, "scores flow")
+    return up
+
+
+def samples(chain: Chain, topic: str, column: str) -> set[int]:
+    """The values of a column of samples in all parts of the recording, an unfinished one too."""
+    return {
+        int(value)
+        for path in chain.folder.glob("recording*.mcap*")
+        for entry in read_recording(path, topics=(topic,))
+        for value in getattr(entry.message, column)
+    }
+
+
+def check_whole(chain: Chain) -> None:
+    """The recording is whole for a plain MCAP reader, and holds all that was sent, judged to the end."""
+    (recording,) = chain.recordings()
+    assert not list(chain.folder.glob("*.active"))
+    with recording.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary and summary.statistics
+    topics = {channel.topic for channel in summary.channels.values()}
+    assert {tray_key(SITE, TRAY, name) for name in ("raw", "grid", "prediction", "score", "twin")} <= topics
+    grid, prediction, score = (samples(chain, topic, "t_ns") for topic in ("grid", "prediction", "score"))
+    assert grid == prediction == score
+    assert len(score) > MANY
+    assert chain.tray
+    assert len(samples(chain, "raw", "device_sequence")) == chain.tray.output()["samples_sent"]
+
+
+def command_reaches_the_fan(chain: Chain) -> None:
+    newest: dict[str, np.ndarray] = {}
+
+    def keep(_key: str, payload: bytes) -> None:
+        message = decode(Raw, payload)
+        assert isinstance(message, Raw)
+        newest["command"] = message.command[-1]
+
+    with Bus(BusConfig(endpoint=chain.endpoint), listens=False) as bus:
+        bus.subscribe(tray_key(SITE, TRAY, "raw"), keep)
+        done = fantwin(*chain.words("command"), "--fan", 3, 0.625, "--json")
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout) == {"tray": TRAY, "fan": 3, "kind": "command", "value": 0.625, "unit": ""}
+        eventually(lambda: "command" in newest and newest["command"][3] == 0.625, "fan 3 has its command")
+        assert np.count_nonzero(newest["command"] == 0.625) == 1
+
+
+def a_second_up_is_refused(chain: Chain) -> None:
+    second = fantwin(*chain.words("up"))
+    assert second.returncode == 1
+    assert "site 'demo' already runs at" in second.stderr
+    assert "started, process" not in second.stderr
+
+
+def a_stage_of_its_own_comes_and_goes(chain: Chain) -> None:
+    """Ctrl-C ends a stage that was started by itself, while the others go on."""
+    alone = Running([*chain.words("run"), "scorer"])
+    try:
+        with chain.watcher() as watcher:
+            eventually(
+                lambda: any(v.health.process_id == alone.process.pid for v in watcher.stages()),
+                "the second scorer is seen",
+            )
+        assert alone.end(signal.SIGINT) == 0, alone.lines
+    finally:
+        alone.kill()
+
+
+def test_visitors_change_nothing_and_ctrl_c_stops_in_order_with_everything_recorded_and_scored(chain):
+    up = start(chain)
+    command_reaches_the_fan(chain)
+    a_second_up_is_refused(chain)
+    a_stage_of_its_own_comes_and_goes(chain)
+    status = up.end(signal.SIGINT)  # while the tray is sending
+    assert chain.tray and chain.tray.end() == 0
+    assert status == 0, up.lines
+    assert up.output() == {
+        "run_folder": str(chain.folder),
+        "restarts": {},
+        "killed": [],
+        "failed": [],
+        "lost": dict.fromkeys(sorted(chain.stages), 0),
+    }
+    assert not any(map(is_running, chain.process_ids().values()))
+    check_whole(chain)
+
+
+def test_a_recorder_that_is_down_at_the_end_is_brought_back_for_what_it_missed(chain):
+    up = start(chain)
+    os.kill(chain.process_ids()["recorder"], signal.SIGKILL)
+    up.line_with("recorder: was ended by signal 9")
+    status = up.end(signal.SIGINT)
+    assert chain.tray and chain.tray.end() == 0
+    assert status == 0, (up.output()["lost"], up.lines[-3:])
+    assert samples(chain, "raw", "device_sequence") == set(range(chain.tray.output()["samples_sent"]))
+
+
+def test_without_their_launcher_all_stages_end_in_order_and_leave_a_whole_recording(chain):
+    up = start(chain)
+    with chain.watcher() as watcher:
+        children = chain.process_ids()
+        up.process.kill()
+        eventually(lambda: not any(map(is_running, children.values())), "all stages have ended")
+        last = {view.health.stage: view.health.status.name for view in watcher.stages()}
+        assert not any(watcher.losses().values())
+    assert set(last.values()) == {"STOPPED"}
+    assert chain.tray and chain.tray.end() == 0
+    check_whole(chain)
+
+
+def test_a_stage_that_cannot_start_ends_all_with_one_line(tmp_path, endpoint):
+    chain = Chain(tmp_path, endpoint, "tray.0.twin='none.onnx'", viewer=False)
+    try:
+        up = chain.start_up()
+        assert up.process.wait(60) == 1
+        up.kill()
+        errors = [line for line in up.lines if line.startswith("fantwin:")]
+        assert errors == [
+            f"fantwin: {DEMO}/none.onnx: cannot read the twin: No such file or directory; correct [[tray]] twin"
+        ]
+        assert "Traceback" not in "\n".join(up.lines)
+        started = chain.process_ids()
+        assert "twin_integrator" in started
+        assert not any(map(is_running, started.values()))
+    finally:
+        chain.close()

@@ -1,0 +1,169 @@
+"""One site in processes of its own: a fault is raised, operators answer, every stage is killed, nothing is forgotten.
+
+The whole chain runs once. What operators do comes first, because it must survive the kills; the recorder is killed
+before the other stages, because its death alone must lose nothing.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.launch.watcher import Watcher
+from pipeline.recordings.reading import read_recording
+from schemas.messages import Alarm, Request, Transition
+from tests.support.running_chain import TRAY, Chain, eventually, fantwin, is_running, published, received, view_of
+
+pytestmark = pytest.mark.slow
+
+FAULTY = 2
+OF_THE_OCCURRENCE = (
+    *("tray", "fan", "severity", "active", "onset_t_ns", "acknowledged", "confirmed", "latched"),
+    *("acknowledged_by", "shelved_until_t_ns", "suppressed", "out_of_service", "retained", "presented"),
+)
+
+
+@pytest.fixture
+def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
+    chain = Chain(tmp_path, endpoint, "scorer.baseline_s=2", "twin_integrator.warm_up_s=2")
+    try:
+        yield chain
+    finally:
+        chain.close()
+
+
+def current_alarms(chain: Chain) -> list[dict[str, Any]]:
+    """The alarms that `fantwin alarms` lists, without what keeps changing."""
+    done = fantwin(*chain.words("alarms"), "--json")
+    assert done.returncode == 0, done.stderr
+    return [{name: alarm[name] for name in OF_THE_OCCURRENCE} for alarm in json.loads(done.stdout)["alarms"]]
+
+
+def ask(chain: Chain, *words: object) -> dict[str, Any]:
+    """The answer for the one fan."""
+    done = fantwin(*chain.words("alarms"), *words, "--json")
+    assert done.returncode == 0, done.stderr
+    (answer,) = json.loads(done.stdout)["answers"]
+    return answer
+
+
+def operate(chain: Chain) -> list[dict[str, Any]]:
+    """Acknowledge and shelve the alarm, take another fan out of service; the alarms as they stand then."""
+    (alarm,) = eventually(lambda: current_alarms(chain), "an alarm stands")
+    assert (alarm["tray"], alarm["fan"], alarm["active"], alarm["presented"]) == (TRAY, FAULTY, True, True)
+    ask(chain, "ack", TRAY, FAULTY, "--operator", "Ann")
+    ask(chain, "shelve", TRAY, FAULTY, "--for", "30m", "--operator", "Bob")
+    ask(chain, "out-of-service", TRAY, 5)
+    refused = fantwin(*chain.words("alarms"), "ack", TRAY, FAULTY)
+    said = f"fantwin: {TRAY}: fan {FAULTY}: refused: it is acknowledged already\n"
+    assert (refused.returncode, refused.stderr) == (1, said)
+    alarms = current_alarms(chain)
+    assert [(a["fan"], a["acknowledged_by"], a["retained"], a["presented"], a["out_of_service"]) for a in alarms] == [
+        (FAULTY, "Ann", True, False, False),
+        (5, "", False, False, True),
+    ]
+    return alarms
+
+
+def kill(chain: Chain, watcher: Watcher, label: str) -> None:
+    """Kill a stage and wait until samples flow through the whole chain again: it alone has been replaced."""
+    before = chain.process_ids()
+    chain.kill(watcher, label)
+    scored = published(view_of(watcher, "scorer"))
+    eventually(lambda: published(view_of(watcher, "scorer")) > scored + 50, "scores flow again")
+    if label == "recorder":
+        eventually(lambda: received(view_of(watcher, "recorder")) > 50, "the new recorder records")
+    after = chain.process_ids()
+    assert {name for name in after if after[name] != before[name]} == {label}
+    assert is_running(after[label])
+
+
+def recorded_sequences(chain: Chain) -> dict[tuple[str, str], set[int]]:
+    """(topic, producer) -> sequence numbers in all recordings together."""
+    found: dict[tuple[str, str], set[int]] = {}
+    for path in chain.recordings():
+        for entry in read_recording(path):
+            header = entry.message.header
+            found.setdefault((entry.topic, header.producer), set()).add(header.sequence)
+    return found
+
+
+def recorded_values(chain: Chain, topic: str, column: str) -> set[int]:
+    """All values of a column of samples in all recordings together."""
+    entries = (entry for path in chain.recordings() for entry in read_recording(path, topics=[topic]))
+    return {int(value) for entry in entries for value in getattr(entry.message, column)}
+
+
+def check_account(chain: Chain, sent: dict[str, Any], account: dict[str, Any], status: int) -> None:
+    """Every sample that the device counted is recorded or counted as lost, and only the pause may lose any."""
+    assert account["restarts"] == dict.fromkeys(chain.stages, 1)
+    assert account["killed"] == []
+    lost = sum(account["lost"].values())
+    # what nobody took while acquisition was dead has a number of the device too, and counts as lost
+    assert sent["samples_unsent"] > 0
+    recorded = recorded_values(chain, "raw", "device_sequence")
+    assert len(recorded) + lost >= sent["samples_sent"] + sent["samples_unsent"]
+    assert 0 < lost <= sent["samples_unsent"] + 200, "lost is what fell into the pause, not more"
+    assert status == 3
+
+
+def check_recordings(chain: Chain) -> None:
+    """The recordings together have everything that any session published, and a score for each grid sample."""
+    assert len(chain.recordings()) == 2
+    for (topic, producer), numbers in recorded_sequences(chain).items():
+        assert numbers == set(range(max(numbers) + 1)), f"{topic} of {producer} has holes"
+    times = sorted(recorded_values(chain, "grid", "t_ns"))
+    assert times == list(range(times[0], times[-1] + 1, 10_000_000))
+    assert recorded_values(chain, "prediction", "t_ns") == recorded_values(chain, "score", "t_ns") == set(times)
+
+
+def check_alarms(chain: Chain, onset_t_ns: int) -> None:
+    """The alarm was raised once, and each request of the operators was answered under its name."""
+    recorded = [entry.message for path in chain.recordings() for entry in read_recording(path, ("alarm", "request"))]
+    requests = [message for message in recorded if isinstance(message, Request)]
+    by_time = sorted(requests, key=lambda request: request.t_ns)
+    assert [message.operator_name for message in by_time[:2]] == ["Ann", "Bob"]
+    assert len(requests) == 5
+    alarms = [message for message in recorded if isinstance(message, Alarm) and message.fan == FAULTY]
+    raised = {alarm.onset_t_ns for alarm in alarms if alarm.transition == Transition.RAISED}
+    assert raised == {onset_t_ns}
+    names = {f"{message.header.producer}/{message.header.sequence}" for message in requests if message.fan == FAULTY}
+    assert names == {alarm.request for alarm in alarms if alarm.request}
+
+
+def test_operators_are_answered_and_whatever_is_killed_comes_back_and_nothing_is_forgotten(chain):
+    chain.start_tray("--fault", f"inlet:fan={FAULTY},start=8,stop=600,size=2.5")
+    up = chain.start_up()
+    up.line_with("ALARM")
+    before = operate(chain)
+
+    with chain.watcher() as watcher:
+        kill(chain, watcher, "recorder")
+        assert not any(watcher.losses().values()), "neither a killed recorder nor commands that come and go lose any"
+        kill(chain, watcher, "scorer")
+        assert current_alarms(chain) == before
+        answer = ask(chain, "unshelve", TRAY, FAULTY)
+        assert (answer["presented"], answer["onset_t_ns"]) == (True, before[0]["onset_t_ns"])
+
+        kill(chain, watcher, chain.stages[0])
+        shown = fantwin(*chain.words("status"), "--json")
+        (resampler,) = (stage for stage in json.loads(shown.stdout)["stages"] if stage["stage"] == "resampler")
+        assert shown.returncode == 3, "a running site says that it has lost something"
+        assert resampler["counters"]["lost_between_sessions"] == resampler["lost"] > 0
+        for label in ("resampler", "twin_integrator", "viewer"):
+            kill(chain, watcher, label)
+
+    assert chain.tray and chain.tray.end() == 0
+    sent = chain.tray.output()
+    status = up.end()
+    check_account(chain, sent, up.output(), status)
+    check_recordings(chain)
+    check_alarms(chain, answer["onset_t_ns"])
+
+    # a replay that is given what each session was given decides the same, to the bit
+    verified = fantwin("replay", "--offline", "--verify", *chain.recordings())
+    assert verified.returncode == 0, verified.stdout + verified.stderr
