@@ -267,6 +267,5 @@ STAGE = Stage(
     writes=("raw",),
     config=AcquisitionConfig,
     build=build,
-    process_per_tray=True,
     check=check,
 )

@@ -14,9 +14,8 @@ import numpy as np
 
 from bench.detection.knobs import BY_HAND, Knobs
 from bench.detection.plant import RATE_HZ, START_NS, TRAY_FANS, Plant
-from pipeline.config.models import parse_config
-from pipeline.config.registry import load_stage
-from pipeline.runtime.stage import Context, Core
+from pipeline.config.loading import parse_config
+from pipeline.runtime.stage import Context, Core, load_stage
 from schemas.messages import Array, Grid, Prediction, Raw
 from simulation.plant import FanParameters, tray_of_fans
 from twin.build import train_twin

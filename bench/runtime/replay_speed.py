@@ -20,7 +20,7 @@ from bench.printing import JsonOption, progress, show
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from pipeline.config.models import load_config
+from pipeline.config.loading import load_config
 from pipeline.recordings.reading import read_recording
 from pipeline.replay.offline.judging import judge
 from pipeline.replay.offline.replay_input import open_replay_input

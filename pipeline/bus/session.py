@@ -30,7 +30,7 @@ from schemas.topics import Topic
 _RETRY = '{"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}'
 
 KEPT_BYTES = 16 << 20
-"""What an outlet keeps at most, whatever its history: large messages of a large fleet would fill the memory."""
+"""What a publisher keeps at most, whatever its history: large messages of a large fleet would fill the memory."""
 
 _ROUTER_TIMEOUT_MS = "1000"
 _ROUTER_RETRY_S = 0.2
@@ -111,7 +111,7 @@ class Bus:
     ) -> None:
         self.close()
 
-    def outlet(self, key: str, topic: Topic, encoding: str, producer: str) -> Publisher:
+    def publisher(self, key: str, topic: Topic, encoding: str, producer: str) -> Publisher:
         """Declare an output; `encoding` is the full protobuf name of its messages."""
         return Publisher(self._session, key, topic, encoding, producer)
 

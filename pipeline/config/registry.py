@@ -1,34 +1,47 @@
-"""The stages, named by import string: the pipeline knows their names and order, never their code.
+"""The registry of stages: one row each. It is data: reading it imports no stage, and a row starts nothing by itself.
 
-The order is that of the data. The launcher starts from the end, so that whoever listens is there first,
-and stops from the beginning, so that what is in flight arrives.
+Rows are in the order of the data flow. The launcher starts stages from the end, so that consumers are ready first, and
+stops them from the beginning, so that messages in flight arrive.
 """
 
 from __future__ import annotations
 
-from functools import cache
+from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from pipeline.runtime.stage import Stage
-
-STAGES: dict[str, str] = {
-    "acquisition": "stages.acquisition:STAGE",
-    "resampler": "stages.resampler:STAGE",
-    "twin_integrator": "stages.twin_integrator:STAGE",
-    "scorer": "stages.scorer:STAGE",
-    "recorder": "stages.recorder:STAGE",
-    "viewer": "stages.viewer:STAGE",
-}
+from typing import Any, Literal
 
 
-@cache
-def load_stage(name: str) -> Stage:
-    """The declaration of the stage called `name`.
+@dataclass(frozen=True)
+class StageRow:
+    """What is known of a stage without importing it.
 
-    Raises:
-        KeyError: no such stage.
+    Attributes:
+        name: also the name of its section in the configuration.
+        declaration: import string of its `pipeline.runtime.stage.Stage`, `module:attribute`.
+        enabled_by: what enables it where `launcher.stages` is not given. "default": always; "section": a section
+            `[name]` in the configuration.
+        scope: one process for the site, or one for each tray.
     """
-    module, attribute = STAGES[name].split(":")
-    return getattr(import_module(module), attribute)
+
+    name: str
+    declaration: str
+    enabled_by: Literal["default", "section"] = "section"
+    scope: Literal["site", "tray"] = "site"
+
+    def load(self) -> Any:
+        """Import the stage and return its declaration."""
+        module, _, attribute = self.declaration.partition(":")
+        return getattr(import_module(module), attribute)
+
+
+STAGES: dict[str, StageRow] = {
+    row.name: row
+    for row in (
+        StageRow("acquisition", "stages.acquisition:STAGE", enabled_by="default", scope="tray"),
+        StageRow("resampler", "stages.resampler:STAGE", enabled_by="default"),
+        StageRow("twin_integrator", "stages.twin_integrator:STAGE", enabled_by="default"),
+        StageRow("scorer", "stages.scorer:STAGE", enabled_by="default"),
+        StageRow("recorder", "stages.recorder:STAGE", enabled_by="default"),
+        StageRow("viewer", "stages.viewer:STAGE", enabled_by="default"),
+    )
+}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
-from pipeline.config.registry import load_stage
+from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
 from pipeline.launch.loss_accounting import label
 from pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, process_list
@@ -205,5 +205,5 @@ class Launcher:
 
 
 def _listens_only(row: StageProcess) -> bool:
-    """Whether a stage has all its input from the bus, rather than from a device."""
-    return not load_stage(row.stage).process_per_tray
+    """Whether a stage has all its input from the bus. Stages with a process for each tray may have a device."""
+    return STAGES[row.stage].scope == "site"

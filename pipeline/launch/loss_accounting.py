@@ -15,7 +15,8 @@ from collections import Counter
 from collections.abc import Iterable
 from itertools import chain, pairwise
 
-from pipeline.config.registry import STAGES, load_stage
+from pipeline.config.registry import STAGES
+from pipeline.runtime.stage import load_stage
 from schemas.messages import Health, StageStatus
 from schemas.streams import StreamId, input_streams, output_streams
 

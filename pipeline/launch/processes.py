@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.config.models import Config
-from pipeline.config.registry import STAGES, load_stage
+from pipeline.config.registry import STAGES
 
 EXIT_CANNOT_START = 78  # the stage said in one line why it cannot run as configured (EX_CONFIG of sysexits.h)
 
@@ -32,12 +32,10 @@ class StageProcess:
 
 
 def process_list(config: Config) -> list[StageProcess]:
-    """The processes of a configuration, in the order of the data."""
+    """The processes of a configuration, in the order of the data flow."""
     rows: list[StageProcess] = []
-    for name in STAGES:
-        if name not in config.launcher.stages:
-            continue
-        if load_stage(name).process_per_tray:
+    for name in config.stages:
+        if STAGES[name].scope == "tray":
             rows += [StageProcess(name, tray.name, tray.name) for tray in config.trays]
         else:
             rows.append(StageProcess(name, "all", None))

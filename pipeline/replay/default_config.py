@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.config.models import Config, parse_config
+from pipeline.config.loading import parse_config
+from pipeline.config.models import Config
 from pipeline.recordings.packets import PacketReading
 from pipeline.recordings.reading import RecordingError, RecordingMetadata
 from pipeline.runtime.twin_file import TwinFile
@@ -48,7 +49,12 @@ def first_raw(paths: Sequence[Path], head: RecordingMetadata) -> dict[str, list[
 
 
 def default_config(
-    path: Path, head: RecordingMetadata, first: Mapping[str, Sequence[Raw]], twin: Path, overrides: Iterable[str]
+    path: Path,
+    head: RecordingMetadata,
+    first: Mapping[str, Sequence[Raw]],
+    twin: Path,
+    overrides: Iterable[str],
+    stages: Iterable[str],
 ) -> Config:
     """Defaults, with the trays of the recording, the twin's rate, and gaps measured by the recording's own samples.
 
@@ -66,7 +72,7 @@ def default_config(
     for tray, messages in first.items():
         unit = head.speed_unit(tray) if head.speed_unit(tray) in ("rad/s", "rpm") else "rad/s"
         text += f'\n[[tray]]\nname = {json.dumps(tray)}\nfans = {messages[0].fans}\nspeed_unit = "{unit}"\n'
-    return parse_config(text, path, overrides)
+    return parse_config(text, path, overrides, stages)
 
 
 def _step_s(messages: Sequence[Raw]) -> float:

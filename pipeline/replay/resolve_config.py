@@ -6,10 +6,10 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
-from pipeline.config.models import Config, load_config, parse_config
+from pipeline.config.loading import load_config, parse_config
+from pipeline.config.models import Config
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.reading import Entry, RecordingError, RecordingMetadata, read_metadata
-from pipeline.replay.live.sender import tray_of
 
 
 def resolve_config(file: Path, first: Entry, config: Path | None, overrides: Iterable[str]) -> Config:
@@ -21,19 +21,23 @@ def resolve_config(file: Path, first: Entry, config: Path | None, overrides: Ite
         RecordingError: the file cannot be read.
     """
     if config is not None:
-        return load_config(config, overrides)
+        return load_config(config, overrides, stages=())
     head = read_metadata(file)
     if CONFIGURATION in head.attachments:
         # where its own processes met is over; those who listen now are where the file says, or at the default
         recorded = [override for override in _recorded_overrides(file, head) if not override.startswith("bus.")]
-        return _parsed(file, head, [*recorded, *overrides])
-    trays = head.metadata.get("trays") or tray_of(first.key)
+        return _parsed(file, head, [*recorded, *overrides], stages=())
+    _, site, tray, *_ = first.key.split("/")
+    trays = head.metadata.get("trays") or tray
     sections = [f"[[tray]]\nname = {json.dumps(tray)}\nfans = 1\n" for tray in trays.split(",")]  # fans do not matter
-    return parse_config(f"site = {json.dumps(first.key.split('/')[1])}\n{''.join(sections)}", file, overrides)
+    return parse_config(f"site = {json.dumps(site)}\n{''.join(sections)}", file, overrides, stages=())
 
 
-def attached_config(file: Path, head: RecordingMetadata, overrides: Iterable[str] = ()) -> Config | None:
-    """The configuration that a recording was made with, `overrides` on top of it; None where there is none.
+def attached_config(
+    file: Path, head: RecordingMetadata, stages: Iterable[str], overrides: Iterable[str] = ()
+) -> Config | None:
+    """The configuration that a recording was made with, `overrides` on top of it; None where there is none. Only the
+    sections of `stages` are checked.
 
     Raises:
         ConfigError: it cannot be used any more.
@@ -41,12 +45,12 @@ def attached_config(file: Path, head: RecordingMetadata, overrides: Iterable[str
     """
     if CONFIGURATION not in head.attachments:
         return None
-    return _parsed(file, head, [*_recorded_overrides(file, head), *overrides])
+    return _parsed(file, head, [*_recorded_overrides(file, head), *overrides], stages)
 
 
-def _parsed(file: Path, head: RecordingMetadata, overrides: Iterable[str]) -> Config:
+def _parsed(file: Path, head: RecordingMetadata, overrides: Iterable[str], stages: Iterable[str]) -> Config:
     text = head.attachments[CONFIGURATION].decode(errors="replace")
-    return parse_config(text, Path(f"{file}:{CONFIGURATION}"), overrides)
+    return parse_config(text, Path(f"{file}:{CONFIGURATION}"), overrides, stages)
 
 
 def _recorded_overrides(file: Path, head: RecordingMetadata) -> list[str]:

@@ -18,6 +18,7 @@ from typing import Any
 
 from pipeline.bus.session import Bus, Publisher
 from pipeline.config.models import Config
+from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.health import HealthBook
@@ -117,15 +118,16 @@ class Runner:
             StageError, ConfigError, BusError: it cannot be built; nothing has been published.
         """
         trays = (config.tray(tray),) if tray else config.trays
-        if stage.process_per_tray and len(trays) != 1:
+        is_per_tray = STAGES[stage.name].scope == "tray"
+        if is_per_tray and len(trays) != 1:
             names = ", ".join(t.name for t in trays)
-            raise UserError(f"{stage.name} runs one process for each tray: say which with --tray (of {names})")
+            raise UserError(f"{stage.name} runs one process for each tray: say which with --tray (one of {names})")
         self.stage = stage
         self.stop = stop
         self.orphaned = threading.Event()
         """Set when whoever started this stage has gone: it ends as soon as those it reads from have ended."""
         self._site = config.site
-        self._instance = trays[0].name if stage.process_per_tray else "all"
+        self._instance = trays[0].name if is_per_tray else "all"
         self.producer = f"{stage.name}-{self._instance}-{secrets.token_hex(4)}"
         self._inbox = _Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
@@ -151,12 +153,12 @@ class Runner:
         self._clock = StageClock()
         self._bus = Bus(config.bus, stop)
         self._tracker = SequenceTracker(self._recover_rare if stage.may_drop else self._recover)
-        self._outlets: dict[tuple[str, str], Publisher] = {
-            (t.name, name): self._outlet(tray_key(config.site, t.name, name), name)
+        self._publishers: dict[tuple[str, str], Publisher] = {
+            (t.name, name): self._publisher(tray_key(config.site, t.name, name), name)
             for t in trays
             for name in stage.writes
         }
-        self._health_outlet = self._outlet(health_key(config.site, stage.name, self._instance), "health")
+        self._health_publisher = self._publisher(health_key(config.site, stage.name, self._instance), "health")
         self._read_keys = {
             tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
         }
@@ -340,8 +342,8 @@ class Runner:
                 for due in self._tracker.accept(packet):
                     self._step(due)
 
-    def _outlet(self, key: str, topic: str) -> Publisher:
-        return self._bus.outlet(key, BY_NAME[topic], type_name(BY_NAME[topic].message), self.producer)
+    def _publisher(self, key: str, topic: str) -> Publisher:
+        return self._bus.publisher(key, BY_NAME[topic], type_name(BY_NAME[topic].message), self.producer)
 
     def _publish(self, tray: str, messages: Sequence[Message], *, from_timer: bool = False) -> None:
         # what comes of a device is made of nothing that came over the bus
@@ -349,9 +351,9 @@ class Runner:
         if position and from_timer:
             position = replace(position, from_timer=True)
         for message in messages:
-            outlet = self._outlets[tray, _TOPIC_NAMES[type(message)]]
-            stamped = replace(message, header=Header(self.producer, outlet.published, tray, position))
-            outlet.put(encode(stamped))
+            publisher = self._publishers[tray, _TOPIC_NAMES[type(message)]]
+            stamped = replace(message, header=Header(self.producer, publisher.published, tray, position))
+            publisher.put(encode(stamped))
             if (now_ns := self._clock.now_ns(tray)) is not None:
                 self._health.note_output(stamped, now_ns)
 
@@ -371,16 +373,18 @@ class Runner:
             status=status,
             problems=[self._crash, *(parts.core.problem() for parts in self._parts.values())],
             inputs=self._tracker.inputs(),
-            outputs=[Output(key=outlet.key, published=outlet.published) for outlet in self._outlets.values()],
+            outputs=[
+                Output(key=publisher.key, published=publisher.published) for publisher in self._publishers.values()
+            ],
             counters=self._counters(),
             now_ns=time.time_ns(),
         )
-        header = Header(self.producer, self._health_outlet.published, "")
+        header = Header(self.producer, self._health_publisher.published, "")
         health = replace(health, header=header)
         payload = encode(health)
-        self._health_outlet.put(payload)
+        self._health_publisher.put(payload)
         if "health" in self.stage.reads and status != StageStatus.STOPPED:  # the bus brings what others publish
-            self._step(Envelope(self._health_outlet.key, "health", payload, time.time_ns(), health))
+            self._step(Envelope(self._health_publisher.key, "health", payload, time.time_ns(), health))
         return health
 
 

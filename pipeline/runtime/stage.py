@@ -1,7 +1,7 @@
-"""What a stage is: a pure core, the adapters it is handed, and one declaration.
+"""The stage contract: a pure core, the adapters handed to it, and one declaration.
 
-A core sees no bus, no clock, no file and no environment: the runner (or a test, or a replay) hands it
-messages one at a time and takes what it returns. The runner is the only loop.
+A core sees no bus, clock, file or environment. The runner (or a test, or a replay) passes it one message at a time and
+publishes what it returns. The runner is the only loop.
 """
 
 from __future__ import annotations
@@ -9,39 +9,49 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
-from pydantic import BaseModel, ConfigDict
-
-from pipeline.config.models import TrayConfig
+from pipeline.config.models import Section, TrayConfig
+from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
 from schemas.messages import Message
+from schemas.topics import BY_NAME
 
 
-class StageConfig(BaseModel):
-    """Base of every stage's section in the configuration file: frozen, unknown keys refused."""
-
-    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+class StageConfig(Section):
+    """Base of every stage's section in the configuration file."""
 
 
 class StageError(UserError):
-    """A stage cannot start or go on: one line that says what, where and what to do."""
+    """A stage cannot start or continue: one line that says what, where and what to do."""
 
 
 class Core(Protocol):
-    """The pure part of a stage. Only `step` has to be written; the rest has a neutral default."""
+    """The pure part of a stage. Only `step` must be written; everything else has a neutral default.
+
+    Messages are returned unstamped: the runner sets producer, sequence number, tray and input position. A core that
+    serves all trays names the tray of what it returns in the header; without one, a message made by `step` belongs to
+    the tray of the input message.
+    """
 
     def step(self, item: Any) -> Sequence[Message]:
-        """Take one message (or one item of the stage's source) and return what follows from it, unstamped."""
+        """Process one message (or one item of the stage's source) and return the resulting messages."""
         ...
 
     def tick(self, now_ns: int) -> Sequence[Message]:
-        """Called about every 50 ms; `now_ns` is the host's time, or a replay's while one feeds the stage."""
+        """Called about every 50 ms. `now_ns` is the host's time, or the replay's while one feeds the stage."""
         return ()
 
     def close(self) -> Sequence[Message]:
-        """Called once after the last item: hand out what is still held, let go of adapters."""
+        """Called once after the last item: return what is still held, release adapters."""
         return ()
+
+    def abort(self) -> None:
+        """Called instead of `close` when this core raised: release adapters, save nothing.
+
+        The state may be half updated. Without a saved state the restarted stage takes the failed input again, or
+        counts it as lost.
+        """
 
     def counters(self) -> Mapping[str, int]:
         """What the core counts. Names that begin with `lost_` are losses and are summed up in health."""
@@ -53,14 +63,15 @@ class Core(Protocol):
 
 
 class Source(Protocol):
-    """An adapter that brings items in from outside the bus (a serial port): calls `deliver` from its own thread."""
+    """An adapter that brings in items from outside the bus, such as a serial port. It calls `deliver` from its own
+    thread."""
 
     def start(self, deliver: Callable[[Any], None]) -> None:
         """Begin; `deliver` blocks while the stage is behind."""
         ...
 
     def stop(self) -> None:
-        """Deliver what has already arrived, then end. Returns when nothing more will be delivered."""
+        """Deliver what has already arrived, then end. Nothing more is delivered after it returns."""
         ...
 
 
@@ -75,7 +86,7 @@ class Context:
     run_folder: Path
     started_t_ns: int
     snapshot_folder: Path | None = None
-    """where a stage keeps what a restart must not forget; None: nothing is kept, as in a replay"""
+    """where a stage keeps the state that survives a restart; None: nothing is kept, as in a replay"""
     configuration_text: str = field(default="", repr=False)
     overrides: tuple[str, ...] = ()
     """the keys set on the command line, `key=value`"""
@@ -108,9 +119,21 @@ def no_problems(_context: Context) -> Sequence[str]:
 class Stage:
     """The declaration of a stage: what the runner and the launcher need to know, and nothing of how it works.
 
-    The first topic of `reads` is the main input: outputs say how far it had been taken (`Cause`); others come aside.
-    `check` looks, without side effects, for what would keep the stage from working (a missing port, a twin that
-    does not fit) and gives one line each; `fantwin doctor` prints them.
+    Attributes:
+        name: as in the registry.
+        about: one line for people.
+        reads: topics. The first is the main input, the only one that advances the input position of outputs.
+        writes: topics.
+        config: model of its section.
+        build: builds the core, and its source if it has one.
+        core_per_tray: a core for each tray, or one core that serves all trays of the process.
+        wants_envelopes: whether `step` is given envelopes instead of messages.
+        may_drop: a consumer that may drop messages: its missing messages are no loss.
+        check: looks, without side effects, for what would keep the stage from working (a missing port, a twin that
+            does not fit); one line each. `fantwin doctor` prints them.
+
+    Raises:
+        ValueError: `reads` or `writes` names an unknown topic.
     """
 
     name: str
@@ -120,7 +143,24 @@ class Stage:
     config: type[StageConfig]
     build: Callable[[Context], Parts]
     core_per_tray: bool = True
-    process_per_tray: bool = False
     wants_envelopes: bool = False
     may_drop: bool = False
     check: Callable[[Context], Sequence[str]] = no_problems
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in (*self.reads, *self.writes) if name not in BY_NAME]
+        if unknown:
+            raise ValueError(f"stage {self.name!r}: no such topic: {', '.join(unknown)}; known: {', '.join(BY_NAME)}")
+        if "health" in self.writes:
+            raise ValueError(f"stage {self.name!r}: health is published by the runner; take it out of `writes`")
+
+
+def load_stage(name: str) -> Stage:
+    """Import the stage called `name` and return its declaration.
+
+    Raises:
+        KeyError: no such stage.
+    """
+    stage = STAGES[name].load()
+    assert isinstance(stage, Stage)
+    return stage

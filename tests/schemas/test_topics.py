@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config.registry import STAGES, load_stage
+from pipeline.config.registry import STAGES
+from pipeline.runtime.stage import load_stage
 from schemas.messages import MESSAGE_TYPES
 from schemas.topics import BY_NAME, RESERVED_TRAY_NAMES, TOPICS, alive_key, health_key, topic_of, tray_key
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.config.models import TrayConfig
+from pipeline.config.registry import STAGES
 from pipeline.devices.sample_source import LinkDown, LinkUp
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.serial_port import ReceivedBytes
@@ -332,4 +333,4 @@ def test_the_stage_is_built_with_the_serial_line_as_its_source() -> None:
     parts = STAGE.build(context("/dev/ttyTEST"))
     assert isinstance(parts.core, AcquisitionCore)
     assert isinstance(parts.source, SerialSource)
-    assert STAGE.process_per_tray
+    assert STAGES[STAGE.name].scope == "tray"

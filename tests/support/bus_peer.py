@@ -25,12 +25,12 @@ TOPIC = BY_NAME["alarm"]
 
 
 def publish(bus: Bus, count: int) -> None:
-    outlet = bus.outlet(KEY, TOPIC, type_name(Alarm), "peer")
+    publisher = bus.publisher(KEY, TOPIC, type_name(Alarm), "peer")
     for sequence in range(count):
-        outlet.put(encode(alarm(sequence)))
+        publisher.put(encode(alarm(sequence)))
     print("published", flush=True)
     for sequence, _ in enumerate(sys.stdin, start=count):
-        outlet.put(encode(alarm(sequence)))
+        publisher.put(encode(alarm(sequence)))
 
 
 def alarm(sequence: int) -> Alarm:
@@ -53,14 +53,14 @@ def collect(bus: Bus, count: int) -> None:
     def packet(payload: bytes) -> Envelope:
         return Envelope(KEY, "alarm", payload, 0, decode(Alarm, payload))
 
-    inlet = SequenceTracker(
+    tracker = SequenceTracker(
         lambda key, who, first, last: [packet(found) for _, found in bus.recover(key, who, first, last, pause)]
     )
     bus.subscribe(KEY, lambda _key, payload: inbox.put(payload))
     print("ready", flush=True)
     got: list[int] = []
     while len(got) < count:
-        got += [due.message.header.sequence for due in inlet.accept(packet(inbox.get(timeout=20)))]
+        got += [due.message.header.sequence for due in tracker.accept(packet(inbox.get(timeout=20)))]
     print(" ".join(map(str, got)), flush=True)
 
 

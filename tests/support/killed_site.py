@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config.models import Config, load_config
-from pipeline.config.registry import load_stage
+from pipeline.config.loading import load_config
+from pipeline.config.models import Config
 from pipeline.recordings.writing import RecordingWriter
-from pipeline.runtime.stage import Context, Core
+from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
 from schemas.messages import Action, Header, InputPosition, Message, Raw, Request
 from schemas.topics import TOPICS, tray_key

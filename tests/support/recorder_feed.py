@@ -68,14 +68,14 @@ def main(endpoint: str, trays: int, fans: int, history: int, file: Path) -> None
     threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
     sent_ns: dict[str, list[int]] = {}
     with Bus(BusConfig(endpoint=endpoint)) as bus:
-        outlets = {}
+        publishers = {}
         for tray in (f"tray{number + 1}" for number in range(trays)):
             for name in TOPICS:
                 topic = replace(BY_NAME[name], history=history)
                 key = tray_key(SITE, tray, name)
-                outlets[tray, name] = bus.outlet(key, topic, type_name(topic.message), PRODUCER)
+                publishers[tray, name] = bus.publisher(key, topic, type_name(topic.message), PRODUCER)
                 sent_ns[key] = []
-        own = bus.outlet(health_key(SITE, STAGE, "all"), BY_NAME["health"], type_name(Health), PRODUCER)
+        own = bus.publisher(health_key(SITE, STAGE, "all"), BY_NAME["health"], type_name(Health), PRODUCER)
         bus.declare_alive(alive_key(SITE, STAGE, "all"))
 
         def put_health(status: StageStatus) -> None:
@@ -86,7 +86,9 @@ def main(endpoint: str, trays: int, fans: int, history: int, file: Path) -> None
                 status=status,
                 t_ns=time.time_ns(),
                 uptime_s=0.0,
-                outputs=tuple(Output(key=outlet.key, published=outlet.published) for outlet in outlets.values()),
+                outputs=tuple(
+                    Output(key=publisher.key, published=publisher.published) for publisher in publishers.values()
+                ),
             )
             own.put(encode(health))
 
@@ -94,10 +96,10 @@ def main(endpoint: str, trays: int, fans: int, history: int, file: Path) -> None
         began_s, number = time.monotonic(), 0
         while not stop.wait(max(0.0, began_s + number * STEP_S - time.monotonic())):
             made = messages(fans, number)
-            for (tray, name), outlet in outlets.items():
-                stamped = replace(made[name], header=Header(PRODUCER, outlet.published, tray))
-                sent_ns[outlet.key].append(time.time_ns())
-                outlet.put(encode(stamped))
+            for (tray, name), publisher in publishers.items():
+                stamped = replace(made[name], header=Header(PRODUCER, publisher.published, tray))
+                sent_ns[publisher.key].append(time.time_ns())
+                publisher.put(encode(stamped))
             if number % 100 == 0:
                 put_health(StageStatus.OK)
             number += 1

@@ -13,9 +13,10 @@ from typer.main import get_command
 
 from pipeline.cli import main as command_line
 from pipeline.cli.main import COMMANDS
-from pipeline.config.models import load_config
-from pipeline.config.registry import STAGES, load_stage
+from pipeline.config.loading import load_config
+from pipeline.config.registry import STAGES
 from pipeline.devices.serial_config import SerialConfig
+from pipeline.runtime.stage import load_stage
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = (ROOT / "compose.yaml").read_text(encoding="utf-8")

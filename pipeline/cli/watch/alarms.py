@@ -20,7 +20,8 @@ from rich.text import Text
 from pipeline.bus.session import Bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.watch.request import ask
-from pipeline.config.models import Config, load_config
+from pipeline.config.loading import load_config
+from pipeline.config.models import Config
 from pipeline.errors import UserError
 from pipeline.launch.watcher import Watcher
 from pipeline.runtime.signals import stop_on_signals
@@ -82,7 +83,7 @@ def alarms(
 
     Example: fantwin alarms shelve tray1 3 --for 30m --comment "spare part ordered"
     """
-    settings = load_config(config, overrides or ())
+    settings = load_config(config, overrides or (), stages=())
     stop = threading.Event()
     if asked is None:
         if duration or comment or operator:

@@ -15,7 +15,8 @@ import typer
 
 from pipeline.bus.session import Bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.models import TrayConfig, load_config
+from pipeline.config.loading import load_config
+from pipeline.config.models import TrayConfig
 from pipeline.errors import UserError
 from pipeline.launch.watcher import Watcher
 from pipeline.runtime.signals import stop_on_signals
@@ -42,7 +43,7 @@ def command(
 
     Example: fantwin command -c fantwin.toml --fan 0 0.6
     """
-    settings = load_config(config, overrides or ())
+    settings = load_config(config, overrides or (), stages=())
     names = [each.name for each in settings.trays]
     if tray is None and len(names) > 1:
         raise UserError(f"say which tray with --tray (of {', '.join(names)})")
@@ -83,7 +84,7 @@ def _send(bus: Bus, watcher: Watcher, site: str, tray: str, message: Command, st
     nobody = f"no acquisition of tray {tray} took the command: is `fantwin up` running?"
     producer = f"command-{tray}-{secrets.token_hex(4)}"
     key = tray_key(site, tray, "command")
-    outlet = bus.outlet(key, BY_NAME["command"], type_name(Command), producer)
+    publisher = bus.publisher(key, BY_NAME["command"], type_name(Command), producer)
 
     def acquisition() -> Health | None:
         return next(
@@ -101,8 +102,8 @@ def _send(bus: Bus, watcher: Watcher, site: str, tray: str, message: Command, st
         return health if taken else None
 
     before = _wait(acquisition, stop, nobody)
-    header = Header(producer, outlet.published, tray)
-    outlet.put(encode(replace(message, header=header)))
+    header = Header(producer, publisher.published, tray)
+    publisher.put(encode(replace(message, header=header)))
     after = _wait(has_it, stop, nobody)
     if _not_sent(after) > (_not_sent(before) if after.header.producer == before.header.producer else 0):
         raise UserError(f"tray {tray}: acquisition could not send the command: {after.problem or 'it was refused'}")

@@ -25,7 +25,8 @@ from pipeline.bus.session import Bus
 from pipeline.cli.options import JsonOption
 from pipeline.cli.watch.demo_report import Summary, summarise
 from pipeline.cli.watch.demo_screen import DemoScreen
-from pipeline.config.models import Config, load_config
+from pipeline.config.loading import load_config
+from pipeline.config.models import Config
 from pipeline.errors import UserError
 from pipeline.runtime.signals import stop_on_signals
 from schemas.units import NS_PER_S

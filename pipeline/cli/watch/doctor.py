@@ -17,11 +17,11 @@ import typer
 from rich.console import Console
 
 from pipeline.cli.options import JsonOption, SetOption
-from pipeline.config.models import Config, ConfigError, load_config
-from pipeline.config.registry import load_stage
+from pipeline.config.loading import load_config
+from pipeline.config.models import Config, ConfigError
 from pipeline.launch.processes import process_list
 from pipeline.optional_dependencies import how_to_install
-from pipeline.runtime.stage import Context
+from pipeline.runtime.stage import Context, load_stage
 
 _DEVELOPMENT_EXTRAS = {"dev", "bench"}  # used by tests and benches only
 _MIN_FREE_BYTES = 1 << 30

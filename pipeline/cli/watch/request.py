@@ -26,11 +26,11 @@ def ask(
         UserError: not all have been answered in time.
     """
     producer = f"alarms-{tray}-{secrets.token_hex(4)}"
-    outlet = bus.outlet(tray_key(site, tray, "request"), BY_NAME["request"], type_name(Request), producer)
-    name = f"{producer}/{outlet.published}"
+    publisher = bus.publisher(tray_key(site, tray, "request"), BY_NAME["request"], type_name(Request), producer)
+    name = f"{producer}/{publisher.published}"
     heard: queue.Queue[bytes] = queue.Queue()
     bus.subscribe(tray_key(site, tray, "alarm"), lambda _key, payload: heard.put(payload))
-    outlet.put(encode(replace(request, header=Header(producer, outlet.published, tray))))
+    publisher.put(encode(replace(request, header=Header(producer, publisher.published, tray))))
     answers: dict[int, Alarm] = {}
     until_s = time.monotonic() + timeout_s
     while set(answers) < fans:

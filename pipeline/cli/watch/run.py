@@ -11,12 +11,13 @@ from typing import Annotated
 import typer
 
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.models import load_config
-from pipeline.config.registry import STAGES, load_stage
+from pipeline.config.loading import load_config
+from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
 from pipeline.launch.processes import EXIT_CANNOT_START
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.signals import stop_on_signals
+from pipeline.runtime.stage import load_stage
 
 
 def run(
@@ -35,7 +36,7 @@ def run(
     """
     if stage not in STAGES:
         raise UserError(f"no stage called {stage!r}; known: {', '.join(STAGES)}")
-    settings = load_config(config, overrides or ())
+    settings = load_config(config, overrides or (), stages=(stage,))
     stop = threading.Event()
     stop_on_signals(stop)
     try:

@@ -17,7 +17,8 @@ from rich.text import Text
 
 from pipeline.bus.session import Bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.models import Config, load_config
+from pipeline.config.loading import load_config
+from pipeline.config.models import Config
 from pipeline.errors import UserError
 from pipeline.launch.watcher import StageView, Watcher
 from pipeline.runtime.signals import stop_on_signals
@@ -44,7 +45,7 @@ def status(
 
     Example: fantwin status -c fantwin.toml --once
     """
-    settings = load_config(config, overrides or ())
+    settings = load_config(config, overrides or (), stages=())
     stop = threading.Event()
     stop_on_signals(stop)
     with Bus(settings.bus, listens=False) as bus:

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.config.models import load_config
+from pipeline.config.loading import load_config
 from pipeline.launch.launcher import Launcher
 from pipeline.runtime.signals import stop_on_signals
 

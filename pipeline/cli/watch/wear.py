@@ -20,7 +20,7 @@ from pipeline.bus.session import Bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.progress import working
 from pipeline.cli.watch.alarms import meet
-from pipeline.config.models import load_config
+from pipeline.config.loading import load_config
 from pipeline.errors import UserError
 from pipeline.launch.watcher import Watcher
 from pipeline.recordings.reading import read_recording
@@ -57,7 +57,7 @@ def wear(
         snapshots, damage = _recorded(recordings)
         nothing = f"no wear in {', '.join(map(str, recordings))}: a scorer notes it each minute and at the end"
     else:
-        settings, damage = load_config(config, overrides or ()), []
+        settings, damage = load_config(config, overrides or (), stages=()), []
         stop = threading.Event()
         stop_on_signals(stop)
         with Bus(settings.bus, stop, listens=False) as bus:

@@ -9,11 +9,11 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 from pipeline.bus.session import Bus
-from pipeline.config.registry import STAGES, load_stage
+from pipeline.config.registry import STAGES
 from pipeline.launch.loss_accounting import label
 from pipeline.launch.watcher import StageView, Watcher
 from pipeline.runtime.clock import REPLAY
-from pipeline.runtime.stage import Stage
+from pipeline.runtime.stage import Stage, load_stage
 from schemas.messages import Health
 from schemas.streams import StreamId, input_streams, output_streams
 from schemas.topics import alive_key
@@ -44,14 +44,16 @@ class Present:
 def conflict(present: Collection[Present], topics: Collection[str], trays: Collection[str], site: str) -> str:
     """Why a replay of these topics must not be: one line, empty if it may."""
     if "command" in topics:
-        driving = [each for each in present if each.stage.process_per_tray and "command" in each.stage.reads]
+        driving = [
+            each for each in present if STAGES[each.stage.name].scope == "tray" and "command" in each.stage.reads
+        ]
         if driving:
             return (
                 f"{driving[0].label} of site {site!r} is running, and recorded commands are not for the fans of today: "
                 "stop it, or replay on a site or bus.endpoint of its own"
             )
     for each in present:
-        if each.stage.process_per_tray and each.instance not in trays:
+        if STAGES[each.stage.name].scope == "tray" and each.instance not in trays:
             continue
         for topic in each.stage.writes:
             if topic in topics:

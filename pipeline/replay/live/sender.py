@@ -28,9 +28,9 @@ class Sender:
         """messages of each topic"""
         self._bus = bus
         self._site = site
-        self._outlets: dict[str, Publisher] = {}
-        self._clocks = {tray: self._outlet(tray_key(site, tray, "clock"), "clock") for tray in trays}
-        self._health = self._outlet(health_key(site, REPLAY, "all"), "health")
+        self._publishers: dict[str, Publisher] = {}
+        self._clocks = {tray: self._publisher(tray_key(site, tray, "clock"), "clock") for tray in trays}
+        self._health = self._publisher(health_key(site, REPLAY, "all"), "health")
         self._book = HealthBook(REPLAY, "all", time.time_ns(), may_drop=False)
         self.tell_health(StageStatus.STARTING)
         bus.declare_alive(alive_key(site, REPLAY, "all"))
@@ -45,15 +45,15 @@ class Sender:
         if tray not in self._clocks:
             raise UserError(f"the recording has a tray {tray!r}, the configuration has none of that name: see -c")
         key = tray_key(self._site, tray, entry.topic)
-        if key not in self._outlets:
-            self._outlets[key] = self._outlet(key, entry.topic)
-        self._put(self._outlets[key], entry.message, tray)
+        if key not in self._publishers:
+            self._publishers[key] = self._publisher(key, entry.topic)
+        self._put(self._publishers[key], entry.message, tray)
         self.sent[entry.topic] += 1
 
     def tell_clock(self, t_ns: int, rate: float) -> None:
         """Say what recorded time is now, and how fast it goes."""
-        for tray, outlet in self._clocks.items():
-            self._put(outlet, Clock(t_ns=t_ns, rate=rate), tray)
+        for tray, publisher in self._clocks.items():
+            self._put(publisher, Clock(t_ns=t_ns, rate=rate), tray)
 
     def tell_health(self, status: StageStatus = StageStatus.OK, problem: str = "") -> None:
         """Say how it is and how much has been sent, so that whoever missed the last messages asks for them."""
@@ -69,13 +69,13 @@ class Sender:
 
     def published(self) -> Mapping[str, int]:
         """How many messages have been sent on each key."""
-        return {key: outlet.published for key, outlet in self._outlets.items()}
+        return {key: publisher.published for key, publisher in self._publishers.items()}
 
-    def _outlet(self, key: str, topic: str) -> Publisher:
-        return self._bus.outlet(key, BY_NAME[topic], type_name(BY_NAME[topic].message), self.producer)
+    def _publisher(self, key: str, topic: str) -> Publisher:
+        return self._bus.publisher(key, BY_NAME[topic], type_name(BY_NAME[topic].message), self.producer)
 
-    def _put(self, outlet: Publisher, message: Message, tray: str) -> None:
-        outlet.put(encode(replace(message, header=Header(self.producer, outlet.published, tray))))
+    def _put(self, publisher: Publisher, message: Message, tray: str) -> None:
+        publisher.put(encode(replace(message, header=Header(self.producer, publisher.published, tray))))
 
 
 def tray_of(key: str) -> str:

@@ -15,10 +15,9 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from pipeline.config.registry import load_stage
 from pipeline.recordings.packets import Packet, decode_together, header_of
 from pipeline.replay.offline.plan import RawSpan, ResamplerSession, RowSession, RowSpan, TrayPlan
-from pipeline.runtime.stage import Context, Core
+from pipeline.runtime.stage import Context, Core, load_stage
 from schemas.blocks import cut
 from schemas.messages import Grid, InvalidReason, Message, Prediction, Raw, Score, ScorerSnapshot
 

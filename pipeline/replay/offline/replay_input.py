@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pipeline.config.models import Config, TrayConfig, load_config
+from pipeline.config.loading import load_config
+from pipeline.config.models import Config, TrayConfig
 from pipeline.recordings.order import in_order
 from pipeline.recordings.packets import Packet, PacketReading
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
@@ -136,16 +137,16 @@ def open_replay_input(
     first = first_raw(ordered, head)
     with tempfile.TemporaryDirectory() as folder:
         recorded = _recorded_twins(head, Path(folder), first)
-        own = attached_config(ordered[0], head)
+        own = attached_config(ordered[0], head, CHAIN)
         if config is not None:
-            base = load_config(config, overrides)
+            base = load_config(config, overrides, CHAIN)
         elif own is not None:
-            base = attached_config(ordered[0], head, overrides) or own
+            base = attached_config(ordered[0], head, CHAIN, overrides) or own
         else:
             any_twin = twin or next(iter(recorded.values()), None)
             if any_twin is None:
                 raise RecordingError(f"{ordered[0]}: no twin in this recording: name one with --twin FILE.onnx")
-            base = default_config(ordered[0], head, first, any_twin, overrides)
+            base = default_config(ordered[0], head, first, any_twin, overrides, CHAIN)
         trays = tuple(base.tray(name) for name in first)
         yield ReplayInput(
             paths=ordered,

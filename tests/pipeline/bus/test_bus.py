@@ -113,7 +113,7 @@ def test_who_only_looks_in_leaves_the_endpoint_to_those_who_stay(endpoint):
             assert late.came_second
 
 
-def test_an_outlet_keeps_the_newest_messages_that_fit_its_memory(endpoint):
+def test_a_publisher_keeps_the_newest_messages_that_fit_its_memory(endpoint):
     size, count = KEPT_BYTES // 4, 6
     patient = BusConfig(endpoint=endpoint, recovery_timeout_s=30)
     pause = threading.Event()
@@ -122,19 +122,19 @@ def test_an_outlet_keeps_the_newest_messages_that_fit_its_memory(endpoint):
         pause.wait(0.002)
 
     met = threading.Event()
-    with Bus(patient) as publisher, Bus(patient) as asker:
-        publisher.declare_alive(alive_key("site", "big", "all"))
+    with Bus(patient) as bus, Bus(patient) as asker:
+        bus.declare_alive(alive_key("site", "big", "all"))
         asker.watch_alive(alive_key("site", "*", "*"), lambda _key, _alive: met.set())
         assert met.wait(20)
-        outlet = publisher.outlet(KEY, TOPIC, "", "big")
+        publisher = bus.publisher(KEY, TOPIC, "", "big")
         for number in range(count):
-            outlet.put(bytes([number]) * size)
+            publisher.put(bytes([number]) * size)
         # the asker has to have heard who answers for them
         eventually(lambda: list(asker.recover(KEY, "big", count - 1, count - 1, wait)), "somebody answers")
         kept = [payload[0] for _, payload in asker.recover(KEY, "big", 0, count, wait)]
         assert kept == [2, 3, 4, 5]
         for _ in range(TOPIC.history + 1):
-            outlet.put(b"small")
+            publisher.put(b"small")
         assert len(list(asker.recover(KEY, "big", 0, 2**63, wait))) == TOPIC.history
 
 

@@ -35,9 +35,9 @@ def exchange(listener: Bus, speaker: Bus) -> bytes:
     """What the one hears of the other; said again until it is, since nobody knows when they have met."""
     heard: queue.Queue[bytes] = queue.Queue()
     listener.subscribe(KEY, lambda _key, payload: heard.put(payload))
-    outlet = speaker.outlet(KEY, BY_NAME["alarm"], "x", "speaker")
+    publisher = speaker.publisher(KEY, BY_NAME["alarm"], "x", "speaker")
     for _ in range(600):
-        outlet.put(b"hello")
+        publisher.put(b"hello")
         try:
             return heard.get(timeout=0.1)
         except queue.Empty:

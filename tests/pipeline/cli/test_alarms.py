@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from pipeline.cli.watch.alarms import Asked, standing_lines
-from pipeline.config.models import load_config
+from pipeline.config.loading import load_config
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import Core, Parts, Stage
 from schemas.messages import Action, Alarm, Diagnosis, Header, Message, Request, StageStatus, Transition

@@ -17,7 +17,8 @@ from PIL import Image
 from rich.console import Console
 
 from pipeline.cli.watch.demo import DEMO_FOLDER, _run, demo
-from pipeline.config.models import Config, load_config
+from pipeline.config.loading import load_config
+from pipeline.config.models import Config
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.errors import UserError
 from tests.support.running_chain import fantwin, is_running

@@ -18,7 +18,8 @@ from rich.console import Console
 
 from pipeline.bus.session import Bus, Publisher
 from pipeline.cli.watch.status import as_json, stage_table
-from pipeline.config.models import BusConfig, load_config
+from pipeline.config.loading import load_config
+from pipeline.config.models import BusConfig
 from pipeline.launch.watcher import StageView, Watcher
 from schemas.codec import encode, type_name
 from schemas.messages import (
@@ -71,14 +72,14 @@ class Site:
     def __init__(self, endpoint: str) -> None:
         self.buses = [Bus(BusConfig(endpoint=endpoint)) for _ in range(2)]
         stage, outside = self.buses
-        self.health = self._outlet(stage, health_key(SITE, "scorer", "all"), "health", HEALTH.header.producer)
-        self.alarm = self._outlet(stage, tray_key(SITE, TRAY, "alarm"), "alarm", ALARM.header.producer)
+        self.health = self._publisher(stage, health_key(SITE, "scorer", "all"), "health", HEALTH.header.producer)
+        self.alarm = self._publisher(stage, tray_key(SITE, TRAY, "alarm"), "alarm", ALARM.header.producer)
         stage.declare_alive(alive_key(SITE, "scorer", "all"))
         self.outside = outside
 
     @staticmethod
-    def _outlet(bus: Bus, key: str, topic: str, producer: str) -> Publisher:
-        return bus.outlet(key, BY_NAME[topic], type_name(BY_NAME[topic].message), producer)
+    def _publisher(bus: Bus, key: str, topic: str, producer: str) -> Publisher:
+        return bus.publisher(key, BY_NAME[topic], type_name(BY_NAME[topic].message), producer)
 
     def close(self) -> None:
         for bus in self.buses:

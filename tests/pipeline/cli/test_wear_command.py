@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.config.models import load_config
+from pipeline.config.loading import load_config
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import Core, Parts, Stage

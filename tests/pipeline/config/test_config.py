@@ -1,10 +1,13 @@
 """The configuration is checked before anything starts, and says what is wrong in one line."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from pipeline.config.models import ConfigError, load_config, parse_config
+from pipeline.config.loading import load_config, parse_config
+from pipeline.config.models import ConfigError
 from pipeline.devices.serial_config import SerialConfig
 
 GOOD = """
@@ -22,7 +25,7 @@ def parse(text: str, *overrides: str):
     return parse_config(text, Path("conf/fan.toml"), overrides)
 
 
-def test_a_good_file_gives_every_stage_its_section():
+def test_a_good_file_gives_every_enabled_stage_its_section():
     config = parse(GOOD)
     assert config.site == "lab"
     assert config.tray("a").fans == 8
@@ -56,6 +59,32 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(text, words):
     assert "\n" not in line
     for word in words:
         assert word in line
+
+
+def test_launcher_stages_says_which_stages_are_enabled():
+    config = parse(GOOD, 'launcher.stages=["recorder", "acquisition"]')
+    assert config.stages == ("acquisition", "recorder"), "in the order of the data flow"
+    assert set(config.sections) == {"acquisition", "recorder"}
+
+
+def test_only_the_sections_of_the_stages_asked_for_are_checked():
+    wrong = GOOD + "on_dealy_s = 1\n"
+    config = parse_config(wrong, Path("conf/fan.toml"), stages=("recorder",))
+    assert set(config.sections) == {"recorder"}
+    with pytest.raises(ConfigError, match="unknown key 'scorrer'"):
+        parse_config(GOOD.replace("[scorer]", "[scorrer]"), Path("conf/fan.toml"), stages=())
+
+
+def test_only_the_stages_whose_sections_are_checked_are_imported(tmp_path):
+    path = tmp_path / "fan.toml"
+    path.write_text(GOOD)
+    code = (
+        "import sys; from pathlib import Path; from pipeline.config.loading import load_config\n"
+        f"load_config(Path({str(path)!r}), stages=('resampler',))\n"
+        "print(sorted(name for name in sys.modules if name.startswith('stages.')))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "['stages.resampler']"
 
 
 def test_two_trays_of_one_name_are_refused():

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.config.models import ConfigError, load_config, parse_config
+from pipeline.config.loading import load_config, parse_config
+from pipeline.config.models import ConfigError
 from pipeline.devices.sample_source import SourceEvent
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.source_kinds import SOURCE_KINDS, SourceKind

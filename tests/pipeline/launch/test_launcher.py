@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.config.models import load_config
+from pipeline.config.loading import load_config
 from pipeline.errors import UserError
 from pipeline.launch.launcher import Launcher, Outcome
 from pipeline.launch.processes import process_list

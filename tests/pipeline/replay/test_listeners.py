@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
-from pipeline.config.registry import load_stage
 from pipeline.replay.live.listeners import Listeners, Present, conflict
+from pipeline.runtime.stage import load_stage
 from schemas.codec import encode, type_name
 from schemas.messages import Header, Health, Input, Output, StageStatus
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
@@ -60,22 +60,24 @@ class FakeStage:
         self.stage = stage
         self.producer = f"{stage}-1"
         bus.declare_alive(alive_key("s", stage, "all"))
-        self.outlet = bus.outlet(health_key("s", stage, "all"), BY_NAME["health"], type_name(Health), self.producer)
+        self.publisher = bus.publisher(
+            health_key("s", stage, "all"), BY_NAME["health"], type_name(Health), self.producer
+        )
 
     def say(self, *inputs: Input, published: int = 0, lost: int = 0) -> None:
         out = load_stage(self.stage).writes[:1]
         health = Health(
-            header=Header(self.producer, self.outlet.published, ""),
+            header=Header(self.producer, self.publisher.published, ""),
             stage=self.stage,
             instance="all",
             status=StageStatus.OK,
-            t_ns=self.outlet.published,
+            t_ns=self.publisher.published,
             uptime_s=0.0,
             inputs=inputs,
             outputs=tuple(Output(key=tray_key("s", "a", name), published=published) for name in out),
             lost=lost,
         )
-        self.outlet.put(encode(health))
+        self.publisher.put(encode(health))
 
 
 def line(key: str, producer: str, received: int, first: int = 0, missing: int = 0) -> Input:

@@ -90,6 +90,7 @@ def config(endpoint, tmp_path) -> Config:
         run_folder=tmp_path,
         bus=BusConfig(endpoint=endpoint),
         launcher=LauncherConfig(),
+        stages=("acquisition", "resampler"),
         trays=tuple(TrayConfig(name=name, fans=1) for name in (TRAY_A, TRAY_B)),
         sections={"resampler": ToyConfig(), "acquisition": ToyConfig()},
     )
@@ -108,8 +109,8 @@ class Bench:
         self.bus = Bus(config.bus)
         self.bus.subscribe(tray_key("s", "*", "grid"), self._hear(Grid))
         self.bus.subscribe(health_key("s", "*", "*"), self._hear(Health))
-        self.outlet = {
-            name: self.bus.outlet(tray_key("s", name, "raw"), BY_NAME["raw"], type_name(Raw), "feeder")
+        self.publisher = {
+            name: self.bus.publisher(tray_key("s", name, "raw"), BY_NAME["raw"], type_name(Raw), "feeder")
             for name in (TRAY_A, TRAY_B)
         }
         self.runner = Runner(stage, config, tray, self.stop)
@@ -129,8 +130,8 @@ class Bench:
         return lambda key, payload: self.heard.put((key, decode(kind, payload)))
 
     def feed(self, tray: str, t_ns: int) -> None:
-        outlet = self.outlet[tray]
-        outlet.put(encode(replace(raw(t_ns), header=Header("feeder", outlet.published, tray))))
+        publisher = self.publisher[tray]
+        publisher.put(encode(replace(raw(t_ns), header=Header("feeder", publisher.published, tray))))
 
     def next(self, kind: type[Message]) -> Any:
         while True:
@@ -208,8 +209,8 @@ class Answers(Passer):
 
 
 def send_once(bus: Bus, producer: str, t_ns: int) -> None:
-    outlet = bus.outlet(tray_key("s", TRAY_A, "command"), BY_NAME["command"], type_name(Command), producer)
-    outlet.put(encode(Command(header=Header(producer, 0, TRAY_A), fans=1, t_ns=t_ns)))
+    publisher = bus.publisher(tray_key("s", TRAY_A, "command"), BY_NAME["command"], type_name(Command), producer)
+    publisher.put(encode(Command(header=Header(producer, 0, TRAY_A), fans=1, t_ns=t_ns)))
 
 
 def test_a_side_input_becomes_no_cause_and_does_not_count_as_taken(config):
@@ -264,7 +265,7 @@ def test_health_accounts_for_inputs_outputs_counters_and_losses(config):
     bench = Bench(toy(), config)
     for t_ns in range(5):
         bench.feed(TRAY_A, t_ns)
-    bench.outlet[TRAY_A].published += 3  # three that were never sent, nor kept
+    bench.publisher[TRAY_A].published += 3  # three that were never sent, nor kept
     bench.feed(TRAY_A, 9)
     health = bench.health_with(lambda h: any(line.received == 6 for line in h.inputs))
     bench.end()
@@ -277,7 +278,7 @@ def test_health_accounts_for_inputs_outputs_counters_and_losses(config):
 
 def test_bytes_that_are_no_message_are_counted_and_harm_nothing(config):
     bench = Bench(toy(), config)
-    bench.outlet[TRAY_A]._publisher.put(b"\xff\xff\xff")
+    bench.publisher[TRAY_A]._publisher.put(b"\xff\xff\xff")
     bench.feed(TRAY_A, 1)
     assert bench.next(Grid).t_ns.tolist() == [1]
     assert {c.name: c.value for c in bench.end().counters}["lost_undecodable"] == 1
@@ -285,7 +286,7 @@ def test_bytes_that_are_no_message_are_counted_and_harm_nothing(config):
 
 def test_what_a_source_still_delivers_when_told_to_stop_is_handled_before_the_end(config):
     items = [raw(t_ns) for t_ns in range(50)]
-    stage = toy(lambda _context: Parts(Passer(), Burst(items)), process_per_tray=True, name="acquisition")
+    stage = toy(lambda _context: Parts(Passer(), Burst(items)), name="acquisition")
     bench = Bench(stage, config, TRAY_A)
     last = bench.end()
     grids = []
@@ -298,8 +299,8 @@ def test_what_a_source_still_delivers_when_told_to_stop_is_handled_before_the_en
 
 def test_messages_of_trays_that_are_not_configured_are_not_read(config):
     bench = Bench(toy(reads=("command",)), config)
-    outlet = bench.bus.outlet(tray_key("s", "stranger", "command"), BY_NAME["command"], type_name(Command), "x")
-    outlet.put(encode(Command(header=Header("x", 0, "stranger"), fans=1, t_ns=0)))
+    publisher = bench.bus.publisher(tray_key("s", "stranger", "command"), BY_NAME["command"], type_name(Command), "x")
+    publisher.put(encode(Command(header=Header("x", 0, "stranger"), fans=1, t_ns=0)))
     last = bench.end()
     assert last.inputs == ()
 
@@ -308,15 +309,15 @@ def test_a_stage_that_may_drop_asks_again_for_what_is_said_once(config):
     stage = toy(lambda _context: Parts(Deaf()), reads=("command", "raw"), may_drop=True)
     bench = Bench(stage, config)
     for topic, kind in (("command", Command), ("raw", Raw)):
-        outlet = bench.bus.outlet(tray_key("s", TRAY_A, topic), BY_NAME[topic], type_name(kind), "x")
+        publisher = bench.bus.publisher(tray_key("s", TRAY_A, topic), BY_NAME[topic], type_name(kind), "x")
         for sequence in (0, 1):
             header = Header("x", sequence, TRAY_A)
             message = Command(header=header, fans=1, t_ns=0) if kind is Command else replace(raw(1), header=header)
             if sequence == 0:  # sent before this stage was there
-                outlet._kept.append((0, encode(message)))
-                outlet.published = 1
+                publisher._kept.append((0, encode(message)))
+                publisher.published = 1
             else:
-                outlet.put(encode(message))
+                publisher.put(encode(message))
     inputs = bench.health_with(lambda health: len(health.inputs) == 2).inputs
     bench.end()
     assert {line.key.split("/")[-1]: line.received for line in inputs} == {"command": 2, "raw": 1}
@@ -418,9 +419,9 @@ def test_an_orphaned_stage_goes_on_until_those_it_reads_from_have_ended(config):
             outputs=(Output(key=tray_key("s", TRAY_A, "raw"), published=0),),
         )
         feeder.declare_alive(alive_key("s", *stage))
-        outlet = feeder.outlet(key, BY_NAME["health"], type_name(Health), "feeder")
+        publisher = feeder.publisher(key, BY_NAME["health"], type_name(Health), "feeder")
         while not any(map(bench.runner._is_fed_by, set(bench.runner._alive))):  # until they have met
-            outlet.put(encode(health))
+            publisher.put(encode(health))
             bench.next(Health)
         bench.runner.orphaned.set()
         last = None

@@ -36,8 +36,8 @@ class Replay:
     def __init__(self, config: Config) -> None:
         self.bus = Bus(config.bus)
         self.bus.declare_alive(alive_key("s", "replay", "all"))
-        self.clock = self.bus.outlet(tray_key("s", TRAY_A, "clock"), BY_NAME["clock"], type_name(Clock), "replay-1")
-        self.health = self.bus.outlet(
+        self.clock = self.bus.publisher(tray_key("s", TRAY_A, "clock"), BY_NAME["clock"], type_name(Clock), "replay-1")
+        self.health = self.bus.publisher(
             health_key("s", "replay", "all"), BY_NAME["health"], type_name(Health), "replay-1"
         )
 
@@ -100,16 +100,16 @@ def test_latency_is_told_in_the_time_of_the_replay_and_not_at_all_where_that_sta
 
 def test_a_stage_with_a_device_takes_nothing_of_a_replay_and_keeps_the_hosts_time(config):
     core = Ticker()
-    declared = {"process_per_tray": True, "name": "acquisition", "reads": ("command",)}
+    declared = {"name": "acquisition", "reads": ("command",)}
     bench = Bench(toy(lambda _context: Parts(core, Burst([])), **declared), config, TRAY_A)
-    outlets = {
-        who: bench.bus.outlet(tray_key("s", TRAY_A, "command"), BY_NAME["command"], type_name(Command), who)
+    publishers = {
+        who: bench.bus.publisher(tray_key("s", TRAY_A, "command"), BY_NAME["command"], type_name(Command), who)
         for who in ("replay-all-1", "command-1")
     }
     replay = Replay(config)
     replay.tell(1000)
-    for who, outlet in outlets.items():
-        outlet.put(encode(Command(header=Header(who, 0, TRAY_A), fans=3 if who == "replay-all-1" else 1, t_ns=0)))
+    for who, publisher in publishers.items():
+        publisher.put(encode(Command(header=Header(who, 0, TRAY_A), fans=3 if who == "replay-all-1" else 1, t_ns=0)))
     health = bench.health_with(lambda h: len(h.inputs) == 2)
     replay.bus.close()
     bench.end()

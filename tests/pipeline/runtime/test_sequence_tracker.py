@@ -59,34 +59,34 @@ def health(published: int, producer: str = "p") -> Health:
 
 def test_a_gap_is_filled_in_order_from_what_the_producer_keeps():
     producer = Producer(range(10))
-    inlet = SequenceTracker(producer.recover)
-    assert sequences(inlet.accept(packet(0))) == [0]
-    assert sequences(inlet.accept(packet(4))) == [1, 2, 3, 4]
+    tracker = SequenceTracker(producer.recover)
+    assert sequences(tracker.accept(packet(0))) == [0]
+    assert sequences(tracker.accept(packet(4))) == [1, 2, 3, 4]
     assert producer.asked == [(1, 3)]
-    (line,) = inlet.inputs()
+    (line,) = tracker.inputs()
     assert (line.received, line.missing, line.duplicated, line.next_sequence) == (5, 0, 0, 5)
 
 
 def test_what_the_producer_no_longer_keeps_is_counted_missing():
-    inlet = SequenceTracker(Producer([2]).recover)
-    list(inlet.accept(packet(0)))
-    assert sequences(inlet.accept(packet(5))) == [2, 5]
-    (line,) = inlet.inputs()
+    tracker = SequenceTracker(Producer([2]).recover)
+    list(tracker.accept(packet(0)))
+    assert sequences(tracker.accept(packet(5))) == [2, 5]
+    (line,) = tracker.inputs()
     assert (line.received, line.missing) == (3, 3)
 
 
 def test_a_message_that_comes_again_is_dropped_and_counted():
-    inlet = SequenceTracker(Producer([]).recover)
-    list(inlet.accept(packet(0)))
-    assert sequences(inlet.accept(packet(0))) == []
-    assert inlet.inputs()[0].duplicated == 1
+    tracker = SequenceTracker(Producer([]).recover)
+    list(tracker.accept(packet(0)))
+    assert sequences(tracker.accept(packet(0))) == []
+    assert tracker.inputs()[0].duplicated == 1
 
 
 def test_a_late_joiner_gets_what_is_still_kept_and_counts_no_loss_for_what_is_history():
     producer = Producer([98, 99])
-    inlet = SequenceTracker(producer.recover)
-    assert sequences(inlet.accept(packet(100))) == [98, 99, 100]
-    assert inlet.inputs()[0].missing == 0
+    tracker = SequenceTracker(producer.recover)
+    assert sequences(tracker.accept(packet(100))) == [98, 99, 100]
+    assert tracker.inputs()[0].missing == 0
 
 
 def test_a_late_joiner_asks_for_no_more_than_a_producer_keeps():
@@ -97,43 +97,43 @@ def test_a_late_joiner_asks_for_no_more_than_a_producer_keeps():
 
 
 def test_a_new_session_of_a_producer_starts_its_own_sequence():
-    inlet = SequenceTracker(Producer([]).recover)
-    list(inlet.accept(packet(7, "old")))
-    assert sequences(inlet.accept(packet(0, "new"))) == [0]
-    assert all(line.duplicated == 0 for line in inlet.inputs())
+    tracker = SequenceTracker(Producer([]).recover)
+    list(tracker.accept(packet(7, "old")))
+    assert sequences(tracker.accept(packet(0, "new"))) == [0]
+    assert all(line.duplicated == 0 for line in tracker.inputs())
 
 
 def test_of_many_producers_the_latest_are_known_by_name_and_the_others_counted_together():
-    inlet = SequenceTracker(Producer([]).recover)
-    list(inlet.accept(packet(0, "controller")))
+    tracker = SequenceTracker(Producer([]).recover)
+    list(tracker.accept(packet(0, "controller")))
     for number in range(100):
-        list(inlet.accept(packet(0, f"operator-{number}")))
-        list(inlet.accept(packet(3, f"operator-{number}")))
-        assert sequences(inlet.accept(packet(number + 1, "controller"))) == [number + 1], "who speaks stays known"
-    *named, others = inlet.inputs()
+        list(tracker.accept(packet(0, f"operator-{number}")))
+        list(tracker.accept(packet(3, f"operator-{number}")))
+        assert sequences(tracker.accept(packet(number + 1, "controller"))) == [number + 1], "who speaks stays known"
+    *named, others = tracker.inputs()
     assert {line.producer for line in named} == {"controller", *(f"operator-{number}" for number in range(37, 100))}
     assert (others.producer, others.received, others.missing) == ("", 2 * 37, 2 * 37)
-    assert sum(line.received for line in inlet.inputs()) == 301
+    assert sum(line.received for line in tracker.inputs()) == 301
 
 
 def test_health_shows_a_last_message_that_never_came():
     producer = Producer(range(3))
-    inlet = SequenceTracker(producer.recover)
-    list(inlet.accept(packet(0)))
-    assert sequences(inlet.reconcile(health(3), [KEY])) == [1, 2]
-    assert sequences(inlet.reconcile(health(3), [KEY])) == []
+    tracker = SequenceTracker(producer.recover)
+    list(tracker.accept(packet(0)))
+    assert sequences(tracker.reconcile(health(3), [KEY])) == [1, 2]
+    assert sequences(tracker.reconcile(health(3), [KEY])) == []
 
 
 def test_health_shows_a_first_message_that_never_came():
-    inlet = SequenceTracker(Producer([0]).recover)
-    assert sequences(inlet.reconcile(health(1), [KEY])) == [0]
+    tracker = SequenceTracker(Producer([0]).recover)
+    assert sequences(tracker.reconcile(health(1), [KEY])) == [0]
 
 
 def test_of_a_producer_that_was_there_before_its_first_message_all_are_accounted_for():
-    inlet = SequenceTracker(Producer([]).recover)
-    assert sequences(inlet.reconcile(health(0), [KEY])) == []
-    assert sequences(inlet.accept(packet(3))) == [3]
-    (line,) = inlet.inputs()
+    tracker = SequenceTracker(Producer([]).recover)
+    assert sequences(tracker.reconcile(health(0), [KEY])) == []
+    assert sequences(tracker.accept(packet(3))) == [3]
+    (line,) = tracker.inputs()
     assert (line.received, line.missing, line.next_sequence) == (1, 3, 4)
 
 
@@ -144,10 +144,10 @@ def test_health_about_keys_that_are_not_read_is_ignored():
 
 
 def test_a_stage_that_may_drop_counts_and_asks_nobody():
-    inlet = SequenceTracker(None)
-    list(inlet.accept(packet(0)))
-    assert sequences(inlet.accept(packet(5))) == [5]
-    assert inlet.inputs()[0].missing == 4
+    tracker = SequenceTracker(None)
+    list(tracker.accept(packet(0)))
+    assert sequences(tracker.accept(packet(5))) == [5]
+    assert tracker.inputs()[0].missing == 4
 
 
 @given(
@@ -155,10 +155,10 @@ def test_a_stage_that_may_drop_counts_and_asks_nobody():
     kept=st.sets(st.integers(0, 60)),
 )
 def test_whatever_arrives_each_message_comes_once_in_order_and_the_account_adds_up(arriving, kept):
-    inlet = SequenceTracker(Producer(kept).recover)
-    out = [s for sequence in arriving for s in sequences(inlet.accept(packet(sequence)))]
+    tracker = SequenceTracker(Producer(kept).recover)
+    out = [s for sequence in arriving for s in sequences(tracker.accept(packet(sequence)))]
     assert out == sorted(set(out))
     if arriving:
-        (line,) = inlet.inputs()
+        (line,) = tracker.inputs()
         assert line.received == len(out)
         assert line.missing == line.next_sequence - out[0] - len(out)

@@ -1,0 +1,151 @@
+"""Loads the configuration: one TOML file for all stages, checked before anything starts.
+
+Sections `bus`, `launcher` and `[[tray]]` are the pipeline's own; every other section has the name of a stage and is
+checked by the model that the stage declares. Unknown keys are refused with the nearest known one. Only the stages whose
+sections are checked are imported.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+from pydantic import BaseModel, Field, ValidationError
+
+from pipeline.config.models import BusConfig, Config, ConfigError, LauncherConfig, Name, Section, TrayConfig, nearest
+from pipeline.config.registry import STAGES
+
+
+class _File(Section):
+    site: Name = "site"
+    run_folder: Path = Path("runs")
+    bus: BusConfig = BusConfig()
+    launcher: LauncherConfig = LauncherConfig()
+    tray: tuple[TrayConfig, ...] = Field(min_length=1)
+
+
+def load_config(path: Path, overrides: Iterable[str] = (), stages: Iterable[str] | None = None) -> Config:
+    """Read and check a configuration file.
+
+    Args:
+        path: the file.
+        overrides: keys set on top of it, `key=value`, such as `scorer.on_delay_s=1.0`.
+        stages: the stages whose sections are checked, and which are imported for that; None: all enabled stages.
+
+    Raises:
+        ConfigError: the file is missing, is not UTF-8, is not TOML, or holds a wrong key or value.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot read the configuration: {error.strerror}; give one with -c FILE") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: the configuration is not UTF-8 (byte {error.start}); save it as UTF-8") from error
+    return parse_config(text, path, overrides, stages)
+
+
+def parse_config(text: str, path: Path, overrides: Iterable[str] = (), stages: Iterable[str] | None = None) -> Config:
+    """Check the text of a configuration; `path` names it in errors and is where relative paths start.
+
+    Raises:
+        ConfigError: see `load_config`.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    overrides = tuple(overrides)
+    for override in overrides:
+        _override(table, override)
+    own = {key: value for key, value in table.items() if key not in STAGES}
+    for key in own:
+        if key not in _File.model_fields:
+            raise ConfigError(f"{path}: unknown key {key!r}{nearest(key, [*_File.model_fields, *STAGES])}")
+    file = _check(_File, own, path, "")
+    enabled = enabled_stages(file.launcher, table)
+    sections = {
+        name: _check(STAGES[name].load().config, table.get(name, {}), path, name)
+        for name in (enabled if stages is None else stages)
+    }
+    names = [tray.name for tray in file.tray]
+    if len(set(names)) != len(names):
+        raise ConfigError(f"{path}: two trays have the same name; names must differ: {', '.join(names)}")
+    folder = path.parent
+    return Config(
+        path=path,
+        text=text,
+        overrides=overrides,
+        site=file.site,
+        run_folder=Path(os.path.normpath(folder / file.run_folder)),
+        bus=file.bus,
+        launcher=file.launcher,
+        trays=file.tray,
+        stages=enabled,
+        sections=sections,
+    )
+
+
+def enabled_stages(launcher: LauncherConfig, table: Mapping[str, Any]) -> tuple[str, ...]:
+    """The stages that a configuration enables, in the order of the data flow. `launcher.stages` overrides the rows'
+    `enabled_by`; `table` is the whole configuration."""
+    if launcher.stages is not None:
+        return tuple(name for name in STAGES if name in launcher.stages)
+    return tuple(name for name, row in STAGES.items() if row.enabled_by == "default" or name in table)
+
+
+def _override(table: dict[str, Any], override: str) -> None:
+    """Set one dotted key; `tray.0.port` is the port of the first tray."""
+    dotted, equals, value_text = override.partition("=")
+    if not equals:
+        raise ConfigError(f"--set {override}: write KEY=VALUE, for example --set scorer.on_delay_s=1.0")
+    try:
+        value = tomllib.loads(f"value = {value_text}")["value"]
+    except tomllib.TOMLDecodeError as error:
+        value = value_text.strip()  # a bare word is a string
+        if value.startswith(("'", '"')):
+            raise ConfigError(f"--set {override}: not a TOML string: {error}; write it in double quotes") from error
+    here: Any = table
+    *parents, last = (int(part) if part.isascii() and part.isdecimal() else part for part in dotted.strip().split("."))
+    try:
+        for part in parents:
+            here = here[part] if isinstance(part, int) else here.setdefault(part, {})
+        here[last] = value
+    except (IndexError, TypeError, AttributeError) as error:
+        raise ConfigError(f"--set {override}: the configuration has no such place") from error
+
+
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+def _check(model: type[_Model], values: Any, path: Path, section: str) -> _Model:
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: {section!r} must be a section, write [{section}]")
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_first_problem(error, model, section)}") from error
+
+
+def _first_problem(error: ValidationError, model: type[BaseModel], section: str) -> str:
+    # a misspelt key is both unknown and missing: the unknown one says what to correct
+    first = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
+    where = ".".join(str(part) for part in ((section,) if section else ()) + first["loc"])
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    if first["type"] == "extra_forbidden":
+        known = _keys_at(model, first["loc"][:-1])
+        return f"unknown key {where!r}{nearest(str(first['loc'][-1]), known)}{more}"
+    if first["type"] == "missing":
+        return f"{where!r} is missing{more}"
+    message = first["msg"].removeprefix("Value error, ")
+    return f"{where} = {first['input']!r}: {message[0].lower()}{message[1:]}{more}"
+
+
+def _keys_at(model: type[BaseModel], location: Iterable[int | str]) -> list[str]:
+    """The keys allowed at a place in a nested model."""
+    here: Any = model
+    for part in location:
+        here = here.model_fields[part].annotation if isinstance(part, str) else get_args(here)[0]
+    return [*here.model_fields, *getattr(here, "short_form_keys", ())]
