@@ -1,1 +1,1 @@
-"""Simulated fans, trays and faults whose truth is known: used by demo, tests and benches."""
+"""Simulated fans, trays and faults with known ground truth, for the demo, tests and benches."""

@@ -1,7 +1,7 @@
-"""What the fans are told to do when nobody tells them: profiles of command over time.
+"""Command profiles over time, for fans that nobody commands.
 
-A profile is a function of time, `command(t_s) -> (fans,)`, within `low..high`; each fan has its own, and the same seed
-gives the same. Profiles repeat with their period, without a jump unless jumping is what they are for.
+A profile is a function of time, `command(t_s) -> (fans,)`, within `low..high`. Each fan has its own; the same seed
+gives the same commands. Profiles are periodic; only those made of steps jump where a period begins again.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.errors import TwinError
+from simulation.errors import SimulationError
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ class Excitation(Protocol):
 
 
 class Staircase:
-    """Up in equal steps and down again, each step held; the fans climb one after the other."""
+    """Up in equal steps and down again, each step held; each fan starts at a step of its own."""
 
     def __init__(self, fans: int, seed: int, low: float, high: float, steps: int = 8, hold_s: float = 4.0) -> None:
         climb = np.linspace(low, high, steps + 1)
@@ -69,11 +69,11 @@ class Multisine:
         self._low, self._high = low, high
         samples_s = np.linspace(0.0, period_s, 40 * int(self.HARMONICS[-1]))
         waves = np.stack([self._wave(t_s) for t_s in samples_s])
-        self._bottom, self._top = waves.min(axis=0), waves.max(axis=0)
+        self._minimum, self._maximum = waves.min(axis=0), waves.max(axis=0)
 
     def command(self, t_s: float) -> Array:
         """(fans,) commands at t_s; the extremes over a period are low and high."""
-        share = (self._wave(t_s) - self._bottom) / (self._top - self._bottom)
+        share = (self._wave(t_s) - self._minimum) / (self._maximum - self._minimum)
         return self._low + (self._high - self._low) * np.clip(share, 0.0, 1.0)
 
     def _wave(self, t_s: float) -> Array:
@@ -101,11 +101,13 @@ class Chirp:
     def command(self, t_s: float) -> Array:
         """(fans,) commands at t_s."""
         sweeps, into_s = divmod(t_s, 2.0 * self._sweep_s)
-        whole = self._cycles(self._sweep_s)
+        sweep_cycles = self._cycles(self._sweep_s)
         falling_s = into_s - self._sweep_s
-        # On the way down the sweep runs backwards: what was left to go is subtracted from the whole.
-        cycles = self._cycles(into_s) if falling_s < 0.0 else 2.0 * whole - self._cycles(self._sweep_s - falling_s)
-        turn_rad = 2.0 * np.pi * (2.0 * whole * sweeps + cycles)
+        # On the way down the sweep runs backwards: the remaining cycles are subtracted from the total.
+        cycles = (
+            self._cycles(into_s) if falling_s < 0.0 else 2.0 * sweep_cycles - self._cycles(self._sweep_s - falling_s)
+        )
+        turn_rad = 2.0 * np.pi * (2.0 * sweep_cycles * sweeps + cycles)
         return self._centre + self._amplitude * np.sin(turn_rad + self._phase_rad)
 
     def _cycles(self, into_s: float) -> float:
@@ -113,7 +115,7 @@ class Chirp:
 
 
 class Manual:
-    """A person at the knobs: turns one slowly to somewhere, leaves it for a while, turns again; each fan on its own."""
+    """A person turning a knob per fan: slow turns to random levels, with pauses between them."""
 
     def __init__(
         self,
@@ -126,7 +128,7 @@ class Manual:
         hold_s: tuple[float, float] = (1.0, 6.0),
     ) -> None:
         self._period_s = period_s
-        # The knobs of all fans lie on one line of time, one after the other: a single interpolation serves them all.
+        # The profiles of all fans follow one another on one time axis, so that one interpolation serves them all.
         self._offset_s = np.arange(fans) * period_s
         times, levels = [], []
         for offset_s, rng in zip(self._offset_s, np.random.default_rng(seed).spawn(fans), strict=True):
@@ -148,15 +150,15 @@ def _knob(
     turn_s: tuple[float, float],
     hold_s: tuple[float, float],
 ) -> tuple[Array, Array]:
-    """Corners of one knob's movement: times (n,) from 0 up to, not including, period_s, and levels (n,).
+    """Breakpoints of one profile: times (n,) from 0 to below period_s, and levels (n,).
 
-    The knob ends where it began, so that the next period joins without a jump.
+    The last level is the first one, so that the next period continues without a jump.
     """
     turns = int(period_s / (turn_s[0] + hold_s[0])) + 1
     durations_s = np.stack((rng.uniform(*hold_s, size=turns), rng.uniform(*turn_s, size=turns)), axis=1)
     corners_s = np.concatenate(([0.0], np.cumsum(durations_s)))
     levels = np.repeat(rng.uniform(low, high, size=turns + 1), 2)[: len(corners_s)]
-    # Whole turns that end a turn's time before the end, then back to the first level.
+    # Only turns that leave time for the last one, which goes back to the first level.
     count = 2 * int(np.searchsorted(corners_s[::2], period_s - turn_s[1])) - 1
     last_s = np.nextafter(period_s, 0.0)
     return np.append(corners_s[:count], last_s), np.append(levels[:count], levels[0])
@@ -173,15 +175,15 @@ LOW, HIGH = 0.1, 0.95
 
 
 def excitation(profile: str, fans: int, seed: int, low: float = LOW, high: float = HIGH) -> Excitation:
-    """The profile of that name.
+    """The profile called `profile`.
 
     Raises:
-        TwinError: no such profile, or low is not below high.
+        SimulationError: no such profile, or low is not below high.
     """
     if profile not in PROFILES:
         close = difflib.get_close_matches(profile, PROFILES, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(PROFILES)}"
-        raise TwinError(f"unknown profile {profile!r}; {hint}")
+        raise SimulationError(f"unknown profile {profile!r}; {hint}")
     if not low < high:
-        raise TwinError(f"commands from {low:g} to {high:g}: the first must be the smaller")
+        raise SimulationError(f"commands from {low:g} to {high:g}: the first must be smaller")
     return PROFILES[profile](fans, seed, low, high)

@@ -1,6 +1,6 @@
 """Faults of the simulated tray, on a schedule.
 
-Each works on one fan from `start_s` until `stop_s`, and is wholly gone then. `size` means, by kind:
+Each acts on one fan from `start_s` until `stop_s`, and leaves nothing behind. The meaning of `size` by kind:
 
 | kind | what it is | size | default |
 |---|---|---|---|
@@ -9,7 +9,7 @@ Each works on one fan from `start_s` until `stop_s`, and is wholly gone then. `s
 | wear | worn bearing | sliding friction added at stop, V; grows linearly from 0 at start | 0.8 |
 | supply | supply sag | factor on the supply voltage | 0.85 |
 | tacho-stuck | tacho repeats its last reading | (none) | |
-| tacho-dropout | tacho gives no reading (NaN) | share of readings that are missing, 0 to 1 | 1.0 |
+| tacho-dropout | tacho gives no reading (NaN) | share of missing readings, 0 to 1 | 1.0 |
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from simulation.errors import SimulationError
 from simulation.plant import Disturbance
-from twin.errors import TwinError
 
 
 @dataclass(frozen=True)
@@ -54,42 +54,42 @@ class Fault:
     size: float | None = None
 
     def active(self, t_s: float) -> bool:
-        """Whether it is there at t_s."""
+        """Whether the fault acts at t_s."""
         return self.start_s <= t_s < self.stop_s
 
     def size_at(self, t_s: float) -> float:
-        """Its size while it is there; that of wear grows."""
+        """Its size at t_s while it is active; that of wear grows linearly."""
         assert self.size is not None
-        grown = (t_s - self.start_s) / (self.stop_s - self.start_s) if self.kind == "wear" else 1.0
-        return self.size * grown
+        growth = (t_s - self.start_s) / (self.stop_s - self.start_s) if self.kind == "wear" else 1.0
+        return self.size * growth
 
 
 def parse_fault(text: str) -> Fault:
     """A fault as written on the command line: `KIND:fan=N[,start=S][,stop=S][,size=X]`.
 
     Raises:
-        TwinError: one line that says which part is wrong, with the nearest known word.
+        SimulationError: one line that says which part is wrong, with the most similar known word.
     """
     kind, _, settings = text.partition(":")
     if kind not in KINDS:
-        raise TwinError(f"fault {text!r}: unknown kind {kind!r}; {_nearest(kind, KINDS)}")
+        raise SimulationError(f"fault {text!r}: unknown kind {kind!r}; {_nearest(kind, KINDS)}")
     values: dict[str, float] = {}
     for setting in filter(None, settings.split(",")):
         key, _, number = setting.partition("=")
         if key not in KEYS:
-            raise TwinError(f"fault {text!r}: unknown key {key!r}; {_nearest(key, KEYS)}")
+            raise SimulationError(f"fault {text!r}: unknown key {key!r}; {_nearest(key, KEYS)}")
         if key in values:
-            raise TwinError(f"fault {text!r}: {key} is given twice")
+            raise SimulationError(f"fault {text!r}: {key} is given twice")
         try:
             values[key] = float(number)
         except ValueError as error:
-            raise TwinError(f"fault {text!r}: {key} = {number!r} is not a number") from error
+            raise SimulationError(f"fault {text!r}: {key} = {number!r} is not a number") from error
         if not math.isfinite(values[key]):
-            raise TwinError(f"fault {text!r}: {key} = {number} must be finite")
+            raise SimulationError(f"fault {text!r}: {key} = {number} must be finite")
     if "fan" not in values:
-        raise TwinError(f"fault {text!r}: say which fan, counted from 0: {kind}:fan=0")
+        raise SimulationError(f"fault {text!r}: fan is missing; fans count from 0, for example {kind}:fan=0")
     if values["fan"] != int(values["fan"]) or values["fan"] < 0:
-        raise TwinError(f"fault {text!r}: fan must be a whole number from 0 on")
+        raise SimulationError(f"fault {text!r}: fan must be a whole number from 0 on")
     fault = Fault(
         kind,
         int(values["fan"]),
@@ -104,31 +104,35 @@ def parse_fault(text: str) -> Fault:
 def _check(fault: Fault, where: str) -> None:
     kind = KINDS[fault.kind]
     if fault.start_s < 0.0:
-        raise TwinError(f"{where}: start must not be negative")
+        raise SimulationError(f"{where}: start must not be negative")
     if fault.stop_s <= fault.start_s:
-        raise TwinError(f"{where}: stop must come after start")
+        raise SimulationError(f"{where}: stop must come after start")
     if fault.size is None:
         return
     if kind.default_size is None:
-        raise TwinError(f"{where}: {fault.kind} has no size; leave it out")
+        raise SimulationError(f"{where}: {fault.kind} has no size; leave it out")
     if not kind.smallest <= fault.size <= kind.largest:
         upto = f" to {kind.largest:g}" if math.isfinite(kind.largest) else " on"
-        raise TwinError(f"{where}: size = {fault.size:g}; give one from {kind.smallest:g}{upto}")
+        raise SimulationError(f"{where}: size = {fault.size:g}; give one from {kind.smallest:g}{upto}")
 
 
 def check_schedule(faults: Iterable[Fault], fans: int, duration_s: float) -> None:
-    """Whether these faults fit a tray of so many fans that runs so long.
+    """Check that these faults fit a tray of `fans` fans that runs for `duration_s`.
 
     Raises:
-        TwinError: a fan that is not there, wear without an end to grow towards, or a start after the end.
+        SimulationError: a fan does not exist, wear has no end, or a fault starts after the end.
     """
     for fault in faults:
         if fault.fan >= fans:
-            raise TwinError(f"{fault.kind} fault: fan {fault.fan} is not there; the tray's are 0 to {fans - 1}")
+            raise SimulationError(
+                f"{fault.kind} fault: fan {fault.fan} does not exist; the tray has fans 0 to {fans - 1}"
+            )
         if fault.start_s >= duration_s:
-            raise TwinError(f"{fault.kind} fault: start = {fault.start_s:g} s is after the end at {duration_s:g} s")
+            raise SimulationError(
+                f"{fault.kind} fault: start = {fault.start_s:g} s is after the end at {duration_s:g} s"
+            )
         if fault.kind == "wear" and math.isinf(fault.stop_s):
-            raise TwinError("wear fault: give stop=S, when it has grown to its size")
+            raise SimulationError("wear fault: stop is missing; give stop=S, the time at which it reaches its size")
 
 
 def _nearest(word: str, known: Iterable[str]) -> str:
@@ -137,15 +141,15 @@ def _nearest(word: str, known: Iterable[str]) -> str:
 
 
 @dataclass(frozen=True)
-class TachoTrouble:
-    """What is wrong with the tachos: which are stuck (fans,), and the share of missing readings (fans,)."""
+class TachoFaults:
+    """Tacho faults: which tachos are stuck (fans,), and the share of missing readings (fans,)."""
 
     stuck: np.ndarray
     dropout: np.ndarray
 
 
 def disturbance(faults: Sequence[Fault], fans: int, t_s: float) -> Disturbance:
-    """What the active faults do to the fans at t_s. Several of one fan add up: factors multiply, torques add."""
+    """The disturbance of the fans at t_s. Several faults of one fan combine: factors multiply, torques add."""
     drag, brake, supply = np.ones(fans), np.zeros(fans), np.ones(fans)
     for fault in faults:
         if not fault.active(t_s):
@@ -159,12 +163,12 @@ def disturbance(faults: Sequence[Fault], fans: int, t_s: float) -> Disturbance:
     return Disturbance(drag, brake, supply)
 
 
-def tacho_trouble(faults: Sequence[Fault], fans: int, t_s: float) -> TachoTrouble:
-    """What the active faults do to the tachos at t_s."""
+def tacho_faults(faults: Sequence[Fault], fans: int, t_s: float) -> TachoFaults:
+    """The tacho faults that are active at t_s."""
     stuck, dropout = np.zeros(fans, dtype=bool), np.zeros(fans)
     for fault in faults:
         if fault.kind == "tacho-stuck" and fault.active(t_s):
             stuck[fault.fan] = True
         elif fault.kind == "tacho-dropout" and fault.active(t_s):
             dropout[fault.fan] = max(dropout[fault.fan], fault.size_at(t_s))
-    return TachoTrouble(stuck, dropout)
+    return TachoFaults(stuck, dropout)

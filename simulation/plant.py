@@ -1,4 +1,4 @@
-"""Simulated fans: the equation of motion, and what real fans have that it leaves out.
+"""Simulated fans: the equation of motion with friction, electrical lag, dead zone and saturation.
 
     J w' + alpha w + C_D w|w| = gain i - friction(w)       torques in V-equivalents
     lag i' + i = supply * drive(duty)                      current follows the bridge
@@ -9,8 +9,8 @@ J, alpha and C_D are per volt, as identified on the real fan of Peng and Chen (e
 curve is that of Armstrong-Helouvry, Dupont and Canudas de Wit (Automatica 30, 1994).
 
 Time stepping: the current is exact for a held command, the smooth part of the motion is a midpoint step (order two),
-and friction is an impulse that can stop the rotor but never turn it round (Moreau), so that a rotor below breakaway
-stands exactly still.
+and friction is an impulse that can stop the rotor but never reverse it (Moreau), so that a rotor below breakaway
+has exactly zero speed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.errors import TwinError
+from simulation.errors import SimulationError
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -47,34 +47,34 @@ class FanParameters:
     coulomb_v: float | Array = 0.08
     """sliding friction, V"""
     breakaway_v: float | Array = 0.25
-    """friction to be overcome from standstill, V; not below coulomb_v"""
+    """largest friction at standstill, V; not below coulomb_v"""
     stribeck_rad_s: float | Array = 6.0
-    """speed at which friction has fallen most of the way from breakaway to sliding, rad/s"""
+    """speed at which friction has fallen by 63 % from breakaway to sliding, rad/s"""
     duty_dead: float | Array = 0.02
-    """duty up to which the bridge gives nothing"""
+    """duty up to which the bridge gives no voltage"""
     duty_full: float | Array = 0.99
     """duty from which the bridge is fully on"""
 
 
-SPREAD_OF = ("J", "alpha", "C_D", "gain", "lag_s", "coulomb_v", "breakaway_v", "stribeck_rad_s")
+VARYING_PARAMETERS = ("J", "alpha", "C_D", "gain", "lag_s", "coulomb_v", "breakaway_v", "stribeck_rad_s")
 
 
 def tray_of_fans(fans: int, seed: int, spread: float = 0.03, base: FanParameters | None = None) -> FanParameters:
-    """Parameters of a tray, each field (fans,): unit-to-unit spread is normal, cut at three standard deviations.
+    """Parameters of a tray, each field (fans,). Fans differ by a normal variation, cut at three standard deviations.
 
-    spread: relative standard deviation of each of `SPREAD_OF`. The same seed gives the same fans.
+    spread: relative standard deviation of each of `VARYING_PARAMETERS`. The same seed gives the same fans.
 
     Raises:
-        TwinError: spread is negative or so large that a parameter could become negative.
+        SimulationError: spread is negative or so large that a parameter could become negative.
     """
     if not 0.0 <= spread < 0.3:
-        raise TwinError(f"spread = {spread:g}: give a relative standard deviation from 0 to 0.3")
+        raise SimulationError(f"spread = {spread:g}: give a relative standard deviation from 0 to 0.3")
     rng = np.random.default_rng(seed)
     base = base or FanParameters()
     scattered = {}
     for field in fields(FanParameters):
         values = np.full(fans, getattr(base, field.name), dtype=np.float64)
-        if field.name in SPREAD_OF:
+        if field.name in VARYING_PARAMETERS:
             values *= 1.0 + spread * np.clip(rng.normal(size=fans), -3.0, 3.0)
         scattered[field.name] = values
     scattered["breakaway_v"] = np.maximum(scattered["breakaway_v"], scattered["coulomb_v"])
@@ -82,24 +82,24 @@ def tray_of_fans(fans: int, seed: int, spread: float = 0.03, base: FanParameters
 
 
 def drive(duty: Array, parameters: FanParameters) -> Array:
-    """(fans,) share of the supply that the bridge lets through: dead zone, slope, saturation."""
+    """(fans,) share of the supply voltage that reaches the fan: dead zone, slope, saturation."""
     return np.clip((duty - parameters.duty_dead) / (parameters.duty_full - parameters.duty_dead), 0.0, 1.0)
 
 
 def friction_v(speed_rad_s: Array, parameters: FanParameters) -> Array:
-    """(fans,) magnitude of Coulomb and Stribeck friction, V; at standstill the most it can hold."""
+    """(fans,) magnitude of Coulomb and Stribeck friction, V; at standstill its largest value."""
     rise = np.exp(-np.square(speed_rad_s / parameters.stribeck_rad_s))
     return parameters.coulomb_v + (parameters.breakaway_v - parameters.coulomb_v) * rise
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What works on the fans from outside or is wrong with them; each field (fans,). The defaults are health."""
+    """External influences and damage; each field (fans,). The defaults are those of a healthy fan."""
 
     drag_factor: float | Array = 1.0
     """multiplies C_D"""
     brake_v: float | Array = 0.0
-    """torque against the motion that adds to friction, V"""
+    """braking torque that adds to friction, V"""
     supply_factor: float | Array = 1.0
     """multiplies the supply voltage"""
 
@@ -109,14 +109,14 @@ HEALTHY = Disturbance()
 
 @dataclass(frozen=True)
 class PlantState:
-    """Where the fans are: speed (fans,) in rad/s and current (fans,) as the voltage it answers to, V."""
+    """Speed (fans,) in rad/s and current (fans,), expressed as the voltage that would cause it, V."""
 
     speed_rad_s: Array
     current_v: Array
 
 
 def at_rest(fans: int) -> PlantState:
-    """All fans stand and carry no current."""
+    """All fans at zero speed, without current."""
     return PlantState(np.zeros(fans), np.zeros(fans))
 
 
@@ -127,14 +127,14 @@ def advance(
     parameters: FanParameters,
     disturbance: Disturbance = HEALTHY,
 ) -> PlantState:
-    """The fans `duration_s` later, duty (fans,) and disturbance held; substeps of at most 1 ms."""
+    """The state `duration_s` later with duty (fans,) and disturbance held; substeps of at most 1 ms."""
     if duration_s <= 0.0:
         return state
     substeps = int(np.ceil(duration_s / MAX_SUBSTEP_S))
     step_s = duration_s / substeps
     target_v = parameters.supply_v * disturbance.supply_factor * drive(duty, parameters)
     decay = np.exp(-step_s / np.asarray(parameters.lag_s))
-    # The mean of the current over a substep: what its impulse on the rotor comes from.
+    # The impulse on the rotor comes from the mean of the current over a substep.
     mean_share = (1.0 - decay) * parameters.lag_s / step_s
     drag = parameters.C_D * disturbance.drag_factor
     coulomb = parameters.coulomb_v + disturbance.brake_v
@@ -154,7 +154,7 @@ def advance(
 
 @dataclass(frozen=True)
 class Tacho:
-    """Reads the speed: white noise, then steps of `step_rad_s`; without direction, and 0 below `floor_rad_s`."""
+    """Measures speed: white noise, then rounding to `step_rad_s`; no direction, and 0 below `floor_rad_s`."""
 
     noise_rad_s: float = 4.0
     step_rad_s: float = 0.5
@@ -170,13 +170,13 @@ class Tacho:
 
 @dataclass(frozen=True)
 class DeviceClock:
-    """The device's own clock: microseconds in 32 bits, `drift_ppm` fast (negative: slow), `start_us` at time 0."""
+    """The device clock: 32 bits of microseconds, fast by `drift_ppm` (negative: slow), at `start_us` at time 0."""
 
     drift_ppm: float = 0.0
     start_us: int = 0
 
     def at(self, t_s: float) -> int:
-        """What the clock shows at true time t_s; wraps at 2^32."""
+        """Reading of the clock at true time t_s; wraps at 2^32."""
         return (self.start_us + round(t_s * (1e6 + self.drift_ppm))) % 2**32
 
 

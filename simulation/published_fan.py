@@ -1,17 +1,16 @@
-"""Simulated fans whose truth is known: the published one, and a rough one that the physics do not describe.
+"""Simulated fans with known ground truth: the published one, and a rough one that the physics do not describe.
 
 The published fan is that of Peng and Chen, section 3: J w' + alpha w + C_D w|w| = tau with the parameters below,
 RK4 at 0.5 ms, sampled at 10 ms, white measurement noise of variance 10. Its excitation is shown there in figures only
-(5 and 6), so ours is made to fit what the tables say: R2 0.9979 at an RMSE of 3.227 means training speeds that scatter
-by 70 rad/s, R2 0.9925 at 3.219 test speeds that scatter by 37 rad/s, and largest errors of 3.6 and 3.8 standard
-deviations are those of about 4000 samples, 40 s, of white noise. Training is by random stairs, the test by a sum of
-sines: another kind of command, within the range of the training.
+(5 and 6), so ours is chosen to fit the published tables: R2 0.9979 at an RMSE of 3.227 means a standard deviation of
+70 rad/s of the training speeds, R2 0.9925 at 3.219 one of 37 rad/s of the test speeds, and maximum errors of 3.6 and
+3.8 standard deviations are those of about 4000 samples, 40 s, of white noise. Training uses random stairs, the test a
+sum of sines: another kind of command, within the training range.
 
 The rough fan adds what the published physics leave out: a dead zone in the drive, Stribeck friction that falls with
 speed, and, if wanted, a first-order electrical lag between command and torque.
 
-Nothing here uses twin.models.physics or twin.models.integration: what is tested with these fans must not be what made
-them.
+Nothing here uses twin.models.physics or twin.models.integration: a test must not compare that code with itself.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ Torque: TypeAlias = Callable[[float, float], float]
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
-    """What was measured, and what was true."""
+    """A measured run and its true speeds."""
 
     run: Run
     true_speed_rad_s: Array
@@ -53,22 +52,22 @@ class SimulatedRun:
 
     @property
     def noise_rms_rad_s(self) -> float:
-        """The noise as it fell in this run: the error of a perfect model."""
+        """RMS of the noise in this run: the error of a perfect model."""
         return float(np.sqrt(np.mean((self.run.speed_rad_s - self.true_speed_rad_s) ** 2)))
 
 
 def published_training(seed: int, duration_s: float = 40.0) -> SimulatedRun:
-    """The published fan under random stairs; speeds scatter by about 70 rad/s."""
+    """The published fan under random stairs; speeds with a standard deviation of about 70 rad/s."""
     return published_fan(random_stairs(seed, duration_s, 1, *TRAINING_RANGE), seed, f"published training {seed}")
 
 
 def published_test(seed: int, duration_s: float = 40.0) -> SimulatedRun:
-    """The published fan under a sum of sines; speeds scatter by about 37 rad/s."""
+    """The published fan under a sum of sines; speeds with a standard deviation of about 37 rad/s."""
     return published_fan(sum_of_sines(seed, duration_s, 1, *TEST_RANGE), seed, f"published test {seed}")
 
 
 def published_fan(command: Array, seed: int, name: str, *, lag_s: float = 0.0) -> SimulatedRun:
-    """Fans alike under commands (n, fans) at 100 Hz, from standstill. The seed is that of the noise."""
+    """Identical fans under commands (n, fans) at 100 Hz, from standstill. seed: of the noise."""
     return _measured(command, [(_published_torque, INERTIA, VISCOUS, DRAG)] * command.shape[1], lag_s, seed, name)
 
 
@@ -81,19 +80,19 @@ def rough_run(
     lag_s: float = 0.0,
     low: float = ROUGH_RANGE[0],
 ) -> SimulatedRun:
-    """Rough fans under random stairs from low on. spread: J, alpha and C_D go from -spread to +spread along several."""
+    """Rough fans under random stairs from `low` up. spread: the parameters of the fans vary from -spread to +spread."""
     scatter = 1.0 + spread * np.linspace(-1.0, 1.0, fans) if fans > 1 else np.ones(1)
     parts = [(_rough_torque, INERTIA * s, VISCOUS * s, DRAG * s) for s in scatter.tolist()]
     return _measured(random_stairs(seed, duration_s, fans, low, ROUGH_RANGE[1]), parts, lag_s, seed, f"rough {seed}")
 
 
 def random_stairs(seed: int, duration_s: float, fans: int, low: float, high: float) -> Array:
-    """(n, fans) commands at 100 Hz that jump to a random level every 0.5 to 2 s, each fan on its own."""
+    """(n, fans) commands at 100 Hz that jump to a random level every 0.5 to 2 s, independently for each fan."""
     return stairs(np.random.default_rng([seed, 0]), round(duration_s * RATE_HZ), fans, low, high)
 
 
 def stairs(rng: np.random.Generator, samples: int, fans: int, low: float, high: float) -> Array:
-    """(samples, fans): random_stairs, drawn from rng."""
+    """As `random_stairs`, (samples, fans), drawn from rng."""
     shortest, longest = (round(hold_s * RATE_HZ) for hold_s in STAIR_S)
     command = np.empty((samples, fans))
     for fan in range(fans):
@@ -121,7 +120,7 @@ def _published_torque(_speed_rad_s: float, command: float) -> float:
 
 
 def _rough_torque(speed_rad_s: float, command: float) -> float:
-    """A dead zone, and friction that is steep but smooth through standstill, so that RK4 keeps its order."""
+    """Dead zone and friction; the friction is steep but smooth at standstill, so that RK4 keeps its order."""
     stribeck = (BREAKAWAY - COULOMB) * math.exp(-((speed_rad_s / STRIBECK_RAD_S) ** 2))
     return max(command - DEAD_ZONE, 0.0) - (COULOMB + stribeck) * math.tanh(speed_rad_s / STANDSTILL_RAD_S)
 

@@ -1,8 +1,8 @@
-"""A simulated tray: fans, tachos, a clock and a profile, giving one sample after the other.
+"""A simulated tray: fans, tachos, a device clock and a command profile, which give one sample after the other.
 
-The command of a sample is in force from that sample to the next, as on a real device that sets its outputs when it
-measures; so are the faults. Nothing here knows the wall clock: a line plays the samples in real time, a recording
-takes them as fast as they come, and both get the same ones from the same seed.
+The command of a sample applies from that sample to the next, as on a real device that sets its outputs when it
+measures; so do the faults. Nothing here uses the wall clock: a serial line sends the samples in real time, a recording
+takes them as fast as they are computed, and the same seed gives both the same samples.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from simulation.errors import SimulationError
 from simulation.excitation import excitation
-from simulation.faults import Fault, check_schedule, disturbance, tacho_trouble
+from simulation.faults import Fault, check_schedule, disturbance, tacho_faults
 from simulation.plant import HEALTHY, DeviceClock, Tacho, advance, at_rest, tray_of_fans
-from twin.errors import TwinError
 
 Array: TypeAlias = NDArray[np.float64]
 
 MAX_FANS = 64
 MAX_JITTER_PERIODS = 0.4
-# Speed loop of a fan given a set-point, in duty per rad/s and duty per rad. A fan gives about 900 rad/s at full duty
-# and takes about a second: the integral cancels that second, and the closed loop follows about four times as fast.
+# Speed loop of a fan with a set-point, in duty per rad/s and duty per rad. A fan reaches about 900 rad/s at full duty
+# with a time constant of about 1 s. The zero of the controller cancels it; the closed loop is about four times as fast.
 LOOP_GAIN = 4e-3
 LOOP_INTEGRAL_GAIN_PER_S = 4e-3
 
 
 @dataclass(frozen=True)
 class TraySettings:
-    """Which tray to simulate."""
+    """Settings of a simulated tray."""
 
     fans: int = 8
     rate_hz: float = 100.0
@@ -40,11 +40,11 @@ class TraySettings:
     seed: int = 1
     """of commands, noise, jitter and losses"""
     fans_seed: int = 1
-    """which fans: how they differ from one another"""
+    """of the variation between fans"""
     spread: float = 0.03
     """relative standard deviation of the fans' parameters"""
     lost: float = 0.0
-    """share of the samples that never reach the line"""
+    """share of samples that are lost"""
     jitter_us: float = 100.0
     """standard deviation of the time of sampling, cut at 0.4 periods"""
     tacho: Tacho = Tacho()
@@ -54,7 +54,7 @@ class TraySettings:
 
 @dataclass(frozen=True)
 class TraySample:
-    """One sample at true time t_s since the tray began. A lost one takes its sequence number with it."""
+    """One sample at true time t_s since the start. A lost one still uses up its sequence number."""
 
     t_s: float
     clock_us: int
@@ -65,10 +65,10 @@ class TraySample:
 
 
 class SimulatedTray:
-    """Gives samples while there are any: ask `due_s` when the next one is measured, then `take` it.
+    """Gives samples: `due_s` says when the next one is measured, `take` measures it.
 
     Raises:
-        TwinError: a setting is out of its range.
+        SimulationError: a setting is out of its range.
     """
 
     def __init__(self, settings: TraySettings) -> None:
@@ -93,18 +93,18 @@ class SimulatedTray:
         self._due_s = self._next_due_s()
 
     def due_s(self) -> float | None:
-        """When the next sample is measured, s since the tray began; None after the last."""
+        """Time of the next sample, s since the start; None after the last."""
         return self._due_s if self._count / self.settings.rate_hz < self.settings.duration_s else None
 
     def take(self) -> TraySample:
-        """Let the fans run until the next sample is due, and measure."""
+        """Advance the fans to the next sample and measure it."""
         t_s, step_s = self._due_s, self._due_s - self._t_s
         self._state = advance(self._state, self._command, step_s, self.parameters, self._disturbance)
         self._t_s = t_s
         speed_rad_s = self._measure(t_s)
-        self._command = self._decide(t_s, speed_rad_s, step_s)
+        self._command = self._next_duty(t_s, speed_rad_s, step_s)
         self._disturbance = disturbance(self.settings.faults, self.fans, t_s)
-        self._note_faults(t_s)
+        self._record_faults(t_s)
         sample = TraySample(
             t_s,
             self.settings.clock.at(t_s),
@@ -118,24 +118,24 @@ class SimulatedTray:
         return sample
 
     def command(self, values: Array) -> None:
-        """Take fans out of the profile (or of the speed loop): values (fans,) duty, NaN leaves a fan as it is."""
+        """Override the profile and the speed loop: values (fans,) duty, NaN leaves a fan unchanged."""
         given = ~np.isnan(values)
         self._override = np.where(given, np.clip(values, 0.0, 1.0), self._override)
         self._set_point_rad_s = np.where(given, np.nan, self._set_point_rad_s)
 
     def set_point(self, values_rad_s: Array) -> None:
-        """Let the device hold speeds itself: values (fans,) rad/s, NaN leaves a fan as it is."""
+        """Start the speed loop: values (fans,) rad/s, NaN leaves a fan unchanged."""
         given = ~np.isnan(values_rad_s)
         self._integral = np.where(given & np.isnan(self._set_point_rad_s), self._command, self._integral)
         self._set_point_rad_s = np.where(given, values_rad_s, self._set_point_rad_s)
 
     def happened(self, fault: int) -> tuple[float | None, float | None]:
-        """When the fault (by its place in the settings) began and ended, s since the tray began; None: it has not."""
+        """When fault number `fault` of the settings began and ended, s since the start; None if it has not."""
         return self._started_s.get(fault), self._stopped_s.get(fault)
 
     @property
     def t_s(self) -> float:
-        """Time of the sample last taken, s since the tray began."""
+        """Time of the last sample, s since the start."""
         return self._t_s
 
     def _next_due_s(self) -> float:
@@ -145,27 +145,27 @@ class SimulatedTray:
         return max(0.0, self._count * period_s + min(max(jitter_s, -limit_s), limit_s))
 
     def _measure(self, t_s: float) -> Array:
-        """(fans,) what the tachos say. Random numbers are drawn alike with and without faults."""
-        trouble = tacho_trouble(self.settings.faults, self.fans, t_s)
-        fresh = self.settings.tacho.read(self._state.speed_rad_s, self._tacho_rng)
-        self._reading_rad_s = np.where(trouble.stuck, self._reading_rad_s, fresh)
-        missing = self._dropout_rng.random(self.fans) < trouble.dropout
+        """(fans,) tacho readings. Faults do not change which random numbers are drawn."""
+        faults = tacho_faults(self.settings.faults, self.fans, t_s)
+        measured = self.settings.tacho.read(self._state.speed_rad_s, self._tacho_rng)
+        self._reading_rad_s = np.where(faults.stuck, self._reading_rad_s, measured)
+        missing = self._dropout_rng.random(self.fans) < faults.dropout
         return np.where(missing, np.nan, self._reading_rad_s)
 
-    def _decide(self, t_s: float, speed_rad_s: Array, step_s: float) -> Array:
-        """(fans,) duty from now on: of the profile, of whoever commands over the line, or of the speed loop."""
+    def _next_duty(self, t_s: float, speed_rad_s: Array, step_s: float) -> Array:
+        """(fans,) duty until the next sample: from a command, the speed loop, or else the profile."""
         duty = np.where(np.isnan(self._override), self._excitation.command(t_s), self._override)
-        looped = ~np.isnan(self._set_point_rad_s)
-        if not looped.any():
+        closed_loop = ~np.isnan(self._set_point_rad_s)
+        if not closed_loop.any():
             return duty
-        error_rad_s = np.nan_to_num(self._set_point_rad_s - speed_rad_s)  # without a reading the loop waits
+        error_rad_s = np.nan_to_num(self._set_point_rad_s - speed_rad_s)  # without a reading the loop holds
         proportional = LOOP_GAIN * error_rad_s
         wanted = proportional + self._integral + LOOP_INTEGRAL_GAIN_PER_S * step_s * error_rad_s
         possible = np.clip(wanted, 0.0, 1.0)
-        self._integral = possible - proportional  # what cannot be given is not remembered: no wind-up
-        return np.where(looped, possible, duty)
+        self._integral = possible - proportional  # anti-windup
+        return np.where(closed_loop, possible, duty)
 
-    def _note_faults(self, t_s: float) -> None:
+    def _record_faults(self, t_s: float) -> None:
         for number, fault in enumerate(self.settings.faults):
             if fault.active(t_s):
                 self._started_s.setdefault(number, t_s)
@@ -189,5 +189,5 @@ def _check(settings: TraySettings) -> None:
     for name, value, smallest, largest in limits:
         if not smallest <= value <= largest:
             upto = f"to {largest:g}" if math.isfinite(largest) else "on"
-            raise TwinError(f"{name} = {value:g}; give one from {smallest:g} {upto}")
+            raise SimulationError(f"{name} = {value:g}; give one from {smallest:g} {upto}")
     check_schedule(settings.faults, settings.fans, settings.duration_s)

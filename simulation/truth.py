@@ -1,8 +1,8 @@
-"""The ground truth of a simulated run: what was really done to which fan, and when, for whoever judges an alarm.
+"""The ground truth of a simulated run: which fault acted on which fan and when, to judge alarms by.
 
-A JSON file beside the run. It is there from the start (`complete` false, times unknown) and is replaced as a whole at
-the end. Times are nanoseconds since the epoch at which a fault really began and ended: those of the first samples
-with it and without it. A fault still there at the end ends with the run; one that never came has null.
+A JSON file beside the run. It is written at the start (`complete` false, times unknown) and replaced at the end. The
+times of a fault, ns since the epoch, are those of the first samples with it and without it. A fault still active at
+the end ends with the run; the times of one that never began are null.
 """
 
 from __future__ import annotations
@@ -13,14 +13,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from schemas.units import NS_PER_S
 from simulation.plant import fan
 from simulation.tray import SimulatedTray
 
 
 def truth(tray: SimulatedTray, start_ns: int | None, *, complete: bool, counts: Mapping[str, int]) -> dict[str, Any]:
-    """What is known of the run so far. start_ns: the epoch time of t_s = 0, None before it has begun.
+    """The ground truth so far. start_ns: epoch time of t_s = 0, None before the start.
 
-    counts: `samples_sent`, `samples_dropped`, `samples_unsent` and whatever else was counted.
+    counts: `samples_sent`, `samples_dropped`, `samples_unsent` and any other counters.
     """
     settings = tray.settings
     return {
@@ -58,11 +59,11 @@ def _fault(tray: SimulatedTray, number: int, start_ns: int | None, complete: boo
 
 
 def _at(start_ns: int | None, t_s: float | None) -> int | None:
-    return None if start_ns is None or t_s is None else start_ns + round(t_s * 1e9)
+    return None if start_ns is None or t_s is None else start_ns + round(t_s * NS_PER_S)
 
 
 def write_truth(path: Path, content: Mapping[str, Any]) -> None:
-    """Replace the file as a whole, so that no reader ever sees half of it.
+    """Replace the file in one step, so that a reader never sees half of it.
 
     Raises:
         OSError: the file cannot be written.

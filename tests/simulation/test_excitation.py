@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from simulation.errors import SimulationError
 from simulation.excitation import PROFILES, Manual, Multisine, Prbs, Staircase, excitation
-from twin.errors import TwinError
 
 TIMES_S = np.arange(0.0, 130.0, 0.05)
 
@@ -69,10 +69,10 @@ def test_manual_knobs_hold_still_most_of_the_time_and_the_period_closes_without_
 
 
 def test_an_unknown_profile_names_the_nearest() -> None:
-    with pytest.raises(TwinError, match="unknown profile 'chrip'; did you mean 'chirp'"):
+    with pytest.raises(SimulationError, match="unknown profile 'chrip'; did you mean 'chirp'"):
         excitation("chrip", 1, 0)
 
 
 def test_a_range_that_is_none_is_refused() -> None:
-    with pytest.raises(TwinError, match=r"commands from 0.5 to 0.5"):
+    with pytest.raises(SimulationError, match=r"commands from 0.5 to 0.5"):
         excitation("manual", 1, 0, low=0.5, high=0.5)

@@ -4,10 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simulation.faults import Fault, check_schedule, disturbance, parse_fault, tacho_trouble
+from simulation.errors import SimulationError
+from simulation.faults import Fault, check_schedule, disturbance, parse_fault, tacho_faults
 from simulation.plant import Tacho
 from simulation.tray import SimulatedTray, TraySettings
-from twin.errors import TwinError
 
 QUIET = TraySettings(fans=2, duration_s=12.0, profile="staircase", spread=0.0, jitter_us=0.0, tacho=Tacho(0.0, 0.0))
 
@@ -85,7 +85,7 @@ def test_several_faults_of_one_fan_add_up() -> None:
     felt = disturbance([*faults, parse_fault("rotor:fan=0,size=0.5")], 2, 1.0)
     assert np.array_equal(np.asarray(felt.drag_factor), [6.0, 1.0])
     assert np.array_equal(np.asarray(felt.brake_v), [1.5, 0.0])
-    assert not tacho_trouble(faults, 2, 1.0).stuck.any()
+    assert not tacho_faults(faults, 2, 1.0).stuck.any()
 
 
 def test_the_tray_tells_when_a_fault_really_began_and_ended() -> None:
@@ -111,7 +111,7 @@ def test_a_fault_is_read_from_the_command_line() -> None:
         ("fire:fan=2", "unknown kind 'fire'; known: inlet, rotor, wear"),
         ("inlet:fna=2", "unknown key 'fna'; did you mean 'fan'"),
         ("inlet:fan=2,sizes=1", "unknown key 'sizes'; did you mean 'size'"),
-        ("inlet", "say which fan"),
+        ("inlet", "fan is missing; fans count from 0"),
         ("inlet:fan=two", "fan = 'two' is not a number"),
         ("inlet:fan=-1", "fan must be a whole number"),
         ("inlet:fan=1.5", "fan must be a whole number"),
@@ -125,7 +125,7 @@ def test_a_fault_is_read_from_the_command_line() -> None:
     ],
 )
 def test_a_wrong_fault_is_told_in_one_line_that_says_which_part(text: str, message: str) -> None:
-    with pytest.raises(TwinError, match=message) as caught:
+    with pytest.raises(SimulationError, match=message) as caught:
         parse_fault(text)
     assert text in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -134,11 +134,11 @@ def test_a_wrong_fault_is_told_in_one_line_that_says_which_part(text: str, messa
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("inlet:fan=2", "fan 2 is not there; the tray's are 0 to 1"),
+        ("inlet:fan=2", "fan 2 does not exist; the tray has fans 0 to 1"),
         ("inlet:fan=1,start=10", "start = 10 s is after the end at 10 s"),
         ("wear:fan=1", "give stop=S"),
     ],
 )
 def test_a_fault_that_does_not_fit_the_tray_is_refused(text: str, message: str) -> None:
-    with pytest.raises(TwinError, match=message):
+    with pytest.raises(SimulationError, match=message):
         check_schedule([parse_fault(text)], fans=2, duration_s=10.0)

@@ -5,6 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from simulation.errors import SimulationError
 from simulation.plant import (
     DeviceClock,
     Disturbance,
@@ -19,7 +20,6 @@ from simulation.plant import (
     tray_of_fans,
 )
 from simulation.tray import SimulatedTray, TraySettings
-from twin.errors import TwinError
 
 ONE = tray_of_fans(1, seed=0, spread=0.0)
 NO_FRICTION = dataclasses.replace(ONE, coulomb_v=np.zeros(1), breakaway_v=np.zeros(1))
@@ -134,7 +134,7 @@ def test_fans_differ_by_the_spread_and_the_seed_says_how() -> None:
 
 
 def test_a_spread_that_could_turn_a_parameter_negative_is_refused() -> None:
-    with pytest.raises(TwinError, match=r"spread = 0\.5"):
+    with pytest.raises(SimulationError, match=r"spread = 0\.5"):
         tray_of_fans(2, seed=0, spread=0.5)
 
 
@@ -236,6 +236,6 @@ def test_a_fan_given_a_set_point_reaches_it_and_a_command_takes_it_back() -> Non
     ],
 )
 def test_a_setting_out_of_range_is_refused_in_one_line(settings: TraySettings, message: str) -> None:
-    with pytest.raises(TwinError, match=message) as caught:
+    with pytest.raises(SimulationError, match=message) as caught:
         SimulatedTray(settings)
     assert "\n" not in str(caught.value)

@@ -409,7 +409,7 @@ def test_a_clock_set_back_is_lost_and_said_until_it_has_caught_up(producer: str)
     assert core.counters()["lost_clock_set_back"] == 4
     assert core.counters().get("out_of_order", 0) == 0
     assert core.problem() == (
-        "the host's clock was set back by 3600 s, or a replay began anew: "
+        "the host clock was set back by 3600 s, or a replay was restarted: "
         "samples are refused until it has caught up; restart the stages"
     )
     core.step(stamped(moved(message, 1), producer, 3))

@@ -62,7 +62,7 @@ class Line:
         elif what == "ticks":
             items += [methodcaller("tick", int(at(self._now_s + k / 10)[0])) for k in range(count)]
         elif what == "given up":
-            items += [methodcaller("give_up_until", int(at(self._now_s + self._rng.uniform(-0.1, 0.3))[0]))]
+            items += [methodcaller("publish_until", int(at(self._now_s + self._rng.uniform(-0.1, 0.3))[0]))]
         else:
             steps_s = {"dense": 0.001, "sparse": 0.06, "again": 0.0, "earlier": -0.004, "losses": 0.03}
             items += [self._sample(steps_s.get(what, 0.01), what) for _ in range(count)]

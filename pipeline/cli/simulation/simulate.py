@@ -184,17 +184,17 @@ def _tray(*, faults: list[str], tacho: Mapping[str, Any], clock: Mapping[str, An
     Raises:
         UserError: a setting is out of its range, or a fault cannot be understood.
     """
+    from simulation.errors import SimulationError  # noqa: PLC0415  the command line loads twin only when it is needed
     from simulation.faults import parse_fault  # noqa: PLC0415
     from simulation.plant import DeviceClock, Tacho  # noqa: PLC0415
     from simulation.tray import SimulatedTray, TraySettings  # noqa: PLC0415
-    from twin.errors import TwinError  # noqa: PLC0415  the command line loads twin only when it is needed
 
     try:
         schedule = tuple(map(parse_fault, faults))
         return SimulatedTray(
             TraySettings(faults=schedule, tacho=Tacho(**tacho), clock=DeviceClock(**clock), **settings)
         )
-    except TwinError as error:
+    except SimulationError as error:
         raise UserError(str(error)) from error
 
 

@@ -351,7 +351,7 @@ def test_a_link_never_replaces_a_file_but_does_replace_a_stale_link(tmp_path: Pa
         ({"fault": ["inlte:fan=1"]}, "did you mean 'inlet'"),
         ({"profile": "manuel"}, "did you mean 'manual'"),
         ({"fans": 65}, "fans = 65"),
-        ({"fault": ["inlet:fan=8"]}, "fan 8 is not there"),
+        ({"fault": ["inlet:fan=8"]}, "fan 8 does not exist"),
         ({"time": "t:s"}, "name it with --from-csv"),
         ({"recording": Path("x.mcap")}, "--recording needs --duration"),
         ({"from_csv": Path("x.csv"), "fault": ["inlet:fan=1"]}, "leave out --fault"),

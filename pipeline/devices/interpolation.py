@@ -1,0 +1,104 @@
+"""Speeds at grid times, interpolated linearly between raw samples; each fan between its own readings."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from schemas.messages import Array
+
+NEVER_NS = -(1 << 62)
+
+
+class Samples(NamedTuple):
+    """Raw samples by strictly rising time. t_ns: (n,). command, speed_rad_s: (n, fans)."""
+
+    t_ns: Array
+    command: Array
+    speed_rad_s: Array
+
+    def extended(self, t_ns: Array, command: Array, speed_rad_s: Array) -> Samples:
+        """These samples and later ones."""
+        return Samples(
+            np.concatenate((self.t_ns, t_ns)),
+            np.concatenate((self.command, command)),
+            np.concatenate((self.speed_rad_s, speed_rad_s)),
+        )
+
+    def rows(self, wanted: slice) -> Samples:
+        """The samples in these rows."""
+        return Samples(self.t_ns[wanted], self.command[wanted], self.speed_rad_s[wanted])
+
+
+def all_true(mask: Array) -> bool:
+    """As mask.all(), a few times faster for small masks."""
+    return np.count_nonzero(mask) == mask.size
+
+
+def interpolate_samples(t_ns: Array, at: Array, samples: Samples) -> Array:
+    """Speeds (n, fans) at t_ns (n,), if every fan has a reading in every sample.
+
+    at: (n,), index of the last sample at or before each time.
+    """
+    after = at + 1
+    here_t_ns, here = samples.t_ns.take(at), samples.speed_rad_s.take(at, axis=0)
+    since_ns = t_ns - here_t_ns
+    span_ns = samples.t_ns.take(after, mode="clip") - here_t_ns
+    share = since_ns / np.maximum(span_ns, 1)
+    between = here + share[:, np.newaxis] * (samples.speed_rad_s.take(after, axis=0, mode="clip") - here)
+    return np.where((since_ns == 0)[:, np.newaxis], here, between)
+
+
+class LastReadings:
+    """The last reading of each fan before the samples that are still held."""
+
+    def __init__(self, fans: int, limit_ns: int) -> None:
+        self._limit_ns = limit_ns
+        self._fans = np.arange(fans)
+        self._t_ns = np.full(fans, NEVER_NS, np.int64)
+        self._speed_rad_s = np.full(fans, np.nan)
+
+    def update(self, samples: Samples, count: int) -> None:
+        """Take readings from the first `count` samples, which will no longer be held."""
+        has = np.isfinite(samples.speed_rad_s[:count])
+        last = count - 1
+        if all_true(has[last]):
+            self._t_ns, self._speed_rad_s = np.full(len(self._fans), samples.t_ns[last]), samples.speed_rad_s[last]
+            return
+        rows = last - has[::-1].argmax(axis=0)
+        found = has[rows, self._fans]
+        self._t_ns = np.where(found, samples.t_ns.take(rows), self._t_ns)
+        self._speed_rad_s = np.where(found, samples.speed_rad_s[rows, self._fans], self._speed_rad_s)
+
+    def too_old(self, t_ns: int) -> Array:
+        """Which fans (fans,) have no reading within the limit before t_ns."""
+        return t_ns - self._t_ns > self._limit_ns
+
+    def interpolate(self, t_ns: Array, at: Array, samples: Samples, newest_t_ns: int) -> tuple[Array, Array]:
+        """Speeds (n, fans) at t_ns (n,) between each fan's own readings; NaN where one is missing or too far away.
+
+        at: (n,), index of the last sample at or before each time. newest_t_ns: time of the newest sample received.
+        The second array, (n, fans), is true where a fan's next reading may still arrive within the limit.
+        """
+        # Row 0 holds the last reading before these samples, so that every fan has a row before each time.
+        fans = self._fans
+        reading_t_ns = np.concatenate(
+            (self._t_ns[np.newaxis], np.broadcast_to(samples.t_ns[:, np.newaxis], samples.speed_rad_s.shape))
+        )
+        speed = np.concatenate((self._speed_rad_s[np.newaxis], samples.speed_rad_s))
+        rows, missing = np.arange(len(speed))[:, np.newaxis], len(speed)
+        has = np.isfinite(speed)
+        before = np.maximum.accumulate(np.where(has, rows, 0))[at + 1]
+        following = np.minimum.accumulate(np.where(has, rows, missing)[::-1])[::-1]
+        after = np.concatenate((following, np.full((1, len(fans)), missing)))[at + 2]
+        none = after == missing
+        after = np.where(none, before, after)
+        here_t_ns, here = reading_t_ns[before, fans], speed[before, fans]
+        since_ns = t_ns[:, np.newaxis] - here_t_ns
+        span_ns = reading_t_ns[after, fans] - here_t_ns
+        near = ~none & (span_ns <= self._limit_ns)
+        between = here + since_ns / np.where(near, span_ns, 1) * (speed[after, fans] - here)
+        found = np.where(since_ns == 0, here, np.where(near, between, np.nan))
+        may_arrive = none & (since_ns > 0) & (newest_t_ns - here_t_ns <= self._limit_ns)
+        return found, may_arrive

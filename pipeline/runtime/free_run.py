@@ -1,0 +1,123 @@
+"""The free run of a twin: from one initial speed and the commands alone, never corrected by a measurement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.runtime.twin_file import TwinFile
+from schemas.messages import Array
+
+NEVER_NS = np.iinfo(np.int64).min // 2
+
+
+@dataclass(frozen=True)
+class FreeRunInputs:
+    """Inputs of the free runs over a block of n samples. All (n, fans), except `missing`, (n,)."""
+
+    command: Array
+    """the last known command"""
+    unknown: Array
+    """the command of this sample is not known"""
+    overdue: Array
+    """a command has been held for longer than allowed"""
+    usable: Array
+    """the sample has a reading and a command, so that it counts towards a start"""
+    missing: Array
+    """number of grid samples missing before this one"""
+
+    def next_event(self, after: int, running: Array) -> int:
+        """The first row after `after` where a free run may start or stop or samples are missing; n if there is none."""
+        if after + 1 == len(self.missing):
+            return after + 1
+        rest = slice(after + 1, None)
+        may_change = (self.overdue[rest] & running) | (self.usable[rest] & ~running)
+        rows = np.flatnonzero(may_change.any(axis=1) | (self.missing[rest] > 0))
+        return after + 1 + int(rows[0]) if len(rows) else len(self.missing)
+
+
+class FreeRun:
+    """The free runs of all fans: which are running, since when, and their state. All arrays are (fans,)."""
+
+    def __init__(self, twin: TwinFile, start_samples: int) -> None:
+        """start_samples: how many readings a start averages."""
+        self._twin = twin
+        self._start_samples = start_samples
+        fans = twin.fans
+        self.running = np.zeros(fans, np.bool_)
+        self.started_t_ns = np.zeros(fans, np.int64)
+        self.held_command = np.full(fans, twin.command_range[0])
+        self._known_t_ns = np.zeros(fans, np.int64)  # when the command was last known
+        self._out_of_range_t_ns = np.full(fans, NEVER_NS)
+        self._readings = np.zeros(fans, np.int64)  # counted towards a start
+        self._sum_rad_s = np.zeros(fans)
+        self._state = twin.initial_state(np.zeros(fans), self.held_command)
+
+    def hold(self, t_ns: Array, command: Array, known: Array) -> tuple[Array, Array]:
+        """Hold the last known command where one is unknown. t_ns: (n,); command, known: (n, fans).
+
+        Returns the commands (n, fans), and when the command of the sample before was known, (n, fans) ns.
+        """
+        known_t_ns = np.broadcast_to(t_ns[:, np.newaxis], command.shape)
+        if not known.all():
+            rows = np.maximum.accumulate(np.where(known, np.arange(len(t_ns))[:, np.newaxis], -1))
+            known_t_ns = np.where(rows < 0, self._known_t_ns, t_ns[rows])
+            command = np.where(rows < 0, self.held_command, np.take_along_axis(command, rows, axis=0))
+        before_t_ns = np.concatenate((self._known_t_ns[np.newaxis], known_t_ns[:-1]))
+        self.held_command, self._known_t_ns = command[-1], known_t_ns[-1]
+        return command, before_t_ns
+
+    def last_out_of_range(self, t_ns: Array, beyond: Array) -> Array:
+        """When the command was last out of range, (n, fans) ns: from then on the free run has to settle."""
+        last = np.where(beyond, t_ns[:, np.newaxis], NEVER_NS)
+        last = np.maximum(np.maximum.accumulate(last, axis=0), self._out_of_range_t_ns)
+        self._out_of_range_t_ns = last[-1].copy()
+        return last
+
+    def stop(self, fans: Array) -> None:
+        """End the free run of some fans; the next one starts from measured speeds again."""
+        self.running &= ~fans
+        self.forget_readings(fans)
+
+    def add_readings(self, usable: Array, speed_rad_s: Array) -> Array:
+        """Add the readings of one sample. Returns the fans (fans,) that now have enough for a start."""
+        usable = usable & ~self.running
+        self._readings[usable] += 1
+        self._sum_rad_s[usable] += speed_rad_s[usable]
+        return usable & (self._readings >= self._start_samples)
+
+    def forget_readings(self, fans: Array) -> None:
+        """Discard the readings of some fans that count towards a start."""
+        self._readings[fans] = 0
+        self._sum_rad_s[fans] = 0.0
+
+    def start(self, fans: Array, t_ns: int, command: Array) -> None:
+        """Begin the free run of some fans at this sample."""
+        speed = np.where(fans, self._sum_rad_s / np.maximum(self._readings, 1), 0.0)
+        initial = self._twin.initial_state(speed, command)
+        self._state = np.where(fans[:, np.newaxis], initial, self._state)
+        self.started_t_ns[fans] = t_ns
+        self.running |= fans
+        self.forget_readings(fans)
+
+    def advance(self, command: Array, step_s: float) -> tuple[Array, Array]:
+        """Run over a block, or over its first part. command: (n, fans), n >= 1.
+
+        Returns speeds (m, fans), NaN where no free run is active, and which fans (fans,) diverged at the last of
+        these samples. The run is cut at a divergence so that the result does not depend on the size of the block.
+        """
+        rows = len(command)
+        if not self.running.any():
+            return np.full(command.shape, np.nan), np.zeros_like(self.running)
+        while True:
+            speed_rad_s, state = self._twin.advance(self._state, command[:rows], np.full(rows, step_s))
+            finite = np.isfinite(speed_rad_s)
+            diverged = self.running & ~(finite.all(axis=0) & np.isfinite(state).all(axis=1))
+            if rows == 1 or not diverged.any():
+                break
+            rows //= 2
+        self._state = np.where((self.running & ~diverged)[:, np.newaxis], state, self._state)
+        predicted = np.where(self.running & finite, speed_rad_s, np.nan)
+        self.stop(diverged)
+        return predicted, diverged
