@@ -25,7 +25,6 @@ from pipeline.recordings.metadata import head_of
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
-from pipeline.recordings.writing import Pending
 from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from schemas.envelope import Envelope
 from schemas.messages import Health, Message
@@ -79,10 +78,10 @@ class OpenPart(Protocol):
     written: Counter[str]
 
     @property
-    def pending(self) -> Sequence[Pending]: ...  # noqa: D102
+    def pending(self) -> Sequence[Envelope]: ...  # noqa: D102
     @property
     def size(self) -> int: ...  # noqa: D102
-    def write(self, key: str, payload: bytes, message: Message, log_time_ns: int) -> None: ...  # noqa: D102
+    def add(self, envelope: Envelope) -> None: ...  # noqa: D102
     def flush(self) -> None: ...  # noqa: D102
     def close(self, *, has_ended: bool = False) -> None: ...  # noqa: D102
 
@@ -115,12 +114,12 @@ class Recorder(Core):
         self._part: OpenPart | None = None
         self._ledger = SequenceLedger(place.before)
         self._before = place.before
-        self._cards: dict[str, Pending] = {}
+        self._cards: dict[str, Envelope] = {}
         self._own_producer = ""
         self._duplicated: dict[StreamId, int] = {}
         self._recorded: Counter[str] = Counter()
         self._counts: Counter[str] = Counter(lost_unwritten=0)
-        self._held: deque[Pending] = deque()
+        self._held: deque[Envelope] = deque()
         self._held_bytes = 0
         self._lost_in_pause = 0
         self._problem = self._paused_because = ""
@@ -141,15 +140,14 @@ class Recorder(Core):
         """Record one packet."""
         header = item.message.header
         self._now_ns = max(self._now_ns, item.received_t_ns)
-        pending = Pending(item.key, item.payload, item.message, item.received_t_ns)
         if item.topic == "twin":
-            self._cards[item.key] = pending
+            self._cards[item.key] = item
         elif header.sequence < self._before.get((item.key, header.producer), 0):  # the bus still had it
             self._ledger.note_duplicated(item.key, header.producer)
             return ()
         if isinstance(item.message, Health):
             self._note_duplicated(item.message)
-        self._put(pending)
+        self._put(item)
         return ()
 
     def tick(self, now_ns: int) -> Sequence[Message]:
@@ -195,14 +193,14 @@ class Recorder(Core):
         """Why nothing is recorded now, if so."""
         return self._problem
 
-    def _put(self, pending: Pending) -> None:
+    def _put(self, envelope: Envelope) -> None:
         if self._part is None:
-            self._hold([pending])
+            self._hold([envelope])
             return
         if self._unflushed_ns is None:
-            self._unflushed_ns = min(pending.log_time_ns, self._now_ns)
+            self._unflushed_ns = min(envelope.received_t_ns, self._now_ns)
         try:
-            self._part.write(*pending)
+            self._part.add(envelope)
         except RecordingError as error:
             self._pause(str(error))
 
@@ -214,12 +212,12 @@ class Recorder(Core):
             self._pause(str(error))
 
     def _begin(self, about: Mapping[str, str]) -> None:
-        self._began_ns = min(self._held[0].log_time_ns, self._now_ns) if self._held else self._now_ns
+        self._began_ns = min(self._held[0].received_t_ns, self._now_ns) if self._held else self._now_ns
         self._part = self._place.begin(self._began_ns, self._ledger, about)
         self._counts["parts"] += 1
         self._problem = ""
         for card in self._cards.values():
-            self._part.write(card.key, card.payload, card.message, self._began_ns)
+            self._part.add(card.received_at(self._began_ns))
 
     def _is_flush_due(self) -> bool:
         """By the next tick the oldest message would be too old; but behind a backlog, not at every tick."""
@@ -252,10 +250,10 @@ class Recorder(Core):
             unwritten, self._part, self._unflushed_ns = self._part.pending, None, None
             self._hold(unwritten)
 
-    def _hold(self, unwritten: Sequence[Pending]) -> None:
+    def _hold(self, unwritten: Sequence[Envelope]) -> None:
         """Keep messages until they can be recorded; when there are too many, the oldest are lost."""
         self._held.extend(unwritten)
-        self._held_bytes += sum(len(pending.payload) for pending in unwritten)
+        self._held_bytes += sum(len(envelope.payload) for envelope in unwritten)
         while self._held_bytes > HELD_BYTES:
             lost = self._held.popleft()
             self._held_bytes -= len(lost.payload)
@@ -323,8 +321,8 @@ class Recorder(Core):
             self._lost_in_pause,
         )
         held, self._held, self._held_bytes = self._held, deque(), 0
-        for pending in held:
-            self._put(pending)
+        for envelope in held:
+            self._put(envelope)
 
     def _note_duplicated(self, health: Health) -> None:
         """Our own health, which the runner hands over before anything else, says what the bus brought twice."""

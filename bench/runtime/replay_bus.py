@@ -66,8 +66,8 @@ def measured(source: Path, folder: Path) -> dict[str, Any]:
         times = message.host_receive_t_ns if entry.topic == "raw" else message.t_ns
         new = wanted[entry.topic] & {int(t_ns - START_NS) // STEP_NS for t_ns in times}
         wanted[entry.topic] -= new
-        first_ns = first_ns or entry.log_time_ns
-        last_ns = entry.log_time_ns if new and entry.topic == "score" else last_ns
+        first_ns = first_ns or entry.received_t_ns
+        last_ns = entry.received_t_ns if new and entry.topic == "score" else last_ns
     return {
         "messages": told["messages"]["raw"],
         "published, x real time": told["rate"],

@@ -14,7 +14,8 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from pipeline.recordings.order import Seen, in_order
-from pipeline.recordings.reading import Entry, RecordingError, read_recording
+from pipeline.recordings.reading import RecordingError, read_recording
+from schemas.envelope import Envelope
 from schemas.messages import MESSAGE_TYPES, Array, FanState, InvalidReason, Message, Severity, StageStatus, columns
 from schemas.topics import BY_NAME, HEALTH_CHUNK, TOPICS
 
@@ -89,7 +90,7 @@ class Arrays:
         for rest in gathered.values():
             yield rest.block()
 
-    def _entries(self) -> Iterator[Entry]:
+    def _entries(self) -> Iterator[Envelope]:
         """The messages of all parts, each once."""
         seen: dict[tuple[str, str], Seen] = {}
         for path in self.paths:

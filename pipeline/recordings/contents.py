@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import Chunk
 from mcap.summary import Summary
 
 from pipeline.recordings.disk import unwritten
-from pipeline.recordings.reading import CORRUPT_DATA_ERRORS, METADATA_NAME
-from pipeline.recordings.records import RECORD, open_chunk, payloads_of
+from pipeline.recordings.reading import METADATA_NAME
+from pipeline.recordings.records import CORRUPT_DATA_ERRORS, MESSAGE, RECORD, chunk_data, parse, records_in
 from pipeline.recordings.scan import Scan, scan
 from pipeline.recordings.sequence_ledger import (
     BEFORE_NAME,
@@ -224,11 +226,16 @@ def _last_message(file: BinaryIO, summary: Summary, number: int) -> tuple[str, M
     key = summary.channels[number].topic
     chunk = next(chunk for chunk in reversed(summary.chunk_indexes) if number in chunk.message_index_offsets)
     file.seek(chunk.chunk_start_offset + RECORD.size)
-    opened = open_chunk(file.read(chunk.chunk_length - RECORD.size))
+    data = chunk_data(parse(Chunk, file.read(chunk.chunk_length - RECORD.size)))
+    payloads = [
+        data[start + MESSAGE.size : end]
+        for _, opcode, start, end in records_in(data)
+        if opcode == Opcode.MESSAGE and MESSAGE.unpack_from(data, start)[0] == number
+    ]
     kind = _kind(key)
     assert kind is not None
     try:
-        return key, decode(kind, payloads_of(opened, number)[-1])
+        return key, decode(kind, payloads[-1])
     except CodecError:
         return key, None
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.recordings.reading import RecordingError
+from pipeline.recordings.records import RecordingError
 
 _PASSING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENODEV, errno.ENXIO, errno.EROFS, errno.ESTALE)
 

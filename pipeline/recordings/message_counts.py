@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.recordings.packets import Packet, header_of
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
 from schemas.codec import CodecError, decode
+from schemas.envelope import Envelope
+from schemas.fast_decode import decode_header
 from schemas.messages import Health, ModelCard
 from schemas.topics import Topic, topic_of
 
@@ -76,7 +77,7 @@ class MessageCounts:
 
     def _decode(self, lane: _Lane, topic: Topic, log_time_ns: int, payload: bytes) -> None:
         try:
-            header = header_of(Packet(lane.key, topic, log_time_ns, 0, payload))
+            header = decode_header(Envelope(lane.key, topic.name, payload, log_time_ns))
             message = decode(topic.message, payload) if lane.is_news else None
         except CodecError:
             self.undecodable += 1

@@ -44,7 +44,7 @@ def _sessions_in_order(paths: Iterable[Path]) -> list[Path]:
 
 def _start_ns(path: Path) -> int:
     """When its first message was received; a file without any may stand anywhere."""
-    return next((entry.log_time_ns for entry in read_recording(path)), 0)
+    return next((entry.received_t_ns for entry in read_recording(path)), 0)
 
 
 class Seen:

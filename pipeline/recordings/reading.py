@@ -1,116 +1,131 @@
-"""Reading recordings: MCAP files that hold what went over the bus, as any MCAP reader understands it.
+"""Reading recordings: their messages, as bytes or decoded, and what stands before the first message.
 
-A channel is a key of the bus, its messages are the protobuf bytes that were sent, and the schema is embedded. A file
-that breaks off, or is damaged in the middle, is read as far as it goes. See docs/reference/recordings.md.
+A channel is a key of the bus; its messages are the protobuf bytes that were sent. A truncated or damaged file is read
+as far as possible. See docs/reference/recordings.md.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mcap.exceptions import McapError
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata
-from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import MCAP0_MAGIC
-from zstandard import ZstdError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Metadata
 
-from pipeline.errors import UserError
-from schemas.codec import CodecError, decode
-from schemas.messages import Message
-from schemas.topics import Topic, topic_of
+from pipeline.recordings.records import (
+    CORRUPT_DATA_ERRORS,
+    MESSAGE,
+    RECORD,
+    RecordingError,
+    RecordReader,
+    chunk_data,
+    parse,
+)
+from schemas.codec import CodecError
+from schemas.envelope import Envelope
+from schemas.topics import topic_of
+
+__all__ = ["METADATA_NAME", "Reading", "RecordingError", "RecordingMetadata", "read_metadata", "read_recording"]
 
 METADATA_NAME = "fantwin"
-
-
-class RecordingError(UserError):
-    """A recording cannot be read, or not be written any more: one line."""
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One message of a recording."""
-
-    key: str
-    topic: str
-    message: Message
-    log_time_ns: int
-    """when it was received"""
+"""the metadata record that describes a recording"""
 
 
 @dataclass
 class Reading:
-    """The messages of a recording, in the order they were received; one chunk at a time is in memory.
+    """The messages of a file in the order they were recorded; one chunk at a time is in memory.
 
-    What cannot be read is left out and counted: once the messages are through, `damage` says what it was.
+    What cannot be read is skipped and counted. The counts are final once an iteration has ended.
     """
 
     path: Path
     topics: Collection[str] | None
-    torn: bool = field(default=False, init=False)
-    """the file breaks off: its recorder was killed, or lost its power"""
+    tray: str | None
+    truncated: bool = field(default=False, init=False)
+    """the file has no end: its recorder was killed, or lost power"""
     damaged_chunks: int = field(default=0, init=False)
     undecodable: int = field(default=0, init=False)
-    """messages that are not what their channel says"""
+    """messages that do not have the type of their channel"""
 
     @property
     def damage(self) -> str:
-        """One line on what could not be read; empty when all could."""
+        """One line about what could not be read; empty if nothing is missing."""
         found = (
-            ("it breaks off, as after a crash; read up to there", self.torn),
+            ("it is truncated, as after a crash; read up to that point", self.truncated),
             (f"damaged chunks left out: {self.damaged_chunks}", self.damaged_chunks),
             (f"messages left out that cannot be decoded: {self.undecodable}", self.undecodable),
         )
-        said = "; ".join(text for text, is_so in found if is_so)
-        return f"{self.path}: {said}" if said else ""
+        text = "; ".join(line for line, is_so in found if is_so)
+        return f"{self.path}: {text}" if text else ""
 
-    def __iter__(self) -> Iterator[Entry]:
-        self.torn, self.damaged_chunks, self.undecodable = False, 0, 0
-        channels: dict[int, tuple[str, Topic] | None] = {}
-        for record in self._records():
-            if isinstance(record, Channel):
-                channels[record.id] = _key_and_topic(record)
-            elif isinstance(record, McapMessage):
-                channel = channels.get(record.channel_id)
-                if channel is None or (self.topics is not None and channel[1].name not in self.topics):
-                    continue
-                key, topic = channel
-                try:
-                    message = decode(topic.message, record.data)
-                except CodecError:
-                    self.undecodable += 1
-                    continue
-                yield Entry(key, topic.name, message, record.log_time)
+    def __iter__(self) -> Iterator[Envelope]:
+        """The messages, decoded; those that cannot be decoded are skipped."""
+        self.undecodable = 0
+        for envelope in self.undecoded():
+            try:
+                _ = envelope.message
+            except CodecError:
+                self.undecodable += 1
+            else:
+                yield envelope
 
-    def _records(self) -> Iterator[McapRecord]:
-        try:
-            for record in records_of(self.path):
-                if not isinstance(record, Chunk):
-                    yield record
-                    continue
-                try:
-                    inside = breakup_chunk(record, validate_crc=True)
-                except CORRUPT_DATA_ERRORS:
-                    self.damaged_chunks += 1
+    def undecoded(self) -> Iterator[Envelope]:
+        """The messages as bytes; `Envelope.message` decodes one, and may raise CodecError."""
+        self.truncated, self.damaged_chunks = False, 0
+        channels: dict[int, tuple[str, str]] = {}
+        reader = RecordReader(self.path)
+        for record in reader:
+            try:
+                if isinstance(record.parsed, Chunk):
+                    envelopes = self._envelopes(chunk_data(record.parsed), channels)
+                elif record.opcode in (Opcode.CHANNEL, Opcode.MESSAGE):
+                    envelopes = self._envelopes(record.data, channels)
                 else:
-                    yield from inside
-        except CORRUPT_DATA_ERRORS:
-            self.torn = True
+                    continue
+            except CORRUPT_DATA_ERRORS:
+                self.damaged_chunks += 1
+            else:
+                yield from envelopes
+        self.truncated = not reader.is_complete
+        self.damaged_chunks += len(reader.damaged_ranges)
+
+    def _envelopes(self, data: bytes, channels: dict[int, tuple[str, str]]) -> list[Envelope]:
+        """The wanted messages in the records of a chunk; their channels are added to `channels`."""
+        envelopes = []
+        at, end = 0, len(data)
+        while at < end:
+            opcode, length = RECORD.unpack_from(data, at)
+            at += RECORD.size
+            if opcode == Opcode.MESSAGE:
+                channel, _, received_t_ns, newest_t_ns = MESSAGE.unpack_from(data, at)
+                if channel in channels:
+                    payload = data[at + MESSAGE.size : at + length]
+                    envelopes.append(Envelope(*channels[channel], payload, received_t_ns, None, newest_t_ns))
+            elif opcode == Opcode.CHANNEL:
+                self._add_channel(parse(Channel, data[at : at + length]), channels)
+            at += length
+        return envelopes
+
+    def _add_channel(self, channel: Channel, channels: dict[int, tuple[str, str]]) -> None:
+        key = channel.topic
+        try:
+            topic = topic_of(key).name
+        except KeyError:
+            return  # not a channel of fantwin
+        is_wanted = self.topics is None or topic in self.topics
+        if is_wanted and (self.tray is None or key.split("/")[2] == self.tray):
+            channels[channel.id] = (key, topic)
 
 
-def read_recording(path: Path, topics: Collection[str] | None = None) -> Reading:
-    """The messages of a recording, of all topics or of some, to iterate over.
+def read_recording(path: Path, topics: Collection[str] | None = None, tray: str | None = None) -> Reading:
+    """The messages of a recording, to iterate over: of all topics and trays, or only of those named.
 
     Raises:
-        RecordingError: there is no such file, or it is no recording.
+        RecordingError: the file cannot be opened or is not a recording.
     """
-    with suppress(*CORRUPT_DATA_ERRORS):
-        next(records_of(path))
-    return Reading(path, topics)
+    next(iter(RecordReader(path)), None)
+    return Reading(path, topics, tray)
 
 
 @dataclass(frozen=True)
@@ -121,7 +136,7 @@ class RecordingMetadata:
     attachments: Mapping[str, bytes]
 
     def speed_unit(self, tray: str) -> str:
-        """The unit in which people are shown a tray's speeds: of the tray, of the whole recording, or rad/s."""
+        """The unit in which people see a tray's speeds: the tray's, the recording's, or rad/s."""
         return self.metadata.get(f"speed_unit.{tray}") or self.metadata.get("speed_unit", "rad/s")
 
 
@@ -129,40 +144,15 @@ def read_metadata(path: Path) -> RecordingMetadata:
     """The metadata and attachments of a recording.
 
     Raises:
-        RecordingError: there is no such file, or it is no recording.
+        RecordingError: the file cannot be opened or is not a recording.
     """
     metadata: dict[str, str] = {}
     attachments: dict[str, bytes] = {}
-    with suppress(*CORRUPT_DATA_ERRORS):
-        for record in records_of(path):
-            if isinstance(record, Metadata) and record.name == METADATA_NAME:
-                metadata.update(record.metadata)
-            elif isinstance(record, Attachment):
-                attachments[record.name] = record.data
-            elif isinstance(record, Chunk):
-                break
+    for record in RecordReader(path):
+        if isinstance(record.parsed, Metadata) and record.parsed.name == METADATA_NAME:
+            metadata.update(record.parsed.metadata)
+        elif isinstance(record.parsed, Attachment):
+            attachments[record.parsed.name] = record.parsed.data
+        elif record.opcode == Opcode.CHUNK:
+            break
     return RecordingMetadata(metadata, attachments)
-
-
-CORRUPT_DATA_ERRORS = (McapError, ZstdError, ValueError, struct.error, OverflowError, MemoryError)
-"""What reading bytes that are not what they should be raises; the last two where a damaged length asks for too much."""
-
-
-def records_of(path: Path) -> Iterator[McapRecord]:
-    """The records of a file, chunks as they are. Raises RecordingError at its beginning, or one of `BROKEN` later."""
-    try:
-        with path.open("rb") as file:
-            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                raise RecordingError(f"{path}: not a recording (MCAP); make one of a table with `fantwin import`")
-            file.seek(0)
-            size = path.stat().st_size
-            yield from StreamReader(file, emit_chunks=True, record_size_limit=size).records
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot read the recording: {error.strerror}") from error
-
-
-def _key_and_topic(channel: Channel) -> tuple[str, Topic] | None:
-    try:
-        return channel.topic, topic_of(channel.topic)
-    except KeyError:
-        return None  # somebody else's channel

@@ -1,4 +1,8 @@
-"""The records of an MCAP file as they lie in it, as far as they are whole, and past what is damaged."""
+"""The records of an MCAP file in file order, damaged files included: the only place that reads MCAP byte by byte.
+
+The `mcap` library parses each record and opens each chunk. Its own readers stop at the first damaged byte, which is why
+finding the records is done here.
+"""
 
 from __future__ import annotations
 
@@ -10,125 +14,116 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
-from zlib import crc32
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
-from zstandard import ZstdDecompressor
+from zstandard import ZstdError
 
-from pipeline.recordings.reading import CORRUPT_DATA_ERRORS, RecordingError
+from pipeline.errors import UserError
 
 RECORD = struct.Struct("<BQ")
-"""before each record: opcode, length"""
+"""before each record's content: opcode, length of the content"""
 MESSAGE = struct.Struct("<HIQQ")
-"""before a message's bytes: channel, sequence, log time, publish time"""
-_CHUNK = struct.Struct("<QQQI")
-_BEFORE_COMPRESSION = RECORD.size + _CHUNK.size
+"""before a message's payload: channel, sequence, log time, publish time"""
+CORRUPT_DATA_ERRORS = (McapError, ZstdError, ValueError, struct.error, OverflowError, MemoryError)
+"""What parsing damaged bytes raises; the last two where a damaged length asks for too much memory."""
+_BEFORE_COMPRESSION = RECORD.size + 28  # of a chunk: start time, end time, size and checksum
 _ZSTD = b"\x04\x00\x00\x00zstd"
 _KNOWN = frozenset(int(opcode) for opcode in Opcode)
-_DESCRIBING: dict[int, type[McapRecord]] = {
+_PARSED: dict[int, type[McapRecord]] = {
     Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
     Opcode.METADATA: Metadata,
     Opcode.ATTACHMENT: Attachment,
+    Opcode.CHUNK: Chunk,
 }
 _FOOTER_BYTES = 20
 _BLOCK_BYTES = 1 << 20
 
-_Record = TypeVar("_Record", bound=McapRecord)
+_Kind = TypeVar("_Kind", bound=McapRecord)
 
 
-class Found(NamedTuple):
-    """A whole record: where it begins, and what stands after its opcode and length."""
+class RecordingError(UserError):
+    """A recording cannot be read or written. The message is one line."""
+
+
+class Record(NamedTuple):
+    """One record of a file."""
 
     offset: int
     opcode: int
     content: bytes
+    """without opcode and length"""
+    parsed: McapRecord | None
+    """a header, schema, channel, metadata, attachment or chunk; None for other records, and where it is damaged"""
 
     @property
-    def length(self) -> int:
-        """Of all of it in the file."""
-        return RECORD.size + len(self.content)
+    def data(self) -> bytes:
+        """The whole record as in the file."""
+        return RECORD.pack(self.opcode, len(self.content)) + self.content
 
     @property
     def end(self) -> int:
-        """Where the next one begins."""
-        return self.offset + self.length
-
-
-class ChunkContent(NamedTuple):
-    """A chunk, opened and found to be whole."""
-
-    first_ns: int
-    last_ns: int
-    data: bytes
-    """its records, uncompressed"""
-    compression: str
-    compressed_bytes: int
-
-
-class LooseMessage(NamedTuple):
-    """A message record."""
-
-    offset: int
-    channel: int
-    sequence: int
-    log_time_ns: int
-    publish_time_ns: int
-    payload: bytes
+        """Offset of the byte after it."""
+        return self.offset + RECORD.size + len(self.content)
 
 
 @dataclass
 class RecordReader:
-    """All records of a file up to the footer, in order; one is in memory at a time.
+    """The records of a file up to the footer, in file order; one at a time is in memory.
 
-    Where what follows cannot be one, the walk goes on at the next whole chunk, if there is one. Once it is through:
+    After bytes that are no record, reading continues at the next intact chunk. The attributes below are final once the
+    iteration has ended.
     """
 
     path: Path
     is_complete: bool = field(default=False, init=False)
-    """the file ends as it should, with footer and magic"""
+    """the file ends with a footer and the closing magic"""
     end: int = field(default=0, init=False)
-    """where the last whole record ends, that closing magic included"""
+    """offset after the last whole record, closing magic included"""
     size: int = field(default=0, init=False)
-    damaged: list[tuple[int, int]] = field(default_factory=list, init=False)
-    """stretches before `end` that are no records"""
+    damaged_ranges: list[tuple[int, int]] = field(default_factory=list, init=False)
+    """offsets of bytes before `end` that are no records: first, and one past the last"""
 
-    def __iter__(self) -> Iterator[Found]:
-        """Raises RecordingError: the file cannot be read, or is no MCAP file."""
-        self.is_complete, self.end, self.damaged = False, len(MCAP0_MAGIC), []
+    def __iter__(self) -> Iterator[Record]:
+        """Raises RecordingError if the file cannot be read or is not an MCAP file."""
+        self.is_complete, self.end, self.damaged_ranges = False, len(MCAP0_MAGIC), []
         try:
             with self.path.open("rb") as file:
                 if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                    raise RecordingError(f"{self.path}: not a recording (MCAP)")
+                    raise RecordingError(
+                        f"{self.path}: not a recording (MCAP); make one from a table with `fantwin import`"
+                    )
                 self.size = os.fstat(file.fileno()).st_size
                 yield from self._records(file)
         except OSError as error:
             raise RecordingError(f"{self.path}: cannot read the recording: {error.strerror}") from error
 
-    def _records(self, file: BinaryIO) -> Iterator[Found]:
+    def _records(self, file: BinaryIO) -> Iterator[Record]:
         while True:
-            found = self._record(file)
-            if found is None:
+            record = self._record(file)
+            if record is None:
                 resumed = self._next_chunk(file, self.end + 1)
                 if resumed is None:
                     return
-                self.damaged.append((self.end, resumed))
+                self.damaged_ranges.append((self.end, resumed))
                 self.end = resumed
                 file.seek(resumed)
                 continue
-            self.end = found.end
-            yield found
-            if found.opcode == Opcode.FOOTER and len(found.content) == _FOOTER_BYTES:
+            self.end = record.end
+            yield record
+            if record.opcode == Opcode.FOOTER and len(record.content) == _FOOTER_BYTES:
                 self.is_complete = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC and self.end + 8 == self.size
                 self.end += len(MCAP0_MAGIC) if self.is_complete else 0
                 return
 
-    def _record(self, file: BinaryIO) -> Found | None:
+    def _record(self, file: BinaryIO) -> Record | None:
+        """The record at `self.end`; None if the bytes there are no record."""
         head = file.read(RECORD.size)
         if not self._is_plausible(head, self.end):
             return None
@@ -136,20 +131,25 @@ class RecordReader:
         content = file.read(length)
         if len(content) < length:
             return None
-        found = Found(self.end, opcode, content)
-        if opcode in _KNOWN and _is_of_its_length(opcode, content):
-            return found
+        try:
+            parsed = _parse_known(opcode, content)
+        except CORRUPT_DATA_ERRORS:
+            parsed = None
+        else:
+            if opcode in _KNOWN:
+                return Record(self.end, opcode, content, parsed)
         if opcode in (Opcode.CHUNK, Opcode.MESSAGE_INDEX):
-            return None  # a damaged length would cost all that it spans, and the next chunk is easily found
-        following = file.read(RECORD.size)  # the length is not trusted unless it leads to another record
-        file.seek(found.end)
-        return found if self._is_plausible(following, found.end) and following[0] in _KNOWN else None
+            return None  # a damaged length would skip whatever it spans, and the next chunk is easy to find
+        following = file.read(RECORD.size)  # the length is trusted only if it leads to another record
+        file.seek(self.end + RECORD.size + length)
+        leads_on = self._is_plausible(following, self.end + RECORD.size + length) and following[0] in _KNOWN
+        return Record(self.end, opcode, content, parsed) if leads_on else None
 
     def _is_plausible(self, head: bytes, offset: int) -> bool:
         return len(head) == RECORD.size and head[0] != 0 and RECORD.unpack(head)[1] <= self.size - offset - RECORD.size
 
     def _next_chunk(self, file: BinaryIO, start: int) -> int | None:
-        """Where the next whole chunk of our own kind begins, from `start` on."""
+        """Offset of the next intact zstd chunk at or after `start`; None if there is none."""
         at, window = start, b""
         file.seek(start)
         while block := file.read(_BLOCK_BYTES):
@@ -172,64 +172,54 @@ class RecordReader:
         if opcode != Opcode.CHUNK or length > self.size - offset - RECORD.size:
             return False
         try:
-            open_chunk(file.read(length))
+            chunk_data(parse(Chunk, file.read(length)))
         except CORRUPT_DATA_ERRORS:
             return False
         return True
 
 
-def _is_of_its_length(opcode: int, content: bytes) -> bool:
-    """Whether the lengths inside a record agree with its own, where it has any inside."""
+def parse(kind: type[_Kind], content: bytes) -> _Kind:
+    """A record (of any kind but Message) from its content. Raises one of CORRUPT_DATA_ERRORS."""
+    record = kind.read(ReadDataStream(BytesIO(content)))  # type: ignore[attr-defined]  every kind but Message has it
+    written = record_bytes(record)[RECORD.size :]
+    has_no_checksum = kind is Attachment and content == written[:-4] + bytes(4)
+    if content != written and not has_no_checksum:
+        raise ValueError(f"these {len(content)} bytes are not a {kind.__name__} record, or its checksum is wrong")
+    return record
+
+
+def _parse_known(opcode: int, content: bytes) -> McapRecord | None:
+    if opcode == Opcode.MESSAGE_INDEX:  # its entries are not needed, and parsing them is slow
+        if struct.unpack_from("<I", content, 2)[0] != len(content) - 6:
+            raise ValueError("a message index whose length is wrong")
+        return None
+    return parse(_PARSED[opcode], content) if opcode in _PARSED else None
+
+
+def chunk_data(chunk: Chunk) -> bytes:
+    """The uncompressed records of a chunk. Raises one of CORRUPT_DATA_ERRORS where it is damaged."""
+    if chunk.compression not in ("", "zstd", "lz4"):
+        raise ValueError(f"unknown compression {chunk.compression!r}")
     try:
-        if opcode == Opcode.CHUNK:
-            _, at = _text(content, _CHUNK.size)
-            return struct.unpack_from("<Q", content, at)[0] == len(content) - at - 8
-        if opcode == Opcode.MESSAGE_INDEX:
-            return struct.unpack_from("<I", content, 2)[0] == len(content) - 6
-        if opcode in _DESCRIBING:
-            parse(_DESCRIBING[opcode], content)
-    except CORRUPT_DATA_ERRORS:
-        return False
-    return True
-
-
-def open_chunk(content: bytes) -> ChunkContent:
-    """Open a chunk record. Raises one of `BROKEN` where it is damaged."""
-    first_ns, last_ns, size, crc = _CHUNK.unpack_from(content)
-    compression, at = _text(content, _CHUNK.size)
-    (length,) = struct.unpack_from("<Q", content, at)
-    packed = content[at + 8 :]
-    if length != len(packed):
-        raise ValueError("a chunk of another length than it says")
-    if compression == "zstd":
-        data = ZstdDecompressor().decompress(packed, max_output_size=size)
-    elif not compression:
-        data = packed
-    elif compression == "lz4":
-        data = _by_the_library(content)
-    else:
-        raise ValueError(f"compressed with {compression!r}")
-    if len(data) != size or (crc and crc32(data) != crc):
-        raise ValueError("a chunk that is not what was written")
-    chunk = ChunkContent(first_ns, last_ns, data, compression, len(packed))
-    if not crc:
-        deque(records_in(chunk), 0)  # what has no checksum must have a form at least
-    return chunk
-
-
-def _by_the_library(content: bytes) -> bytes:
-    try:
-        stream, size = get_chunk_data_stream(parse(Chunk, content))
-    except RuntimeError as error:  # of lz4, which knows no other
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    except RuntimeError as error:  # lz4 raises nothing more specific
         raise ValueError(str(error)) from error
-    return stream.read(size)
+    if size != chunk.uncompressed_size:
+        raise ValueError(f"a chunk of {size} bytes instead of {chunk.uncompressed_size}")
+    data = stream.read(size)
+    if not chunk.uncompressed_crc:
+        deque(records_in(data), 0)  # without a checksum, at least the lengths must be right
+    return data
 
 
-def records_in(chunk: ChunkContent) -> Iterator[tuple[int, int, int, int]]:
-    """Offset, opcode, and where the content begins and ends, of each record of a chunk. Raises one of `BROKEN`."""
-    at, size = 0, len(chunk.data)
+def records_in(data: bytes) -> Iterator[tuple[int, int, int, int]]:
+    """Of each record in a chunk's data: offset, opcode, and where its content begins and ends.
+
+    Raises one of CORRUPT_DATA_ERRORS.
+    """
+    at, size = 0, len(data)
     while at < size:
-        opcode, length = RECORD.unpack_from(chunk.data, at)
+        opcode, length = RECORD.unpack_from(data, at)
         start = at + RECORD.size
         if start + length > size:
             raise ValueError("a record that is longer than its chunk")
@@ -237,38 +227,9 @@ def records_in(chunk: ChunkContent) -> Iterator[tuple[int, int, int, int]]:
         at = start + length
 
 
-def message_of(content: bytes) -> LooseMessage:
-    """A message from a record's content. Raises one of `BROKEN`."""
-    channel, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(content)
-    return LooseMessage(0, channel, sequence, log_time_ns, publish_time_ns, content[MESSAGE.size :])
-
-
-def payloads_of(chunk: ChunkContent, channel: int) -> list[bytes]:
-    """The payloads of a channel's messages in a chunk. Raises one of `BROKEN`."""
-    return [
-        chunk.data[start + MESSAGE.size : end]
-        for _, opcode, start, end in records_in(chunk)
-        if opcode == Opcode.MESSAGE and MESSAGE.unpack_from(chunk.data, start)[0] == channel
-    ]
-
-
-def parse(kind: type[_Record], content: bytes) -> _Record:
-    """A record from its content; not for messages. Raises one of `BROKEN`."""
-    record = kind.read(ReadDataStream(BytesIO(content)))  # type: ignore[attr-defined]  all but messages have it
-    if len(record_bytes(record)) != RECORD.size + len(content):
-        raise ValueError(f"what says it is {kind.__name__} is something else")
-    return record
-
-
 def record_bytes(*records: McapRecord) -> bytes:
-    """Records as they stand in a file."""
+    """Records as they are written to a file."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
     return builder.end()
-
-
-def _text(content: bytes, at: int) -> tuple[str, int]:
-    (length,) = struct.unpack_from("<I", content, at)
-    end = at + 4 + length
-    return content[at + 4 : end].decode(), end

@@ -10,20 +10,20 @@ from zlib import crc32
 
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Header, Metadata, Schema
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from pipeline.recordings.index import Index, message_indexes
 from pipeline.recordings.message_counts import MessageCounts
-from pipeline.recordings.reading import CORRUPT_DATA_ERRORS, METADATA_NAME
+from pipeline.recordings.reading import METADATA_NAME
 from pipeline.recordings.records import (
+    CORRUPT_DATA_ERRORS,
     MESSAGE,
     RECORD,
-    ChunkContent,
-    Found,
+    Record,
     RecordReader,
-    open_chunk,
+    chunk_data,
     parse,
     record_bytes,
     records_in,
@@ -85,7 +85,7 @@ class Scan:
     def is_damaged(self) -> bool:
         """Something in the middle cannot be read."""
         records = self.damaged_chunks + self.damaged_attachments + self.damaged_records
-        return bool(self.walk.damaged or records or self.nameless)
+        return bool(self.walk.damaged_ranges or records or self.nameless)
 
     @property
     def is_whole(self) -> bool:
@@ -135,7 +135,7 @@ class _Scanner:
 
     def scan(self) -> Scan:
         found, walk = self._found, self._found.walk
-        footer: Found | None = None
+        footer: Record | None = None
         for record in walk:
             if not self._past_data:
                 self._take(record)
@@ -143,20 +143,20 @@ class _Scanner:
                 footer = record
         found.has_index = footer is not None and walk.is_complete and self._is_index_sound(footer)
         torn_at = walk.end if not self._past_data else walk.size
-        found.thrown_away_bytes += walk.size - torn_at + sum(end - start for start, end in walk.damaged)
+        found.thrown_away_bytes += walk.size - torn_at + sum(end - start for start, end in walk.damaged_ranges)
         return found
 
-    def _take(self, record: Found) -> None:
+    def _take(self, record: Record) -> None:
         found = self._found
         try:
             self._take_kind(record)
         except CORRUPT_DATA_ERRORS:
-            found.thrown_away_bytes += record.length
+            found.thrown_away_bytes += record.end - record.offset
             found.damaged_chunks += record.opcode == Opcode.CHUNK
             found.damaged_attachments += record.opcode == Opcode.ATTACHMENT
             found.damaged_records += record.opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT)
 
-    def _take_kind(self, record: Found) -> None:
+    def _take_kind(self, record: Record) -> None:
         opcode, content = record.opcode, record.content
         if opcode == Opcode.CHUNK:
             self._take_chunk(record)
@@ -177,7 +177,7 @@ class _Scanner:
         elif opcode != Opcode.MESSAGE_INDEX or len(content) != 6 + struct.unpack_from("<HI", content)[1]:
             raise ValueError("no such record may stand here")  # indexes of messages may, and are made anew
 
-    def _take_loose(self, record: Found) -> None:
+    def _take_loose(self, record: Record) -> None:
         """A message outside of chunks, as others write them."""
         channel, sequence, log_time_ns, _ = MESSAGE.unpack_from(record.content)
         if not self._found.census.knows(channel):
@@ -186,16 +186,16 @@ class _Scanner:
         self._found.index.note_loose(channel, log_time_ns)
         self._keep_record(record)
 
-    def _keep_record(self, record: Found) -> int:
+    def _keep_record(self, record: Record) -> int:
         if not self._has_begun and record.opcode != Opcode.HEADER:
             self._keep(record_bytes(Header(profile="", library="fantwin")))
         self._has_begun = True
         offset = self._keep(RECORD.pack(record.opcode, len(record.content)) + record.content)
         self._found.fits &= offset == record.offset
-        self._found.solid_end, self._found.tail = offset + record.length, b""
+        self._found.solid_end, self._found.tail = offset + (record.end - record.offset), b""
         return offset
 
-    def _take_metadata(self, record: Found) -> None:
+    def _take_metadata(self, record: Record) -> None:
         found, metadata = self._found, parse(Metadata, record.content)
         if metadata.name == LEDGER_NAME:
             found.recorded = accounts_of(metadata.metadata)
@@ -208,21 +208,22 @@ class _Scanner:
         elif metadata.name == BEFORE_NAME:
             found.before = before_of(metadata.metadata)
             found.census.ledger = SequenceLedger(found.before)
-        found.index.note_metadata(metadata, self._keep_record(record), record.length)
+        found.index.note_metadata(metadata, self._keep_record(record), (record.end - record.offset))
 
-    def _take_attachment(self, record: Found) -> None:
+    def _take_attachment(self, record: Record) -> None:
         attachment = parse(Attachment, record.content)
         crc = int.from_bytes(record.content[-4:], "little")
         if crc and crc != crc32(record.content[:-4]):
             raise ValueError("an attachment that is not what was written")
         self._found.attachments.append(attachment.name)
-        self._found.index.note_attachment(attachment, self._keep_record(record), record.length)
+        self._found.index.note_attachment(attachment, self._keep_record(record), (record.end - record.offset))
 
-    def _take_chunk(self, record: Found) -> None:
-        chunk = open_chunk(record.content)
-        data = chunk.data
+    def _take_chunk(self, record: Record) -> None:
+        assert isinstance(record.parsed, Chunk)
+        chunk = record.parsed
+        data = chunk_data(chunk)
         entries: dict[int, list[int]] = {}
-        for offset, opcode, start, end in records_in(chunk):
+        for offset, opcode, start, end in records_in(data):
             if opcode == Opcode.MESSAGE:
                 channel, sequence, log_time_ns, _ = MESSAGE.unpack_from(data, start)
                 flat = entries.get(channel)
@@ -236,22 +237,22 @@ class _Scanner:
         self._found.nameless += sum(len(entries[channel]) // 2 for channel in entries.keys() & self._made_up)
         self._keep_chunk(record, chunk, entries)
 
-    def _keep_chunk(self, record: Found, chunk: ChunkContent, entries: dict[int, list[int]]) -> None:
+    def _keep_chunk(self, record: Record, chunk: Chunk, entries: dict[int, list[int]]) -> None:
         offset = self._keep_record(record)
-        indexes, offsets = message_indexes(entries, offset + record.length)
+        indexes, offsets = message_indexes(entries, offset + (record.end - record.offset))
         self._keep(indexes)
         self._found.tail = indexes
         self._found.index.note_chunk(
             ChunkIndex(
-                message_start_time=chunk.first_ns,
-                message_end_time=chunk.last_ns,
+                message_start_time=chunk.message_start_time,
+                message_end_time=chunk.message_end_time,
                 chunk_start_offset=offset,
-                chunk_length=record.length,
+                chunk_length=(record.end - record.offset),
                 message_index_offsets=offsets,
                 message_index_length=len(indexes),
                 compression=chunk.compression,
-                compressed_size=chunk.compressed_bytes,
-                uncompressed_size=len(chunk.data),
+                compressed_size=len(chunk.data),
+                uncompressed_size=chunk.uncompressed_size,
             ),
             {channel: len(flat) // 2 for channel, flat in entries.items()},
         )
@@ -283,7 +284,7 @@ class _Scanner:
             if each:
                 self._describe(Opcode.SCHEMA if each is schema else Opcode.CHANNEL, record_bytes(each)[RECORD.size :])
 
-    def _is_index_sound(self, footer: Found) -> bool:
+    def _is_index_sound(self, footer: Record) -> bool:
         start, _, crc = struct.unpack("<QQI", footer.content)
         if not start:
             return False

@@ -44,7 +44,7 @@ def record(device: Device, path: Path, epoch_ns: int, duration_s: float, speed_u
         task = progress.add_task(f"simulating {duration_s:g} s", total=duration_s)
         for sequence, block in enumerate(_blocks(device, played)):
             raw = _raw(device.fans, block, epoch_ns, sequence)
-            writer.write_message(tray_key(SITE, TRAY, "raw"), raw, int(raw.host_receive_t_ns[-1]))
+            writer.add_message(tray_key(SITE, TRAY, "raw"), raw, int(raw.host_receive_t_ns[-1]))
             played.samples_sent += len(block)
             progress.update(task, completed=block[-1].t_s)
     return played

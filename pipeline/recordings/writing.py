@@ -25,8 +25,8 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from pipeline.recordings.chunk import FillingChunk
 from pipeline.recordings.disk import AtomicAppendFile, refused, sync_folder
 from pipeline.recordings.index import SHORT_ENDING, Index
-from pipeline.recordings.reading import METADATA_NAME, RecordingError
-from pipeline.recordings.records import record_bytes
+from pipeline.recordings.reading import METADATA_NAME
+from pipeline.recordings.records import RecordingError, record_bytes
 from pipeline.recordings.sequence_ledger import (
     BEFORE_NAME,
     ENDED,
@@ -37,7 +37,8 @@ from pipeline.recordings.sequence_ledger import (
     StreamId,
     as_metadata,
 )
-from schemas.codec import encode, proto_type, type_name
+from schemas.codec import proto_type, type_name
+from schemas.envelope import Envelope
 from schemas.messages import Health, Message, newest_t_ns
 from schemas.topics import topic_of
 
@@ -46,15 +47,6 @@ CHUNK_BYTES = 64 * 1024
 """What is not yet in a finished chunk is lost in a crash, and a reader holds one chunk in memory."""
 UNSYNCED_BYTES = 4 << 20
 """About so much is held in memory at most until it is through to the disk."""
-
-
-class Pending(NamedTuple):
-    """A message that is to be in a recording: the key it came on, its bytes, when it was received."""
-
-    key: str
-    payload: bytes
-    message: Message
-    log_time_ns: int
 
 
 class RecordingWriter:
@@ -94,7 +86,7 @@ class RecordingWriter:
         self.ledger = ledger or SequenceLedger()
         self.written: Counter[str] = Counter()
         """messages of each topic that are in the file for good: through to the disk"""
-        self._filling: list[Pending] = []
+        self._filling: list[Envelope] = []
         """those of the chunk that is not written yet"""
         self._unsynced: list[_WrittenChunk] = []
         """what is written and may not be on the disk yet"""
@@ -134,33 +126,36 @@ class RecordingWriter:
         return self._file.size
 
     @property
-    def pending(self) -> list[Pending]:
+    def pending(self) -> list[Envelope]:
         """The messages that are not in the file for good, in their order."""
         return [*chain.from_iterable(chunk.messages for chunk in self._unsynced), *self._filling]
 
-    def write(self, key: str, payload: bytes, message: Message, log_time_ns: int) -> None:
-        """Add a message: the key it came on, its bytes, and when it was received.
+    def add(self, envelope: Envelope) -> None:
+        """Add a message.
 
         Raises:
             RecordingError: the disk refuses; `pending` then has what did not get into the file.
         """
+        key, message = envelope.key, envelope.message
         channel, _ = self._channels.get(key) or self._register(key, type(message))
-        self._filling.append(Pending(key, payload, message, log_time_ns))
-        self._chunk.add(channel, message.header.sequence, log_time_ns, newest_t_ns(message), payload)
+        self._filling.append(envelope)
+        self._chunk.add(
+            channel, message.header.sequence, envelope.received_t_ns, newest_t_ns(message), envelope.payload
+        )
         if self._chunk.size > CHUNK_BYTES:
             self._close_chunk()
             if self._unsynced_bytes > UNSYNCED_BYTES:
                 self._sync()
 
-    def write_message(self, key: str, message: Message, log_time_ns: int) -> None:
-        """The same for a message that has not been on the bus."""
-        self.write(key, encode(message), message, log_time_ns)
+    def add_message(self, key: str, message: Message, received_t_ns: int) -> None:
+        """Add a message that has not been on the bus. Raises RecordingError as `add` does."""
+        self.add(Envelope.of(key, message, received_t_ns))
 
     def flush(self) -> None:
         """Through to the disk: what has been written until now survives a crash, of the machine too.
 
         Raises:
-            RecordingError: as in `write`.
+            RecordingError: as in `add`.
         """
         self._close_chunk()
         self._sync()
@@ -171,7 +166,7 @@ class RecordingWriter:
         has_ended: the recorder comes to its end with it; what was published and has not come is then missing.
 
         Raises:
-            RecordingError: as in `write`.
+            RecordingError: as in `add`.
         """
         if self._ended:
             return
@@ -249,9 +244,10 @@ class RecordingWriter:
 
     def _note(self, chunk: _WrittenChunk) -> None:
         self._index.note_chunk(chunk.place, chunk.counts)
-        for key, _, message, log_time_ns in chunk.messages:
+        for envelope in chunk.messages:
+            key, message = envelope.key, envelope.message
             header = message.header
-            self.ledger.note(key, header.producer, header.sequence, log_time_ns)
+            self.ledger.note(key, header.producer, header.sequence, envelope.received_t_ns)
             self.written[self._channels[key][1]] += 1
             if isinstance(message, Health):
                 self.ledger.note_health(message)
@@ -306,7 +302,7 @@ class _WrittenChunk(NamedTuple):
     place: ChunkIndex
     counts: dict[int, int]
     """messages by channel"""
-    messages: list[Pending]
+    messages: list[Envelope]
 
 
 @cache

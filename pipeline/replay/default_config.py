@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.config.loading import parse_config
 from pipeline.config.models import Config
-from pipeline.recordings.packets import PacketReading
-from pipeline.recordings.reading import RecordingError, RecordingMetadata
+from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_recording
 from pipeline.runtime.twin_file import TwinFile
-from schemas.codec import CodecError, decode
+from schemas.codec import CodecError
 from schemas.messages import Raw
 
 GAP_STEPS = 5.0
@@ -31,11 +31,11 @@ def first_raw(paths: Sequence[Path], head: RecordingMetadata) -> dict[str, list[
     told = [name for name in head.metadata.get("trays", "").split(",") if name]
     found: dict[str, list[Raw]] = {}
     samples: dict[str, int] = {}
-    for packet in PacketReading(paths, ("raw",)):
+    for packet in chain.from_iterable(read_recording(path, ("raw",)).undecoded() for path in paths):
         tray = packet.key.split("/")[2]
         if samples.get(tray, 0) < _LOOKED_AT:
             try:
-                message = decode(Raw, packet.payload)
+                message = packet.message
             except CodecError:
                 continue
             assert isinstance(message, Raw)

@@ -9,10 +9,11 @@ from pathlib import Path
 from pipeline.config.loading import load_config, parse_config
 from pipeline.config.models import Config
 from pipeline.recordings.metadata import CONFIGURATION
-from pipeline.recordings.reading import Entry, RecordingError, RecordingMetadata, read_metadata
+from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
+from schemas.envelope import Envelope
 
 
-def resolve_config(file: Path, first: Entry, config: Path | None, overrides: Iterable[str]) -> Config:
+def resolve_config(file: Path, first: Envelope, config: Path | None, overrides: Iterable[str]) -> Config:
     """The configuration to replay with: the one given, else the one attached to `file`, else site and trays out of the
     recording, and defaults. `first` is the recording's first message.
 

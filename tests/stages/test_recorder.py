@@ -23,7 +23,7 @@ from pipeline.config.models import TrayConfig
 from pipeline.recordings.disk import DiskError
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
-from pipeline.recordings.writing import Pending, RecordingWriter
+from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.stage import Context, StageError
 from schemas.codec import encode
 from schemas.envelope import Envelope
@@ -71,15 +71,15 @@ class Part:
         self.path, self.t_ns, self.about, self.ledger = Path(name), t_ns, dict(about), ledger
         self._disk = disk
         self.written: Counter[str] = Counter()
-        self.pending: list[Pending] = []
-        self.content: list[Pending] = []
+        self.pending: list[Envelope] = []
+        self.content: list[Envelope] = []
         self.flushes = 0
         self.closed = ""
         self.size = 0
 
-    def write(self, key: str, payload: bytes, message: Message, log_time_ns: int) -> None:
+    def add(self, envelope: Envelope) -> None:
         self._touch()
-        self.pending.append(Pending(key, payload, message, log_time_ns))
+        self.pending.append(envelope)
         if len(self.content) + len(self.pending) > self._disk.room:
             self._refuse()
 
@@ -87,8 +87,9 @@ class Part:
         self._touch()
         if self._disk.refuses:
             self._refuse()
-        for key, _, message, log_time_ns in self.pending:
-            self.ledger.note(key, message.header.producer, message.header.sequence, log_time_ns)
+        for envelope in self.pending:
+            header = envelope.message.header
+            self.ledger.note(envelope.key, header.producer, header.sequence, envelope.received_t_ns)
         self.written.update(topic_of(pending.key).name for pending in self.pending)
         self.size += sum(len(pending.payload) for pending in self.pending)
         self.content += self.pending
@@ -173,7 +174,7 @@ def test_every_topic_of_the_table_is_recorded_as_it_came(tmp_path_factory, messa
         assert list(core.step(item)) == []
     core.close()
     entries = list(read_recording(run.run_folder / "recording.mcap"))
-    assert [(e.key, e.topic, e.log_time_ns) for e in entries] == [(p.key, p.topic, p.received_t_ns) for p in packets]
+    assert [(e.key, e.topic, e.received_t_ns) for e in entries] == [(p.key, p.topic, p.received_t_ns) for p in packets]
     for entry, item in zip(entries, packets, strict=True):
         assert same(encode(entry.message), item.payload)
     counted = {f"recorded_{topic.name}": 1 for topic in TOPICS}
@@ -211,7 +212,7 @@ def test_a_twin_that_cannot_be_read_does_not_keep_it_from_recording(tmp_path, ca
 def test_it_says_under_which_name_the_recording_of_a_killed_recorder_is_kept(tmp_path, caplog):
     run = context(tmp_path)
     with RecordingWriter(run.run_folder / "recording.mcap", {}) as writer:
-        writer.write_message(tray_key("plant", "tray1", "raw"), raw(0), 1)
+        writer.add_message(tray_key("plant", "tray1", "raw"), raw(0), 1)
     writer.path.rename(run.run_folder / "recording.mcap.active")
     with caplog.at_level(logging.WARNING):
         STAGE.build(run).core.close()
@@ -240,7 +241,7 @@ def test_every_message_is_on_the_disk_a_second_after_it_was_received_and_not_at_
         now_ns = NOW_NS + tick * TICK_NS
         core.step(packet(raw(tick), "raw", now_ns - 1))
         core.tick(now_ns)
-        assert all(now_ns + TICK_NS - pending.log_time_ns <= SECOND_NS for pending in disk.parts[0].pending)
+        assert all(now_ns + TICK_NS - pending.received_t_ns <= SECOND_NS for pending in disk.parts[0].pending)
     assert disk.parts[0].flushes == 10
 
 
@@ -469,7 +470,7 @@ def test_each_part_begins_with_the_last_card_of_each_twin():
     first, second = ([(type(p.message).__name__, p.message.header.sequence) for p in q.content] for q in disk.parts)
     assert first == [("ModelCard", 0), ("ModelCard", 1), ("Raw", 0)]
     assert second == [("ModelCard", 1), ("Raw", 1)]
-    assert disk.parts[1].content[0].log_time_ns == disk.parts[1].t_ns
+    assert disk.parts[1].content[0].received_t_ns == disk.parts[1].t_ns
     assert (tray_key("plant", "tray1", "twin"), "twin_integrator-1") not in disk.parts[1].ledger.accounts
 
 

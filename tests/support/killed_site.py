@@ -175,7 +175,7 @@ class Stages:
         stamped: Any = replace(message, header=Header(session.producer, sequence, self.tray, position))
         session.kept.append((topic, stamped))
         if self.records:
-            self.writer.write_message(tray_key(self.config.site, self.tray, topic), stamped, self.now_ns)
+            self.writer.add_message(tray_key(self.config.site, self.tray, topic), stamped, self.now_ns)
         if topic == "raw" and self.lost_on_the_bus:
             self.lost_on_the_bus -= 1
             return

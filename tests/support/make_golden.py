@@ -91,7 +91,7 @@ def keep(recording: Path) -> None:
     with RecordingWriter(GOLDEN, metadata, head.attachments, overwrite=True) as writer:
         for entry in read_recording(recording):
             if entry.topic != "health":
-                writer.write_message(entry.key, entry.message, entry.log_time_ns)
+                writer.add_message(entry.key, entry.message, entry.received_t_ns)
 
 
 def run(*words: object) -> None:

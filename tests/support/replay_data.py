@@ -35,5 +35,5 @@ def write_raw(path: Path, samples: int, *, fans: int = 8, tray: str = "tray1", m
     with RecordingWriter(path, {"trays": tray, "speed_unit": "rpm"}, t_ns=START_NS) as writer:
         for sequence, sample in enumerate(kept):
             raw = raw_of(sample, fans, sequence=sequence, tray=tray)
-            writer.write_message(tray_key("demo", tray, "raw"), raw, START_NS + sample * STEP_NS + 2_000_000)
+            writer.add_message(tray_key("demo", tray, "raw"), raw, START_NS + sample * STEP_NS + 2_000_000)
     return path

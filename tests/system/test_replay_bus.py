@@ -243,12 +243,12 @@ def test_the_viewer_draws_every_score_of_a_replay(site, tmp_path):
     scores, alarms = made_up_tray(seconds=20, fans=8)
     with RecordingWriter(tmp_path / "source.mcap", {"trays": TRAY}) as writer:
         card = ModelCard(header=Header("t", 0, TRAY), t_ns=0, twin="f40", kind="hybrid", sha256="")
-        writer.write_message(tray_key("elsewhere", TRAY, "twin"), card, int(scores[0].t_ns[0]))
+        writer.add_message(tray_key("elsewhere", TRAY, "twin"), card, int(scores[0].t_ns[0]))
         for topic, messages in (("score", scores), ("alarm", alarms)):
             for sequence, message in enumerate(messages):
                 stamped = type(message)(**{**vars(message), "header": Header("scorer-1", sequence, TRAY)})
                 t_ns = message.t_ns if isinstance(message.t_ns, int) else int(message.t_ns[-1])
-                writer.write_message(tray_key("elsewhere", TRAY, topic), stamped, t_ns)
+                writer.add_message(tray_key("elsewhere", TRAY, topic), stamped, t_ns)
     viewer = site.start("viewer")
     done = site.replay(tmp_path / "source.mcap", "--rate", 50, "--json")
     assert done.returncode == 0, done.stderr

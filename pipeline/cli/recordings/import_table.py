@@ -92,7 +92,7 @@ def write_table(table: Table, output: Path, tray: str) -> None:
                 command=table.command[rows],
                 speed_rad_s=table.speed_rad_s[rows],
             )
-            writer.write_message(tray_key(SITE, tray, "raw"), raw, int(table.t_ns[rows][-1]))
+            writer.add_message(tray_key(SITE, tray, "raw"), raw, int(table.t_ns[rows][-1]))
 
 
 def account(table: Table, output: Path) -> dict[str, object]:

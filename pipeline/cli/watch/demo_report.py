@@ -118,7 +118,7 @@ def _read(recordings: Iterable[Path]) -> _Recorded:
                 recorded.grid |= _named(message, message.t_ns)
             elif isinstance(message, Score):
                 recorded.scored |= _named(message, message.t_ns)
-                recorded.latencies_ms += ((entry.log_time_ns - message.t_ns) / 1e6).tolist()
+                recorded.latencies_ms += ((entry.received_t_ns - message.t_ns) / 1e6).tolist()
             elif isinstance(message, Alarm):
                 recorded.alarms.append(message)
     recorded.alarms.sort(key=lambda alarm: alarm.t_ns)

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from pipeline.recordings.reading import Entry
 from pipeline.replay.live.keyboard import Key
 from pipeline.replay.live.pace import Pace, faster, slower
+from schemas.envelope import Envelope
 from schemas.messages import Raw, StageStatus
 from schemas.topics import TOPICS
 
@@ -53,7 +53,7 @@ class RealTime:
 class Output(Protocol):
     """Where the messages go; see `pipeline.replay.live.sender`."""
 
-    def send(self, entry: Entry) -> None: ...  # noqa: D102
+    def send(self, entry: Envelope) -> None: ...  # noqa: D102
     def tell_clock(self, t_ns: int, rate: float) -> None: ...  # noqa: D102
     def tell_health(self, status: StageStatus = ..., problem: str = ...) -> None: ...  # noqa: D102
     def published(self) -> Mapping[str, int]: ...  # noqa: D102
@@ -99,7 +99,7 @@ class Player:
         self.began_s = self.ended_s = clock.now_s()
         """the same by this process's clock"""
 
-    def play(self, rounds: Iterable[tuple[int, Entry]]) -> None:
+    def play(self, rounds: Iterable[tuple[int, Envelope]]) -> None:
         """Play to the end.
 
         Raises:
@@ -112,7 +112,7 @@ class Player:
                 self._wait_for(entry)
                 self._output.send(entry)
                 self._messages += 1
-                self.last_ns = max(self.last_ns, entry.log_time_ns)
+                self.last_ns = max(self.last_ns, entry.received_t_ns)
                 self._note_step(entry)
         finally:
             self.ended_s = self._clock.now_s()
@@ -124,19 +124,19 @@ class Player:
         if self._clock.now_s() >= self._next_beat_s:
             self._beat(self._clock.now_s(), self.last_ns, self.last_ns)
 
-    def _begin(self, entry: Entry) -> None:
+    def _begin(self, entry: Envelope) -> None:
         self.began_s = self._clock.now_s()
-        self.first_ns = self.last_ns = entry.log_time_ns
-        self._pace.start(entry.log_time_ns, self.began_s)
+        self.first_ns = self.last_ns = entry.received_t_ns
+        self._pace.start(entry.received_t_ns, self.began_s)
 
-    def _wait_for(self, entry: Entry) -> None:
+    def _wait_for(self, entry: Envelope) -> None:
         """Return when the message is due."""
         while True:
             now_s = self._clock.now_s()
             if now_s >= self._next_beat_s:
                 self._press(entry, now_s)
-                self._beat(now_s, self._pace.position_ns(now_s, entry.log_time_ns), _no_later(entry))
-            wait_s = 0.0 if self._steps else self._pace.due_in_s(entry.log_time_ns, now_s)
+                self._beat(now_s, self._pace.position_ns(now_s, entry.received_t_ns), _no_later(entry))
+            wait_s = 0.0 if self._steps else self._pace.due_in_s(entry.received_t_ns, now_s)
             if self._clock.wait(min(max(wait_s, 0.0), BEAT_S)):
                 raise Stopped
             if wait_s <= 0.0:
@@ -152,10 +152,10 @@ class Player:
             self._output.tell_health()
         self._look(Progress(position_ns, self._pace.rate, self._pace.paused, self._round, self._messages))
 
-    def _press(self, entry: Entry, now_s: float) -> None:
+    def _press(self, entry: Envelope, now_s: float) -> None:
         """Do what the keys ask for."""
         for key in self._keys():
-            at_ns = self._pace.position_ns(now_s, entry.log_time_ns)
+            at_ns = self._pace.position_ns(now_s, entry.received_t_ns)
             match key:
                 case Key.PAUSE:
                     self._pace.change(at_ns, now_s, paused=not self._pace.paused)
@@ -169,18 +169,18 @@ class Player:
                 case Key.QUIT:
                     raise Stopped
 
-    def _note_step(self, entry: Entry) -> None:
+    def _note_step(self, entry: Envelope) -> None:
         """A step ends with a message of the first topic there is: with the next sample, and all recorded before it."""
         self._leading = min(self._leading, _RANK[entry.topic])
         if self._steps and _RANK[entry.topic] == self._leading:
             self._steps -= 1
-            self._pace.change(entry.log_time_ns, self._clock.now_s(), paused=True)
+            self._pace.change(entry.received_t_ns, self._clock.now_s(), paused=True)
             self._next_beat_s = self._clock.now_s()  # to be seen at once
 
 
-def _no_later(entry: Entry) -> int:
+def _no_later(entry: Envelope) -> int:
     """The time of its oldest raw sample, or its own."""
     message = entry.message
     if isinstance(message, Raw) and len(message.host_receive_t_ns):
         return int(message.host_receive_t_ns[0])
-    return entry.log_time_ns
+    return entry.received_t_ns

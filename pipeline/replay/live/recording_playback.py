@@ -15,7 +15,8 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from pipeline.recordings.order import Seen, in_order
-from pipeline.recordings.reading import Entry, RecordingError, read_recording
+from pipeline.recordings.reading import RecordingError, read_recording
+from schemas.envelope import Envelope
 from schemas.messages import Array, Grid, Message, Prediction, Raw, Score
 from schemas.units import NS_PER_S
 
@@ -44,27 +45,27 @@ class RecordingPlayback:
         self._topics = topics
         first = self.first = firsts[self.files[0]]
         self._start_ns = (
-            first.log_time_ns + round(start_s * NS_PER_S) if start_s else 0
+            first.received_t_ns + round(start_s * NS_PER_S) if start_s else 0
         )  # all of it, whatever its times
-        self._end_ns = first.log_time_ns + round(end_s * NS_PER_S) if math.isfinite(end_s) else None
+        self._end_ns = first.received_t_ns + round(end_s * NS_PER_S) if math.isfinite(end_s) else None
         self.damage: tuple[str, ...] = ()
         """what could not be read, a line for each file, once the messages are through"""
 
     def seconds_at(self, t_ns: int) -> float:
         """Seconds since the first message of the recording."""
-        return (t_ns - self.first.log_time_ns) / NS_PER_S
+        return (t_ns - self.first.received_t_ns) / NS_PER_S
 
     def end_s(self) -> float | None:
         """Where it ends, in seconds since its first message; None where no file says so."""
-        recorded = max(map(_last_log_time_ns, self.files))
+        recorded = max(map(_last_received_t_ns, self.files))
         if not recorded:
             return None
         return self.seconds_at(min(recorded, self._end_ns) if self._end_ns is not None else recorded)
 
-    def __iter__(self) -> Iterator[Entry]:
+    def __iter__(self) -> Iterator[Envelope]:
         """One round."""
         seen: dict[tuple[str, str], Seen] = {}
-        carried: dict[str, Entry] = {}
+        carried: dict[str, Envelope] = {}
         damage: list[str] = []
         for file in self.files:
             reading = read_recording(file, self._topics)
@@ -72,20 +73,20 @@ class RecordingPlayback:
                 header = entry.message.header
                 if not seen.setdefault((entry.key, header.producer), Seen()).is_new(header.sequence):
                     continue  # the part before this one had it, too
-                if self._end_ns is not None and entry.log_time_ns > self._end_ns:
-                    if entry.log_time_ns > self._end_ns + OUT_OF_ORDER_NS:
+                if self._end_ns is not None and entry.received_t_ns > self._end_ns:
+                    if entry.received_t_ns > self._end_ns + OUT_OF_ORDER_NS:
                         return
                     continue
-                if entry.log_time_ns >= self._start_ns:
+                if entry.received_t_ns >= self._start_ns:
                     yield from carried.values()
                     carried.clear()
                     yield entry
                 elif entry.topic == CARRIED:
-                    carried[entry.key] = replace(entry, log_time_ns=self._start_ns)
+                    carried[entry.key] = entry.received_at(self._start_ns)
             damage += filter(None, [reading.damage])
             self.damage = tuple(damage)
 
-    def rounds(self) -> Iterator[tuple[int, Entry]]:
+    def rounds(self) -> Iterator[tuple[int, Envelope]]:
         """Round after round without end, each with its number; times are shifted so that they never run back."""
         number, by_ns = 0, 0
         while True:
@@ -105,9 +106,9 @@ class Extent:
         self._spans: dict[str, tuple[int, int]] = {}
         self._steps_ns: set[int] = set()
 
-    def note(self, entry: Entry) -> None:
+    def note(self, entry: Envelope) -> None:
         """Take a message in."""
-        self._widen("received", entry.log_time_ns)
+        self._widen("received", entry.received_t_ns)
         times = sample_times(entry.message)
         if len(times):
             self._widen("sampled", int(times[0]))
@@ -135,13 +136,13 @@ def sample_times(message: Message) -> Array:
     return message.t_ns if isinstance(message, Grid | Prediction | Score) else np.zeros(0, np.int64)
 
 
-def shifted(entry: Entry, by_ns: int) -> Entry:
+def shifted(entry: Envelope, by_ns: int) -> Envelope:
     """The same, later."""
     if not by_ns:
         return entry
     message = entry.message
     times = {f.name: _later(getattr(message, f.name), by_ns) for f in fields(message) if f.name.endswith("t_ns")}
-    return replace(entry, message=replace(message, **times), log_time_ns=entry.log_time_ns + by_ns)
+    return Envelope.of(entry.key, replace(message, **times), entry.received_t_ns + by_ns)
 
 
 def _later(t_ns: Any, by_ns: int) -> Any:
@@ -150,7 +151,7 @@ def _later(t_ns: Any, by_ns: int) -> Any:
     return t_ns if is_none else t_ns + by_ns
 
 
-def _last_log_time_ns(file: Path) -> int:
+def _last_received_t_ns(file: Path) -> int:
     """When the last message was received, as the file's index says; 0 where it has none."""
     with suppress(McapError, OSError, ValueError), file.open("rb") as opened:
         summary = make_reader(opened).get_summary()

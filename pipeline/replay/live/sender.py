@@ -10,10 +10,10 @@ from dataclasses import replace
 
 from pipeline.bus.session import Bus, Publisher
 from pipeline.errors import UserError
-from pipeline.recordings.reading import Entry
 from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.health import HealthBook
 from schemas.codec import encode, type_name
+from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Message, Output, StageStatus
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
@@ -35,7 +35,7 @@ class Sender:
         self.tell_health(StageStatus.STARTING)
         bus.declare_alive(alive_key(site, REPLAY, "all"))
 
-    def send(self, entry: Entry) -> None:
+    def send(self, entry: Envelope) -> None:
         """Publish a message; waits while those who read it are behind.
 
         Raises:

@@ -257,4 +257,4 @@ class _Outputs:
             self._asked.add(header)
         self._sequences[topic] += 1
         key = tray_key(self._site, self._tray, topic)
-        self._writer.write_message(key, replace(message, header=header), newest_t_ns(message))
+        self._writer.add_message(key, replace(message, header=header), newest_t_ns(message))

@@ -15,10 +15,11 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from pipeline.recordings.packets import Packet, decode_together, header_of
 from pipeline.replay.offline.plan import RawSpan, ResamplerSession, RowSession, RowSpan, TrayPlan
 from pipeline.runtime.stage import Context, Core, load_stage
 from schemas.blocks import cut
+from schemas.envelope import Envelope
+from schemas.fast_decode import decode_header, decode_together
 from schemas.messages import Grid, InvalidReason, Message, Prediction, Raw, Score, ScorerSnapshot
 
 BLOCK = 512
@@ -85,7 +86,7 @@ class OfflinePipeline:
     def __init__(
         self,
         contexts: Mapping[str, Context],
-        raw: Callable[[], Iterable[Packet]],
+        raw: Callable[[], Iterable[Envelope]],
         plan: TrayPlan,
         observe: Callable[[Message], None],
         stretch_s: tuple[float, float] = (0.0, math.inf),
@@ -266,7 +267,7 @@ class OfflinePipeline:
         number, has_begun = 0, not spans[0].producer
         due: dict[str, int] = {spans[0].producer: spans[0].first} if spans[0].producer else {}
         for packet in self._raw():
-            header = header_of(packet)
+            header = decode_header(packet)
             producer, sequence = header.producer, header.sequence
             if sequence < following.get(producer, 0):
                 continue  # a part that overlaps the one before

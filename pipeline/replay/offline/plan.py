@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from pipeline.recordings.packets import Packet, header_of
 from schemas import fan_pb2
-from schemas.codec import decode
+from schemas.envelope import Envelope
+from schemas.fast_decode import decode_header
 from schemas.messages import Alarm, Grid, Message, Prediction, Request, Score, ScorerSnapshot
 
 CHAIN = {"resampler": "grid", "twin_integrator": "prediction", "scorer": "score"}
@@ -99,14 +99,14 @@ class Planner:
     def __init__(self) -> None:
         self._books = {topic: _Book(topic) for topic in CHAIN.values()}
 
-    def note(self, packet: Packet) -> None:
+    def note(self, packet: Envelope) -> None:
         """Take the next one.
 
         Raises:
             UnplannedError: it does not say what it was made of.
             CodecError: it cannot be decoded.
         """
-        self._books[packet.topic.name].note(packet)
+        self._books[packet.topic].note(packet)
 
     def plan(self) -> TrayPlan | None:
         """The sessions; None where what is recorded does not tell all of them."""
@@ -180,8 +180,8 @@ class _Book:
         self._topic = topic
         self.sessions: dict[str, _Session] = {}
 
-    def note(self, packet: Packet) -> None:
-        header = header_of(packet)
+    def note(self, packet: Envelope) -> None:
+        header = decode_header(packet)
         if not header.HasField("input_position"):
             raise UnplannedError
         position = header.input_position
@@ -228,10 +228,10 @@ class _Book:
         span.last = session.cause_sequence + max(before, 0)
         session.raw_spans.append(RawSpan(position.producer, position.contiguous_from, position.sequence))
 
-    def _follow_rows(self, session: _Session, position: fan_pb2.InputPosition, packet: Packet) -> None:
+    def _follow_rows(self, session: _Session, position: fan_pb2.InputPosition, packet: Envelope) -> None:
         goes_on = position.producer == session.cause_producer and position.contiguous_from <= session.cause_sequence + 1
         if not session.spans or not goes_on:
-            message = decode(packet.topic.message, packet.payload)
+            message = packet.message
             assert isinstance(message, Grid | Prediction | Score)
             session.spans.append(RowSpan(position.producer, int(message.t_ns[0]), packet.newest_t_ns))
         else:

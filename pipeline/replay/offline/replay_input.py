@@ -12,13 +12,13 @@ from pathlib import Path
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
 from pipeline.recordings.order import in_order
-from pipeline.recordings.packets import Packet, PacketReading
-from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
+from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
 from pipeline.replay.default_config import default_config, first_raw
 from pipeline.replay.offline.plan import CHAIN, SIDE_TOPICS, Planner, SideInputs, TrayPlan, UnplannedError
 from pipeline.replay.resolve_config import attached_config
 from pipeline.runtime.stage import Context
-from schemas.codec import CodecError, decode
+from schemas.codec import CodecError
+from schemas.envelope import Envelope
 from schemas.messages import Alarm, Raw
 
 
@@ -52,13 +52,15 @@ class ReplayInput:
         """The trays that are judged."""
         return self.config.trays
 
-    def packets(self, tray: str, topics: Iterable[str]) -> Iterator[Packet]:
+    def packets(self, tray: str, topics: Iterable[str]) -> Iterator[Envelope]:
         """The packets of a tray, in the order they were recorded."""
-        reading = PacketReading(self.paths, tuple(topics), tray)
-        yield from reading
-        self.damage |= reading.damage
+        for path in self.paths:
+            reading = read_recording(path, tuple(topics), tray)
+            yield from reading.undecoded()
+            if reading.damage:
+                self.damage[path] = reading.damage
 
-    def raw(self, tray: str) -> Iterator[Packet]:
+    def raw(self, tray: str) -> Iterator[Envelope]:
         """Its raw packets."""
         return self.packets(tray, ("raw",))
 
@@ -73,8 +75,8 @@ class ReplayInput:
         side = SideInputs()
         for packet in self.packets(tray, (*CHAIN.values(), *SIDE_TOPICS)):
             try:
-                if packet.topic.name in SIDE_TOPICS:
-                    message = decode(packet.topic.message, packet.payload)
+                if packet.topic in SIDE_TOPICS:
+                    message = packet.message
                     side.note(message)
                     if isinstance(message, Alarm):
                         alarms.setdefault((message.header.producer, message.header.sequence), message)

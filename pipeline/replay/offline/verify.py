@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.recordings.packets import Packet, decode_together, header_of
 from schemas.blocks import cut
+from schemas.envelope import Envelope
+from schemas.fast_decode import decode_header, decode_together
 from schemas.messages import Alarm, Array, Message, Score, columns
 
 NAMED = 5
@@ -52,7 +53,7 @@ class Comparison:
 class RecordedSession:
     """The recorded scores of one session of the scorer, in order, each once."""
 
-    def __init__(self, packets: Iterable[Packet], producer: str) -> None:
+    def __init__(self, packets: Iterable[Envelope], producer: str) -> None:
         self._blocks = _scores(packets, producer)
         self._rest: Score | None = next(self._blocks, None)
 
@@ -128,11 +129,11 @@ def when(t_ns: int) -> str:
     return datetime.fromtimestamp(t_ns / 1e9, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def _scores(packets: Iterable[Packet], producer: str) -> Iterator[Score]:
+def _scores(packets: Iterable[Envelope], producer: str) -> Iterator[Score]:
     waiting: list[bytes] = []
     following = 0
     for packet in packets:
-        header = header_of(packet)
+        header = decode_header(packet)
         if header.producer == producer and header.sequence >= following:
             following = header.sequence + 1
             waiting.append(packet.payload)

@@ -48,7 +48,7 @@ class Run:
         recording = self.folder / "recording.mcap"
         with RecordingWriter(recording, {}, overwrite=True) as writer:
             for topic, message, log_t_ns in self._messages():
-                writer.write_message(tray_key("demo", "tray1", topic), message, log_t_ns)
+                writer.add_message(tray_key("demo", "tray1", topic), message, log_t_ns)
         return summarise(truth, [recording], self.lost)
 
     def _messages(self) -> list[tuple[str, Message, int]]:

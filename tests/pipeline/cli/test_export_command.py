@@ -170,7 +170,7 @@ def test_what_could_be_read_of_a_torn_recording_is_exported_with_exit_code_3(tmp
     path.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     result = fantwin("export", path, "--to", form, "-o", tmp_path, "--json")
     assert result.exit_code == 3
-    assert result.stderr == f"{path}: it breaks off, as after a crash; read up to there\n"
+    assert result.stderr == f"{path}: it is truncated, as after a crash; read up to that point\n"
     told = json.loads(result.stdout)
     assert told["damage"] == [result.stderr.strip()]
     frame = table(tmp_path / f"torn.tray1.raw.{form}")
@@ -223,7 +223,7 @@ def test_the_same_tray_of_two_sites_does_not_become_one_table(tmp_path):
     path = tmp_path / "r.mcap"
     with RecordingWriter(path, {}) as writer:
         for site in ("here", "there"):
-            writer.write_message(f"fantwin/{site}/tray1/raw", raw(0), 1)
+            writer.add_message(f"fantwin/{site}/tray1/raw", raw(0), 1)
     assert "would hold both" in said_instead("export", path, "--to", "csv", "-o", tmp_path / "out")
 
 

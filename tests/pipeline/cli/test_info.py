@@ -33,9 +33,9 @@ def recording(path: Path) -> Path:
     """With a hole, a repetition, a twin, and a stage that complains."""
     with RecordingWriter(path, METADATA, {"configuration.toml": b"", "tray1.onnx": b"twin"}) as writer:
         for number, sequence in enumerate((0, 1, 4, 5, 5)):
-            writer.write_message(RAW_KEY, raw(sequence), number * SECOND_NS)
+            writer.add_message(RAW_KEY, raw(sequence), number * SECOND_NS)
         card = ModelCard(header=Header("ti-1", 0, "tray1"), t_ns=1, twin="demo", kind="hybrid", sha256="ab" * 32)
-        writer.write_message(tray_key("plant", "tray1", "twin"), card, 5 * SECOND_NS)
+        writer.add_message(tray_key("plant", "tray1", "twin"), card, 5 * SECOND_NS)
         for number, problem in enumerate(("", "the line is silent: look at the cable")):
             health = Health(
                 header=Header("acquisition-1", number, ""),
@@ -48,7 +48,7 @@ def recording(path: Path) -> Path:
                 counters=(Counter(name="lost_samples", value=3 * number),),
                 lost=3 * number,
             )
-            writer.write_message(health_key("plant", "acquisition", "tray1"), health, 6 * SECOND_NS)
+            writer.add_message(health_key("plant", "acquisition", "tray1"), health, 6 * SECOND_NS)
     return path
 
 
@@ -124,9 +124,9 @@ def test_a_file_that_breaks_off_is_told(tmp_path):
 
 def test_a_file_that_is_still_being_written_is_shown_as_far_as_it_is_on_the_disk(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
-        writer.write_message(RAW_KEY, raw(0), 1)
+        writer.add_message(RAW_KEY, raw(0), 1)
         writer.flush()
-        writer.write_message(RAW_KEY, raw(1), 2)
+        writer.add_message(RAW_KEY, raw(1), 2)
         (found,) = told(tmp_path / "r.mcap.active")["files"]
     assert found["damage"] == ["it is still being written"]
     assert found["topics"][RAW_KEY]["messages"] == 1
@@ -163,7 +163,7 @@ def test_what_is_left_of_a_ring_of_parts_is_well(tmp_path):
 
 def test_a_file_that_is_named_twice_counts_once(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
-        writer.write_message(RAW_KEY, raw(0), 1)
+        writer.add_message(RAW_KEY, raw(0), 1)
     assert told(tmp_path / "r.mcap", tmp_path / "r.mcap")["topics"][RAW_KEY]["messages"] == 1
 
 
@@ -224,7 +224,7 @@ def test_a_recording_without_messages_is_shown_too(tmp_path):
 
 def test_an_alarm_alone_has_no_rate(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
-        writer.write_message(ALARM_KEY, alarm(0), 5)
+        writer.add_message(ALARM_KEY, alarm(0), 5)
     assert told(tmp_path / "r.mcap")["topics"][ALARM_KEY]["rate_hz"] is None
 
 

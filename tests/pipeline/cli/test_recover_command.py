@@ -104,12 +104,12 @@ def test_what_a_recovered_file_has_lost_info_says_ever_after(tmp_path, number):
     with RecordingWriter(path, {}) as writer:
         for chunk in range(3):
             for sequence in range(5):
-                writer.write_message(RAW_KEY, raw(5 * chunk + sequence), 1000)
-            writer.write_message(keys, healths_of(f"scorer-{chunk}"), 1000)
+                writer.add_message(RAW_KEY, raw(5 * chunk + sequence), 1000)
+            writer.add_message(keys, healths_of(f"scorer-{chunk}"), 1000)
             writer.flush()
     chunks = [record for record in RecordReader(path) if record.opcode == Opcode.CHUNK]
     content = bytearray(path.read_bytes())
-    content[chunks[number].offset + chunks[number].length // 2] ^= 0xFF
+    content[(chunks[number].offset + chunks[number].end) // 2] ^= 0xFF
     path.write_bytes(content)
     assert fantwin("recover", path, "-o", tmp_path / "out.mcap").exit_code == 3
     done = fantwin("info", tmp_path / "out.mcap", "--json")
@@ -142,7 +142,7 @@ def test_where_the_output_cannot_be_it_says_to_name_another(tmp_path, whole):
 
 def test_what_a_health_says_was_published_and_is_not_there_is_told(tmp_path):
     writer = RecordingWriter(tmp_path / "r.mcap", {"flush_interval_s": "0.5"})
-    writer.write_message(RAW_KEY, raw(0), 1)
+    writer.add_message(RAW_KEY, raw(0), 1)
     health = Health(
         header=Header("acquisition-1", 0, ""),
         stage="acquisition",
@@ -152,7 +152,7 @@ def test_what_a_health_says_was_published_and_is_not_there_is_told(tmp_path):
         uptime_s=1.0,
         outputs=(Output(key=RAW_KEY, published=4),),
     )
-    writer.write_message(health_key("plant", "acquisition", "tray1"), health, 2)
+    writer.add_message(health_key("plant", "acquisition", "tray1"), health, 2)
     writer.flush()
     writer._file.close()
     done = fantwin("recover", tmp_path / "r.mcap.active")

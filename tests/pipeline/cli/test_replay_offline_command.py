@@ -134,7 +134,7 @@ def test_an_imported_table_is_judged_at_the_twins_own_rate(tmp_path):
     bare = tmp_path / "bare.mcap"
     with RecordingWriter(bare, {"source": "a table"}) as writer:
         for entry in read_recording(table):
-            writer.write_message(entry.key, entry.message, entry.log_time_ns)
+            writer.add_message(entry.key, entry.message, entry.received_t_ns)
     told = replay("--json", bare)
     assert told.returncode == 1 and "--twin" in told.stderr
     told = replay("--json", bare, "--twin", tmp_path / "twin.onnx")
@@ -183,7 +183,7 @@ def test_an_attachment_is_written_nowhere_else(tmp_path):
     attachments = {**head.attachments, str(tmp_path / "planted.onnx"): b"x", "sub/dir.onnx": b"x"}
     with RecordingWriter(evil, head.metadata, attachments) as writer:
         for entry in read_recording(GOLDEN):
-            writer.write_message(entry.key, entry.message, entry.log_time_ns)
+            writer.add_message(entry.key, entry.message, entry.received_t_ns)
     assert replay("--verify", evil).returncode == 0
     assert not (tmp_path / "planted.onnx").exists()
 
@@ -194,7 +194,7 @@ def test_damaged_metadata_are_one_line(tmp_path, metadata):
     path = tmp_path / "[odd].mcap"
     with RecordingWriter(path, {**head.metadata, **metadata}, head.attachments) as writer:
         for entry in read_recording(GOLDEN, ("raw",)):
-            writer.write_message(entry.key, entry.message, entry.log_time_ns)
+            writer.add_message(entry.key, entry.message, entry.received_t_ns)
     told = replay(path)
     assert told.returncode == 1 and "[odd].mcap: its metadata are damaged" in told.stderr
     assert len(told.stderr.strip().splitlines()) == 1
@@ -207,7 +207,7 @@ def test_a_torn_recording_is_judged_as_far_as_it_goes_exit_code_3(tmp_path):
         file.truncate(GOLDEN.stat().st_size // 2)
     told = replay("--json", torn)
     assert told.returncode == 3
-    assert "breaks off" in json.loads(told.stdout)["damage"][0]
+    assert "is truncated" in json.loads(told.stdout)["damage"][0]
 
 
 def test_a_file_that_is_not_there_is_one_line():

@@ -27,7 +27,7 @@ def record(path: Path, run: Run, unit: str = "rad/s", tray: str = "tray1") -> Pa
             command=run.command,
             speed_rad_s=run.speed_rad_s,
         )
-        writer.write_message(tray_key("test", tray, "raw"), raw, int(t_ns[-1]))
+        writer.add_message(tray_key("test", tray, "raw"), raw, int(t_ns[-1]))
     return path
 
 
@@ -148,7 +148,7 @@ def test_what_is_damaged_in_a_recording_is_told(folder, twin, tmp_path):
     torn.write_bytes(whole[:-100])
     result = fantwin("evaluate", twin, torn, "--json")
     assert json.loads(result.stdout)["samples"] == 4000
-    assert "torn.mcap: it breaks off" in result.stderr
+    assert "torn.mcap: it is truncated" in result.stderr
 
 
 def test_what_cannot_be_done_is_told_in_one_line(folder, twin, tmp_path):

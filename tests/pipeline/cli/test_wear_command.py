@@ -41,7 +41,7 @@ def notes() -> list[ScorerSnapshot]:
 def recording(path: Path, notes: Sequence[ScorerSnapshot]) -> Path:
     with RecordingWriter(path, {}) as writer:
         for memory in notes:
-            writer.write_message(KEY, memory, memory.t_ns)
+            writer.add_message(KEY, memory, memory.t_ns)
     return path
 
 
@@ -120,7 +120,7 @@ def test_what_could_not_be_read_in_full_is_shown_as_far_as_it_is_known(tmp_path,
     path = recording(tmp_path / "r.mcap", notes[:1])
     whole = path.read_bytes()
     with RecordingWriter(tmp_path / "torn.mcap", {}) as writer:
-        writer.write_message(KEY, notes[0], notes[0].t_ns)
+        writer.add_message(KEY, notes[0], notes[0].t_ns)
         writer.flush()
         torn = (tmp_path / "torn.mcap.active").read_bytes()
     path.write_bytes(torn)
@@ -128,7 +128,7 @@ def test_what_could_not_be_read_in_full_is_shown_as_far_as_it_is_known(tmp_path,
     done = fantwin("wear", path, "--json")
     assert done.exit_code == 3
     assert json.loads(done.stdout)["wear"]
-    assert "it breaks off" in done.stderr
+    assert "it is truncated" in done.stderr
 
 
 class Noted(Core):

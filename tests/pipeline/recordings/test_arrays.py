@@ -48,7 +48,7 @@ def key_of(message: Message, site: str = "plant") -> str:
 def write(path: Path, messages: Iterable[Message], metadata: dict[str, str] | None = None, start: int = 1) -> Path:
     with RecordingWriter(path, metadata or {"site": "plant"}, overwrite=True) as writer:
         for number, message in enumerate(messages, start):
-            writer.write_message(key_of(message), message, number)
+            writer.add_message(key_of(message), message, number)
     return path
 
 
@@ -247,7 +247,7 @@ def test_a_torn_part_is_read_up_to_where_it_tears_and_said_to_be(tmp_path):
     assert 0 < len(found) < 9000
     assert found[-100:] == list(range(9000, 9100))
     assert [line.split(":")[0] for line in arrays.damage] == [str(torn)]
-    assert "breaks off" in arrays.damage[0]
+    assert "is truncated" in arrays.damage[0]
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path):

@@ -59,10 +59,10 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     keys = [key_of(message) for message in sent]
     with RecordingWriter(folder / "whole.mcap", METADATA, ATTACHMENTS, t_ns=START_NS) as writer:
         for number, message in enumerate(sent):
-            writer.write_message(keys[number], message, START_NS + number)
+            writer.add_message(keys[number], message, START_NS + number)
     with pytest.raises(KeyboardInterrupt), RecordingWriter(folder / "r.mcap", METADATA, ATTACHMENTS) as writer:
         for number, message in enumerate(sent):
-            writer.write_message(keys[number], message, START_NS + number)
+            writer.add_message(keys[number], message, START_NS + number)
             if number == RAWS + 10:
                 writer.flush()
             if number == RAWS + 15:  # what is on the disk at this moment is what a kill -9 would leave

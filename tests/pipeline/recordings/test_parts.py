@@ -27,7 +27,7 @@ def shelf(folder: Path, session: str = "s1") -> RecordingParts:
 def part(shelf: RecordingParts, numbers=(), ledger: SequenceLedger | None = None) -> RecordingWriter:
     writer = shelf.begin(5_000_000_000, ledger or SequenceLedger(shelf.before), {})
     for sequence in numbers:
-        writer.write_message(RAW_KEY, raw(sequence), sequence)
+        writer.add_message(RAW_KEY, raw(sequence), sequence)
     return writer
 
 
@@ -156,7 +156,7 @@ def test_a_file_of_others_with_a_higher_number_does_not_hide_the_last_part(tmp_p
 def damage_a_chunk(path: Path, number: int) -> None:
     chunk = [record for record in RecordReader(path) if record.opcode == Opcode.CHUNK][number]
     content = bytearray(path.read_bytes())
-    content[chunk.offset + chunk.length // 2] ^= 0xFF
+    content[(chunk.offset + chunk.end) // 2] ^= 0xFF
     path.write_bytes(content)
 
 

@@ -17,7 +17,7 @@ START_NS = 1_800_000_000_000_000_000
 def record(path: Path, *messages: Raw) -> Path:
     with RecordingWriter(path, {"speed_unit": "rpm"}, overwrite=True) as writer:
         for message in messages:
-            writer.write_message(tray_key("plant", message.header.tray, "raw"), message, START_NS)
+            writer.add_message(tray_key("plant", message.header.tray, "raw"), message, START_NS)
     return path
 
 

@@ -25,6 +25,7 @@ from pipeline.recordings.disk import AtomicAppendFile, DiskError
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from pipeline.recordings.sequence_ledger import StreamCounts, accounts_of
 from pipeline.recordings.writing import ACTIVE_SUFFIX, CHUNK_BYTES, RecordingWriter
+from schemas.envelope import Envelope
 from schemas.messages import Alarm, Array, Command, Header, Message, Raw, Severity
 from schemas.topics import tray_key
 
@@ -64,8 +65,8 @@ def alarm(sequence: int) -> Alarm:
 def write(path: Path, messages: int, **options) -> Path:
     with RecordingWriter(path, {"site": "plant"}, {"configuration.toml": b"site = 'plant'"}, **options) as writer:
         for sequence in range(messages):
-            writer.write_message(RAW_KEY, raw(sequence), 1000 + sequence)
-        writer.write_message(ALARM_KEY, alarm(0), 5000)
+            writer.add_message(RAW_KEY, raw(sequence), 1000 + sequence)
+        writer.add_message(ALARM_KEY, alarm(0), 5000)
     return writer.path
 
 
@@ -76,7 +77,7 @@ def sequences(path: Path) -> list[int]:
 def test_messages_are_read_back_as_written_in_their_order(tmp_path):
     path = write(tmp_path / "r.mcap", 3)
     entries = list(read_recording(path))
-    assert [(e.key, e.topic, e.log_time_ns) for e in entries] == [
+    assert [(e.key, e.topic, e.received_t_ns) for e in entries] == [
         (RAW_KEY, "raw", 1000),
         (RAW_KEY, "raw", 1001),
         (RAW_KEY, "raw", 1002),
@@ -181,10 +182,10 @@ from tests.pipeline.recordings.test_recordings import RAW_KEY, raw
 from pipeline.recordings.writing import RecordingWriter
 writer = RecordingWriter(Path(sys.argv[1]), {{}})
 for sequence in range({flushed}):
-    writer.write_message(RAW_KEY, raw(sequence), sequence)
+    writer.add_message(RAW_KEY, raw(sequence), sequence)
 writer.flush()
 for sequence in range({flushed}, {flushed} + 3):
-    writer.write_message(RAW_KEY, raw(sequence), sequence)
+    writer.add_message(RAW_KEY, raw(sequence), sequence)
 os.kill(os.getpid(), signal.SIGKILL)
 """
     child = subprocess.run([sys.executable, "-c", program, path], cwd=Path(__file__).parents[3], check=False)
@@ -197,14 +198,14 @@ def test_all_that_was_flushed_survives_kill_9(tmp_path):
     active = path.with_name(path.name + ACTIVE_SUFFIX)
     reading = read_recording(active)
     assert [e.message.header.sequence for e in reading] == list(range(25))
-    assert reading.torn
-    assert "breaks off" in reading.damage
+    assert reading.truncated
+    assert "it is truncated" in reading.damage
 
 
 def test_a_recording_that_is_being_written_is_not_touched(tmp_path):
     path = tmp_path / "r.mcap"
     with RecordingWriter(path, {}) as first:
-        first.write_message(RAW_KEY, raw(0), 0)
+        first.add_message(RAW_KEY, raw(0), 0)
         with pytest.raises(RecordingError, match="another recorder is writing it"):
             RecordingWriter(path, {})
     assert sequences(path) == [0]
@@ -212,7 +213,7 @@ def test_a_recording_that_is_being_written_is_not_touched(tmp_path):
 
 def test_an_exception_while_writing_leaves_no_file(tmp_path):
     with pytest.raises(ZeroDivisionError), RecordingWriter(tmp_path / "r.mcap", {}) as writer:
-        writer.write_message(RAW_KEY, raw(0), 0)
+        writer.add_message(RAW_KEY, raw(0), 0)
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
 
@@ -221,7 +222,7 @@ def test_what_is_counted_as_written_is_in_the_file(tmp_path):
     writer = RecordingWriter(tmp_path / "r.mcap", {})
     active = tmp_path / f"r.mcap{ACTIVE_SUFFIX}"
     for sequence in range(600):
-        writer.write_message(RAW_KEY, raw(sequence), sequence)
+        writer.add_message(RAW_KEY, raw(sequence), sequence)
         if sequence % 50 == 0:
             assert len(sequences(active)) >= writer.written["raw"]
             assert writer.written["raw"] + len(writer.pending) == sequence + 1
@@ -236,7 +237,7 @@ def test_what_is_flushed_is_through_to_the_disk_and_so_is_the_name(tmp_path, mon
     monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(Path(f"/proc/self/fd/{descriptor}").readlink()))
     writer = RecordingWriter(tmp_path / "r.mcap", {})
     assert synced == [tmp_path]
-    writer.write_message(RAW_KEY, raw(0), 0)
+    writer.add_message(RAW_KEY, raw(0), 0)
     writer.flush()
     writer.flush()
     assert synced == [tmp_path, writer.size], "once, as long as there is nothing new"
@@ -248,7 +249,7 @@ def test_what_is_flushed_is_through_to_the_disk_and_so_is_the_name(tmp_path, mon
 def test_a_disk_that_fails_to_sync_is_told_and_the_file_ends_readable(tmp_path, monkeypatch, for_ever):
     writer = RecordingWriter(tmp_path / "r.mcap", {})
     for sequence in range(500):
-        writer.write_message(RAW_KEY, raw(sequence), sequence)
+        writer.add_message(RAW_KEY, raw(sequence), sequence)
     writer.flush()
     sync, failures = os.fdatasync, count()
 
@@ -259,7 +260,7 @@ def test_a_disk_that_fails_to_sync_is_told_and_the_file_ends_readable(tmp_path, 
 
     monkeypatch.setattr(os, "fdatasync", fail)
     for sequence in range(500, 1001):
-        writer.write_message(RAW_KEY, raw(sequence), sequence)
+        writer.add_message(RAW_KEY, raw(sequence), sequence)
     with pytest.raises(DiskError, match="r.mcap: cannot be written any more: Input/output error; it ends here"):
         writer.flush()
     reading = read_recording(tmp_path / "r.mcap")
@@ -276,7 +277,7 @@ def test_a_writer_that_nobody_flushes_holds_no_more_than_a_little_in_memory(tmp_
     monkeypatch.setattr(writing, "UNSYNCED_BYTES", 2 * CHUNK_BYTES)
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
         for sequence in range(2000):
-            writer.write_message(RAW_KEY, raw(sequence), sequence)
+            writer.add_message(RAW_KEY, raw(sequence), sequence)
             assert sum(len(pending.payload) for pending in writer.pending) < 4 * CHUNK_BYTES
 
 
@@ -309,7 +310,7 @@ def test_a_full_disk_ends_the_file_where_it_was_whole(tmp_path, size):
     written = 0
     with disk_of(size), pytest.raises(RecordingError, match="File too large; it ends here and is readable"):
         for written in count():
-            writer.write_message(RAW_KEY, raw(written), written)
+            writer.add_message(RAW_KEY, raw(written), written)
     assert writer.written["raw"] > 0
     unwritten = [pending.message.header.sequence for pending in writer.pending]
     assert unwritten == list(range(writer.written["raw"], written + 1))
@@ -326,7 +327,7 @@ def test_a_full_disk_leaves_room_for_no_index_and_the_file_is_readable_all_the_s
     writer = RecordingWriter(path, {})
     with pytest.raises(RecordingError, match="it ends here and is readable"):
         for sequence in count():
-            writer.write_message(RAW_KEY, raw(sequence), sequence)
+            writer.add_message(RAW_KEY, raw(sequence), sequence)
             if writer.written["raw"] > 500:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (writer.size + 100, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
@@ -341,7 +342,7 @@ def test_the_ledger_stands_in_the_file(tmp_path):
     path = tmp_path / "r.mcap"
     with RecordingWriter(path, {}) as writer:
         for sequence in (3, 4, 7):
-            writer.write_message(RAW_KEY, raw(sequence), 1000 + sequence)
+            writer.add_message(RAW_KEY, raw(sequence), 1000 + sequence)
     with path.open("rb") as file:
         records = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
     assert accounts_of(records["fantwin.ledger"]) == {
@@ -353,7 +354,7 @@ def test_the_ledger_stands_in_the_file(tmp_path):
 
 def test_an_ending_that_is_refused_at_first_is_in_the_index_once(tmp_path, monkeypatch):
     writer = RecordingWriter(tmp_path / "r.mcap", {})
-    writer.write_message(RAW_KEY, raw(0), 0)
+    writer.add_message(RAW_KEY, raw(0), 0)
     writer.flush()
     write_whole, refusals = AtomicAppendFile.write, iter([OSError(errno.ENOSPC, "No space left on device")])
 
@@ -400,7 +401,7 @@ def test_a_torn_file_is_read_up_to_where_it_tears(tmp_path):
         torn.write_bytes(whole[:size])
         reading = read_recording(torn)
         found.append(len([e.message.header.sequence for e in reading]))
-        assert reading.torn
+        assert reading.truncated
     assert found == sorted(found)
     assert found[0] == 0
     assert found[-1] >= 400
@@ -449,8 +450,8 @@ def test_channels_of_others_are_passed_over(tmp_path):
 
 def test_a_payload_that_is_not_its_message_is_left_out_and_counted(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
-        writer.write(RAW_KEY, b"\xff\xff\xff", raw(0), 0)
-        writer.write_message(RAW_KEY, raw(1), 1)
+        writer.add(Envelope(RAW_KEY, "raw", b"\xff\xff\xff", 0, raw(0)))
+        writer.add_message(RAW_KEY, raw(1), 1)
     reading = read_recording(writer.path)
     assert [e.message.header.sequence for e in reading] == [1]
     assert "messages left out that cannot be decoded: 1" in reading.damage
@@ -475,7 +476,7 @@ def test_every_key_gets_a_channel_of_its_own(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
         for key in keys:
             message: Message = Command(fans=1, t_ns=1, command=np.ones(1), set_point_rad_s=np.ones(1))
-            writer.write_message(key, message, 1)
+            writer.add_message(key, message, 1)
     assert [e.key for e in read_recording(writer.path)] == keys
     with writer.path.open("rb") as file:
         summary = make_reader(file).get_summary()

@@ -33,9 +33,9 @@ def small(path: Path) -> Path:
     """A recording of many small chunks, an attachment and two topics."""
     with RecordingWriter(path, {"site": "plant"}, {"tray1.onnx": os.urandom(300)}) as writer:
         for sequence in range(40):
-            writer.write_message(RAW_KEY, raw(sequence, samples=2), 1000 + sequence)
+            writer.add_message(RAW_KEY, raw(sequence, samples=2), 1000 + sequence)
             if sequence == 20:
-                writer.write_message(ALARM_KEY, alarm(0), 1000 + sequence)
+                writer.add_message(ALARM_KEY, alarm(0), 1000 + sequence)
             if sequence % 5 == 4:
                 writer.flush()
     return path
@@ -195,7 +195,7 @@ def test_a_file_that_is_whole_is_left_alone_or_copied(tmp_path, whole):
 
 def test_the_ledger_of_a_file_that_was_finished_but_for_its_index_is_kept(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
-        writer.write_message(RAW_KEY, raw(0), 1)
+        writer.add_message(RAW_KEY, raw(0), 1)
         writer.ledger.note_duplicated(*LINE, 7)
     path = writer.path
     path.write_bytes(path.read_bytes()[:-40])
@@ -207,7 +207,7 @@ def test_the_ledger_of_a_file_that_was_finished_but_for_its_index_is_kept(tmp_pa
 def test_holes_are_told_and_stand_in_the_new_ledger(tmp_path):
     writer = RecordingWriter(tmp_path / "r.mcap", {})
     for sequence in (0, 1, 5):
-        writer.write_message(RAW_KEY, raw(sequence), 1000 + sequence)
+        writer.add_message(RAW_KEY, raw(sequence), 1000 + sequence)
     writer.flush()
     writer._file.close()
     recovery = recover(tmp_path / "r.mcap.active")
@@ -246,7 +246,7 @@ def test_a_damaged_length_costs_one_chunk_though_it_fits_into_the_file(tmp_path,
     chunks = len(records)
     found = recover(path).found
     lost = before - found.messages
-    assert found.walk.damaged
+    assert found.walk.damaged_ranges
     assert (0 < lost < 2 * before / chunks) if opcode == Opcode.CHUNK else lost == 0
     assert contents_of(path).accounts[LINE].missing == lost
 
@@ -262,7 +262,7 @@ def test_after_a_damaged_length_the_next_whole_chunk_is_found(tmp_path, whole):
     path.write_bytes(content)
     found = recover(path).found
     assert len(read_by_others(path)) == 36
-    (stretch,) = found.walk.damaged
+    (stretch,) = found.walk.damaged_ranges
     assert stretch == (third, summary.chunk_indexes[3].chunk_start_offset)
     assert contents_of(path).accounts[LINE].missing == 5
 
@@ -337,7 +337,7 @@ def test_a_disk_that_is_full_costs_a_killed_recorder_s_file_only_its_index(tmp_p
 
 def test_a_file_that_is_being_written_is_not_touched(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
-        writer.write_message(RAW_KEY, raw(0), 0)
+        writer.add_message(RAW_KEY, raw(0), 0)
         writer.flush()
         with pytest.raises(RecordingError, match="a recorder is writing it; stop it first"):
             recover(tmp_path / "r.mcap.active")

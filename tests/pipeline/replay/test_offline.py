@@ -47,7 +47,7 @@ def changed(path: Path, out: Path, change) -> Path:
         for entry in read_recording(path):
             message = change(entry)
             if message is not None:
-                writer.write_message(entry.key, message, entry.log_time_ns)
+                writer.add_message(entry.key, message, entry.received_t_ns)
     return out
 
 
@@ -219,8 +219,8 @@ def test_a_recording_of_another_version_is_judged_from_its_raw_samples(tmp_path,
     site.run(300)
     with open_replay_input([site.finished()], None, (), None) as material:
         packets = list(material.packets("tray1", ("grid", "prediction", "score", "raw")))
-        old = [p if p.topic.name != "prediction" else p._replace(payload=_without(lacks, p.payload)) for p in packets]
-        material.packets = lambda tray, topics: (p for p in old if p.topic.name in topics)  # type: ignore[method-assign]
+        old = [p if p.topic != "prediction" else replace(p, payload=_without(lacks, p.payload)) for p in packets]
+        material.packets = lambda tray, topics: (p for p in old if p.topic in topics)  # type: ignore[method-assign]
         plan, _ = material.survey("tray1")
         (tray,) = judge(material, None, verify=False)
     assert (plan is not None) == is_planned
@@ -324,8 +324,8 @@ def test_an_undecodable_alarm_costs_that_alarm_only(tmp_path):
     alarms = recorded(path, "alarm")
     with open_replay_input([path], None, (), None) as material:
         packets = list(material.packets("tray1", ("grid", "prediction", "score", "alarm")))
-        first = next(n for n, packet in enumerate(packets) if packet.topic.name == "alarm")
-        packets[first] = packets[first]._replace(payload=b"\xff\xff")
+        first = next(n for n, packet in enumerate(packets) if packet.topic == "alarm")
+        packets[first] = replace(packets[first], payload=b"\xff\xff")
         material.packets = lambda tray, topics: iter(packets)  # type: ignore[method-assign]
         plan, found = material.survey("tray1")
     assert plan and len(found) == len(alarms) - 1

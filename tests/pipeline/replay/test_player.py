@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.recordings.reading import Entry
 from pipeline.replay.live.keyboard import Key
 from pipeline.replay.live.pace import Pace
 from pipeline.replay.live.player import BEAT_S, Player, Progress, Stopped
+from schemas.envelope import Envelope
 from schemas.messages import Alarm, Severity, StageStatus
 from tests.support.replay_data import START_NS, STEP_NS, raw_of
 
@@ -45,7 +45,7 @@ class Sent:
     healths: list[float] = field(default_factory=list)
     cost_s: float = 0.0
 
-    def send(self, entry: Entry) -> None:
+    def send(self, entry: Envelope) -> None:
         self.messages.append((round(self.time.s - 50.0, 6), entry.topic, entry.message.header.sequence))
         self.time.s += self.cost_s
 
@@ -72,23 +72,23 @@ class Script:
         return due
 
 
-def raws(count: int, period_ns: int = STEP_NS, samples: int = 1) -> list[tuple[int, Entry]]:
+def raws(count: int, period_ns: int = STEP_NS, samples: int = 1) -> list[tuple[int, Envelope]]:
     found = []
     for k in range(count):
         raw = raw_of(k * samples, 1, sequence=k, samples=samples)
         log_ns = START_NS + ((k + 1) * samples - 1) * period_ns
-        found.append((0, Entry("fantwin/demo/tray1/raw", "raw", raw, log_ns)))
+        found.append((0, Envelope.of("fantwin/demo/tray1/raw", raw, log_ns)))
     return found
 
 
-def alarm(log_ns: int, sequence: int) -> Entry:
+def alarm(log_ns: int, sequence: int) -> Envelope:
     said: dict[str, Any] = {"residual_rad_s": 0, "limit_rad_s": 0, "message": ""}
     message = Alarm(fan=0, active=True, severity=Severity.ALARM, t_ns=log_ns, onset_t_ns=log_ns, **said)
-    return Entry("fantwin/demo/tray1/alarm", "alarm", message, log_ns)
+    return Envelope.of("fantwin/demo/tray1/alarm", message, log_ns)
 
 
 def play(
-    rounds: Sequence[tuple[int, Entry]],
+    rounds: Sequence[tuple[int, Envelope]],
     rate: float = 1.0,
     *,
     paused: bool = False,
@@ -132,7 +132,7 @@ def test_the_time_is_told_before_the_first_message():
     order: list[str] = []
 
     class Ordered(Sent):
-        def send(self, entry: Entry) -> None:
+        def send(self, entry: Envelope) -> None:
             order.append("message")
 
         def tell_clock(self, t_ns: int, rate: float) -> None:

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recordings.reading import Entry, RecordingError
+from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.live.recording_playback import Extent, RecordingPlayback, shifted
+from schemas.envelope import Envelope
 from schemas.messages import MESSAGE_TYPES, Alarm, Grid, Header, InvalidReason, ModelCard, Severity, columns
 from schemas.topics import tray_key
 from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
@@ -20,11 +21,13 @@ from tests.support.replay_data import START_NS, STEP_NS, raw_of, write_raw
 
 RAW = tray_key("demo", "tray1", "raw")
 
+ALARM_KEY = "fantwin/demo/tray1/alarm"
+
 
 def part(path: Path, sequences: range, log_s: float = 0.0, **metadata: str) -> Path:
     with RecordingWriter(path, {"trays": "tray1", **metadata}) as writer:
         for sequence in sequences:
-            writer.write_message(RAW, raw_of(sequence, 1), START_NS + round(log_s * 1e9) + sequence * STEP_NS)
+            writer.add_message(RAW, raw_of(sequence, 1), START_NS + round(log_s * 1e9) + sequence * STEP_NS)
     return path
 
 
@@ -53,7 +56,7 @@ def test_a_message_that_was_fetched_later_does_not_end_a_stretch(tmp_path):
     path = tmp_path / "r.mcap"
     with RecordingWriter(path, {"trays": "tray1"}) as writer:
         for sequence, log_s in enumerate((0, 1, 2, 9, 9, 9, 3, 4, 5, 30)):
-            writer.write_message(RAW, raw_of(sequence, 1), START_NS + log_s * 10**9)
+            writer.add_message(RAW, raw_of(sequence, 1), START_NS + log_s * 10**9)
     assert sequences(RecordingPlayback([path], ("raw",), 0.0, 6.0)) == [0, 1, 2, 6, 7, 8]
 
 
@@ -70,13 +73,13 @@ def test_the_twin_that_was_in_force_is_told_at_the_start_of_a_stretch(tmp_path):
             card = ModelCard(
                 header=Header("t", number, "tray1"), t_ns=0, twin=f"twin{number}", kind="hybrid", sha256=""
             )
-            writer.write_message(tray_key("demo", "tray1", "twin"), card, START_NS + number)
+            writer.add_message(tray_key("demo", "tray1", "twin"), card, START_NS + number)
         for sample in range(300):
-            writer.write_message(RAW, raw_of(sample, 1), START_NS + sample * STEP_NS)
+            writer.add_message(RAW, raw_of(sample, 1), START_NS + sample * STEP_NS)
     first, second, *_ = RecordingPlayback([tmp_path / "r.mcap"], ("raw", "twin"), 1.0)
     assert isinstance(first.message, ModelCard)
     assert first.message.twin == "twin1"
-    assert first.log_time_ns == START_NS + 10**9
+    assert first.received_t_ns == START_NS + 10**9
     assert second.message.header.sequence == 100
 
 
@@ -86,7 +89,7 @@ def test_rounds_go_on_in_time_without_a_gap_and_on_the_grid(tmp_path):
     assert [numbers.count(n) for n in range(3)] == [150, 150, 150]
     times = np.concatenate([entry.message.host_receive_t_ns for entry in entries])
     assert (np.diff(times) == STEP_NS).all()
-    assert (np.diff([entry.log_time_ns for entry in entries]) == STEP_NS).all()
+    assert (np.diff([entry.received_t_ns for entry in entries]) == STEP_NS).all()
     assert sequences(entries)[:150] == sequences(entries)[150:300]
 
 
@@ -102,7 +105,7 @@ def test_a_round_is_a_whole_number_of_grid_steps_and_longer_than_all_that_is_in_
         why = np.full((1, 1), InvalidReason.NONE, np.uint8)
         states = {"valid": zeros == 0, "invalid_reason": why, "command": zeros, "speed_rad_s": zeros}
         grid = Grid(fans=1, period_ns=33_333_333, t_ns=np.array([t_ns]), **states)
-        extent.note(Entry("k", "grid", grid, START_NS + 7))
+        extent.note(Envelope.of("fantwin/demo/tray1/grid", grid, START_NS + 7))
     assert extent.length_ns() % 33_333_333 == 0
     assert span_ns < extent.length_ns() <= span_ns + 33_333_333
 
@@ -111,14 +114,14 @@ def test_all_times_of_a_message_are_shifted_and_nothing_else():
     alarm = Alarm(
         fan=1, active=True, severity=Severity.ALARM, t_ns=50, onset_t_ns=40, residual_rad_s=3, limit_rad_s=2, message=""
     )
-    later = shifted(Entry("k", "alarm", alarm, 60), 1000)
-    assert later.log_time_ns == 1060
+    later = shifted(Envelope.of(ALARM_KEY, alarm, 60), 1000)
+    assert later.received_t_ns == 1060
     assert vars(later.message) == vars(replace(alarm, t_ns=1050, onset_t_ns=1040))
     for until, moved in ((70, 1070), (UNTIL_IT_CLEARS_T_NS, UNTIL_IT_CLEARS_T_NS)):
-        shelved = shifted(Entry("k", "alarm", replace(alarm, shelved_until_t_ns=until), 60), 1000).message
+        shelved = shifted(Envelope.of(ALARM_KEY, replace(alarm, shelved_until_t_ns=until), 60), 1000).message
         assert isinstance(shelved, Alarm) and shelved.shelved_until_t_ns == moved
     raw = raw_of(3, 2)
-    moved = shifted(Entry("k", "raw", raw, 60), 1000).message
+    moved = shifted(Envelope.of("fantwin/demo/tray1/raw", raw, 60), 1000).message
     assert (moved.host_receive_t_ns == raw.host_receive_t_ns + 1000).all()  # type: ignore[union-attr]
     assert (moved.device_clock_us == raw.device_clock_us).all()  # type: ignore[union-attr]
 

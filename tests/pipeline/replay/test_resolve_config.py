@@ -26,7 +26,7 @@ fans = 8
 
 def recording(path: Path, metadata: dict[str, str], attachments: dict[str, bytes] | None = None) -> Path:
     with RecordingWriter(path, metadata, attachments, t_ns=START_NS) as writer:
-        writer.write_message(tray_key("lab", "tray1", "raw"), raw_of(0, 2), START_NS)
+        writer.add_message(tray_key("lab", "tray1", "raw"), raw_of(0, 2), START_NS)
     return path
 
 

@@ -151,7 +151,7 @@ def record(
 ) -> Path:
     with RecordingWriter(path, metadata) as writer:
         for score in scores:
-            writer.write_message(tray_key("site", score.header.tray, "score"), score, int(score.t_ns[-1]))
+            writer.add_message(tray_key("site", score.header.tray, "score"), score, int(score.t_ns[-1]))
         for alarm in alarms:
-            writer.write_message(tray_key("site", alarm.header.tray, "alarm"), alarm, alarm.t_ns)
+            writer.add_message(tray_key("site", alarm.header.tray, "alarm"), alarm, alarm.t_ns)
     return path

@@ -1,0 +1,56 @@
+"""Reading messages as bytes: the same as the decoded ones, and past what is damaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mcap.opcode import Opcode
+
+from pipeline.recordings.reading import read_recording
+from pipeline.recordings.records import RECORD, RecordReader
+from schemas.codec import encode
+from schemas.messages import newest_t_ns
+
+GOLDEN = Path(__file__).parents[2] / "support" / "data" / "golden.mcap"
+
+
+def test_the_messages_read_as_bytes_are_those_read_decoded():
+    topics = ("raw", "score", "alarm")
+    as_bytes, decoded = list(read_recording(GOLDEN, topics).undecoded()), list(read_recording(GOLDEN, topics))
+    assert [(e.key, e.topic, e.received_t_ns) for e in as_bytes] == [(e.key, e.topic, e.received_t_ns) for e in decoded]
+    for one, other in zip(as_bytes, decoded, strict=True):
+        assert one.payload == encode(other.message)
+        assert one.newest_t_ns == newest_t_ns(other.message)
+
+
+def test_one_tray_can_be_chosen():
+    assert list(read_recording(GOLDEN, ("raw",), tray="tray1").undecoded())
+    assert not list(read_recording(GOLDEN, ("raw",), tray="tray2").undecoded())
+
+
+def test_a_truncated_file_is_read_up_to_its_end_and_reported(tmp_path):
+    truncated = tmp_path / "truncated.mcap"
+    truncated.write_bytes(GOLDEN.read_bytes()[: GOLDEN.stat().st_size // 2])
+    reading = read_recording(truncated, ("score",))
+    found = list(reading.undecoded())
+    assert 0 < len(found) < len(list(read_recording(GOLDEN, ("score",)).undecoded()))
+    assert "it is truncated" in reading.damage
+
+
+@pytest.mark.parametrize("what", ["content", "length"])
+def test_a_damaged_chunk_costs_only_that_chunk(tmp_path, what):
+    damaged = tmp_path / "damaged.mcap"
+    content = bytearray(GOLDEN.read_bytes())
+    chunks = [record for record in RecordReader(GOLDEN) if record.opcode == Opcode.CHUNK]
+    chunk = chunks[len(chunks) // 2]
+    if what == "content":
+        content[chunk.end - 10] ^= 0xFF
+    else:
+        RECORD.pack_into(content, chunk.offset, Opcode.CHUNK, 1 << 62)
+    damaged.write_bytes(content)
+    reading, whole = read_recording(damaged), list(read_recording(GOLDEN))
+    for found in (list(reading), list(reading.undecoded())):
+        assert 0.5 * len(whole) < len(found) < len(whole)
+        assert found[-1].received_t_ns == whole[-1].received_t_ns
+        assert reading.damage == f"{damaged}: damaged chunks left out: 1"

@@ -1,0 +1,52 @@
+"""Shortcuts for reading many messages: the same headers and columns as by decoding each message in full."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from schemas.codec import CodecError, encode
+from schemas.envelope import Envelope
+from schemas.fast_decode import decode_header, decode_together
+from schemas.messages import Header, InputPosition, Raw
+from tests.support.message_strategies import same
+
+KEY = "fantwin/plant/tray1/raw"
+
+
+def raw(sequence: int, fans: int = 2, position: InputPosition | None = None) -> Raw:
+    return Raw(
+        header=Header("acquisition-1", sequence, "tray1", position),
+        fans=fans,
+        host_receive_t_ns=np.array([sequence + 5], np.int64),
+        command=np.full((1, fans), sequence / 7),
+        speed_rad_s=np.full((1, fans), np.nan),
+    )
+
+
+@pytest.mark.parametrize("length", [1, 100, 130, 20_000])
+def test_a_header_of_any_length_is_read_without_the_rest(length):
+    message = raw(3, position=InputPosition("raw", "p" * length, 9, 10, 0))
+    header = decode_header(Envelope(KEY, "raw", encode(message), 0))
+    assert (header.producer, header.sequence, header.tray) == ("acquisition-1", 3, "tray1")
+    assert (header.input_position.producer, header.input_position.sequence) == ("p" * length, 9)
+
+
+@pytest.mark.parametrize("payload", [b"\x0a\x05\xff", b"\xff\xff\xff", b"\x0a\x02\xff\xff"])
+def test_bytes_that_are_not_a_message_raise_a_codec_error(payload):
+    with pytest.raises(CodecError):
+        decode_header(Envelope(KEY, "raw", payload, 0))
+
+
+def test_many_messages_are_decoded_as_one_block():
+    messages = [raw(k) for k in range(100)]
+    (block,) = decode_together(Raw, [encode(message) for message in messages])
+    assert block.header.sequence == 99
+    for name in ("host_receive_t_ns", "command", "speed_rad_s"):
+        assert same(getattr(block, name), np.concatenate([getattr(message, name) for message in messages]))
+
+
+def test_messages_that_do_not_fit_together_are_decoded_one_by_one():
+    blocks = decode_together(Raw, [encode(raw(0, fans=2)), encode(raw(1, fans=3))])
+    assert [block.fans for block in blocks] == [2, 3]
+    assert decode_together(Raw, []) == []
