@@ -26,7 +26,7 @@ from pydantic import Field, ValidationError
 
 from pipeline.runtime.snapshot_store import SnapshotStore
 from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
-from pipeline.runtime.twin_file import TwinFile, twin_of
+from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from schemas.blocks import chosen
 from schemas.messages import (
     Alarm,
@@ -363,7 +363,7 @@ def build(context: Context) -> Parts:
     snapshot_store = (
         SnapshotStore(context.snapshot_folder / f"scorer-{tray.name}.snapshot") if context.snapshot_folder else None
     )
-    healthy = _healthy(context, twin_of(context))
+    healthy = _healthy(context, load_tray_twin(twin_path(context), tray.fans))
     return Parts(ScorerCore(tray.fans, tray.speed_unit, context.config, healthy, snapshot_store))
 
 
@@ -381,9 +381,9 @@ def limits_in_force(config: ScorerConfig, calibration: Mapping[str, Any] | None)
     return limits.model_copy(update={"timing": timing, "promise": promise}).times(config.limit_factor)
 
 
-def _healthy(context: Context, twin: TwinFile) -> Healthy:
+def _healthy(context: Context, twin: TrayTwin) -> Healthy:
     try:
-        limits = limits_in_force(context.config, twin.calibration)
+        limits = limits_in_force(context.config, twin.card.calibration)
     except ValidationError as error:
         where = ".".join(map(str, error.errors()[0]["loc"]))
         raise StageError(
@@ -396,13 +396,13 @@ def _healthy(context: Context, twin: TwinFile) -> Healthy:
                 f"{context.tray.twin}: its calibration is of {len(part.fans.offset_sigmas)} fans, the tray has "
                 f"{context.tray.fans}; calibrate it anew: fantwin calibrate"
             )
-    return Healthy(twin.sha256, limits, twin.healthy_balances(), twin.command_unit)
+    return Healthy(twin.sha256, limits, twin.healthy_balances(), twin.card.command_unit)
 
 
 def check(context: Context) -> list[str]:
     """What keeps the scorer from judging; of a twin that cannot be loaded the twin integrator tells."""
     try:
-        twin = twin_of(context)
+        twin = load_tray_twin(twin_path(context), context.tray.fans)
     except StageError:
         return []
     try:

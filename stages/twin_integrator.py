@@ -26,7 +26,7 @@ from pydantic import Field
 
 from pipeline.runtime.free_run import FreeRun, FreeRunInputs
 from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
-from pipeline.runtime.twin_file import TwinFile, twin_of
+from pipeline.runtime.twin_file import TwinFile, load_twin
 from schemas.blocks import chosen
 from schemas.messages import Array, Grid, InvalidReason, ModelCard, Prediction
 from schemas.units import NS_PER_S
@@ -55,7 +55,7 @@ class TwinIntegratorCore(Core):
         self._twin = twin
         self._warm_up_ns = round(config.warm_up_s * NS_PER_S)
         self._hold_limit_ns = round(config.hold_limit_s * NS_PER_S)
-        low, high = twin.command_range
+        low, high = twin.card.command_range
         margin = RANGE_MARGIN * (high - low)
         self._lowest_command, self._highest_command = low - margin, high + margin
         self._off_below = twin.off_below
@@ -64,8 +64,8 @@ class TwinIntegratorCore(Core):
         self._card = [
             ModelCard(
                 t_ns=started_t_ns,
-                twin=twin.name,
-                kind=twin.kind,
+                twin=twin.card.name,
+                kind=twin.card.kind,
                 sha256=twin.sha256,
                 sigma_rad_s=twin.sigma_rad_s,
                 card_json=twin.card_json,
@@ -92,10 +92,11 @@ class TwinIntegratorCore(Core):
             self._run.stop(np.ones_like(self._run.running))
             self._balance.reset()
             self._period_ns = grid.period_ns
-        if self._twin.is_discrete and abs(grid.period_ns * self._twin.rate_hz / NS_PER_S - 1) > RATE_TOLERANCE:
+        card = self._twin.card
+        if card.fixed_rate and abs(grid.period_ns * card.rate_hz / NS_PER_S - 1) > RATE_TOLERANCE:
             self._problem = (
-                f"twin {self._twin.name} holds at {self._twin.rate_hz:g} Hz only, the grid has "
-                f"{NS_PER_S / grid.period_ns:g} Hz: set [resampler] rate_hz = {self._twin.rate_hz:g}"
+                f"twin {card.name} holds at {card.rate_hz:g} Hz only, the grid has "
+                f"{NS_PER_S / grid.period_ns:g} Hz: set [resampler] rate_hz = {card.rate_hz:g}"
             )
             messages.append(self._without_twin(grid))
         else:
@@ -235,7 +236,7 @@ class TwinIntegratorCore(Core):
             sigma_rad_s=self._twin.sigma_rad_s,
             valid=invalid_reason == InvalidReason.NONE,
             invalid_reason=invalid_reason,
-            twin=self._twin.name,
+            twin=self._twin.card.name,
             torque_balance_command=self._torque_balance(grid),
             torque_balance_sigma_command=self._twin.balance.sigma_command,
         )
@@ -252,7 +253,7 @@ def _balance_of(twin: TwinFile) -> TorqueBalance:
             lag_s=balance.lag_s,
             filter_rate_per_s=balance.filter_rate_per_s,
             lowest_speed_rad_s=balance.lowest_speed_rad_s,
-            highest_speed_rad_s=HIGHEST_SPEED * twin.top_speed_rad_s,
+            highest_speed_rad_s=HIGHEST_SPEED * twin.card.top_speed_rad_s,
             off_below=twin.off_below,
         )
     )
@@ -264,13 +265,13 @@ def build(context: Context) -> Parts:
     Raises:
         StageError: the tray names no twin, or one that cannot be used.
     """
-    return Parts(TwinIntegratorCore(twin_of(context), context.config, context.started_t_ns))
+    return Parts(TwinIntegratorCore(load_twin(context), context.config, context.started_t_ns))
 
 
 def check(context: Context) -> list[str]:
     """What would keep the twin from being loaded."""
     try:
-        twin_of(context)
+        load_twin(context)
     except StageError as error:
         return [str(error)]
     return []

@@ -10,6 +10,15 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from schemas.twin_card import (
+    BalanceCard,
+    DataCard,
+    Four,
+    HealthyCard,
+    TrainingCard,
+    TwinCard,
+    ValidationCard,
+)
 from twin.errors import TwinError
 from twin.evaluation.accuracy import (
     Evaluation,
@@ -19,32 +28,18 @@ from twin.evaluation.accuracy import (
     free_run_residuals,
 )
 from twin.evaluation.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
-from twin.export.card import BalanceCard, Card, DataCard, HealthyCard, NetworkCard, TrainingCard, ValidationCard
+from twin.export.fan_rows import fan_rows
 from twin.export.onnx_export import export_onnx
 from twin.export.onnx_twin import OnnxTwin
 from twin.fitting.balance import FILTER_RATE_PER_S
 from twin.fitting.balance_fit import BalanceFit, fit_balance
-from twin.fitting.cross_validation import chosen_spread
 from twin.fitting.identification import Identification, identify
-from twin.fitting.initial_weights import initial_weights
-from twin.fitting.narx_training import train_narx
-from twin.fitting.training import GRID_SPREAD, Physics, Progress, data_scaling, train_network
-from twin.models.hybrid import UNITS as HYBRID_UNITS
-from twin.models.hybrid import Hybrid
-from twin.models.model import KINDS, Kind, Model, NetworkOde
-from twin.models.narx import PARAMETER_COUNT, Narx
-from twin.models.narx import UNITS as NARX_UNITS
-from twin.models.network import TanhNetwork
-from twin.models.neural_ode import UNITS as NEURAL_ODE_UNITS
-from twin.models.neural_ode import NeuralOde
-from twin.models.physical import PhysicalModel
+from twin.fitting.model_fits import FitRequest, Trainer
+from twin.fitting.training import Physics, Progress
+from twin.kinds import BOTH_INPUTS, ModelKind, find_kind
+from twin.models.model import Model
 from twin.models.physics import PARAMETER_NAMES
 from twin.runs import Array, Run, common_fans
-
-Trainer = Literal["levenberg-marquardt", "adam"]
-NETWORK_UNITS: dict[Kind, int] = {"neural-ode": NEURAL_ODE_UNITS, "hybrid": HYBRID_UNITS}
-DEFAULT_ITERATIONS: dict[Trainer, int] = {"levenberg-marquardt": 120, "adam": 400}
-NARX_ITERATIONS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +48,7 @@ class TrainedTwin:
 
     model: Model
     parameters: Array
-    card: Card
+    card: TwinCard
     identification: Identification
     validation: Evaluation
 
@@ -70,13 +65,13 @@ class TrainedTwin:
 def train_twin(
     runs: Sequence[Run],
     validation_runs: Sequence[Run],
-    kind: Kind,
+    kind: str,
     *,
     name: str,
     seed: int = 0,
     trainer: Trainer = "levenberg-marquardt",
     max_iterations: int | None = None,
-    network_inputs: tuple[str, ...] = ("speed", "command"),
+    network_inputs: tuple[str, ...] = BOTH_INPUTS,
     physics: Physics = "refined",
     command_unit: str = "",
     fan_numbers: Sequence[int] | None = None,
@@ -96,21 +91,20 @@ def train_twin(
     runs give the same model.
     Raises TwinError when the runs do not tell the parameters, or the result cannot serve as a twin.
     """
-    _require_known(kind, trainer)
+    model_kind = find_kind(kind)
+    _require_trainer(model_kind, trainer)
     fans = common_fans([*runs, *validation_runs])
     numbers = tuple(range(fans) if fan_numbers is None else fan_numbers)
     started_s = time.monotonic()
     identification = identify(runs)
-    limit = max_iterations or (NARX_ITERATIONS if kind == "narx" else DEFAULT_ITERATIONS[trainer])
-    model, parameters, iterations = _train(
-        kind, runs, validation_runs, identification, seed, trainer, limit, network_inputs, physics, progress
+    fitted = model_kind.fit(
+        FitRequest(
+            runs, validation_runs, identification, seed, trainer, max_iterations, network_inputs, physics, progress
+        )
     )
+    model, parameters = fitted.model, fitted.parameters
     duration_s = time.monotonic() - started_s
-    if kind == "physical":
-        identification = replace(identification, warnings=(*identification.warnings, *identification.misfits))
-    if isinstance(model, Hybrid) and not np.any(model.network.theta):
-        silent = "the network stays silent: free runs with it were no better than those of the physics alone"
-        identification = replace(identification, warnings=(*identification.warnings, silent))
+    identification = replace(identification, warnings=(*identification.warnings, *fitted.warnings))
     judged = validation_runs or runs
     pieces = evaluation_pieces(judged)
     healthy = healthy_residual(free_run_residuals(model, parameters, pieces), pieces)
@@ -130,15 +124,16 @@ def train_twin(
     balance = fit_balance(runs, validation_runs, identification)
     speeds = np.concatenate([run.speed_rad_s.ravel() for run in runs])
     commands = np.concatenate([run.command.ravel() for run in runs])
-    moved: Physics = physics if kind == "hybrid" and trainer == "levenberg-marquardt" else "fixed"
-    card = Card(
+    card = TwinCard(
         kind=kind,
         name=name,
         created=(created or datetime.now(UTC)).isoformat(timespec="seconds"),
         fans=fans,
         n_state=model.state_layout.size,
         state_layout=model.state_layout,
+        fixed_rate=model.fixed_rate,
         parameter_names=PARAMETER_NAMES,
+        used_parameters=model.used_parameters,
         parameters=_rows(parameters),
         identified_parameters=_rows(identification.parameters),
         parameter_std_errors=_rows(identification.standard_errors),
@@ -151,8 +146,10 @@ def train_twin(
         speed_range_rad_s=(float(np.nanmin(speeds)), float(np.nanmax(speeds))),
         command_range=(float(commands.min()), float(commands.max())),
         rate_hz=1.0 / float(np.median(np.concatenate([np.diff(run.t_s) for run in runs]))),
-        network=_network_card(model),
-        training=TrainingCard(trainer, moved, seed, iterations, round(duration_s, 3), tuple(data), numbers),
+        network=model.network_card,
+        training=TrainingCard(
+            trainer, fitted.physics, seed, fitted.iterations, round(duration_s, 3), tuple(data), numbers
+        ),
         validation=_validation_card(
             validation.pooled, "held-out" if validation_runs else "training", tuple(validation_data)
         ),
@@ -167,78 +164,20 @@ def evaluate(
 ) -> Evaluation:
     """Figures of a twin, or of its file, on runs.
 
-    fan_numbers: what the recordings call the runs' fans, as card.Card.rows wants them. A twin of one fan serves any.
+    fan_numbers: what the recordings call the runs' fans, as in fan_rows. A twin of one fan serves any.
     Raises TwinError when the fans do not fit.
     """
     loaded = OnnxTwin(twin) if isinstance(twin, str | Path) else twin
     model = loaded if isinstance(loaded, OnnxTwin) else loaded.model
-    rows = loaded.card.rows(common_fans(runs), fan_numbers)
+    rows = fan_rows(loaded.card, common_fans(runs), fan_numbers)
     return evaluate_model(model, loaded.parameters[rows], np.array(loaded.card.sigma_rad_s)[rows], runs)
 
 
-def _require_known(kind: str, trainer: str) -> None:
-    if kind not in KINDS:
-        raise TwinError(f"kind {kind!r} is unknown; use one of {', '.join(KINDS)}")
+def _require_trainer(kind: ModelKind, trainer: str) -> None:
     if trainer not in get_args(Trainer):
         raise TwinError(f"trainer {trainer!r} is unknown; use one of {', '.join(get_args(Trainer))}")
-    if trainer == "adam" and kind not in NETWORK_UNITS:
-        raise TwinError(f"trainer 'adam' cannot train the {kind} model; use levenberg-marquardt")
-
-
-def _train(
-    kind: Kind,
-    runs: Sequence[Run],
-    validation_runs: Sequence[Run],
-    identification: Identification,
-    seed: int,
-    trainer: Trainer,
-    max_iterations: int,
-    network_inputs: tuple[str, ...],
-    physics: Physics,
-    progress: Progress | None,
-) -> tuple[Model, Array, int]:
-    if kind == "physical":
-        return PhysicalModel(), identification.parameters, identification.iterations
-    scaling = data_scaling(runs, identification)
-    if kind == "narx":
-        narx, iterations = train_narx(
-            runs, validation_runs, scaling, seed=seed, max_iterations=max_iterations, progress=progress
-        )
-        return narx, identification.parameters, iterations
-    units = NETWORK_UNITS[kind]
-    network = TanhNetwork.zero(units, network_inputs, scaling)
-    untrained: NetworkOde = Hybrid(network) if kind == "hybrid" else NeuralOde(network)
-    if trainer == "adam":
-        # torch is needed by this trainer alone, and takes seconds to import.
-        from twin.fitting.torch_reference import train_adam  # noqa: PLC0415
-
-        pieces = evaluation_pieces(runs)
-        (theta,) = initial_weights(untrained, pieces, identification, np.random.default_rng(seed), 1)
-        start = untrained.with_theta(theta)
-        model, iterations = train_adam(start, runs, identification, max_iterations=max_iterations, progress=progress)
-        return model, identification.parameters, iterations
-    spread = GRID_SPREAD
-    if not validation_runs:
-        spread = chosen_spread(untrained, runs, seed=seed, physics=physics, progress=progress)
-    return train_network(
-        untrained,
-        runs,
-        validation_runs,
-        identification,
-        max_iterations=max_iterations,
-        seed=seed,
-        physics=physics,
-        spread=spread,
-        progress=progress,
-    )
-
-
-def _network_card(model: Model) -> NetworkCard:
-    if isinstance(model, PhysicalModel):
-        return NetworkCard(units=0, inputs=(), parameter_count=0)
-    if isinstance(model, Narx):
-        return NetworkCard(units=NARX_UNITS, inputs=("speed", "command"), parameter_count=PARAMETER_COUNT)
-    return NetworkCard(model.network.units, model.network.inputs, model.network.parameter_count)
+    if trainer not in kind.trainers:
+        raise TwinError(f"trainer {trainer!r} cannot train the {kind.name} model; use {' or '.join(kind.trainers)}")
 
 
 def _healthy_card(healthy: HealthyResidual) -> HealthyCard:
@@ -258,8 +197,7 @@ def _balance_card(balance: BalanceFit) -> BalanceCard:
         viscous=viscous,
         drag=drag,
         friction=friction,
-        std_errors=_fours(balance.std_errors),
-        covariance=tuple(_fours(of_fan) for of_fan in balance.covariance),
+        covariance=tuple(map(_square, balance.covariance)),
         lag_s=tuple(balance.lag_s.tolist()),
         source=balance.sources,
         sigma_command=tuple(balance.sigma_command.tolist()),
@@ -267,6 +205,11 @@ def _balance_card(balance: BalanceFit) -> BalanceCard:
         lowest_speed_rad_s=tuple(balance.lowest_speed_rad_s.tolist()),
         filter_rate_per_s=FILTER_RATE_PER_S,
     )
+
+
+def _square(matrix: Array) -> tuple[Four, Four, Four, Four]:
+    first, second, third, fourth = _fours(matrix)
+    return first, second, third, fourth
 
 
 def _fours(rows: Array) -> tuple[tuple[float, float, float, float], ...]:

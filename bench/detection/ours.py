@@ -16,7 +16,7 @@ from bench.detection.methods import Change, Verdict
 from bench.detection.plant import BLOCK, STEP_NS, TRAY_FANS
 from bench.detection.simulated import tray_number
 from pipeline.runtime.stage import Core
-from pipeline.runtime.twin_file import TwinFile
+from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.messages import Alarm, Array, Prediction, Score
 from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import Running
@@ -107,11 +107,11 @@ def calibrated_twins(
         TooLittleError: the healthy running cannot support so low a rate.
     """
     given = list(twins)
-    known = [TwinFile.load(path) for path in given]
+    known = [load_tray_twin(path) for path in given]
     bends = [twin.bend_rad_s for twin in known if twin.bend_rad_s is not None]
     limits = calibrate(
         healthy,
-        max(twin.top_speed_rad_s for twin in known),
+        max(twin.card.top_speed_rad_s for twin in known),
         Timing(),
         alarms_per_day,
         extrapolate=extrapolate,

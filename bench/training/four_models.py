@@ -1,4 +1,4 @@
-"""Figures of the models that `fantwin compare` sets side by side (twin.evaluation.comparison), over runs held out."""
+"""Figures of the models that `fantwin compare` sets side by side (twin.comparison), over runs held out."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from twin.build import evaluate
+from twin.comparison import Contender
 from twin.evaluation.accuracy import Figures
-from twin.evaluation.comparison import Contender
 from twin.runs import Run
 
 NO_FIGURES = Figures(np.inf, np.inf, -np.inf, np.inf, 0.0, 0)

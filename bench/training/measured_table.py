@@ -14,7 +14,7 @@ import typer
 from bench.printing import JsonOption, progress, show
 from bench.training.four_models import held_out_figures, trained_in_s
 from bench.training.measured_sets import Split, splits
-from twin.evaluation.comparison import CANDIDATES, Contender, contend
+from twin.comparison import Contender, all_candidates, contend
 
 
 def main(
@@ -29,13 +29,15 @@ def main(
         if not split.name.startswith(only):
             continue
         learned = []
-        for candidate in CANDIDATES:
-            progress(f"{split.name} ({split.how}): {candidate.said}")
+        for candidate in all_candidates():
+            progress(f"{split.name} ({split.how}): {candidate.title}")
             learned.append(contend(candidate, split.training, [], [], seed=seed))
         rows[split.covered] += _rows(split, learned)
         notes.append(f"{split.name}, held out: {split.how}")
         notes += [
-            f"{split.name}: {found.candidate.said}: {found.invalid_reason}" for found in learned if found.invalid_reason
+            f"{split.name}: {found.candidate.title}: {found.invalid_reason}"
+            for found in learned
+            if found.invalid_reason
         ]
     titles = {True: "held out at levels that training covers", False: "held out beyond the levels of training"}
     show({titles[covered]: found for covered, found in rows.items() if found}, notes, as_json=json_output)
@@ -47,7 +49,7 @@ def _rows(split: Split, learned: list[Contender]) -> list[dict[str, Any]]:
     return [
         {
             "set": split.name,
-            "model": one.candidate.said,
+            "model": one.candidate.title,
             "rmse": found.rmse_rad_s / split.rad_s_per_unit,
             "unit": split.unit,
             "max error": found.max_error_rad_s / split.rad_s_per_unit,

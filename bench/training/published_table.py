@@ -24,7 +24,7 @@ from simulation.published_fan import (
     published_test,
     published_training,
 )
-from twin.evaluation.comparison import CANDIDATES, Contender, contend
+from twin.comparison import Contender, all_candidates, contend
 from twin.models.physics import PARAMETER_NAMES
 
 # Test RMSE in Peng and Chen, table 2, and what the project asks of ours in multiples of the floor.
@@ -48,9 +48,9 @@ def main(
     """Print the test error of each model over the noise floor, beside the published one, and the parameters."""
     pairs = [(published_training(seed), published_test(seed)) for seed in range(runs)]
     learned: dict[str, list[Contender]] = {}
-    for candidate in CANDIDATES:
-        progress(candidate.said)
-        learned[candidate.said] = [
+    for candidate in all_candidates():
+        progress(candidate.title)
+        learned[candidate.title] = [
             contend(candidate, [training.run], [], [], seed=seed) for seed, (training, _) in enumerate(pairs)
         ]
     tables = {

@@ -17,7 +17,7 @@ from bench.training.four_models import held_out_figures, trained_in_s
 from simulation.excitation import Manual
 from simulation.plant import FanParameters, Tacho, advance, at_rest
 from simulation.published_fan import RATE_HZ, SimulatedRun, random_stairs
-from twin.evaluation.comparison import CANDIDATES, Contender, contend
+from twin.comparison import Contender, all_candidates, contend
 from twin.runs import Array, Run
 
 DUTY_RANGE = (0.0, 1.0)
@@ -38,8 +38,8 @@ def main(
             "a hand at the knob": simulated_plant(_by_hand(2000 + seed, 80.0), 2000 + seed),
         }
         learned = []
-        for candidate in CANDIDATES:
-            progress(f"repetition {seed + 1} of {runs}: {candidate.said}")
+        for candidate in all_candidates():
+            progress(f"repetition {seed + 1} of {runs}: {candidate.title}")
             learned.append(contend(candidate, [training.run], [], [], seed=seed))
         for kind, test in tests.items():
             tables[f"held out: {kind}, seed {seed}"] = _rows(learned, test)
@@ -73,7 +73,7 @@ def _rows(learned: list[Contender], test: SimulatedRun) -> list[dict[str, Any]]:
     physical_distance = figures[0].rmse_rad_s - floor_rad_s
     return [
         {
-            "model": one.candidate.said,
+            "model": one.candidate.title,
             "rmse": found.rmse_rad_s,
             "floor": floor_rad_s,
             "to floor": found.rmse_rad_s / floor_rad_s,

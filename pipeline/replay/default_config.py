@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.config.loading import parse_config
 from pipeline.config.models import Config
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_recording
-from pipeline.runtime.twin_file import TwinFile
+from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
 from schemas.messages import Raw
 
@@ -62,7 +62,7 @@ def default_config(
         StageError: the twin cannot be used.
         ConfigError: `overrides` are wrong, or a tray cannot be described.
     """
-    rate_hz = float(f"{TwinFile.load(twin, next(iter(first.values()))[0].fans).rate_hz:.3g}")
+    rate_hz = float(f"{load_tray_twin(twin, next(iter(first.values()))[0].fans).card.rate_hz:.3g}")
     gap_limit_s = max(0.1, GAP_STEPS * max(_step_s(messages) for messages in first.values()))
     text = (
         f"# made up: the recording has no configuration\nsite = {json.dumps(head.metadata.get('site', 'site'))}\n\n"

@@ -47,7 +47,7 @@ class FreeRun:
         fans = twin.fans
         self.running = np.zeros(fans, np.bool_)
         self.started_t_ns = np.zeros(fans, np.int64)
-        self.held_command = np.full(fans, twin.command_range[0])
+        self.held_command = np.full(fans, twin.card.command_range[0])
         self._known_t_ns = np.zeros(fans, np.int64)  # when the command was last known
         self._out_of_range_t_ns = np.full(fans, NEVER_NS)
         self._readings = np.zeros(fans, np.int64)  # counted towards a start

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,14 +13,15 @@ from numpy.typing import NDArray
 
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import Context, StageError
-from pipeline.runtime.twin_file import StateLayout, TwinFile
+from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import cut, join
 from schemas.messages import Grid, InvalidReason, ModelCard, Prediction
 from stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
-from tests.support.twin_files import PARAMETERS, SIGMA_RAD_S, small_hybrid, still_balance, write_twin
+from tests.support.twin_files import PARAMETERS, SIGMA_RAD_S, made_up_card, small_hybrid, still_balance, write_twin
 from twin.models import physics
 from twin.models.integration import step_through
 from twin.models.lag import effective_command
+from twin.models.physical import PhysicalModel
 from twin.models.physics import LAG
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -36,23 +38,19 @@ def run_freely(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, 
     return speed, np.column_stack((last, lagged))
 
 
-def physical_twin(fans: int = 1, kind: str = "physical") -> TwinFile:
+def physical_twin(fans: int = 1, fixed_rate: bool = False, **changes: Any) -> TwinFile:
     def advance(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
         assert np.isfinite(state).all()
         assert np.isfinite(command).all()
         return run_freely(state, command, step_s)
 
+    card = replace(made_up_card(PhysicalModel(), fans), speed_range_rad_s=(0.0, 1e9))
     return TwinFile(
-        name="fake",
-        kind=kind,
-        sha256="0",
+        card=replace(card, name="fake", fixed_rate=fixed_rate, **changes),
         card_json="{}",
-        layout=StateLayout(speed=1, command=1),
+        sha256="0",
         sigma_rad_s=np.full(fans, 3.0),
         balance=still_balance(fans),
-        calibration=None,
-        command_range=(0.0, 100.0),
-        rate_hz=100.0,
         advance=advance,
     )
 
@@ -289,14 +287,15 @@ def test_it_must_settle_over_the_end_of_a_block_as_well() -> None:
 
 
 def test_a_friction_amidst_the_commands_of_a_fan_that_was_held_at_one_speed_is_no_dead_zone() -> None:
-    held = replace(twin_with_friction(25.6), command_range=(24.5, 27.3))
+    held = twin_with_friction(25.6)
+    held = replace(held, card=replace(held.card, command_range=(24.5, 27.3)))
     prediction = feed(core_of(held), [grid_of(np.full(100, 25.0), np.full(100, 31.0))])
     assert prediction.valid.all()
     assert np.isfinite(prediction.torque_balance_command[40:]).all()
 
 
 def test_without_friction_a_small_or_reversed_command_is_as_good_as_any() -> None:
-    reversing = replace(physical_twin(), command_range=(-100.0, 100.0))
+    reversing = physical_twin(command_range=(-100.0, 100.0))
     assert feed(core_of(reversing), [grid_of(np.array([40.0, 0.0, -50.0, -104.0]))]).valid.all()
 
 
@@ -348,11 +347,11 @@ def test_readings_from_before_a_silence_do_not_start_a_free_run_after_it() -> No
 
 
 def test_a_discrete_twin_at_another_rate_says_so_and_judges_nothing() -> None:
-    core = core_of(physical_twin(kind="narx"))
+    core = core_of(physical_twin(fixed_rate=True))
     prediction = feed(core, [grid_of(stairs(20), period_ns=2 * STEP_NS)])
     assert (prediction.invalid_reason == InvalidReason.NO_TWIN).all()
     assert "rate_hz = 100" in core.problem()
-    assert feed(core_of(physical_twin(kind="narx")), [grid_of(stairs(20))]).valid.all()
+    assert feed(core_of(physical_twin(fixed_rate=True)), [grid_of(stairs(20))]).valid.all()
 
 
 def test_the_whole_block_of_all_fans_is_one_run_of_the_graph() -> None:

@@ -122,15 +122,15 @@ def test_at_another_rate_of_the_grid_it_begins_anew() -> None:
 
 
 def test_it_needs_no_free_run() -> None:
-    twin = physical_twin(kind="narx")
-    prediction = feed(core_of(replace(twin, rate_hz=50.0)), [healthy()])
+    twin = physical_twin(fixed_rate=True, rate_hz=50.0)
+    prediction = feed(core_of(twin), [healthy()])
     assert not prediction.valid.any()
     assert (prediction.invalid_reason == InvalidReason.NO_TWIN).all()
     assert np.isfinite(prediction.torque_balance_command[SETTLES:]).all()
 
 
 def test_far_above_the_speeds_it_was_made_from_nobody_knows_what_a_fan_needs() -> None:
-    twin = replace(physical_twin(), card_json='{"speed_range_rad_s": [0, 200]}')
+    twin = physical_twin(speed_range_rad_s=(0.0, 200.0))
     fast = grid_of(np.full(100, 60.0), np.full(100, 301.0))
     slower = grid_of(np.full(100, 60.0), np.full(100, 299.0))
     assert np.isnan(feed(core_of(twin), [fast]).torque_balance_command).all()

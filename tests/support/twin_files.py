@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
 
-from pipeline.runtime.twin_file import Balance
-from pipeline.runtime.twin_file import BalanceCard as BalanceOfCard
-from twin.export.card import CARD_KEY, BalanceCard, Card, HealthyCard, NetworkCard, TrainingCard, ValidationCard
+from pipeline.runtime.tray_twin import Balance
+from schemas.twin_card import (
+    CARD_PROPERTY,
+    BalanceCard,
+    HealthyCard,
+    NetworkCard,
+    TrainingCard,
+    TwinCard,
+    ValidationCard,
+)
 from twin.export.onnx_export import export_onnx
 from twin.fitting.balance import FILTER_RATE_PER_S
 from twin.models.hybrid import Hybrid
@@ -25,7 +31,6 @@ PARAMETERS = (0.15, 0.12, 0.0005, 0.02)
 """J, alpha, C_D, lag_s of a fan that settles within about a second."""
 SIGMA_RAD_S = 3.0
 SIGMA_COMMAND = 1.0
-STD_ERRORS = (0.001, 0.001, 1e-5, 0.1)
 COVARIANCE = ((1e-6, 0.0, 0.0, 0.0), (0.0, 1e-6, 0.0, 0.0), (0.0, 0.0, 1e-10, 0.0), (0.0, 0.0, 0.0, 0.01))
 COMMAND_RANGE = (0.0, 100.0)
 
@@ -39,20 +44,22 @@ def small_hybrid(seed: int = 1) -> Hybrid:
     return Hybrid(network.with_theta(rng.normal(0.0, 0.3, network.parameter_count)))
 
 
-def made_up_card(model: Model, fans: int) -> Card:
+def made_up_card(model: Model, fans: int) -> TwinCard:
     """A card that fits a model, each fan a little different."""
     layout = model.state_layout
     scale = 1.0 + 0.05 * np.arange(fans)
     parameters = tuple(tuple((np.array(PARAMETERS) * s).tolist()) for s in scale)
     unknown = (None,) * fans
-    return Card(
+    return TwinCard(
         kind=model.kind,
         name=f"made up {model.kind}",
         created="2024-01-01T00:00:00Z",
         fans=fans,
         n_state=layout.size,
         state_layout=layout,
+        fixed_rate=model.fixed_rate,
         parameter_names=PARAMETER_NAMES,
+        used_parameters=model.used_parameters,
         parameters=parameters,
         identified_parameters=parameters,
         parameter_std_errors=tuple((0.0,) * len(PARAMETER_NAMES) for _ in scale),
@@ -80,7 +87,6 @@ def made_up_balance(parameters: tuple[tuple[float, ...], ...]) -> BalanceCard:
         viscous=viscous,
         drag=drag,
         friction=tuple((0.0 * each).tolist()),
-        std_errors=(STD_ERRORS,) * len(parameters),
         covariance=(COVARIANCE,) * len(parameters),
         lag_s=lag_s,
         source=("physics",) * len(parameters),
@@ -93,9 +99,7 @@ def made_up_balance(parameters: tuple[tuple[float, ...], ...]) -> BalanceCard:
 
 def still_balance(fans: int) -> Balance:
     """made_up_balance as a stage has it."""
-    card = BalanceOfCard.model_validate(asdict(made_up_balance((PARAMETERS,) * fans)))
-    arrays = {name: np.array(values) for name, values in card.of_fans.items()}
-    return Balance(**arrays, filter_rate_per_s=card.filter_rate_per_s)
+    return Balance.from_card(made_up_balance((PARAMETERS,) * fans), fans)
 
 
 def write_twin(path: Path, model: Model | None = None, fans: int = 1, **changes: Any) -> Path:
@@ -103,8 +107,8 @@ def write_twin(path: Path, model: Model | None = None, fans: int = 1, **changes:
     model = model or PhysicalModel()
     file = onnx.load_model_from_string(export_onnx(model, made_up_card(model, fans)))
     properties = {entry.key: entry.value for entry in file.metadata_props}
-    card = json.loads(properties[CARD_KEY]) | changes
-    properties[CARD_KEY] = json.dumps({key: value for key, value in card.items() if value is not None})
+    card = json.loads(properties[CARD_PROPERTY]) | changes
+    properties[CARD_PROPERTY] = json.dumps({key: value for key, value in card.items() if value is not None})
     onnx.helper.set_model_props(file, properties)
     path.write_bytes(file.SerializeToString())
     return path

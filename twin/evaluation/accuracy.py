@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.units import NS_PER_S
 from twin.errors import TwinError
 from twin.models.model import TwinModel
 from twin.runs import STARTING_SAMPLES, Array, Run, common_fans, starting_speed_rad_s
@@ -178,7 +179,7 @@ def _advance_side_by_side(model: TwinModel, states: Array, command: Array, step_
     in which times are recorded.
     """
     following = np.empty_like(states)
-    period_ns = np.rint(1e9 * step_s)
+    period_ns = np.rint(NS_PER_S * step_s)
     for step in np.unique(period_ns):
         same = period_ns == step
         count = int(np.count_nonzero(same))

@@ -5,8 +5,8 @@ from typing import Any
 
 import onnx
 
+from schemas.twin_card import CARD_PROPERTY
 from twin.errors import TwinError
-from twin.export.card import CARD_KEY
 
 
 def with_calibration(content: bytes, calibration: dict[str, Any]) -> bytes:
@@ -17,8 +17,8 @@ def with_calibration(content: bytes, calibration: dict[str, Any]) -> bytes:
     """
     model = onnx.load_model_from_string(content)
     for entry in model.metadata_props:
-        if entry.key == CARD_KEY:
+        if entry.key == CARD_PROPERTY:
             card = json.loads(entry.value)
             entry.value = json.dumps(card | {"calibration": calibration}, allow_nan=False)
             return model.SerializeToString()
-    raise TwinError(f"an ONNX file, but not a twin: it has no {CARD_KEY}")
+    raise TwinError(f"an ONNX file, but not a twin: it has no {CARD_PROPERTY}")

@@ -1,50 +1,31 @@
-"""A twin as one ONNX file: a Scan over samples whose body is one step of the model, in float64, with the card inside.
+"""A twin as one ONNX file in float64: the graph of its model, with the card in its metadata.
 
-    inputs   state (fans, n_state)         see state.StateLayout; of an ODE the speed and the lagged command
+    inputs   state (fans, n_state)         see schemas.twin_card.StateLayout
              command (n, fans)             held from sample k to k + 1
              step_s (n,)                   time from sample k to k + 1
              parameters (fans, 4)          in the order of physics.PARAMETER_NAMES
     outputs  speed_rad_s (n, fans)         at sample k, before command k acts
              state_out (fans, n_state)     after the last step: the next block's state
 
-fans and n are dynamic. Every kind has all four inputs, whether it needs them or not, so that a reader needs to know
-one contract only. The nodes are written by hand, and few: each costs a third of a microsecond or more, whatever it
-computes for a tray of fans. A layer of the network with its bias is one node (Gemm), and so is a Runge-Kutta stage's
-advance; what does not depend on the speed is computed once for the four stages, and what does not depend on the
-sample, once for the block. Fans lie side by side in rows (1, fans), so that products with weights are long in their
-inner loop. All that varies in shape with the block happens sample by sample or is exact: the numbers do not depend on
-how a run is cut into blocks.
+fans and n are dynamic. A graph has all four inputs, whether its model needs them or not, so that all kinds of model
+look the same to a reader.
 """
 
-from collections.abc import Callable
-
-import numpy as np
 from onnx import checker, helper
 
-from twin.export.card import CARD_KEY, Card
-from twin.export.onnx_graph import Nodes, double
-from twin.models.model import Model, OdeModel
-from twin.models.narx import ORDER, Narx
-from twin.models.network import TanhNetwork
-from twin.models.neural_ode import NeuralOde
-from twin.models.physical import PhysicalModel
+from schemas.twin_card import CARD_PROPERTY, TwinCard
+from twin.models.model import Model
+from twin.models.onnx_nodes import double
 from twin.models.physics import PARAMETER_NAMES
 
 OPSET = 17
 IR_VERSION = 8
 
-SMALLEST_STEP_S = 1e-30
-"""A step of zero counts as this long, lest it be divided by a lag of zero."""
-RK4_WEIGHTS = np.array([[1.0, 2.0, 2.0, 1.0]]) / 6.0
 
-Term = Callable[[str], str]
-"""The name of a speed (1, fans) to the name of what depends on it."""
-
-
-def export_onnx(model: Model, card: Card) -> bytes:
+def export_onnx(model: Model, card: TwinCard) -> bytes:
     """The serialised file. The same model and card give the same bytes."""
     width = model.state_layout.size
-    nodes = _narx_run(model) if isinstance(model, Narx) else _ode_run(model)
+    nodes = model.graph()
     graph = helper.make_graph(
         nodes.nodes,
         "fantwin",
@@ -60,152 +41,6 @@ def export_onnx(model: Model, card: Card) -> bytes:
     file = helper.make_model(
         graph, producer_name="fantwin", opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION
     )
-    helper.set_model_props(file, {CARD_KEY: card.to_json()})
+    helper.set_model_props(file, {CARD_PROPERTY: card.to_json()})
     checker.check_model(file, full_check=True)
     return file.SerializeToString(deterministic=True)
-
-
-def _ode_run(model: OdeModel) -> Nodes:
-    """An ordinary differential equation: right_hand_side.advance."""
-    block, body = Nodes(), Nodes("step/")
-    states = block.rows("state", ["speed", "lagged"], "state_rows")
-    parameters: dict[str, str] = dict(
-        zip(PARAMETER_NAMES, block.rows("parameters", list(PARAMETER_NAMES), "turned"), strict=True)
-    )
-    step_s = block.add("Unsqueeze", ["step_s", block.constant("step_axes", [1, 2], np.int64)], "step")
-    exponent = _decay_exponent(block, step_s, parameters["lag_s"])
-
-    acting, lagged = _lag(body)
-    speed = _rk4_step(body, _acceleration(model, block, body, parameters, acting))
-    present = body.add("Identity", ["speed_k"], "speed_now")
-    row = [1, "fans"]
-    one_step = helper.make_graph(
-        body.nodes,
-        "one_step",
-        [
-            double("speed_k", row),
-            double("lagged_k", row),
-            double("command_k", ["fans"]),
-            double("step_k", [1, 1]),
-            double("exponent_k", row),
-        ],
-        [double(speed, row), double(lagged, row), double(present, row)],
-        body.constants,
-    )
-    finals = ["speed_final", "lagged_final"]
-    block.scan(one_step, states, ["command", step_s, exponent], finals, "speed_rows")
-    block.add("Squeeze", ["speed_rows", block.constant("row_axis", [1], np.int64)], "speed_rad_s")
-    block.add("Transpose", [block.add("Concat", finals, "final_rows", axis=0)], "state_out", perm=[1, 0])
-    return block
-
-
-def _decay_exponent(block: Nodes, step_s: str, lag_s: str) -> str:
-    """(n, 1, fans) minus step over lag: minus infinity where there is no lag."""
-    smallest = block.constant("smallest_step_s", SMALLEST_STEP_S)
-    return block.add(
-        "Div", [block.add("Max", [step_s, smallest], "positive_step"), block.add("Neg", [lag_s], "minus_lag")], "decays"
-    )
-
-
-def _lag(body: Nodes) -> tuple[str, str]:
-    """lag.effective_command for one sample: the command that acts, and the lagged one after the step.
-
-    Without a lag both are the command itself, to the last bit. 1 - exp(-x) loses digits where steps are much shorter
-    than the lag: of sixteen, as many as x = step / lag has zeros behind the point.
-    """
-    # The exponential belongs in here: over a whole block its last bit would depend on a sample's place in it.
-    decay = body.add("Exp", ["exponent_k"], "decay")
-    lost = body.add("Sub", [decay, body.constant("one", 1.0)], "lost")
-    mean_share = body.add("Div", [lost, "exponent_k"], "mean_share")
-    distance = body.add("Sub", ["lagged_k", "command_k"], "distance")
-    acting = body.add("Add", ["command_k", body.add("Mul", [distance, mean_share], "mean_left")], "acting")
-    lagged = body.add("Add", ["command_k", body.add("Mul", [distance, decay], "left")], "lagged_next")
-    return acting, lagged
-
-
-def _rk4_step(body: Nodes, acceleration: Term) -> str:
-    """integration.rk4_step node by node."""
-    half_step = body.add("Mul", ["step_k", body.constant("half", 0.5)], "half_step")
-    weights = body.add("Mul", ["step_k", body.constant("rk4_weights", RK4_WEIGHTS)], "stage_steps")
-    slopes: list[str] = []
-    speed = "speed_k"
-    for stage, reach in enumerate((half_step, half_step, "step_k", None), start=1):
-        with body.scope(f"k{stage}"):
-            slopes.append(acceleration(speed))
-            if reach is not None:
-                speed = body.add("Gemm", [reach, slopes[-1], "speed_k"], "speed_there")
-    return body.add("Gemm", [weights, body.add("Concat", slopes, "slopes", axis=0), "speed_k"], "speed_next")
-
-
-def _acceleration(model: OdeModel, block: Nodes, body: Nodes, parameters: dict[str, str], acting: str) -> Term:
-    """right_hand_side.FanEquation. What does not depend on the speed, tau / J + b_o, is the same in all four stages."""
-    forcing, load, hidden, weights = "", None, None, ""
-    if not isinstance(model, NeuralOde):
-        forcing = body.add("Div", [acting, parameters["J"]], "drive")
-        load = _load(block, body, parameters)
-    if not isinstance(model, PhysicalModel):
-        _, _, output_weights, output_bias = model.network.physical_weights()
-        weights, bias = body.constant("output_weights", [output_weights]), body.constant("output_bias", [[output_bias]])
-        forcing = body.add("Add", [forcing, bias], "forcing") if forcing else bias
-        hidden = _hidden_layer(model.network, body, acting)
-
-    def acceleration(speed: str) -> str:
-        known = body.add("Sub", [forcing, load(speed)], "known") if load else forcing
-        return body.add("Gemm", [weights, hidden(speed), known], "acceleration") if hidden else known
-
-    return acceleration
-
-
-def _load(block: Nodes, body: Nodes, parameters: dict[str, str]) -> Term:
-    """(alpha + C_D |w|) w / J. The quotients are taken once for the block."""
-    viscous = block.add("Div", [parameters["alpha"], parameters["J"]], "viscous_per_s")
-    drag = block.add("Div", [parameters["C_D"], parameters["J"]], "drag_per_rad")
-
-    def load(speed: str) -> str:
-        turning = body.add("Mul", [drag, body.add("Abs", [speed], "turning")], "drag_damping")
-        return body.add("Mul", [body.add("Add", [viscous, turning], "damping"), speed], "load")
-
-    return load
-
-
-def _hidden_layer(network: TanhNetwork, body: Nodes, acting: str) -> Term:
-    """TanhNetwork.hidden, (units, fans). The command's share is the same in all four stages."""
-    input_weights, input_bias, _, _ = network.physical_weights()
-    speed_weights = body.constant("speed_weights", input_weights[:1].T)
-    bias = body.constant("hidden_bias", input_bias[:, np.newaxis])
-    if len(network.inputs) > 1:
-        bias = body.add("Gemm", [body.constant("command_weights", input_weights[1:].T), acting, bias], "command_bias")
-
-    def hidden(speed: str) -> str:
-        return body.add("Tanh", [body.add("Gemm", [speed_weights, speed, bias], "pre_activation")], "hidden")
-
-    return hidden
-
-
-def _narx_run(model: Narx) -> Nodes:
-    """Narx.advance: predict, then shift both delay lines by one. The state stays as it is, fans below one another."""
-    block, body = Nodes(), Nodes("step/")
-    input_weights, input_bias, output_weights, output_bias = model.physical_weights()
-    command = body.add("Unsqueeze", ["command_k", body.constant("column", [1], np.int64)], "command")
-    speeds = body.slice("state_k", 1, 0, ORDER, "speeds")
-    commands = body.slice("state_k", 1, ORDER, 2 * ORDER, "commands")
-    regressors = body.add("Concat", [speeds, command, commands], "regressors", axis=1)
-    weights, bias = body.constant("input_weights", input_weights), body.constant("hidden_bias", input_bias)
-    hidden = body.add("Tanh", [body.add("Gemm", [regressors, weights, bias], "pre_activation")], "hidden")
-    weights, bias = body.constant("output_weights", output_weights[:, np.newaxis]), body.constant("bias", output_bias)
-    following = body.add("Gemm", [hidden, weights, bias], "speed_next")
-    kept_speeds = body.slice(speeds, 1, 0, ORDER - 1, "kept_speeds")
-    kept_commands = body.slice(commands, 1, 0, ORDER - 1, "kept_commands")
-    state = body.add("Concat", [following, kept_speeds, command, kept_commands], "state_next", axis=1)
-    newest = body.slice("state_k", 1, 0, 1, "newest")
-    present = body.add("Squeeze", [newest, body.constant("row", [1], np.int64)], "speed_now")
-    size = model.state_layout.size
-    one_step = helper.make_graph(
-        body.nodes,
-        "one_step",
-        [double("state_k", ["fans", size]), double("command_k", ["fans"])],
-        [double(state, ["fans", size]), double(present, ["fans"])],
-        body.constants,
-    )
-    block.scan(one_step, ["state"], ["command"], ["state_out"], "speed_rad_s")
-    return block

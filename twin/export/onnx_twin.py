@@ -6,13 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from schemas.twin_card import CARD_PROPERTY, GRAPH_INPUTS, GRAPH_OUTPUTS, CardError, StateLayout, TwinCard
 from twin.errors import TwinError
-from twin.export.card import CARD_KEY, Card
-from twin.models.state import StateLayout
 from twin.runs import Array
-
-INPUTS = ["state", "command", "step_s", "parameters"]
-OUTPUTS = ["speed_rad_s", "state_out"]
 
 
 class OnnxTwin:
@@ -24,13 +20,13 @@ class OnnxTwin:
             raise TwinError(f"{self.path}: no such file; give the .onnx file of a twin")
         self._session = _session(self.path)
         metadata = self._session.get_modelmeta().custom_metadata_map
-        if CARD_KEY not in metadata:
+        if CARD_PROPERTY not in metadata:
             raise TwinError(
-                f"{self.path}: an ONNX file without {CARD_KEY}, so not a fantwin twin; make one with fantwin train"
+                f"{self.path}: an ONNX file without {CARD_PROPERTY}, so not a fantwin twin; make one with fantwin train"
             )
         try:
-            self.card = Card.from_json(metadata[CARD_KEY])
-        except TwinError as error:
+            self.card = TwinCard.from_json(metadata[CARD_PROPERTY])
+        except CardError as error:
             raise TwinError(f"{self.path}: {error}") from error
         _require_fit(self.path, self._session, self.card)
         self.parameters = np.array(self.card.parameters, dtype=np.float64)
@@ -41,31 +37,26 @@ class OnnxTwin:
         return self.card.state_layout
 
     def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
-        """Free run over a block of samples; see models.TwinModel."""
+        """Free run over a block of samples; see model.TwinModel."""
         values = [np.ascontiguousarray(value, dtype=np.float64) for value in (state, command, step_s, parameters)]
-        speed_rad_s, state_out = self._session.run(OUTPUTS, dict(zip(INPUTS, values, strict=True)))
+        speed_rad_s, state_out = self._session.run(list(GRAPH_OUTPUTS), dict(zip(GRAPH_INPUTS, values, strict=True)))
         return np.asarray(speed_rad_s), np.asarray(state_out)
 
 
-def _require_fit(path: Path, session: Any, card: Card) -> None:
-    """Raise TwinError unless card and graph tell of the same arrays."""
+def _require_fit(path: Path, session: Any, card: TwinCard) -> None:
+    """Raise TwinError unless the graph has the inputs and outputs that the card describes."""
     inputs, outputs = session.get_inputs(), session.get_outputs()
-    names = [value.name for value in inputs], [value.name for value in outputs]
-    if names != (INPUTS, OUTPUTS):
-        raise TwinError(f"{path}: inputs {names[0]} and outputs {names[1]}; expected {INPUTS} and {OUTPUTS}")
+    names = tuple(value.name for value in inputs), tuple(value.name for value in outputs)
+    if names != (GRAPH_INPUTS, GRAPH_OUTPUTS):
+        raise TwinError(
+            f"{path}: inputs {names[0]} and outputs {names[1]}; expected {GRAPH_INPUTS} and {GRAPH_OUTPUTS}"
+        )
     if any(value.type != "tensor(double)" for value in (*inputs, *outputs)):
         raise TwinError(f"{path}: inputs and outputs must be float64; export the twin again")
-    widths = {"state": card.state_layout.size, "parameters": len(card.parameter_names)}
-    for name, width in widths.items():
-        shape = inputs[INPUTS.index(name)].shape
+    for name, width in (("state", card.n_state), ("parameters", len(card.parameter_names))):
+        shape = inputs[GRAPH_INPUTS.index(name)].shape
         if len(shape) != 2 or shape[1] != width:
             raise TwinError(f"{path}: {name} is {shape}, the card says (fans, {width}); export the twin again")
-    if card.n_state != widths["state"] or [len(row) for row in card.parameters] != [widths["parameters"]] * card.fans:
-        raise TwinError(f"{path}: n_state or parameters of the model card do not fit the rest; export the twin again")
-    if len(card.fan_numbers) != card.fans:
-        raise TwinError(
-            f"{path}: training.fans of the model card does not name {card.fans} fans; export the twin again"
-        )
 
 
 def _session(path: Path) -> Any:
@@ -73,7 +64,7 @@ def _session(path: Path) -> Any:
     import onnxruntime  # noqa: PLC0415
 
     options = onnxruntime.SessionOptions()
-    # A body of fifty tiny nodes gains nothing from threads, and their hand-over costs more than the work.
+    # Threads gain nothing on fifty tiny nodes: handing over costs more than the work.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 3

@@ -16,8 +16,6 @@ deviation s makes a balance of about inertia lambda s, whatever the rate. Where 
 twin.fitting.balance_fit.
 """
 
-from typing import Literal
-
 import numpy as np
 
 from twin.models.lag import effective_command
@@ -26,8 +24,6 @@ from twin.runs import Array
 
 FILTER_RATE_PER_S = 3.0
 COEFFICIENTS = ("inertia", "viscous", "drag", "friction")
-
-Source = Literal["physics", "least-squares"]
 
 
 def torque_balance(command: Array, speed_rad_s: Array, step_s: float, coefficients: Array, lag_s: Array) -> Array:

@@ -29,10 +29,11 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import lsq_linear
 
+from schemas.twin_card import BalanceSource
 from twin.errors import TwinError
 from twin.evaluation.resampling import resampled
 from twin.evaluation.residual_analysis import analyse_residual
-from twin.fitting.balance import COEFFICIENTS, FILTER_RATE_PER_S, Source, balance_of, filtered_terms
+from twin.fitting.balance import COEFFICIENTS, FILTER_RATE_PER_S, balance_of, filtered_terms
 from twin.fitting.identification import Identification
 from twin.models.physics import LAG
 from twin.runs import GAP_IN_MEDIAN_STEPS, Array, Run
@@ -61,7 +62,7 @@ class BalanceFit:
     sigma_command: Array
     autocorrelation_time_s: Array
     lowest_speed_rad_s: Array
-    sources: tuple[Source, ...]
+    sources: tuple[BalanceSource, ...]
 
     @property
     def std_errors(self) -> Array:
@@ -141,7 +142,9 @@ def _bridged(speed_rad_s: Array) -> Array:
     return np.where(short, between, speed_rad_s)
 
 
-def _choose(learned: Sequence[_Stretch], identification: Identification, fan: int) -> tuple[Array, Array, Source]:
+def _choose(
+    learned: Sequence[_Stretch], identification: Identification, fan: int
+) -> tuple[Array, Array, BalanceSource]:
     """(4,) coefficients of a fan, the (4, 4) covariance of their errors, and which candidate they are."""
     runs = _by_run(learned, fan)
     parts = 1 if len(runs) >= ENOUGH_RUNS else -(-GROUPS // len(runs))

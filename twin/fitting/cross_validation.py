@@ -16,7 +16,6 @@ from twin.errors import TwinError
 from twin.evaluation.accuracy import evaluation_pieces, free_run_residuals
 from twin.fitting.identification import identify
 from twin.fitting.training import GRID_SPREAD, Physics, Progress, train_network
-from twin.models.hybrid import Hybrid
 from twin.models.model import NetworkOde
 from twin.runs import Array, Run
 
@@ -34,7 +33,7 @@ def chosen_spread(
     folds = min(FOLDS, len(runs))
     if folds < 2:
         return GRID_SPREAD
-    spreads = (0.0, *SPREADS) if isinstance(model, Hybrid) else SPREADS
+    spreads = (0.0, *SPREADS) if model.has_physics else SPREADS
     losses: list[list[float]] = [[] for _ in spreads]
     for fold in range(folds):
         left_out, rest = list(runs[fold::folds]), [run for k, run in enumerate(runs) if k % folds != fold]

@@ -25,7 +25,7 @@ from twin.models.integration import free_run, free_run_sensitivities
 from twin.models.lag import effective_command, effective_command_by_lag
 from twin.models.model import OdeModel
 from twin.models.network import TanhNetwork
-from twin.models.physical import PhysicalModel, parameters_by_unknowns, physical_parameters
+from twin.models.physical import parameters_by_unknowns, physical_parameters
 from twin.models.physics import LAG, PARAMETER_NAMES
 from twin.models.right_hand_side import FanEquation
 from twin.runs import Array
@@ -136,8 +136,7 @@ def fit_free_run(
     less than tolerance, relative, or when none lowers it.
     """
     problem = FreeRunProblem(model, trajectories, top_speed_rad_s, free, prior, estimate_initial_speed)
-    weights = np.zeros(0) if isinstance(model, PhysicalModel) else model.network.theta
-    start = Unknowns(weights, own, trajectories.starting_speed_rad_s())
+    start = Unknowns(model.theta, own, trajectories.starting_speed_rad_s())
     point = problem.evaluate(start, trajectories.interpolated_speed_rad_s())
     iteration = 0
     for _ in range(SCALE_ROUNDS):
@@ -200,7 +199,7 @@ class FreeRunProblem:
         self.prior = prior
         self.estimate_initial_speed = estimate_initial_speed
         self.fans = len(top_speed_rad_s)
-        self.weights = 0 if isinstance(model, PhysicalModel) else model.network.parameter_count
+        self.weights = len(model.theta)
         self.groups = 1 if self.weights else self.fans
         self.group_of_fan = np.zeros(self.fans, dtype=np.intp) if self.weights else np.arange(self.fans)
         self.scale_rad_s = np.ones(self.fans)
@@ -223,11 +222,10 @@ class FreeRunProblem:
         """The equation of some trajectories, and the command that acts on them (n, batch)."""
         data = self.trajectories
         parameters = self.parameters(unknowns)[data.fan[part]]
-        model = self.model if isinstance(self.model, PhysicalModel) else self.model.with_theta(unknowns.weights)
         command, _ = effective_command(
             data.command[:, part], data.step_s[:, part], parameters[:, LAG], data.command_before[part]
         )
-        return model.equation(parameters), command
+        return self.model.with_theta(unknowns.weights).equation(parameters), command
 
     def parameters(self, unknowns: Unknowns) -> Array:
         """(fans, 4) physical parameters."""
@@ -321,8 +319,9 @@ class FreeRunProblem:
         return Unknowns(unknowns.weights + move, new_own, unknowns.initial_speed_rad_s + initial_move)
 
     def _network(self, weights: Array) -> TanhNetwork:
-        assert not isinstance(self.model, PhysicalModel), "a prior on a network needs a network"
-        return self.model.network.with_theta(weights)
+        network = self.model.network
+        assert network is not None, "a prior on a network needs a network"
+        return network.with_theta(weights)
 
     def _own_pivot(self, unknowns: Unknowns, reduced: Array, downhill: Array, diagonal: Array, damping: Array) -> Array:
         """(fans, 4, 4) the damped curvature of the own unknowns; those that are held get one beyond all measure."""

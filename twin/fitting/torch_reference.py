@@ -14,7 +14,6 @@ from twin.evaluation.accuracy import evaluation_pieces
 from twin.fitting.identification import Identification
 from twin.fitting.training import SHORT_STRETCH_TIME_CONSTANTS, Progress
 from twin.fitting.trajectories import cut_into_trajectories, stretch_samples
-from twin.models.hybrid import Hybrid
 from twin.models.lag import effective_command
 from twin.models.model import NetworkOde
 from twin.models.physics import LAG
@@ -45,7 +44,7 @@ def torch_free_run(
         if len(network.inputs) > 1:
             pre = pre + ((held - scale.command_offset) / scale.command_scale)[:, None] * rows[1]
         learned = scale.acceleration_scale_rad_s2 * (torch.tanh(pre) @ rows[-1] + theta[-1])
-        if not isinstance(model, Hybrid):
+        if not model.has_physics:
             return learned
         return (held - viscous * speed - drag * speed * speed.abs()) / inertia + learned
 

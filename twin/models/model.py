@@ -1,24 +1,19 @@
-"""What the four models have in common, and their table."""
+"""What a model of a fan must offer: the protocols that evaluation, fitting and export rely on.
 
-from typing import Literal, Protocol, get_args
+A kind of model is one class in a file of its own in this package. twin.kinds lists the kinds.
+"""
 
-from twin.models.hybrid import Hybrid
-from twin.models.narx import Narx
-from twin.models.neural_ode import NeuralOde
-from twin.models.physical import PhysicalModel
-from twin.models.state import StateLayout
+from typing import ClassVar, Protocol, Self
+
+from schemas.twin_card import NetworkCard, StateLayout
+from twin.models.network import TanhNetwork
+from twin.models.onnx_nodes import Nodes
+from twin.models.right_hand_side import FanEquation
 from twin.runs import Array
-
-Kind = Literal["physical", "narx", "neural-ode", "hybrid"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
-
-Model = PhysicalModel | Narx | NeuralOde | Hybrid
-NetworkOde = NeuralOde | Hybrid
-OdeModel = PhysicalModel | NeuralOde | Hybrid
 
 
 class TwinModel(Protocol):
-    """State and commands in, speeds and state out."""
+    """State and commands in, speeds and state out. A model in memory and a file in onnxruntime both are one."""
 
     @property
     def state_layout(self) -> StateLayout:
@@ -32,4 +27,58 @@ class TwinModel(Protocol):
         (fans, 4). Returns speed_rad_s (n, fans), at each sample before its command acts, and the state after the last
         step. Two blocks with the state carried over give what one block gives.
         """
+        ...
+
+
+class Model(TwinModel, Protocol):
+    """A model of some kind, with all that the card and the ONNX file need to know about it.
+
+    fixed_rate: whether it holds only at the sample rate it was trained at. used_parameters: the names of a fan's own
+    parameters (twin.models.physics) that it uses.
+    """
+
+    kind: ClassVar[str]
+    fixed_rate: ClassVar[bool]
+    used_parameters: ClassVar[tuple[str, ...]]
+
+    @property
+    def network_card(self) -> NetworkCard:
+        """The size of its network."""
+        ...
+
+    def graph(self) -> Nodes:
+        """`advance` as ONNX nodes, between the inputs and outputs that schemas.twin_card names."""
+        ...
+
+
+class OdeModel(Model, Protocol):
+    """A model w' = f(w, command) with weights theta (P,), none without a network. It is fitted on its free run."""
+
+    @property
+    def network(self) -> TanhNetwork | None:
+        """Its network, or None."""
+        ...
+
+    @property
+    def theta(self) -> Array:
+        """(P,) the weights of the network; empty without one."""
+        ...
+
+    def with_theta(self, theta: Array) -> Self:
+        """The same model with other weights."""
+        ...
+
+    def equation(self, parameters: Array) -> FanEquation:
+        """The right-hand side for a batch of fans with the physical parameters (batch, 4)."""
+        ...
+
+
+class NetworkOde(OdeModel, Protocol):
+    """A model w' = f(w, command) with a network. has_physics: whether it is a fan without its network, too."""
+
+    has_physics: ClassVar[bool]
+
+    @property
+    def network(self) -> TanhNetwork:
+        """Its network."""
         ...

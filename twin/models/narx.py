@@ -7,13 +7,15 @@ they came at their median rate.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from onnx import helper
 
+from schemas.twin_card import NetworkCard, StateLayout
 from twin.models.network import Scaling
-from twin.models.state import StateLayout
+from twin.models.onnx_nodes import Nodes, double
 from twin.runs import Array
 
 UNITS = 50
@@ -28,8 +30,16 @@ class Narx:
 
     theta: Array
     scaling: Scaling
-    kind: Literal["narx"] = "narx"
     state_layout: StateLayout = StateLayout(speed=ORDER, command=ORDER)
+
+    kind: ClassVar[str] = "narx"
+    fixed_rate: ClassVar[bool] = True
+    used_parameters: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def network_card(self) -> NetworkCard:
+        """The size of the network."""
+        return NetworkCard(UNITS, ("speed", "command"), PARAMETER_COUNT)
 
     def weights(self) -> tuple[Array, Array, Array, float]:
         """W_i (21, 50), b_i (50,), W_o (50,) and b_o, in scaled units."""
@@ -48,7 +58,7 @@ class Narx:
         return per_unit, input_bias - offsets @ per_unit, scale.speed_scale_rad_s * output_weights, output_offset
 
     def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
-        """Free run from state; see models.TwinModel. step_s and parameters are not used."""
+        """Free run from state; see model.TwinModel. step_s and parameters are not used."""
         input_weights, input_bias, output_weights, output_bias = self.physical_weights()
         # Time runs forwards in memory, lags backwards in the weights: turned round once, a past is a plain slice.
         by_speed, by_command = input_weights[ORDER - 1 :: -1].T, input_weights[: ORDER - 1 : -1].T
@@ -60,6 +70,35 @@ class Narx:
             speeds[k + ORDER] = output_weights @ np.tanh(by_speed @ past + by_command @ driven + bias) + output_bias
         final = np.column_stack((speeds[: -ORDER - 1 : -1].T, commands[: -ORDER - 1 : -1].T))
         return speeds[ORDER - 1 : -1].copy(), final
+
+    def graph(self) -> Nodes:
+        """`advance` as ONNX nodes: predict, then shift both delay lines by one. Fans are the rows of the state."""
+        block, body = Nodes(), Nodes("step/")
+        input_weights, input_bias, output_weights, output_bias = self.physical_weights()
+        command = body.add("Unsqueeze", ["command_k", body.constant("column", [1], np.int64)], "command")
+        speeds = body.slice("state_k", 1, 0, ORDER, "speeds")
+        commands = body.slice("state_k", 1, ORDER, 2 * ORDER, "commands")
+        regressors = body.add("Concat", [speeds, command, commands], "regressors", axis=1)
+        weights, bias = body.constant("input_weights", input_weights), body.constant("hidden_bias", input_bias)
+        hidden = body.add("Tanh", [body.add("Gemm", [regressors, weights, bias], "pre_activation")], "hidden")
+        weights = body.constant("output_weights", output_weights[:, np.newaxis])
+        bias = body.constant("bias", output_bias)
+        following = body.add("Gemm", [hidden, weights, bias], "speed_next")
+        kept_speeds = body.slice(speeds, 1, 0, ORDER - 1, "kept_speeds")
+        kept_commands = body.slice(commands, 1, 0, ORDER - 1, "kept_commands")
+        state = body.add("Concat", [following, kept_speeds, command, kept_commands], "state_next", axis=1)
+        newest = body.slice("state_k", 1, 0, 1, "newest")
+        present = body.add("Squeeze", [newest, body.constant("row", [1], np.int64)], "speed_now")
+        size = self.state_layout.size
+        one_step = helper.make_graph(
+            body.nodes,
+            "one_step",
+            [double("state_k", ["fans", size]), double("command_k", ["fans"])],
+            [double(state, ["fans", size]), double(present, ["fans"])],
+            body.constants,
+        )
+        block.scan(one_step, ["state"], ["command"], ["state_out"], "speed_rad_s")
+        return block
 
 
 def regressor_rows(speed: Array, command: Array) -> Array:

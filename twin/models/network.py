@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from schemas.twin_card import NetworkCard
 from twin.errors import TwinError
 from twin.runs import Array
 
@@ -54,6 +55,11 @@ class TanhNetwork:
     def parameter_count(self) -> int:
         """The length of theta."""
         return self.units * (len(self.inputs) + 2) + 1
+
+    @property
+    def card(self) -> NetworkCard:
+        """Its size, for the twin card."""
+        return NetworkCard(self.units, self.inputs, self.parameter_count)
 
     def with_theta(self, theta: Array) -> "TanhNetwork":
         """The same network with other weights."""

@@ -6,30 +6,58 @@ speed, which is all that physics demands: C_D may come out negative where fricti
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Self
 
 import numpy as np
 
-from twin.models.physics import LAG
-from twin.models.right_hand_side import FanEquation, advance
-from twin.models.state import ODE_LAYOUT, StateLayout
+from schemas.twin_card import NetworkCard, StateLayout
+from twin.models.ode_graph import ode_graph
+from twin.models.onnx_nodes import Nodes
+from twin.models.physics import LAG, PARAMETER_NAMES
+from twin.models.right_hand_side import ODE_LAYOUT, FanEquation, advance
 from twin.runs import Array
 
 
 @dataclass(frozen=True)
 class PhysicalModel:
-    """Physics alone. Shapes as in models.TwinModel."""
+    """Physics alone. Shapes as in model.TwinModel."""
 
-    kind: Literal["physical"] = "physical"
     state_layout: StateLayout = ODE_LAYOUT
+
+    kind: ClassVar[str] = "physical"
+    fixed_rate: ClassVar[bool] = False
+    used_parameters: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
+
+    @property
+    def network(self) -> None:
+        """There is none."""
+        return None
+
+    @property
+    def network_card(self) -> NetworkCard:
+        """The size of the network: none."""
+        return NetworkCard(units=0, inputs=(), parameter_count=0)
+
+    @property
+    def theta(self) -> Array:
+        """(0,): there is no network."""
+        return np.zeros(0)
+
+    def with_theta(self, theta: Array) -> Self:
+        """The same model: it has no weights."""
+        return self
 
     def equation(self, parameters: Array) -> FanEquation:
         """w' of a batch of fans with the physical parameters (batch, 4)."""
         return FanEquation(parameters, None)
 
     def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
-        """Free run from state; see models.TwinModel."""
+        """Free run from state; see model.TwinModel."""
         return advance(self.equation(parameters), state, command, step_s, parameters[:, LAG])
+
+    def graph(self) -> Nodes:
+        """See model.Model."""
+        return ode_graph(None, has_physics=True)
 
 
 def physical_parameters(unknowns: Array, top_speed_rad_s: Array) -> Array:

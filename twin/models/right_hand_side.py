@@ -7,11 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from schemas.twin_card import StateLayout
 from twin.models import physics
 from twin.models.integration import free_run
 from twin.models.lag import effective_command
 from twin.models.network import TanhNetwork
 from twin.runs import Array
+
+ODE_LAYOUT = StateLayout(speed=1, command=1)
+"""The one command is the lagged one (twin.models.lag): what is left of the commands before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +71,7 @@ class FanEquation:
 
 
 def advance(equation: FanEquation, state: Array, command: Array, step_s: Array, lag_s: Array) -> tuple[Array, Array]:
-    """Free run from a state (fans, 2) of speed and lagged command; see models.TwinModel. lag_s: (fans,)."""
+    """Free run from a state (fans, 2) of speed and lagged command; see model.TwinModel. lag_s: (fans,)."""
     acting, lagged = effective_command(command, step_s[:, np.newaxis], lag_s, state[:, 1])
     speed_rad_s, final = free_run(equation, state[:, 0], acting, step_s)
     return speed_rad_s, np.column_stack((final, lagged))

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from schemas.twin_card import DataCard, TwinCard
 from twin.build import evaluate
 from twin.evaluation.accuracy import Evaluation, Figures, evaluation_pieces, free_run_speeds
 from twin.evaluation.residual_analysis import ResidualAnalysis, analyse_residual
-from twin.export.card import Card, DataCard
+from twin.export.fan_rows import fan_rows
 from twin.export.onnx_twin import OnnxTwin
 from twin.report.speed_bins import SpeedBin, speed_bins
 from twin.report.timeline import Timeline, timeline
@@ -77,7 +78,7 @@ class Content:
     fans: tuple[FanContent, ...]
 
     @property
-    def card(self) -> Card:
+    def card(self) -> TwinCard:
         """The twin's."""
         return self.twin.card
 
@@ -96,7 +97,7 @@ def report_content(
     evaluation = evaluate(twin, runs, fan_numbers)
     pieces = evaluation_pieces(runs)
     fans = pieces[0].fans
-    rows = twin.card.rows(fans, fan_numbers)
+    rows = fan_rows(twin.card, fans, fan_numbers)
     parameters, sigma_rad_s = twin.parameters[rows], np.array(twin.card.sigma_rad_s)[rows]
     identified, intervals_95 = (
         np.array(of_card)[rows] for of_card in (twin.card.identified_parameters, twin.card.parameter_interval_95)
@@ -135,7 +136,7 @@ def report_content(
     )
 
 
-def _parameters(card: Card, values: Array, intervals_95: Array, in_force: Array) -> tuple[Parameter, ...]:
+def _parameters(card: TwinCard, values: Array, intervals_95: Array, in_force: Array) -> tuple[Parameter, ...]:
     return tuple(
         Parameter(name, float(value), float(low), float(high), float(used))
         for name, value, (low, high), used in zip(card.parameter_names, values, intervals_95, in_force, strict=True)

@@ -10,16 +10,16 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from twin.evaluation.residual_analysis import SIGNIFICANCE
+from twin.kinds import kind_title
 from twin.report import figures
 from twin.report.content import Content, FanContent
 from twin.report.steady_states import StaticCurve, static_curve
-from twin.report.verdict import AS_DECLARED, LOOSER, PHYSICS_USED, Verdict, judge, level_of
+from twin.report.verdict import AS_DECLARED, LOOSER, Verdict, judge, level_of
 
 MOST_FANS_DRAWN = 12
 FOUR_DIGITS = ".4g"
 BEYOND_REASON = 1e7
 
-KIND_SAID = {"physical": "physical", "narx": "NARX", "neural-ode": "neural ODE", "hybrid": "hybrid"}
 PARAMETER_SAID = {
     "J": ("J", "inertia, in command s²/rad"),
     "alpha": ("α", "viscous friction, in command s/rad"),
@@ -50,9 +50,9 @@ def report_page(content: Content, judged: Verdict | None = None) -> str:
         unit=content.unit.name,
         each=content.unit.rad_s,
         verdict=judged or judge(content),
-        kind=KIND_SAID[content.card.kind],
+        kind=kind_title(content.card.kind),
         parameter_said=PARAMETER_SAID,
-        physics_used=PHYSICS_USED[content.card.kind],
+        physics_used=content.card.used_parameters,
         level_of=level_of,
         refined=any(it.in_force != it.value for fan in content.fans for it in fan.parameters),
         as_declared=AS_DECLARED,

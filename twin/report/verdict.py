@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 
-from twin.models.model import Kind
 from twin.report.content import Content, FanContent, Parameter
 
 Level = Literal["as declared", "looser than declared", "not followed"]
@@ -31,13 +30,6 @@ WIDE_BAND = 1.5
 """A card's sigma is wide when it exceeds the standard deviation of the errors by this factor."""
 FEW_INDEPENDENT = 0.5 / (AS_DECLARED - 1.0) ** 2
 """Fewer independent errors than these tell their rmse, to 1 / sqrt(2 n), worse than the margin of as declared."""
-
-PHYSICS_USED: dict[Kind, tuple[str, ...]] = {
-    "physical": ("J", "alpha", "C_D", "lag_s"),
-    "hybrid": ("J", "alpha", "C_D", "lag_s"),
-    "neural-ode": ("lag_s",),
-    "narx": (),
-}
 
 
 @dataclass(frozen=True)
@@ -93,7 +85,7 @@ def _about_the_data(content: Content) -> Iterable[str]:
             f"{outside:.1%} of the commands lie outside the trained range {low:.4g} to {high:.4g} {card.command_unit}"
             .rstrip() + ": there the twin is a guess."
         )  # fmt: skip
-    if card.kind == "narx" and abs(content.rate_hz / card.rate_hz - 1.0) > RATE_TOLERANCE:
+    if card.fixed_rate and abs(content.rate_hz / card.rate_hz - 1.0) > RATE_TOLERANCE:
         yield (
             f"A discrete twin of {card.rate_hz:.4g} Hz was run at {content.rate_hz:.4g} Hz: "
             "its figures say nothing about the fan."
@@ -134,7 +126,7 @@ def _biased_at_a_speed(fan: FanContent) -> bool:
 
 
 def _about_the_parameters(content: Content) -> Iterable[str]:
-    for name in PHYSICS_USED[content.card.kind]:
+    for name in content.card.used_parameters:
 
         def negative(fan: FanContent, name: str = name) -> bool:
             return any(parameter.name == name and parameter.value < 0.0 for parameter in fan.parameters)

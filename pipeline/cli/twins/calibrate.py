@@ -19,7 +19,7 @@ from pipeline.cli.twins.outlier_run_check import doubt
 from pipeline.cli.twins.training_data import model_maker, sha256_of
 from pipeline.errors import UserError
 from pipeline.replay.offline.healthy_runs import HealthyRuns
-from pipeline.runtime.twin_file import TwinFile
+from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.calibration.calibration import TooLittleError
 from scoring.calibration.calibration import calibrate as find_limits
 from scoring.limits import Limits, ResidualLimits, Timing
@@ -100,12 +100,10 @@ def _calibrated(
     twin: Path, healthy: list[Path], per_day: float, extrapolate: bool, overrides: list[str], seed: int
 ) -> tuple[Limits, str]:
     """The limits, and what is to be told of the recordings, empty if nothing."""
-    known = TwinFile.load(twin)
-    top_speed_rad_s = known.top_speed_rad_s
-    if not 0.0 < top_speed_rad_s < math.inf:
-        raise UserError(
-            f"{twin}: its card does not say up to which speed it was made (speed_range_rad_s): train it anew"
-        )
+    known = load_tray_twin(twin)
+    top_speed_rad_s = known.card.top_speed_rad_s
+    if top_speed_rad_s <= 0.0:
+        raise UserError(f"{twin}: its training data have no speed above zero (speed_range_rad_s): train it again")
     with working("judging healthy recordings") as tell:
         runs = HealthyRuns(healthy, twin, overrides, tell)
         try:

@@ -14,7 +14,7 @@ from pipeline.errors import UserError
 from pipeline.replay.offline.alarm_episodes import episodes
 from pipeline.replay.offline.judging import judge
 from pipeline.replay.offline.replay_input import open_replay_input
-from pipeline.runtime.twin_file import TwinFile
+from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
 from scoring.calibration.alarm_rate import poisson_interval
 
 NS_PER_HOUR = 3.6e12
@@ -79,8 +79,8 @@ def check_promise(twin: Path, recordings: Sequence[Path], overrides: Sequence[st
         UserError: the twin declares nothing or was made of a recording, one cannot be used, or none of its samples
             could be judged.
     """
-    loaded = TwinFile.load(twin)
-    calibration = loaded.calibration
+    loaded = load_tray_twin(twin)
+    calibration = loaded.card.calibration
     if calibration is None or calibration.get("promise") is None:
         raise UserError(f"{twin}: its alarms were never calibrated: give healthy recordings and --false-alarms-per-day")
     _refuse_what_it_was_made_of(twin, loaded, recordings)
@@ -98,7 +98,7 @@ def check_promise(twin: Path, recordings: Sequence[Path], overrides: Sequence[st
     return Check(alarms, fan_hours, float(calibration["promise"]["false_alarms_per_day"]))
 
 
-def _refuse_what_it_was_made_of(path: Path, twin: TwinFile, recordings: Sequence[Path]) -> None:
+def _refuse_what_it_was_made_of(path: Path, twin: TrayTwin, recordings: Sequence[Path]) -> None:
     card = json.loads(twin.card_json)
     for verb, part in (("calibrated", card["calibration"]["promise"]), ("trained", card.get("training", {}))):
         known = {data["sha256"] for data in part.get("data", ())}

@@ -32,7 +32,7 @@ from pipeline.cli.twins.training_data import (
 from pipeline.errors import UserError
 
 if TYPE_CHECKING:
-    from twin.evaluation.comparison import Candidate, Contender
+    from twin.comparison import Candidate, Contender
 
 SOURCE_HEADER = {"held-out": "held\nout", "test": "test\nrmse"}
 SOURCE_SAID = {
@@ -81,7 +81,7 @@ def compare(
     Example: fantwin compare healthy-1.mcap healthy-2.mcap --validate healthy-3.mcap --test healthy-4.mcap -o twins
     """
     with model_maker():
-        from twin.evaluation.comparison import best, contend, source_of  # noqa: PLC0415  loads twin only when it is needed
+        from twin.comparison import best, contend, source_of  # noqa: PLC0415  loads twin only when it is needed
 
         chosen = _chosen(model)
         material = read_material(recordings, tray, fans, from_s, to_s)
@@ -104,7 +104,7 @@ def compare(
                     fan_numbers=material.fans,
                     data=data,
                     validation_data=validation_data,
-                    progress=start(candidate.said),
+                    progress=start(candidate.title),
                 )
                 if folder and contender.twin:
                     contender.twin.save(_file(folder, candidate))
@@ -139,7 +139,7 @@ def account(contender: Contender, material: Material, folder: Path | None) -> di
     candidate, twin, each = contender.candidate, contender.twin, material.rad_s_per_unit
     told: dict[str, Any] = {
         "model": candidate.name,
-        "said": candidate.said,
+        "said": candidate.title,
         "invalid_reason": contender.invalid_reason or None,
     }
     if twin is None:
@@ -187,9 +187,9 @@ def table(told: dict[str, Any]) -> Table:
 
 
 def _chosen(names: str | None) -> list[Candidate]:
-    from twin.evaluation.comparison import CANDIDATES  # noqa: PLC0415
+    from twin.comparison import all_candidates  # noqa: PLC0415
 
-    by_name = {candidate.name: candidate for candidate in CANDIDATES}
+    by_name = {candidate.name: candidate for candidate in all_candidates()}
     wanted = list(by_name) if names is None else [name.strip() for name in names.split(",")]
     for name in wanted:
         if name not in by_name:

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from twin.build import TrainedTwin
 
 
-Model: TypeAlias = Literal["physical", "narx", "neural-ode", "hybrid"]
 Trainer: TypeAlias = Literal["levenberg-marquardt", "adam"]
 Physics: TypeAlias = Literal["fixed", "refined"]
 NetworkInputs: TypeAlias = Literal["speed,command", "speed"]
@@ -39,7 +38,7 @@ NetworkInputs: TypeAlias = Literal["speed,command", "speed"]
 def train(
     recordings: RecordingsArgument,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="TWIN.onnx", help="Twin to write.")],
-    model: Annotated[Model, typer.Option(help="Which model.")] = "hybrid",
+    model: Annotated[str, typer.Option(help="Kind of model: physical, narx, neural-ode or hybrid.")] = "hybrid",
     validate: Annotated[
         list[Path] | None,
         typer.Option(metavar="REC.mcap", help="Healthy recording to judge by and not to fit on. Repeatable."),
@@ -74,7 +73,9 @@ def train(
     """
     with model_maker():
         from twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
+        from twin.kinds import find_kind  # noqa: PLC0415
 
+        find_kind(model)
         check_writable(output, ".onnx")
         material = read_material(recordings, tray, fans, from_s, to_s)
         held_out = read_held_out(material, validate, tray, fans, validate_from_s, validate_to_s) if validate else None

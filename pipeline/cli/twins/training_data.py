@@ -19,7 +19,7 @@ from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.runs import RecordedRun, read_runs
 
 if TYPE_CHECKING:
-    from twin.export.card import DataCard
+    from schemas.twin_card import DataCard
     from twin.runs import Run
 
 RecordingsArgument: TypeAlias = Annotated[
@@ -115,7 +115,7 @@ def model_maker() -> Iterator[None]:
 
 def data_cards(material: Material) -> list[DataCard]:
     """The files of some material, for a card: one entry a file."""
-    from twin.export.card import DataCard  # noqa: PLC0415
+    from schemas.twin_card import DataCard  # noqa: PLC0415
 
     samples: dict[Path, int] = {}
     for run in material.recorded:

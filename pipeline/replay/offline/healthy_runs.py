@@ -11,7 +11,7 @@ from pipeline.errors import UserError
 from pipeline.replay.offline.offline_pipeline import OfflinePipeline
 from pipeline.replay.offline.plan import undisturbed
 from pipeline.replay.offline.replay_input import open_replay_input
-from pipeline.runtime.twin_file import TwinFile
+from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
 from scoring.calibration.healthy_statistics import Running
 from scoring.fan_scorer import Samples, samples_of
@@ -40,7 +40,7 @@ class HealthyRuns:
         self._twin = twin
         self._overrides = overrides
         self._progress = progress
-        self._knows_fans = TwinFile.load(twin).fans > 1
+        self._knows_fans = load_tray_twin(twin).fans > 1
         self._pass = 0
         self._kept: list[Running] | None = None
         self.runs: list[HealthyRun] = []

@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.cli.main import spell_out
 from pipeline.cli.twins.calibration_check import Check
-from pipeline.runtime.twin_file import TwinFile
+from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.limits import Limits, Timing
 from tests.support.fantwin_command import fantwin, said_instead
 
@@ -53,16 +53,16 @@ def calibrate(folder: Path, *more: object):
 
 
 def card(twin: Path) -> dict[str, Any]:
-    return json.loads(TwinFile.load(twin).card_json)
+    return json.loads(load_tray_twin(twin).card_json)
 
 
 def test_the_limits_are_in_the_card_and_all_else_of_the_twin_is_as_it_was(folder: Path, calibrated: Path) -> None:
     before, after = folder / "twin.onnx", calibrated
-    assert TwinFile.load(before).calibration is None
+    assert load_tray_twin(before).card.calibration is None
     assert {**card(after), "calibration": None} == {**card(before), "calibration": card(before).get("calibration")}
     graphs = [onnx.load(twin).graph.SerializeToString(deterministic=True) for twin in (before, after)]
     assert graphs[0] == graphs[1]
-    limits = Limits.model_validate(TwinFile.load(after).calibration)
+    limits = Limits.model_validate(load_tray_twin(after).card.calibration)
     assert limits.speed.step and limits.balance.step
     assert limits.promise
     assert limits.promise.false_alarms_per_day == PER_DAY
@@ -89,7 +89,7 @@ def strict(folder: Path, calibrated: Path) -> Path:
     """The twin with limits that healthy fans pass all the time, and a promise that they never do."""
     from twin.export.calibrated import with_calibration  # noqa: PLC0415
 
-    was = Limits.model_validate(TwinFile.load(calibrated).calibration)
+    was = Limits.model_validate(load_tray_twin(calibrated).card.calibration)
     assert was.promise
     promise = was.promise.model_copy(update={"false_alarms_per_day": 0.1})
     limits = was.times(0.3).model_copy(update={"promise": promise})
@@ -119,7 +119,7 @@ def test_without_an_output_the_twin_itself_is_calibrated(folder: Path) -> None:
     twin.write_bytes((folder / "twin.onnx").read_bytes())
     result = fantwin("calibrate", twin, folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY)
     assert result.exit_code == 0, result.output
-    assert TwinFile.load(twin).calibration is not None
+    assert load_tray_twin(twin).card.calibration is not None
 
 
 def test_too_little_is_refused_with_what_would_be_needed_and_the_twin_is_left_alone(folder: Path) -> None:
@@ -138,7 +138,7 @@ def test_what_is_extrapolated_promises_nothing(folder: Path) -> None:
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     assert "nothing is promised" in result.stdout
-    promise = Limits.model_validate(TwinFile.load(output).calibration).promise
+    promise = Limits.model_validate(load_tray_twin(output).card.calibration).promise
     assert promise
     assert promise.extrapolated
 
@@ -262,7 +262,7 @@ def test_limits_are_found_for_the_times_that_the_scorer_is_set_to(folder: Path, 
     output = folder / "slow.onnx"
     result = calibrate(folder, "-o", output, "--set", "scorer.smoothing_s=1.0")
     assert result.exit_code == 0, result.output
-    slow, usual = (Limits.model_validate(TwinFile.load(twin).calibration) for twin in (output, calibrated))
+    slow, usual = (Limits.model_validate(load_tray_twin(twin).card.calibration) for twin in (output, calibrated))
     assert (usual.timing, slow.timing) == (Timing(), Timing(smoothing_s=1.0))
     assert slow.speed.step != usual.speed.step
 

@@ -10,8 +10,8 @@ from tests.pipeline.cli.test_train_commands import record
 from tests.support.fan_data import rough_run
 from tests.support.fantwin_command import fantwin, said_instead
 from twin.build import train_twin
+from twin.comparison import Contender, all_candidates, best
 from twin.errors import TwinError
-from twin.evaluation.comparison import CANDIDATES, Contender, best
 from twin.runs import Run
 
 FIGURES = ("rmse", "max_error", "r2", "one_step_rmse", "coverage_2_sigma")
@@ -96,7 +96,7 @@ def test_a_model_that_cannot_be_trained_is_a_row_and_not_the_end(folder, monkeyp
             raise TwinError("the narx model diverges")
         return train_twin(runs, validation_runs, kind, **options)
 
-    monkeypatch.setattr("twin.evaluation.comparison.train_twin", train_or_diverge)
+    monkeypatch.setattr("twin.comparison.train_twin", train_or_diverge)
     arguments = ("compare", folder / "healthy.mcap", "--model", "narx,physical")
     told = json.loads(fantwin(*arguments, "--json").stdout)
     assert told["best"] == "physical"
@@ -108,7 +108,7 @@ def test_a_model_that_cannot_be_trained_is_a_row_and_not_the_end(folder, monkeyp
 
 def test_nothing_that_can_be_trained_is_an_error_that_says_why():
     with pytest.raises(TwinError, match="nothing moved"):
-        best([Contender(candidate, invalid_reason="nothing moved") for candidate in CANDIDATES])
+        best([Contender(candidate, invalid_reason="nothing moved") for candidate in all_candidates()])
 
 
 def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):

@@ -152,7 +152,7 @@ def test_a_twin_of_one_fan_serves_many_and_a_twin_of_two_does_not_serve_three() 
     three = fan_data.published_run(2, 15.0, fans=3)
     assert len(evaluate(one, [three]).per_fan) == 3
     two = train_twin([fan_data.published_run(1, 15.0, fans=2)], [], "physical", name="two")
-    with pytest.raises(TwinError, match="twin 'two' is of fans 0, 1, the runs of 0, 1, 2"):
+    with pytest.raises(TwinError, match="twin 'two' has fans 0, 1, the runs have 0, 1, 2"):
         evaluate(two, [three])
 
 
@@ -244,9 +244,9 @@ def test_a_card_names_the_fans_it_is_of_and_a_fan_is_judged_by_its_own_parameter
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("three.mcap",), "is of fans 0, 2, the runs of 0, 1, 2; choose its fans with --fans"),
-        (("three.mcap", "--fans", "0,1"), "is of fans 0, 2, the runs of 0, 1;"),
-        (("two.mcap",), "is of fans 0, 2, the runs of 0, 1;"),
+        (("three.mcap",), "has fans 0, 2, the runs have 0, 1, 2; choose its fans with --fans"),
+        (("three.mcap", "--fans", "0,1"), "has fans 0, 2, the runs have 0, 1;"),
+        (("two.mcap",), "has fans 0, 2, the runs have 0, 1;"),
     ],
 )
 def test_where_the_fans_are_not_those_of_the_twin_one_line_says_so(tray: Path, arguments: tuple, words: str) -> None:
@@ -262,7 +262,7 @@ def test_a_twin_made_before_cards_named_fans_is_still_read_and_serves_as_many(tr
     for options in (("two.mcap",), ("three.mcap", "--fans", "0,2")):
         told = json.loads(fantwin("evaluate", old, tray / options[0], *options[1:], "--json").stdout)
         assert len(told["fans"]) == 2
-    assert "is of 2 fans and does not say which" in said_instead("evaluate", old, tray / "two.mcap", "--fans", "1")
+    assert "has 2 fans and does not say which" in said_instead("evaluate", old, tray / "two.mcap", "--fans", "1")
 
 
 @pytest.mark.parametrize("rate", ["0", "-50", "fast", "nan", "inf"])

@@ -14,7 +14,8 @@ import pytest
 from onnx import TensorProto, helper
 
 from pipeline.runtime.stage import StageError
-from pipeline.runtime.twin_file import CARD_PROPERTY, TwinFile
+from pipeline.runtime.twin_file import TwinFile
+from schemas.twin_card import CARD_PROPERTY
 from tests.support.twin_files import PARAMETERS, SIGMA_COMMAND, SIGMA_RAD_S, made_up_balance, small_hybrid, write_twin
 from tests.twin.models.test_models import random_narx
 from twin.models.neural_ode import NeuralOde
@@ -33,11 +34,11 @@ def _refusal(path: Path, fans: int = 2) -> str:
 def test_the_card_is_read_and_the_file_is_named_by_its_hash(tmp_path: Path) -> None:
     path = write_twin(tmp_path / "twin.onnx", fans=2)
     twin = TwinFile.load(path, 2)
-    assert (twin.name, twin.kind, twin.fans, twin.rate_hz) == ("made up physical", "physical", 2, 100.0)
+    assert (twin.card.name, twin.card.kind, twin.fans, twin.card.rate_hz) == ("made up physical", "physical", 2, 100.0)
     assert twin.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert json.loads(twin.card_json)["kind"] == "physical"
     np.testing.assert_allclose(twin.sigma_rad_s, [SIGMA_RAD_S, 1.05 * SIGMA_RAD_S])
-    assert not twin.is_discrete
+    assert not twin.card.fixed_rate
 
 
 def test_each_fan_runs_with_its_own_parameters_and_lag(tmp_path: Path) -> None:
@@ -77,8 +78,7 @@ def test_the_balance_of_each_fan_is_read_and_that_of_one_fan_holds_for_all(tmp_p
 
 
 def test_of_an_older_card_errors_are_known_one_by_one(tmp_path: Path) -> None:
-    older = asdict(made_up_balance((PARAMETERS,)))
-    del older["covariance"]
+    older = asdict(made_up_balance((PARAMETERS,))) | {"std_errors": [[0.001, 0.001, 1e-5, 0.1]], "covariance": None}
     balance = TwinFile.load(write_twin(tmp_path / "twin.onnx", balance=older), 1).balance
     np.testing.assert_allclose(balance.covariance[0], np.diag(np.square(older["std_errors"][0])))
     older["std_errors"] = [[1.0, 1.0, 1.0]]
@@ -86,9 +86,9 @@ def test_of_an_older_card_errors_are_known_one_by_one(tmp_path: Path) -> None:
 
 
 def test_a_calibration_is_carried_as_it_stands(tmp_path: Path) -> None:
-    assert TwinFile.load(write_twin(tmp_path / "never.onnx"), 1).calibration is None
+    assert TwinFile.load(write_twin(tmp_path / "never.onnx"), 1).card.calibration is None
     told = {"limits": [1.5, {"kind": "fast"}]}
-    assert TwinFile.load(write_twin(tmp_path / "twin.onnx", calibration=told), 1).calibration == told
+    assert TwinFile.load(write_twin(tmp_path / "twin.onnx", calibration=told), 1).card.calibration == told
 
 
 def test_a_balance_that_makes_no_sense_is_refused_by_name(tmp_path: Path) -> None:
@@ -107,14 +107,14 @@ def test_a_balance_that_makes_no_sense_is_refused_by_name(tmp_path: Path) -> Non
 
 def test_a_continuous_twin_starts_with_its_lagged_command_settled(tmp_path: Path) -> None:
     twin = TwinFile.load(write_twin(tmp_path / "twin.onnx"), 2)
-    assert not twin.is_discrete
+    assert not twin.card.fixed_rate
     state = twin.initial_state(np.array([1.0, 2.0]), np.array([8.0, 9.0]))
     np.testing.assert_array_equal(state, [[1.0, 8.0], [2.0, 9.0]])
 
 
 def test_a_discrete_twin_starts_with_its_past_filled_by_the_start(tmp_path: Path) -> None:
     twin = TwinFile.load(write_twin(tmp_path / "twin.onnx", random_narx()), 2)
-    assert twin.is_discrete
+    assert twin.card.fixed_rate
     state = twin.initial_state(np.array([1.0, 2.0]), np.array([8.0, 9.0]))
     np.testing.assert_array_equal(state, [[1.0] * 10 + [8.0] * 10, [2.0] * 10 + [9.0] * 10])
     speed, _ = twin.advance(state, np.full((2, 2), 40.0), np.full(2, 0.01))
@@ -162,9 +162,9 @@ def test_a_newer_format_is_refused_even_if_its_card_looks_different(tmp_path: Pa
     assert "update fantwin" in _refusal(write_twin(tmp_path / "b.onnx", format_version=4, sigma_rad_s=None))
 
 
-def test_an_older_format_is_to_be_trained_anew(tmp_path: Path) -> None:
+def test_an_older_format_is_refused_with_the_advice_to_train_again(tmp_path: Path) -> None:
     line = _refusal(write_twin(tmp_path / "a.onnx", format_version=1, parameters=[[0.15, 0.12, 0.0005]], n_state=1))
-    assert "twin format 1, this fantwin knows 3: train it anew" in line
+    assert "twin format 1, this fantwin knows 3: train it again" in line
 
 
 def test_a_card_without_a_format_is_refused(tmp_path: Path) -> None:
@@ -177,8 +177,11 @@ def test_a_card_without_a_format_is_refused(tmp_path: Path) -> None:
         ({"sigma_rad_s": None}, "sigma_rad_s"),
         ({"sigma_rad_s": [0.0]}, "sigma_rad_s"),
         ({"parameters": [[0.1, 0.1, 0.1, 0.0]] * 2}, "parameters"),
-        ({"parameters": [[0.1, 0.1, 0.1]]}, "parameters is ['fans', 4], the card says (fans, 3)"),
-        ({"kind": "oracle"}, "kind"),
+        ({"parameters": [[0.1, 0.1, 0.1]]}, "parameters"),
+        (
+            {"parameters": [[0.1, 0.1, 0.1]], "parameter_names": ["J", "alpha", "C_D"]},
+            "parameters is ['fans', 4], the card says (fans, 3)",
+        ),
         ({"rate_hz": 0.0}, "rate_hz"),
         ({"command_range": [1.0, 0.0]}, "command_range"),
         ({"n_state": 3}, "state_layout"),

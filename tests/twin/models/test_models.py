@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from schemas.twin_card import StateLayout
 from tests.support import fan_data
 from twin.errors import TwinError
 from twin.models.hybrid import Hybrid
@@ -10,7 +11,6 @@ from twin.models.narx import PARAMETER_COUNT, Narx
 from twin.models.network import Scaling, TanhNetwork
 from twin.models.neural_ode import NeuralOde
 from twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
-from twin.models.state import StateLayout
 
 SCALING = Scaling(80.0, 90.0, 50.0, 50.0, 300.0)
 PARAMETERS = np.tile([*fan_data.PUBLISHED_PARAMETERS, 0.02], (2, 1))

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from schemas.twin_card import DataCard
 from simulation.excitation import Staircase
 from simulation.plant import FanParameters, Tacho, advance, at_rest
 from simulation.published_fan import published_fan
@@ -22,7 +23,6 @@ from tests.pipeline.cli.test_train_commands import record
 from tests.support.browser import seen_in_browser
 from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run
 from tests.support.fantwin_command import fantwin, said_instead
-from twin.export.card import DataCard
 from twin.export.onnx_twin import OnnxTwin
 from twin.fitting.identification import identify
 from twin.models.physical import PhysicalModel
@@ -377,7 +377,7 @@ def test_errors_are_gathered_by_speed_and_few_samples_make_no_point():
 
 def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
     twin, held_out = folder / "healthy.onnx", folder / "held-out.mcap"
-    assert "is of fans 0, 1, the runs of 0, 1, 2" in said_instead("report", folder / "two.onnx", folder / "three.mcap")
+    assert "has fans 0, 1, the runs have 0, 1, 2" in said_instead("report", folder / "two.onnx", folder / "three.mcap")
     assert "no such file" in said_instead("report", tmp_path / "nowhere.onnx", held_out)
     assert "not an ONNX file" in said_instead("report", held_out, held_out)
     assert "cannot read the recording" in said_instead("report", twin, tmp_path / "nowhere.mcap")

@@ -6,13 +6,13 @@ from typing import Literal
 
 import numpy as np
 
+from schemas.twin_card import DataCard
 from twin.build import TrainedTwin, evaluate, train_twin
 from twin.errors import TwinError
 from twin.evaluation.accuracy import Evaluation, evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
-from twin.export.card import DataCard
 from twin.fitting.training import Progress
-from twin.models.model import Kind
-from twin.models.physics import LAG
+from twin.kinds import KINDS, Variant
+from twin.models.physics import LAG, PARAMETER_NAMES
 from twin.runs import Run
 
 Source = Literal["test", "held-out", "training"]
@@ -22,21 +22,21 @@ theirs. training: fitted, which flatters."""
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model to train: what it is called, its kind, and what its network sees."""
+    """A model to train: a kind of model with certain network inputs. title: for people."""
 
     name: str
-    kind: Kind
-    said: str
-    network_inputs: tuple[str, ...] = ("speed", "command")
+    kind: str
+    title: str
+    network_inputs: tuple[str, ...]
 
 
-CANDIDATES = (
-    Candidate("physical", "physical", "physical"),
-    Candidate("narx", "narx", "NARX"),
-    Candidate("neural-ode", "neural-ode", "neural ODE"),
-    Candidate("hybrid", "hybrid", "hybrid [w, tau]"),
-    Candidate("hybrid-w", "hybrid", "hybrid [w]", network_inputs=("speed",)),
-)
+def all_candidates() -> tuple[Candidate, ...]:
+    """Every variant of every kind, in the order of twin.kinds."""
+    return tuple(
+        Candidate(variant.name, kind.name, variant.title, variant.network_inputs)
+        for kind in KINDS
+        for variant in kind.variants or (Variant(kind.name, kind.title),)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +62,10 @@ class Contender:
     @property
     def physical_parameters(self) -> int:
         """How many of a fan's own parameters the model uses; a lag of zero is none."""
-        if self.twin is None or self.candidate.kind == "narx":
+        if self.twin is None:
             return 0
-        lag = int(np.any(self.twin.parameters[:, LAG] != 0.0))
-        return lag if self.candidate.kind == "neural-ode" else LAG + lag
+        has_lag = bool(np.any(self.twin.parameters[:, LAG] != 0.0))
+        return sum(has_lag or name != PARAMETER_NAMES[LAG] for name in self.twin.model.used_parameters)
 
 
 def source_of(validation_runs: Sequence[Run], test_runs: Sequence[Run]) -> Source:
@@ -96,7 +96,7 @@ def contend(
             runs,
             validation_runs,
             candidate.kind,
-            name=candidate.said,
+            name=candidate.title,
             seed=seed,
             max_iterations=max_iterations,
             network_inputs=candidate.network_inputs,

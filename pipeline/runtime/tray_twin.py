@@ -1,0 +1,177 @@
+"""The card of a twin, for the fans of one tray. It is read without onnxruntime; pipeline.runtime.twin_file runs it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.runtime.onnx_metadata import read_onnx_metadata
+from pipeline.runtime.stage import Context, StageError
+from schemas.messages import Array
+from schemas.twin_card import CARD_PROPERTY, BalanceCard, CardError, TwinCard
+
+if TYPE_CHECKING:
+    from scoring.diagnosis.regression_window import HealthyBalance
+
+DEAD_ZONE = 0.25
+"""of the command range; a larger friction is not taken for a dead zone"""
+
+
+@dataclass(frozen=True)
+class Balance:
+    """The torque balance of each fan: schemas.twin_card.BalanceCard as arrays.
+
+    covariance: (fans, 4, 4). filter_rate_per_s: one number. All others: (fans,).
+    """
+
+    inertia: Array
+    viscous: Array
+    drag: Array
+    friction: Array
+    covariance: Array
+    lag_s: Array
+    sigma_command: Array
+    autocorrelation_time_s: Array
+    lowest_speed_rad_s: Array
+    filter_rate_per_s: float
+
+    @classmethod
+    def from_card(cls, card: BalanceCard, fans: int) -> Balance:
+        """The balance of a card for a tray of so many fans."""
+        arrays = {name: for_fans(values, fans) for name, values in card.per_fan.items() if name != "source"}
+        return cls(**arrays, filter_rate_per_s=card.filter_rate_per_s)
+
+
+@dataclass(frozen=True)
+class TrayTwin:
+    """A twin's card, and what it holds for each fan of a tray. A twin of one fan serves every fan.
+
+    card_json: the card as it stands in the file. sha256: of the file. sigma_rad_s: (fans,), standard deviation of the
+    healthy residual.
+    """
+
+    card: TwinCard
+    card_json: str
+    sha256: str
+    sigma_rad_s: Array
+    balance: Balance
+
+    @property
+    def fans(self) -> int:
+        """The number of fans of the tray."""
+        return len(self.sigma_rad_s)
+
+    @property
+    def off_below(self) -> Array:
+        """(fans,) the smallest command that turns the rotor: the friction, or -inf where it is not a dead zone.
+
+        Friction amid the healthy commands is no dead zone: the fan was held at one speed, where a friction and a drag
+        cannot be distinguished.
+        """
+        low, high = self.card.command_range
+        friction = self.balance.friction
+        return np.where((friction > 0.0) & (friction < low + DEAD_ZONE * (high - low)), friction, -np.inf)
+
+    @property
+    def bend_rad_s(self) -> float | None:
+        """The speed at which viscous friction and drag contribute equally to the slope of the needed command.
+
+        The median over the fans; None where a fan lacks either.
+        """
+        viscous, drag = self.balance.viscous, self.balance.drag
+        if not np.all((viscous > 0.0) & (drag > 0.0)):
+            return None
+        return float(np.median(viscous / (2.0 * drag)))
+
+    def healthy_balances(self) -> list[HealthyBalance]:
+        """The balance of each fan, for diagnosis."""
+        # Imported here: it loads scipy, which a process that only runs the twin does not need.
+        from scoring.diagnosis.regression_window import HealthyBalance  # noqa: PLC0415
+
+        balance = self.balance
+        return [
+            HealthyBalance(
+                inertia=float(balance.inertia[fan]),
+                viscous=float(balance.viscous[fan]),
+                drag=float(balance.drag[fan]),
+                friction=float(balance.friction[fan]),
+                lag_s=float(balance.lag_s[fan]),
+                covariance=balance.covariance[fan],
+                filter_rate_per_s=balance.filter_rate_per_s,
+                sigma_command=float(balance.sigma_command[fan]),
+                autocorrelation_time_s=float(balance.autocorrelation_time_s[fan]),
+                lowest_speed_rad_s=float(balance.lowest_speed_rad_s[fan]),
+            )
+            for fan in range(self.fans)
+        ]
+
+
+def for_fans(values: tuple[Any, ...], fans: int) -> Array:
+    """(fans, ...) values of each fan; those of a twin of one fan hold for all."""
+    of_card = np.array(values, dtype=np.float64)
+    return np.broadcast_to(of_card, (fans, *of_card.shape[1:])).copy()
+
+
+def read_file(path: Path) -> bytes:
+    """The content of a twin's file.
+
+    Raises:
+        StageError: it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise StageError(f"{path}: cannot read the twin: {error.strerror}; correct [[tray]] twin") from error
+
+
+def tray_twin(path: Path, content: bytes, fans: int | None) -> TrayTwin:
+    """The twin in the content of a file, for a tray of so many fans; without `fans`, for as many as it has.
+
+    Raises:
+        StageError: it is not a twin, of another format, or for other fans.
+    """
+    try:
+        card_json = read_onnx_metadata(content).get(CARD_PROPERTY)
+    except ValueError as error:
+        raise StageError(f"{path}: {error}; make a twin: fantwin train") from error
+    if card_json is None:
+        raise StageError(f"{path}: not a twin: it has no {CARD_PROPERTY}; make one: fantwin train")
+    try:
+        card = TwinCard.from_json(card_json)
+    except CardError as error:
+        raise StageError(f"{path}: {error}") from error
+    fans = fans or card.fans
+    if card.fans not in (1, fans):
+        raise StageError(f"{path}: a twin of {card.fans} fans, [[tray]] says fans = {fans}: choose a twin that fits")
+    return TrayTwin(
+        card=card,
+        card_json=card_json,
+        sha256=hashlib.sha256(content).hexdigest(),
+        sigma_rad_s=for_fans(card.sigma_rad_s, fans),
+        balance=Balance.from_card(card.balance, fans),
+    )
+
+
+def load_tray_twin(path: Path, fans: int | None = None) -> TrayTwin:
+    """The twin in a file, for a tray of so many fans; without `fans`, for as many as it has. Its graph is not loaded.
+
+    Raises:
+        StageError: the file cannot be read, is not a twin, of another format, or for other fans.
+    """
+    return tray_twin(path, read_file(path), fans)
+
+
+def twin_path(context: Context) -> Path:
+    """Where the twin of a context's one tray is.
+
+    Raises:
+        StageError: the tray names none.
+    """
+    tray = context.tray
+    if tray.twin is None:
+        raise StageError(f'tray {tray.name} has no twin: set [[tray]] twin = "FILE.onnx"')
+    return context.resolve(tray.twin)

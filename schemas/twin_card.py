@@ -1,0 +1,296 @@
+"""The twin card: what a twin is and how good it is, as JSON inside its ONNX file (metadata property `fantwin.card`).
+
+The model maker writes it. The runtime, the reports and the viewer read it. This is its only definition.
+
+The graph beside it (float64) takes `state` (fans, n_state), `command` (n, fans), `step_s` (n,) and `parameters`
+(fans, n_parameters). It returns `speed_rad_s` (n, fans), the speed at each sample before its command acts, and
+`state_out` (fans, n_state).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Annotated, Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
+
+CARD_PROPERTY = "fantwin.card"
+FORMAT_VERSION = 3
+GRAPH_INPUTS = ("state", "command", "step_s", "parameters")
+GRAPH_OUTPUTS = ("speed_rad_s", "state_out")
+
+FORMER_FIELDS_BY_KIND: dict[str, dict[str, Any]] = {
+    "physical": {"fixed_rate": False, "used_parameters": ("J", "alpha", "C_D", "lag_s")},
+    "hybrid": {"fixed_rate": False, "used_parameters": ("J", "alpha", "C_D", "lag_s")},
+    "neural-ode": {"fixed_rate": False, "used_parameters": ("lag_s",)},
+    "narx": {"fixed_rate": True, "used_parameters": ()},
+}
+"""Fields that early cards do not have: their kind implies them."""
+FORMER_ERRORS = "std_errors"
+"""Early cards have standard errors of the balance in place of `covariance`: their correlations are not known."""
+
+Array: TypeAlias = NDArray[np.float64]
+Positive: TypeAlias = Annotated[float, Field(gt=0)]
+NotNegative: TypeAlias = Annotated[float, Field(ge=0)]
+Count: TypeAlias = Annotated[int, Field(ge=1)]
+Range: TypeAlias = tuple[float, float]
+Four: TypeAlias = tuple[float, float, float, float]
+BalanceSource: TypeAlias = Literal["physics", "least-squares"]
+
+# Unknown fields are ignored: a later program may add some without a new format.
+_CONFIG = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+
+class CardError(ValueError):
+    """Text that is not a card, or a card of another format. One line that says what to do."""
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class StateLayout:
+    """A state holds, for each fan, `speed` past speeds and then `command` past commands, newest first.
+
+    A model that is continuous in time has one of each: its speed and the lagged command. The command part follows from
+    the commands alone, whatever the speeds are.
+    """
+
+    speed: Count
+    command: Annotated[int, Field(ge=0)]
+
+    @property
+    def size(self) -> int:
+        """Numbers of state per fan."""
+        return self.speed + self.command
+
+    def initial_state(self, speed_rad_s: Array, command: Array) -> Array:
+        """(fans, size) state of fans that have run for long at speed_rad_s (fans,) under command (fans,)."""
+        return np.column_stack([speed_rad_s] * self.speed + [command] * self.command)
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class NetworkCard:
+    """The network; zero units without one. parameter_count: its trained weights; physics do not count."""
+
+    units: int
+    inputs: tuple[str, ...]
+    parameter_count: int
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class DataCard:
+    """One file of training data."""
+
+    name: str
+    sha256: str
+    fans: int
+    samples: int
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class TrainingCard:
+    """How the twin was trained.
+
+    physics: whether they were refined together with the network. duration_s: duration of the training. fans: the fan
+    numbers in the recordings, in the order of the card's lists; empty in early cards.
+    """
+
+    trainer: str
+    physics: Literal["fixed", "refined"]
+    seed: int
+    iterations: int
+    duration_s: float
+    data: tuple[DataCard, ...]
+    fans: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class ValidationCard:
+    """Free-run errors pooled over fans, in rad/s. None where a figure is undefined.
+
+    source: whether the runs were held out or are the training runs themselves. data: the held-out files.
+    """
+
+    source: Literal["held-out", "training"]
+    data: tuple[DataCard, ...]
+    samples: int
+    rmse: float | None
+    max_error: float | None
+    r2: float | None
+    one_step_rmse: float | None
+    coverage_2_sigma: float | None
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class HealthyCard:
+    """The healthy free-run residual, one entry a fan; None where the runs were too short to estimate it.
+
+    autocorrelation_time_s, independent_samples: as in twin.evaluation.residual_analysis. quantiles_sigma: magnitudes,
+    in sigma, that a healthy sample stays below with the given probabilities. max_sigma: the largest magnitude seen.
+    """
+
+    autocorrelation_time_s: tuple[float | None, ...]
+    independent_samples: tuple[float | None, ...]
+    probabilities: tuple[float, ...]
+    quantiles_sigma: tuple[tuple[float | None, ...], ...]
+    max_sigma: tuple[float | None, ...]
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class BalanceCard:
+    """The torque balance, one entry a fan, in units of the command with rad/s and s.
+
+    needed command = inertia w' + viscous w + drag w|w| + friction, with a constant friction, and both sides filtered
+    by lambda / (s + lambda). lambda is filter_rate_per_s. lag_s: lag of the command before it acts. covariance: of the
+    errors of the four coefficients. source: how the coefficients were found (twin.fitting.balance_fit). sigma_command
+    and autocorrelation_time_s: standard deviation and autocorrelation time of the healthy balance within a run.
+    lowest_speed_rad_s: the balance does not hold below this speed.
+    """
+
+    inertia: tuple[NotNegative, ...]
+    viscous: tuple[float, ...]
+    drag: tuple[float, ...]
+    friction: tuple[float, ...]
+    covariance: tuple[tuple[Four, Four, Four, Four], ...]
+    lag_s: tuple[NotNegative, ...]
+    source: tuple[BalanceSource, ...]
+    sigma_command: tuple[Positive, ...]
+    autocorrelation_time_s: tuple[Positive, ...]
+    lowest_speed_rad_s: tuple[NotNegative, ...]
+    filter_rate_per_s: Positive
+
+    @model_validator(mode="after")
+    def _check_covariance(self) -> BalanceCard:
+        for matrix in map(np.array, self.covariance):
+            if not np.allclose(matrix, matrix.T) or matrix.diagonal().min() < 0.0:
+                raise ValueError("covariance must be symmetric, with no variance below zero")
+        return self
+
+    @property
+    def per_fan(self) -> dict[str, tuple[Any, ...]]:
+        """The fields with one entry a fan, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, tuple)}
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class TwinCard:
+    """Everything a reader of the file needs to know. Lists per fan are in the order of the fans.
+
+    kind: name of the kind of model, for people; programs ask the other fields. fixed_rate: whether the model holds at
+    rate_hz only. parameters: those in force, per fan, in the order of parameter_names; used_parameters:
+    the names of those that the model uses. identified_parameters,
+    parameter_std_errors, parameter_interval_95: of the physical model alone; a hybrid's parameters in force differ
+    where its network has taken a share. sigma_rad_s: per fan, the healthy root mean square free-run error.
+    speed_range_rad_s, command_range, rate_hz: of the training data; outside them the twin extrapolates. calibration:
+    of the alarms (scoring.limits), None before calibration.
+    """
+
+    kind: str
+    name: str
+    created: str
+    fans: Count
+    n_state: Count
+    state_layout: StateLayout
+    fixed_rate: bool
+    parameter_names: tuple[str, ...]
+    used_parameters: tuple[str, ...]
+    parameters: tuple[tuple[float, ...], ...]
+    identified_parameters: tuple[tuple[float, ...], ...]
+    parameter_std_errors: tuple[tuple[float, ...], ...]
+    parameter_interval_95: tuple[tuple[Range, ...], ...]
+    sigma_rad_s: tuple[Positive, ...]
+    healthy: HealthyCard
+    balance: BalanceCard
+    speed_range_rad_s: Range
+    command_range: Range
+    rate_hz: Positive
+    network: NetworkCard
+    training: TrainingCard
+    validation: ValidationCard
+    versions: dict[str, str]
+    command_unit: str
+    speed_unit: Literal["rad/s"] = "rad/s"
+    calibration: dict[str, Any] | None = None
+    format_version: int = FORMAT_VERSION
+
+    @model_validator(mode="after")
+    def _check_consistency(self) -> TwinCard:
+        if self.state_layout.size != self.n_state:
+            raise ValueError("state_layout does not add up to n_state")
+        if [len(row) for row in self.parameters] != [len(self.parameter_names)] * self.fans:
+            raise ValueError("parameters must have one row for each fan, as long as parameter_names")
+        if len(self.sigma_rad_s) != self.fans:
+            raise ValueError("sigma_rad_s must have one value for each fan")
+        for name, values in self.balance.per_fan.items():
+            if len(values) != self.fans:
+                raise ValueError(f"balance.{name} must have one value for each fan")
+        if len(self.fan_numbers) != self.fans:
+            raise ValueError("training.fans must name each fan, or none")
+        if not self.command_range[0] < self.command_range[1]:
+            raise ValueError("command_range must rise")
+        return self
+
+    @property
+    def fan_numbers(self) -> tuple[int, ...]:
+        """Numbers of the fans in the recordings; counted from 0 where the card does not say."""
+        return self.training.fans or tuple(range(self.fans))
+
+    @property
+    def top_speed_rad_s(self) -> float:
+        """The highest speed in the training data, in either direction."""
+        return max(map(abs, self.speed_range_rad_s))
+
+    def to_json(self) -> str:
+        """One line of JSON."""
+        return json.dumps(asdict(self), allow_nan=False)
+
+    @staticmethod
+    def from_json(text: str) -> TwinCard:
+        """The card in JSON text of this format, earlier forms of its fields included.
+
+        Raises:
+            CardError: it is not a card, or of another format.
+        """
+        try:
+            fields = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise CardError(f"the twin's card cannot be used: it is not JSON ({error}); train it again") from error
+        try:
+            version = _ANY_FORMAT.validate_python(fields).format_version
+            if version != FORMAT_VERSION:
+                advice = "update fantwin" if version > FORMAT_VERSION else "train it again"
+                raise CardError(f"twin format {version}, this fantwin knows {FORMAT_VERSION}: {advice}")
+            return _CARD.validate_python(_in_present_form(fields))
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(map(str, first["loc"])) or "it"
+            raise CardError(f"the twin's card cannot be used: {where}: {first['msg']}; train it again") from error
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class _CardOfAnyFormat:
+    format_version: int
+
+
+def _in_present_form(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a card, with those of earlier cards of the same format in their present form."""
+    present = FORMER_FIELDS_BY_KIND.get(str(fields.get("kind")), {}) | dict(fields)
+    balance = present.get("balance")
+    if isinstance(balance, dict) and balance.get("covariance") is None and FORMER_ERRORS in balance:
+        try:
+            errors = _FOURS.validate_python(balance[FORMER_ERRORS])
+        except ValidationError as error:
+            raise CardError(
+                f"the twin's card cannot be used: balance.{FORMER_ERRORS} must have four numbers for each fan; "
+                "train it again"
+            ) from error
+        present["balance"] = balance | {"covariance": [np.diag(np.square(of_fan)).tolist() for of_fan in errors]}
+    return present
+
+
+_CARD = TypeAdapter(TwinCard)
+_ANY_FORMAT = TypeAdapter(_CardOfAnyFormat)
+_FOURS = TypeAdapter(tuple[Four, ...])

@@ -1,0 +1,31 @@
+"""Which fan of a twin is which fan of some runs."""
+
+from collections.abc import Sequence
+
+from schemas.twin_card import TwinCard
+from twin.errors import TwinError
+
+
+def fan_rows(card: TwinCard, fans: int, fan_numbers: Sequence[int] | None = None) -> list[int]:
+    """For each fan of some runs, its index in the card's lists per fan.
+
+    fan_numbers: of the fans chosen from the recordings; without a choice it is all of them, counted from 0. A twin of
+    one fan serves every fan. Raises TwinError where fans and twin cannot be matched.
+    """
+    if card.fans == 1:
+        return [0] * fans
+    known, numbers = card.training.fans, tuple(fan_numbers or range(fans))
+    if not known and fans == card.fans:
+        return list(range(fans))
+    if numbers == known or (fan_numbers and set(numbers) <= set(known)):
+        return [known.index(number) for number in numbers]
+    in_runs = ", ".join(map(str, numbers))
+    if known:
+        in_twin = ", ".join(map(str, known))
+        raise TwinError(
+            f"twin {card.name!r} has fans {in_twin}, the runs have {in_runs}; choose its fans with --fans, or retrain"
+        )
+    raise TwinError(
+        f"twin {card.name!r} has {card.fans} fans and does not say which, the runs have {in_runs}; "
+        "give recordings of as many fans, or retrain"
+    )

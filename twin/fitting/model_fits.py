@@ -1,0 +1,120 @@
+"""The fit of each kind of model: one call for all of them, from runs and the identified physics to a trained model."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from twin.evaluation.accuracy import evaluation_pieces
+from twin.fitting.cross_validation import chosen_spread
+from twin.fitting.identification import Identification
+from twin.fitting.initial_weights import initial_weights
+from twin.fitting.narx_training import train_narx
+from twin.fitting.training import GRID_SPREAD, Physics, Progress, data_scaling, train_network
+from twin.models.model import Model, NetworkOde
+from twin.models.network import TanhNetwork
+from twin.models.physical import PhysicalModel
+from twin.runs import Array, Run
+
+Trainer = Literal["levenberg-marquardt", "adam"]
+
+DEFAULT_ITERATIONS: dict[Trainer, int] = {"levenberg-marquardt": 120, "adam": 400}
+NARX_ITERATIONS = 100
+SILENT_NETWORK = "the network stays silent: free runs with it were no better than those of the physics alone"
+
+
+@dataclass(frozen=True, eq=False)
+class FitRequest:
+    """What a model is fitted to, and how. See build.train_twin; max_iterations None: the default of the fit."""
+
+    runs: Sequence[Run]
+    validation_runs: Sequence[Run]
+    identification: Identification
+    seed: int = 0
+    trainer: Trainer = "levenberg-marquardt"
+    max_iterations: int | None = None
+    network_inputs: tuple[str, ...] = ("speed", "command")
+    physics: Physics = "refined"
+    progress: Progress | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FittedModel:
+    """A fitted model. parameters: (fans, 4), each fan's own. physics: whether they were refined with the network."""
+
+    model: Model
+    parameters: Array
+    iterations: int
+    physics: Physics = "fixed"
+    warnings: tuple[str, ...] = ()
+
+
+def fit_physical(request: FitRequest) -> FittedModel:
+    """The identified physics as they are, with what they fail to describe as warnings."""
+    found = request.identification
+    return FittedModel(PhysicalModel(), found.parameters, found.iterations, warnings=found.misfits)
+
+
+def fit_narx(request: FitRequest) -> FittedModel:
+    """Levenberg-Marquardt on the free run (twin.fitting.narx_training)."""
+    narx, iterations = train_narx(
+        request.runs,
+        request.validation_runs,
+        data_scaling(request.runs, request.identification),
+        seed=request.seed,
+        max_iterations=request.max_iterations or NARX_ITERATIONS,
+        progress=request.progress,
+    )
+    return FittedModel(narx, request.identification.parameters, iterations)
+
+
+def fit_network_ode(request: FitRequest, units: int, make: Callable[[TanhNetwork], NetworkOde]) -> FittedModel:
+    """A model with a network of so many units, by the trainer of the request."""
+    scaling = data_scaling(request.runs, request.identification)
+    untrained = make(TanhNetwork.zero(units, request.network_inputs, scaling))
+    limit = request.max_iterations or DEFAULT_ITERATIONS[request.trainer]
+    train = _by_adam if request.trainer == "adam" else _by_levenberg_marquardt
+    model, parameters, iterations = train(untrained, request, limit)
+    refinable = model.has_physics and request.trainer == "levenberg-marquardt"
+    silent = model.has_physics and not np.any(model.theta)
+    return FittedModel(
+        model,
+        parameters,
+        iterations,
+        physics=request.physics if refinable else "fixed",
+        warnings=(SILENT_NETWORK,) if silent else (),
+    )
+
+
+def _by_adam(untrained: NetworkOde, request: FitRequest, limit: int) -> tuple[NetworkOde, Array, int]:
+    """The published recipe. The physics stay as identified."""
+    # torch is needed by this trainer alone, and takes seconds to import.
+    from twin.fitting.torch_reference import train_adam  # noqa: PLC0415
+
+    found = request.identification
+    (theta,) = initial_weights(
+        untrained, evaluation_pieces(request.runs), found, np.random.default_rng(request.seed), 1
+    )
+    start = untrained.with_theta(theta)
+    model, iterations = train_adam(start, request.runs, found, max_iterations=limit, progress=request.progress)
+    return model, found.parameters, iterations
+
+
+def _by_levenberg_marquardt(untrained: NetworkOde, request: FitRequest, limit: int) -> tuple[NetworkOde, Array, int]:
+    spread = GRID_SPREAD
+    if not request.validation_runs:
+        spread = chosen_spread(
+            untrained, request.runs, seed=request.seed, physics=request.physics, progress=request.progress
+        )
+    return train_network(
+        untrained,
+        request.runs,
+        request.validation_runs,
+        request.identification,
+        max_iterations=limit,
+        seed=request.seed,
+        physics=request.physics,
+        spread=spread,
+        progress=request.progress,
+    )
