@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 RETIRED_NAMES = (
-    *("Inlet", "Outlet", "keeper", "why_not", "WhyNot", "MemoryFile", "AlarmDesk", "StandingAlarm", "NotJudged"),
+    *("Outlet", "keeper", "why_not", "WhyNot", "MemoryFile", "AlarmDesk", "StandingAlarm", "NotJudged"),
     *("WearWatch", "Suspect", "WhatIf", "WholeFile", "Census", "Reel", "Shelf", "disown", "restate", "beginnings"),
     *("safe_level", "made_up_config", "place_of", "NO_SNAPSHOT", "BROKEN", "motion_rad_s", "farewell", "hand_over"),
 )
