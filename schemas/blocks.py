@@ -1,56 +1,61 @@
-"""Blocks: several messages of one kind made one, and one cut into several.
+"""Joining messages of one type into one, and cutting one into several.
 
-A message holds one sample or many (docs/reference/messages.md); what a stage makes of samples does not depend on how
-they are cut
-into messages. So whoever has many small messages at hand may join them and spare the work that each one costs.
+A message holds one sample or many (docs/reference/messages.md), and the output of a stage does not depend on how its
+input is cut. A stage that has many small messages at hand can therefore join them and save the cost per message.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import cache
 from operator import attrgetter
 from typing import Any, TypeVar
 
 import numpy as np
 
-from schemas.messages import MESSAGE_TYPES, Array, Message, columns
+from schemas.fields import Array, columns, other_fields
+from schemas.messages import Message
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
 
 
 @dataclass(frozen=True)
 class _Form:
-    """What two messages of a kind must have in common to be joined, and what is joined."""
+    """The columns that are joined, and what two messages of a kind must have in common for that.
 
-    of_samples: tuple[str, ...]
-    of_fans: tuple[str, ...]
-    optional: tuple[str, ...]  # columns of samples that some devices do not have
+    Attributes:
+        by_sample: columns with an axis of samples, which are joined.
+        by_fan: columns without one; they must be equal.
+        optional: columns of samples that both or neither must have.
+        scalars: gives the other fields but the header; they must be equal.
+    """
+
+    by_sample: tuple[str, ...]
+    by_fan: tuple[str, ...]
+    optional: tuple[str, ...]
     scalars: Callable[[Message], Any]
 
 
+@cache
 def _form(message_type: type[Message]) -> _Form:
-    shapes = {name: shape for name, (shape, _) in columns(message_type).items()}
-    scalars = [f.name for f in fields(message_type) if f.name not in shapes and f.name != "header"]
+    declared = columns(message_type).items()
     return _Form(
-        of_samples=tuple(name for name, shape in shapes.items() if shape != "fans"),
-        of_fans=tuple(name for name, shape in shapes.items() if shape == "fans"),
-        optional=tuple(name for name, shape in shapes.items() if shape == "samples")[1:],
-        scalars=attrgetter(*scalars),
+        by_sample=tuple(name for name, column in declared if column.by_sample),
+        by_fan=tuple(name for name, column in declared if not column.by_sample),
+        optional=tuple(name for name, column in declared if column.by_sample and column.optional),
+        scalars=attrgetter(*(name for name in other_fields(message_type) if name != "header")),
     )
 
 
-_FORMS = {t: _form(t) for t in MESSAGE_TYPES}
-
-
 def can_join(one: Message, other: Message) -> bool:
-    """Whether two messages differ in their samples only, and have the same columns of them."""
+    """Whether two messages differ only in their samples and have the same columns."""
     if type(other) is not type(one):
         return False
-    form = _FORMS[type(one)]
-    if not form.of_samples or form.scalars(one) != form.scalars(other):
+    form = _form(type(one))
+    if not form.by_sample or form.scalars(one) != form.scalars(other):
         return False
-    for name in form.of_fans:
+    for name in form.by_fan:
         mine, others = getattr(one, name), getattr(other, name)
         if mine is not others and not np.array_equal(mine, others, equal_nan=True):
             return False
@@ -58,10 +63,10 @@ def can_join(one: Message, other: Message) -> bool:
 
 
 def join(messages: Sequence[AnyMessage]) -> AnyMessage:
-    """One message with the samples of all, in their order, and the first one's header.
+    """One message with the samples of all messages in order, and the header of the first.
 
     Raises:
-        ValueError: no messages, or some that differ in more than their samples.
+        ValueError: there are no messages, or they differ in more than their samples.
     """
     if not messages:
         raise ValueError("no messages to join")
@@ -74,28 +79,28 @@ def join(messages: Sequence[AnyMessage]) -> AnyMessage:
                 f"message {number}, a {type(message).__name__}, differs from message 0 in more than samples"
             )
     return replace(
-        first, **{name: np.concatenate([getattr(m, name) for m in messages]) for name in _FORMS[type(first)].of_samples}
+        first, **{name: np.concatenate([getattr(m, name) for m in messages]) for name in _form(type(first)).by_sample}
     )
 
 
 def cut(message: AnyMessage, first: int, end: int) -> AnyMessage:
-    """The samples from `first` up to and without `end`, counted from 0, and the header. Columns are views.
+    """A message with the samples `first` to `end - 1`, counted from 0, and the same header. Columns are views.
 
     Raises:
-        ValueError: a message without samples, or without those.
+        ValueError: the message does not have these samples.
     """
-    of_samples = _FORMS[type(message)].of_samples
-    if not of_samples or not 0 <= first <= end <= len(getattr(message, of_samples[0])):
+    by_sample = _form(type(message)).by_sample
+    if not by_sample or not 0 <= first <= end <= len(getattr(message, by_sample[0])):
         raise ValueError(f"a {type(message).__name__} without samples {first} to {end}")
-    return replace(message, **{name: getattr(message, name)[first:end] for name in of_samples})
+    return replace(message, **{name: getattr(message, name)[first:end] for name in by_sample})
 
 
-def chosen(message: AnyMessage, rows: Array) -> AnyMessage:
-    """Some of the samples, (n,) of bool, and the header."""
-    of_samples = {name: getattr(message, name) for name in _FORMS[type(message)].of_samples}
-    return replace(message, **{name: values[rows] if len(values) else values for name, values in of_samples.items()})
+def select(message: AnyMessage, rows: Array) -> AnyMessage:
+    """A message with the samples selected by `rows`, (n,) of bool, and the same header."""
+    by_sample = {name: getattr(message, name) for name in _form(type(message)).by_sample}
+    return replace(message, **{name: values[rows] if len(values) else values for name, values in by_sample.items()})
 
 
 def _has_columns(message: Message, form: _Form) -> list[bool]:
-    samples = len(getattr(message, form.of_samples[0]))
+    samples = len(getattr(message, form.by_sample[0]))
     return [len(getattr(message, name)) == samples for name in form.optional]

@@ -1,23 +1,26 @@
 """The messages as the stages see them: frozen dataclasses with NumPy columns.
 
-Field names, order and units are those of `fan.proto`; a test holds the two together. Columns say their
-shape in their type: `Samples` (n,), `SamplesFans` (n, fans), `Fans` (fans,).
+Field names, order and units are those of `fan.proto`, and a test compares the two. Codec and export take enums, shapes
+and types from the declarations below, so that a new field needs an entry here and in `fan.proto`, and nothing else.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from enum import IntEnum
-from typing import Any, TypeAlias
+from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array: TypeAlias = NDArray[Any]
+from schemas.fields import Array, OpenEnum, column, time_column
+
+LARGEST_PERIOD_NS = 86_400_000_000_000  # a day
+FURTHEST_T_NS = (1 << 62) - LARGEST_PERIOD_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits
+RECEIVE_TIMES = (1 - FURTHEST_T_NS, FURTHEST_T_NS - 1)
+GRID_TIMES = (1 - (1 << 62), (1 << 62) - 1)  # the grid may go a little beyond what was received
 
 
-class InvalidReason(IntEnum):
-    """Why a sample must not be judged."""
+class InvalidReason(OpenEnum):
+    """Why a sample is not scored."""
 
     NONE = 0
     STALE = 1
@@ -29,8 +32,8 @@ class InvalidReason(IntEnum):
     NO_TWIN = 7
 
 
-class FanState(IntEnum):
-    """What the scorer says of a fan at one sample."""
+class FanState(OpenEnum):
+    """The state of a fan at one sample, as the scorer sees it."""
 
     UNKNOWN = 0
     NORMAL = 1
@@ -40,8 +43,8 @@ class FanState(IntEnum):
     COMMISSIONING = 5
 
 
-class Statistic(IntEnum):
-    """Which statistic is the furthest towards its limit."""
+class Statistic(OpenEnum):
+    """The statistics that are compared with limits; the values number them across messages and snapshots."""
 
     NONE = 0
     SPEED_SMOOTHED = 1
@@ -53,8 +56,8 @@ class Statistic(IntEnum):
     SENSOR = 7
 
 
-class Transition(IntEnum):
-    """What happened to an alarm, in the words of OPC UA Part 9."""
+class Transition(OpenEnum):
+    """What happened to an alarm, in the terms of OPC UA Part 9."""
 
     NONE = 0
     RAISED = 1
@@ -75,8 +78,8 @@ class Transition(IntEnum):
     REFUSED = 16
 
 
-class Action(IntEnum):
-    """What an operator may ask for."""
+class Action(OpenEnum):
+    """What an operator can request."""
 
     NONE = 0
     ACKNOWLEDGE = 1
@@ -91,16 +94,16 @@ class Action(IntEnum):
     COMMISSION = 10
 
 
-class Severity(IntEnum):
-    """How much an alarm matters."""
+class Severity(OpenEnum):
+    """Severity of an alarm."""
 
     NONE = 0
     WARNING = 1
     ALARM = 2
 
 
-class StageStatus(IntEnum):
-    """How a stage says it is."""
+class StageStatus(OpenEnum):
+    """Status that a stage reports of itself."""
 
     STARTING = 0
     OK = 1
@@ -110,13 +113,13 @@ class StageStatus(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class InputPosition:
-    """What a stage had taken of its inputs, for one tray, when it made a message.
+    """How far a stage had read its main input for one tray when it made a message.
 
-    `topic`, `producer` and `sequence` name the message taken last, `consumed_count` counts all, that one included.
-    From `contiguous_from`
-    on up to `sequence` none is missing. `from_timer`: made since, because time had passed or the stage ended, and not
-    on
-    taking it.
+    Attributes:
+        topic, producer, sequence: the input message consumed last.
+        consumed_count: all input messages consumed so far, that one included.
+        contiguous_from: no sequence number is missing from this one up to `sequence`.
+        from_timer: the message was made later, by a timer or at the end of the stage, not on consuming the input.
     """
 
     topic: str
@@ -128,7 +131,7 @@ class InputPosition:
 
     @classmethod
     def after(cls, before: InputPosition | None, topic: str, header: Header) -> InputPosition:
-        """What has been taken once a message with this header has, too."""
+        """The position after one more message, the one with this header."""
         follows = before is not None and (before.producer, before.sequence + 1) == (header.producer, header.sequence)
         return cls(
             topic=topic,
@@ -141,7 +144,7 @@ class InputPosition:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Who sent a message, which one of theirs it is, the tray it is about, and what it was made of."""
+    """Producer and sequence number of a message, its tray, and the input it was made from."""
 
     producer: str = ""
     sequence: int = 0
@@ -149,99 +152,82 @@ class Header:
     input_position: InputPosition | None = None
 
 
-def _column(shape: str, dtype: type) -> Any:
-    """A column of one message: its shape in words, and the dtype its packed bytes have."""
-    return field(default_factory=lambda: np.zeros(0, dtype), metadata={"shape": shape, "dtype": np.dtype(dtype)})
-
-
-def _samples(dtype: type) -> Any:
-    return _column("samples", dtype)
-
-
-def _samples_fans(dtype: type) -> Any:
-    return _column("samples x fans", dtype)
-
-
-def _fans(dtype: type) -> Any:
-    return _column("fans", dtype)
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Raw:
-    """Samples as the device sent them; `device_clock_us` and `device_sequence` are empty where it has none."""
+    """Samples as the device sent them. `device_clock_us` and `device_sequence` are empty if the device has none."""
 
     header: Header = Header()
     fans: int
-    host_receive_t_ns: Array = _samples(np.int64)
-    device_clock_us: Array = _samples(np.uint32)
-    device_sequence: Array = _samples(np.uint32)
-    command: Array = _samples_fans(np.float64)
-    speed_rad_s: Array = _samples_fans(np.float64)
+    host_receive_t_ns: Array = column("samples", np.int64, limits=RECEIVE_TIMES)
+    device_clock_us: Array = column("samples", np.uint32, optional=True)
+    device_sequence: Array = column("samples", np.uint32, optional=True)
+    command: Array = column("samples x fans", np.float64)
+    speed_rad_s: Array = column("samples x fans", np.float64)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Grid:
-    """The samples on a uniform grid of time; command held, speed interpolated."""
+    """Samples on a uniform time grid: command held, speed interpolated."""
 
     header: Header = Header()
     fans: int
     period_ns: int
-    t_ns: Array = _samples(np.int64)
-    command: Array = _samples_fans(np.float64)
-    speed_rad_s: Array = _samples_fans(np.float64)
-    valid: Array = _samples_fans(np.bool_)
-    invalid_reason: Array = _samples_fans(np.uint8)
+    t_ns: Array = column("samples", np.int64, limits=GRID_TIMES)
+    command: Array = column("samples x fans", np.float64)
+    speed_rad_s: Array = column("samples x fans", np.float64)
+    valid: Array = column("samples x fans", np.bool_)
+    invalid_reason: Array = column("samples x fans", InvalidReason)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Prediction:
-    """What the healthy twin says, in free run, beside what was measured."""
+    """The free run of the healthy twin beside the measurement."""
 
     header: Header = Header()
     fans: int
     period_ns: int
-    t_ns: Array = _samples(np.int64)
-    command: Array = _samples_fans(np.float64)
-    measured_speed_rad_s: Array = _samples_fans(np.float64)
-    predicted_speed_rad_s: Array = _samples_fans(np.float64)
-    sigma_rad_s: Array = _fans(np.float64)
-    valid: Array = _samples_fans(np.bool_)
-    invalid_reason: Array = _samples_fans(np.uint8)
+    t_ns: Array = column("samples", np.int64, limits=GRID_TIMES)
+    command: Array = column("samples x fans", np.float64)
+    measured_speed_rad_s: Array = column("samples x fans", np.float64)
+    predicted_speed_rad_s: Array = column("samples x fans", np.float64)
+    sigma_rad_s: Array = column("fans", np.float64)
+    valid: Array = column("samples x fans", np.bool_)
+    invalid_reason: Array = column("samples x fans", InvalidReason)
     twin: str = ""
-    torque_balance_command: Array = _samples_fans(np.float64)
-    torque_balance_sigma_command: Array = _fans(np.float64)
+    torque_balance_command: Array = column("samples x fans", np.float64, added_later=True)
+    torque_balance_sigma_command: Array = column("fans", np.float64, added_later=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Score:
-    """A judged sample, with everything a viewer needs to draw it."""
+    """Scored samples, with everything a viewer needs to draw them."""
 
     header: Header = Header()
     fans: int
     period_ns: int
-    t_ns: Array = _samples(np.int64)
-    command: Array = _samples_fans(np.float64)
-    measured_speed_rad_s: Array = _samples_fans(np.float64)
-    predicted_speed_rad_s: Array = _samples_fans(np.float64)
-    lower_bound_rad_s: Array = _samples_fans(np.float64)
-    upper_bound_rad_s: Array = _samples_fans(np.float64)
-    band_variance: Array = _samples_fans(np.float64)
-    residual_rad_s: Array = _samples_fans(np.float64)
-    smoothed_residual_rad_s: Array = _samples_fans(np.float64)
-    outside: Array = _samples_fans(np.bool_)
-    state: Array = _samples_fans(np.uint8)
-    valid: Array = _samples_fans(np.bool_)
-    invalid_reason: Array = _samples_fans(np.uint8)
-    torque_balance_command: Array = _samples_fans(np.float64)
-    speed_baseline_rad_s: Array = _samples_fans(np.float64)
-    balance_baseline_command: Array = _samples_fans(np.float64)
-    score: Array = _samples_fans(np.float64)
-    statistic: Array = _samples_fans(np.uint8)
+    t_ns: Array = column("samples", np.int64, limits=GRID_TIMES)
+    command: Array = column("samples x fans", np.float64)
+    measured_speed_rad_s: Array = column("samples x fans", np.float64)
+    predicted_speed_rad_s: Array = column("samples x fans", np.float64)
+    lower_bound_rad_s: Array = column("samples x fans", np.float64)
+    upper_bound_rad_s: Array = column("samples x fans", np.float64)
+    band_variance: Array = column("samples x fans", np.float64)
+    residual_rad_s: Array = column("samples x fans", np.float64)
+    smoothed_residual_rad_s: Array = column("samples x fans", np.float64)
+    outside: Array = column("samples x fans", np.bool_)
+    state: Array = column("samples x fans", FanState)
+    valid: Array = column("samples x fans", np.bool_)
+    invalid_reason: Array = column("samples x fans", InvalidReason)
+    torque_balance_command: Array = column("samples x fans", np.float64, added_later=True)
+    speed_baseline_rad_s: Array = column("samples x fans", np.float64, added_later=True)
+    balance_baseline_command: Array = column("samples x fans", np.float64, added_later=True)
+    score: Array = column("samples x fans", np.float64, added_later=True)
+    statistic: Array = column("samples x fans", Statistic, added_later=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """One possible cause of an alarm, with what speaks for it."""
+    """One possible cause of an alarm, with its evidence."""
 
     cause: str
     probability: float
@@ -255,7 +241,7 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Alarm:
-    """What happened to the alarm of a fan, and how it stands since; tray, fan and `onset_t_ns` name it."""
+    """A transition of a fan's alarm, and the state after it. Tray, fan and `onset_t_ns` identify the alarm."""
 
     header: Header = Header()
     fan: int
@@ -285,7 +271,7 @@ class Alarm:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Request:
-    """What an operator wants of the alarms of a tray; fan -1 means all of them."""
+    """An operator's request about the alarms of a tray; fan -1 means all fans."""
 
     header: Header = Header()
     t_ns: int
@@ -298,7 +284,7 @@ class Request:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScorerSnapshot:
-    """What a scorer must not forget when it is restarted."""
+    """State that a scorer needs to continue after a restart."""
 
     header: Header = Header()
     t_ns: int
@@ -309,13 +295,13 @@ class ScorerSnapshot:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Command:
-    """What an operator or a controller wants of the fans; NaN leaves a fan as it is."""
+    """Commands or set points for the fans, from an operator or a controller; NaN leaves a fan unchanged."""
 
     header: Header = Header()
     fans: int
     t_ns: int
-    command: Array = _fans(np.float64)
-    set_point_rad_s: Array = _fans(np.float64)
+    command: Array = column("fans", np.float64, optional=True)
+    set_point_rad_s: Array = column("fans", np.float64, optional=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -327,13 +313,13 @@ class ModelCard:
     twin: str
     kind: str
     sha256: str
-    sigma_rad_s: Array = _fans(np.float64)
+    sigma_rad_s: Array = column("fans", np.float64, optional=True)
     card_json: str = ""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Clock:
-    """What a replay has come to, in the recording's own time; `rate` is 0 while it is paused."""
+    """Position of a replay in the recording's own time; `rate` is 0 while it is paused."""
 
     header: Header = Header()
     t_ns: int
@@ -342,7 +328,7 @@ class Clock:
 
 @dataclass(frozen=True, kw_only=True)
 class Counter:
-    """One counter of a stage; grows only, within a session."""
+    """One counter of a stage; it only grows within a session."""
 
     name: str
     value: int
@@ -350,7 +336,7 @@ class Counter:
 
 @dataclass(frozen=True, kw_only=True)
 class Input:
-    """One input of a stage: the messages on one key from one producer."""
+    """One input of a stage: messages on one key from one producer."""
 
     key: str
     producer: str
@@ -370,7 +356,7 @@ class Output:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Health:
-    """How a stage is, what it has received, sent and lost."""
+    """Status of a stage, and what it has received, sent and lost."""
 
     header: Header = Header()
     stage: str
@@ -397,16 +383,8 @@ MESSAGE_TYPES: tuple[type[Message], ...] = (
 
 
 def newest_t_ns(message: Message) -> int:
-    """The time of the newest sample (or of the event) a message is about, ns since the epoch; 0 if it has none."""
-    if isinstance(message, Raw):
-        times = message.host_receive_t_ns
-    elif isinstance(message, Grid | Prediction | Score):
-        times = message.t_ns
-    else:
-        return message.t_ns
+    """Time of a message's newest sample, or of the event it is about, ns since the epoch; 0 if it has no samples."""
+    times = getattr(message, time_column(type(message)))
+    if isinstance(times, int):
+        return times
     return int(times[-1]) if len(times) else 0
-
-
-def columns(message_type: type[Message]) -> dict[str, tuple[str, np.dtype[Any]]]:
-    """The columns of a message type: name -> (shape in words, dtype)."""
-    return {f.name: (f.metadata["shape"], f.metadata["dtype"]) for f in fields(message_type) if "shape" in f.metadata}

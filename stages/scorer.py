@@ -27,7 +27,7 @@ from pydantic import Field, ValidationError
 from pipeline.runtime.snapshot_store import SnapshotStore
 from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
-from schemas.blocks import chosen
+from schemas.blocks import select
 from schemas.messages import (
     Alarm,
     Array,
@@ -202,7 +202,7 @@ class ScorerCore(Core):
         if not new.any():
             return [*self.tick(0), *disowned]
         self._last_t_ns, self._fed_by = int(item.t_ns[new][-1]), item.header.producer
-        score, alarms = self._judge_block(item if new.all() else chosen(item, new))
+        score, alarms = self._judge_block(item if new.all() else select(item, new))
         return [*self.tick(0), *disowned, score, *alarms, *self._note(bool(alarms))]
 
     def counters(self) -> Mapping[str, int]:

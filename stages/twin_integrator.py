@@ -27,7 +27,7 @@ from pydantic import Field
 from pipeline.runtime.free_run import FreeRun, FreeRunInputs
 from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from pipeline.runtime.twin_file import TwinFile, load_twin
-from schemas.blocks import chosen
+from schemas.blocks import select
 from schemas.messages import Array, Grid, InvalidReason, ModelCard, Prediction
 from schemas.units import NS_PER_S
 from scoring.detectors.torque_balance import BalanceModel, TorqueBalance
@@ -124,7 +124,7 @@ class TwinIntegratorCore(Core):
         if new.all():
             return grid
         self._counts["repeated"] += int((~new).sum())
-        return chosen(grid, new)
+        return select(grid, new)
 
     def _predict(self, grid: Grid) -> Prediction:
         run = self._run

@@ -20,8 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import UserError
-from schemas.codec import FURTHEST_T_NS
-from schemas.messages import Array
+from schemas.messages import FURTHEST_T_NS, Array
 from schemas.units import RAD_S_PER_UNIT
 
 NS_PER_UNIT = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}

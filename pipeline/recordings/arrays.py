@@ -1,47 +1,42 @@
-"""Recordings as NumPy arrays: the columns of a topic in blocks of samples, one block of each tray in memory at a time.
+"""Recordings as NumPy arrays: blocks of a topic's columns, with one block of each tray in memory at a time.
 
-A recording may lie in several files, the parts of one. See docs/how-to/read-recordings.md.
+A recording can consist of several files, its parts. See docs/how-to/read-recordings.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
-from enum import IntEnum
+from functools import cache
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
 
 from pipeline.recordings.order import Seen, in_order
 from pipeline.recordings.reading import RecordingError, read_recording
 from schemas.envelope import Envelope
-from schemas.messages import MESSAGE_TYPES, Array, FanState, InvalidReason, Message, Severity, StageStatus, columns
-from schemas.topics import BY_NAME, HEALTH_CHUNK, TOPICS
-
-WORDS: Mapping[str, type[IntEnum]] = {
-    "state": FanState,
-    "invalid_reason": InvalidReason,
-    "severity": Severity,
-    "status": StageStatus,
-}
-"""The columns that hold codes, and what these mean: `WORDS["state"](2).name` is SUSPECT."""
+from schemas.fields import LARGEST_ENUM_VALUE, Array, OpenEnum, columns, other_fields, time_column
+from schemas.messages import Message
+from schemas.topics import BY_NAME, FORMER_NAMES, HEALTH_CHUNK, TOPICS
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Successive rows of one topic of one tray: samples, or events where a message is about one moment.
+    """Successive rows of one topic of one tray: samples, or events if a message is about one moment.
 
-    columns: (rows,) or (rows, fans), named as in the message and with the same units; what a message says once stands
-    in each of its rows. `producer` is the session that sent the row. A column that the device does not have is empty.
+    Attributes:
+        tray: empty for the health of stages.
+        fans: 0 for a topic without columns by fan.
+        columns: (rows,) or (rows, fans), with the names and units of the message. A value that a message carries once
+            is repeated in each of its rows. `producer` is the session that sent the row. A column that the device does
+            not have is empty.
     """
 
     site: str
     tray: str
-    """empty for the health of stages"""
     topic: str
     fans: int
-    """0 for a topic that has no columns by fan"""
     columns: Mapping[str, Array]
 
     def __getitem__(self, name: str) -> Array:
@@ -50,17 +45,30 @@ class Block:
     def __len__(self) -> int:
         return len(self.t_ns)
 
+    def names(self, column: str) -> Array:
+        """An enum column as names (`NORMAL`), str in the shape of the column; unknown values as numbers.
+
+        Raises:
+            ValueError: the column holds quantities.
+        """
+        enum = block_columns(BY_NAME[self.topic].message)[column].enum
+        if enum is None:
+            raise ValueError(f"{self.topic}.{column} is no enum")
+        return enum_names(enum)[self.columns[column]]
+
     @property
     def t_ns(self) -> Array:
-        """(rows,) int64, ns since 1970: of the samples or events; of `raw`, when the host received them."""
+        """(rows,) int64, ns since 1970: time of the samples or events; for `raw`, when the host received them."""
         return self.columns[time_column(BY_NAME[self.topic].message)]
 
 
 @dataclass
 class Arrays:
-    """The blocks of a recording, to iterate over; those of several trays or topics come in turns.
+    """The blocks of a recording, to iterate over. Blocks of several trays or topics are interleaved.
 
-    Once they are through, `damage` has a line for each file that could not be read in full.
+    Attributes:
+        damage: after the iteration, a line for each file that could not be read in full.
+        duplicated: messages that were recorded twice and left out the second time.
     """
 
     paths: list[Path]
@@ -69,7 +77,6 @@ class Arrays:
     rows: int
     damage: list[str] = field(default_factory=list, init=False)
     duplicated: int = field(default=0, init=False)
-    """messages that came again, and were left out"""
 
     def __iter__(self) -> Iterator[Block]:
         self.damage, self.duplicated = [], 0
@@ -77,16 +84,16 @@ class Arrays:
         for entry in self._entries():
             if not _rows(entry.message):
                 continue
-            whose = (*_site_and_tray(entry.key), entry.topic)
-            mine = gathered.get(whose)
-            if mine is not None and not mine.takes(entry.message):
-                yield mine.block()
-                mine = None
-            if mine is None:
-                mine = gathered[whose] = _Gathered(*whose, _form(entry.message))
-            mine.add(entry.message)
-            if mine.rows >= self.rows:
-                yield gathered.pop(whose).block()
+            source = (*_site_and_tray(entry.key), entry.topic)
+            pending = gathered.get(source)
+            if pending is not None and not pending.accepts(entry.message):
+                yield pending.block()
+                pending = None
+            if pending is None:
+                pending = gathered[source] = _Gathered(*source, _form(entry.message))
+            pending.add(entry.message)
+            if pending.rows >= self.rows:
+                yield gathered.pop(source).block()
         for rest in gathered.values():
             yield rest.block()
 
@@ -108,27 +115,29 @@ class Arrays:
 
 
 def read_arrays(recording: Path | Iterable[Path], topic: str, tray: str | None = None, rows: int = 4096) -> Arrays:
-    """The columns of a topic, in blocks of `rows` rows or a little more; only the last of a tray may be shorter, and
-    one after which the number of fans changes.
+    """Read the columns of one topic in blocks of at least `rows` rows.
+
+    A block is shorter only at the end of a tray, or before a change of the number of fans.
 
     Args:
         recording: a file, or the parts of one recording in any order. A message that is in two parts counts once.
-        topic: see docs/reference/messages.md.
-        tray: only this one; None for all. A stage's health is of no tray and always there.
-        rows: in a block. As many of each tray are in memory.
+        topic: see docs/reference/messages.md; names of older recordings work too.
+        tray: the tray to read; None for all. The health of stages belongs to no tray and is always read.
+        rows: rows of a block. As many are held in memory for each tray.
 
     Raises:
-        RecordingError: a file cannot be read, is no part of a recording, or there is no such topic.
+        RecordingError: a file cannot be read or is not a part of a recording, or the topic is unknown.
     """
     return read_topics([recording] if isinstance(recording, Path) else recording, (topic,), tray, rows)
 
 
 def read_topics(parts: Iterable[Path], topics: Collection[str], tray: str | None = None, rows: int = 4096) -> Arrays:
-    """The same for several topics, in one go through the files.
+    """Read several topics in one pass through the files; see `read_arrays`.
 
     Raises:
         RecordingError: as in `read_arrays`.
     """
+    topics = [FORMER_NAMES.get(topic, topic) for topic in topics]
     for topic in topics:
         if topic not in BY_NAME:
             known = ", ".join(known.name for known in TOPICS if known.recorded)
@@ -137,39 +146,49 @@ def read_topics(parts: Iterable[Path], topics: Collection[str], tray: str | None
 
 
 @dataclass(frozen=True)
-class Column:
-    """A column of a topic's blocks; `once`: said once in a message, for all its rows."""
+class BlockColumn:
+    """A column of a topic's blocks.
+
+    Attributes:
+        by_fan: shape (rows, fans), otherwise (rows,).
+        once: a message carries one value for all its rows.
+        enum: what the values mean: `enum(2).name`; None for quantities.
+    """
 
     dtype: np.dtype[Any]
-    by_fan: bool
-    once: bool
+    by_fan: bool = False
+    once: bool = False
+    enum: type[OpenEnum] | None = None
 
 
-def block_columns(message_type: type[Message]) -> dict[str, Column]:
+@cache
+def block_columns(message_type: type[Message]) -> Mapping[str, BlockColumn]:
     """The columns of a topic's blocks by name: the time first, then as in the message, `producer` last.
 
-    Lists of records are left out: `read_recording` has them.
+    Nested records are left out; `read_recording` gives them.
     """
     kinds = {bool: np.bool_, int: np.int64, float: np.float64, str: np.object_}
-    shapes, hints = columns(message_type), get_type_hints(message_type)
-    found = {time_column(message_type): Column(np.dtype(np.int64), by_fan=False, once=False)}
-    for f in fields(message_type):
-        if f.name in shapes:
-            shape, dtype = shapes[f.name]
-            found[f.name] = Column(dtype, by_fan="fans" in shape, once="samples" not in shape)
-        elif f.name != "fans" and (f.name in WORDS or hints[f.name] in kinds):
-            dtype = np.dtype(np.uint8 if f.name in WORDS else kinds[hints[f.name]])
-            found[f.name] = Column(dtype, by_fan=False, once=True)
-    return found | {"producer": Column(np.dtype(np.object_), by_fan=False, once=True)}
+    declared, others = columns(message_type), other_fields(message_type)
+    found = {time_column(message_type): BlockColumn(np.dtype(np.int64))}
+    for name in (f.name for f in fields(message_type) if f.name != "fans"):
+        if column := declared.get(name):
+            found[name] = BlockColumn(column.dtype, column.by_fan, not column.by_sample, column.enum)
+        elif others[name] in kinds:
+            found[name] = BlockColumn(np.dtype(kinds[others[name]]), once=True)
+        elif isinstance(enum := others[name], type) and issubclass(enum, OpenEnum):
+            found[name] = BlockColumn(np.dtype(np.uint8), once=True, enum=enum)
+    return found | {"producer": BlockColumn(np.dtype(np.object_), once=True)}
 
 
-def time_column(message_type: type[Message]) -> str:
-    """Name of the column that says when: of a message's samples, or of the event it is about."""
-    return next((name for name, (shape, _) in columns(message_type).items() if shape == "samples"), "t_ns")
+@cache
+def enum_names(enum: type[OpenEnum]) -> Array:
+    """The text for each value that a column of this enum can hold, (128,) of str; the number for an unknown value."""
+    values = [enum(value) for value in range(LARGEST_ENUM_VALUE + 1)]
+    return np.array([value.name if value.is_known else str(int(value)) for value in values], np.object_)
 
 
 class _Gathered:
-    """Messages of one form that will be one block."""
+    """Messages of one form, gathered for one block."""
 
     def __init__(self, site: str, tray: str, topic: str, form: tuple[int, ...]) -> None:
         self.rows = 0
@@ -177,7 +196,7 @@ class _Gathered:
         self._form = form
         self._messages: list[Message] = []
 
-    def takes(self, message: Message) -> bool:
+    def accepts(self, message: Message) -> bool:
         """Whether its columns have the same shapes."""
         return _form(message) == self._form
 
@@ -189,30 +208,26 @@ class _Gathered:
         counts = [_rows(message) for message in self._messages]
         found: dict[str, Array] = {}
         for name, column in block_columns(type(self._messages[0])).items():
-            said = [
+            values = [
                 message.header.producer if name == "producer" else getattr(message, name) for message in self._messages
             ]
             found[name] = (
-                np.repeat(np.array(said, column.dtype), counts, axis=0) if column.once else np.concatenate(said)
+                np.repeat(np.array(values, column.dtype), counts, axis=0) if column.once else np.concatenate(values)
             )
         return Block(*self._of, self._form[0], found)
 
 
-_COLUMNS = {kind: columns(kind) for kind in MESSAGE_TYPES}
-_TIME = {kind: time_column(kind) for kind in MESSAGE_TYPES}
-
-
 def _rows(message: Message) -> int:
-    name = _TIME[type(message)]
-    return len(getattr(message, name)) if name in _COLUMNS[type(message)] else 1
+    name = time_column(type(message))
+    return len(getattr(message, name)) if name in columns(type(message)) else 1
 
 
 def _form(message: Message) -> tuple[int, ...]:
-    """Its fans, and which of its columns are not there: messages of one form fit beneath one another."""
-    shapes = _COLUMNS[type(message)]
-    by_fan = (len(getattr(message, name)) for name, (shape, _) in shapes.items() if shape == "fans")
+    """The number of fans, and which columns are empty: messages of the same form can be concatenated."""
+    declared = columns(type(message))
+    by_fan = (len(getattr(message, name)) for name, column in declared.items() if column.shape == "fans")
     fans = getattr(message, "fans", max(by_fan, default=0))
-    return fans, *(number for number, name in enumerate(shapes) if not getattr(message, name).size)
+    return fans, *(number for number, name in enumerate(declared) if not getattr(message, name).size)
 
 
 def _site_and_tray(key: str) -> tuple[str, str]:

@@ -1,7 +1,7 @@
-"""Blocks of a recording as tables for other programs: a row for each sample and fan, in a CSV or a Parquet file.
+"""Blocks of a recording as tables for other programs: CSV or Parquet, one row per sample and fan.
 
-A table is written in pieces, so what is in memory does not grow with it. Codes become words, and what is not there (NaN
-in the messages) is empty. See docs/how-to/read-recordings.md.
+A table is written in pieces, so memory does not grow with it. Enum values become their names, and missing values (NaN
+in the messages) become empty cells. See docs/how-to/read-recordings.md.
 """
 
 from __future__ import annotations
@@ -13,18 +13,17 @@ from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
-from pipeline.recordings.arrays import WORDS, Block, block_columns
-from schemas.messages import Array, Message
+from pipeline.recordings.arrays import Block, BlockColumn, block_columns, enum_names
+from schemas.fields import Array, OpenEnum
+from schemas.messages import Message
 from schemas.topics import BY_NAME
 
 Form: TypeAlias = Literal["csv", "parquet"]
 PIECE_ROWS = 65_536
 
-_WORDS = {name: np.array([code.name for code in codes], np.object_) for name, codes in WORDS.items()}
-
 
 class TableFile(Protocol):
-    """A file that takes the blocks of one topic, one after the other."""
+    """A file that is written block by block, for one topic."""
 
     rows: int
 
@@ -33,32 +32,31 @@ class TableFile(Protocol):
 
 
 def open_table(form: Form, path: Path, topic: str, about: Mapping[str, str]) -> TableFile:
-    """Begin a table.
+    """Create a table file.
 
     Args:
         form: `parquet` needs the extra of that name.
-        path: is overwritten.
-        topic: of its blocks.
-        about: what the table is of; kept where the form has room for it.
+        path: overwritten if it exists.
+        topic: topic of the blocks.
+        about: metadata of the table; kept by Parquet, dropped by CSV.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     message_type = BY_NAME[topic].message
     return CsvTable(path, message_type) if form == "csv" else ParquetTable(path, message_type, about)
 
 
-def table_columns(message_type: type[Message]) -> dict[str, np.dtype[Any]]:
-    """The columns of a topic's table by name, the time first; those of `WORDS` are words in the file."""
+def table_columns(message_type: type[Message]) -> dict[str, BlockColumn]:
+    """The columns of a topic's table by name, the time first. Enum columns are written as names."""
     found = block_columns(message_type)
-    kinds = {name: column.dtype for name, column in found.items()}
-    time = next(iter(kinds))
-    fan = {"fan": np.dtype(np.int64)} if any(column.by_fan for column in found.values()) else {}
-    return {time: kinds[time]} | fan | kinds
+    time = next(iter(found))
+    fan = {"fan": BlockColumn(np.dtype(np.int64))} if any(column.by_fan for column in found.values()) else {}
+    return {time: found[time], **fan, **found}
 
 
 class CsvTable:
-    """Comma-separated text with a line of names."""
+    """Comma-separated text with a header line."""
 
     def __init__(self, path: Path, message_type: type[Message]) -> None:
         self.rows = 0
@@ -70,7 +68,8 @@ class CsvTable:
     def add(self, block: Block) -> None:
         """Append a block's rows."""
         for rows, piece in _pieces(block):
-            self._writer.writerows(zip(*(_texts(name, piece[name], rows) for name in self._columns), strict=True))
+            texts = (_texts(column.enum, piece[name], rows) for name, column in self._columns.items())
+            self._writer.writerows(zip(*texts, strict=True))
             self.rows += rows
 
     def close(self, damage: str = "") -> None:
@@ -86,10 +85,11 @@ class ParquetTable:
         from pyarrow.parquet import ParquetWriter  # noqa: PLC0415
 
         self.rows = 0
-        kinds = table_columns(message_type)
-        self._time = next(iter(kinds))
-        types = {"time": pa.timestamp("ns", tz="UTC")} | {name: _arrow_type(name, kinds[name]) for name in kinds}
-        self._schema = pa.schema(list(types.items()), {f"fantwin.{name}": said for name, said in about.items()})
+        self._columns = table_columns(message_type)
+        self._time = next(iter(self._columns))
+        types = {"time": pa.timestamp("ns", tz="UTC")}
+        types |= {name: _arrow_type(column) for name, column in self._columns.items()}
+        self._schema = pa.schema(list(types.items()), {f"fantwin.{name}": value for name, value in about.items()})
         self._writer = ParquetWriter(path, self._schema, compression="zstd")
 
     def add(self, block: Block) -> None:
@@ -97,23 +97,26 @@ class ParquetTable:
         import pyarrow as pa  # noqa: PLC0415
 
         for rows, piece in _pieces(block):
-            values = {"time": piece[self._time]} | piece
-            arrays = [_arrow(field.name, values[field.name], rows, field.type) for field in self._schema]
+            arrays = [pa.array(piece[self._time], self._schema.field("time").type)]
+            for name, column in self._columns.items():
+                arrays.append(_arrow(column.enum, piece[name], rows, self._schema.field(name).type))
             self._writer.write_table(pa.Table.from_arrays(arrays, schema=self._schema))
             self.rows += rows
 
     def close(self, damage: str = "") -> None:
-        """End the file. damage: what could not be read of the recording, kept in the table's metadata."""
+        """End the file. damage: what could not be read of the recording; kept in the table's metadata."""
         if damage:
             self._writer.add_key_value_metadata({"fantwin.damage": damage})
         self._writer.close()
 
 
 def _pieces(block: Block) -> Iterator[tuple[int, dict[str, Array]]]:
-    """A block with a row for each sample and fan, in pieces: their rows, their columns. A column that the device does
-    not have is empty."""
+    """Split a block into pieces with one row per sample and fan: (rows, columns by name).
+
+    A column that the device does not have stays empty.
+    """
     kinds = block_columns(BY_NAME[block.topic].message)
-    wide = max(1, block.fans)  # what is said of no fan (a twin without any) is a row all the same
+    wide = max(1, block.fans)  # a message without fans (a twin that lists none) is one row
     step = max(1, PIECE_ROWS // wide)
     for first in range(0, len(block), step):
         part = {name: values[first : first + step] for name, values in block.columns.items()}
@@ -128,12 +131,12 @@ def _pieces(block: Block) -> Iterator[tuple[int, dict[str, Array]]]:
         )
 
 
-def _texts(name: str, values: Array, rows: int) -> list[Any]:
-    """The values of a column as the CSV writer wants them."""
+def _texts(enum: type[OpenEnum] | None, values: Array, rows: int) -> list[Any]:
+    """The values of a column for the CSV writer."""
     if not values.size:
         return [""] * rows
-    if name in WORDS:
-        return _WORDS[name][values].tolist()
+    if enum:
+        return enum_names(enum)[values].tolist()
     if values.dtype == np.bool_:
         return np.where(values, "true", "false").tolist()
     if values.dtype == np.float64:
@@ -141,19 +144,23 @@ def _texts(name: str, values: Array, rows: int) -> list[Any]:
     return values.tolist()
 
 
-def _arrow_type(name: str, dtype: np.dtype[Any]) -> Any:
+def _arrow_type(column: BlockColumn) -> Any:
     import pyarrow as pa  # noqa: PLC0415
 
-    if name in WORDS:
+    if column.enum:
         return pa.dictionary(pa.int8(), pa.string())
-    return pa.string() if dtype == np.object_ else pa.from_numpy_dtype(dtype)
+    return pa.string() if column.dtype == np.object_ else pa.from_numpy_dtype(column.dtype)
 
 
-def _arrow(name: str, values: Array, rows: int, type_: Any) -> Any:
+def _arrow(enum: type[OpenEnum] | None, values: Array, rows: int, type_: Any) -> Any:
     import pyarrow as pa  # noqa: PLC0415
 
     if not values.size:
         return pa.nulls(rows, type_)
-    if name in WORDS:
-        return pa.DictionaryArray.from_arrays(pa.array(values.astype(np.int8)), pa.array(_WORDS[name]))
+    if enum:
+        # The categories are all known names, and the unknown numbers that occur.
+        present = np.union1d([int(value) for value in enum], values)
+        categories = enum_names(enum)[present]
+        codes = np.searchsorted(present, values).astype(np.int8)
+        return pa.DictionaryArray.from_arrays(pa.array(codes), pa.array(categories))
     return pa.array(values, type_, from_pandas=True)

@@ -243,9 +243,9 @@ def _alarm_of(plain: dict[str, Any]) -> Alarm:
     return Alarm(
         **plain
         | {
-            "severity": Severity(plain["severity"]),
-            "transition": Transition(plain["transition"]),
-            "statistic": Statistic(plain["statistic"]),
+            "severity": Severity.known(plain["severity"]),
+            "transition": Transition.known(plain["transition"]),
+            "statistic": Statistic.known(plain["statistic"]),
             "causes": tuple(Diagnosis(**cause) for cause in plain["causes"]),
         }
     )

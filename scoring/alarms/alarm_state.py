@@ -155,14 +155,14 @@ class Condition:
             KeyError, TypeError, ValueError, OverflowError: it is none.
         """
         condition = cls(settings)
-        condition.state = int(FanState(kept["state"]))
+        condition.state = int(FanState.known(kept["state"]))
         if condition.state not in (NORMAL, SUSPECT, ALARM, RETURNING):
             raise ValueError(kept["state"])
         condition._excursion_t_ns = _time(kept["excursion_t_ns"])
         condition._lasted_ns = _time(kept["lasted_ns"])
         condition.standing = AlarmState(
             active=condition.state in (ALARM, RETURNING),
-            severity=Severity(kept["severity"]),
+            severity=Severity.known(kept["severity"]),
             onset_t_ns=_time(kept["onset_t_ns"]),
             shelved_until_t_ns=_time(kept["shelved_until_t_ns"]),
             acknowledged=bool(kept["acknowledged"]),
@@ -202,6 +202,7 @@ class Condition:
         once = now.shelved_until_t_ns == UNTIL_IT_CLEARS_T_NS and duration_ns == 0
         fits = 0 <= duration_ns < UNTIL_IT_CLEARS_T_NS - now_t_ns  # NaN does not
         raised = now.severity != Severity.NONE
+        unknown = ((True, f"there is no such action: {int(action)}"),)
         reasons: dict[Action, tuple[tuple[bool, str], ...]] = {
             Action.ACKNOWLEDGE: (
                 (not raised, "no alarm has been raised"),
@@ -229,7 +230,7 @@ class Condition:
             Action.COMMISSION: (),
             Action.NONE: ((True, "no action is named"),),
         }
-        return next((why for applies, why in reasons[action] if applies), "")
+        return next((why for applies, why in reasons.get(action, unknown) if applies), "")
 
 
 def _time(value: Any) -> int:

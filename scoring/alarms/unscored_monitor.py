@@ -49,5 +49,7 @@ class UnscoredMonitor:
             names = ", ".join(map(str, fans.tolist()))
             who = f"fan {names} is" if len(fans) == 1 else f"fans {names} are"
             lasted_s = self._limit_ns * 2**doubled / NS_PER_S
-            parts.append(f"{who} not judged: {IN_WORDS[InvalidReason(why)]} for {lasted_s:g} s and more")
+            reason = InvalidReason(why)
+            words = IN_WORDS.get(reason, reason.words)
+            parts.append(f"{who} not judged: {words} for {lasted_s:g} s and more")
         return "; ".join(parts)

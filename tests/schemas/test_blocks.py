@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.blocks import can_join, chosen, cut, join
+from schemas.blocks import can_join, cut, join, select
 from schemas.codec import decode, encode
-from schemas.messages import Command, Grid, Header, Message, Prediction, Raw, Score, columns
+from schemas.fields import columns
+from schemas.messages import Command, Grid, Header, Message, Prediction, Raw, Score
 from tests.support.message_strategies import any_message, same
 
 OF_SAMPLES = (Raw, Grid, Prediction, Score)
@@ -114,7 +115,7 @@ def test_predictions_of_one_twin_are_joined_although_each_brings_its_own_sigma()
 
 
 def test_some_samples_of_a_message_are_chosen() -> None:
-    some = chosen(raw(3, clock=False), np.array([True, False, True]))
+    some = select(raw(3, clock=False), np.array([True, False, True]))
     assert (some.host_receive_t_ns.tolist(), some.device_sequence.tolist()) == ([0, 2], [0, 2])
     assert (some.command.shape, some.device_clock_us.tolist()) == ((2, 1), [])
 

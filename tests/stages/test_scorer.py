@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import Context, StageError
 from schemas.blocks import cut
+from schemas.fields import columns
 from schemas.messages import (
     Action,
     FanState,
@@ -28,7 +29,6 @@ from schemas.messages import (
     Severity,
     Statistic,
     Transition,
-    columns,
 )
 from scoring.limits import Timing
 from stages.scorer import STAGE, ScorerConfig, ScorerCore, limits_in_force

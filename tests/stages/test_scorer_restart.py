@@ -13,7 +13,8 @@ import pytest
 
 from pipeline.runtime.snapshot_store import SnapshotStore
 from schemas.blocks import cut
-from schemas.messages import Action, Alarm, FanState, Header, Prediction, Score, ScorerSnapshot, Transition, columns
+from schemas.fields import columns
+from schemas.messages import Action, Alarm, FanState, Header, Prediction, Score, ScorerSnapshot, Transition
 from scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
 from scoring.alarms.current_alarms import CurrentAlarm, current_alarms
 from stages.scorer import ScorerCore
@@ -30,11 +31,9 @@ def core() -> ScorerCore:
 def bits(scores: Sequence[Score], from_t_ns: int = 0) -> dict[str, bytes]:
     rows = [score.t_ns >= from_t_ns for score in scores]
     return {
-        name: np.concatenate(
-            [getattr(s, name)[r] if shape != "fans" else getattr(s, name) for s, r in zip(scores, rows, strict=True)]
-        ).tobytes()
-        for name, (shape, _) in columns(Score).items()
-        if shape != "fans"
+        name: np.concatenate([getattr(s, name)[r] for s, r in zip(scores, rows, strict=True)]).tobytes()
+        for name, column in columns(Score).items()
+        if column.by_sample
     }
 
 

@@ -234,7 +234,7 @@ def standing_lines(standing: CurrentAlarm) -> Text:
     alarm = standing.newest
     by = f" by {standing.acknowledged_by}" if standing.acknowledged_by else ""
     words = [f"{word}{by}" if word == "acknowledged" else word for word in standing.words()]
-    style = _STYLES[alarm.severity] if is_presented(alarm) else "dim"
+    style = _STYLES.get(alarm.severity, "bold red") if is_presented(alarm) else "dim"
     text = Text.assemble((f"{_name(alarm)}  {alarm.severity.name:7}", style), f"  {', '.join(words)}")
     if alarm.severity != Severity.NONE:
         text.append(f"  since {clock(alarm.onset_t_ns)} ({_age(time.time_ns() - alarm.onset_t_ns)})")
@@ -251,7 +251,10 @@ def standing_lines(standing: CurrentAlarm) -> Text:
 def _happened_line(alarm: Alarm) -> Text:
     by = f" by {alarm.operator_name}" if alarm.operator_name else ""
     why = f"  {_probable(alarm.causes)}" if alarm.causes else ""
-    word = Text(f"{alarm.transition.name.replace('_', ' ')}{by}", style=_STYLES[alarm.severity] if alarm.active else "")
+    word = Text(
+        f"{alarm.transition.name.replace('_', ' ')}{by}",
+        style=_STYLES.get(alarm.severity, "bold red") if alarm.active else "",
+    )
     return Text.assemble(
         f"{clock(alarm.t_ns)}  {_name(alarm)}  {alarm.severity.name:7}  ", word, f"{why}  {alarm.message}"
     )

@@ -112,7 +112,7 @@ def _state(view: StageView) -> Text:
 
 def _alarm_line(current: CurrentAlarm) -> Text:
     alarm = current.newest
-    style = _STYLES[alarm.severity] if alarm.active else "green"
+    style = _STYLES.get(alarm.severity, "bold red") if alarm.active else "green"
     text = Text.assemble(
         (f"{clock(alarm.t_ns)}  {alarm.severity.name:7}", style if is_presented(alarm) else "dim"),
         f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(current.words())}",

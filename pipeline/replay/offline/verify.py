@@ -12,12 +12,13 @@ import numpy as np
 from schemas.blocks import cut
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header, decode_together
-from schemas.messages import Alarm, Array, Message, Score, columns
+from schemas.fields import columns
+from schemas.messages import Alarm, Array, Message, Score
 
 NAMED = 5
 """so many differences are told"""
 _TOGETHER = 512
-_OF_A_SAMPLE = tuple(name for name, (shape, _) in columns(Score).items() if shape != "fans" and name != "t_ns")
+_OF_A_SAMPLE = tuple(name for name, column in columns(Score).items() if column.by_sample and name != "t_ns")
 
 
 @dataclass

@@ -13,7 +13,8 @@ import pytest
 from pipeline.cli.watch.demo_report import SETTLING_NS, summarise
 from pipeline.errors import UserError
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Alarm, Grid, Header, Message, Raw, Score, Severity, Transition, columns
+from schemas.fields import columns
+from schemas.messages import Alarm, Grid, Header, Message, Raw, Score, Severity, Transition
 from schemas.topics import tray_key
 
 START_NS = 1_700_000_000_000_000_000
@@ -82,8 +83,8 @@ class Run:
 
 def one_fan(message: type[Message], count: int) -> dict[str, Any]:
     """The columns of samples by fans, all zero."""
-    shapes = columns(message).items()
-    return {name: np.zeros((count, 1), dtype) for name, (shape, dtype) in shapes if shape == "samples x fans"}
+    found = columns(message).items()
+    return {name: np.zeros((count, 1), column.dtype) for name, column in found if column.shape == "samples x fans"}
 
 
 def alarm(number: int, fan: int, active: bool, t_ns: int) -> Alarm:

@@ -6,6 +6,7 @@ import resource
 import sys
 import tracemalloc
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,7 +18,8 @@ import pytest
 from pipeline.recordings import read_arrays
 from pipeline.recordings.tables import PIECE_ROWS, open_table, table_columns
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import MESSAGE_TYPES, Health, ModelCard, Raw
+from schemas.codec import proto_type
+from schemas.messages import MESSAGE_TYPES, FanState, Health, ModelCard, Raw, Statistic
 from tests.pipeline.recordings.test_arrays import alarm, raw, write
 from tests.support.fantwin_command import fantwin, said_instead
 from tests.support.score_data import START_NS, made_up_tray
@@ -129,6 +131,31 @@ def test_events_are_tables_of_their_own(tmp_path, form):
     (row,) = table(tmp_path / f"r.tray1.alarm.{form}").to_dict("records")
     assert (row["t_ns"], row["onset_t_ns"], row["fan"], row["active"]) == (70, 50, 0, True)
     assert (row["severity"], row["message"], row["producer"]) == ("ALARM", "alarm 0", "s")
+    assert (row["transition"], row["statistic"]) == ("RAISED", "SPEED_DRIFT")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_enum_column_is_exported_as_names(tmp_path, form):
+    scores, _ = made_up_tray(seconds=1)
+    statistic = np.arange(scores[0].statistic.size, dtype=np.uint8).reshape(scores[0].statistic.shape) % 8
+    path = write(tmp_path / "r.mcap", [replace(scores[0], statistic=statistic)])
+    fantwin("export", path, "--to", form, "-o", tmp_path / f"scores.{form}")
+    assert table(tmp_path / f"scores.{form}")["statistic"].tolist() == [Statistic(n).name for n in statistic.ravel()]
+    for kind in MESSAGE_TYPES:
+        enums = {f.name for f in proto_type(kind).DESCRIPTOR.fields if f.enum_type}
+        assert {name for name, column in table_columns(kind).items() if column.enum} == enums
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_an_unknown_value_of_a_newer_producer_is_exported_as_its_number(tmp_path, form):
+    (score, *_), _ = made_up_tray(seconds=1)
+    state = score.state.copy()
+    state[1, 2] = 99
+    path = write(tmp_path / "r.mcap", [replace(score, state=state)])
+    fantwin("export", path, "--to", form, "-o", tmp_path / f"scores.{form}")
+    names = table(tmp_path / f"scores.{form}")["state"].tolist()
+    assert names[5] == "99"
+    assert set(names) - {"99"} <= {known.name for known in FanState}
 
 
 def test_there_is_a_table_for_each_topic_and_tray(tmp_path):
@@ -265,8 +292,8 @@ def test_every_topic_has_a_table_of_plain_columns():
     for kind in MESSAGE_TYPES:
         found = table_columns(kind)
         assert next(iter(found)) == ("host_receive_t_ns" if kind is Raw else "t_ns")
-        assert ("fan" in found) == (kind.__name__ not in ("Health", "Clock", "Memory"))
-        assert all(dtype.kind in "iufbO" for dtype in found.values())
+        assert ("fan" in found) == (kind.__name__ not in ("Health", "Clock", "ScorerSnapshot"))
+        assert all(column.dtype.kind in "iufbO" for column in found.values())
     assert not {"inputs", "outputs", "counters"} & set(table_columns(Health))
 
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.recordings import read_arrays
-from pipeline.recordings.arrays import WORDS, Arrays, Block, block_columns, read_topics
+from pipeline.recordings.arrays import Arrays, Block, block_columns, read_topics
 from pipeline.recordings.order import Seen
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.writing import RecordingWriter
@@ -31,6 +31,8 @@ from schemas.messages import (
     Raw,
     Severity,
     StageStatus,
+    Statistic,
+    Transition,
 )
 from schemas.topics import health_key, tray_key
 from tests.support.score_data import made_up_tray
@@ -79,6 +81,8 @@ def alarm(sequence: int) -> Alarm:
         residual_rad_s=3.5,
         limit_rad_s=2.0,
         message=f"alarm {sequence}",
+        transition=Transition.RAISED if sequence == 0 else Transition(88),
+        statistic=Statistic.SPEED_DRIFT,
     )
 
 
@@ -103,7 +107,11 @@ def test_the_columns_are_those_of_the_messages(tmp_path):
     assert block["measured_speed_rad_s"].shape == (200, 3)
     assert set(block["period_ns"]) == {scores[0].period_ns}
     assert set(block["producer"]) == {"test"}
-    assert WORDS["invalid_reason"](block["invalid_reason"][120, 1]) == InvalidReason.GAP
+    assert block["invalid_reason"][120, 1] == InvalidReason.GAP
+    assert block.names("invalid_reason")[120].tolist() == ["NONE", "GAP", "NONE"]
+    assert set(block.names("statistic").ravel()) <= {statistic.name for statistic in Statistic}
+    with pytest.raises(ValueError, match=r"score\.command is no enum"):
+        block.names("command")
     assert np.isnan(block["measured_speed_rad_s"][120, 1])
 
 
@@ -160,7 +168,9 @@ def test_an_event_is_a_row(tmp_path):
     assert alarms["fan"].tolist() == [0, 1]
     assert alarms["active"].tolist() == [True, False]
     assert alarms["message"].tolist() == ["alarm 0", "alarm 1"]
-    assert [WORDS["severity"](code).name for code in alarms["severity"]] == ["ALARM", "ALARM"]
+    assert alarms.names("severity").tolist() == ["ALARM", "ALARM"]
+    assert alarms.names("transition").tolist() == ["RAISED", "88"]
+    assert alarms.names("statistic").tolist() == ["SPEED_DRIFT", "SPEED_DRIFT"]
     (commands,) = read_arrays(path, "command")
     np.testing.assert_array_equal(commands["command"], [[1, nan]])
     assert commands["set_point_rad_s"].size == 0

@@ -14,7 +14,8 @@ from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.live.recording_playback import Extent, RecordingPlayback, shifted
 from schemas.envelope import Envelope
-from schemas.messages import MESSAGE_TYPES, Alarm, Grid, Header, InvalidReason, ModelCard, Severity, columns
+from schemas.fields import columns
+from schemas.messages import MESSAGE_TYPES, Alarm, Grid, Header, InvalidReason, ModelCard, Severity
 from schemas.topics import tray_key
 from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from tests.support.replay_data import START_NS, STEP_NS, raw_of, write_raw

@@ -208,6 +208,10 @@ def test_the_time_of_what_is_no_shelving_does_not_matter(duration_ns):
     assert asked(at_once(), Action.SUPPRESS, now_t_ns=5, duration_ns=duration_ns) == granted
 
 
+def test_an_unknown_action_of_a_newer_client_is_refused():
+    assert asked(at_once(), Action(99)) == (Transition.REFUSED, "there is no such action: 99")
+
+
 def test_every_fan_asked_about_gets_exactly_one_answer():
     conditions = conditions_of(fans=2)
     answers = conditions.request(Action.SUPPRESS, [1, 0, 2, -3], 0)
