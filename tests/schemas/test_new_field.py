@@ -128,7 +128,7 @@ def test_a_new_field_is_joined_and_cut_with_the_others(toy):
 def test_a_new_field_is_exported_with_its_words(tmp_path: Path, toy, form):
     path = tmp_path / "r.mcap"
     with RecordingWriter(path, {"site": "plant"}) as writer:
-        writer.write_message(tray_key("plant", "tray1", "score"), toy, 1)
+        writer.add_message(tray_key("plant", "tray1", "score"), toy, 1)
     (block,) = read_arrays(path, "score")
     assert same(block["bearing"], toy.bearing)
     table = tmp_path / f"scores.{form}"
