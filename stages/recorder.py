@@ -183,6 +183,11 @@ class Recorder(Core):
         self._held.clear()
         return ()
 
+    def abort(self) -> None:
+        """Finish the file after a crash; it does not say that the recorder ended in order."""
+        if self._part:
+            self._attempt(self._end_part)
+
     def counters(self) -> Mapping[str, int]:
         """How many messages of each topic are in files for good, how many were lost because they could not be written,
         and what became of parts."""

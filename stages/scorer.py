@@ -349,7 +349,7 @@ class ScorerCore(Core):
             state_json=json.dumps(state, allow_nan=False),
         )
         if self._snapshot_store:
-            self._snapshot_store.keep(snapshot)
+            self._snapshot_store.save(snapshot)
         return [snapshot]
 
 

@@ -150,6 +150,10 @@ class ViewerCore(Core):
         self._sink.close()
         return ()
 
+    def abort(self) -> None:
+        """Finish the file after a crash."""
+        self._sink.close()
+
     def counters(self) -> Mapping[str, int]:
         """Samples drawn; scores of another number of fans, and messages of another tray, than the configuration's."""
         return {"samples_drawn": self._samples_drawn, "wrong_fan_count": 0, **self._counts}

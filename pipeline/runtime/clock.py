@@ -1,8 +1,8 @@
-"""What time it is for a stage: the host's, or that of a replay for as long as one is there.
+"""The time a stage goes by: the host's, or the replay's while a recording is replayed.
 
-A stage that makes data of data goes by the time of the data. While a recording is replayed, slowly, paused or faster
-than time, the line must not look silent because the replay is; so its ticks bear the time the replay has come to.
-Stages with a device of their own, and those that serve all trays at once (people, disks), stay with the host's time.
+Stages with an input use the time of their samples; only sources use the host clock. While a recording is replayed,
+slowly, paused or faster than real time, a tray must not look silent because of the replay's pace. So ticks carry the
+time that the replay has reached. Stages with a source, and stages that serve all trays at once, keep the host's time.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from collections.abc import Callable
 from schemas.messages import Clock
 
 REPLAY = "replay"
-"""name of the replayer, as that of a stage, in its health, its liveliness token and its session ids"""
+"""name of the replayer, used like a stage name in health, liveliness token and producer"""
 
 
 def is_of_replay(producer: str) -> bool:
-    """Whether a message comes from a recording, and not from a fan of today."""
+    """Whether a message comes from a recording and not from a live fan."""
     return producer.startswith(f"{REPLAY}-")
 
 
@@ -27,29 +27,29 @@ class StageClock:
 
     def __init__(self, host_ns: Callable[[], int] = time.time_ns) -> None:
         self._host_ns = host_ns
-        self._told: dict[str, tuple[Clock, int]] = {}
-        """of each tray: what the replay said last, and when that was received, in the host's time"""
+        self._replay: dict[str, tuple[Clock, int]] = {}
+        """by tray: the last clock message of a replay, and the host time at which it was received"""
 
-    def note(self, clock: Clock, received_t_ns: int) -> None:
-        """A replay has said what it has come to: from now on its time is in force for that tray."""
-        self._told[clock.header.tray] = (clock, received_t_ns)
+    def update(self, clock: Clock, received_t_ns: int) -> None:
+        """A replay has published its time: from now on it applies to that tray."""
+        self._replay[clock.header.tray] = (clock, received_t_ns)
 
-    def forget(self) -> None:
-        """The replay has left: the host's time is in force again."""
-        self._told.clear()
+    def clear(self) -> None:
+        """The replay has left: the host's time applies again."""
+        self._replay.clear()
 
     def tick_ns(self, tray: str) -> int:
-        """The time for `tick`: exactly what the replay said last, never beyond it."""
-        told = self._told.get(tray)
-        return told[0].t_ns if told else self._host_ns()
+        """The time for `tick`: exactly the last time of the replay, never beyond it; otherwise the host's."""
+        last = self._replay.get(tray)
+        return last[0].t_ns if last else self._host_ns()
 
     def now_ns(self, tray: str) -> int | None:
-        """The time against which the age of a sample is told; None in a replay that stands still, or goes as fast as it
-        can: there an age says nothing."""
-        told = self._told.get(tray)
-        if told is None:
+        """The time against which the age of a sample is measured. None in a replay that is paused or runs as fast as it
+        can: an age has no meaning there."""
+        last = self._replay.get(tray)
+        if last is None:
             return self._host_ns()
-        clock, since_ns = told
+        clock, received_ns = last
         if clock.rate == 0.0 or math.isinf(clock.rate):
             return None
-        return clock.t_ns + round((self._host_ns() - since_ns) * clock.rate)
+        return clock.t_ns + round((self._host_ns() - received_ns) * clock.rate)

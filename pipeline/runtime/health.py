@@ -1,4 +1,4 @@
-"""A stage's account of itself: built by the runner, published once a second and once more at the end."""
+"""Health messages: built by the runner, published once a second and once more at the end."""
 
 from __future__ import annotations
 
@@ -10,27 +10,28 @@ import numpy as np
 
 from schemas.messages import Counter, Health, Input, Message, Output, StageStatus, newest_t_ns
 from schemas.streams import stage_losses
+from schemas.units import NS_PER_S
 
-_LATENCIES_KEPT = 2000
+_MAX_LATENCIES = 2000
 
 
-class HealthBook:
-    """Collects what a stage counts and makes `Health` messages of it."""
+class HealthBuilder:
+    """Collects the latencies of a stage's outputs and builds its `Health` messages."""
 
     def __init__(self, stage: str, instance: str, started_t_ns: int, *, may_drop: bool) -> None:
         self._stage = stage
         self._instance = instance
         self._started_t_ns = started_t_ns
         self._may_drop = may_drop
-        self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES_KEPT)
+        self._latencies_ms: deque[float] = deque(maxlen=_MAX_LATENCIES)
 
-    def note_output(self, message: Message, now_ns: int) -> None:
-        """Remember how old the newest sample of an output was when it was sent."""
+    def add_output(self, message: Message, now_ns: int) -> None:
+        """Add the latency of an output: the age of its newest sample when it was published."""
         t_ns = newest_t_ns(message)
         if t_ns:
             self._latencies_ms.append((now_ns - t_ns) / 1e6)
 
-    def make(
+    def build(
         self,
         *,
         status: StageStatus,
@@ -40,7 +41,7 @@ class HealthBook:
         counters: Mapping[str, int],
         now_ns: int,
     ) -> Health:
-        """The health message of this moment."""
+        """The health message as of now."""
         problem = "; ".join(filter(None, problems))
         if problem and status == StageStatus.OK:
             status = StageStatus.DEGRADED
@@ -50,7 +51,7 @@ class HealthBook:
             instance=self._instance,
             status=status,
             t_ns=now_ns,
-            uptime_s=(now_ns - self._started_t_ns) / 1e9,
+            uptime_s=(now_ns - self._started_t_ns) / NS_PER_S,
             problem=problem,
             inputs=inputs,
             outputs=tuple(outputs),

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM set an event; a second one ends at once."""
+"""Ctrl-C and SIGTERM request an orderly stop; a second one ends the process at once."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from types import FrameType
 
 
 def stop_on_signals(stop: threading.Event) -> None:
-    """Let SIGINT and SIGTERM ask for an orderly end; whoever asks twice means it."""
+    """Set `stop` on the first SIGINT or SIGTERM; exit on the second."""
 
-    def ask(number: int, _frame: FrameType | None) -> None:
+    def on_signal(number: int, _frame: FrameType | None) -> None:
         if stop.is_set():
             sys.exit(128 + number)
         stop.set()
 
-    signal.signal(signal.SIGINT, ask)
-    signal.signal(signal.SIGTERM, ask)
+    signal.signal(signal.SIGINT, on_signal)
+    signal.signal(signal.SIGTERM, on_signal)

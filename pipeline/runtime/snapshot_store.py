@@ -1,4 +1,4 @@
-"""Where a stage keeps what it must not forget: one small file, replaced as a whole."""
+"""Where a stage keeps the state that survives a restart: one small file, replaced as a whole."""
 
 from __future__ import annotations
 
@@ -9,46 +9,54 @@ from pipeline.runtime.stage import StageError
 from schemas.codec import CodecError, decode, encode
 from schemas.messages import ScorerSnapshot
 
+FORMER_SUFFIX = ".memory"
+"""what earlier versions called the file: a site that is upgraded must not forget its baselines and alarms"""
+
 
 class SnapshotStore:
-    """One file. A kill at any moment leaves the old one or the new one, never half of either."""
+    """One file. A kill at any moment leaves the old file or the new one, never a part of either.
+
+    Where only a file with the former suffix exists, that one is loaded. Saving always writes the new one.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.problem = ""
-        """one line, while the last note could not be written"""
+        """one line, while the last snapshot could not be saved"""
 
     def load(self) -> ScorerSnapshot | None:
-        """What was kept last; None when there is nothing.
+        """The last snapshot; None when there is none.
 
         Raises:
-            StageError: there is something, and it cannot be read.
+            StageError: there is one, and it cannot be read.
         """
+        former = self.path.with_suffix(FORMER_SUFFIX)
+        path = former if former.exists() and not self.path.exists() else self.path
         try:
-            message = decode(ScorerSnapshot, self.path.read_bytes())
+            message = decode(ScorerSnapshot, path.read_bytes())
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise StageError(f"{self.path}: cannot read what the scorer knew: {error.strerror}") from error
+            raise StageError(f"{path}: cannot read the scorer's snapshot: {error.strerror}") from error
         except CodecError as error:
             raise StageError(
-                f"{self.path}: not what a scorer kept ({error}); remove it to begin anew: fans are commissioned again"
+                f"{path}: not a scorer's snapshot ({error}); remove it to start without: fans are commissioned again"
             ) from error
         assert isinstance(message, ScorerSnapshot)
         return message
 
-    def keep(self, snapshot: ScorerSnapshot) -> None:
-        """Replace what is kept. A full disk is told and does not stop the scorer."""
+    def save(self, snapshot: ScorerSnapshot) -> None:
+        """Replace the snapshot. A full disk is reported in `problem` and does not stop the scorer."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            beside = self.path.with_suffix(".new")
-            with beside.open("wb") as file:
+            temporary = self.path.with_suffix(".new")
+            with temporary.open("wb") as file:
                 file.write(encode(snapshot))
                 file.flush()
                 os.fsync(file.fileno())
-            beside.replace(self.path)
+            temporary.replace(self.path)
             self.problem = ""
         except OSError as error:
             self.problem = (
-                f"{self.path}: cannot keep baselines and alarms: {error.strerror}; a restart would forget them"
+                f"{self.path}: cannot save baselines and alarms: {error.strerror}; a restart would forget them"
             )

@@ -17,6 +17,7 @@ from schemas.fields import columns
 from schemas.messages import Action, Alarm, FanState, Header, Prediction, Score, ScorerSnapshot, Transition
 from scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
 from scoring.alarms.current_alarms import CurrentAlarm, current_alarms
+from scoring.fan_scorer import FanScorer
 from stages.scorer import ScorerCore
 from tests.stages.test_scorer import eventful_prediction
 from tests.support.scored_blocks import LIVELY, commissioned, core_of, feed, note_of, prediction_of, request_of
@@ -97,6 +98,29 @@ def test_after_a_kill_what_producers_still_keep_is_made_up_for(tmp_path: Path) -
     assert bits(scores, kept.t_ns + 1) == bits([s for s in unbroken if s.t_ns[-1] > kept.t_ns], kept.t_ns + 1)
 
 
+def test_a_block_on_which_the_scorer_crashed_is_judged_after_the_restart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks = [cut(eventful_prediction(3, 300, 0.0), k, k + 10) for k in range(0, 300, 10)]
+    store = SnapshotStore(tmp_path / "scorer.snapshot")
+    crashed = core_of(3, calibration=LIVELY, baseline_s=0.1, on_delay_s=0.03, snapshot_store=store)
+
+    def crash(*_: Any) -> None:
+        raise ZeroDivisionError
+
+    with np.errstate(all="ignore"):
+        feed(crashed, blocks[:-1])
+        store.save(note_of(crashed))
+        with monkeypatch.context() as patch:
+            patch.setattr(FanScorer, "update", crash)
+            with pytest.raises(ZeroDivisionError):
+                crashed.step(blocks[-1])
+        crashed.abort()
+        successor = core_of(3, calibration=LIVELY, baseline_s=0.1, on_delay_s=0.03, snapshot_store=store)
+        scores, _ = feed(successor, blocks[-1:])
+    assert [score.t_ns.tolist() for score in scores] == [blocks[-1].t_ns.tolist()]
+
+
 def test_every_alarm_and_answer_is_noted_before_it_is_told(tmp_path: Path) -> None:
     snapshot_store = SnapshotStore(tmp_path / "m")
     scorer = commissioned(core_of(snapshot_store=snapshot_store))
@@ -152,7 +176,7 @@ def test_a_restarted_scorer_tells_again_what_stands_and_who_acknowledged_it() ->
 
 def test_a_successor_tells_of_it_at_once_and_once(tmp_path: Path) -> None:
     snapshot_store = SnapshotStore(tmp_path / "m")
-    snapshot_store.keep(note_of(raised()))
+    snapshot_store.save(note_of(raised()))
     successor = core_of(3, snapshot_store=snapshot_store)
     assert [type(message) for message in successor.tick(0)] == [ScorerSnapshot, Alarm, Alarm]
     assert [*successor.tick(0), *successor.step(prediction_of(np.zeros((1, 3)), first=100))][0].__class__ is Score
@@ -345,4 +369,4 @@ def test_a_full_disk_is_told_and_stops_nothing(tmp_path: Path) -> None:
     commissioned(scorer)
     scores, _ = feed(scorer, [prediction_of(np.zeros(10))])
     assert len(scores) == 1
-    assert "cannot keep baselines and alarms" in scorer.problem()
+    assert "cannot save baselines and alarms" in scorer.problem()

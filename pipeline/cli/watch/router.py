@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.bus.session import open_router
+from pipeline.bus.router import open_router
 from pipeline.cli.options import JsonOption
 from pipeline.runtime.signals import stop_on_signals
 

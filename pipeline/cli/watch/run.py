@@ -47,7 +47,7 @@ def run(
         typer.echo(error, err=True)  # for the launcher, which then gives up instead of starting it again
         raise typer.Exit(EXIT_CANNOT_START) from error
     if until_stdin_closes:
-        threading.Thread(target=_set_when_stdin_closes, args=(runner.orphaned,), daemon=True).start()
+        threading.Thread(target=_set_when_stdin_closes, args=(runner.launcher_gone,), daemon=True).start()
     last = runner.run()
     if json_output:
         typer.echo(
@@ -58,8 +58,8 @@ def run(
         raise typer.Exit(3)
 
 
-def _set_when_stdin_closes(orphaned: threading.Event) -> None:
+def _set_when_stdin_closes(launcher_gone: threading.Event) -> None:
     """The launcher holds our standard input open for as long as it lives."""
     while os.read(sys.stdin.fileno(), 1024):  # not sys.stdin.read(): its lock would be held at the interpreter's end
         pass
-    orphaned.set()
+    launcher_gone.set()

@@ -8,10 +8,11 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
-from pipeline.bus.session import Bus, Publisher
+from pipeline.bus.publisher import Publisher
+from pipeline.bus.session import Bus
 from pipeline.errors import UserError
 from pipeline.runtime.clock import REPLAY
-from pipeline.runtime.health import HealthBook
+from pipeline.runtime.health import HealthBuilder
 from schemas.codec import encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Message, Output, StageStatus
@@ -31,7 +32,7 @@ class Sender:
         self._publishers: dict[str, Publisher] = {}
         self._clocks = {tray: self._publisher(tray_key(site, tray, "clock"), "clock") for tray in trays}
         self._health = self._publisher(health_key(site, REPLAY, "all"), "health")
-        self._book = HealthBook(REPLAY, "all", time.time_ns(), may_drop=False)
+        self._builder = HealthBuilder(REPLAY, "all", time.time_ns(), may_drop=False)
         self.tell_health(StageStatus.STARTING)
         bus.declare_alive(alive_key(site, REPLAY, "all"))
 
@@ -57,7 +58,7 @@ class Sender:
 
     def tell_health(self, status: StageStatus = StageStatus.OK, problem: str = "") -> None:
         """Say how it is and how much has been sent, so that whoever missed the last messages asks for them."""
-        health = self._book.make(
+        health = self._builder.build(
             status=status,
             problems=[problem],
             inputs=(),

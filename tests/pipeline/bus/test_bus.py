@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.bus.session import KEPT_BYTES, Bus, BusError
+from pipeline.bus.errors import BusError
+from pipeline.bus.publisher import KEPT_BYTES
+from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from schemas.topics import alive_key
 from tests.support.bus_peer import KEY, TOPIC

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.bus.session import Bus, BusError
+from pipeline.bus.errors import BusError
+from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from schemas.topics import BY_NAME, tray_key
 from tests.support.running_chain import DEMO, Running, eventually, fantwin

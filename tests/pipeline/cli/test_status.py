@@ -16,7 +16,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from pipeline.bus.session import Bus, Publisher
+from pipeline.bus.publisher import Publisher
+from pipeline.bus.session import Bus
 from pipeline.cli.watch.status import as_json, stage_table
 from pipeline.config.loading import load_config
 from pipeline.config.models import BusConfig

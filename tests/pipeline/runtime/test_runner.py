@@ -6,7 +6,7 @@ import queue
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -14,8 +14,9 @@ import pytest
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig, Config, LauncherConfig, TrayConfig
 from pipeline.launch.loss_accounting import losses
-from pipeline.runtime.runner import INBOX_SIZE, Runner
-from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig
+from pipeline.runtime.inbox import INBOX_SIZE
+from pipeline.runtime.runner import Runner
+from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from schemas.codec import decode, encode, type_name
 from schemas.messages import Command, Grid, Header, Health, InputPosition, Message, Output, Raw, StageStatus
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
@@ -29,7 +30,7 @@ class ToyConfig(StageConfig):
 
 
 class Passer(Core):
-    """Makes a Grid of every Raw; at the end one more, so that a test sees `close` was called."""
+    """Returns a Grid for each Raw, and one more at the end, so that a test sees that `close` was called."""
 
     def __init__(self) -> None:
         self.fans = 0
@@ -54,15 +55,15 @@ class Passer(Core):
         return Grid(fans=self.fans, period_ns=1, t_ns=t_ns, command=column, speed_rad_s=column, **states)
 
 
-class Deaf(Passer):
-    """Makes nothing of anything."""
+class Silent(Passer):
+    """Returns nothing."""
 
     def step(self, item: Any) -> Sequence[Message]:
         return []
 
 
 class Burst:
-    """A source that delivers its items when it is told to stop: the hardest moment."""
+    """A source that delivers its items while it is being stopped: the hardest moment."""
 
     def __init__(self, items: Sequence[Any]) -> None:
         self.items = items
@@ -164,7 +165,7 @@ def test_outputs_are_stamped_with_producer_sequence_and_tray(config):
     assert first.t_ns.tolist() == [10]
 
 
-def test_an_output_says_what_had_been_taken_when_it_was_made(config):
+def test_an_output_carries_the_position_of_its_main_input(config):
     bench = Bench(toy(), config)
     for t_ns in (10, 11):
         bench.feed(TRAY_A, t_ns)
@@ -178,7 +179,7 @@ def test_an_output_says_what_had_been_taken_when_it_was_made(config):
     ]
 
 
-def test_what_is_made_because_time_has_passed_says_so(config):
+def test_an_output_made_because_time_passed_says_so(config):
     class Waits(Core):
         def __init__(self) -> None:
             self.held: list[Grid] = []
@@ -213,7 +214,7 @@ def send_once(bus: Bus, producer: str, t_ns: int) -> None:
     publisher.put(encode(Command(header=Header(producer, 0, TRAY_A), fans=1, t_ns=t_ns)))
 
 
-def test_a_side_input_becomes_no_cause_and_does_not_count_as_taken(config):
+def test_a_side_input_does_not_advance_the_input_position(config):
     bench = Bench(toy(lambda _context: Parts(Answers()), reads=("raw", "command")), config)
     send_once(bench.bus, "operator", 5)
     bench.feed(TRAY_A, 10)
@@ -231,7 +232,7 @@ def test_a_side_input_becomes_no_cause_and_does_not_count_as_taken(config):
     ]
 
 
-def test_a_producer_that_says_one_thing_and_leaves_is_heard_and_no_loss(config):
+def test_a_producer_that_publishes_one_message_and_leaves_causes_no_loss(config):
     class Careful(Answers):
         def counters(self):
             return {}
@@ -276,7 +277,7 @@ def test_health_accounts_for_inputs_outputs_counters_and_losses(config):
     assert {output.key: output.published for output in health.outputs}[tray_key("s", TRAY_A, "grid")] == 6
 
 
-def test_bytes_that_are_no_message_are_counted_and_harm_nothing(config):
+def test_undecodable_bytes_are_counted_and_the_stage_goes_on(config):
     bench = Bench(toy(), config)
     bench.publisher[TRAY_A]._publisher.put(b"\xff\xff\xff")
     bench.feed(TRAY_A, 1)
@@ -284,7 +285,7 @@ def test_bytes_that_are_no_message_are_counted_and_harm_nothing(config):
     assert {c.name: c.value for c in bench.end().counters}["lost_undecodable"] == 1
 
 
-def test_what_a_source_still_delivers_when_told_to_stop_is_handled_before_the_end(config):
+def test_items_a_source_delivers_while_stopping_are_processed_before_the_end(config):
     items = [raw(t_ns) for t_ns in range(50)]
     stage = toy(lambda _context: Parts(Passer(), Burst(items)), name="acquisition")
     bench = Bench(stage, config, TRAY_A)
@@ -305,8 +306,8 @@ def test_messages_of_trays_that_are_not_configured_are_not_read(config):
     assert last.inputs == ()
 
 
-def test_a_stage_that_may_drop_asks_again_for_what_is_said_once(config):
-    stage = toy(lambda _context: Parts(Deaf()), reads=("command", "raw"), may_drop=True)
+def test_a_stage_that_may_drop_recovers_messages_published_on_change(config):
+    stage = toy(lambda _context: Parts(Silent()), reads=("command", "raw"), may_drop=True)
     bench = Bench(stage, config)
     for topic, kind in (("command", Command), ("raw", Raw)):
         publisher = bench.bus.publisher(tray_key("s", TRAY_A, topic), BY_NAME[topic], type_name(kind), "x")
@@ -323,7 +324,7 @@ def test_a_stage_that_may_drop_asks_again_for_what_is_said_once(config):
     assert {line.key.split("/")[-1]: line.received for line in inputs} == {"command": 2, "raw": 1}
 
 
-def test_a_stage_that_may_drop_throws_its_oldest_away_and_counts(config):
+def test_a_stage_that_may_drop_discards_its_oldest_items_and_counts_them(config):
     release, newest = threading.Event(), threading.Event()
     taken: list[int] = []
     count = 6000
@@ -372,7 +373,7 @@ def test_a_stage_stops_while_its_producer_goes_on(config):
     assert stopped
 
 
-def test_a_stage_that_crashes_says_so_and_not_that_it_stopped_in_order(config):
+def test_the_last_health_of_a_stage_that_crashed_says_why(config):
     class Broken(Passer):
         def step(self, item: Any) -> Sequence[Message]:
             raise ZeroDivisionError("on purpose")
@@ -385,6 +386,134 @@ def test_a_stage_that_crashes_says_so_and_not_that_it_stopped_in_order(config):
     assert bench.crashes
     assert last.status == StageStatus.DEGRADED
     assert "ZeroDivisionError: on purpose" in last.problem
+
+
+class CrashesOnce(Passer):
+    """Like a scorer: it keeps a snapshot (in `saved`) that `close` updates. Crashes on the sample `crash_t_ns`."""
+
+    saved: ClassVar[dict[str, int]] = {}
+
+    def __init__(self, tray: str, crash_t_ns: int) -> None:
+        super().__init__()
+        self.tray, self.crash_t_ns = tray, crash_t_ns
+        self.last_t_ns = self.saved.get(tray, 0)
+        self.aborted = False
+
+    def step(self, item: Any) -> Sequence[Message]:
+        t_ns = int(item.host_receive_t_ns[0])
+        if t_ns <= self.last_t_ns:
+            return []
+        self.last_t_ns = t_ns  # the state advances before all of it is processed
+        if t_ns == self.crash_t_ns:
+            raise ZeroDivisionError("on purpose")
+        return super().step(item)
+
+    def close(self) -> Sequence[Message]:
+        self.saved[self.tray] = self.last_t_ns
+        return super().close()
+
+    def abort(self) -> None:
+        self.aborted = True
+
+
+def test_a_core_that_crashed_saves_and_publishes_nothing_and_its_successor_takes_the_message_again(config):
+    CrashesOnce.saved.clear()
+    cores: dict[str, CrashesOnce] = {}
+
+    def build(context: Context, crash_t_ns: int = 2) -> Parts:
+        cores[context.tray.name] = CrashesOnce(context.tray.name, crash_t_ns)
+        return Parts(cores[context.tray.name])
+
+    bench = Bench(toy(build), config)
+    bench.feed(TRAY_B, 1)
+    bench.feed(TRAY_A, 1)
+    bench.feed(TRAY_A, 2)
+    crash = bench.health_with(lambda health: "crashed" in health.problem)
+    bench.thread.join(20)
+    crashed, saved = cores[TRAY_A], dict(CrashesOnce.saved)
+    stop = threading.Event()
+    successor = Runner(toy(lambda context: build(context, crash_t_ns=-1)), config, None, stop)
+    stop.set()
+    last = successor.run()  # it catches up before it looks at `stop`
+    bench.bus.close()
+    assert crashed.aborted
+    assert saved == {TRAY_B: 1}, "only the core of the other tray was closed"
+    assert {output.key.split("/")[2]: output.published for output in crash.outputs} == {TRAY_A: 1, TRAY_B: 2}
+    assert CrashesOnce.saved == {TRAY_A: 2, TRAY_B: 1}
+    assert {output.key.split("/")[2]: output.published for output in last.outputs} == {TRAY_A: 3, TRAY_B: 0}
+
+
+class OfAllTrays(Core):
+    """One core for all trays that publishes from `step`, `tick` and `close`."""
+
+    def __init__(self, tray: str = TRAY_B) -> None:
+        self.header = Header("", 0, tray)
+        self.seen = 0
+        self.due: list[Grid] = []
+
+    def grid(self, t_ns: int) -> Grid:
+        passer = Passer()
+        passer.fans = 1
+        return replace(passer.grid([t_ns]), header=self.header)
+
+    def step(self, item: Any) -> Sequence[Message]:
+        self.due.append(self.grid(200))
+        return [replace(self.grid(100), header=Header("", 0, ""))]
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        due, self.due = self.due, []
+        return due
+
+    def close(self) -> Sequence[Message]:
+        return [self.grid(300)]
+
+
+def test_a_core_of_all_trays_publishes_from_tick_and_close_for_the_tray_in_the_header(config):
+    bench = Bench(toy(lambda _context: Parts(OfAllTrays()), core_per_tray=False), config)
+    bench.feed(TRAY_A, 1)
+    grids = [bench.next(Grid), bench.next(Grid)]
+    bench.stop.set()
+    grids.append(bench.next(Grid))
+    bench.end()
+    assert [(grid.header.tray, grid.t_ns.tolist()) for grid in grids] == [
+        (TRAY_A, [100]),
+        (TRAY_B, [200]),
+        (TRAY_B, [300]),
+    ]
+
+
+def test_an_output_without_a_tray_is_refused_in_one_line(config):
+    stop = threading.Event()
+    stop.set()
+    runner = Runner(toy(lambda _context: Parts(OfAllTrays("")), core_per_tray=False), config, None, stop)
+    with pytest.raises(StageError, match="'resampler' serves all trays and returned a grid without one: set header"):
+        runner.run()
+
+
+def test_an_output_that_is_not_declared_is_refused_in_one_line(config):
+    stop = threading.Event()
+    stop.set()
+    runner = Runner(toy(lambda _context: Parts(OfAllTrays()), core_per_tray=False, writes=()), config, None, stop)
+    with pytest.raises(StageError, match="message of topic 'grid': add it to `writes` of its declaration"):
+        runner.run()
+
+
+@pytest.mark.parametrize("declared", [{"reads": ("rwa",)}, {"writes": ("gird",)}])
+def test_a_stage_with_an_unknown_topic_is_refused_when_it_is_declared(declared):
+    with pytest.raises(ValueError, match="stage 'resampler': no such topic: (rwa|gird); known: raw, grid"):
+        toy(**declared)
+
+
+def test_sources_in_one_process_for_all_trays_feed_each_the_core_of_its_tray(config):
+    def build(context: Context) -> Parts:
+        return Parts(Passer(), Burst([raw(1 if context.tray.name == TRAY_A else 2)]))
+
+    bench = Bench(toy(build, reads=()), config)
+    bench.end()
+    grids = []
+    while not bench.heard.empty():
+        grids += [(m.header.tray, m.t_ns.tolist()) for _, m in [bench.heard.get()] if isinstance(m, Grid)]
+    assert sorted(grids) == [(TRAY_A, [-1]), (TRAY_A, [1]), (TRAY_B, [-1]), (TRAY_B, [2])]
 
 
 def test_a_stage_that_crashes_with_a_full_inbox_leaves_the_bus_at_once(config):
@@ -405,7 +534,7 @@ def test_a_stage_that_crashes_with_a_full_inbox_leaves_the_bus_at_once(config):
     assert str(bench.crashes[0]) == "on purpose"  # and not that the bus could not be closed
 
 
-def test_an_orphaned_stage_goes_on_until_those_it_reads_from_have_ended(config):
+def test_a_stage_whose_launcher_has_gone_runs_until_its_producers_have_ended(config):
     bench = Bench(toy(), config)
     with Bus(config.bus) as feeder:
         key, stage = health_key("s", "acquisition", TRAY_A), ("acquisition", TRAY_A)
@@ -420,10 +549,10 @@ def test_an_orphaned_stage_goes_on_until_those_it_reads_from_have_ended(config):
         )
         feeder.declare_alive(alive_key("s", *stage))
         publisher = feeder.publisher(key, BY_NAME["health"], type_name(Health), "feeder")
-        while not any(map(bench.runner._is_fed_by, set(bench.runner._alive))):  # until they have met
+        while not bench.runner._peers.has_producer():  # until they have discovered each other
             publisher.put(encode(health))
             bench.next(Health)
-        bench.runner.orphaned.set()
+        bench.runner.launcher_gone.set()
         last = None
         for _ in range(3):  # seconds in which it could have ended
             last = bench.health_with(lambda h: h.stage == "resampler")

@@ -1,5 +1,4 @@
-"""pipeline.runtime.snapshot_store: what is kept is whole whatever happens, and what cannot be read is told in one
-line."""
+"""The snapshot store: the file is whole whatever happens, and one that cannot be read is one line."""
 
 from __future__ import annotations
 
@@ -18,25 +17,27 @@ def snapshot(number: int) -> ScorerSnapshot:
     return ScorerSnapshot(t_ns=number, twin_sha256="twin", state_json="{}" * number)
 
 
-def kept(path: Path) -> int:
+def saved(path: Path) -> int:
     found = SnapshotStore(path).load()
     assert found
     return found.t_ns
 
 
-def test_what_was_kept_last_is_found_again(tmp_path: Path) -> None:
+def test_the_last_snapshot_is_loaded_again(tmp_path: Path) -> None:
     file = SnapshotStore(tmp_path / "not there yet" / "scorer-tray1.snapshot")
     assert file.load() is None
     for number in (1, 2, 3):
-        file.keep(snapshot(number))
-    assert kept(file.path) == 3
+        file.save(snapshot(number))
+    assert saved(file.path) == 3
     assert [path.name for path in file.path.parent.iterdir()] == ["scorer-tray1.snapshot"]
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_a_kill_at_any_step_leaves_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+def test_a_kill_at_any_step_leaves_the_previous_snapshot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
     file = SnapshotStore(tmp_path / "m.snapshot")
-    file.keep(snapshot(1))
+    file.save(snapshot(1))
 
     def killed(*_: object) -> None:
         raise SystemExit
@@ -47,54 +48,62 @@ def test_a_kill_at_any_step_leaves_the_one_before(tmp_path: Path, monkeypatch: p
         else:
             patch.setattr(Path, "replace", killed)
         with pytest.raises(SystemExit):
-            file.keep(snapshot(2))
-    assert kept(file.path) == 1
-    file.keep(snapshot(3))
-    assert kept(file.path) == 3
+            file.save(snapshot(2))
+    assert saved(file.path) == 1
+    file.save(snapshot(3))
+    assert saved(file.path) == 3
 
 
-def test_a_full_disk_is_told_until_there_is_room_and_leaves_the_one_before(
+def test_a_full_disk_is_reported_until_there_is_room_and_leaves_the_previous_snapshot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = SnapshotStore(tmp_path / "m.snapshot")
-    file.keep(snapshot(1))
+    file.save(snapshot(1))
 
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        file.keep(snapshot(2))
-    assert file.problem.startswith(f"{file.path}: cannot keep baselines and alarms: No space left on device")
-    assert kept(file.path) == 1
-    file.keep(snapshot(3))
-    assert (file.problem, kept(file.path)) == ("", 3)
+        file.save(snapshot(2))
+    assert file.problem.startswith(f"{file.path}: cannot save baselines and alarms: No space left on device")
+    assert saved(file.path) == 1
+    file.save(snapshot(3))
+    assert (file.problem, saved(file.path)) == ("", 3)
 
 
-def test_two_trays_keep_theirs_apart(tmp_path: Path) -> None:
+def test_two_trays_have_separate_snapshots(tmp_path: Path) -> None:
     for name, number in (("scorer-a.1.snapshot", 1), ("scorer-a.2.snapshot", 2)):
-        SnapshotStore(tmp_path / name).keep(snapshot(number))
-    assert (kept(tmp_path / "scorer-a.1.snapshot"), kept(tmp_path / "scorer-a.2.snapshot")) == (1, 2)
+        SnapshotStore(tmp_path / name).save(snapshot(number))
+    assert (saved(tmp_path / "scorer-a.1.snapshot"), saved(tmp_path / "scorer-a.2.snapshot")) == (1, 2)
 
 
-def test_what_is_no_memory_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_file_that_is_no_snapshot_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "m.snapshot"
     path.write_bytes(b"\xff\xffgarbage")
     with pytest.raises(StageError) as refused:
         SnapshotStore(path).load()
-    assert str(refused.value).startswith(f"{path}: not what a scorer kept")
-    assert "remove it to begin anew" in str(refused.value) and "\n" not in str(refused.value)
+    assert str(refused.value).startswith(f"{path}: not a scorer's snapshot")
+    assert "remove it to start without" in str(refused.value) and "\n" not in str(refused.value)
 
 
-def test_a_half_of_one_is_told(tmp_path: Path) -> None:
+def test_half_a_snapshot_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "m.snapshot"
-    SnapshotStore(path).keep(snapshot(100))
+    SnapshotStore(path).save(snapshot(100))
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(StageError, match="remove it to begin anew"):
+    with pytest.raises(StageError, match="remove it to start without"):
         SnapshotStore(path).load()
 
 
-def test_what_cannot_be_read_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(StageError) as refused:
         SnapshotStore(tmp_path).load()
-    assert str(refused.value) == f"{tmp_path}: cannot read what the scorer knew: Is a directory"
+    assert str(refused.value) == f"{tmp_path}: cannot read the scorer's snapshot: Is a directory"
+
+
+def test_a_snapshot_under_the_name_of_earlier_versions_is_loaded_until_there_is_a_newer_one(tmp_path: Path) -> None:
+    store = SnapshotStore(tmp_path / "scorer-tray.1.snapshot")
+    SnapshotStore(tmp_path / "scorer-tray.1.memory").save(snapshot(1))
+    assert saved(store.path) == 1
+    store.save(snapshot(2))
+    assert saved(store.path) == 2
