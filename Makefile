@@ -1,10 +1,10 @@
 # make demo   install what the demo needs into .venv and run it
-# make test   install what the tests need, check, and test: what only computes two at a time, then the rest alone
+# make test   install what the tests need, check, and run all tests; those in real time come last, two at once
 # make check  format, lint, types, direction of imports, generated code
 # make bench  measurements, as ratios
 # make schema regenerate the code of schemas/fan.proto
-# make twin   train the demo's twin anew
-# make lock   pin the dependencies anew
+# make twin   train the demo's twin again
+# make lock   pin the dependencies again
 # make clean  remove what was built (and nothing that was recorded)
 
 PYTHON ?= python3
@@ -13,8 +13,8 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate pyproject.toml
 TORCH := torch==2.13.0
-BENCHES := published_table interval_coverage rough_table measured_table onnx_speed training_race restart \
-	recorder_throughput recorder_kills replay_bus replay_speed
+BENCHES := $(addprefix training/,published_table interval_coverage rough_table measured_table onnx_speed training_race) \
+	$(addprefix runtime/,restart recorder_throughput recorder_kills replay_bus replay_speed)
 SOURCES := schemas scoring pipeline simulation stages twin tests bench
 
 .PHONY: demo test check bench schema twin lock clean
@@ -24,8 +24,8 @@ demo: $(VENV)/.runtime
 	$(BIN)/fantwin demo
 
 test: $(VENV)/.development check
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not alone" --numprocesses 2 --dist worksteal
-	$(BIN)/python -m pytest -m alone
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not real_time" --numprocesses 3 --dist worksteal
+	$(BIN)/python -m pytest -m real_time --numprocesses 2 --dist worksteal
 
 check: $(VENV)/.development
 	$(BIN)/ruff format --check $(SOURCES)

@@ -17,13 +17,6 @@ settings.register_profile("house", derandomize=True, deadline=None)
 settings.load_profile("house")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whoever asks for a bus has processes or threads that keep time, and runs alone; others say so by their mark."""
-    for item in items:
-        if isinstance(item, pytest.Function) and "endpoint" in item.fixturenames:
-            item.add_marker(pytest.mark.alone)
-
-
 @pytest.fixture
 def endpoint() -> str:
     """A bus endpoint on loopback that nobody else uses."""

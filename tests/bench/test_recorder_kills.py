@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.killed_recorder import Kills, Outcome
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 
 def outcome(folder, endpoint, history: int) -> Outcome:

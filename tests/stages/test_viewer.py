@@ -377,7 +377,6 @@ def test_a_taken_port_is_told_in_one_line_and_no_file_is_begun(tmp_path: Path, k
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.alone
 def test_live_viewers_are_served_on_the_loopback_only(tmp_path: Path) -> None:
     port = free_port()
     core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core

@@ -31,7 +31,7 @@ from tests.support.running_chain import (
     view_of,
 )
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 MANY = 100  # scores: the chain has come to run evenly
 
 

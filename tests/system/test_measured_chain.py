@@ -55,6 +55,7 @@ def trained_on_the_first_part(measured_data: Path, folder: Path, name: str, colu
 
 @pytest.mark.slow
 @pytest.mark.data
+@pytest.mark.real_time
 @pytest.mark.parametrize(
     ("data", "first_part_s", "played_s"), [(ESC, 80, (94, 115)), (ROSA, 30, (30, 48))], ids=["esc_test", "rosa"]
 )

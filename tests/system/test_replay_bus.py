@@ -28,6 +28,7 @@ from tests.support.replay_data import START_NS, STEP_NS, write_raw
 from tests.support.running_chain import DEADLINE_S, FANTWIN, SITE, TRAY, Chain, Running, eventually, fantwin, view_of
 from tests.support.score_data import made_up_tray
 
+pytestmark = pytest.mark.real_time
 WORKING = ["resampler", "twin_integrator", "scorer", "recorder"]
 
 

@@ -18,7 +18,7 @@ from pipeline.recordings.reading import read_recording
 from schemas.messages import Alarm, Request, Transition
 from tests.support.running_chain import TRAY, Chain, eventually, fantwin, is_running, published, received, view_of
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 FAULTY = 2
 OF_THE_OCCURRENCE = (

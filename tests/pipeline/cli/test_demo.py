@@ -25,7 +25,7 @@ from tests.support.running_chain import fantwin, is_running
 
 
 @pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.real_time
 def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
     out = tmp_path / "demo"
     done = fantwin("demo", "-o", out, timeout_s=200)

@@ -23,7 +23,6 @@ from pipeline.recordings.reading import read_recording
 from schemas import wire
 from schemas.messages import Raw
 
-pytestmark = pytest.mark.alone
 FANTWIN = (
     sys.executable,
     "-P",

@@ -112,7 +112,6 @@ def test_its_section_is_checked_like_any_other(tmp_path):
         parse(SITE + SECTION.replace("file", "fiel"), tmp_path)
 
 
-@pytest.mark.alone
 def test_the_runner_runs_it(tmp_path, endpoint):
     config = parse(SITE + SECTION, tmp_path, f"bus.endpoint='{endpoint}'")
     stop, ready = threading.Event(), threading.Event()

@@ -18,7 +18,6 @@ from tests.stages.test_viewer import LATER_NS, card, context, free_port, health,
 from tests.support.running_chain import eventually
 from tests.support.score_data import made_up_tray
 
-pytestmark = pytest.mark.alone
 rerun_picture = pytest.importorskip("pipeline.viewing.rerun_picture", exc_type=ModuleNotFoundError)
 needs_a_driver = pytest.mark.skipif(
     not rerun_picture.has_vulkan_driver(), reason="no Vulkan driver here: apt-get install mesa-vulkan-drivers"
