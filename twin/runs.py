@@ -15,7 +15,7 @@ from twin.errors import TwinError
 
 Array = NDArray[np.float64]
 
-GAP_IN_MEDIAN_STEPS = 5.0
+GAP_IN_MEDIAN_PERIODS = 5.0
 STARTING_SAMPLES = 5
 
 
@@ -74,7 +74,7 @@ class Run:
         return float(self.t_s[-1] - self.t_s[0])
 
     @property
-    def median_step_s(self) -> float:
+    def median_period_s(self) -> float:
         """The typical time between samples."""
         return float(np.median(np.diff(self.t_s)))
 
@@ -112,7 +112,7 @@ class Run:
 
         A held command says nothing about a long gap. Stretches of a single sample hold no step and are left out.
         """
-        limit_s = GAP_IN_MEDIAN_STEPS * self.median_step_s if max_gap_s is None else max_gap_s
+        limit_s = GAP_IN_MEDIAN_PERIODS * self.median_period_s if max_gap_s is None else max_gap_s
         cuts = [0, *(np.flatnonzero(np.diff(self.t_s) > limit_s) + 1).tolist(), self.samples]
         spans = [(first, last) for first, last in pairwise(cuts) if last - first >= 2]
         return [self.rows(first, last) for first, last in spans]

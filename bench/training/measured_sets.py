@@ -20,7 +20,7 @@ import pandas as pd
 from scipy.io import loadmat
 
 from pipeline.cli.recordings.import_table import write_table
-from pipeline.cli.twins.training_data import read_material
+from pipeline.cli.twins.training_data import read_training_data
 from pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT, read_table
 from twin.runs import Run
 
@@ -129,7 +129,7 @@ def _imported(
 ) -> list[Run]:
     recording = folder / f"{name or table.stem}.mcap"
     write_table(read_table(table, time, command, speed, period=period), recording, "tray1")
-    return read_material([recording], None, None, 0.0, math.inf).runs
+    return read_training_data([recording], None, None, 0.0, math.inf).runs
 
 
 def _by_time(

@@ -36,7 +36,7 @@ class Problem:
     @property
     def step_s(self) -> float:
         """Time between samples."""
-        return self.run.median_step_s
+        return self.run.median_period_s
 
     def stretches(self, samples: int) -> tuple[Array, Array]:
         """Commands and measured speeds (samples, batch), one after the other; a rest at the end is left out."""

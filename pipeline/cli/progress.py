@@ -1,4 +1,4 @@
-"""What commands show while they work: something that moves on a terminal, a plain line now and then elsewhere."""
+"""Progress of commands: bars on a terminal, a plain line every few seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -12,48 +12,48 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from pipeline.cli.twins.training_data import Material
+    from pipeline.cli.twins.training_data import TrainingData
     from twin.fitting.training import Progress as ProgressCallback
 
-A_LINE_EVERY_S = 5.0
+LINE_PERIOD_S = 5.0
 
 
 @contextmanager
-def working(said: str) -> Iterator[Callable[[str], None]]:
-    """Around work that cannot tell how far it is; gives what says which part of it is being done."""
+def working(title: str) -> Iterator[Callable[[str], None]]:
+    """Around work of unknown length; yields a function that shows which part is being done."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        typer.echo(said, err=True)
+        typer.echo(title, err=True)
         yield lambda part: typer.echo(part, err=True)
         return
-    with console.status(said) as status:
+    with console.status(title) as status:
         yield status.update
 
 
 @contextmanager
-def training_progress(material: Material) -> Iterator[Callable[[str], ProgressCallback]]:
-    """Gives what shows the progress of each training, by the name it is given: bars that go when all is done, or lines.
+def training_progress(training_data: TrainingData) -> Iterator[Callable[[str], ProgressCallback]]:
+    """Around trainings; yields a function that starts the display of one by its name and returns its progress callback.
 
-    A line tells when a training begins, and every few seconds how far it is.
+    Bars disappear at the end. Lines appear when a training begins and every LINE_PERIOD_S.
     """
     console = Console(stderr=True)
 
     def error(rmse_rad_s: float) -> str:
-        return f"free-run rmse {rmse_rad_s / material.rad_s_per_unit:.4g} {material.speed_unit}"
+        return f"free-run rmse {rmse_rad_s / training_data.rad_s_per_unit:.4g} {training_data.speed_unit}"
 
     def start_lines(name: str) -> ProgressCallback:
-        said = f"{name}: " if name else ""
-        typer.echo(f"{said}identifying", err=True)
-        started_s = told_s = time.monotonic()
+        prefix = f"{name}: " if name else ""
+        typer.echo(f"{prefix}identifying", err=True)
+        started_s = shown_s = time.monotonic()
 
-        def tell(done: int, at_most: int, rmse_rad_s: float) -> None:
-            nonlocal told_s
+        def show(done: int, at_most: int, rmse_rad_s: float) -> None:
+            nonlocal shown_s
             now_s = time.monotonic()
-            if now_s - told_s >= A_LINE_EVERY_S:
-                told_s = now_s
-                typer.echo(f"{said}{done}/{at_most}, {error(rmse_rad_s)}, {now_s - started_s:.0f} s", err=True)
+            if now_s - shown_s >= LINE_PERIOD_S:
+                shown_s = now_s
+                typer.echo(f"{prefix}{done}/{at_most}, {error(rmse_rad_s)}, {now_s - started_s:.0f} s", err=True)
 
-        return tell
+        return show
 
     if not console.is_terminal:
         yield start_lines
@@ -62,11 +62,11 @@ def training_progress(material: Material) -> Iterator[Callable[[str], ProgressCa
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bars:
 
         def start_bar(name: str) -> ProgressCallback:
-            said = f"{name}: " if name else ""
-            task = bars.add_task(f"{said}identifying", total=None)
+            prefix = f"{name}: " if name else ""
+            task = bars.add_task(f"{prefix}identifying", total=None)
 
             def show(done: int, at_most: int, rmse_rad_s: float) -> None:
-                bars.update(task, completed=done, total=at_most, description=said + error(rmse_rad_s))
+                bars.update(task, completed=done, total=at_most, description=prefix + error(rmse_rad_s))
 
             return show
 

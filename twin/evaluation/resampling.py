@@ -36,7 +36,7 @@ def resampled(run: Run, rate_hz: float) -> Run:
     """
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise TwinError(f"a rate of {rate_hz} Hz; give a positive number")
-    if rate_hz * run.median_step_s > MOST_TIMES_FASTER:
+    if rate_hz * run.median_period_s > MOST_TIMES_FASTER:
         raise TwinError(f"a rate of {rate_hz:g} Hz; give at most {MOST_TIMES_FASTER} times that of the run")
     steps = int(run.duration_s * rate_hz * (1.0 + 1e-12) + 1e-6)
     if steps < 1:
@@ -90,7 +90,7 @@ def _mean_command(run: Run, t_s: Array) -> Array:
 def _speed_rad_s(run: Run, t_s: Array) -> Array:
     after = np.clip(np.searchsorted(run.t_s, t_s), 1, run.samples - 1)
     nearest = np.where(t_s - run.t_s[after - 1] < run.t_s[after] - t_s, after - 1, after)
-    same = np.abs(t_s - run.t_s[nearest]) <= SAME_TIME_IN_STEPS * run.median_step_s
+    same = np.abs(t_s - run.t_s[nearest]) <= SAME_TIME_IN_STEPS * run.median_period_s
     if _steps_are_even(run) and same.mean() >= MIN_SHARE_MEASURED:
         return np.where(same[:, np.newaxis], run.speed_rad_s[nearest], np.nan)
     return np.column_stack([_interpolated(run, speed, t_s) for speed in run.speed_rad_s.T])
@@ -98,7 +98,7 @@ def _speed_rad_s(run: Run, t_s: Array) -> Array:
 
 def _steps_are_even(run: Run) -> bool:
     """Whether all but a few steps are multiples of the median one: samples may be lost, but time does not jitter."""
-    in_medians = np.diff(run.t_s) / run.median_step_s
+    in_medians = np.diff(run.t_s) / run.median_period_s
     return bool(np.mean(np.abs(in_medians - np.rint(in_medians)) > SAME_TIME_IN_STEPS) <= MAX_SHARE_UNEVEN)
 
 
@@ -109,7 +109,7 @@ def _interpolated(run: Run, speed_rad_s: Array, t_s: Array) -> Array:
     if len(known) < 2:
         return np.full_like(t_s, np.nan)
     after = np.clip(np.searchsorted(known_s, t_s), 1, len(known) - 1)
-    bridged = known_s[after] - known_s[after - 1] <= BRIDGE_IN_STEPS * run.median_step_s
-    slack_s = SAME_TIME_IN_STEPS * run.median_step_s
+    bridged = known_s[after] - known_s[after - 1] <= BRIDGE_IN_STEPS * run.median_period_s
+    slack_s = SAME_TIME_IN_STEPS * run.median_period_s
     inside = (t_s >= known_s[0] - slack_s) & (t_s <= known_s[-1] + slack_s)
     return np.where(bridged & inside, np.interp(t_s, known_s, known), np.nan)

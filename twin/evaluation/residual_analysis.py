@@ -40,7 +40,7 @@ QUANTILES = (0.95, 0.99, 0.999)
 class ResidualAnalysis:
     """One fan's free-run residual. NaN where nothing can be said: too few samples, a diverged run, a still command.
 
-    samples: the measured ones. step_s: of the grid. mean_rad_s: what the fan is above the model on average.
+    samples: the measured ones. period_s: of the grid. mean_rad_s: what the fan is above the model on average.
     independent_samples: as many independent ones would tell the mean as well; at most samples.
     autocorrelation_time_s: half the time from one independent sample to the next; T where it decays as exp(-t / T).
     lags_s, autocorrelation: (lags,) from one step on, about the mean. bound_95: white noise stays within it at 95 % of
@@ -52,7 +52,7 @@ class ResidualAnalysis:
     """
 
     samples: int
-    step_s: float
+    period_s: float
     mean_rad_s: float
     independent_samples: float
     autocorrelation_time_s: float
@@ -106,7 +106,7 @@ class _Grid:
 
     slot: NDArray[np.intp]
     slots: int
-    step_s: float
+    period_s: float
     lags: int
     window: int
 
@@ -160,29 +160,29 @@ def _settled(residual: Array, pieces: Sequence[Run], settling_s: float) -> Array
 
 
 def _lay_out(pieces: Sequence[Run], max_lag_s: float) -> _Grid:
-    step_s = float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces])))
+    period_s = float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces])))
     within = [
-        np.concatenate(([0], np.cumsum(np.maximum(np.rint(np.diff(piece.t_s) / step_s), 1.0)))).astype(int)
+        np.concatenate(([0], np.cumsum(np.maximum(np.rint(np.diff(piece.t_s) / period_s), 1.0)))).astype(int)
         for piece in pieces
     ]
     longest = int(LONGEST_LAG_OF_RUN * max(slots[-1] + 1 for slots in within))
-    lags = max(1, min(round(max_lag_s / step_s), longest, MAX_LAGS))
-    window = max(lags, min(round(WINDOW_S / step_s), longest))
+    lags = max(1, min(round(max_lag_s / period_s), longest, MAX_LAGS))
+    window = max(lags, min(round(WINDOW_S / period_s), longest))
     start = np.cumsum([0, *(slots[-1] + 1 + window for slots in within)])
     slot = np.concatenate([first + slots for first, slots in zip(start[:-1], within, strict=True)])
-    return _Grid(slot, int(start[-1]), step_s, lags, window)
+    return _Grid(slot, int(start[-1]), period_s, lags, window)
 
 
 def _of_fan(residual: Array, command: Array, grid: _Grid) -> ResidualAnalysis:
     measured = np.isfinite(residual)
     samples = int(np.count_nonzero(measured))
-    lags_s = grid.step_s * np.arange(1, grid.lags + 1, dtype=np.float64)
-    cross_lags_s = grid.step_s * np.arange(-grid.lags, grid.lags + 1, dtype=np.float64)
+    lags_s = grid.period_s * np.arange(1, grid.lags + 1, dtype=np.float64)
+    cross_lags_s = grid.period_s * np.arange(-grid.lags, grid.lags + 1, dtype=np.float64)
     if samples < MIN_SAMPLES or np.any(np.isinf(residual)) or np.ptp(residual[measured]) == 0.0:
         nothing = np.full_like(lags_s, np.nan)
         nothing_cross = np.full_like(cross_lags_s, np.nan)
         return ResidualAnalysis(
-            samples, grid.step_s, np.nan, np.nan, np.nan, lags_s, nothing, np.nan, 0, np.nan,
+            samples, grid.period_s, np.nan, np.nan, np.nan, lags_s, nothing, np.nan, 0, np.nan,
             cross_lags_s, nothing_cross, np.nan,
         )  # fmt: skip
     mean = float(residual[measured].mean())
@@ -198,10 +198,10 @@ def _of_fan(residual: Array, command: Array, grid: _Grid) -> ResidualAnalysis:
     cross_correlation, cross_bound = _cross(error, known, products, command, grid)
     return ResidualAnalysis(
         samples=samples,
-        step_s=grid.step_s,
+        period_s=grid.period_s,
         mean_rad_s=mean,
         independent_samples=samples / inflation,
-        autocorrelation_time_s=grid.step_s * time_in_steps,
+        autocorrelation_time_s=grid.period_s * time_in_steps,
         lags_s=lags_s,
         autocorrelation=autocorrelation[1 : grid.lags + 1],
         bound_95=float(NORMAL_95 / np.sqrt(_typical(pairs[1 : grid.lags + 1]))),

@@ -4,7 +4,7 @@
 
 In units of the command; positive where the fan takes more than a healthy one. Under a speed loop a fault shows here
 and hardly in the speed. Both sides go through lambda / (s + lambda), so that nothing is differentiated. On a uniform
-grid of step h, with a = exp(-lambda h), v_k the command that acts from k to k + 1 (after its lag, twin.models.lag)
+grid of period h, with a = exp(-lambda h), v_k the command that acts from k to k + 1 (after its lag, twin.models.lag)
 and m_k
 the mean of w_k and w_k+1,
 
@@ -26,13 +26,13 @@ FILTER_RATE_PER_S = 3.0
 COEFFICIENTS = ("inertia", "viscous", "drag", "friction")
 
 
-def torque_balance(command: Array, speed_rad_s: Array, step_s: float, coefficients: Array, lag_s: Array) -> Array:
+def torque_balance(command: Array, speed_rad_s: Array, period_s: float, coefficients: Array, lag_s: Array) -> Array:
     """(n, fans) balance in units of the command; NaN at first, and wherever the speed was not known.
 
-    command, speed_rad_s: (n, fans) on a grid of step_s; an unknown speed is NaN, and the filter starts anew after it.
+    command, speed_rad_s: (n, fans) on a grid of period_s; an unknown speed is NaN, and the filter starts anew after it.
     coefficients: (fans, 4) in the order of COEFFICIENTS. lag_s: (fans,), in which the command has long been the first.
     """
-    terms, _ = filtered_terms(command, speed_rad_s, step_s, lag_s)
+    terms, _ = filtered_terms(command, speed_rad_s, period_s, lag_s)
     return balance_of(terms, coefficients)
 
 
@@ -41,18 +41,18 @@ def balance_of(terms: Array, coefficients: Array) -> Array:
     return terms[..., 0] - np.sum(terms[..., 1:] * coefficients, axis=-1)
 
 
-def filtered_terms(command: Array, speed_rad_s: Array, step_s: float, lag_s: Array) -> tuple[Array, Array]:
+def filtered_terms(command: Array, speed_rad_s: Array, period_s: float, lag_s: Array) -> tuple[Array, Array]:
     """The balance is linear: (n, fans, 5) filtered command and what each coefficient multiplies; arguments as above.
 
     Beside it (n, fans) how much of the filter rests on what was seen, from 0 at a start to 1.
     """
-    acting, _ = effective_command(command, np.full((len(command), 1), step_s), lag_s, command[0])
+    acting, _ = effective_command(command, np.full((len(command), 1), period_s), lag_s, command[0])
     middle = (speed_rad_s[1:] + speed_rad_s[:-1]) / 2.0
-    rise = np.diff(speed_rad_s, axis=0) / step_s
+    rise = np.diff(speed_rad_s, axis=0) / period_s
     one = np.ones_like(middle)
     terms = np.stack((acting[:-1], rise, middle, middle * np.abs(middle), one, one), axis=-1)
     known = np.isfinite(middle)
-    decay = np.exp(-FILTER_RATE_PER_S * step_s)
+    decay = np.exp(-FILTER_RATE_PER_S * period_s)
     forcing = (1.0 - decay) * np.where(known[..., np.newaxis], terms, 0.0)
     start = np.zeros((1, *forcing.shape[1:]))
     filtered = linear_recursion(np.where(known, decay, 0.0), np.concatenate((start, forcing)))

@@ -36,7 +36,7 @@ from twin.evaluation.residual_analysis import analyse_residual
 from twin.fitting.balance import COEFFICIENTS, FILTER_RATE_PER_S, balance_of, filtered_terms
 from twin.fitting.identification import Identification
 from twin.models.physics import LAG
-from twin.runs import GAP_IN_MEDIAN_STEPS, Array, Run
+from twin.runs import GAP_IN_MEDIAN_PERIODS, Array, Run
 
 LOWEST_SHARE_OF_TOP = 0.05
 SETTLING_S = 3.0 / FILTER_RATE_PER_S
@@ -114,7 +114,7 @@ def _stretches(runs: Sequence[Run], lag_s: Array, lowest_speed_rad_s: Array) -> 
     """All stretches of the runs, each run at its own rate. Missing speeds are bridged where a command would be."""
     found: list[_Stretch] = []
     for index, run in enumerate(runs):
-        rate_hz = 1.0 / run.median_step_s
+        rate_hz = 1.0 / run.median_period_s
         for piece in run.split_at_gaps():
             if piece.duration_s * rate_hz < 1.0:
                 continue
@@ -137,7 +137,7 @@ def _bridged(speed_rad_s: Array) -> Array:
         return np.full_like(speed_rad_s, np.nan)
     at = np.arange(len(speed_rad_s))
     after = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
-    short = known[after] - known[after - 1] <= GAP_IN_MEDIAN_STEPS
+    short = known[after] - known[after - 1] <= GAP_IN_MEDIAN_PERIODS
     between = np.interp(at, known, speed_rad_s[known], left=np.nan, right=np.nan)
     return np.where(short, between, speed_rad_s)
 

@@ -172,7 +172,7 @@ def _inertia(pieces: Sequence[Run], fan: int, parameters: Array, covariance: Arr
     return [
         f"J is poorly determined ({inertia:.3g} ± {REACH * error:.2g}): it shows in transients alone, and too few "
         f"stand out; the speed moves by {high - low:.3g} rad/s, its noise is {_noise(pieces, fan):.2g} rad/s and "
-        f"samples are {_step_s(pieces):.2g} s apart: record more and larger steps, several samples in each transient"
+        f"samples are {_period_s(pieces):.2g} s apart: record more and larger steps, several samples in each transient"
     ]
 
 
@@ -232,11 +232,11 @@ def _determined(low_rad_s: float, high_rad_s: float, parameters: Array, covarian
 
 
 def _lag(pieces: Sequence[Run], parameters: Array, covariance: Array) -> list[str]:
-    lag_s, reach_s, step_s = parameters[LAG_S], REACH * np.sqrt(covariance[LAG_S, LAG_S]), _step_s(pieces)
-    if reach_s == 0.0 or lag_s > max(reach_s, step_s):
+    lag_s, reach_s, period_s = parameters[LAG_S], REACH * np.sqrt(covariance[LAG_S, LAG_S]), _period_s(pieces)
+    if reach_s == 0.0 or lag_s > max(reach_s, period_s):
         return []
     return [
-        f"lag_s ({1e3 * lag_s:.3g} ± {1e3 * reach_s:.2g} ms) is not told by samples every {1e3 * step_s:.3g} ms: "
+        f"lag_s ({1e3 * lag_s:.3g} ± {1e3 * reach_s:.2g} ms) is not told by samples every {1e3 * period_s:.3g} ms: "
         "no lag, a delay, and clocks of command and speed that differ look the same; record with several samples in a "
         "lag, or take it as the twin's and not as the fan's"
     ]
@@ -290,5 +290,5 @@ def _noise(pieces: Sequence[Run], fan: int) -> float:
     return float(1.4826 * np.median(np.abs(bends)) / np.sqrt(6.0)) if bends.size else 0.0
 
 
-def _step_s(pieces: Sequence[Run]) -> float:
+def _period_s(pieces: Sequence[Run]) -> float:
     return float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces])))

@@ -100,7 +100,7 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
     start, lambda_per_s = _filtered_start(pieces, top_speed)
     speed = np.array([np.nanmedian(_pooled(pieces, fan)[1]) for fan in range(fans)])
     longest_s = float(np.max(_positive(physics.time_constant_s(speed, start), pieces)))
-    step_s = min(piece.median_step_s for piece in pieces)
+    step_s = min(piece.median_period_s for piece in pieces)
     trajectories = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, STRETCH_TIME_CONSTANTS))
     free = np.tile(ALL_FREE, (fans, 1))
     free[:, LAG] = with_lag
@@ -161,7 +161,7 @@ def _filtered_start(pieces: Sequence[Run], top_speed_rad_s: Array) -> tuple[Arra
     """(fans, 4) parameters and (fans,) lambda: the largest rung that is nearly the best."""
     fans = len(top_speed_rad_s)
     longest_s = max(piece.duration_s for piece in pieces)
-    step_s = min(piece.median_step_s for piece in pieces)
+    step_s = min(piece.median_period_s for piece in pieces)
     ladder = np.geomspace(4.0 / longest_s, 0.5 / step_s, LAMBDA_LADDER)
     candidates = np.array([[filtering_operator(pieces, fan, rung) for fan in range(fans)] for rung in ladder])
     trajectories = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, 1.0))

@@ -73,9 +73,9 @@ def train_adam(
     were identified.
     """
     pieces = evaluation_pieces(runs)
-    step_s = min(piece.median_step_s for piece in pieces)
+    period_s = min(piece.median_period_s for piece in pieces)
     longest_s = float(identification.time_constant_s.max())
-    data = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, SHORT_STRETCH_TIME_CONSTANTS))
+    data = cut_into_trajectories(pieces, stretch_samples(longest_s, period_s, SHORT_STRETCH_TIME_CONSTANTS))
     measured = _tensor(data.measured)
     speed = _tensor(np.nan_to_num(data.speed_rad_s))
     parameters = identification.parameters[data.fan]

@@ -92,8 +92,8 @@ def train_network(
     if spread == 0.0:
         return model.with_theta(np.zeros_like(model.network.theta)), identification.parameters, 0
     pieces = evaluation_pieces(runs)
-    step_s = min(piece.median_step_s for piece in pieces)
-    short = stretch_samples(float(identification.time_constant_s.max()), step_s, SHORT_STRETCH_TIME_CONSTANTS)
+    period_s = min(piece.median_period_s for piece in pieces)
+    short = stretch_samples(float(identification.time_constant_s.max()), period_s, SHORT_STRETCH_TIME_CONSTANTS)
     top_speed = identification.top_speed_rad_s
     own = fitted_unknowns(identification.parameters, top_speed)
     free = np.full(own.shape, physics == "refined")

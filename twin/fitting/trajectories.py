@@ -95,9 +95,9 @@ def cut_into_trajectories(runs: Sequence[Run], max_samples: int) -> Trajectories
     )
 
 
-def stretch_samples(time_constant_s: float, step_s: float, time_constants: float) -> int:
+def stretch_samples(time_constant_s: float, period_s: float, time_constants: float) -> int:
     """How many samples span a number of time constants, within bounds that keep the batch efficient."""
-    return int(np.clip(time_constants * time_constant_s / step_s, MIN_SAMPLES, MAX_SAMPLES))
+    return int(np.clip(time_constants * time_constant_s / period_s, MIN_SAMPLES, MAX_SAMPLES))
 
 
 def practical_samples(runs: Sequence[Run], at_most: int) -> int:

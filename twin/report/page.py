@@ -1,4 +1,4 @@
-"""The report as one HTML page: its figures drawn inside, its style inside, no script and nothing to fetch."""
+"""The report as one self-contained HTML page: inline figures and style, no script, nothing to fetch."""
 
 import math
 from collections.abc import Sequence
@@ -12,15 +12,15 @@ from markupsafe import Markup
 from twin.evaluation.residual_analysis import SIGNIFICANCE
 from twin.kinds import kind_title
 from twin.report import figures
+from twin.report.assessment import AS_DECLARED, LOOSER, Assessment, assess, level_of
 from twin.report.content import Content, FanContent
 from twin.report.steady_states import StaticCurve, static_curve
-from twin.report.verdict import AS_DECLARED, LOOSER, Verdict, judge, level_of
 
 MOST_FANS_DRAWN = 12
 FOUR_DIGITS = ".4g"
-BEYOND_REASON = 1e7
+UNREASONABLY_LARGE = 1e7
 
-PARAMETER_SAID = {
+PARAMETER_MEANING = {
     "J": ("J", "inertia, in command s²/rad"),
     "alpha": ("α", "viscous friction, in command s/rad"),
     "C_D": ("C_D", "drag, in command s²/rad²"),
@@ -38,8 +38,8 @@ class Figure:
     narrow_svg: str = ""
 
 
-def report_page(content: Content, judged: Verdict | None = None) -> str:
-    """The page. judged: by default, the verdict on the content."""
+def report_page(content: Content, assessment: Assessment | None = None) -> str:
+    """The page. assessment: by default, that of the content."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"shown": shown, "svg": Markup}
     template = environment.from_string(files("twin.report").joinpath("page.html").read_text(encoding="utf-8"))
@@ -49,9 +49,9 @@ def report_page(content: Content, judged: Verdict | None = None) -> str:
         card=content.card,
         unit=content.unit.name,
         each=content.unit.rad_s,
-        verdict=judged or judge(content),
+        assessment=assessment or assess(content),
         kind=kind_title(content.card.kind),
-        parameter_said=PARAMETER_SAID,
+        parameter_meaning=PARAMETER_MEANING,
         physics_used=content.card.used_parameters,
         level_of=level_of,
         refined=any(it.in_force != it.value for fan in content.fans for it in fan.parameters),
@@ -63,7 +63,7 @@ def report_page(content: Content, judged: Verdict | None = None) -> str:
 
 
 def drawn_fans(fans: Sequence[FanContent]) -> list[FanContent]:
-    """The fans that get figures: all, or of many the worst by their error in sigma, in the recording's order."""
+    """The fans that get figures, in order: all, or of many those with the largest error in sigma."""
 
     def error(fan: FanContent) -> float:
         return math.inf if math.isnan(fan.rmse_in_sigma) else fan.rmse_in_sigma
@@ -85,32 +85,32 @@ def fan_figures(content: Content, fan: FanContent) -> list[Figure]:
     return [
         Figure(
             "Fit and error over time",
-            "The free run starts from the measured speed and then knows the commands alone. "
+            "The free run starts from the measured speed and then gets only the commands. "
             + _how_time_is_drawn(content),
             figures.over_time(content, fan, narrow=False),
             figures.over_time(content, fan, narrow=True),
         ),
         Figure(
             "Around the largest error",
-            "What happened where the twin was furthest off: a step that it takes too slowly, a dropout, or a fault.",
+            "The stretch where the twin was furthest off: a step that it follows too slowly, a dropout, or a fault.",
             figures.around_the_largest_error(content, fan),
         ),
         Figure(
             "Histogram of the error",
-            "Errors that are noise fill the normal curve; a second hump or long tails are states that the twin does "
-            "not know, or a sensor that slips. Errors beyond the axis are counted at its ends.",
+            "Noise fills the normal curve; a second hump or long tails point to states that the twin does not know, "
+            "or to a faulty sensor. Errors beyond the axis are counted at its ends.",
             figures.histogram(content, fan),
         ),
         Figure(
             "Whiteness",
-            "What is left should not be foreseeable from its own past: beyond the first lags it should stay in the "
-            f"band. {_whiteness(fan)}",
+            "The error should not be predictable from its past: beyond the first lags it should stay in the band. "
+            f"{_whiteness(fan)}",
             figures.autocorrelation(fan),
         ),
         Figure(
             "Cross-correlation with the command",
-            "A peak at a positive lag says that the twin misses a part of what the command does; one at a negative "
-            "lag says that the command answers the speed (closed loop).",
+            "A peak at a positive lag shows that the twin misses part of the effect of the command; one at a negative "
+            "lag shows that the command reacts to the speed (closed loop).",
             figures.cross_correlation(fan),
         ),
         Figure(
@@ -120,7 +120,7 @@ def fan_figures(content: Content, fan: FanContent) -> list[Figure]:
         ),
         Figure(
             "Error over speed",
-            "Points off the zero line are speeds at which the twin is biased; long bars those at which it is loose.",
+            "Points off the zero line are speeds at which the twin is biased; long bars speeds of large scatter.",
             figures.error_over_speed(content, fan),
         ),
     ]
@@ -128,24 +128,26 @@ def fan_figures(content: Content, fan: FanContent) -> list[Figure]:
 
 def _how_time_is_drawn(content: Content) -> str:
     line = content.timeline
-    said = ["Long recordings are thinned to the extremes of 500 columns, so no excursion is lost."]
+    sentences = ["Long recordings are thinned to the extremes of 500 columns, so no excursion is lost."]
     if len(line.recordings) > 1:
-        said.append("Recordings follow one another.")
+        sentences.append("Recordings follow one another.")
     if line.gaps:
         longest = max(gap.lasted_s for gap in line.gaps)
         cut = "; long ones are cut short" if any(gap.shortened for gap in line.gaps) else ""
-        said.append(f"Gaps are grey ({len(line.gaps)}, the longest {longest:.4g} s{cut}): the free run starts anew.")
-    return " ".join(said)
+        sentences.append(
+            f"Gaps are grey ({len(line.gaps)}, the longest {longest:.4g} s{cut}): the free run starts again after each."
+        )
+    return " ".join(sentences)
 
 
 def _holds(curve: StaticCurve) -> str:
     if settled := len(curve.measured):
         return f"{settled} of {len(curve.holds)} holds of the command were long enough to settle."
     if not curve.holds:
-        return "The command never held still, so nothing measured can be shown."
+        return "The command was never constant, so no measured point can be shown."
     nearest = min(curve.holds, key=lambda hold: hold.needed_s - hold.lasted_s)
     return (
-        "No hold of the command was long enough for the fan to settle: the one that came nearest lasted "
+        "No hold of the command was long enough for the fan to settle: the nearest lasted "
         f"{nearest.lasted_s:.2g} s and needed {nearest.needed_s:.2g} s."
     )
 
@@ -154,17 +156,17 @@ def _whiteness(fan: FanContent) -> str:
     p = fan.residual.ljung_box_p
     if math.isnan(p):
         return "Too little was measured to test it."
-    found = "Not white" if p < SIGNIFICANCE else "Nothing speaks against white"
+    found = "Not white" if p < SIGNIFICANCE else "Compatible with white"
     probability = "less than 0.0001" if p < 1e-4 else f"{p:.2g}"
-    return f"{found}: noise does as much over {fan.residual.ljung_box_lags} lags with probability {probability}."
+    return f"{found}: over {fan.residual.ljung_box_lags} lags, noise gives such a value with probability {probability}."
 
 
 def shown(value: float | None, form: str = FOUR_DIGITS) -> str:
-    """A number for people, with an exponent only beyond reason; what is undefined or infinite is said in words."""
+    """A number as text; undefined and infinite as words, very large ones with an exponent."""
     if value is None or math.isnan(value):
         return "undefined"
     if math.isinf(value):
         return "infinite"
-    if abs(value) >= BEYOND_REASON and not form.endswith("d"):
+    if abs(value) >= UNREASONABLY_LARGE and not form.endswith("d"):
         return f"{value:.3g}"
     return f"{value:.0f}" if form == FOUR_DIGITS and abs(value) >= 1e3 else format(value, form)

@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 from pipeline.cli.options import JsonOption
-from pipeline.cli.twins.training_data import made_folder
+from pipeline.cli.twins.training_data import make_folder
 from pipeline.errors import UserError
 from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.arrays import Block, in_order, read_topics
@@ -111,7 +111,7 @@ class _Tables:
         self._output = output
         self._is_file = output.suffix == f".{form}"
         self._replace = replace
-        made_folder(output.parent if self._is_file else output)
+        make_folder(output.parent if self._is_file else output)
 
     @property
     def rows(self) -> int:

@@ -16,7 +16,7 @@ from pipeline.cli.options import JsonOption, SetOption
 from pipeline.cli.progress import working
 from pipeline.cli.twins.calibration_check import check_promise
 from pipeline.cli.twins.outlier_run_check import doubt
-from pipeline.cli.twins.training_data import model_maker, sha256_of
+from pipeline.cli.twins.training_data import sha256_of, twin_errors
 from pipeline.errors import UserError
 from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.runtime.tray_twin import load_tray_twin
@@ -181,7 +181,7 @@ def _round_up(rate: float) -> float:
 
 
 def _write(twin: Path, output: Path, limits: Limits) -> None:
-    with model_maker():
+    with twin_errors():
         from twin.export.calibrated import with_calibration  # noqa: PLC0415  the command line loads twin only when needed
 
         content = with_calibration(twin.read_bytes(), json.loads(limits.model_dump_json()))

@@ -18,13 +18,13 @@ from pipeline.cli.twins.figures import figures_in, sentence, shown
 from pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
-    Material,
     RecordingsArgument,
     ToOption,
+    TrainingData,
     TrayOption,
     data_cards,
-    model_maker,
-    read_material,
+    read_training_data,
+    twin_errors,
 )
 from pipeline.errors import UserError
 
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from twin.evaluation.accuracy import Evaluation
     from twin.evaluation.resampling import Grid
     from twin.evaluation.residual_analysis import ResidualAnalysis
+    from twin.report.assessment import Assessment
     from twin.report.content import Content
-    from twin.report.verdict import Verdict
 
 EXPECTED_COVERAGE = math.erf(math.sqrt(2.0))
 """share of a normal distribution within two standard deviations"""
@@ -51,81 +51,81 @@ def evaluate(
     fans: FansOption = None,
     rate: Annotated[
         list[str] | None,
-        typer.Option(metavar="HZ|irregular", help="Judge it on this grid, too, e.g. 50. Repeatable."),
+        typer.Option(metavar="HZ|irregular", help="Evaluate on this sample grid, too, e.g. 50. Repeatable."),
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Run a twin freely over recordings and compare it with what was measured, in the recording's own units.
+    """Run a twin freely over recordings and compare it with the measured speeds, in the recording's own units.
 
-    The free run gets one initial speed and then the commands alone. The one-step error is given beside it; it says
-    little, because it is corrected at each sample. What is left is tested: a good twin leaves white noise that does
-    not follow the command.
+    The free run gets one initial speed and then only the commands. The one-step error is shown for comparison: it is
+    corrected at every sample, so it is small even for a poor twin. The residual is tested: that of a good twin is
+    white noise that does not depend on the command.
 
     Example: fantwin evaluate TWIN.onnx held-out.mcap --rate 20 --rate irregular --json
     """
     grids: list[Grid] = [_grid(text) for text in rate or []]
-    with model_maker():
+    with twin_errors():
         # The command line loads twin only when it is needed.
         from twin.build import evaluate as evaluate_twin  # noqa: PLC0415
         from twin.evaluation.resampling import on_grid  # noqa: PLC0415
         from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
+        from twin.report.assessment import assess  # noqa: PLC0415
         from twin.report.content import SpeedUnit, report_content  # noqa: PLC0415
-        from twin.report.verdict import judge  # noqa: PLC0415
 
         loaded = OnnxTwin(twin)
-        material = read_material(recordings, tray, fans, from_s, to_s)
-        unit = SpeedUnit(material.speed_unit, material.rad_s_per_unit)
-        content = report_content(loaded, material.runs, data_cards(material), unit, fan_numbers(fans))
-        judged = judge(content)
+        training_data = read_training_data(recordings, tray, fans, from_s, to_s)
+        unit = SpeedUnit(training_data.speed_unit, training_data.rad_s_per_unit)
+        content = report_content(loaded, training_data.runs, data_cards(training_data), unit, fan_numbers(fans))
+        assessment = assess(content)
         on_grids: list[tuple[Grid, Evaluation]] = [
-            (grid, evaluate_twin(loaded, on_grid(material.runs, grid), fan_numbers(fans))) for grid in grids
+            (grid, evaluate_twin(loaded, on_grid(training_data.runs, grid), fan_numbers(fans))) for grid in grids
         ]
-    told = account(content, judged, on_grids, material)
+    result = as_json(content, assessment, on_grids, training_data)
     if json_output:
-        typer.echo(json.dumps(told))
+        typer.echo(json.dumps(result))
         return
-    typer.echo(f"{told['headline']}\n{sentence(told, material.speed_unit)}")
+    typer.echo(f"{result['headline']}\n{sentence(result, training_data.speed_unit)}")
     console = Console()
-    console.print(_fan_table(told))
+    console.print(_fan_table(result))
     if grids:
-        console.print(_grid_table(told))
-    for warning in told["warnings"]:
+        console.print(_grid_table(result))
+    for warning in result["warnings"]:
         typer.echo(warning, err=True)
 
 
-def account(
+def as_json(
     content: Content,
-    judged: Verdict,
+    assessment: Assessment,
     on_grids: Sequence[tuple[Grid, Evaluation]],
-    material: Material,
+    training_data: TrainingData,
 ) -> dict[str, Any]:
-    """What a machine is told of an evaluation; speeds in the recordings' own unit, None where a figure is undefined."""
-    scale = material.rad_s_per_unit
+    """The result as JSON fields; speeds in the recordings' own unit, None where a figure is undefined."""
+    scale = training_data.rad_s_per_unit
 
     def figures_of(evaluation: Evaluation) -> dict[str, Any]:
-        by_fan = zip(material.fans, evaluation.per_fan, strict=True)
+        by_fan = zip(training_data.fans, evaluation.per_fan, strict=True)
         return figures_in(evaluation.pooled, scale) | {
             "fans": [{"fan": number} | figures_in(fan, scale) for number, fan in by_fan]
         }
 
-    told = figures_of(content.evaluation)
-    for its, fan in zip(told["fans"], content.fans, strict=True):
-        its["residual"] = residual_account(fan.residual, scale)
-    return told | {
-        "speed_unit": material.speed_unit,
+    result = figures_of(content.evaluation)
+    for its, fan in zip(result["fans"], content.fans, strict=True):
+        its["residual"] = residual_json(fan.residual, scale)
+    return result | {
+        "speed_unit": training_data.speed_unit,
         "expected_coverage_2_sigma": EXPECTED_COVERAGE,
-        "verdict": judged.level,
-        "headline": judged.headline,
-        "warnings": [*material.outliers, *judged.warnings],
+        "assessment": assessment.level,
+        "headline": assessment.headline,
+        "warnings": [*training_data.outliers, *assessment.warnings],
         "grids": [{"rate": grid} | figures_of(evaluation) for grid, evaluation in on_grids],
     }
 
 
-def residual_account(analysis: ResidualAnalysis, rad_s_per_unit: float) -> dict[str, Any]:
-    """One fan's residual analysis for machines; the mean in a unit of theirs."""
+def residual_json(analysis: ResidualAnalysis, rad_s_per_unit: float) -> dict[str, Any]:
+    """One fan's residual analysis as JSON fields, the mean in the unit of the recordings."""
     return {
         "samples": analysis.samples,
-        "step_s": analysis.step_s,
+        "period_s": analysis.period_s,
         "mean": _finite(analysis.mean_rad_s / rad_s_per_unit),
         "independent_samples": _finite(analysis.independent_samples),
         "autocorrelation_time_s": _finite(analysis.autocorrelation_time_s),
@@ -155,8 +155,8 @@ def _grid(text: str) -> Grid:
     return rate_hz
 
 
-def _fan_table(told: dict[str, Any]) -> Table:
-    unit = told["speed_unit"]
+def _fan_table(result: dict[str, Any]) -> Table:
+    unit = result["speed_unit"]
     table = _empty_table("fan")
     expected = f"in ±2σ\n({EXPECTED_COVERAGE:.1%})"
     for header in (
@@ -169,24 +169,24 @@ def _fan_table(told: dict[str, Any]) -> Table:
         "cross\n/ bound",
     ):
         table.add_column(header, justify="right", no_wrap=True)
-    for figures in told["fans"]:
+    for figures in result["fans"]:
         residual = figures["residual"]
         tests = (_probability(residual["ljung_box_p"]), shown(residual["cross_over_bound"], ".1f", "-"))
         table.add_row(str(figures["fan"]), *_cells(figures), *tests)
-    if len(told["fans"]) > 1:
-        table.add_row("all", *_cells(told), "", "")
+    if len(result["fans"]) > 1:
+        table.add_row("all", *_cells(result), "", "")
     return table
 
 
-def _grid_table(told: dict[str, Any]) -> Table:
-    """Figures of all fans together on the recordings' own grid and on the others."""
-    unit = told["speed_unit"]
+def _grid_table(result: dict[str, Any]) -> Table:
+    """Figures of all fans together on the recorded grid and on the others."""
+    unit = result["speed_unit"]
     table = _empty_table("grid")
     for header in ("samples", f"rmse\n{unit}", f"max error\n{unit}", "R2", f"one step\n{unit}", "in ±2σ"):
         table.add_column(header, justify="right", no_wrap=True)
-    for grid in ({"rate": None} | told, *told["grids"]):
+    for grid in ({"rate": None} | result, *result["grids"]):
         rate = grid["rate"]
-        name = "own" if rate is None else rate if rate == "irregular" else f"{rate:g} Hz"
+        name = "recorded" if rate is None else rate if rate == "irregular" else f"{rate:g} Hz"
         table.add_row(name, str(grid["samples"]), *_cells(grid))
     return table
 

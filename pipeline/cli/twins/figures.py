@@ -1,4 +1,4 @@
-"""The figures of a twin as commands tell them: for machines, and for people in their own units."""
+"""The figures of a twin as commands print them: as JSON and as text, in the unit of the recordings."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ if TYPE_CHECKING:
     from twin.evaluation.accuracy import Figures
 
 FOUR_DIGITS = ".4g"
-BEYOND_REASON = 1e7
-"""From here on a number says only that something went wrong, and is shown with an exponent."""
+UNREASONABLY_LARGE = 1e7
+"""Numbers from here on are shown with an exponent: such an error means that something went wrong."""
 
 
 def figures_in(figures: Figures, rad_s_per_unit: float) -> dict[str, float | int | None]:
-    """Figures for people and machines: speeds in a unit of theirs, None where a figure is undefined or infinite."""
+    """Figures with speeds in the given unit; None where a figure is undefined or infinite."""
     values = {
         "rmse": figures.rmse_rad_s / rad_s_per_unit,
         "max_error": figures.max_error_rad_s / rad_s_per_unit,
@@ -28,19 +28,19 @@ def figures_in(figures: Figures, rad_s_per_unit: float) -> dict[str, float | int
 
 
 def shown(value: float | None, form: str = FOUR_DIGITS, undefined: str = "undefined") -> str:
-    """A figure for people. Four digits do not cut a large number short."""
+    """A figure as text. Integers of more than four digits keep all their digits."""
     if value is None:
         return undefined
-    if abs(value) >= BEYOND_REASON:
+    if abs(value) >= UNREASONABLY_LARGE:
         return f"{value:.3g}"
     return f"{value:.0f}" if form == FOUR_DIGITS and abs(value) >= 1e3 else format(value, form)
 
 
 def sentence(figures: dict[str, Any], unit: str) -> str:
-    """Figures in a line."""
-    said = {name: shown(figures[name]) for name in ("rmse", "max_error", "one_step_rmse")}
+    """Figures in one line."""
+    text = {name: shown(figures[name]) for name in ("rmse", "max_error", "one_step_rmse")}
     return (
-        f"free run: rmse {said['rmse']} {unit}, max error {said['max_error']} {unit}, "
+        f"free run: rmse {text['rmse']} {unit}, max error {text['max_error']} {unit}, "
         f"R2 {shown(figures['r2'], '.4f')}, {shown(figures['coverage_2_sigma'], '.1%')} within 2 sigma; "
-        f"one step: rmse {said['one_step_rmse']} {unit}; {figures['samples']} samples"
+        f"one step: rmse {text['one_step_rmse']} {unit}; {figures['samples']} samples"
     )

@@ -16,12 +16,12 @@ from pipeline.cli.progress import working
 from pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
-    Material,
     RecordingsArgument,
     ToOption,
+    TrainingData,
     TrayOption,
-    model_maker,
-    read_material,
+    read_training_data,
+    twin_errors,
 )
 
 if TYPE_CHECKING:
@@ -46,29 +46,29 @@ def identify(
 ) -> None:
     """Find J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, and the lag of its command.
 
-    Each comes with its 95 % interval. w is in rad/s and the command in its own unit, so the parameters are in that unit
-    too: only their ratios are mechanical. What the recordings cannot tell, and why, is said on stderr.
+    Each has a 95 % interval. w is in rad/s and the command in its own unit, and so are the parameters: only their
+    ratios are mechanical quantities. A warning on stderr names what the recordings do not determine, and why.
 
     Example: fantwin identify REC.mcap --json
     """
-    with model_maker():
+    with twin_errors():
         from twin.fitting.identification import identify as identify_fans  # noqa: PLC0415  loads twin only when it is needed
 
-        material = read_material(recordings, tray, fans, from_s, to_s)
-        samples = sum(run.samples for run in material.runs)
-        with working(f"identifying {material.runs[0].fans} fan(s) from {samples:,} samples each"):
-            found = identify_fans(material.runs)
-    told = account(found, material)
+        training_data = read_training_data(recordings, tray, fans, from_s, to_s)
+        samples = sum(run.samples for run in training_data.runs)
+        with working(f"identifying {training_data.runs[0].fans} fan(s) from {samples:,} samples each"):
+            found = identify_fans(training_data.runs)
+    result = as_json(found, training_data)
     if json_output:
-        typer.echo(json.dumps(told))
+        typer.echo(json.dumps(result))
         return
-    Console().print(_table(told))
-    for warning in told["warnings"]:
+    Console().print(_table(result))
+    for warning in result["warnings"]:
         typer.secho(f"warning: {warning}", fg=typer.colors.YELLOW, err=True)
 
 
-def account(found: Identification, material: Material) -> dict[str, Any]:
-    """What a machine is told of an identification; None where a figure is undefined.
+def as_json(found: Identification, training_data: TrainingData) -> dict[str, Any]:
+    """The result as JSON fields; None where a figure is undefined.
 
     Rows and columns of covariance and correlation are in the order of `parameters`; those of a lag that was not found
     are zero, and undefined.
@@ -77,14 +77,14 @@ def account(found: Identification, material: Material) -> dict[str, Any]:
 
     fans = [
         {
-            "fan": material.fans[fan],
+            "fan": training_data.fans[fan],
             **dict(zip(PARAMETER_NAMES, found.parameters[fan].tolist(), strict=True)),
             **{f"{name}_95": _interval(found, fan, k) for k, name in enumerate(PARAMETER_NAMES)},
             "covariance": found.covariance[fan].tolist(),
             "correlation": _correlation(found.covariance[fan]),
             "time_constant_s": float(found.time_constant_s[fan]),
             "lambda_per_s": float(found.lambda_per_s[fan]),
-            "rmse": float(found.rmse_rad_s[fan]) / material.rad_s_per_unit,
+            "rmse": float(found.rmse_rad_s[fan]) / training_data.rad_s_per_unit,
         }
         for fan in range(len(found.parameters))
     ]
@@ -92,9 +92,9 @@ def account(found: Identification, material: Material) -> dict[str, Any]:
         "fans": fans,
         "parameters": list(PARAMETER_NAMES),
         "units": {name: UNITS[name] for name in PARAMETER_NAMES},
-        "speed_unit": material.speed_unit,
+        "speed_unit": training_data.speed_unit,
         "iterations": found.iterations,
-        "warnings": material.named([*found.warnings, *found.misfits]),
+        "warnings": training_data.with_fan_numbers([*found.warnings, *found.misfits]),
     }
 
 
@@ -113,10 +113,10 @@ def _correlation(covariance: Array) -> list[list[float | None]]:
     return [[between(row, column) for column in range(len(errors))] for row in range(len(errors))]
 
 
-def _table(told: dict[str, Any]) -> Table:
+def _table(result: dict[str, Any]) -> Table:
     """A row for each fan, the half width of each interval below its value."""
-    mechanical = [name for name in told["parameters"] if name != "lag_s"]
-    units = "; ".join(f"{name} in {told['units'][name]}" for name in mechanical)
+    mechanical = [name for name in result["parameters"] if name != "lag_s"]
+    units = "; ".join(f"{name} in {result['units'][name]}" for name in mechanical)
     table = Table(
         box=SIMPLE_HEAD,
         pad_edge=False,
@@ -124,9 +124,9 @@ def _table(told: dict[str, Any]) -> Table:
         caption_justify="left",
     )
     table.add_column("fan", no_wrap=True)
-    for header in (*mechanical, "lag\nms", "time\nconst. s", f"rmse\n{told['speed_unit']}", "lambda\n1/s"):
+    for header in (*mechanical, "lag\nms", "time\nconst. s", f"rmse\n{result['speed_unit']}", "lambda\n1/s"):
         table.add_column(header, justify="right", no_wrap=True)
-    for fan in told["fans"]:
+    for fan in result["fans"]:
         values = [_with_interval(fan[name], fan[f"{name}_95"]) for name in mechanical]
         figures = (f"{fan['time_constant_s']:.3g}", f"{fan['rmse']:.4g}", f"{fan['lambda_per_s']:.3g}")
         table.add_row(str(fan["fan"]), *values, _lag(fan), *figures)

@@ -1,4 +1,4 @@
-"""`fantwin report`: how well a twin follows recordings, as one page to read, print and pass on."""
+"""`fantwin report`: how well a twin follows recordings, as one HTML page."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from pipeline.cli.twins.training_data import (
     TrayOption,
     check_writable,
     data_cards,
-    model_maker,
-    read_material,
+    read_training_data,
+    twin_errors,
 )
 from pipeline.errors import UserError
 
@@ -38,52 +38,52 @@ def report(
     fans: FansOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Run a twin freely over recordings and write what comes of it as one HTML page that needs nothing else.
+    """Run a twin freely over recordings and write the result as one self-contained HTML page.
 
-    It holds the figures of `fantwin evaluate` with a verdict in words, fit and error over time, histogram, whiteness,
+    It holds the figures of `fantwin evaluate`, an assessment in words, fit and error over time, histogram, whiteness,
     cross-correlation with the command, static curve, parameters with 95 % intervals and the model card.
 
     Example: fantwin report TWIN.onnx held-out.mcap -o report.html
     """
-    with model_maker():
+    with twin_errors():
         from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415  the command line loads twin only when it is needed
+        from twin.report.assessment import assess, level_of  # noqa: PLC0415
         from twin.report.content import SpeedUnit, report_content  # noqa: PLC0415
         from twin.report.page import report_page  # noqa: PLC0415
-        from twin.report.verdict import judge, level_of  # noqa: PLC0415
 
         loaded = OnnxTwin(twin)
         check_writable(output, ".html")
-        material = read_material(recordings, tray, fans, from_s, to_s)
-        unit = SpeedUnit(material.speed_unit, material.rad_s_per_unit)
+        training_data = read_training_data(recordings, tray, fans, from_s, to_s)
+        unit = SpeedUnit(training_data.speed_unit, training_data.rad_s_per_unit)
         with working(f"drawing {output}"):
-            content = report_content(loaded, material.runs, data_cards(material), unit, fan_numbers(fans))
-            judged = judge(content)
-            page = report_page(content, judged)
+            content = report_content(loaded, training_data.runs, data_cards(training_data), unit, fan_numbers(fans))
+            assessment = assess(content)
+            page = report_page(content, assessment)
     try:
         output.write_text(page, encoding="utf-8")
     except OSError as error:
         raise UserError(f"{output}: cannot be written: {error.strerror}; name another file with -o") from error
-    warnings = [*material.outliers, *judged.warnings]
-    pooled = figures_in(content.evaluation.pooled, material.rad_s_per_unit)
+    warnings = [*training_data.outliers, *assessment.warnings]
+    pooled = figures_in(content.evaluation.pooled, training_data.rad_s_per_unit)
     if json_output:
         by_fan = [
             {
                 "fan": fan.number,
-                **figures_in(fan.figures, material.rad_s_per_unit),
-                "sigma": fan.sigma_rad_s / material.rad_s_per_unit,
-                "verdict": level_of(fan),
+                **figures_in(fan.figures, training_data.rad_s_per_unit),
+                "sigma": fan.sigma_rad_s / training_data.rad_s_per_unit,
+                "assessment": level_of(fan),
             }
             for fan in content.fans
         ]
-        told = {
+        result = {
             "report": str(output),
             "bytes": len(page.encode()),
-            "verdict": judged.level,
-            "headline": judged.headline,
+            "assessment": assessment.level,
+            "headline": assessment.headline,
         }
-        typer.echo(json.dumps({**told, **pooled, "speed_unit": unit.name, "fans": by_fan, "warnings": warnings}))
+        typer.echo(json.dumps({**result, **pooled, "speed_unit": unit.name, "fans": by_fan, "warnings": warnings}))
         return
-    typer.echo(f"{output}: {judged.headline}")
+    typer.echo(f"{output}: {assessment.headline}")
     typer.echo(f"  {sentence(pooled, unit.name)}")
     for warning in warnings:
         typer.echo(warning, err=True)

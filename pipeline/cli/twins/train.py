@@ -15,15 +15,15 @@ from pipeline.cli.twins.figures import figures_in, sentence, shown
 from pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
-    Material,
     RecordingsArgument,
     ToOption,
+    TrainingData,
     TrayOption,
     check_writable,
     data_cards,
-    model_maker,
     read_held_out,
-    read_material,
+    read_training_data,
+    twin_errors,
 )
 
 if TYPE_CHECKING:
@@ -41,47 +41,49 @@ def train(
     model: Annotated[str, typer.Option(help="Kind of model: physical, narx, neural-ode or hybrid.")] = "hybrid",
     validate: Annotated[
         list[Path] | None,
-        typer.Option(metavar="REC.mcap", help="Healthy recording to judge by and not to fit on. Repeatable."),
+        typer.Option(metavar="REC.mcap", help="Held-out healthy recording: evaluated, not fitted. Repeatable."),
     ] = None,
     from_s: FromOption = 0.0,
     to_s: ToOption = math.inf,
-    validate_from_s: Annotated[float, typer.Option("--validate-from", help="As --from, of --validate.")] = 0.0,
-    validate_to_s: Annotated[float, typer.Option("--validate-to", help="As --to, of --validate.")] = math.inf,
+    validate_from_s: Annotated[float, typer.Option("--validate-from", help="Like --from, for --validate.")] = 0.0,
+    validate_to_s: Annotated[float, typer.Option("--validate-to", help="Like --to, for --validate.")] = math.inf,
     tray: TrayOption = None,
     fans: FansOption = None,
-    name: Annotated[str | None, typer.Option(help="Of the twin; without it, that of the file.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the twin. Default: the name of the file.")] = None,
     seed: Annotated[int, typer.Option(help="The same seed and recordings give the same twin.")] = 0,
-    trainer: Annotated[Trainer, typer.Option(help="adam is the published recipe.")] = "levenberg-marquardt",
+    trainer: Annotated[Trainer, typer.Option(help="adam is the published one.")] = "levenberg-marquardt",
     iterations: Annotated[
-        int | None, typer.Option(min=1, help="At most, of the start that goes on; without it, as fits the trainer.")
+        int | None, typer.Option(min=1, help="Maximum iterations. Default: depends on the trainer.")
     ] = None,
     network_inputs: Annotated[
-        NetworkInputs, typer.Option(help="Of the hybrid's and the neural ODE's network.")
+        NetworkInputs, typer.Option(help="Inputs of the network (hybrid, neural ODE).")
     ] = "speed,command",
     physics: Annotated[
-        Physics, typer.Option(help="Of a hybrid: refined with its network, or fixed as identified.")
+        Physics, typer.Option(help="Hybrid: physics refined with the network, or fixed as identified.")
     ] = "refined",
-    command_unit: Annotated[str, typer.Option(help="For the card, e.g. %.")] = "",
+    command_unit: Annotated[str, typer.Option(help="Unit of the command, for the card, e.g. %.")] = "",
     json_output: JsonOption = False,
 ) -> None:
-    """Learn a twin of healthy fans and write it, with its card, as an ONNX file.
+    """Train a twin of healthy fans and write it, with its card, as an ONNX file.
 
-    The band of the twin rests on the free-run error over --validate; without it, on that over the training part,
-    which flatters.
+    The width of the band is the free-run error over --validate. Without --validate it is the error over the training
+    data, which is too optimistic.
 
     Example: fantwin train healthy-1.mcap healthy-2.mcap --validate healthy-3.mcap --model hybrid -o TWIN.onnx
     """
-    with model_maker():
+    with twin_errors():
         from twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
         from twin.kinds import find_kind  # noqa: PLC0415
 
         find_kind(model)
         check_writable(output, ".onnx")
-        material = read_material(recordings, tray, fans, from_s, to_s)
-        held_out = read_held_out(material, validate, tray, fans, validate_from_s, validate_to_s) if validate else None
-        with training_progress(material) as start:
+        training_data = read_training_data(recordings, tray, fans, from_s, to_s)
+        held_out = (
+            read_held_out(training_data, validate, tray, fans, validate_from_s, validate_to_s) if validate else None
+        )
+        with training_progress(training_data) as start:
             trained = train_twin(
-                material.runs,
+                training_data.runs,
                 held_out.runs if held_out else [],
                 model,
                 name=name or output.stem,
@@ -91,43 +93,43 @@ def train(
                 network_inputs=tuple(network_inputs.split(",")),
                 physics=physics,
                 command_unit=command_unit,
-                fan_numbers=material.fans,
-                data=data_cards(material),
+                fan_numbers=training_data.fans,
+                data=data_cards(training_data),
                 validation_data=data_cards(held_out) if held_out else (),
                 progress=start(""),
             )
         trained.save(output)
-    told = account(trained, material, output)
+    result = as_json(trained, training_data, output)
     if json_output:
-        typer.echo(json.dumps(told))
+        typer.echo(json.dumps(result))
         return
-    typer.echo(f"{output}: {model} of {told['fans']} fan(s), {told['network_parameters']} network parameters")
-    typer.echo(f"  {told['judged_on']} data, {sentence(told, material.speed_unit)}")
-    typer.echo(f"  {balance_sentence(told)}")
-    for warning in told["warnings"]:
+    typer.echo(f"{output}: {model} of {result['fans']} fan(s), {result['network_parameters']} network parameters")
+    typer.echo(f"  {result['evaluated_on']} data, {sentence(result, training_data.speed_unit)}")
+    typer.echo(f"  {balance_sentence(result)}")
+    for warning in result["warnings"]:
         typer.echo(warning, err=True)
 
 
-def balance_sentence(told: dict[str, Any]) -> str:
-    """How still the torque balance of healthy fans is, in a line."""
-    lowest, highest = (shown(sigma(told["balance_sigma"])) for sigma in (min, max))
-    spread = lowest if lowest == highest else f"{lowest} to {highest}"
-    chosen: list[str] = told["balance_source"]
+def balance_sentence(result: dict[str, Any]) -> str:
+    """One line on the torque balance: its healthy standard deviation, and the source of its coefficients."""
+    lowest, highest = (shown(sigma(result["balance_sigma"])) for sigma in (min, max))
+    sigmas = lowest if lowest == highest else f"{lowest} to {highest}"
+    chosen: list[str] = result["balance_source"]
     sources = ", ".join(f"{chosen.count(source)} fan(s) by {source}" for source in dict.fromkeys(chosen))
-    unit = told["command_unit"] or "of the command"
-    return f"torque balance: healthy sigma {spread} {unit}; coefficients of {sources}"
+    unit = result["command_unit"] or "of the command"
+    return f"torque balance: healthy sigma {sigmas} {unit}; coefficients of {sources}"
 
 
-def account(trained: TrainedTwin, material: Material, output: Path) -> dict[str, Any]:
-    """What a machine is told of a training; figures in the recordings' own units."""
+def as_json(trained: TrainedTwin, training_data: TrainingData, output: Path) -> dict[str, Any]:
+    """The result as JSON fields; figures in the recordings' own units."""
     card = trained.card
     return {
         "twin": str(output),
         "model": card.kind,
-        **figures_in(trained.validation.pooled, material.rad_s_per_unit),
-        "judged_on": card.validation.source,
-        "speed_unit": material.speed_unit,
-        "sigma": [sigma / material.rad_s_per_unit for sigma in card.sigma_rad_s],
+        **figures_in(trained.validation.pooled, training_data.rad_s_per_unit),
+        "evaluated_on": card.validation.source,
+        "speed_unit": training_data.speed_unit,
+        "sigma": [sigma / training_data.rad_s_per_unit for sigma in card.sigma_rad_s],
         "balance_sigma": list(card.balance.sigma_command),
         "balance_source": list(card.balance.source),
         "command_unit": card.command_unit,
@@ -135,5 +137,5 @@ def account(trained: TrainedTwin, material: Material, output: Path) -> dict[str,
         "network_parameters": card.network.parameter_count,
         "iterations": card.training.iterations,
         "duration_s": card.training.duration_s,
-        "warnings": material.named(trained.identification.warnings),
+        "warnings": training_data.with_fan_numbers(trained.identification.warnings),
     }

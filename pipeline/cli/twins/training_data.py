@@ -1,4 +1,4 @@
-"""What the commands that build and judge twins share: recordings as runs, errors in one line."""
+"""What the commands that train and evaluate twins share: recordings as runs, and errors in one line."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ _EXTRA_MODULES = ("jinja2", "matplotlib", "onnx", "scipy", "torch")
 
 
 @dataclass(frozen=True, eq=False)
-class Material:
-    """Runs for the model maker, outliers left out, and what people call their fans and units.
+class TrainingData:
+    """Runs without their outliers, with the fan numbers and the speed unit of their recordings.
 
-    fans: the numbers of the runs' columns in the tray. outliers: one line for each fan and file that had some.
+    fans: the fan number of each column. outliers: a warning for each fan and file with many outliers.
     """
 
     runs: list[Run]
@@ -49,21 +49,21 @@ class Material:
 
     @property
     def rad_s_per_unit(self) -> float:
-        """One of the people's unit in rad/s."""
+        """How many rad/s one unit of the recordings is."""
         return RAD_S_PER_TABLE_UNIT[self.speed_unit]
 
-    def named(self, warnings: Sequence[str]) -> list[str]:
-        """Warnings of the model maker, which counts columns, with the fans' own numbers; those of outliers first."""
+    def with_fan_numbers(self, warnings: Sequence[str]) -> list[str]:
+        """The outlier warnings, then those of the model maker with its column numbers replaced by fan numbers."""
         return [
             *self.outliers,
             *(re.sub(r"^fan (\d+):", lambda found: f"fan {self.fans[int(found[1])]}:", line) for line in warnings),
         ]
 
 
-def read_material(
+def read_training_data(
     recordings: Sequence[Path], tray: str | None, fans: str | None, from_s: float, to_s: float
-) -> Material:
-    """The runs of several recordings, their outliers left out. What is damaged in them is told on stderr.
+) -> TrainingData:
+    """The runs of several recordings, their outliers left out. Damage in a recording is reported on stderr.
 
     Raises:
         UserError: a recording cannot be used, or they are not in one unit.
@@ -80,26 +80,26 @@ def read_material(
         recorded += found.runs
         units.setdefault(found.speed_unit, path)
     if len(units) > 1:
-        said = " and ".join(f"{unit} ({path})" for unit, path in units.items())
-        raise UserError(f"recordings in different units, {said}: give those of one unit")
+        found_units = " and ".join(f"{unit} ({path})" for unit, path in units.items())
+        raise UserError(f"recordings in different units, {found_units}: give recordings of one unit")
     (unit,) = units
     if unit not in RAD_S_PER_TABLE_UNIT:
-        raise UserError(f"{units[unit]}: unknown unit of speed {unit!r}; known: {', '.join(RAD_S_PER_TABLE_UNIT)}")
-    with model_maker():
+        raise UserError(f"{units[unit]}: unknown speed unit {unit!r}; known: {', '.join(RAD_S_PER_TABLE_UNIT)}")
+    with twin_errors():
         cleaned = [without_outliers(Run(run.path.stem, run.t_s, run.command, run.speed_rad_s)) for run in recorded]
     numbers = fan_numbers(fans) or list(range(recorded[0].command.shape[1]))
     outliers = tuple(
-        f"{run.path}: fan {fan}: {share:.1%} of the speeds are outliers and left out; check the tacho and its line"
+        f"{run.path}: fan {fan}: {share:.1%} of the speeds are outliers and left out; check the tacho and its wiring"
         for run, (_, shares) in zip(recorded, cleaned, strict=True)
         for fan, share in zip(numbers, shares, strict=False)
         if share > MANY_OUTLIERS
     )
-    return Material([run for run, _ in cleaned], recorded, unit, numbers, outliers)
+    return TrainingData([run for run, _ in cleaned], recorded, unit, numbers, outliers)
 
 
 @contextmanager
-def model_maker() -> Iterator[None]:
-    """Around calls of the model maker: its errors, and a missing extra, become one line."""
+def twin_errors() -> Iterator[None]:
+    """Turns errors of the twin package, and a missing extra, into a UserError of one line."""
     try:
         from twin.errors import TwinError  # noqa: PLC0415
 
@@ -113,57 +113,62 @@ def model_maker() -> Iterator[None]:
         raise UserError(f"this needs the extra `train` ({error.name}); {how_to_install('train')}") from error
 
 
-def data_cards(material: Material) -> list[DataCard]:
-    """The files of some material, for a card: one entry a file."""
+def data_cards(training_data: TrainingData) -> list[DataCard]:
+    """One card entry for each file of the training data."""
     from schemas.twin_card import DataCard  # noqa: PLC0415
 
     samples: dict[Path, int] = {}
-    for run in material.recorded:
+    for run in training_data.recorded:
         samples[run.path] = samples.get(run.path, 0) + len(run.t_s)
-    fans = material.runs[0].fans
+    fans = training_data.runs[0].fans
     return [
         DataCard(name=path.name, sha256=sha256_of(path), fans=fans, samples=count) for path, count in samples.items()
     ]
 
 
 def sha256_of(path: Path) -> str:
-    """Of a file, in hexadecimal."""
+    """The hash of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_held_out(
-    material: Material, recordings: Sequence[Path], tray: str | None, fans: str | None, from_s: float, to_s: float
-) -> Material:
-    """Recordings to judge by and not to learn from.
+    training_data: TrainingData,
+    recordings: Sequence[Path],
+    tray: str | None,
+    fans: str | None,
+    from_s: float,
+    to_s: float,
+) -> TrainingData:
+    """Recordings for evaluation, which take no part in the fit.
 
     Raises:
-        UserError: they cannot be used, are in another unit, or hold what was learned from.
+        UserError: they cannot be used, are in another unit, or overlap the training data.
     """
-    held_out = read_material(recordings, tray, fans, from_s, to_s)
-    if held_out.speed_unit != material.speed_unit:
+    held_out = read_training_data(recordings, tray, fans, from_s, to_s)
+    if held_out.speed_unit != training_data.speed_unit:
         raise UserError(
-            f"{recordings[0]}: speeds in {held_out.speed_unit}, those to learn from in {material.speed_unit}: "
+            f"{recordings[0]}: speeds in {held_out.speed_unit}, the training data are in {training_data.speed_unit}: "
             "give recordings of one unit"
         )
     for own in held_out.recorded:
-        for other in material.recorded:
+        for other in training_data.recorded:
             if own.path == other.path and own.t_s[0] <= other.t_s[-1] and other.t_s[0] <= own.t_s[-1]:
                 raise UserError(
-                    f"{own.path}: judged by what it was learned from; give another recording, or other seconds of it"
+                    f"{own.path}: overlaps the training data; give another recording, or other seconds of it"
                 )
     return held_out
 
 
 def check_writable(output: Path, suffix: str) -> None:
-    """Before long work: that its result can be written, and that nothing else is overwritten by mistake.
+    """Check before long work that its result can be written, under a name with this suffix.
 
     Raises:
-        UserError: it cannot, or the name does not end as it should.
+        UserError: it cannot be written, or the name has another suffix.
     """
     if output.suffix != suffix:
         raise UserError(f"{output}: name a file that ends in {suffix} with -o")
-    made_folder(output.parent)
+    make_folder(output.parent)
     existed = output.exists()
     try:
         output.open("ab").close()
@@ -173,14 +178,14 @@ def check_writable(output: Path, suffix: str) -> None:
         raise UserError(f"{output}: cannot be written: {error.strerror}; name another file with -o") from error
 
 
-def made_folder(folder: Path) -> Path:
-    """The folder, made where it was missing.
+def make_folder(folder: Path) -> Path:
+    """Create the folder if it is missing.
 
     Raises:
-        UserError: it cannot be made.
+        UserError: it cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"{folder}: cannot be made: {error.strerror}; name another folder with -o") from error
+        raise UserError(f"{folder}: cannot be created: {error.strerror}; name another folder with -o") from error
     return folder

@@ -43,7 +43,7 @@ def test_all_models_are_there_with_the_parameters_of_their_layers(compared):
 
 
 def test_the_best_has_the_smallest_error_over_the_untouched_recordings(compared):
-    assert compared["judged_on"] == "test"
+    assert compared["evaluated_on"] == "test"
     errors = {its["model"]: its["figures"]["test"]["rmse"] for its in compared["models"]}
     assert compared["best"] == min(errors, key=errors.__getitem__)
 
@@ -62,19 +62,19 @@ def test_a_kept_twin_gives_on_each_recording_the_figures_that_were_told(folder, 
 def test_the_untouched_recordings_take_no_part_in_training(folder, compared):
     arguments = ("--validate", folder / "held-out.mcap", "--iterations", 3, "--model", "hybrid", "--json")
     without = json.loads(fantwin("compare", folder / "healthy.mcap", *arguments).stdout)
-    assert (without["judged_on"], without["best"]) == ("held-out", "hybrid")
+    assert (without["evaluated_on"], without["best"]) == ("held-out", "hybrid")
     (alone,), (among,) = without["models"], [its for its in compared["models"] if its["model"] == "hybrid"]
     assert alone["figures"] == {"held-out": among["figures"]["held-out"]}
     assert alone["twin"] is None
 
 
-def test_without_other_recordings_it_says_that_the_figures_flatter(folder):
+def test_without_other_recordings_it_says_that_the_figures_are_too_optimistic(folder):
     arguments = (folder / "healthy.mcap", "--model", "physical")
-    told = json.loads(fantwin("compare", *arguments, "--json").stdout)
-    (its,) = told["models"]
-    assert (told["judged_on"], list(its["figures"])) == ("training", ["training"])
+    result = json.loads(fantwin("compare", *arguments, "--json").stdout)
+    (its,) = result["models"]
+    assert (result["evaluated_on"], list(its["figures"])) == ("training", ["training"])
     assert its["training_rmse"] == pytest.approx(its["figures"]["training"]["rmse"])
-    assert "the training recordings, which flatters" in fantwin("compare", *arguments).stdout
+    assert "the training recordings, which is too optimistic" in fantwin("compare", *arguments).stdout
 
 
 def test_the_table_fits_a_terminal_and_marks_the_best(folder):
@@ -98,9 +98,9 @@ def test_a_model_that_cannot_be_trained_is_a_row_and_not_the_end(folder, monkeyp
 
     monkeypatch.setattr("twin.comparison.train_twin", train_or_diverge)
     arguments = ("compare", folder / "healthy.mcap", "--model", "narx,physical")
-    told = json.loads(fantwin(*arguments, "--json").stdout)
-    assert told["best"] == "physical"
-    assert told["models"][0] == {"model": "narx", "said": "NARX", "invalid_reason": "the narx model diverges"}
+    result = json.loads(fantwin(*arguments, "--json").stdout)
+    assert result["best"] == "physical"
+    assert result["models"][0] == {"model": "narx", "title": "NARX", "invalid_reason": "the narx model diverges"}
     shown = fantwin(*arguments)
     assert shown.exit_code == 0
     assert "NARX: not trained: the narx model diverges" in shown.stderr
@@ -117,7 +117,7 @@ def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
     assert "cannot read the recording" in said_instead("compare", healthy, "--test", tmp_path / "nowhere.mcap")
     (tmp_path / "file").touch()
     unwritable = ("-o", tmp_path / "file" / "twins", "--model", "physical")
-    assert "cannot be made" in said_instead("compare", healthy, *unwritable)
+    assert "cannot be created" in said_instead("compare", healthy, *unwritable)
     still = rough_run(1, 5.0)
     record(tmp_path / "still.mcap", Run("still", still.t_s, np.full_like(still.command, 50.0), still.speed_rad_s))
     assert "command" in said_instead("compare", tmp_path / "still.mcap")

@@ -168,12 +168,12 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def test_evaluate_tells_machines_of_other_grids_and_of_what_is_left(recorded: tuple[Path, Path]) -> None:
     arguments = ("--rate", "50", "--rate", "irregular", "--json")
-    told = json.loads(fantwin("evaluate", *recorded, *arguments).stdout)
-    assert [(grid["rate"], grid["samples"], len(grid["fans"])) for grid in told["grids"][:1]] == [(50.0, 1500, 2)]
-    assert told["grids"][1]["rate"] == "irregular"
-    assert told["grids"][0]["rmse"] != told["rmse"]
-    assert told["expected_coverage_2_sigma"] == pytest.approx(0.9545, abs=1e-4)
-    for fan in told["fans"]:
+    result = json.loads(fantwin("evaluate", *recorded, *arguments).stdout)
+    assert [(grid["rate"], grid["samples"], len(grid["fans"])) for grid in result["grids"][:1]] == [(50.0, 1500, 2)]
+    assert result["grids"][1]["rate"] == "irregular"
+    assert result["grids"][0]["rmse"] != result["rmse"]
+    assert result["expected_coverage_2_sigma"] == pytest.approx(0.9545, abs=1e-4)
+    for fan in result["fans"]:
         left = fan["residual"]
         assert left["samples"] == 1500 - 300
         assert len(left["lags_s"]) == len(left["autocorrelation"]) > 100
@@ -187,8 +187,8 @@ def test_evaluate_tells_machines_of_other_grids_and_of_what_is_left(recorded: tu
 
 def test_evaluate_shows_a_row_for_each_fan_and_each_grid(recorded: tuple[Path, Path]) -> None:
     shown = fantwin("evaluate", *recorded, "--rate", "12.5", "--rate", "irregular").stdout
-    rows = re.findall(r"^ ([\d.]+ Hz|\d+|all|own|irregular) ", shown, re.MULTILINE)
-    assert rows == ["0", "1", "all", "own", "12.5 Hz", "irregular"]
+    rows = re.findall(r"^ ([\d.]+ Hz|\d+|all|recorded|irregular) ", shown, re.MULTILINE)
+    assert rows == ["0", "1", "all", "recorded", "12.5 Hz", "irregular"]
     assert "free run: rmse" in shown.splitlines()[1]
     assert "Hz" not in fantwin("evaluate", *recorded).stdout
 
@@ -196,8 +196,8 @@ def test_evaluate_shows_a_row_for_each_fan_and_each_grid(recorded: tuple[Path, P
 def test_evaluate_warns_as_the_report_does(recorded: tuple[Path, Path]) -> None:
     evaluated = json.loads(fantwin("evaluate", *recorded, "--json").stdout)
     reported = json.loads(fantwin("report", *recorded, "-o", recorded[0].parent / "page.html", "--json").stdout)
-    for said in ("warnings", "verdict", "headline"):
-        assert evaluated[said] == reported[said]
+    for key in ("warnings", "assessment", "headline"):
+        assert evaluated[key] == reported[key]
     assert "two.mcap: used in training" in evaluated["warnings"][0]
     assert fantwin("evaluate", *recorded).stderr.splitlines() == evaluated["warnings"]
 
@@ -205,10 +205,10 @@ def test_evaluate_warns_as_the_report_does(recorded: tuple[Path, Path]) -> None:
 def test_numbers_beyond_reason_are_shown_whole_in_the_table_and_with_an_exponent() -> None:
     wild = {"rmse": 3.21e14, "max_error": 123456.7, "r2": -4.56e18, "one_step_rmse": 8.7e300, "coverage_2_sigma": 0.0}
     residual = {"ljung_box_p": 0.0, "cross_over_bound": -1.2e9}
-    told = {"speed_unit": "rpm", "fans": [{"fan": 63, **wild, "residual": residual}]}
+    result = {"speed_unit": "rpm", "fans": [{"fan": 63, **wild, "residual": residual}]}
     console = Console(width=80)
     with console.capture() as captured:
-        console.print(_fan_table(told))
+        console.print(_fan_table(result))
     shown = captured.get()
     assert shown.split()[-8:] == ["63", "3.21e+14", "123457", "-4.56e+18", "8.7e+300", "0.0%", "<0.001", "-1.2e+09"]
     assert "…" not in shown
@@ -260,8 +260,8 @@ def test_a_twin_made_before_cards_named_fans_is_still_read_and_serves_as_many(tr
     old = write_twin(tray / "old.onnx", fans=2, training=training)
     assert OnnxTwin(old).card.training.fans == ()
     for options in (("two.mcap",), ("three.mcap", "--fans", "0,2")):
-        told = json.loads(fantwin("evaluate", old, tray / options[0], *options[1:], "--json").stdout)
-        assert len(told["fans"]) == 2
+        result = json.loads(fantwin("evaluate", old, tray / options[0], *options[1:], "--json").stdout)
+        assert len(result["fans"]) == 2
     assert "has 2 fans and does not say which" in said_instead("evaluate", old, tray / "two.mcap", "--fans", "1")
 
 

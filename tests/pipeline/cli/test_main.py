@@ -141,4 +141,4 @@ def test_train_takes_every_recording_after_validate_as_one_to_judge_by(recording
     words[6] = other
     done = fantwin(*words, "--json")
     assert done.returncode == 0, done.stderr
-    assert '"judged_on": "held-out"' in done.stdout
+    assert '"evaluated_on": "held-out"' in done.stdout

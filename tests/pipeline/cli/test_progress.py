@@ -1,20 +1,22 @@
 """What is said on stderr while a command works and nobody watches a terminal."""
 
 from types import SimpleNamespace
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
 from pipeline.cli import progress
-from pipeline.cli.twins.training_data import Material
 
-MATERIAL = cast("Material", SimpleNamespace(rad_s_per_unit=0.1, speed_unit="rpm"))
+if TYPE_CHECKING:
+    from pipeline.cli.twins.training_data import TrainingData
+
+TRAINING_DATA = cast("TrainingData", SimpleNamespace(rad_s_per_unit=0.1, speed_unit="rpm"))
 
 
 def test_without_a_terminal_a_line_tells_every_few_seconds_how_far_a_training_is(monkeypatch, capsys) -> None:
     now_s = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now_s[0])
-    with progress.training_progress(MATERIAL) as start:
+    with progress.training_progress(TRAINING_DATA) as start:
         tell = start("hybrid")
         for iteration in range(1, 14):
             now_s[0] += 1.0

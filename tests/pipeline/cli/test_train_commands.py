@@ -50,13 +50,13 @@ def twin(folder: Path) -> Path:
 
 
 def test_identify_finds_the_published_fan(folder):
-    told = json.loads(fantwin("identify", folder / "healthy.mcap", "--json").stdout)
-    (fan,) = told["fans"]
+    result = json.loads(fantwin("identify", folder / "healthy.mcap", "--json").stdout)
+    (fan,) = result["fans"]
     for name, published in zip(("J", "alpha", "C_D"), PUBLISHED_PARAMETERS, strict=True):
         low, high = fan[f"{name}_95"]
         assert low < fan[name] < high
         assert fan[name] == pytest.approx(published, rel=0.15)
-    assert told["speed_unit"] == "rad/s"
+    assert result["speed_unit"] == "rad/s"
 
 
 def test_identify_shows_a_row_for_each_fan(folder):
@@ -70,19 +70,24 @@ def test_identify_shows_a_row_for_each_fan(folder):
 def test_each_model_is_trained_and_its_file_evaluates_as_it_said(folder, tmp_path, model):
     file = tmp_path / "twin.onnx"
     arguments = ("--model", model, "--validate", folder / "held-out.mcap", "--iterations", "2", "--json")
-    told = json.loads(fantwin("train", folder / "healthy.mcap", *arguments, "-o", file).stdout)
-    assert (told["model"], told["twin"], told["judged_on"], told["fans"]) == (model, str(file), "held-out", 1)
+    result = json.loads(fantwin("train", folder / "healthy.mcap", *arguments, "-o", file).stdout)
+    assert (result["model"], result["twin"], result["evaluated_on"], result["fans"]) == (
+        model,
+        str(file),
+        "held-out",
+        1,
+    )
     evaluated = json.loads(fantwin("evaluate", file, folder / "held-out.mcap", "--json").stdout)
     for figure in ("rmse", "max_error", "r2", "one_step_rmse", "coverage_2_sigma"):
-        assert evaluated[figure] == pytest.approx(told[figure], rel=1e-4), figure
+        assert evaluated[figure] == pytest.approx(result[figure], rel=1e-4), figure
     assert evaluated["samples"] == 4000
 
 
 def test_a_good_twin_is_as_good_as_the_noise_lets_it(folder, twin):
-    told = json.loads(fantwin("evaluate", twin, folder / "held-out.mcap", "--json").stdout)
-    assert told["rmse"] == pytest.approx(np.sqrt(10), rel=0.05)
-    assert told["r2"] > 0.98
-    assert told["coverage_2_sigma"] == pytest.approx(0.954, abs=0.02)
+    result = json.loads(fantwin("evaluate", twin, folder / "held-out.mcap", "--json").stdout)
+    assert result["rmse"] == pytest.approx(np.sqrt(10), rel=0.05)
+    assert result["r2"] > 0.98
+    assert result["coverage_2_sigma"] == pytest.approx(0.954, abs=0.02)
 
 
 def test_figures_are_in_the_recordings_own_unit(folder, twin):
@@ -100,11 +105,11 @@ def test_a_part_of_a_recording_can_be_used(folder, twin):
     whole = json.loads(fantwin("evaluate", twin, folder / "healthy.mcap", "--json").stdout)
     part = json.loads(fantwin("evaluate", twin, folder / "healthy.mcap", "--from", 10, "--to", 25, "--json").stdout)
     assert (whole["samples"], part["samples"]) == (4000, 1500)
-    told = json.loads(
+    result = json.loads(
         fantwin("train", folder / "healthy.mcap", "--to", 20, "--validate", folder / "healthy.mcap",
                 "--validate-from", 30, "--model", "physical", "-o", folder / "part.onnx", "--json").stdout
     )  # fmt: skip
-    assert (told["judged_on"], told["samples"]) == ("held-out", 1000)
+    assert (result["evaluated_on"], result["samples"]) == ("held-out", 1000)
 
 
 def test_without_held_out_recordings_it_says_so(folder, tmp_path):
@@ -114,9 +119,9 @@ def test_without_held_out_recordings_it_says_so(folder, tmp_path):
 
 def test_the_healthy_torque_balance_is_told(folder, tmp_path):
     command = ("train", folder / "two.mcap", "--model", "physical", "--command-unit", "%", "-o", tmp_path / "t.onnx")
-    told = json.loads(fantwin(*command, "--json").stdout)
-    assert told["balance_source"] == ["physics"] * 2
-    low, high = sorted(told["balance_sigma"])
+    result = json.loads(fantwin(*command, "--json").stdout)
+    assert result["balance_source"] == ["physics"] * 2
+    low, high = sorted(result["balance_sigma"])
     implied = PUBLISHED_PARAMETERS[0] * 3.0 * NOISE_RAD_S
     assert (low, high) == (pytest.approx(implied, rel=0.1), pytest.approx(implied, rel=0.1))
     line = f"  torque balance: healthy sigma {low:.4g} to {high:.4g} %; coefficients of 2 fan(s) by physics"
@@ -126,9 +131,9 @@ def test_the_healthy_torque_balance_is_told(folder, tmp_path):
 def test_the_same_seed_gives_the_same_figures(folder, tmp_path):
     def train(seed: int) -> dict:
         arguments = ("--model", "neural-ode", "--iterations", 2, "--to", 15, "--seed", seed, "--json")
-        told = json.loads(fantwin("train", folder / "healthy.mcap", *arguments, "-o", tmp_path / "t.onnx").stdout)
-        del told["duration_s"]
-        return told
+        result = json.loads(fantwin("train", folder / "healthy.mcap", *arguments, "-o", tmp_path / "t.onnx").stdout)
+        del result["duration_s"]
+        return result
 
     first = train(1)
     assert train(1) == first
@@ -160,7 +165,7 @@ def test_what_cannot_be_done_is_told_in_one_line(folder, twin, tmp_path):
     assert "runs of [1, 2] fans are mixed" in said_instead("train", healthy, folder / "two.mcap", "-o", out)
     (tmp_path / "file").touch()
     unwritable = tmp_path / "file" / "t.onnx"
-    assert "cannot be made" in said_instead("train", healthy, "--model", "physical", "-o", unwritable)
+    assert "cannot be created" in said_instead("train", healthy, "--model", "physical", "-o", unwritable)
 
 
 def test_nothing_is_overwritten_or_judged_by_mistake(folder, tmp_path):
@@ -170,9 +175,9 @@ def test_nothing_is_overwritten_or_judged_by_mistake(folder, tmp_path):
     assert healthy.read_bytes() == before
     twin = tmp_path / "twin.onnx"
     same = said_instead("train", healthy, "--validate", healthy, *physical, "-o", twin)
-    assert "judged by what it was learned from" in same
+    assert "overlaps the training data" in same
     other_unit = said_instead("train", healthy, "--validate", folder / "healthy-rpm.mcap", *physical, "-o", twin)
-    assert "speeds in rpm, those to learn from in rad/s" in other_unit
+    assert "speeds in rpm, the training data are in rad/s" in other_unit
     assert not twin.exists()
     parts = fantwin("train", healthy, "--to", 20, "--validate", healthy, "--validate-from", 20, *physical, "-o", twin)
     assert parts.exit_code == 0, parts.output
@@ -189,11 +194,11 @@ def test_outliers_are_left_out_alike_wherever_a_twin_is_judged(tmp_path):
     trained = fantwin(
         "train", tmp_path / "learn.mcap", "--validate", judge, "--model", "physical", "-o", twin, "--json"
     )
-    told = json.loads(trained.stdout)
+    result = json.loads(trained.stdout)
     evaluated = json.loads(fantwin("evaluate", twin, judge, "--json").stdout)
-    assert told["rmse"] == pytest.approx(evaluated["rmse"], rel=1e-6)
-    assert told["rmse"] < 1.05 * NOISE_RAD_S
-    assert any("of the speeds are outliers" in line for line in told["warnings"])
+    assert result["rmse"] == pytest.approx(evaluated["rmse"], rel=1e-6)
+    assert result["rmse"] < 1.05 * NOISE_RAD_S
+    assert any("of the speeds are outliers" in line for line in result["warnings"])
     assert any("of the speeds are outliers" in line for line in evaluated["warnings"])
 
 

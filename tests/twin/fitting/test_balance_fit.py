@@ -57,8 +57,8 @@ def plants() -> tuple[Run, Identification]:
 
 def within_run(run: Run, fit: BalanceFit) -> Array:
     """(n, fans) balance of a run about its mean, without its first second."""
-    balance = torque_balance(run.command, run.speed_rad_s, run.median_step_s, fit.coefficients, fit.lag_s)
-    settled = balance[round(1.0 / run.median_step_s) :]
+    balance = torque_balance(run.command, run.speed_rad_s, run.median_period_s, fit.coefficients, fit.lag_s)
+    settled = balance[round(1.0 / run.median_period_s) :]
     return settled - np.nanmean(settled, axis=0)
 
 

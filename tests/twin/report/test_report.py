@@ -27,16 +27,16 @@ from twin.export.onnx_twin import OnnxTwin
 from twin.fitting.identification import identify
 from twin.models.physical import PhysicalModel
 from twin.models.physics import PARAMETER_NAMES
+from twin.report.assessment import assess
 from twin.report.content import Content, SpeedUnit, report_content
 from twin.report.figures import error_over_speed, histogram
 from twin.report.page import MOST_FANS_DRAWN, drawn_fans, report_page, shown
 from twin.report.speed_bins import speed_bins
 from twin.report.steady_states import static_curve
 from twin.report.timeline import broken_at, kept_samples, timeline
-from twin.report.verdict import judge
 from twin.runs import Run
 
-SECTIONS = ["verdict", "figures", "parameters", "fan-0", "meaning", "card"]
+SECTIONS = ["assessment", "figures", "parameters", "fan-0", "meaning", "card"]
 TITLES = [
     "Fit and error over time",
     "Around the largest error",
@@ -158,7 +158,7 @@ def test_ids_are_told_once_and_every_reference_has_its_target(folder):
     assert len(parsed.ids) == len(set(parsed.ids))
     targets = {reference[1:] for reference in parsed.references} | set(re.findall(r"url\(#([^)]*)\)", text))
     assert targets <= set(parsed.ids)
-    assert parsed.sections == ["verdict", "figures", "parameters", "fan-0", "fan-1", "meaning", "card"]
+    assert parsed.sections == ["assessment", "figures", "parameters", "fan-0", "fan-1", "meaning", "card"]
     assert set(parsed.numbers) > {"pooled", "row-0", "row-1"}
 
 
@@ -171,13 +171,13 @@ def test_machines_are_told_the_same(folder, page):
     for figure in figures:
         assert told[figure] == evaluated[figure]
         assert told["fans"][0][figure] == evaluated["fans"][0][figure]
-    assert (told["verdict"], told["fans"][0]["fan"]) == ("as declared", 0)
+    assert (told["assessment"], told["fans"][0]["fan"]) == ("as declared", 0)
     assert told["bytes"] == (folder / "again.html").stat().st_size
     assert (folder / "again.html").read_text() == page
 
 
 def test_a_healthy_fan_is_followed_as_declared_and_without_a_warning(twin):
-    judged = judge(content_of(twin, published_run(5, 30.0)))
+    judged = assess(content_of(twin, published_run(5, 30.0)))
     assert (judged.level, judged.warnings) == ("as declared", ())
     assert judged.headline == "The twin follows this fan as closely as its card says."
 
@@ -185,7 +185,7 @@ def test_a_healthy_fan_is_followed_as_declared_and_without_a_warning(twin):
 def test_a_fan_that_runs_slow_is_not_followed_and_the_page_says_by_how_much(twin):
     healthy = published_run(5, 30.0)
     content = content_of(twin, with_speed(healthy, 0.9 * healthy.speed_rad_s))
-    judged = judge(content)
+    judged = assess(content)
     assert judged.level == "not followed"
     assert f"rmse {content.fans[0].rmse_in_sigma:.2f} times the declared sigma" in judged.headline
     assert any("on average faster or slower" in line for line in judged.warnings)
@@ -195,20 +195,20 @@ def test_a_fan_that_runs_slow_is_not_followed_and_the_page_says_by_how_much(twin
 def test_the_worst_fan_decides_and_is_named(twin):
     healthy = published_run(6, 20.0, fans=3)
     slow = healthy.speed_rad_s * np.array([1.0, 0.85, 1.0])
-    judged = judge(content_of(twin, with_speed(healthy, slow)))
+    judged = assess(content_of(twin, with_speed(healthy, slow)))
     assert "does not follow fan 1: rmse" in judged.headline
-    assert "A twin of one fan judges 3: fans differ, and so may what they leave." in judged.warnings
+    assert "A twin of one fan is used for 3: fans differ, and so may their errors." in judged.warnings
 
 
 def test_what_lessens_the_figures_is_told(twin):
     run = published_run(7, 20.0)
     trained_on = DataCard("healthy.mcap", twin.card.training.data[0].sha256, 1, run.samples)
-    assert "flatter" in judge(report_content(twin, [run], [trained_on], RAD_S)).warnings[0]
+    assert "too optimistic" in assess(report_content(twin, [run], [trained_on], RAD_S)).warnings[0]
     beyond = Run("beyond", run.t_s, run.command + 40.0, run.speed_rad_s)
-    assert any("outside the trained range" in line for line in judge(content_of(twin, beyond)).warnings)
+    assert any("outside the trained range" in line for line in assess(content_of(twin, beyond)).warnings)
     speed = run.speed_rad_s.copy()
     speed[::4] = np.nan
-    assert any("speeds are missing" in line for line in judge(content_of(twin, with_speed(run, speed))).warnings)
+    assert any("speeds are missing" in line for line in assess(content_of(twin, with_speed(run, speed))).warnings)
 
 
 def test_a_free_run_that_diverges_is_told_and_still_drawn(twin):
@@ -220,8 +220,8 @@ def test_a_free_run_that_diverges_is_told_and_still_drawn(twin):
         fan, figures=figures, predicted_rad_s=nowhere, error_rad_s=np.full_like(nowhere, np.inf), by_speed=()
     )
     lost = replace(content, fans=(gone,), evaluation=replace(content.evaluation, per_fan=(figures,), pooled=figures))
-    assert judge(lost).headline == "The twin does not follow this fan: rmse without limit."
-    assert "This fan: the free run diverges." in judge(lost).warnings
+    assert assess(lost).headline == "The twin does not follow this fan: rmse without limit."
+    assert "This fan: the free run diverges." in assess(lost).warnings
     assert Page(report_page(lost)).numbers["row-0"][0] == np.inf
 
 
@@ -318,25 +318,25 @@ def test_the_page_says_why_no_measured_point_is_on_the_static_curve(twin):
     run = published_run(1, 10.0)
     hasty = published_fan(np.where(np.arange(1000) // 10 % 2, 20.0, 80.0)[:, np.newaxis], 1, "hasty").run
     never = report_page(content_of(twin, hasty))
-    assert re.search(r"the one that came nearest lasted 0\.\d+ s and needed \d", Page(never).text)
+    assert re.search(r"the nearest lasted 0\.\d+ s and needed \d", Page(never).text)
     moving = Run("ramp", run.t_s, 10.0 * run.t_s, run.speed_rad_s)
-    assert "The command never held still" in Page(report_page(content_of(twin, moving))).text
+    assert "The command was never constant" in Page(report_page(content_of(twin, moving))).text
 
 
 def test_a_band_that_is_too_wide_and_figures_of_few_errors_are_told(twin):
     run = published_run(5, 30.0)
-    assert judge(content_of(twin, run)).warnings == ()
+    assert assess(content_of(twin, run)).warnings == ()
     content = content_of(twin, run)
     wide = replace(content, fans=(replace(content.fans[0], sigma_rad_s=2.0 * content.fans[0].sigma_rad_s),))
-    (line,) = judge(wide).warnings
-    assert line.startswith("This fan: the card's sigma is over 1.5 times what the errors scatter by")
-    assert judge(wide).level == "as declared"
-    (line,) = judge(content_of(twin, run.between(0.0, 0.9))).warnings
-    assert re.search(r"errors worth \d+ independent ones tell their rmse to 1\d% only", line)
+    (line,) = assess(wide).warnings
+    assert line.startswith("This fan: the card's sigma is over 1.5 times the scatter of the errors")
+    assert assess(wide).level == "as declared"
+    (line,) = assess(content_of(twin, run.between(0.0, 0.9))).warnings
+    assert re.search(r"\d+ independent errors determine the rmse to 1\d% only", line)
     healthy = replace(twin.card.healthy, independent_samples=(8.0,))
     of_few = SimpleNamespace(card=replace(twin.card, healthy=healthy), path=twin.path)
-    (line,) = judge(replace(content, twin=cast("OnnxTwin", of_few))).warnings
-    assert "worth 8 independent ones: its sigma may be off by 25%" in line
+    (line,) = assess(replace(content, twin=cast("OnnxTwin", of_few))).warnings
+    assert "equivalent of 8 independent errors: its sigma may be off by 25%" in line
 
 
 @pytest.mark.parametrize(
@@ -382,7 +382,7 @@ def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
     assert "not an ONNX file" in said_instead("report", held_out, held_out)
     assert "cannot read the recording" in said_instead("report", twin, tmp_path / "nowhere.mcap")
     (tmp_path / "file").touch()
-    assert "cannot be made" in said_instead("report", twin, held_out, "-o", tmp_path / "file" / "page.html")
+    assert "cannot be created" in said_instead("report", twin, held_out, "-o", tmp_path / "file" / "page.html")
     assert "name a file that ends in .html" in said_instead("report", twin, held_out, "-o", tmp_path)
     (tmp_path / "folder.html").mkdir()
     assert "cannot be written" in said_instead("report", twin, held_out, "-o", tmp_path / "folder.html")

@@ -1,4 +1,4 @@
-"""What the figures of a report come to, in plain words."""
+"""The assessment of a report in sentences: one headline, and a warning for each thing a reader should know."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -12,16 +12,16 @@ Level = Literal["as declared", "looser than declared", "not followed"]
 
 AS_DECLARED = 1.1
 LOOSER = 1.5
-"""Of the free-run rmse in healthy sigma: up to the first as declared, up to the second looser, beyond not followed."""
+"""Limits of the free-run rmse in healthy sigma: as declared up to the first, looser up to the second."""
 WORSE: dict[Level, str] = {
     "not followed": "does not follow {}",
     "looser than declared": "follows {} less closely than its card says",
 }
 RANGE_TOLERANCE = 0.05
-"""Commands may leave the trained range by this share of its width, as in production (docs/explanation/deciding.md)."""
+"""of the width of the trained command range; as in production (docs/explanation/deciding.md)"""
 RATE_TOLERANCE = 0.01
 UNCERTAIN = 1.0
-"""A parameter is poorly determined when half its 95 % interval is wider than this share of it."""
+"""A parameter is poorly determined when half its 95 % interval is wider than this share of its value."""
 OFTEN_MISSING = 0.1
 CHANCE_PEAK = 2.0
 BIASED_IN_SIGMA, BIASED_IN_ERRORS = 0.2, 3.0
@@ -29,37 +29,37 @@ BIASED_AT_A_SPEED_IN_SIGMA = 1.0
 WIDE_BAND = 1.5
 """A card's sigma is wide when it exceeds the standard deviation of the errors by this factor."""
 FEW_INDEPENDENT = 0.5 / (AS_DECLARED - 1.0) ** 2
-"""Fewer independent errors than these tell their rmse, to 1 / sqrt(2 n), worse than the margin of as declared."""
+"""With fewer independent errors the rmse is less certain (1 / sqrt(2 n)) than the margin of `as declared`."""
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """The whole report in a line, and what a reader should not overlook, a line each."""
+class Assessment:
+    """The whole report in one line, and its warnings, one line each."""
 
     level: Level
     headline: str
     warnings: tuple[str, ...]
 
 
-def judge(content: Content) -> Verdict:
-    """Judge by the worst fan: a tray's twin is as good as that of each fan."""
-    for level, said in WORSE.items():
+def assess(content: Content) -> Assessment:
+    """The assessment by the worst fan."""
+    for level, sentence in WORSE.items():
         if worse := [fan for fan in content.fans if level_of(fan) == level]:
-            did = said.format(_these(worse, content))
-            return Verdict(level, f"The twin {did}: rmse {_worst(worse)}.", warnings(content))
+            what = sentence.format(_these(worse, content))
+            return Assessment(level, f"The twin {what}: rmse {_worst(worse)}.", warnings(content))
     who = "this fan" if len(content.fans) == 1 else f"all {len(content.fans)} fans"
-    return Verdict("as declared", f"The twin follows {who} as closely as its card says.", warnings(content))
+    return Assessment("as declared", f"The twin follows {who} as closely as its card says.", warnings(content))
 
 
 def level_of(fan: FanContent) -> Level:
-    """One fan's; a diverged or undefined free run is not followed."""
+    """The level of one fan; `not followed` where the free run diverged or is undefined."""
     if fan.rmse_in_sigma <= AS_DECLARED:
         return "as declared"
     return "looser than declared" if fan.rmse_in_sigma <= LOOSER else "not followed"
 
 
 def warnings(content: Content) -> tuple[str, ...]:
-    """A line for each thing that a reader should know before trusting the figures."""
+    """One line for each thing a reader should know before trusting the figures."""
     return (*_about_the_data(content), *_about_the_fit(content), *_about_the_parameters(content))
 
 
@@ -67,28 +67,28 @@ def _about_the_data(content: Content) -> Iterable[str]:
     card = content.card
     trained_on = {data.sha256 for data in card.training.data}
     if seen := [data.name for data in content.recordings if data.sha256 in trained_on]:
-        yield f"{', '.join(seen)}: used in training, wholly or in part; over that part these figures flatter."
+        yield f"{', '.join(seen)}: used in training, at least in part; there these figures are too optimistic."
     if card.validation.source == "training":
-        yield "The band rests on the error over the training data, so it may be too narrow: train with --validate."
+        yield "The band is the error over the training data, so it may be too narrow: train with --validate."
     if few := [n for n in card.healthy.independent_samples if n is not None and n < FEW_INDEPENDENT]:
         yield (
-            f"The band rests on errors worth {min(few):.0f} independent ones: its sigma may be off by "
+            f"The band is estimated from the equivalent of {min(few):.0f} independent errors: its sigma may be off by "
             f"{_uncertainty(min(few)):.0%}; validate on longer recordings."
         )
     if card.fans == 1 and len(content.fans) > 1:
-        yield f"A twin of one fan judges {len(content.fans)}: fans differ, and so may what they leave."
+        yield f"A twin of one fan is used for {len(content.fans)}: fans differ, and so may their errors."
     low, high = card.command_range
     reach = RANGE_TOLERANCE * (high - low)
     outside = np.mean([np.mean((fan.command < low - reach) | (fan.command > high + reach)) for fan in content.fans])
     if outside > 0.0:
         yield (
             f"{outside:.1%} of the commands lie outside the trained range {low:.4g} to {high:.4g} {card.command_unit}"
-            .rstrip() + ": there the twin is a guess."
+            .rstrip() + ": there the twin extrapolates."
         )  # fmt: skip
     if card.fixed_rate and abs(content.rate_hz / card.rate_hz - 1.0) > RATE_TOLERANCE:
         yield (
-            f"A discrete twin of {card.rate_hz:.4g} Hz was run at {content.rate_hz:.4g} Hz: "
-            "its figures say nothing about the fan."
+            f"This twin holds at {card.rate_hz:.4g} Hz only and was run at {content.rate_hz:.4g} Hz: "
+            "these figures are meaningless."
         )
 
     def often_missing(fan: FanContent) -> bool:
@@ -101,23 +101,23 @@ def _about_the_fit(content: Content) -> Iterable[str]:
     yield from _of_fans(content, _unmeasured, "no speed was measured")
     yield from _of_fans(content, _diverged, "the free run diverges")
     yield from _of_fans(
-        content, _wide_band, f"the card's sigma is over {WIDE_BAND:g} times what the errors scatter by, so the verdict "
-        "is generous"
+        content, _wide_band, f"the card's sigma is over {WIDE_BAND:g} times the scatter of the errors: "
+        "the assessment is generous"
     )  # fmt: skip
     if few := [fan for fan in content.fans if _few(fan)]:
         fewest = min(_independent(fan) for fan in few)
         yield (
-            f"{_these(few, content).capitalize()}: errors worth {fewest:.0f} independent ones tell their rmse to "
-            f"{_uncertainty(fewest):.0%} only; judge by longer recordings."
+            f"{_these(few, content).capitalize()}: {fewest:.0f} independent errors determine the rmse "
+            f"to {_uncertainty(fewest):.0%} only; use longer recordings."
         )
     yield from _of_fans(content, _biased, "on average faster or slower than the twin")
     yield from _of_fans(
-        content, _biased_at_a_speed, "at some speeds off by more than sigma on average; see Error over speed"
+        content, _biased_at_a_speed, "the mean error exceeds sigma at some speeds; see Error over speed"
     )
     yield from _of_fans(
         content,
         lambda fan: bool(abs(fan.residual.cross_over_bound) > CHANCE_PEAK),
-        "the error follows the command: the twin misses a part of what the command does",
+        "the error correlates with the command: the twin misses part of its effect",
     )
 
 
@@ -160,26 +160,26 @@ def _few(fan: FanContent) -> bool:
 
 
 def _independent(fan: FanContent) -> float:
-    """How many independent errors the fan's are worth; one, where they are too few to tell."""
+    """The effective number of independent errors of a fan; 1 where it cannot be estimated."""
     return float(np.nan_to_num(fan.residual.independent_samples, nan=1.0))
 
 
 def _uncertainty(independent: float) -> float:
-    """Relative, one standard deviation, of a root mean square of so many independent normal errors."""
+    """Relative standard deviation of the root mean square of so many independent normal errors."""
     return float(1.0 / np.sqrt(2.0 * independent))
 
 
 def _biased(fan: FanContent) -> bool:
-    """Whether the mean error is large beside sigma and beside its own standard error."""
+    """Whether the mean error is large relative to sigma and to its standard error."""
     offset = abs(fan.residual.mean_rad_s)
     standard_error = fan.figures.rmse_rad_s / np.sqrt(fan.residual.independent_samples)
     return bool(offset > BIASED_IN_SIGMA * fan.sigma_rad_s and offset > BIASED_IN_ERRORS * standard_error)
 
 
-def _of_fans(content: Content, concerned: Callable[[FanContent], bool], said: str) -> Iterable[str]:
+def _of_fans(content: Content, concerned: Callable[[FanContent], bool], sentence: str) -> Iterable[str]:
     """One line that names the fans concerned; none when there are none."""
     if fans := [fan for fan in content.fans if concerned(fan)]:
-        yield f"{_these(fans, content).capitalize()}: {said}."
+        yield f"{_these(fans, content).capitalize()}: {sentence}."
 
 
 def _these(fans: list[FanContent], content: Content) -> str:
