@@ -178,7 +178,9 @@ class ScorerCore(Core):
                 self._set_aside = IN_PART
         self._last_t_ns = self._noted_t_ns = snapshot.t_ns
         self._fed_by, self._may_be_of_other_times = fed_by, True
-        told = self._alarms.disown(snapshot.t_ns, stays_quiet=True) if self._set_aside else self._alarms.restate()
+        told = (
+            self._alarms.discard_all(snapshot.t_ns, keep_silenced=True) if self._set_aside else self._alarms.republish()
+        )
         return [replace(snapshot, restored=True), *told]
 
     def tick(self, now_ns: int) -> list[Alarm | ScorerSnapshot]:
@@ -247,7 +249,7 @@ class ScorerCore(Core):
         again = began_t_ns is not None and first_t_ns <= began_t_ns
         if not again and first_t_ns >= self._last_t_ns - BACK_IN_TIME_NS:
             return []
-        disowned, self._set_aside = self._alarms.disown(first_t_ns, stays_quiet=False), ""
+        disowned, self._set_aside = self._alarms.discard_all(first_t_ns, keep_silenced=False), ""
         self._begin()
         self._first = []
         self._counts["snapshots_of_other_times"] += 1
@@ -264,7 +266,7 @@ class ScorerCore(Core):
         told = np.where(np.isin(invalid_reason, (InvalidReason.GAP, InvalidReason.STALE)), np.nan, command)
         usual = np.where(np.isfinite(measured), verdict.balance_usual * sigma_command, np.nan)
         self._diagnoser.take(t_ns, item.period_ns, told, measured, balance_baseline, verdict.balance_baseline_s, usual)
-        state, changes = self._alarms.states(t_ns, item.period_ns, verdict.score, valid)
+        state, changes = self._alarms.update(t_ns, item.period_ns, verdict.score, valid)
         invalid_reason = np.where(
             valid,
             InvalidReason.NONE,
@@ -295,7 +297,7 @@ class ScorerCore(Core):
             score=verdict.score,
             statistic=verdict.statistic,
         )
-        return score, self._alarms.tell(
+        return score, self._alarms.emit(
             changes, score, self._distance(verdict, item.period_ns / NS_PER_S, sigma, sigma_command)
         )
 
@@ -306,7 +308,7 @@ class ScorerCore(Core):
         self._wear.update(
             item.t_ns,
             self._judge.origin_t_ns,
-            quiet=(verdict.score < QUIET) & normal & known,
+            eligible=(verdict.score < QUIET) & normal & known,
             disturbed=(verdict.score >= QUIET) | ~(normal | (state == FanState.UNKNOWN)),
             commissioned_command=verdict.balance_commissioned * sigma_command,
             held=verdict.balance_held,

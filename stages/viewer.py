@@ -82,7 +82,7 @@ def alarm_line(alarm: Alarm) -> tuple[str, str]:
     """Level and text of what happened to an alarm, for people."""
     happened = alarm.transition.name.lower().replace("_", " ")
     if alarm.severity == Severity.NONE and alarm.transition == Transition.REPUBLISHED:
-        states = CurrentAlarm(alarm, alarm.message, (), "").words()
+        states = CurrentAlarm(alarm, alarm.message, (), "").states()
         return "INFO", f"{happened} ({', '.join(states)}): {alarm.message}"
     if alarm.transition not in (Transition.RAISED, Transition.SEVERITY, Transition.REPUBLISHED):
         return "INFO", f"{happened}: {alarm.message}"

@@ -1,7 +1,8 @@
-"""The alarms of a tray as they are told: what happened, how far the fan is from its twin, and why, if that is known."""
+"""The alarms of a tray as messages: each transition with the distance from the twin and, where known, the causes."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -24,9 +25,10 @@ from scoring.alarms.alarm_state import AlarmState, ConditionSettings
 from scoring.alarms.alarm_text import AlarmText
 from scoring.alarms.tray_alarms import AlarmEvent, Conditions
 from scoring.diagnosis.diagnoser import Diagnoser
+from scoring.former_snapshot_keys import FORMER_ALARM_KEYS, current_keys
 
-STILL_THERE = 0.5  # of the torque balance that it had
-MOST_PRODUCERS = 64  # of requests: so many are known, the latest; docs/reference/alarms.md tells what follows of it
+PERSISTING_SHARE = 0.5  # a fault persists while the torque balance is at least this share of what it was
+MAX_REQUESTERS = 64  # the latest whose requests are remembered; docs/reference/alarms.md gives the consequences
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,62 +41,66 @@ class AlarmContext:
 
 
 class AlarmManager:
-    """Conditions and their diagnoses in, Alarm messages out. What it tells does not depend on how blocks are cut."""
+    """Keeps the alarms of a tray and their diagnoses. The messages do not depend on how samples are cut into blocks."""
 
-    def __init__(self, fans: int, settings: ConditionSettings, diagnoser: Diagnoser, wording: AlarmText) -> None:
+    def __init__(self, fans: int, settings: ConditionSettings, diagnoser: Diagnoser, alarm_text: AlarmText) -> None:
         self._fans = fans
         self._conditions = Conditions(fans, settings)
         self._diagnoser = diagnoser
-        self._wording = wording
-        self._told: dict[int, Alarm] = {}
-        """of each fan, what was told of its alarm last"""
+        self._alarm_text = alarm_text
+        self._last_emitted: dict[int, Alarm] = {}
+        """the last message about each fan"""
         self._answered: dict[str, int] = {}
-        """of each producer of requests, the sequence of the first that was not answered"""
+        """for each producer of requests, the sequence of the first one that is not answered"""
         self.raised = self.cleared = self.too_short = 0
 
-    def states(self, t_ns: Array, period_ns: int, score: Array, valid: Array) -> tuple[Array, list[AlarmEvent]]:
-        """Take a block, (n, fans) each but t_ns: the states after each sample, and the changes, for `tell`."""
-        course = self._conditions.update(t_ns, period_ns, score, valid)
-        self.too_short += course.too_short
-        return course.state, course.changes
+    def update(self, t_ns: Array, period_ns: int, score: Array, valid: Array) -> tuple[Array, list[AlarmEvent]]:
+        """Process a block; t_ns (n,), score and valid (n, fans). Returns the states (n, fans) and the events."""
+        result = self._conditions.update(t_ns, period_ns, score, valid)
+        self.too_short += result.too_short
+        return result.state, result.events
 
-    def tell(self, changes: list[AlarmEvent], score: Score, distance: AlarmContext) -> list[Alarm]:
-        """What happened to alarms in a block, in the order of its rows; the diagnoser has taken the block."""
+    def emit(self, events: list[AlarmEvent], score: Score, context: AlarmContext) -> list[Alarm]:
+        """The messages for a block's events and diagnoses, in the order of its rows.
+
+        The diagnoser must have taken the block before.
+        """
         alarms: list[Alarm] = []
 
-        def tell(row: int, fan: int, transition: Transition, **more: Any) -> None:
-            now = _at(row, fan, score, distance)
-            alarms.append(self._tell(replace(self._alarm(fan), **now, transition=transition, **more)))
+        def emit(row: int, fan: int, transition: Transition, **changed: Any) -> None:
+            measured = _measured(row, fan, score, context)
+            alarms.append(self._emit(replace(self._next_message(fan), **measured, transition=transition, **changed)))
 
-        def diagnose_again(t_ns: Array) -> None:
+        def diagnose_due(t_ns: Array) -> None:
             for row, fan in self._diagnoser.due(t_ns) if len(t_ns) else ():
-                if self._still_there(row, fan, score, distance):
-                    tell(row, fan, Transition.DIAGNOSED, causes=self._diagnoser.diagnose(fan, int(t_ns[row])))
+                if self._persists(row, fan, score, context):
+                    emit(row, fan, Transition.DIAGNOSED, causes=self._diagnoser.diagnose(fan, int(t_ns[row])))
 
-        for change in changes:
-            diagnose_again(score.t_ns[: change.row])
-            fan, more = change.fan, _of_standing(change.standing)
-            if change.transition == Transition.RAISED:
+        for event in events:
+            diagnose_due(score.t_ns[: event.row])
+            fan, changed = event.fan, _state_fields(event.alarm_state)
+            if event.transition == Transition.RAISED:
                 self.raised += 1
-                t_ns = int(score.t_ns[change.row])
-                self._diagnoser.raised(fan, t_ns, change.standing.onset_t_ns)
-                more["causes"] = self._diagnoser.diagnose(fan, t_ns)
-            elif change.transition == Transition.CLEARED:
+                t_ns = int(score.t_ns[event.row])
+                self._diagnoser.raised(fan, t_ns, event.alarm_state.onset_t_ns)
+                changed["causes"] = self._diagnoser.diagnose(fan, t_ns)
+            elif event.transition == Transition.CLEARED:
                 self.cleared += 1
                 self._diagnoser.cleared(fan)
-            tell(change.row, fan, change.transition, **more)
-        diagnose_again(score.t_ns)
+            emit(event.row, fan, event.transition, **changed)
+        diagnose_due(score.t_ns)
         return alarms
 
-    def _still_there(self, row: int, fan: int, score: Score, distance: AlarmContext) -> bool:
-        """Whether what was last seen of a fault is still there: its going would be taken for part of its course."""
-        now, then = abs(distance.balance_command[row, fan]), abs(self._alarm(fan).torque_balance_command)
+    def _persists(self, row: int, fan: int, score: Score, context: AlarmContext) -> bool:
+        """Whether the fault of the last message persists. A diagnosis would take its end for part of the fault."""
+        now, before = abs(context.balance_command[row, fan]), abs(self._next_message(fan).torque_balance_command)
         of_sensor = score.statistic[row, fan] == Statistic.SENSOR
-        return bool(of_sensor or not np.isfinite(now) or now >= STILL_THERE * then)
+        return bool(of_sensor or not np.isfinite(now) or now >= PERSISTING_SHARE * before)
 
     def answer(self, request: Request, last_t_ns: int) -> list[Alarm]:
-        """One for every fan that a request concerns, none if it was answered before. last_t_ns: the last sample taken,
-        0 for none.
+        """One answer for each fan that a request concerns; none if it was answered before.
+
+        last_t_ns: time of the last sample, 0 for none.
         """
         if not self._is_new(request.header):
             return []
@@ -106,84 +112,86 @@ class AlarmManager:
             request.operator_name,
             request.comment,
         )
-        told: list[Alarm] = []
-        for fan, transition, invalid_reason in answers:
-            known = 0 <= fan < self._fans
+        alarms: list[Alarm] = []
+        for fan, transition, refusal in answers:
+            exists = 0 <= fan < self._fans
             alarm = replace(
-                self._alarm(fan),
+                self._next_message(fan),
                 t_ns=last_t_ns,
                 transition=transition,
                 request=f"{request.header.producer}/{request.header.sequence}",
                 operator_name=request.operator_name,
                 comment=request.comment,
-                **(_of_standing(self._conditions.standing(fan)) if known else {}),
+                **(_state_fields(self._conditions.alarm_state(fan)) if exists else {}),
             )
-            told.append(
-                self._tell(alarm, invalid_reason) if known else replace(alarm, message=f"fan {fan}: {invalid_reason}")
-            )
-        return told
+            alarms.append(self._emit(alarm, refusal) if exists else replace(alarm, message=f"fan {fan}: {refusal}"))
+        return alarms
 
-    def restate(self) -> list[Alarm]:
-        """What still concerns somebody, or is kept quiet, told again after a restart; and who acknowledged it."""
-        return [self._restated(fan) for fan in self._concerning()]
+    def republish(self) -> list[Alarm]:
+        """After a restart: one message for each listed alarm, with the name of who acknowledged it."""
+        return [self._republished(fan) for fan in self._listed()]
 
-    def disown(self, t_ns: int, *, stays_quiet: bool) -> list[Alarm]:
-        """Forget all alarms, and say so of each that concerned somebody; what operators want quiet may stay so."""
-        fans = self._concerning()
-        self._conditions.forget(stays_quiet=stays_quiet)
-        self._told = {}
-        told: list[Alarm] = []
+    def discard_all(self, t_ns: int, *, keep_silenced: bool) -> list[Alarm]:
+        """Return all alarms to never raised; one message for each that was listed.
+
+        keep_silenced: shelved, suppressed and out of service stay as set.
+        """
+        fans = self._listed()
+        self._conditions.discard_all(keep_silenced=keep_silenced)
+        self._last_emitted = {}
+        alarms: list[Alarm] = []
         for fan in fans:
             self._diagnoser.cleared(fan)
-            self._told[fan] = replace(self._alarm(fan), t_ns=t_ns, **_of_standing(self._conditions.standing(fan)))
-            told.append(self._restated(fan))
-        return told
+            fields = _state_fields(self._conditions.alarm_state(fan))
+            self._last_emitted[fan] = replace(self._next_message(fan), t_ns=t_ns, **fields)
+            alarms.append(self._republished(fan))
+        return alarms
 
-    def _concerning(self) -> list[int]:
-        """Fans whose alarm is retained, or kept quiet."""
-        return [fan for fan in sorted(self._told) if is_listed(self._conditions.standing(fan))]
+    def _listed(self) -> list[int]:
+        """Fans with a message whose alarm is retained or silenced."""
+        return [fan for fan in sorted(self._last_emitted) if is_listed(self._conditions.alarm_state(fan))]
 
-    def _restated(self, fan: int) -> Alarm:
-        now = self._conditions.standing(fan)
-        restated = replace(self._alarm(fan), transition=Transition.REPUBLISHED)
-        return self._tell(replace(restated, operator_name=now.acknowledged_by, comment=now.comment))
+    def _republished(self, fan: int) -> Alarm:
+        now = self._conditions.alarm_state(fan)
+        alarm = replace(self._next_message(fan), transition=Transition.REPUBLISHED)
+        return self._emit(replace(alarm, operator_name=now.acknowledged_by, comment=now.comment))
 
     def snapshot(self) -> dict[str, Any]:
-        """All that must not be forgotten, as JSON can hold it."""
+        """The whole state, as JSON values."""
         return {
             "conditions": self._conditions.snapshot(),
             "diagnoser": self._diagnoser.snapshot(),
-            "told": {str(fan): _plain(alarm) for fan, alarm in self._told.items()},
+            "last_emitted": {str(fan): _to_json(alarm) for fan, alarm in self._last_emitted.items()},
             "answered": self._answered,
         }
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a snapshot of as many fans.
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a snapshot of the same number of fans.
 
         Raises:
-            ValueError, KeyError, TypeError: it is not one.
+            ValueError, KeyError, TypeError, AttributeError: it is not such a snapshot.
         """
-        self._conditions.restore(state["conditions"])
-        self._diagnoser.restore(state["diagnoser"])
-        self._told = {int(fan): _alarm_of(told) for fan, told in state["told"].items()}
-        if not all(0 <= fan < self._fans and alarm.fan == fan for fan, alarm in self._told.items()):
-            raise ValueError("an alarm of a fan that is not there")
-        self._answered = {str(producer): int(following) for producer, following in state["answered"].items()}
+        stored = current_keys(snapshot, FORMER_ALARM_KEYS)
+        self._conditions.restore(stored["conditions"])
+        self._diagnoser.restore(stored["diagnoser"])
+        self._last_emitted = {int(fan): _from_json(alarm) for fan, alarm in stored["last_emitted"].items()}
+        if not all(0 <= fan < self._fans and alarm.fan == fan for fan, alarm in self._last_emitted.items()):
+            raise ValueError("an alarm of a fan that does not exist")
+        self._answered = {str(producer): int(sequence) for producer, sequence in stored["answered"].items()}
 
     def _is_new(self, header: Header) -> bool:
-        """Whether a request was not answered yet. A restarted scorer is given again what producers still keep."""
-        following = self._answered.get(header.producer, 0)
-        if header.sequence < following:
+        """Whether a request is not yet answered. A restarted scorer receives again what producers still hold."""
+        if header.sequence < self._answered.get(header.producer, 0):
             return False
-        self._answered.pop(header.producer, None)  # to the end: the latest are kept
+        self._answered.pop(header.producer, None)  # re-inserted at the end: the latest requesters are kept
         self._answered[header.producer] = header.sequence + 1
-        while len(self._answered) > MOST_PRODUCERS:
+        while len(self._answered) > MAX_REQUESTERS:
             del self._answered[next(iter(self._answered))]
         return True
 
-    def _alarm(self, fan: int) -> Alarm:
-        """What was told of a fan's alarm last, as the beginning of what is told next."""
-        told = self._told.get(fan) or Alarm(
+    def _next_message(self, fan: int) -> Alarm:
+        """The last message about a fan without what belonged to that message alone; a start for the next one."""
+        last = self._last_emitted.get(fan) or Alarm(
             fan=fan,
             active=False,
             severity=Severity.NONE,
@@ -195,57 +203,57 @@ class AlarmManager:
             acknowledged=True,
             confirmed=True,
         )
-        return replace(told, header=Header(), request="", operator_name="", comment="")
+        return replace(last, header=Header(), request="", operator_name="", comment="")
 
-    def _tell(self, alarm: Alarm, invalid_reason: str = "") -> Alarm:
-        alarm = replace(alarm, message=self._wording.of(alarm, invalid_reason))
-        self._told[alarm.fan] = alarm
+    def _emit(self, alarm: Alarm, refusal: str = "") -> Alarm:
+        alarm = replace(alarm, message=self._alarm_text.of(alarm, refusal))
+        self._last_emitted[alarm.fan] = alarm
         return alarm
 
 
-def _at(row: int, fan: int, score: Score, distance: AlarmContext) -> dict[str, Any]:
-    """What an alarm says of its row; 0 where nothing is known."""
+def _measured(row: int, fan: int, score: Score, context: AlarmContext) -> dict[str, Any]:
+    """The fields of an alarm that describe its sample; 0 where nothing is known."""
     return {
         "t_ns": int(score.t_ns[row]),
         "residual_rad_s": float(np.nan_to_num(score.smoothed_residual_rad_s[row, fan])),
-        "limit_rad_s": _if_any(distance.limit_rad_s[fan]),
-        "torque_balance_command": float(np.nan_to_num(distance.balance_command[row, fan])),
-        "torque_balance_limit_command": _if_any(distance.balance_limit_command[fan]),
+        "limit_rad_s": _finite_or_0(context.limit_rad_s[fan]),
+        "torque_balance_command": float(np.nan_to_num(context.balance_command[row, fan])),
+        "torque_balance_limit_command": _finite_or_0(context.balance_limit_command[fan]),
         "statistic": Statistic(int(score.statistic[row, fan])),
         "score": float(np.nan_to_num(score.score[row, fan])),
     }
 
 
-def _if_any(limit: float) -> float:
+def _finite_or_0(limit: float) -> float:
     return float(limit) if np.isfinite(limit) else 0.0
 
 
-def _of_standing(standing: AlarmState) -> dict[str, Any]:
+def _state_fields(state: AlarmState) -> dict[str, Any]:
+    """The fields of an alarm message that carry its state."""
     return {
-        "active": standing.active,
-        "severity": standing.severity,
-        "onset_t_ns": standing.onset_t_ns,
-        "acknowledged": standing.acknowledged,
-        "confirmed": standing.confirmed,
-        "latched": standing.latched,
-        "shelved_until_t_ns": standing.shelved_until_t_ns,
-        "suppressed": standing.suppressed,
-        "out_of_service": standing.out_of_service,
+        "active": state.active,
+        "severity": state.severity,
+        "onset_t_ns": state.onset_t_ns,
+        "acknowledged": state.acknowledged,
+        "confirmed": state.confirmed,
+        "latched": state.latched,
+        "shelved_until_t_ns": state.shelved_until_t_ns,
+        "suppressed": state.suppressed,
+        "out_of_service": state.out_of_service,
     }
 
 
-def _plain(alarm: Alarm) -> dict[str, Any]:
-    """As JSON can hold it."""
+def _to_json(alarm: Alarm) -> dict[str, Any]:
     return {name: value for name, value in asdict(alarm).items() if name != "header"}
 
 
-def _alarm_of(plain: dict[str, Any]) -> Alarm:
+def _from_json(stored: Mapping[str, Any]) -> Alarm:
     return Alarm(
-        **plain
-        | {
-            "severity": Severity.known(plain["severity"]),
-            "transition": Transition.known(plain["transition"]),
-            "statistic": Statistic.known(plain["statistic"]),
-            "causes": tuple(Diagnosis(**cause) for cause in plain["causes"]),
+        **{
+            **stored,
+            "severity": Severity.known(stored["severity"]),
+            "transition": Transition.known(stored["transition"]),
+            "statistic": Statistic.known(stored["statistic"]),
+            "causes": tuple(Diagnosis(**cause) for cause in stored["causes"]),
         }
     )

@@ -1,9 +1,9 @@
-"""The alarm condition of one fan: whether an alarm is active, and what operators have said of it.
+"""The alarm condition of one fan: its alarm, and what operators have done with it.
 
 Names and rules are those of OPC UA Part 9 (OPC 10000-9, release 1.05.03): ActiveState with OnDelay and OffDelay
 (5.8.2), AckedState and ConfirmedState of one occurrence (4.3, 5.7; the rows of table B.1 are a test), LatchedState and
-Reset (4.8, 5.8.5), shelving by time or once (5.8.17), suppressed (5.8.8), out of service (5.8.12).
-Only the present occurrence is kept, no branches of former ones (as in B.1.2). See docs/reference/alarms.md.
+Reset (4.8, 5.8.5), timed and one-shot shelving (5.8.17), suppressed (5.8.8), out of service (5.8.12). Only the present
+occurrence is kept; there are no branches of earlier ones (as in B.1.2). See docs/reference/alarms.md.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from schemas.messages import Action, FanState, Severity, Transition
+from scoring.former_snapshot_keys import FORMER_CONDITION_KEYS, current_keys
 
 NORMAL, SUSPECT, ALARM, RETURNING = map(int, (FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING))
 UNTIL_IT_CLEARS_T_NS = 2**63 - 1
@@ -23,68 +24,71 @@ UNTIL_IT_CLEARS_T_NS = 2**63 - 1
 
 @dataclass(frozen=True)
 class ConditionSettings:
-    """When an alarm is raised and cleared, and what it then asks of operators. Ratios are in the statistic's limit."""
+    """When an alarm is raised and cleared, and what operators must do with it. Ratios are multiples of the limit."""
 
     on_delay_ns: int
     off_delay_ns: int
     return_ratio: float = 0.75
-    """An active alarm begins to return below this share of its limit."""
+    """an active alarm begins to return below this"""
     alarm_ratio: float = 1.5
-    """From here on its severity is ALARM and no longer WARNING."""
+    """from here on the severity is ALARM instead of WARNING"""
     latching: bool = False
-    """A cleared alarm stays until it is reset."""
+    """a cleared alarm stays until it is reset"""
     confirming: bool = False
-    """An acknowledged alarm needs confirming, too."""
+    """an acknowledged alarm must also be confirmed"""
 
 
 @dataclass(frozen=True, slots=True)
 class AlarmState:
-    """How an alarm stands; what it is before it was ever raised are the defaults."""
+    """The state of a fan's alarm. The defaults are those of an alarm that was never raised."""
 
     active: bool = False
     severity: Severity = Severity.NONE
-    """The highest since it was raised; NONE: it never was."""
+    """highest since the alarm was raised; NONE if it never was"""
     onset_t_ns: int = 0
-    """First sample of the excursion that raised it: names the occurrence."""
+    """first sample of the excursion that raised the alarm; identifies the occurrence"""
     acknowledged: bool = True
     confirmed: bool = True
-    """False from an acknowledgement on that needs confirming."""
+    """False between an acknowledgement and its confirmation, where confirming is required"""
     latched: bool = False
     shelved_until_t_ns: int = 0
-    """0: not shelved."""
+    """0: not shelved"""
     suppressed: bool = False
     out_of_service: bool = False
     acknowledged_by: str = ""
     comment: str = ""
-    """Of the last request that had one and was granted."""
+    """of the last granted request that had one"""
 
 
 class Condition:
-    """One fan's alarm. `state`: NORMAL, SUSPECT (on-delay runs), ALARM, RETURNING (off-delay runs)."""
+    """One fan's alarm. `fan_state`: NORMAL, SUSPECT (on-delay runs), ALARM, RETURNING (off-delay runs)."""
 
     def __init__(self, settings: ConditionSettings) -> None:
         self._settings = settings
-        self.state = NORMAL
-        self.standing = AlarmState()
-        self._excursion_t_ns = 0  # its first sample; meaningless when NORMAL
-        self._lasted_ns = 0  # how long the condition of SUSPECT or RETURNING has held
+        self.fan_state = NORMAL
+        self.alarm_state = AlarmState()
+        self._excursion_t_ns = 0  # first sample of the excursion; meaningless when NORMAL
+        self._held_ns = 0  # time since SUSPECT or RETURNING began
 
-    def take(self, t_ns: int, period_ns: int, ratio: float) -> Sequence[tuple[Transition, AlarmState]]:
-        """Take a valid sample: the statistic furthest towards its limit, in that limit. What happened, in order."""
-        if self.standing.active:
-            return self._while_active(period_ns, ratio)
+    def update(self, t_ns: int, period_ns: int, ratio: float) -> Sequence[tuple[Transition, AlarmState]]:
+        """Process one valid sample and return the transitions, in order.
+
+        ratio: the statistic closest to its limit, as a multiple of that limit.
+        """
+        if self.alarm_state.active:
+            return self._update_active(period_ns, ratio)
         if not ratio > 1:
-            self.state = NORMAL
+            self.fan_state = NORMAL
             return ()
-        if self.state == NORMAL:
+        if self.fan_state == NORMAL:
             self._excursion_t_ns = t_ns
-        self._lasted_ns = 0 if self.state == NORMAL else self._lasted_ns + period_ns
-        if self._lasted_ns < self._settings.on_delay_ns:
-            self.state = SUSPECT
+        self._held_ns = 0 if self.fan_state == NORMAL else self._held_ns + period_ns
+        if self._held_ns < self._settings.on_delay_ns:
+            self.fan_state = SUSPECT
             return ()
-        self.state = ALARM
-        self.standing = replace(
-            self.standing,
+        self.fan_state = ALARM
+        self.alarm_state = replace(
+            self.alarm_state,
             active=True,
             severity=self._severity(ratio),
             onset_t_ns=self._excursion_t_ns,
@@ -93,32 +97,32 @@ class Condition:
             latched=self._settings.latching,
             acknowledged_by="",
         )
-        return ((Transition.RAISED, self.standing),)
+        return ((Transition.RAISED, self.alarm_state),)
 
-    def forget(self, *, stays_quiet: bool) -> None:
-        """No alarm was ever raised; what operators want quiet may stay so."""
-        was, self.state, self.standing = self.standing, NORMAL, AlarmState()
-        if stays_quiet:
-            self.standing = AlarmState(
-                shelved_until_t_ns=was.shelved_until_t_ns,
-                suppressed=was.suppressed,
-                out_of_service=was.out_of_service,
-                comment=was.comment,
+    def discard(self, *, keep_silenced: bool) -> None:
+        """Return to an alarm that was never raised. keep_silenced: shelved, suppressed, out of service stay as set."""
+        before, self.fan_state, self.alarm_state = self.alarm_state, NORMAL, AlarmState()
+        if keep_silenced:
+            self.alarm_state = AlarmState(
+                shelved_until_t_ns=before.shelved_until_t_ns,
+                suppressed=before.suppressed,
+                out_of_service=before.out_of_service,
+                comment=before.comment,
             )
 
-    def expire(self) -> tuple[Transition, AlarmState]:
-        """The time of shelving is over."""
-        self.standing = replace(self.standing, shelved_until_t_ns=0)
-        return Transition.UNSHELVED, self.standing
+    def unshelve(self) -> tuple[Transition, AlarmState]:
+        """End the shelving because its time is over."""
+        self.alarm_state = replace(self.alarm_state, shelved_until_t_ns=0)
+        return Transition.UNSHELVED, self.alarm_state
 
     def request(
         self, action: Action, now_t_ns: int, duration_ns: float, operator_name: str, comment: str
     ) -> tuple[Transition, str]:
-        """What an operator asks for: what then happened, or REFUSED and why."""
-        invalid_reason = self._why_not(action, now_t_ns, duration_ns)
-        if invalid_reason:
-            return Transition.REFUSED, invalid_reason
-        timed = action == Action.SHELVE and duration_ns  # of others it is whatever somebody sent, NaN even
+        """Process an operator's request. Returns the transition and "", or REFUSED and the reason."""
+        refusal = self._refusal(action, now_t_ns, duration_ns)
+        if refusal:
+            return Transition.REFUSED, refusal
+        timed = action == Action.SHELVE and duration_ns  # other actions ignore the duration, which may be NaN
         until_t_ns = now_t_ns + round(duration_ns) if timed else UNTIL_IT_CLEARS_T_NS
         confirmed = not self._settings.confirming
         granted: dict[Action, tuple[Transition, dict[str, Any]]] = {
@@ -137,68 +141,70 @@ class Condition:
             Action.COMMISSION: (Transition.COMMISSIONING, {}),
         }
         transition, changed = granted[action]
-        self.standing = replace(self.standing, **changed, comment=comment or self.standing.comment)
+        self.alarm_state = replace(self.alarm_state, **changed, comment=comment or self.alarm_state.comment)
         return transition, ""
 
     def snapshot(self) -> dict[str, Any]:
-        """All that it must not forget, as JSON takes it."""
-        kept = asdict(self.standing)
-        del kept["active"]  # the state says so
-        kept["severity"] = int(self.standing.severity)
-        return {"state": self.state, "excursion_t_ns": self._excursion_t_ns, "lasted_ns": self._lasted_ns, **kept}
+        """The whole state, as JSON values."""
+        alarm = asdict(self.alarm_state)
+        del alarm["active"]  # follows from the fan state
+        alarm["severity"] = int(self.alarm_state.severity)
+        return {"state": self.fan_state, "excursion_t_ns": self._excursion_t_ns, "held_ns": self._held_ns, **alarm}
 
     @classmethod
-    def restored(cls, settings: ConditionSettings, kept: Mapping[str, Any]) -> Self:
-        """The condition whose snapshot this is.
+    def restore(cls, settings: ConditionSettings, snapshot: Mapping[str, Any]) -> Self:
+        """The condition of a snapshot.
 
         Raises:
-            KeyError, TypeError, ValueError, OverflowError: it is none.
+            KeyError, TypeError, ValueError, OverflowError: it is not a snapshot of a condition.
         """
+        stored = current_keys(snapshot, FORMER_CONDITION_KEYS)
         condition = cls(settings)
-        condition.state = int(FanState.known(kept["state"]))
-        if condition.state not in (NORMAL, SUSPECT, ALARM, RETURNING):
-            raise ValueError(kept["state"])
-        condition._excursion_t_ns = _time(kept["excursion_t_ns"])
-        condition._lasted_ns = _time(kept["lasted_ns"])
-        condition.standing = AlarmState(
-            active=condition.state in (ALARM, RETURNING),
-            severity=Severity.known(kept["severity"]),
-            onset_t_ns=_time(kept["onset_t_ns"]),
-            shelved_until_t_ns=_time(kept["shelved_until_t_ns"]),
-            acknowledged=bool(kept["acknowledged"]),
-            confirmed=bool(kept["confirmed"]),
-            latched=bool(kept["latched"]),
-            suppressed=bool(kept["suppressed"]),
-            out_of_service=bool(kept["out_of_service"]),
-            acknowledged_by=str(kept["acknowledged_by"]),
-            comment=str(kept["comment"]),
+        condition.fan_state = int(FanState.known(stored["state"]))
+        if condition.fan_state not in (NORMAL, SUSPECT, ALARM, RETURNING):
+            raise ValueError(stored["state"])
+        condition._excursion_t_ns = _time(stored["excursion_t_ns"])
+        condition._held_ns = _time(stored["held_ns"])
+        condition.alarm_state = AlarmState(
+            active=condition.fan_state in (ALARM, RETURNING),
+            severity=Severity.known(stored["severity"]),
+            onset_t_ns=_time(stored["onset_t_ns"]),
+            shelved_until_t_ns=_time(stored["shelved_until_t_ns"]),
+            acknowledged=bool(stored["acknowledged"]),
+            confirmed=bool(stored["confirmed"]),
+            latched=bool(stored["latched"]),
+            suppressed=bool(stored["suppressed"]),
+            out_of_service=bool(stored["out_of_service"]),
+            acknowledged_by=str(stored["acknowledged_by"]),
+            comment=str(stored["comment"]),
         )
         return condition
 
-    def _while_active(self, period_ns: int, ratio: float) -> Sequence[tuple[Transition, AlarmState]]:
+    def _update_active(self, period_ns: int, ratio: float) -> Sequence[tuple[Transition, AlarmState]]:
         if not ratio < self._settings.return_ratio:
-            self.state = ALARM
+            self.fan_state = ALARM
             severity = self._severity(ratio)
-            if severity <= self.standing.severity:
+            if severity <= self.alarm_state.severity:
                 return ()
-            self.standing = replace(self.standing, severity=severity)
-            return ((Transition.SEVERITY, self.standing),)
-        self._lasted_ns = 0 if self.state == ALARM else self._lasted_ns + period_ns
-        if self._lasted_ns < self._settings.off_delay_ns:
-            self.state = RETURNING
+            self.alarm_state = replace(self.alarm_state, severity=severity)
+            return ((Transition.SEVERITY, self.alarm_state),)
+        self._held_ns = 0 if self.fan_state == ALARM else self._held_ns + period_ns
+        if self._held_ns < self._settings.off_delay_ns:
+            self.fan_state = RETURNING
             return ()
-        self.state = NORMAL
-        self.standing = replace(self.standing, active=False)
-        cleared = (Transition.CLEARED, self.standing)
-        if self.standing.shelved_until_t_ns != UNTIL_IT_CLEARS_T_NS:
+        self.fan_state = NORMAL
+        self.alarm_state = replace(self.alarm_state, active=False)
+        cleared = (Transition.CLEARED, self.alarm_state)
+        if self.alarm_state.shelved_until_t_ns != UNTIL_IT_CLEARS_T_NS:
             return (cleared,)
-        return cleared, self.expire()
+        return cleared, self.unshelve()
 
     def _severity(self, ratio: float) -> Severity:
         return Severity.ALARM if ratio >= self._settings.alarm_ratio else Severity.WARNING
 
-    def _why_not(self, action: Action, now_t_ns: int, duration_ns: float) -> str:
-        now = self.standing
+    def _refusal(self, action: Action, now_t_ns: int, duration_ns: float) -> str:
+        """Why the request must be refused; empty if it is granted."""
+        now = self.alarm_state
         once = now.shelved_until_t_ns == UNTIL_IT_CLEARS_T_NS and duration_ns == 0
         fits = 0 <= duration_ns < UNTIL_IT_CLEARS_T_NS - now_t_ns  # NaN does not
         raised = now.severity != Severity.NONE
@@ -230,7 +236,7 @@ class Condition:
             Action.COMMISSION: (),
             Action.NONE: ((True, "no action is named"),),
         }
-        return next((why for applies, why in reasons.get(action, unknown) if applies), "")
+        return next((reason for applies, reason in reasons.get(action, unknown) if applies), "")
 
 
 def _time(value: Any) -> int:

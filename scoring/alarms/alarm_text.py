@@ -1,13 +1,15 @@
-"""What happened to an alarm, in one line for people."""
+"""An alarm message as one line for people.
+
+The lines are part of a recording, and a replay that verifies it compares them: a changed wording makes recordings of
+earlier versions differ.
+"""
 
 from __future__ import annotations
 
-from math import pi
-
 from schemas.messages import Alarm, Statistic, Transition
+from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 from scoring.alarms.alarm_flags import is_listed
 
-RAD_S_PER_RPM = 2.0 * pi / 60.0
 CANNOT_TELL = "cannot_tell"
 CAUSES = {
     "drag_up": "more drag (airflow blocked, filter clogged)",
@@ -20,7 +22,7 @@ CAUSES = {
     "sensor_scaling": "a tacho that counts wrongly",
     CANNOT_TELL: "cannot tell yet",
 }
-PLAIN = {
+TRANSITIONS = {
     Transition.CLEARED: "back to normal",
     Transition.ACKNOWLEDGED: "acknowledged",
     Transition.CONFIRMED: "confirmed",
@@ -33,29 +35,31 @@ PLAIN = {
     Transition.IN_SERVICE: "in service",
     Transition.COMMISSIONING: "a new baseline is being taken",
 }
+"""transitions whose line does not depend on anything else"""
 
 
 class AlarmText:
-    """In the units of a tray."""
+    """Writes alarm messages in the units of a tray."""
 
-    def __init__(self, speed_unit: str, command_unit: str) -> None:
-        self._speed_unit = speed_unit
+    def __init__(self, speed_unit: SpeedUnit, command_unit: str) -> None:
+        """command_unit: empty where the twin does not name it."""
+        self._speed_unit: SpeedUnit = speed_unit
         self._command_unit = command_unit or "of command"
 
-    def of(self, alarm: Alarm, invalid_reason: str = "") -> str:
-        """The line. invalid_reason: of a request that was refused."""
+    def of(self, alarm: Alarm, refusal: str = "") -> str:
+        """The line. refusal: the reason why a request was refused."""
         fan = f"fan {alarm.fan}"
         if alarm.transition == Transition.REFUSED:
-            return f"{fan}: refused: {invalid_reason}"
+            return f"{fan}: refused: {refusal}"
         if alarm.transition == Transition.DIAGNOSED:
             return f"{fan}: {self._cause(alarm)}"
         if alarm.transition in (Transition.RAISED, Transition.SEVERITY):
-            return f"{fan}: {self._departure(alarm)}{self._cause_if_known(alarm)}"
+            return f"{fan}: {self._deviation(alarm)}{self._cause_if_known(alarm)}"
         if alarm.transition == Transition.REPUBLISHED:
             return f"{fan}: {'still stands' if is_listed(alarm) else 'stands no longer'}"
-        return f"{fan}: {PLAIN[alarm.transition]}"
+        return f"{fan}: {TRANSITIONS[alarm.transition]}"
 
-    def _departure(self, alarm: Alarm) -> str:
+    def _deviation(self, alarm: Alarm) -> str:
         if alarm.statistic == Statistic.SENSOR:
             return "the tacho repeats one reading, or gives none"
         if alarm.statistic in (Statistic.SPEED_VARIANCE_GROWTH, Statistic.BALANCE_VARIANCE_GROWTH):
@@ -63,10 +67,10 @@ class AlarmText:
         if alarm.statistic in (Statistic.SPEED_SMOOTHED, Statistic.SPEED_DRIFT):
             side = "below" if alarm.residual_rad_s < 0 else "above"
             size, limit = self._speed(abs(alarm.residual_rad_s)), self._speed(alarm.limit_rad_s)
-            return f"{size} {self._speed_unit} {side} the twin (limit {limit}){_drifts(alarm)}"
+            return f"{size} {self._speed_unit} {side} the twin (limit {limit}){_duration(alarm)}"
         side = "more" if alarm.torque_balance_command > 0 else "less"
         size, limit = abs(alarm.torque_balance_command), alarm.torque_balance_limit_command
-        return f"takes {size:.2g} {self._command_unit} {side} than a healthy one (limit {limit:.2g}){_drifts(alarm)}"
+        return f"takes {size:.2g} {self._command_unit} {side} than a healthy one (limit {limit:.2g}){_duration(alarm)}"
 
     def _cause_if_known(self, alarm: Alarm) -> str:
         known = alarm.causes and alarm.causes[0].cause != CANNOT_TELL
@@ -76,16 +80,16 @@ class AlarmText:
         if not alarm.causes:
             return "cause unknown"
         first = alarm.causes[0]
-        words = CAUSES.get(first.cause, first.cause)
+        name = CAUSES.get(first.cause, first.cause)
         if first.cause == CANNOT_TELL:
-            return first.evidence or words  # its evidence begins with these words
+            return first.evidence or name  # the evidence begins with the name
         evidence = f": {first.evidence}" if first.evidence else ""
-        return f"{words}, {100 * first.probability:.0f} %{evidence}"
+        return f"{name}, {100 * first.probability:.0f} %{evidence}"
 
     def _speed(self, speed_rad_s: float) -> str:
-        speed = speed_rad_s / RAD_S_PER_RPM if self._speed_unit == "rpm" else speed_rad_s
+        speed = speed_rad_s / RAD_S_PER_UNIT[self._speed_unit]
         return f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
 
 
-def _drifts(alarm: Alarm) -> str:
+def _duration(alarm: Alarm) -> str:
     return ", for long" if alarm.statistic in (Statistic.SPEED_DRIFT, Statistic.BALANCE_DRIFT) else ""

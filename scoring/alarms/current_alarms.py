@@ -1,7 +1,7 @@
-"""How the alarms of a site stand: the messages of each fan reduced to one, in words.
+"""The current alarms of a site: the messages about each fan reduced to one.
 
-A fan has one alarm. Its newest message says how it stands; what it is about, and who acknowledged it, stands in former
-messages of the same occurrence, which tray, fan and onset name.
+A fan has one alarm. The newest message carries its state. The cause and who acknowledged it are in earlier messages of
+the same occurrence, which tray, fan and onset identify.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from datetime import datetime
 from typing import Any
 
 from schemas.messages import Alarm, Diagnosis, Severity, Transition
+from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_presented, is_retained, is_silenced
 from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 
-_ABOUT_THE_FAN = {
+_DESCRIBES_THE_FAN = {
     Transition.NONE,
     Transition.RAISED,
     Transition.SEVERITY,
@@ -23,27 +24,28 @@ _ABOUT_THE_FAN = {
     Transition.CLEARED,
     Transition.REPUBLISHED,
 }
-_TELL_WHO = {Transition.ACKNOWLEDGED, Transition.REPUBLISHED}
+_NAMES_WHO_ACKNOWLEDGED = {Transition.ACKNOWLEDGED, Transition.REPUBLISHED}
 
 
 @dataclass(frozen=True)
 class CurrentAlarm:
-    """The alarm of a fan: its newest message, and what former ones of this occurrence said."""
+    """The alarm of a fan: its newest message, and what earlier messages of the same occurrence add."""
 
     newest: Alarm
     message: str
+    """last message of the occurrence that describes the fan, not an operator's action"""
     causes: tuple[Diagnosis, ...]
     acknowledged_by: str
 
     def line(self) -> str:
-        """What happened last, for a log: nobody is called for what an operator keeps quiet."""
+        """The last transition, for a log; a silenced active alarm is marked as such."""
         alarm = self.newest
         word = alarm.severity.name if alarm.active else alarm.transition.name.lower().replace("_", " ")
         silenced = " (silenced)" if alarm.active and is_silenced(alarm) else ""
         return f"{word}{silenced}  {alarm.header.tray}  {alarm.message}"
 
-    def words(self) -> list[str]:
-        """The states that it is in."""
+    def states(self) -> list[str]:
+        """The states the alarm is in, for people."""
         alarm, raised = self.newest, self.newest.severity != Severity.NONE
         states = {
             "active": alarm.active,
@@ -57,10 +59,10 @@ class CurrentAlarm:
             "suppressed": alarm.suppressed,
             "out of service": alarm.out_of_service,
         }
-        return [state for state, is_so in states.items() if is_so]
+        return [state for state, applies in states.items() if applies]
 
     def as_json(self) -> dict[str, Any]:
-        """What a machine is shown."""
+        """The alarm for machines (`--json`)."""
         alarm = self.newest
         return {
             "tray": alarm.header.tray,
@@ -87,46 +89,50 @@ class CurrentAlarm:
 
 
 def current_alarms(messages: Iterable[Alarm]) -> list[CurrentAlarm]:
-    """One for each fan that was ever told of, by tray and fan; the messages in the order in which they came."""
+    """One for each fan with a message, by tray and fan. messages: in the order in which they were received."""
     by_fan: dict[tuple[str, int], list[Alarm]] = {}
     for alarm in messages:
         by_fan.setdefault((alarm.header.tray, alarm.fan), []).append(alarm)
-    return [_standing(in_sequence(by_fan[fan])) for fan in sorted(by_fan)]
+    return [_current(in_sequence(by_fan[fan])) for fan in sorted(by_fan)]
 
 
 def in_sequence(messages: Iterable[Alarm]) -> list[Alarm]:
-    """Messages as they came, but those of each producer by sequence: some may have been asked for again.
+    """The messages in the order received, but those of each producer by sequence: some may be late, sent again.
 
-    Not by their times: those of a scorer go back when it is fed a recording of long ago.
+    They are not ordered by time: a scorer's times go back when it is fed an old recording.
     """
-    came = list(messages)
-    of: dict[str, list[Alarm]] = {}
-    for alarm in sorted(came, key=lambda alarm: alarm.header.sequence, reverse=True):
-        of.setdefault(alarm.header.producer, []).append(alarm)
-    return [of[alarm.header.producer].pop() for alarm in came]
+    received = list(messages)
+    of_producer: dict[str, list[Alarm]] = {}
+    for alarm in sorted(received, key=lambda alarm: alarm.header.sequence, reverse=True):
+        of_producer.setdefault(alarm.header.producer, []).append(alarm)
+    return [of_producer[alarm.header.producer].pop() for alarm in received]
 
 
-def _standing(told: list[Alarm]) -> CurrentAlarm:
-    newest = told[-1]
-    occurrence = [alarm for alarm in told if alarm.onset_t_ns == newest.onset_t_ns]
-    about = [alarm for alarm in occurrence if alarm.transition in _ABOUT_THE_FAN]
-    who = [alarm.operator_name for alarm in occurrence if alarm.transition in _TELL_WHO and alarm.acknowledged]
+def _current(messages: list[Alarm]) -> CurrentAlarm:
+    newest = messages[-1]
+    occurrence = [alarm for alarm in messages if alarm.onset_t_ns == newest.onset_t_ns]
+    describing = [alarm for alarm in occurrence if alarm.transition in _DESCRIBES_THE_FAN]
+    names = [
+        alarm.operator_name
+        for alarm in occurrence
+        if alarm.transition in _NAMES_WHO_ACKNOWLEDGED and alarm.acknowledged
+    ]
     return CurrentAlarm(
         newest,
-        message=about[-1].message if about else "",
+        message=describing[-1].message if describing else "",
         causes=next((alarm.causes for alarm in reversed(occurrence) if alarm.causes), ()),
-        acknowledged_by=who[-1] if who and newest.acknowledged else "",
+        acknowledged_by=names[-1] if names and newest.acknowledged else "",
     )
 
 
 def until(alarm: Alarm) -> str:
-    """How long it is shelved."""
+    """The end of the shelving, for people."""
     if alarm.shelved_until_t_ns == UNTIL_IT_CLEARS_T_NS:
         return "until it clears"
     return f"until {clock(alarm.shelved_until_t_ns)}"
 
 
 def clock(t_ns: int) -> str:
-    """Local time; the date too, where it is not today's."""
-    at = datetime.fromtimestamp(t_ns / 1e9)
+    """Local time, with the date unless it is today."""
+    at = datetime.fromtimestamp(t_ns / NS_PER_S)
     return at.strftime("%H:%M:%S" if at.date() == datetime.now().date() else "%Y-%m-%d %H:%M:%S")

@@ -1,7 +1,7 @@
-"""The alarm conditions of a tray's fans over blocks of samples.
+"""The alarm conditions of a tray's fans, updated with blocks of samples.
 
-The same whatever the blocks: delays count the time of valid samples, and every change says how the alarm stood at
-its own row. A sample that is not valid leaves state and timers alone; only the time of a shelving runs on.
+The result does not depend on how samples are cut into blocks: delays count the time of valid samples, and every event
+carries the alarm's state at its own row. An invalid sample changes no state and no timer; only shelving times run on.
 """
 
 from __future__ import annotations
@@ -20,24 +20,23 @@ UNKNOWN = int(FanState.UNKNOWN)
 
 @dataclass(frozen=True)
 class AlarmEvent:
-    """What happened to the alarm of a fan at a row of a block, and how it stood then."""
+    """A transition of a fan's alarm at a row of a block, and the alarm's state after it."""
 
     row: int
     fan: int
     transition: Transition
-    standing: AlarmState
+    alarm_state: AlarmState
 
 
 @dataclass(frozen=True)
 class BlockResult:
-    """What a block did. state: (n, fans) uint8 of FanState after each sample, UNKNOWN where it is not valid.
-
-    `changes` are sorted by row, then fan; `too_short` counts excursions that ended before their on-delay.
-    """
+    """The result of a block. state: (n, fans) uint8, the FanState after each sample, UNKNOWN where it is invalid."""
 
     state: Array
-    changes: list[AlarmEvent]
+    events: list[AlarmEvent]
+    """sorted by row, then fan"""
     too_short: int
+    """number of excursions that ended before their on-delay"""
 
 
 class Conditions:
@@ -46,34 +45,33 @@ class Conditions:
     def __init__(self, fans: int, settings: ConditionSettings) -> None:
         self._settings = settings
         self._conditions = [Condition(settings) for _ in range(fans)]
-        self._note_all()
+        self._refresh_all()
 
     def update(self, t_ns: Array, period_ns: int, ratio: Array, valid: Array) -> BlockResult:
-        """Take a block. t_ns: (n,), rising; ratio, valid: (n, fans), see `Condition.take`."""
+        """Process a block. t_ns: (n,), rising; ratio, valid: (n, fans), see `Condition.update`."""
         state = np.where(valid, NORMAL, UNKNOWN).astype(np.uint8)
-        changes: list[AlarmEvent] = []
+        events: list[AlarmEvent] = []
         too_short = 0
         busy = self._not_normal | ((ratio > 1) & valid).any(axis=0)
         for fan in np.flatnonzero(busy | (self._shelved_until_t_ns <= t_ns[-1])).tolist():
             condition = self._conditions[fan]
-            over_row = int(np.searchsorted(t_ns, self._shelved_until_t_ns[fan]))  # where the time of shelving is over
+            unshelve_row = int(np.searchsorted(t_ns, self._shelved_until_t_ns[fan]))
             rows = np.flatnonzero(valid[:, fan]) if busy[fan] else np.zeros(0, np.intp)
             samples = zip(rows.tolist(), t_ns[rows].tolist(), ratio[rows, fan].tolist(), strict=True)
-            for row, time_ns, furthest in samples:
-                if row >= over_row:
-                    changes.append(AlarmEvent(over_row, fan, *condition.expire()))
-                    over_row = len(t_ns)
-                was = condition.state
-                changes += [
-                    AlarmEvent(row, fan, *happened) for happened in condition.take(time_ns, period_ns, furthest)
-                ]
-                state[row, fan] = condition.state
-                too_short += was == SUSPECT and condition.state == NORMAL
-            if over_row < len(t_ns):
-                changes.append(AlarmEvent(over_row, fan, *condition.expire()))
-            self._note(fan)
-        changes.sort(key=lambda change: (change.row, change.fan))
-        return BlockResult(state, changes, too_short)
+            for row, sample_t_ns, sample_ratio in samples:
+                if row >= unshelve_row:
+                    events.append(AlarmEvent(unshelve_row, fan, *condition.unshelve()))
+                    unshelve_row = len(t_ns)
+                before = condition.fan_state
+                transitions = condition.update(sample_t_ns, period_ns, sample_ratio)
+                events += [AlarmEvent(row, fan, *transition) for transition in transitions]
+                state[row, fan] = condition.fan_state
+                too_short += before == SUSPECT and condition.fan_state == NORMAL
+            if unshelve_row < len(t_ns):
+                events.append(AlarmEvent(unshelve_row, fan, *condition.unshelve()))
+            self._refresh(fan)
+        events.sort(key=lambda event: (event.row, event.fan))
+        return BlockResult(state, events, too_short)
 
     def request(
         self,
@@ -84,57 +82,57 @@ class Conditions:
         operator_name: str = "",
         comment: str = "",
     ) -> list[tuple[int, Transition, str]]:
-        """What an operator asks of some fans: for each what then happened, or REFUSED and why.
+        """Process an operator's request. For each fan: the transition and "", or REFUSED and the reason.
 
-        now_t_ns: the last sample taken; a shelving ends `duration_ns` later, or with 0 once the alarm has cleared.
+        now_t_ns: time of the last sample; a shelving ends `duration_ns` later, or with 0 once the alarm has cleared.
         """
         answers: list[tuple[int, Transition, str]] = []
         for fan in fans:
             if not 0 <= fan < len(self._conditions):
                 answers.append((fan, Transition.REFUSED, f"there are fans 0 to {len(self._conditions) - 1}"))
                 continue
-            asked = self._conditions[fan].request(action, now_t_ns, duration_ns, operator_name, comment)
-            answers.append((fan, *asked))
-            self._note(fan)
+            answer = self._conditions[fan].request(action, now_t_ns, duration_ns, operator_name, comment)
+            answers.append((fan, *answer))
+            self._refresh(fan)
         return answers
 
-    def standing(self, fan: int) -> AlarmState:
-        """How a fan's alarm stands now."""
-        return self._conditions[fan].standing
+    def alarm_state(self, fan: int) -> AlarmState:
+        """The present state of a fan's alarm."""
+        return self._conditions[fan].alarm_state
 
-    def forget(self, *, stays_quiet: bool) -> None:
-        """No alarm was ever raised; what operators want quiet may stay so."""
+    def discard_all(self, *, keep_silenced: bool) -> None:
+        """Return all alarms to never raised. keep_silenced: shelved, suppressed, out of service stay as set."""
         for condition in self._conditions:
-            condition.forget(stays_quiet=stays_quiet)
-        self._note_all()
+            condition.discard(keep_silenced=keep_silenced)
+        self._refresh_all()
 
     def snapshot(self) -> dict[str, Any]:
-        """All that must not be forgotten, as JSON takes it."""
+        """The whole state, as JSON values."""
         return {"fans": [condition.snapshot() for condition in self._conditions]}
 
-    def restore(self, kept: Mapping[str, Any]) -> None:
-        """Go on from a snapshot; without it nothing has changed when this raises.
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a snapshot. Nothing has changed if this raises.
 
         Raises:
-            ValueError: it is no snapshot, or one of another number of fans.
+            ValueError: it is not a snapshot of alarm conditions, or one of another number of fans.
         """
         try:
-            conditions = [Condition.restored(self._settings, each) for each in kept["fans"]]
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            conditions = [Condition.restore(self._settings, each) for each in snapshot["fans"]]
+        except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise ValueError(f"not a snapshot of alarm conditions: {error!r}") from error
         if len(conditions) != len(self._conditions):
             raise ValueError(f"a snapshot of {len(conditions)} fans, here are {len(self._conditions)}")
         self._conditions = conditions
-        self._note_all()
+        self._refresh_all()
 
-    def _note_all(self) -> None:
+    def _refresh_all(self) -> None:
         self._not_normal = np.zeros(len(self._conditions), np.bool_)
         self._shelved_until_t_ns = np.full(len(self._conditions), UNTIL_IT_CLEARS_T_NS, np.int64)
         for fan in range(len(self._conditions)):
-            self._note(fan)
+            self._refresh(fan)
 
-    def _note(self, fan: int) -> None:
-        """Which fans need a look, sample by sample: the others are normal, and time takes nothing from them."""
+    def _refresh(self, fan: int) -> None:
+        """Keep the columns by which `update` finds the fans to process sample by sample; it skips the others."""
         condition = self._conditions[fan]
-        self._not_normal[fan] = condition.state != NORMAL
-        self._shelved_until_t_ns[fan] = condition.standing.shelved_until_t_ns or UNTIL_IT_CLEARS_T_NS
+        self._not_normal[fan] = condition.fan_state != NORMAL
+        self._shelved_until_t_ns[fan] = condition.alarm_state.shelved_until_t_ns or UNTIL_IT_CLEARS_T_NS

@@ -1,17 +1,15 @@
-"""What is probably wrong with a fan: causes with probabilities, and what speaks for each.
+"""The probable causes of an alarm, with their evidence.
 
-The window's balance is compared with each single fault (scoring.diagnosis.hypotheses), the readings with those of a
-broken sensor
-(scoring.diagnosis.sensor_evidence). Beforehand causes are equally probable, a changed scale of the sensor less, and
-so is that
-nothing in the balance changed.
+The balance of the window is compared with each single fault (scoring.diagnosis.hypotheses), the readings with those of
+a broken sensor (scoring.diagnosis.sensor_evidence). All causes have the same prior probability, except that a changed
+scale of the sensor has less.
 
-Where the motion excites no difference between two faults, both keep half the probability. `cannot_tell` gets the
-probability that naming the first cause would be wrong, be it because another is true or because nothing changed. So it
-comes first exactly when the best cause is less probable than all the others together.
+Where the motion does not distinguish two faults, each keeps half the probability. `cannot_tell` gets the probability
+that naming the first cause would be wrong, because another is true or because nothing changed. It comes first exactly
+when the best cause is less probable than all the others together.
 
-A stuck sensor says nothing of the motion: its balance is explained as well as by the best of the others. A sensor that
-drops out still tells the truth where it speaks: its balance has to be healthy.
+A stuck sensor carries no information on the motion: its balance counts as explained as well as by the best of the
+others. A sensor that drops out is right whenever it gives a reading: its balance has to be healthy.
 """
 
 from __future__ import annotations
@@ -25,15 +23,16 @@ from scoring.diagnosis.regression_window import Array, HealthyBalance, Regressio
 from scoring.diagnosis.sensor_evidence import dropout_log_ratio, stuck_log_ratio
 
 CANNOT_TELL, STUCK, DROPOUT = "cannot_tell", "sensor_stuck", "sensor_dropout"
-FEWEST_AFTER_S = 0.2
-CLEAR = 0.5
-STILL = 0.05
-"""a speed that moves by less than this share excites nothing"""
+MIN_AFTER_ONSET_S = 0.2
+CLEAR_RATIO = 0.5
+"""the diagnosis is clear if `cannot_tell` has less than this share of the first cause's probability"""
+STEADY_SHARE = 0.05
+"""a speed that varies by less than this share excites nothing"""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What changed: by how much, with a 95 % interval.
+    """The change of one parameter, with a 95 % interval.
 
     unit: `relative` (to the healthy value), `command` (in units of it), `share` or `samples`.
     """
@@ -59,27 +58,27 @@ class RankedCause:
 class Diagnosis:
     """All causes, the most probable first; their probabilities add up to one."""
 
-    suspects: tuple[RankedCause, ...]
+    causes: tuple[RankedCause, ...]
 
     @property
     def first(self) -> RankedCause:
         """The most probable one."""
-        return self.suspects[0]
+        return self.causes[0]
 
 
 def diagnose(window: Window, healthy: HealthyBalance) -> Diagnosis:
-    """Diagnose one fan from its last seconds: some before the onset, and all since.
+    """Diagnose one fan from its last seconds, some before the onset of the fault and all since.
 
-    Some three seconds of health before the onset are enough; what comes after it decides. It may be asked again
-    whenever there is more. Takes milliseconds.
+    About three seconds of health before the onset are enough; the samples after it decide. The diagnosis can be
+    repeated as samples arrive. It takes milliseconds.
     """
-    told = np.isfinite(window.command)  # where not even the command is known the line was silent, not the sensor
-    speed, onset = window.speed_rad_s[told], int(np.count_nonzero(told[: window.onset]))
+    heard = np.isfinite(window.command)  # where the command is missing too, the line was silent and not the sensor
+    speed, onset = window.speed_rad_s[heard], int(np.count_nonzero(heard[: window.onset]))
     regression = RegressionWindow(window, healthy)
     stuck, repeats = stuck_log_ratio(speed, onset)
     dropout, missing = dropout_log_ratio(speed, onset)
-    judged = len(regression.speeds_after) * window.step_s >= FEWEST_AFTER_S
-    if judged:
+    enough = len(regression.speeds_after) * window.period_s >= MIN_AFTER_ONSET_S
+    if enough:
         comparison = Comparison(regression, healthy)
         nothing = comparison.nothing()
         explanations = [comparison.explain(cause) for cause in CAUSES]
@@ -95,18 +94,18 @@ def diagnose(window: Window, healthy: HealthyBalance) -> Diagnosis:
     weight[-1] = 1.0 - weight[:-1].max()
     weight /= weight.sum()
     evidence: dict[str, tuple[Evidence | None, str]] = {one.cause.name: _evidence(one) for one in explanations}
-    evidence[STUCK] = _of_stuck(repeats, window.step_s)
+    evidence[STUCK] = _of_stuck(repeats, window.period_s)
     evidence[DROPOUT] = _of_dropout(missing)
-    evidence[CANNOT_TELL] = None, _why_not(names, weight, healthy_share, regression.speeds_after if judged else None)
-    suspects = [
+    evidence[CANNOT_TELL] = None, _clarity(names, weight, healthy_share, regression.speeds_after if enough else None)
+    causes = [
         RankedCause(name, float(share), *evidence.get(name, (None, "no speed to judge by")))
         for name, share in zip(names, weight, strict=True)
     ]
-    return Diagnosis(tuple(sorted(suspects, key=lambda one: -one.probability)))
+    return Diagnosis(tuple(sorted(causes, key=lambda cause: -cause.probability)))
 
 
-def _evidence(one: Explanation) -> tuple[Evidence, str]:
-    cause, (size, low, high) = one.cause, (one.size, one.low, one.high)
+def _evidence(explanation: Explanation) -> tuple[Evidence, str]:
+    cause, size, low, high = explanation.cause, explanation.size, explanation.low, explanation.high
     unit = "command" if cause.absolute else "relative"
     found = Evidence(cause.parameter, size, low, high, unit)
     if cause.absolute:
@@ -114,11 +113,11 @@ def _evidence(one: Explanation) -> tuple[Evidence, str]:
     return found, f"{cause.parameter} {100 * size:+.0f} % (95 %: {100 * low:.0f} to {100 * high:.0f})"
 
 
-def _of_stuck(repeats: int, step_s: float) -> tuple[Evidence | None, str]:
+def _of_stuck(repeats: int, period_s: float) -> tuple[Evidence | None, str]:
     if not repeats:
         return None, "the readings change"
     found = Evidence("repeated readings", repeats, repeats, repeats, "samples")
-    return found, f"the last {repeats} readings are all the same, for {repeats * step_s:.2g} s"
+    return found, f"the last {repeats} readings are all the same, for {repeats * period_s:.2g} s"
 
 
 def _of_dropout(missing: float) -> tuple[Evidence | None, str]:
@@ -128,15 +127,16 @@ def _of_dropout(missing: float) -> tuple[Evidence | None, str]:
     return found, f"{100 * missing:.0f} % of the readings are missing"
 
 
-def _why_not(names: list[str], weight: Array, healthy_share: float, speeds_after: Array | None) -> str:
+def _clarity(names: list[str], weight: Array, healthy_share: float, speeds_after: Array | None) -> str:
+    """Why the cause is unclear, or that it is clear."""
     first, second = np.argsort(-weight[:-1])[:2]
-    if weight[-1] < weight[first] * CLEAR:
+    if weight[-1] < weight[first] * CLEAR_RATIO:
         return f"little doubt: {names[first]} is more than twice as probable as all others together"
     if speeds_after is None:
         return "cannot tell yet: too few speeds since the onset"
-    if healthy_share > CLEAR:
+    if healthy_share > 0.5:
         return "cannot tell yet: the torque balance is that of a healthy fan"
     low, high = np.quantile(speeds_after, (0.05, 0.95))
-    if high - low < STILL * high:
+    if high - low < STEADY_SHARE * high:
         return "cannot tell yet: the command is not moving"
     return f"cannot tell yet: {names[first]} and {names[second]} explain it alike"

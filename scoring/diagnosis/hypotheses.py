@@ -1,23 +1,21 @@
 """How well each single fault explains a window, as a marginal likelihood.
 
-A hypothesis is one term of the balance (scoring.diagnosis.regression_window), one size u and one course in time. Its
-residual is
-r - u d; what noise remains in a row is normal with standard deviation sigma. Rows are means of samples that are
+A hypothesis is one term of the balance (scoring.diagnosis.regression_window), one size u and one time course. Its
+residual is r - u d; the noise of a row is normal with standard deviation sigma. Rows are means of samples that are
 correlated in time, and so are rows: both follow from the autocorrelation time (a first-order autoregression), and n
-rows count as n_eff = n / inflation. With a normal prior of standard deviation s on u, cut to the sizes that the cause
-can have, the integral over u is closed,
+rows count as n_eff = n / inflation. With a normal prior of standard deviation s on u, truncated to the sizes that the
+cause can have, the integral over u has the closed form
 
     Z = sigma^-n_eff exp(-(S - m^2 A v) / (2 v)) / sqrt(A s^2) * P(u allowed | posterior) / P(u allowed | prior)
     v = sigma^2 inflation    A = d.d / v + 1 / s^2    m = d.r / (A v)    S = r.r
 
-and the factor 1 / sqrt(A s^2) is the price of having a size to choose, Occam's factor (MacKay, Information Theory,
-Inference, and Learning Algorithms, 2003, chapter 28). Two hypotheses that the motion does not excite apart get the same
-Z, without a rule for it.
+The factor 1 / sqrt(A s^2) penalises a free size, Occam's factor (MacKay, Information Theory, Inference, and Learning
+Algorithms, 2003, chapter 28). Two hypotheses that the motion does not distinguish get the same Z, without a special
+rule.
 
-sigma is summed over, from the healthy one upwards: a hypothesis that fits badly needs a larger sigma, with which it is
-no longer sure of anything. Errors of the healthy coefficients, and a slow torque where there may be one, are normal
-unknowns with zero mean; they are integrated out before, which leaves the products of the columns changed and the
-formulas as they are.
+sigma is summed over, from the healthy one upwards: a hypothesis that fits badly needs a larger sigma, which makes it
+less certain of everything. Errors of the healthy coefficients, and a slow torque where one is possible, are normal
+unknowns with zero mean. They are integrated out first, which changes the products of the columns and not the formulas.
 """
 
 from __future__ import annotations
@@ -42,31 +40,30 @@ from scoring.diagnosis.regression_window import (
 )
 
 INFINITE = float("inf")
-TINY = 1e-9
+MIN_SCALE = 1e-9
 SIGMAS = np.array([0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0])
-"""in healthy ones; each next step upwards is less probable than the one before"""
+"""in multiples of the healthy one; the farther from 1, the less probable"""
 LOG_SIGMA_PRIOR: Array = -2.0 * np.abs(np.log(SIGMAS))
 LOG_SIGMA_PRIOR -= np.log(np.exp(LOG_SIGMA_PRIOR).sum())
 
 LATER_S = np.array([0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.17, 0.23, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.25, 1.5, 2.0])
-STEP_S = np.concatenate((-LATER_S[::-1], [0.0], LATER_S))
-"""when a step may have come, in seconds after the onset that the detector has"""
+STEP_CHANGE_S = np.concatenate((-LATER_S[::-1], [0.0], LATER_S))
+"""possible times of a step change, in seconds after the onset that the detector found"""
 RAMP_S = -np.array([60.0, 30.0, 20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5, 1.6, 1.0, 0.5, 0.0])
-"""when a linear growth may have begun"""
+"""possible starts of a linear growth"""
 VARYING_S = 1.0
 VARYING = np.array([0.03, 0.1, 0.3])
-"""a torque that comes and goes: another one each second, with these standard deviations, in typical commands"""
+"""a torque that comes and goes: a new value each second, with these standard deviations in typical commands"""
 
 
 @dataclass(frozen=True)
 class FaultHypothesis:
-    """One thing that can be wrong, by its term in the balance.
+    """One fault, as a term in the balance.
 
-    terms: what a size of one adds to the torque taken, in columns. curved: its effect is not proportional to its size.
-    lowest, largest: sizes that it can have. spread: standard deviation of the size before anything is seen, in typical
-    commands where `absolute`. abrupt: prior probability that it came as a step; else it has grown, or was there all the
-    time. varies: prior probability that it comes and goes instead. weight: how probable it is beforehand, beside the
-    others.
+    terms: what a size of one adds to the torque, by column. lowest, largest: possible sizes. size_std: prior standard
+    deviation of the size, in typical commands where `absolute`. abrupt: prior probability of a step change; otherwise
+    the fault has grown or was present throughout. curved: the effect is not proportional to the size. varies: prior
+    probability that the fault comes and goes. weight: prior probability relative to the other faults.
     """
 
     name: str
@@ -74,7 +71,7 @@ class FaultHypothesis:
     terms: dict[int, float]
     lowest: float
     largest: float
-    spread: float
+    size_std: float
     abrupt: float
     absolute: bool = False
     curved: bool = False
@@ -82,10 +79,10 @@ class FaultHypothesis:
     weight: float = 1.0
 
 
-# Sizes: an effect of a fifth of the typical command is usual for each, so that none is favoured by its prior.
-# Courses: whatever touches a rotor touches it at a time. Friction of a bearing grows over hours, and within a window is
-# there all the time or grows; that it jumps is possible and rare. Anything may cover an inlet at once or clog it.
-# A tacho counts: that its scale changes is rare, and is told by the jump of its readings.
+# Sizes: the typical effect of each is a fifth of the typical command, so that no prior favours one.
+# Time courses: an object touches a rotor at one moment. Friction of a bearing grows over hours, so that within a window
+# it is constant or grows; a jump is rare. An inlet may be covered at once or clog slowly.
+# A tacho counts pulses: a change of its scale is rare and shows as a jump of its readings.
 CAUSES = (
     FaultHypothesis("drag_up", "drag", {DRAG: 1.0}, 0.0, INFINITE, 0.6, abrupt=0.5),
     FaultHypothesis("drag_down", "drag", {DRAG: 1.0}, -1.0, 0.0, 0.4, abrupt=0.7),
@@ -110,7 +107,7 @@ CAUSES = (
 
 @dataclass(frozen=True)
 class Explanation:
-    """A cause's log evidence, and its size: mean, and the 95 % interval."""
+    """The log evidence of a cause, and the mean and 95 % interval of its size."""
 
     cause: FaultHypothesis
     log_evidence: float
@@ -120,17 +117,17 @@ class Explanation:
 
 
 class Comparison:
-    """Compares the causes over one window."""
+    """Compares all causes over one window."""
 
     def __init__(self, window: RegressionWindow, healthy: HealthyBalance) -> None:
-        variance, inflation = mean_of_correlated(healthy.autocorrelation_time_s / window.step_s, window.per_row)
-        self._sigma = max(healthy.sigma_command, TINY) * np.sqrt(variance) * SIGMAS
-        self._typical_command = max(window.typical_command, healthy.sigma_command, TINY)
+        variance, inflation = mean_of_correlated(healthy.autocorrelation_time_s / window.period_s, window.per_row)
+        self._sigma = max(healthy.sigma_command, MIN_SCALE) * np.sqrt(variance) * SIGMAS
+        self._typical_command = max(window.typical_command, healthy.sigma_command, MIN_SCALE)
         self._variance = self._sigma**2 * inflation
         self._effective = window.rows / inflation
         self._constant_need = window.constant_need
-        first_s, last_s = -window.onset * window.step_s, (window.samples - 1 - window.onset) * window.step_s
-        steps_s = STEP_S[(first_s < STEP_S) & (last_s > STEP_S)]
+        first_s, last_s = -window.onset * window.period_s, (window.samples - 1 - window.onset) * window.period_s
+        steps_s = STEP_CHANGE_S[(first_s < STEP_CHANGE_S) & (last_s > STEP_CHANGE_S)]
         begin_s = np.concatenate((steps_s, RAMP_S, [-np.inf]))
         is_step = np.arange(len(begin_s)) < len(steps_s)
         self._log_course = {
@@ -146,25 +143,25 @@ class Comparison:
         self._varying_products = whole @ whole.T
 
     def nothing(self) -> float:
-        """Log evidence of no change of any coefficient."""
+        """Log evidence that no coefficient changed."""
         product, log_det = self._without_errors(self._products[-1:])
         return log_sum(self._log_likelihood(product[..., RESIDUAL, RESIDUAL], log_det) + LOG_SIGMA_PRIOR)
 
     def explain(self, cause: FaultHypothesis) -> Explanation:
-        """The evidence for a cause, and its size."""
-        spread = cause.spread * (self._typical_command if cause.absolute else 1.0)
+        """The log evidence of a cause, and its size."""
+        size_std = cause.size_std * (self._typical_command if cause.absolute else 1.0)
         log_course = np.logaddexp(
             np.log(cause.abrupt) + self._log_course[True],
             np.log1p(-cause.abrupt) + self._log_course[False] if cause.abrupt < 1.0 else -np.inf,
         )
         used = np.isfinite(log_course)
-        parts = [self._evidence(cause, spread, self._products[used])]
+        parts = [self._evidence(cause, size_std, self._products[used])]
         weights = [np.log1p(-cause.varies) + log_course[used]]
         if cause.varies:
             for deviation in VARYING * self._typical_command:
                 scale = np.ones(len(self._varying_products))
                 scale[FIRST_ERROR + 4 :] = deviation
-                parts.append(self._evidence(cause, spread, (self._varying_products * np.outer(scale, scale))[None]))
+                parts.append(self._evidence(cause, size_std, (self._varying_products * np.outer(scale, scale))[None]))
                 weights.append(np.array([np.log(cause.varies / len(VARYING))]))
         log_evidence = np.concatenate([p[0] + w[:, None] for p, w in zip(parts, weights, strict=True)])
         log_evidence += LOG_SIGMA_PRIOR + np.log(cause.weight)
@@ -172,11 +169,11 @@ class Comparison:
         total = log_sum(log_evidence)
         share = np.exp(log_evidence - total)
         size = float((share * mean).sum())
-        reach = 1.96 * float(np.sqrt((share * (deviation**2 + (mean - size) ** 2)).sum()))
-        low, high = np.clip((size - reach, size + reach), cause.lowest, cause.largest)
+        half_interval = 1.96 * float(np.sqrt((share * (deviation**2 + (mean - size) ** 2)).sum()))
+        low, high = np.clip((size - half_interval, size + half_interval), cause.lowest, cause.largest)
         return Explanation(cause, total, size, float(low), float(high))
 
-    def _evidence(self, cause: FaultHypothesis, spread: float, products: Array) -> tuple[Array, Array, Array]:
+    def _evidence(self, cause: FaultHypothesis, size_std: float, products: Array) -> tuple[Array, Array, Array]:
         """Log evidence, mean and standard deviation of the size, (courses, sigmas) each."""
         product, log_det = self._without_errors(products)
         residual = np.zeros((*product.shape[:2], FIRST_ERROR))
@@ -189,7 +186,7 @@ class Comparison:
         mean = precision = s = np.zeros(product.shape[:2])
         for _ in range(rounds):
             if cause.curved:
-                # The square's torque falls by 1 - 1 / (1 + u): taken as its tangent at the size found so far.
+                # The quadratic torque falls by 1 - 1 / (1 + u), linearised at the size found so far.
                 slope = 1.0 / (1.0 + mean) ** 2
                 r, d = residual.copy(), direction.copy()
                 r[..., SQUARE] = 1.0 - 1.0 / (1.0 + mean) - mean * slope
@@ -198,24 +195,24 @@ class Comparison:
             rp = (product @ r[..., None])[..., 0]
             s, b = (r * rp).sum(-1), (d * rp).sum(-1)
             c = (d * (product @ d[..., None])[..., 0]).sum(-1)
-            precision = c / self._variance + 1.0 / spread**2
+            precision = c / self._variance + 1.0 / size_std**2
             mean = np.clip(b / self._variance / precision, cause.lowest if cause.curved else -np.inf, None)
         quadratic = s - mean**2 * precision * self._variance
-        log_z = self._log_likelihood(quadratic, log_det) - 0.5 * np.log(precision * spread**2)
+        log_z = self._log_likelihood(quadratic, log_det) - 0.5 * np.log(precision * size_std**2)
         width = 1.0 / np.sqrt(precision)
-        log_z += _log_mass(cause, mean, width) - _log_mass(cause, np.zeros(1), np.full(1, spread))
+        log_z += _log_mass(cause, mean, width) - _log_mass(cause, np.zeros(1), np.full(1, size_std))
         return log_z, *_truncated(cause, mean, width)
 
     def _without_errors(self, products: Array) -> tuple[Array, Array]:
-        """Products (courses, sigmas, 6, 6) with the errors integrated out, and log determinants (courses, sigmas)."""
+        """Products with the errors integrated out, (courses, sigmas, 6, 6), and log determinants, (courses, sigmas)."""
         q = FIRST_ERROR
-        ours, mixed, errors = products[:, :q, :q], products[:, :q, q:], products[:, q:, q:]
+        kept, mixed, errors = products[:, :q, :q], products[:, :q, q:], products[:, q:, q:]
         values, vectors = np.linalg.eigh(errors)
         values = np.maximum(values, 0.0)[:, np.newaxis, :]
-        turned = (mixed @ vectors)[:, np.newaxis]
+        rotated = (mixed @ vectors)[:, np.newaxis]
         variance = self._variance[:, np.newaxis]
-        left = ours[:, np.newaxis] - (turned / (variance + values)[..., np.newaxis, :]) @ turned.swapaxes(-1, -2)
-        return left, np.log1p(values / variance).sum(-1)
+        reduced = kept[:, np.newaxis] - (rotated / (variance + values)[..., np.newaxis, :]) @ rotated.swapaxes(-1, -2)
+        return reduced, np.log1p(values / variance).sum(-1)
 
     def _log_likelihood(self, quadratic: Array, log_det: Array) -> Array:
         return -self._effective * np.log(self._sigma) - 0.5 * (quadratic / self._variance + log_det)
@@ -228,9 +225,9 @@ def log_sum(logs: Array) -> float:
 
 
 def _log_mass(cause: FaultHypothesis, mean: Array, width: Array) -> Array:
-    """Log of the share of a normal distribution that lies among the sizes that the cause can have."""
+    """Log of the probability that a normally distributed size is one that the cause can have."""
     low, high = (cause.lowest - mean) / width, (cause.largest - mean) / width
-    # From the side on which the smaller tail lies, or digits are lost.
+    # Computed from the side of the smaller tail, to avoid cancellation.
     mirrored = low > -high
     low, high = np.where(mirrored, -high, low), np.where(mirrored, -low, high)
     below, above = log_ndtr(low), log_ndtr(high)
@@ -238,7 +235,7 @@ def _log_mass(cause: FaultHypothesis, mean: Array, width: Array) -> Array:
 
 
 def _truncated(cause: FaultHypothesis, mean: Array, width: Array) -> tuple[Array, Array]:
-    """Mean and standard deviation of a normal distribution cut to the sizes that the cause can have."""
+    """Mean and standard deviation of a normal distribution truncated to the sizes that the cause can have."""
     low, high = (cause.lowest - mean) / width, (cause.largest - mean) / width
     log_mass = _log_mass(cause, mean, width)
     at_low, at_high = (np.exp(-0.5 * z**2 - 0.5 * np.log(2.0 * np.pi) - log_mass) for z in (low, high))

@@ -1,16 +1,16 @@
-"""Slow wear: the trend of a parameter per day, with an interval, and when it will reach a limit.
+"""Slow wear: the trend of a parameter per day with its confidence interval, and when it will reach a limit.
 
-Points (time, value, standard error) come every so often. Memory is bounded: when it is full, neighbours are merged two
-and two, and from then on a stored point is the mean of twice as many.
+Points are (time, value, standard error). Memory is bounded: when the series is full, neighbours are merged in pairs,
+and from then on a stored point is the mean of twice as many.
 
-Slope: the median of the slopes between all pairs of points (Theil 1950; Sen, JASA 63 (1968) 1379), which a third of
-wild points cannot carry away. Interval: residuals of a fan are correlated over hours (temperature, day and night), and
-points that follow one another count for less. How much less is seen in the means of BATCHES stretches and more (batch
-means, as for the output of simulations: Law, Simulation Modeling and Analysis, 2015, section 9.5.3); stretches that are
-still correlated count as (1 - rho) / (1 + rho) each, rho being their correlation from one to the next, with the bias of
-a short series put right (Marriott and Pope, Biometrika 41 (1954) 390; the effective number as in Yue and Wang, Water
-Resources Management 18 (2004) 201). With it the usual interval of a line, Student's t, and scatter by the median, not
-less than the points' own errors.
+Slope: the median of the slopes between all pairs of points (Theil 1950; Sen, JASA 63 (1968) 1379), which tolerates a
+third of outliers. Interval: residuals of a fan are correlated over hours (temperature, day and night), so that
+successive points count for less. The means of at least BATCHES stretches show how much less (batch means, as for the
+output of simulations: Law, Simulation Modeling and Analysis, 2015, section 9.5.3). Stretches that are still correlated
+count as (1 - rho) / (1 + rho) each, where rho is their lag-one correlation, corrected for the bias of a short series
+(Marriott and Pope, Biometrika 41 (1954) 390; the effective number as in Yue and Wang, Water Resources Management 18
+(2004) 201). The interval is that of a regression line by Student's t with this effective number; the scatter is
+estimated by the median absolute deviation and is at least the points' own errors.
 
 A limit is reached between the earliest and the latest time at which the line with its uncertainty crosses it (Fieller).
 """
@@ -26,15 +26,17 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 from scipy.stats import theilslopes
 
+from schemas.units import NS_PER_S
+
 Array = NDArray[np.float64]
 
-NS_PER_DAY = 86_400_000_000_000
+NS_PER_DAY = 86_400 * NS_PER_S
 CAPACITY = 128
-FEWEST_POINTS = 10
-FEWEST_EFFECTIVE = 5.0
+MIN_POINTS = 10
+MIN_EFFECTIVE_POINTS = 5.0
 BATCHES = 24
-FARTHEST = 10.0
-"""a limit that lies farther ahead than so many times the time seen is not foretold"""
+MAX_HORIZON_RATIO = 10.0
+"""no forecast of a limit farther ahead than this many times the observed time"""
 THEIL_SEN_EFFICIENCY = 3.0 / np.pi
 SCATTER_PER_MEDIAN = 1.4826
 
@@ -43,8 +45,8 @@ SCATTER_PER_MEDIAN = 1.4826
 class Trend:
     """A line through the points, at days since `origin_ns`, the mean of their times.
 
-    slope_per_day with its 95 % interval (low, high). level, level_error: the line at the origin. reach: standard errors
-    in half a 95 % interval.
+    slope_per_day with its 95 % interval (low, high). level, level_error: the line at the origin. t_quantile: half the
+    95 % interval in standard errors. days: observed time.
     """
 
     origin_ns: int
@@ -54,24 +56,24 @@ class Trend:
     slope_error: float
     level: float
     level_error: float
-    reach: float
+    t_quantile: float
     points: int
     days: float
 
     @property
     def significant(self) -> bool:
-        """Whether the slope is told from zero."""
+        """Whether the slope differs from zero at 95 % confidence."""
         return self.low > 0.0 or self.high < 0.0
 
 
 @dataclass(frozen=True)
-class Reached:
-    """When a limit will be reached (95 %: earliest to latest), or why that cannot be said."""
+class LimitForecast:
+    """When a limit will be reached (95 %: earliest to latest), or why that is unknown."""
 
     earliest_ns: int | None = None
     likely_ns: int | None = None
     latest_ns: int | None = None
-    invalid_reason: str = ""
+    unknown_reason: str = ""
 
 
 class WearSeries:
@@ -81,25 +83,25 @@ class WearSeries:
         self._t_ns: list[int] = []
         self._value: list[float] = []
         self._std_error: list[float] = []
-        self._each = 1  # how many given points a stored one is the mean of; the last may still be filling
-        self._in_last = 0
+        self._points_per_stored = 1
+        self._points_in_last = 0  # the last stored point may still be incomplete
 
     def __len__(self) -> int:
         return len(self._t_ns)
 
     @property
     def last(self) -> float:
-        """The last value; of none 0."""
+        """The last value; 0 if there is none."""
         return self._value[-1] if self._value else 0.0
 
     def add(self, t_ns: int, value: float, std_error: float) -> None:
-        """Take a point. std_error above 0. Points that are not finite, or older than the last, are left out."""
+        """Add a point. It is ignored if not finite, not newer than the last, or without a positive std_error."""
         if not (np.isfinite(value) and np.isfinite(std_error) and std_error > 0.0):
             return
         if self._t_ns and t_ns <= self._t_ns[-1]:
             return
-        if 0 < self._in_last < self._each:
-            self._in_last += 1
+        if 0 < self._points_in_last < self._points_per_stored:
+            self._points_in_last += 1
             self._t_ns[-1], self._value[-1], self._std_error[-1] = _merged(
                 (self._t_ns[-1], self._value[-1], self._std_error[-1]), (t_ns, value, std_error)
             )
@@ -109,12 +111,12 @@ class WearSeries:
         self._t_ns.append(t_ns)
         self._value.append(value)
         self._std_error.append(std_error)
-        self._in_last = 1
+        self._points_in_last = 1
 
     def trend(self) -> Trend | None:
-        """The line through the points; None while they are too few, or too much alike, to tell anything."""
+        """The line through the points; None while there are too few independent points."""
         n = len(self._t_ns)
-        if n < FEWEST_POINTS:
+        if n < MIN_POINTS:
             return None
         origin_ns = self._t_ns[0] + round(float(np.mean([t - self._t_ns[0] for t in self._t_ns])))
         day = np.array([t - origin_ns for t in self._t_ns], dtype=float) / NS_PER_DAY
@@ -122,43 +124,43 @@ class WearSeries:
         fitted: Any = theilslopes(value, day)
         slope = float(fitted.slope)
         level = float(np.median(value - slope * day))
-        left = value - level - slope * day
-        effective = n / _inflation(left)
-        if effective < FEWEST_EFFECTIVE:
+        residual = value - level - slope * day
+        effective = n / _inflation(residual)
+        if effective < MIN_EFFECTIVE_POINTS:
             return None
-        scatter = SCATTER_PER_MEDIAN * float(np.median(np.abs(left))) * np.sqrt(n / (n - 2.0))
+        scatter = SCATTER_PER_MEDIAN * float(np.median(np.abs(residual))) * np.sqrt(n / (n - 2.0))
         scatter = max(scatter, float(np.median(self._std_error)))
         level_error = scatter / np.sqrt(effective * THEIL_SEN_EFFICIENCY)
         slope_error = level_error / float(day.std())
-        reach = float(stdtrit(min(effective, n // max(1, n // BATCHES)) - 2.0, 0.975))
+        t_quantile = float(stdtrit(min(effective, n // max(1, n // BATCHES)) - 2.0, 0.975))
         return Trend(
             origin_ns=origin_ns,
             slope_per_day=slope,
-            low=slope - reach * slope_error,
-            high=slope + reach * slope_error,
+            low=slope - t_quantile * slope_error,
+            high=slope + t_quantile * slope_error,
             slope_error=slope_error,
             level=level,
             level_error=level_error,
-            reach=reach,
+            t_quantile=t_quantile,
             points=n,
             days=float(day[-1] - day[0]),
         )
 
     def snapshot(self) -> dict[str, NDArray[np.int64] | Array]:
-        """All it knows, as arrays: t_ns, value, std_error (points,), and count (2,)."""
+        """The whole state as arrays: t_ns, value, std_error (points,), and count (2,)."""
         return {
             "t_ns": np.array(self._t_ns, np.int64),
             "value": np.array(self._value, np.float64),
             "std_error": np.array(self._std_error, np.float64),
-            "count": np.array((self._each, self._in_last), np.int64),
+            "count": np.array((self._points_per_stored, self._points_in_last), np.int64),
         }
 
     @classmethod
     def restore(cls, snapshot: Mapping[str, NDArray]) -> WearSeries:
-        """The series of which this is a snapshot.
+        """The series of a snapshot.
 
         Raises:
-            ValueError, KeyError, TypeError: it is none.
+            ValueError, KeyError, TypeError: it is not a snapshot of a series.
         """
         series = cls()
         series._t_ns = [int(t_ns) for t_ns in snapshot["t_ns"]]
@@ -166,70 +168,72 @@ class WearSeries:
         series._std_error = [float(error) for error in snapshot["std_error"]]
         if not len(series._t_ns) == len(series._value) == len(series._std_error) <= CAPACITY:
             raise ValueError("columns of a series must be of one length")
-        series._each, series._in_last = (int(count) for count in snapshot["count"])
+        series._points_per_stored, series._points_in_last = (int(count) for count in snapshot["count"])
         return series
 
     def _halve(self) -> None:
         points = list(zip(self._t_ns, self._value, self._std_error, strict=True))
         pairs = [_merged(first, second) for first, second in zip(points[::2], points[1::2], strict=True)]
         self._t_ns, self._value, self._std_error = (list(column) for column in zip(*pairs, strict=True))
-        self._each *= 2
+        self._points_per_stored *= 2
 
 
-def reached(trend: Trend, limit: float, now_ns: int) -> Reached:
-    """When the parameter will reach `limit`, from either side, if it goes on as it does."""
+def forecast_limit(trend: Trend, limit: float, now_ns: int) -> LimitForecast:
+    """When the parameter will reach `limit`, from either side, if the trend continues."""
     now = (now_ns - trend.origin_ns) / NS_PER_DAY
     level_now = trend.level + trend.slope_per_day * now
-    away = limit - level_now
+    distance = limit - level_now
     if not trend.significant:
-        return Reached(invalid_reason="no trend that can be told from none")
-    if away * trend.slope_per_day <= 0.0:
-        first_away = limit - (trend.level + trend.slope_per_day * (now - trend.days))
-        passed = first_away * trend.slope_per_day > 0.0
-        return Reached(invalid_reason="the limit is already reached" if passed else "it moves away from the limit")
+        return LimitForecast(unknown_reason="no significant trend")
+    if distance * trend.slope_per_day <= 0.0:
+        first_distance = limit - (trend.level + trend.slope_per_day * (now - trend.days))
+        passed = first_distance * trend.slope_per_day > 0.0
+        return LimitForecast(
+            unknown_reason="the limit is already reached" if passed else "it moves away from the limit"
+        )
     likely = (limit - trend.level) / trend.slope_per_day
-    if likely - now > FARTHEST * trend.days:
-        return Reached(
-            invalid_reason=f"it is more than {FARTHEST:g} times as far away as the {trend.days:.2g} days seen"
+    if likely - now > MAX_HORIZON_RATIO * trend.days:
+        return LimitForecast(
+            unknown_reason=f"more than {MAX_HORIZON_RATIO:g} times as far ahead as the {trend.days:.2g} days observed"
         )
     earliest, latest = _crossings(trend, limit)
     earliest_ns, likely_ns, latest_ns = (
         trend.origin_ns + round(max(day, now) * NS_PER_DAY) for day in (earliest, likely, latest)
     )
-    return Reached(earliest_ns, likely_ns, latest_ns)
+    return LimitForecast(earliest_ns, likely_ns, latest_ns)
 
 
 def _crossings(trend: Trend, limit: float) -> tuple[float, float]:
     """Days since the origin at which the two edges of the line's 95 % interval are at the limit.
 
-    They are the solutions x of (limit - level - slope x)^2 = reach^2 (level_error^2 + slope_error^2 x^2), and real,
-    because the slope is significant.
+    They are the solutions x of (limit - level - slope x)^2 = t^2 (level_error^2 + slope_error^2 x^2) with t the
+    t_quantile; they are real because the slope is significant.
     """
-    away = limit - trend.level
-    a = trend.slope_per_day**2 - (trend.reach * trend.slope_error) ** 2
-    b = -2.0 * away * trend.slope_per_day
-    c = away**2 - (trend.reach * trend.level_error) ** 2
+    distance = limit - trend.level
+    a = trend.slope_per_day**2 - (trend.t_quantile * trend.slope_error) ** 2
+    b = -2.0 * distance * trend.slope_per_day
+    c = distance**2 - (trend.t_quantile * trend.level_error) ** 2
     root = np.sqrt(max(b * b - 4.0 * a * c, 0.0))
     return (-b - root) / (2.0 * a), (-b + root) / (2.0 * a)
 
 
-def _inflation(left: Array) -> float:
+def _inflation(residual: Array) -> float:
     """How many correlated points count as one."""
-    bounded = np.clip(left, *np.quantile(left, (0.02, 0.98)))
-    each = max(1, len(left) // BATCHES)
-    n = len(left) // each
-    batches = bounded[len(left) - n * each :].reshape(n, each).mean(axis=1)
+    bounded = np.clip(residual, *np.quantile(residual, (0.02, 0.98)))
+    size = max(1, len(residual) // BATCHES)
+    n = len(residual) // size
+    batches = bounded[len(residual) - n * size :].reshape(n, size).mean(axis=1)
     batches = batches - batches.mean()
     power = float(batches @ batches)
     found = float(batches[:-1] @ batches[1:]) / power if power > 0.0 else 0.0
-    # A fitted line takes two means' worth of correlation away.
+    # Fitting a line lowers the measured correlation by about two stretches' worth.
     rho = np.clip(found + 2.0 * (1.0 + 3.0 * max(found, 0.0)) / n, 0.0, 1.0 - 1.0 / n)
-    within = each * (power / (n - 2.0)) / float(bounded.var()) if power > 0.0 else 1.0
+    within = size * (power / (n - 2.0)) / float(bounded.var()) if power > 0.0 else 1.0
     return float(max(within, 1.0) * (1.0 + rho) / (1.0 - rho))
 
 
 def _merged(first: tuple[int, float, float], second: tuple[int, float, float]) -> tuple[int, float, float]:
-    """The mean of two points, weighed by their variances."""
+    """The mean of two points, weighted by their inverse variances."""
     weights = np.array((first[2] ** -2, second[2] ** -2))
     share = float(weights[1] / weights.sum())
     t_ns = first[0] + round(share * (second[0] - first[0]))

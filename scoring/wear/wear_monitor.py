@@ -1,9 +1,9 @@
-"""Slow wear of a tray: every so often, when a fan is quiet, how far its parameters have moved since commissioning.
+"""Slow wear of a tray: how far each fan's parameters have moved since commissioning, measured at regular intervals.
 
-Drag, friction and gain are identified again over the last seconds (scoring.wear.reidentification), each as if it
-alone had
-moved. `balance` is the torque balance's own baseline, that follows the fan as far as it may; of it a limit is known,
-where its alarm comes. Each is a series with a trend per day (scoring.wear.trend). See docs/explanation/wear.md.
+Drag, friction and gain are identified again over the last seconds (scoring.wear.reidentification), each as if it alone
+had changed. `balance` is the baseline of the torque balance, which follows the fan within bounds; it is the only one
+with a limit, the value at which the alarm is raised. Each is a series with a trend per day (scoring.wear.trend).
+See docs/explanation/wear.md.
 """
 
 from __future__ import annotations
@@ -15,169 +15,177 @@ from typing import Any
 import numpy as np
 
 from schemas.messages import Array
+from schemas.units import NS_PER_S
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.diagnosis.regression_window import HealthyBalance
+from scoring.former_snapshot_keys import FORMER_WEAR_KEYS, current_keys
 from scoring.wear.reidentification import parameter_drifts
-from scoring.wear.trend import NS_PER_DAY, Reached, Trend, WearSeries, reached
+from scoring.wear.trend import NS_PER_DAY, LimitForecast, Trend, WearSeries, forecast_limit
 
 UNITS = {"balance": "command", "drag": "relative", "friction": "command", "gain": "relative"}
-"""of what is watched; `command`: in units of it"""
-TRY_NS = 10_000_000_000
-"""so often it is looked whether a fan that is due is quiet"""
-SHORTEST_DAYS = 1.0
-"""a limit is foretold from a day and a night on: before that all is the weather, or a bearing that warms up"""
-SOON_DAYS = 7.0
-"""what lies nearer is told"""
+"""unit of each parameter; `command`: that of the fan's command"""
+ATTEMPT_PERIOD_NS = 10 * NS_PER_S
+"""how often a fan that is due for a point is tried"""
+MIN_FORECAST_DAYS = 1.0
+"""no forecast before: weather and warming bearings change more within a day than wear does"""
+REPORT_WITHIN_DAYS = 7.0
+"""health reports a limit that is likely to be reached sooner"""
 WINDOW_S = 35.0
-"""so far a point looks back"""
+"""how far a point looks back"""
 NEVER_NS = int(np.iinfo(np.int64).min)
-LARGEST = 1e6
-"""no fan changes so much: what is larger is left out"""
+MAX_CHANGE = 1e6
+"""larger changes are left out: no fan changes so much"""
 
 
 @dataclass(frozen=True)
-class Wear:
-    """What is known of one parameter of one fan. change: since commissioning, by the trend's line if there is one."""
+class ParameterWear:
+    """The wear of one parameter of one fan. change: since commissioning, on the trend line if there is one."""
 
     change: float
     trend: Trend | None
     limit: float | None
-    reached: Reached
+    forecast: LimitForecast
 
 
 class WearMonitor:
-    """Of one tray's fans. What it finds does not depend on how samples are cut into blocks."""
+    """The wear of one tray's fans. The result does not depend on how samples are cut into blocks."""
 
     def __init__(
         self, healthy: Sequence[HealthyBalance], diagnoser: Diagnoser, every_s: float, command_unit: str
     ) -> None:
-        """diagnoser: has the last seconds. every_s: a point of each fan so often."""
+        """diagnoser: holds the last seconds. every_s: interval between the points of a fan."""
         self._healthy = healthy
         self._diagnoser = diagnoser
-        self._every_ns = round(every_s * 1e9)
+        self._every_ns = round(every_s * NS_PER_S)
         self._unit = command_unit
-        self._tried = 0
+        self._last_attempt = 0
         self._disturbed_t_ns = np.full(len(healthy), NEVER_NS)
         """(fans,) the last sample that no point may look back on"""
-        self._fans = [_Fan() for _ in healthy]
+        self._fans = [_FanWear() for _ in healthy]
 
     def update(
         self,
         t_ns: Array,
         origin_t_ns: int,
-        quiet: Array,
+        eligible: Array,
         disturbed: Array,
         commissioned_command: Array,
         held: Array,
         limit_command: Array,
     ) -> None:
-        """Take a block that the diagnoser has taken; (n, fans) each but t_ns, (n,), and limit_command, (fans,).
+        """Process a block that the diagnoser has taken; (n, fans) each but t_ns, (n,), and limit_command, (fans,).
 
-        quiet: a point may be taken here. disturbed: nor is one for as long as it would look back on this.
-        commissioned_command: baseline of the balance at the end of commissioning, NaN before. held: it may go no
-        further, and says nothing more. limit_command: how far the balance may be from that until its alarm comes.
+        eligible: a point may be taken at this sample. disturbed: no point may look back on this sample.
+        commissioned_command: baseline of the balance at the end of commissioning, NaN before. held: the baseline is at
+        its bound, so that its value says nothing about wear. limit_command: the alarm comes at this distance from the
+        commissioned baseline.
         """
-        tries = np.maximum((t_ns - origin_t_ns) // TRY_NS, self._tried)
-        for row in np.flatnonzero(np.diff(tries, prepend=self._tried) > 0).tolist():
+        attempts = np.maximum((t_ns - origin_t_ns) // ATTEMPT_PERIOD_NS, self._last_attempt)
+        for row in np.flatnonzero(np.diff(attempts, prepend=self._last_attempt) > 0).tolist():
             at_ns = int(t_ns[row])
             slot = (at_ns - origin_t_ns) // self._every_ns
-            undisturbed = self._last_disturbed(t_ns[: row + 1], disturbed[: row + 1]) <= at_ns - round(WINDOW_S * 1e9)
-            for fan in np.flatnonzero(quiet[row] & undisturbed & np.isfinite(commissioned_command[row])).tolist():
+            last_disturbed = self._last_disturbed(t_ns[: row + 1], disturbed[: row + 1])
+            undisturbed = last_disturbed <= at_ns - round(WINDOW_S * NS_PER_S)
+            commissioned = np.isfinite(commissioned_command[row])
+            for fan in np.flatnonzero(eligible[row] & undisturbed & commissioned).tolist():
                 due = slot > self._fans[fan].slot
-                if due and self._look(fan, at_ns, float(commissioned_command[row, fan]), bool(held[row, fan])):
+                if due and self._add_point(fan, at_ns, float(commissioned_command[row, fan]), bool(held[row, fan])):
                     self._fans[fan].slot = slot
-                    self._fans[fan].tell(at_ns, float(limit_command[fan]))
-        self._tried = int(tries[-1])
+                    self._fans[fan].evaluate(at_ns, float(limit_command[fan]))
+        self._last_attempt = int(attempts[-1])
         self._disturbed_t_ns = self._last_disturbed(t_ns, disturbed)
 
-    def of(self, fan: int) -> Mapping[str, Wear]:
-        """What is known of a fan, by parameter; empty before its first point."""
-        return self._fans[fan].told
+    def of(self, fan: int) -> Mapping[str, ParameterWear]:
+        """The wear of a fan, by parameter; empty before its first point."""
+        return self._fans[fan].wear
 
     def forget(self, fans: Array, t_ns: int) -> None:
-        """Begin anew with some fans, (fans,) of bool: after t_ns, the last sample taken, they are commissioned anew."""
+        """Start again for some fans, (fans,) of bool, that are commissioned again after t_ns, the last sample."""
         for fan in np.flatnonzero(fans).tolist():
-            self._fans[fan] = _Fan()
+            self._fans[fan] = _FanWear()
             self._disturbed_t_ns[fan] = t_ns
 
     def problem(self, now_ns: int) -> str:
         """One line while a limit is likely to be reached within days; empty otherwise."""
         soon = []
         for number, fan in enumerate(self._fans):
-            when = fan.told["balance"].reached if "balance" in fan.told else Reached()
-            if when.likely_ns is None or when.earliest_ns is None or when.latest_ns is None or now_ns > when.latest_ns:
+            forecast = fan.wear["balance"].forecast if "balance" in fan.wear else LimitForecast()
+            if forecast.likely_ns is None or forecast.earliest_ns is None or forecast.latest_ns is None:
+                continue
+            if now_ns > forecast.latest_ns:
                 continue
             earliest, likely, latest = (
-                max(t - now_ns, 0) / NS_PER_DAY for t in (when.earliest_ns, when.likely_ns, when.latest_ns)
+                max(t - now_ns, 0) / NS_PER_DAY for t in (forecast.earliest_ns, forecast.likely_ns, forecast.latest_ns)
             )
-            if likely <= SOON_DAYS:
+            if likely <= REPORT_WITHIN_DAYS:
                 soon.append((likely, number, earliest, latest))
         if not soon:
             return ""
         likely, number, earliest, latest = min(soon)
         days = "day" if round(likely) == 1 else "days"
-        about = f"in about {likely:.0f} {days} ({earliest:.0f} to {latest:.0f})" if likely > 0.5 else "within a day"
+        when = f"in about {likely:.0f} {days} ({earliest:.0f} to {latest:.0f})" if likely > 0.5 else "within a day"
         others = ", ".join(str(other) for _, other, *_ in sorted(soon)[1:])
-        look = f"look at it, and at fan {others}" if others else "look at it"
-        return f"fan {number} wears: its balance reaches the limit {about}; {look}"
+        advice = f"inspect it, and fan {others}" if others else "inspect it"
+        return f"fan {number} is wearing: its torque balance will reach the limit {when}; {advice}"
 
     def snapshot(self) -> dict[str, Any]:
-        """All it knows, as JSON can hold it, with what it tells of each parameter."""
+        """The whole state, as JSON values, and the present wear of each parameter for `fantwin wear`."""
         return {
             "command_unit": self._unit,
-            "tried": self._tried,
+            "last_attempt": self._last_attempt,
             "disturbed_t_ns": self._disturbed_t_ns.tolist(),
             "fans": [fan.snapshot() for fan in self._fans],
         }
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a snapshot of a watch of as many fans; without it nothing has changed when this raises.
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a snapshot of the same number of fans. Nothing has changed if this raises.
 
         Raises:
-            ValueError, KeyError, TypeError: it is not one.
+            ValueError, KeyError, TypeError, AttributeError: it is not such a snapshot.
         """
-        fans = [_Fan.restore(fan) for fan in state["fans"]]
-        disturbed_t_ns = np.array(state.get("disturbed_t_ns", self._disturbed_t_ns), np.int64)  # not kept at first
+        stored = current_keys(snapshot, FORMER_WEAR_KEYS)
+        fans = [_FanWear.restore(fan) for fan in stored["fans"]]
+        disturbed_t_ns = np.array(stored.get("disturbed_t_ns", self._disturbed_t_ns), np.int64)  # the first had none
         if len(fans) != len(self._fans) or disturbed_t_ns.shape != self._disturbed_t_ns.shape:
             raise ValueError("wear of another number of fans")
-        self._tried, self._disturbed_t_ns, self._fans = int(state["tried"]), disturbed_t_ns, fans
+        self._last_attempt, self._disturbed_t_ns, self._fans = int(stored["last_attempt"]), disturbed_t_ns, fans
 
     def _last_disturbed(self, t_ns: Array, disturbed: Array) -> Array:
-        """(fans,) when each was disturbed last, up to the end of these rows."""
+        """(fans,) time of the last disturbed sample of each fan, up to the end of these rows."""
         return np.where(disturbed, t_ns[:, np.newaxis], self._disturbed_t_ns).max(axis=0)
 
-    def _look(self, fan: int, at_ns: int, commissioned: float, held: bool) -> bool:
-        """Add a point of each parameter; False where the last seconds are too few for it, or too slow."""
+    def _add_point(self, fan: int, at_ns: int, commissioned: float, held: bool) -> bool:
+        """Add a point for each parameter; False where the last seconds are too few for it, or too slow."""
         window = self._diagnoser.window(fan, at_ns, at_ns, WINDOW_S)
         if window is None:
             return False
-        drifts = parameter_drifts(replace(window, offset=commissioned), self._healthy[fan])
+        drifts = parameter_drifts(replace(window, fan_offset=commissioned), self._healthy[fan])
         points = {drift.parameter: (drift.change, drift.std_error) for drift in drifts}
         if points and not held:
-            points["balance"] = window.offset - commissioned, window.offset_std_error
+            points["balance"] = window.fan_offset - commissioned, window.fan_offset_std_error
         for parameter, (change, std_error) in points.items():
-            if max(abs(change), std_error) < LARGEST:
+            if max(abs(change), std_error) < MAX_CHANGE:
                 self._fans[fan].series[parameter].add(at_ns, change, std_error)
         return bool(points)
 
 
-class _Fan:
-    """One fan: its series, and what follows from them."""
+class _FanWear:
+    """One fan: the series of its parameters, and the wear evaluated from them."""
 
     def __init__(self) -> None:
         self.slot = -1
         self.t_ns = 0
         self.limit: float | None = None
         self.series = {parameter: WearSeries() for parameter in UNITS}
-        self.told: dict[str, Wear] = {}
+        self.wear: dict[str, ParameterWear] = {}
 
-    def tell(self, t_ns: int, limit_command: float) -> None:
-        """After a point: work out the trends anew."""
+    def evaluate(self, t_ns: int, limit_command: float) -> None:
+        """Compute trends and forecasts after a point was added."""
         self.t_ns = t_ns
         self.limit = limit_command if np.isfinite(limit_command) else None
-        self.told = {parameter: self._wear(parameter) for parameter in UNITS if len(self.series[parameter])}
+        self.wear = {parameter: self._wear(parameter) for parameter in UNITS if len(self.series[parameter])}
 
-    def _wear(self, parameter: str) -> Wear:
+    def _wear(self, parameter: str) -> ParameterWear:
         series = self.series[parameter]
         trend = series.trend()
         limit = self.limit if parameter == "balance" else None
@@ -185,20 +193,20 @@ class _Fan:
         if trend is not None:
             change = trend.level + trend.slope_per_day * (self.t_ns - trend.origin_ns) / NS_PER_DAY
         if limit is None:
-            why = "the twin is not calibrated" if parameter == "balance" else "it has no limit of its own"
-            return Wear(change, trend, None, Reached(invalid_reason=why))
+            reason = "the twin is not calibrated" if parameter == "balance" else "it has no limit of its own"
+            return ParameterWear(change, trend, None, LimitForecast(unknown_reason=reason))
         if trend is None:
-            return Wear(change, None, limit, Reached(invalid_reason="too little was seen so far"))
-        if trend.days < SHORTEST_DAYS:
-            return Wear(change, trend, limit, Reached(invalid_reason="less than a day was seen"))
+            return ParameterWear(change, None, limit, LimitForecast(unknown_reason="too few points so far"))
+        if trend.days < MIN_FORECAST_DAYS:
+            return ParameterWear(change, trend, limit, LimitForecast(unknown_reason="less than a day was observed"))
         limit = float(np.copysign(limit, trend.slope_per_day))
-        return Wear(change, trend, limit, reached(trend, limit, self.t_ns))
+        return ParameterWear(change, trend, limit, forecast_limit(trend, limit, self.t_ns))
 
     def snapshot(self) -> dict[str, Any]:
         parameters = {
             parameter: {
                 "unit": UNITS[parameter],
-                **_plain(self.told.get(parameter)),
+                **_to_json(self.wear.get(parameter)),
                 "series": {name: column.tolist() for name, column in series.snapshot().items()},
             }
             for parameter, series in self.series.items()
@@ -206,29 +214,31 @@ class _Fan:
         return {"slot": self.slot, "t_ns": self.t_ns, "limit_command": self.limit, "parameters": parameters}
 
     @classmethod
-    def restore(cls, state: Mapping[str, Any]) -> _Fan:
+    def restore(cls, snapshot: Mapping[str, Any]) -> _FanWear:
+        """The series are restored; the wear is evaluated again from them."""
         fan = cls()
-        fan.slot = int(state["slot"])
+        fan.slot = int(snapshot["slot"])
         for parameter in UNITS:
-            series = {name: np.asarray(column) for name, column in state["parameters"][parameter]["series"].items()}
+            series = {name: np.asarray(column) for name, column in snapshot["parameters"][parameter]["series"].items()}
             fan.series[parameter] = WearSeries.restore(series)
         if fan.slot >= 0:
-            fan.tell(int(state["t_ns"]), np.inf if state["limit_command"] is None else float(state["limit_command"]))
+            limit = np.inf if snapshot["limit_command"] is None else float(snapshot["limit_command"])
+            fan.evaluate(int(snapshot["t_ns"]), limit)
         return fan
 
 
-def _plain(wear: Wear | None) -> dict[str, Any]:
-    """What is told of a parameter, for machines."""
+def _to_json(wear: ParameterWear | None) -> dict[str, Any]:
+    """The wear of a parameter, as `fantwin wear` reads it from a snapshot."""
     if wear is None:
         return {}
-    trend, when = wear.trend, wear.reached
+    trend, forecast = wear.trend, wear.forecast
     return {
         "change": wear.change,
         "per_day": trend and {"value": trend.slope_per_day, "low": trend.low, "high": trend.high},
         "days": trend.days if trend else None,
         "limit": wear.limit,
         "reached_t_ns": None
-        if when.likely_ns is None
-        else {"earliest": when.earliest_ns, "likely": when.likely_ns, "latest": when.latest_ns},
-        "invalid_reason": when.invalid_reason,
+        if forecast.likely_ns is None
+        else {"earliest": forecast.earliest_ns, "likely": forecast.likely_ns, "latest": forecast.latest_ns},
+        "unknown_reason": forecast.unknown_reason,
     }

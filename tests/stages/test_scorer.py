@@ -175,7 +175,7 @@ def test_without_a_calibration_neither_torque_balance_nor_tacho_raises_anything(
     dead.valid[1000:] = False
     scores, alarms = feed(core, [prediction_of(np.zeros(500), balance=1000.0), dead])
     assert alarms == []
-    assert core.problem().startswith("fan 0 is not judged: no speed for 10 s and more"), "nor may a baseline drift"
+    assert core.problem().startswith("fan 0 is not scored: no speed, for 10 s or more"), "nor may a baseline drift"
     assert scores[0].valid.all() and not scores[1].valid[1000:].any()
 
 
@@ -518,11 +518,11 @@ def test_fans_that_are_not_judged_for_long_are_told_with_the_reason_until_they_a
     assert core.problem() == ""
     feed(core, [unjudged(0.01, why, first_s=9.99)])
     assert core.problem() == (
-        "fan 2 is not judged: the command is out of the twin's range, or a value is no number for 10 s and more; "
-        "fans 1, 3 are not judged: no speed for 10 s and more"
+        "fan 2 is not scored: the command is outside the twin's range, or a value is not a number, for 10 s or more; "
+        "fans 1, 3 are not scored: no speed, for 10 s or more"
     )
     feed(core, [unjudged(15, why, first_s=10)])
-    assert "no speed for 20 s and more" in core.problem()
+    assert "no speed, for 20 s or more" in core.problem()
     feed(core, [unjudged(0.01, [InvalidReason.NONE] * 4, first_s=25)])
     assert core.problem() == ""
 
@@ -532,7 +532,7 @@ def test_a_first_warm_up_is_not_told_but_one_without_an_end_is() -> None:
     feed(core, [unjudged(59.99, [InvalidReason.WARMING_UP])])
     assert core.problem() == ""
     feed(core, [unjudged(0.01, [InvalidReason.WARMING_UP], first_s=59.99)])
-    assert "fan 0 is not judged: the twin is warming up" in core.problem()
+    assert "fan 0 is not scored: the twin is warming up" in core.problem()
 
 
 def test_a_silent_line_does_not_count_as_not_judged() -> None:

@@ -78,7 +78,7 @@ def test_a_scorer_that_goes_on_from_its_memory_is_one_that_never_stopped(middle:
     assert {Transition.RAISED, Transition.CLEARED} <= {alarm.transition for alarm in expected_alarms}
     assert bits(scores) == bits(expected)
     assert without_causes(alarms) == without_causes(expected_alarms)
-    assert successor.problem() == unbroken.problem() or "not judged" in unbroken.problem()
+    assert successor.problem() == unbroken.problem() or "not scored" in unbroken.problem()
 
 
 def test_after_a_kill_what_producers_still_keep_is_made_up_for(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_every_alarm_and_answer_is_noted_before_it_is_told(tmp_path: Path) -> No
     def noted() -> dict[str, Any]:
         memory = SnapshotStore(tmp_path / "m").load()
         assert memory
-        return json.loads(memory.state_json)["desk"]["told"]["0"]
+        return json.loads(memory.state_json)["desk"]["last_emitted"]["0"]
 
     _, alarms = feed(scorer, [prediction_of(np.full(100, 20.0))])
     assert alarms and noted()["active"]
@@ -223,7 +223,7 @@ def test_of_another_twin_only_what_operators_keep_quiet_is_gone_on_from() -> Non
 def test_of_a_memory_in_an_older_form_what_operators_keep_quiet_is_gone_on_from(of: str) -> None:
     memory = note_of(raised())
     state = json.loads(memory.state_json)
-    state["wear"]["tried"] = 5
+    state["wear"]["last_attempt"] = 5
     state[of].popitem()
     successor = core_of(3)
     first, *told = successor.restore(replace(memory, state_json=json.dumps(state)))
@@ -235,7 +235,7 @@ def test_of_a_memory_in_an_older_form_what_operators_keep_quiet_is_gone_on_from(
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
     assert (score.state == FanState.COMMISSIONING).all()
-    assert json.loads(note_of(successor).state_json)["wear"]["tried"] == 0, "wear begins anew"
+    assert json.loads(note_of(successor).state_json)["wear"]["last_attempt"] == 0, "wear begins anew"
 
 
 def test_what_was_set_aside_is_told_for_a_minute() -> None:
@@ -267,12 +267,12 @@ def test_a_memory_that_is_not_understood_is_set_aside_and_counted(state: str) ->
     feed(successor, [prediction_of(np.zeros((200, 3)))])
 
 
-@pytest.mark.parametrize("where", ["told", "due", "onset_t_ns"])
+@pytest.mark.parametrize("where", ["last_emitted", "due", "onset_t_ns"])
 def test_a_memory_of_a_fan_that_is_not_there_is_not_understood(where: str) -> None:
     memory = note_of(raised())
     state = json.loads(memory.state_json)
-    fans = state["desk"]["told"] if where == "told" else state["desk"]["diagnoser"][where]
-    fans["99"] = next(iter(fans.values())) if where == "told" else {"due": [0], "onset_t_ns": 0}[where]
+    fans = state["desk"]["last_emitted"] if where == "last_emitted" else state["desk"]["diagnoser"][where]
+    fans["99"] = next(iter(fans.values())) if where == "last_emitted" else {"due": [0], "onset_t_ns": 0}[where]
     successor = core_of(3)
     assert successor.restore(replace(memory, state_json=json.dumps(state))) == []
     assert successor.counters()["snapshots_not_understood"] == 1

@@ -79,7 +79,7 @@ def alarms_of(limits: Limits, blocks: Iterable[Samples], fans: int) -> list[Rais
             Raised(
                 change.fan, int(block.t_ns[change.row]) / 1e9, Statistic(int(verdict.statistic[change.row, change.fan]))
             )
-            for change in course.changes
+            for change in course.events
             if change.transition == Transition.RAISED
         ]
     return raised

@@ -233,7 +233,7 @@ def standing_lines(standing: CurrentAlarm) -> Text:
     """How an alarm stands, for people: two lines or three."""
     alarm = standing.newest
     by = f" by {standing.acknowledged_by}" if standing.acknowledged_by else ""
-    words = [f"{word}{by}" if word == "acknowledged" else word for word in standing.words()]
+    words = [f"{word}{by}" if word == "acknowledged" else word for word in standing.states()]
     style = _STYLES.get(alarm.severity, "bold red") if is_presented(alarm) else "dim"
     text = Text.assemble((f"{_name(alarm)}  {alarm.severity.name:7}", style), f"  {', '.join(words)}")
     if alarm.severity != Severity.NONE:

@@ -115,7 +115,7 @@ def _alarm_line(current: CurrentAlarm) -> Text:
     style = _STYLES.get(alarm.severity, "bold red") if alarm.active else "green"
     text = Text.assemble(
         (f"{clock(alarm.t_ns)}  {alarm.severity.name:7}", style if is_presented(alarm) else "dim"),
-        f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(current.words())}",
+        f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(current.states())}",
     )
     about = current.message.removeprefix(f"fan {alarm.fan}: ")
     if current.causes:

@@ -1,4 +1,4 @@
-"""`fantwin wear`: what wears slowly, how fast, and when it will alarm."""
+"""`fantwin wear`: how fast each fan wears, and when that will raise an alarm."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
 from schemas.messages import ScorerSnapshot
 from schemas.topics import tray_key
+from schemas.units import NS_PER_S
+from scoring.former_snapshot_keys import FORMER_PARAMETER_KEYS, current_keys
+from scoring.wear.trend import NS_PER_DAY
 
-NS_PER_DAY = 86_400_000_000_000
-_LOOK_S = 0.02
-_QUIET = "one that is commissioned and then quiet (score below 0.5, no alarm, not too slow)"
-_TOLD = ("unit", "change", "per_day", "days", "limit", "reached_t_ns", "invalid_reason")
+_POLL_S = 0.02
+_NEEDED = "a fan has its first point some time after commissioning (score below 0.5, no alarm, not too slow)"
+_SHOWN = ("unit", "change", "per_day", "days", "limit", "reached_t_ns", "unknown_reason")
 
 
 def wear(
@@ -43,10 +45,10 @@ def wear(
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Show how each fan has changed since commissioning, per day, and when its limit will be reached
+    """Show how each fan has changed since commissioning, how fast, and when its limit will be reached
     (docs/explanation/wear.md).
 
-    By what the scorer of each tray has noted last, which is at most a minute old. Exit code 0: shown; 1: nothing is
+    The values are those of the scorer's last snapshot, which is at most a minute old. Exit code 0: shown; 1: nothing is
     known; 3: a recording could not be read in full.
 
     Example: fantwin wear
@@ -55,7 +57,7 @@ def wear(
     """
     if recordings:
         snapshots, damage = _recorded(recordings)
-        nothing = f"no wear in {', '.join(map(str, recordings))}: a scorer notes it each minute and at the end"
+        nothing = f"no wear in {', '.join(map(str, recordings))}: a scorer records it every minute and when it stops"
     else:
         settings, damage = load_config(config, overrides or (), stages=()), []
         stop = threading.Event()
@@ -63,9 +65,9 @@ def wear(
         with Bus(settings.bus, stop, listens=False) as bus:
             meet(bus, Watcher(bus, settings.site), settings, stop, what="wear")
             key = tray_key(settings.site, "*", "snapshot")
-            replies = bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_LOOK_S))
+            replies = bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_POLL_S))
             snapshots = [snapshot for _, payload in replies for snapshot in _decoded(payload)]
-        nothing = "no scorer has noted anything so far: it does so each minute; ask again"
+        nothing = "no scorer has recorded wear so far: it does so every minute; try again later"
     found = [
         (tray, snapshot.t_ns, wear) for tray, snapshot in _latest(snapshots).items() for wear in _wear_in(snapshot)
     ]
@@ -73,7 +75,7 @@ def wear(
         raise UserError(nothing)
     if not any(_rows(*each) for each in found):
         raise UserError(
-            f"nothing seen yet of any fan of {', '.join(tray for tray, *_ in found)}: that takes {_QUIET}; ask again"
+            f"no data yet for any fan of {', '.join(tray for tray, *_ in found)}: {_NEEDED}; try again later"
         )
     if json_output:
         rows = [row for tray, t_ns, state in found for row in _rows(tray, t_ns, state)]
@@ -99,7 +101,7 @@ def _recorded(recordings: Iterable[Path]) -> tuple[list[ScorerSnapshot], list[st
 
 
 def _latest(snapshots: Iterable[ScorerSnapshot]) -> dict[str, ScorerSnapshot]:
-    """The last of each tray."""
+    """The last snapshot of each tray."""
     latest: dict[str, ScorerSnapshot] = {}
     for snapshot in sorted(snapshots, key=lambda snapshot: (snapshot.t_ns, snapshot.header.sequence)):
         latest[snapshot.header.tray] = snapshot
@@ -107,9 +109,12 @@ def _latest(snapshots: Iterable[ScorerSnapshot]) -> dict[str, ScorerSnapshot]:
 
 
 def _wear_in(snapshot: ScorerSnapshot) -> list[dict[str, Any]]:
-    """What was noted of wear; nothing where the scorer did not watch it yet."""
+    """The wear in a snapshot; none in one of a scorer that did not monitor wear yet."""
     try:
         wear = json.loads(snapshot.state_json)["wear"]
+        for fan in wear["fans"]:
+            for name, parameter in fan["parameters"].items():
+                fan["parameters"][name] = current_keys(parameter, FORMER_PARAMETER_KEYS)
         _rows("", 0, wear)
     except (ValueError, KeyError, TypeError, AttributeError):
         return []
@@ -117,7 +122,7 @@ def _wear_in(snapshot: ScorerSnapshot) -> list[dict[str, Any]]:
 
 
 def _decoded(payload: bytes) -> list[ScorerSnapshot]:
-    """An onlooker judges nobody: what it cannot read, the stages count."""
+    """Unreadable messages are skipped here; the stages count them."""
     try:
         message = decode(ScorerSnapshot, payload)
     except CodecError:
@@ -126,34 +131,34 @@ def _decoded(payload: bytes) -> list[ScorerSnapshot]:
 
 
 def _rows(tray: str, t_ns: int, state: dict[str, Any]) -> list[dict[str, Any]]:
-    """What a machine is shown: one for each fan and parameter of which there is anything."""
+    """Rows for machines: one for each fan and parameter that has a value."""
     return [
         {
             "tray": tray,
             "fan": number,
             "parameter": parameter,
-            **{name: told[name] for name in _TOLD},
+            **{name: values[name] for name in _SHOWN},
             "command_unit": state["command_unit"],
             "seen_t_ns": fan["t_ns"],
             "t_ns": t_ns,
         }
         for number, fan in enumerate(state["fans"])
-        for parameter, told in fan["parameters"].items()
-        if "change" in told
+        for parameter, values in fan["parameters"].items()
+        if "change" in values
     ]
 
 
 def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
     unit = escape(state["command_unit"])
-    silent = [str(number) for number, fan in enumerate(state["fans"]) if not fan["t_ns"]]
-    said = [f"balance, friction: command{f' in {unit}' if unit else ''}; drag, gain: % of healthy"]
-    said += [f"nothing seen yet of fan {', '.join(silent)}: that takes {_QUIET}"] if silent else []
+    without = [str(number) for number, fan in enumerate(state["fans"]) if not fan["t_ns"]]
+    caption = [f"balance, friction: command{f' in {unit}' if unit else ''}; drag, gain: % of healthy"]
+    caption += [f"no data yet for fan {', '.join(without)}: {_NEEDED}"] if without else []
     table = Table(
         "fan",
         "parameter",
-        title=f"wear of {escape(tray)} up to {datetime.fromtimestamp(t_ns / 1e9):%Y-%m-%d %H:%M}",
+        title=f"wear of {escape(tray)} up to {datetime.fromtimestamp(t_ns / NS_PER_S):%Y-%m-%d %H:%M}",
         title_justify="left",
-        caption="\n".join(said),
+        caption="\n".join(caption),
         caption_justify="left",
         box=SIMPLE_HEAD,
     )
@@ -164,9 +169,9 @@ def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
     for row in _rows(tray, t_ns, state):
         name, before = "" if row["fan"] == before else str(row["fan"]), row["fan"]
         per_day = row["per_day"]
-        worn = per_day and not per_day["low"] <= 0.0 <= per_day["high"]
+        significant = per_day and not per_day["low"] <= 0.0 <= per_day["high"]
         change = _number(row, row["change"])
-        table.add_row(name, row["parameter"], change, _per_day(row), _when(row), style="" if worn else "dim")
+        table.add_row(name, row["parameter"], change, _per_day(row), _forecast(row), style="" if significant else "dim")
     return table
 
 
@@ -182,10 +187,10 @@ def _per_day(row: dict[str, Any]) -> str:
     return f"{_number(row, per_day['value'])} ± {_number(row, half, digits=2)[1:]}"
 
 
-def _when(row: dict[str, Any]) -> str:
+def _forecast(row: dict[str, Any]) -> str:
     reached = row["reached_t_ns"]
     if reached is None:
-        return str(row["invalid_reason"]) if row["parameter"] == "balance" else ""
+        return str(row["unknown_reason"]) if row["parameter"] == "balance" else ""
     earliest, likely, latest = (
         max(reached[name] - row["t_ns"], 0) / NS_PER_DAY for name in ("earliest", "likely", "latest")
     )

@@ -46,7 +46,7 @@ class ToldScorer(Core):
         self._now_ns = now_ns
         ratio = np.array([[self.ratio.get(fan, 0.0) for fan in range(FANS)]])
         course = self.conditions.update(np.array([now_ns]), 1, ratio, ratio >= 0)
-        return [self._alarm(c.fan, c.transition, c.standing, "too slow") for c in course.changes]
+        return [self._alarm(c.fan, c.transition, c.alarm_state, "too slow") for c in course.events]
 
     def step(self, item: Any) -> Sequence[Message]:
         if self.deaf or not isinstance(item, Request):
@@ -56,7 +56,7 @@ class ToldScorer(Core):
         name = f"{item.header.producer}/{item.header.sequence}"
         return [
             replace(
-                self._alarm(fan, transition, self.conditions.standing(fan), _in_words(fan, transition, why)),
+                self._alarm(fan, transition, self.conditions.alarm_state(fan), _in_words(fan, transition, why)),
                 request=name,
                 operator_name=item.operator_name,
                 comment=item.comment,
@@ -120,7 +120,7 @@ class Site:
 
     def raise_alarm(self, fan: int, ratio: float = 2.0) -> None:
         self.core.ratio[fan] = ratio
-        eventually(lambda: self.core.conditions.standing(fan).active, f"fan {fan} has an alarm")
+        eventually(lambda: self.core.conditions.alarm_state(fan).active, f"fan {fan} has an alarm")
 
     def ask(self, *words: object) -> str:
         """What the command prints; it must end well."""
@@ -157,7 +157,7 @@ def test_the_list_has_what_stands_and_with_all_what_is_over(site):
     site.raise_alarm(3)
     site.raise_alarm(5)
     site.core.ratio[5] = 0.0
-    eventually(lambda: not site.core.conditions.standing(5).active, "it has cleared")
+    eventually(lambda: not site.core.conditions.alarm_state(5).active, "it has cleared")
     before_ns = time.time_ns()
     assert [(a["tray"], a["fan"], a["active"]) for a in site.listed()] == [(TRAY, 3, True), (TRAY, 5, False)]
     site.ask("ack", TRAY, 5)
@@ -188,7 +188,7 @@ def test_an_acknowledgement_names_who_and_a_shelved_alarm_is_listed_and_not_pres
     site.raise_alarm(3)
     said = site.ask("ack", TRAY, 3, "--operator", "Ann", "--comment", "on my way")
     assert said == f"{TRAY}: fan 3: acknowledged\n"
-    assert site.core.conditions.standing(3).comment == "on my way"
+    assert site.core.conditions.alarm_state(3).comment == "on my way"
     (answer,) = json.loads(site.ask("shelve", TRAY, 3, "--for", "30m", "--json"))["answers"]
     assert (answer["transition"], answer["fan"]) == ("shelved", 3)
     assert answer["shelved_until_t_ns"] == pytest.approx(time.time_ns() + 1800e9, abs=60e9)

@@ -62,7 +62,7 @@ def test_a_recording_tells_what_wears_and_when_its_limit_is_reached(tmp_path, no
     likely = (balance["reached_t_ns"]["likely"] - EPOCH_NS) / DAY_NS
     assert likely == pytest.approx(LIMIT / GROWTH_PER_DAY, rel=0.1)
     assert found[HEALTHY, "balance"]["reached_t_ns"] is None
-    assert found[HEALTHY, "balance"]["invalid_reason"]
+    assert found[HEALTHY, "balance"]["unknown_reason"]
 
 
 def test_parts_in_any_order_tell_what_was_known_last(tmp_path, notes):
@@ -82,7 +82,7 @@ def test_people_are_shown_a_table(tmp_path, notes):
     assert "balance, friction: command in %; drag, gain: % of healthy" in lines[-1]
 
 
-def never_quiet(note: ScorerSnapshot, *fans: int) -> ScorerSnapshot:
+def without_points(note: ScorerSnapshot, *fans: int) -> ScorerSnapshot:
     state = json.loads(note.state_json)
     for fan in fans:
         state["wear"]["fans"][fan]["t_ns"] = 0
@@ -93,27 +93,37 @@ def never_quiet(note: ScorerSnapshot, *fans: int) -> ScorerSnapshot:
     return replace(note, state_json=json.dumps(state))
 
 
-def test_of_a_fan_that_was_never_quiet_nothing_is_shown(tmp_path, notes):
-    path = recording(tmp_path / "r.mcap", [never_quiet(notes[0], HEALTHY)])
+def test_a_fan_without_points_is_named_below_the_table(tmp_path, notes):
+    path = recording(tmp_path / "r.mcap", [without_points(notes[0], HEALTHY)])
     assert {fan for fan, _ in rows(path)} == {WORN}
     assert (
-        "nothing seen yet of fan 0: that takes one that is commissioned and then quiet" in fantwin("wear", path).stdout
+        "no data yet for fan 0: a fan has its first point some time after commissioning" in fantwin("wear", path).stdout
     )
 
 
-def test_where_no_fan_was_quiet_one_line_says_what_that_takes(tmp_path, notes):
-    path = recording(tmp_path / "r.mcap", [never_quiet(notes[0], HEALTHY, WORN)])
+def test_a_tray_without_points_is_one_line(tmp_path, notes):
+    path = recording(tmp_path / "r.mcap", [without_points(notes[0], HEALTHY, WORN)])
     for words in ((), ("--json",)):
         said = said_instead("wear", path, *words)
         assert said.startswith(
-            f"nothing seen yet of any fan of {TRAY}: that takes one that is commissioned and then quiet"
+            f"no data yet for any fan of {TRAY}: a fan has its first point some time after commissioning"
         )
+
+
+@pytest.mark.parametrize("former", ["why_not", "invalid_reason"])
+def test_recordings_of_earlier_versions_are_shown_alike(tmp_path, notes, former):
+    state = json.loads(notes[-1].state_json)
+    for fan in state["wear"]["fans"]:
+        for parameter in fan["parameters"].values():
+            parameter[former] = parameter.pop("unknown_reason")
+    earlier = recording(tmp_path / "earlier.mcap", [replace(notes[-1], state_json=json.dumps(state))])
+    assert rows(earlier) == rows(recording(tmp_path / "r.mcap", notes[-1:]))
 
 
 @pytest.mark.parametrize("state", ["{}", "no json", '{"wear": 3}', '{"wear": {"fans": [{}]}}'])
 def test_a_recording_without_wear_is_one_line(tmp_path, notes, state):
     path = recording(tmp_path / "r.mcap", [replace(notes[0], state_json=state)])
-    assert said_instead("wear", path) == f"no wear in {path}: a scorer notes it each minute and at the end"
+    assert said_instead("wear", path) == f"no wear in {path}: a scorer records it every minute and when it stops"
 
 
 def test_what_could_not_be_read_in_full_is_shown_as_far_as_it_is_known(tmp_path, notes):
@@ -131,8 +141,8 @@ def test_what_could_not_be_read_in_full_is_shown_as_far_as_it_is_known(tmp_path,
     assert "it is truncated" in done.stderr
 
 
-class Noted(Core):
-    """Says what it was given."""
+class SnapshotSender(Core):
+    """Sends the snapshots it was given."""
 
     def __init__(self, notes: Sequence[ScorerSnapshot]) -> None:
         self._notes = list(notes)
@@ -148,7 +158,7 @@ class Noted(Core):
 @pytest.fixture
 def site(endpoint: str, request: pytest.FixtureRequest, notes: list[ScorerSnapshot]) -> Iterator[tuple[object, ...]]:
     """A scorer in a thread; the words that lead to its bus."""
-    core = Noted(notes if request.param else [])
+    core = SnapshotSender(notes if request.param else [])
     stage = Stage(
         name="scorer",
         about="",
@@ -177,7 +187,7 @@ def test_a_running_site_tells_the_same(site, tmp_path, notes):
 
 @pytest.mark.parametrize("site", [False], indirect=True)
 def test_a_scorer_that_has_noted_nothing_yet_is_one_line(site):
-    assert said_instead("wear", *site) == "no scorer has noted anything so far: it does so each minute; ask again"
+    assert said_instead("wear", *site) == "no scorer has recorded wear so far: it does so every minute; try again later"
 
 
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, monkeypatch):

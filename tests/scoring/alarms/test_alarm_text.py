@@ -8,20 +8,21 @@ from typing import Any
 import pytest
 
 from schemas.messages import Alarm, Diagnosis, Severity, Statistic, Transition
+from schemas.units import SpeedUnit
 from scoring.alarms.alarm_text import CAUSES, AlarmText
 from scoring.diagnosis.diagnosis import CANNOT_TELL, DROPOUT, STUCK
 from scoring.diagnosis.hypotheses import CAUSES as HYPOTHESES
 
 
 def line(
-    transition: Transition = Transition.RAISED, *, unit: str = "rad/s", invalid_reason: str = "", **more: Any
+    transition: Transition = Transition.RAISED, *, unit: SpeedUnit = "rad/s", refusal: str = "", **more: Any
 ) -> str:
     told: dict[str, Any] = {
         **{"fan": 2, "active": True, "severity": Severity.WARNING, "t_ns": 0, "onset_t_ns": 0, "message": ""},
         **{"residual_rad_s": -71.2, "limit_rad_s": 8.0, "statistic": Statistic.SPEED_SMOOTHED, "score": 8.9},
         **{"torque_balance_command": 12.34, "torque_balance_limit_command": 3.0},
     }
-    return AlarmText(unit, "%").of(Alarm(transition=transition, **told | more), invalid_reason)
+    return AlarmText(unit, "%").of(Alarm(transition=transition, **told | more), refusal)
 
 
 BLOCKED = Diagnosis(cause="drag_up", probability=0.87, evidence="drag +62 % (95 %: 55 to 70)")
@@ -68,7 +69,7 @@ def test_every_cause_that_can_be_found_has_words() -> None:
 
 @pytest.mark.parametrize("transition", [t for t in Transition if t != Transition.NONE])
 def test_every_transition_is_one_line_that_names_the_fan(transition: Transition) -> None:
-    told = line(transition, invalid_reason="it is active", causes=(BLOCKED,))
+    told = line(transition, refusal="it is active", causes=(BLOCKED,))
     assert told.startswith("fan 2: ") and len(told) > len("fan 2: ") and "\n" not in told
 
 
@@ -81,7 +82,7 @@ def test_after_a_restart_it_is_told_what_still_stands_and_what_does_not() -> Non
 
 
 def test_a_refusal_says_why() -> None:
-    assert line(Transition.REFUSED, invalid_reason="it is not latched") == "fan 2: refused: it is not latched"
+    assert line(Transition.REFUSED, refusal="it is not latched") == "fan 2: refused: it is not latched"
 
 
 def test_a_twin_that_does_not_know_its_unit_says_so() -> None:

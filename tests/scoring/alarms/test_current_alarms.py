@@ -98,13 +98,13 @@ def test_who_acknowledged_is_known_from_what_a_restarted_scorer_tells_again():
 
 
 def test_states_in_words():
-    assert one(alarm()).words() == ["active", "unacknowledged"]
+    assert one(alarm()).states() == ["active", "unacknowledged"]
     over = one(alarm(active=False, acknowledged=True, confirmed=False, latched=True))
-    assert over.words() == ["cleared", "acknowledged", "unconfirmed", "latched"]
+    assert over.states() == ["cleared", "acknowledged", "unconfirmed", "latched"]
     quiet = one(alarm(shelved_until_t_ns=UNTIL_IT_CLEARS_T_NS, suppressed=True, out_of_service=True))
-    assert quiet.words()[2:] == ["shelved until it clears", "suppressed", "out of service"]
+    assert quiet.states()[2:] == ["shelved until it clears", "suppressed", "out of service"]
     never = one(alarm(active=False, severity=Severity.NONE, acknowledged=True, suppressed=True))
-    assert never.words() == ["never raised", "suppressed"]
+    assert never.states() == ["never raised", "suppressed"]
 
 
 def test_a_time_of_another_day_has_its_date():

@@ -42,7 +42,7 @@ def take(
 
 
 def happened(course: BlockResult) -> list[tuple[int, Transition]]:
-    return [(change.row, change.transition) for change in course.changes]
+    return [(change.row, change.transition) for change in course.events]
 
 
 def states(conditions: Conditions, ratios: Sequence[float], valid: Sequence[bool] | None = None) -> list[int]:
@@ -57,13 +57,13 @@ def asked(conditions: Conditions, action: Action, now_t_ns: int = 0, duration_ns
 def test_an_alarm_is_raised_exactly_when_the_on_delay_has_run_out():
     course = take(conditions_of(), [LOW, LOW] + [UP] * 7)
     assert course.state[:, 0].tolist() == [NORMAL] * 2 + [SUSPECT] * 5 + [ALARM] * 2
-    (change,) = course.changes
-    assert (change.row, change.fan, change.transition, change.standing.onset_t_ns) == (7, 0, RAISED, 2 * STEP_NS)
+    (change,) = course.events
+    assert (change.row, change.fan, change.transition, change.alarm_state.onset_t_ns) == (7, 0, RAISED, 2 * STEP_NS)
 
 
 def test_an_excursion_one_sample_too_short_raises_nothing_and_is_counted():
     course = take(conditions_of(), [LOW] + [UP] * 5 + [LOW] + [UP] * 5 + [LOW])
-    assert (course.changes, course.too_short) == ([], 2)
+    assert (course.events, course.too_short) == ([], 2)
 
 
 def test_the_limit_itself_is_not_exceeded_and_the_limit_of_return_itself_is_no_return():
@@ -75,7 +75,7 @@ def test_an_alarm_is_cleared_exactly_when_the_off_delay_has_run_out():
     course = take(conditions_of(), [UP] * 6 + [MID] * 20 + [LOW] * 12)
     assert course.state[5:, 0].tolist() == [ALARM] * 21 + [RETURNING] * 10 + [NORMAL] * 2
     assert happened(course) == [(5, RAISED), (36, CLEARED)]
-    assert [change.standing.onset_t_ns for change in course.changes] == [0, 0]
+    assert [change.alarm_state.onset_t_ns for change in course.events] == [0, 0]
 
 
 def test_a_return_that_is_interrupted_begins_again():
@@ -90,12 +90,12 @@ def test_samples_that_are_not_valid_stop_the_timers_and_end_nothing():
     conditions = at_once()
     take(conditions, [UP])
     assert states(conditions, [LOW] * 9, [False] * 9) == [FanState.UNKNOWN] * 9
-    assert conditions.standing(0).active
+    assert conditions.alarm_state(0).active
 
 
 def test_severity_rises_at_its_ratio_and_does_not_fall_before_the_next_alarm():
     course = take(at_once(), [UP, 1.5, UP, LOW, UP])
-    told = [(change.row, change.transition, change.standing.severity) for change in course.changes]
+    told = [(change.row, change.transition, change.alarm_state.severity) for change in course.events]
     assert told == [
         (0, RAISED, Severity.WARNING),
         (1, Transition.SEVERITY, Severity.ALARM),
@@ -106,7 +106,7 @@ def test_severity_rises_at_its_ratio_and_does_not_fall_before_the_next_alarm():
 
 def test_every_change_says_how_the_alarm_stood_at_its_own_row():
     course = take(at_once(), [UP, LOW, UP])
-    assert [change.standing.active for change in course.changes] == [True, False, True]
+    assert [change.alarm_state.active for change in course.events] == [True, False, True]
 
 
 B1 = [  # table B.1 of Part 9: what happens, then Active, Acked, Confirmed, Retain
@@ -123,26 +123,26 @@ B1 = [  # table B.1 of Part 9: what happens, then Active, Acked, Confirmed, Reta
 
 def test_acknowledging_and_confirming_follow_table_b1_of_part_9():
     conditions = at_once(confirming=True)
-    now = conditions.standing(0)
+    now = conditions.alarm_state(0)
     assert (now.active, now.acknowledged, now.confirmed, is_retained(now)) == (False, True, True, False)
     for event, *expected in B1:
         if isinstance(event, Action):
             assert asked(conditions, event)[0] != Transition.REFUSED
         else:
             take(conditions, [event])
-        now = conditions.standing(0)
+        now = conditions.alarm_state(0)
         assert [now.active, now.acknowledged, now.confirmed, is_retained(now)] == expected, event
 
 
 def test_without_confirming_an_acknowledged_alarm_is_done_once_it_has_cleared():
     conditions = at_once()
     take(conditions, [UP, LOW])
-    assert is_retained(conditions.standing(0))
+    assert is_retained(conditions.alarm_state(0))
     assert asked(conditions, Action.ACKNOWLEDGE) == (Transition.ACKNOWLEDGED, "")
-    now = conditions.standing(0)
+    now = conditions.alarm_state(0)
     assert (is_retained(now), now.acknowledged_by, now.comment) == (False, "Ann", "looked at it")
     take(conditions, [UP])
-    now = conditions.standing(0)
+    now = conditions.alarm_state(0)
     assert (now.acknowledged, now.acknowledged_by) == (False, "")
 
 
@@ -150,7 +150,7 @@ def test_a_new_excursion_that_is_not_yet_an_alarm_leaves_the_name_of_the_last_on
     conditions = conditions_of(off_delay_ns=0)
     take(conditions, [UP] * 6 + [LOW])
     take(conditions, [UP], first_t_ns=1000)
-    assert (conditions.standing(0).onset_t_ns, conditions.standing(0).acknowledged) == (0, False)
+    assert (conditions.alarm_state(0).onset_t_ns, conditions.alarm_state(0).acknowledged) == (0, False)
 
 
 def test_a_latched_alarm_stays_until_it_is_reset_in_its_turn():
@@ -163,9 +163,9 @@ def test_a_latched_alarm_stays_until_it_is_reset_in_its_turn():
     asked(conditions, Action.ACKNOWLEDGE)
     assert asked(conditions, Action.RESET)[1] == "it must be confirmed first"
     asked(conditions, Action.CONFIRM)
-    assert (conditions.standing(0).latched, is_retained(conditions.standing(0))) == (True, True)
+    assert (conditions.alarm_state(0).latched, is_retained(conditions.alarm_state(0))) == (True, True)
     assert asked(conditions, Action.RESET) == (Transition.RESET, "")
-    assert not is_retained(conditions.standing(0))
+    assert not is_retained(conditions.alarm_state(0))
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ def test_a_timed_shelving_ends_with_the_first_sample_at_its_time_even_if_that_is
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=3 * STEP_NS)
     course = take(conditions, [LOW] * 6, [True, True, True, False, False, True])
     assert happened(course) == [(3, UNSHELVED)]
-    assert conditions.standing(0).shelved_until_t_ns == 0
+    assert conditions.alarm_state(0).shelved_until_t_ns == 0
 
 
 def test_a_shelved_alarm_is_evaluated_and_told_as_ever_and_not_presented():
@@ -232,7 +232,7 @@ def test_a_shelved_alarm_is_evaluated_and_told_as_ever_and_not_presented():
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=4 * STEP_NS)
     course = take(conditions, [LOW, LOW, UP, UP, UP])
     assert happened(course) == [(2, RAISED), (4, UNSHELVED)]
-    assert [is_silenced(change.standing) for change in course.changes] == [True, False]
+    assert [is_silenced(change.alarm_state) for change in course.events] == [True, False]
 
 
 def test_an_alarm_raised_at_the_very_sample_at_which_a_shelving_ends_is_presented():
@@ -240,7 +240,7 @@ def test_an_alarm_raised_at_the_very_sample_at_which_a_shelving_ends_is_presente
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=2 * STEP_NS)
     course = take(conditions, [LOW, LOW, UP])
     assert happened(course) == [(2, UNSHELVED), (2, RAISED)]
-    assert not is_silenced(course.changes[1].standing)
+    assert not is_silenced(course.events[1].alarm_state)
 
 
 def test_shelving_again_sets_a_new_time():
@@ -253,7 +253,7 @@ def test_shelving_again_sets_a_new_time():
 def test_a_shelving_without_a_time_ends_when_the_alarm_clears():
     conditions = at_once()
     asked(conditions, Action.SHELVE)
-    assert conditions.standing(0).shelved_until_t_ns == UNTIL_IT_CLEARS_T_NS
+    assert conditions.alarm_state(0).shelved_until_t_ns == UNTIL_IT_CLEARS_T_NS
     assert happened(take(conditions, [LOW, UP, LOW, UP])) == [(1, RAISED), (2, CLEARED), (2, UNSHELVED), (3, RAISED)]
 
 
@@ -262,18 +262,18 @@ def test_suppressed_or_out_of_service_hides_no_transition_and_presents_nothing(a
     conditions = at_once()
     asked(conditions, action)
     assert happened(take(conditions, [UP])) == [(0, RAISED)]
-    assert is_retained(conditions.standing(0)) and is_silenced(conditions.standing(0))
+    assert is_retained(conditions.alarm_state(0)) and is_silenced(conditions.alarm_state(0))
     back = Action.UNSUPPRESS if action == Action.SUPPRESS else Action.IN_SERVICE
     asked(conditions, back)
-    assert is_retained(conditions.standing(0)) and not is_silenced(conditions.standing(0))
+    assert is_retained(conditions.alarm_state(0)) and not is_silenced(conditions.alarm_state(0))
 
 
 def test_commissioning_is_granted_and_leaves_the_alarm_as_it_is():
     conditions = at_once()
     take(conditions, [UP])
-    before = conditions.standing(0)
+    before = conditions.alarm_state(0)
     assert conditions.request(Action.COMMISSION, [0], 0) == [(0, Transition.COMMISSIONING, "")]
-    assert conditions.standing(0) == before
+    assert conditions.alarm_state(0) == before
 
 
 # any history: samples of two fans with requests between them, by the row before which each is asked
@@ -314,7 +314,7 @@ def played(conditions: Conditions, history: dict[str, Any], cuts: set[int], rest
         rows = slice(first, last)
         course = conditions.update(STEP_NS * np.arange(first, last), STEP_NS, ratio[rows], valid[rows])
         states.append(course.state)
-        changes += [(first + c.row, c.fan, c.transition, c.standing) for c in course.changes]
+        changes += [(first + c.row, c.fan, c.transition, c.alarm_state) for c in course.events]
         too_short += course.too_short
         if restart:
             kept = json.loads(json.dumps(conditions.snapshot()))

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from schemas.messages import Transition
-from scoring.diagnosis.diagnoser import MOST_SAMPLES, Diagnoser
+from scoring.diagnosis.diagnoser import MAX_SAMPLES, Diagnoser
 from scoring.limits import summed_deviation
 from tests.support.scored_blocks import (
     CALIBRATION,
@@ -132,7 +132,7 @@ def test_a_very_fast_grid_costs_no_more_than_a_fast_one() -> None:
     column = np.full((100, 1), 50.0)
     diagnoser.take(t_ns, 1, column, column, column)  # a step of a nanosecond, and samples that are far apart
     assert diagnoser.diagnose(0, int(t_ns[-1])) == ()
-    fast_ns = EPOCH_NS + np.arange(3 * MOST_SAMPLES // 2, dtype=np.int64)
+    fast_ns = EPOCH_NS + np.arange(3 * MAX_SAMPLES // 2, dtype=np.int64)
     column = np.full((len(fast_ns), 1), 50.0)
     diagnoser.take(fast_ns, 1, column, column, column)
     assert diagnoser.diagnose(0, int(fast_ns[-1]))
@@ -146,7 +146,7 @@ def test_what_is_the_fans_own_is_known_the_better_the_longer_it_was_seen() -> No
         diagnoser.take(times(1600), STEP_NS, command, speed, np.zeros_like(speed), np.full_like(speed, seconds))
         window = diagnoser.window(0, EPOCH_NS + 15 * S, EPOCH_NS + 14 * S)
         assert window is not None
-        errors.append(window.offset_std_error)
+        errors.append(window.fan_offset_std_error)
     fan = balance_of_a_fan()
     assert errors[0] == pytest.approx(fan.sigma_command * summed_deviation(fan.autocorrelation_time_s, 0.01))
     assert errors[1] == pytest.approx(errors[0] / 10.0)

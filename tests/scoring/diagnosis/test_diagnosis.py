@@ -28,7 +28,7 @@ ALL_CAUSES = {
 
 
 def of(diagnosis: Diagnosis, cause: str) -> RankedCause:
-    return next(suspect for suspect in diagnosis.suspects if suspect.cause == cause)
+    return next(suspect for suspect in diagnosis.causes if suspect.cause == cause)
 
 
 def evidence_of(suspect: RankedCause) -> Evidence:
@@ -64,7 +64,7 @@ def test_under_a_moving_command_the_cause_comes_first_and_its_interval_holds_the
         command = data.moving_command(seed)
         readings, change = faulty_speed(cause, command, seed)
         found = diagnose(data.window(command, readings), data.HEALTHY)
-        assert found.first.cause == cause, found.suspects[:3]
+        assert found.first.cause == cause, found.causes[:3]
         assert found.first.probability > 0.6
         evidence = evidence_of(found.first)
         inside.append(evidence.low <= change <= evidence.high)
@@ -74,8 +74,8 @@ def test_under_a_moving_command_the_cause_comes_first_and_its_interval_holds_the
 def test_probabilities_add_up_to_one_over_all_causes_and_fall() -> None:
     command = data.moving_command(0)
     found = diagnose(data.window(command, faulty_speed("drag_up", command, 0)[0]), data.HEALTHY)
-    probabilities = [suspect.probability for suspect in found.suspects]
-    assert {suspect.cause for suspect in found.suspects} == ALL_CAUSES
+    probabilities = [suspect.probability for suspect in found.causes]
+    assert {suspect.cause for suspect in found.causes} == ALL_CAUSES
     assert sum(probabilities) == pytest.approx(1.0)
     assert probabilities == sorted(probabilities, reverse=True)
 
@@ -95,7 +95,7 @@ def test_the_words_beside_cannot_tell_fit_its_probability() -> None:
     for readings in (faulty_speed("drag_up", command, 0)[0], data.measured(data.speeds(command), 0)):
         found = diagnose(data.window(command, readings), data.HEALTHY)
         doubt = of(found, "cannot_tell")
-        others = [suspect for suspect in found.suspects if suspect is not doubt]
+        others = [suspect for suspect in found.causes if suspect is not doubt]
         if 2.0 * doubt.probability < others[0].probability:
             sure = f"little doubt: {others[0].cause} is more than twice as probable as all others together"
             assert doubt.sentence == sure and found.first is others[0]
@@ -124,7 +124,7 @@ def test_at_a_constant_speed_faults_that_look_alike_share_the_probability(cause)
     assert found.first.cause == "cannot_tell"
     assert found.first.sentence == "cannot tell yet: the command is not moving"
     assert of(found, cause).probability > 0.08
-    assert all(suspect.probability < 0.4 for suspect in found.suspects)
+    assert all(suspect.probability < 0.4 for suspect in found.causes)
 
 
 def test_what_comes_at_once_is_a_torque_and_what_grows_is_friction() -> None:
@@ -159,7 +159,7 @@ def test_of_a_healthy_fan_nothing_is_told(moving) -> None:
     for seed in range(15):
         command = data.moving_command(seed) if moving else data.still_command(seed)
         found = diagnose(data.window(command, data.measured(data.speeds(command), seed)), data.HEALTHY)
-        assert found.first.cause == "cannot_tell", (seed, found.suspects[:2])
+        assert found.first.cause == "cannot_tell", (seed, found.causes[:2])
 
 
 def test_correlated_noise_is_not_taken_for_many_independent_samples() -> None:
@@ -247,16 +247,18 @@ def test_a_controller_that_answers_the_noise_of_the_tacho_is_no_weak_drive(per_r
     assert np.mean([of(one, "gain_down").probability for one in found]) < 0.5
 
 
-def test_what_calibration_found_usual_at_a_speed_is_no_fault() -> None:
+def test_a_deviation_that_calibration_expects_at_a_speed_is_no_fault() -> None:
     command = data.moving_command(7)
     readings = data.measured(data.speeds(command, gain=0.97), 7)
-    usual = 0.03 * command
+    expected = 0.03 * command
     whole = data.window(command, readings)
     assert diagnose(whole, data.HEALTHY).first.cause != "cannot_tell"
-    known = diagnose(replace(whole, usual=usual), data.HEALTHY)
+    known = diagnose(replace(whole, expected_command=expected), data.HEALTHY)
     assert known.first.cause == "cannot_tell"
     missing = np.random.default_rng(7).random(len(readings)) < 0.02
-    some = replace(whole, speed_rad_s=np.where(missing, np.nan, readings), usual=np.where(missing, np.nan, usual))
+    some = replace(
+        whole, speed_rad_s=np.where(missing, np.nan, readings), expected_command=np.where(missing, np.nan, expected)
+    )
     assert diagnose(some, data.HEALTHY).first.cause == "cannot_tell"
 
 
@@ -265,7 +267,7 @@ def test_what_the_fan_showed_at_commissioning_is_no_fault() -> None:
     readings = data.measured(data.speeds(command, torque=0.03), 7)
     whole = data.window(command, readings)
     assert diagnose(whole, data.HEALTHY).first.cause == "friction_up"
-    assert diagnose(replace(whole, offset=0.03), data.HEALTHY).first.cause == "cannot_tell"
+    assert diagnose(replace(whole, fan_offset=0.03), data.HEALTHY).first.cause == "cannot_tell"
 
 
 def test_a_stuck_sensor_is_told_whatever_the_loop_does() -> None:
@@ -342,8 +344,8 @@ def test_windows_without_anything_to_judge_by_are_taken(samples) -> None:
     for readings in (np.full(samples, np.nan), np.zeros(samples), np.full(samples, 300.0)):
         for onset in (0, samples // 2, samples):
             found = diagnose(Window(data.STEP_S, command, readings, onset), data.HEALTHY)
-            assert sum(suspect.probability for suspect in found.suspects) == pytest.approx(1.0)
-    assert diagnose(Window(data.STEP_S, command * np.nan, command * np.nan, 1), data.HEALTHY).suspects
+            assert sum(suspect.probability for suspect in found.causes) == pytest.approx(1.0)
+    assert diagnose(Window(data.STEP_S, command * np.nan, command * np.nan, 1), data.HEALTHY).causes
 
 
 def test_the_command_acts_as_the_twin_says() -> None:

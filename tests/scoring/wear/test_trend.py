@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scoring.wear.trend import CAPACITY, NS_PER_DAY, Reached, Trend, WearSeries, reached
+from scoring.wear.trend import CAPACITY, NS_PER_DAY, LimitForecast, Trend, WearSeries, forecast_limit
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -27,7 +27,7 @@ def trend_of(points: WearSeries) -> Trend:
     return trend
 
 
-def times_of(foretold: Reached) -> tuple[int, int, int]:
+def times_of(foretold: LimitForecast) -> tuple[int, int, int]:
     assert foretold.earliest_ns is not None and foretold.likely_ns is not None and foretold.latest_ns is not None
     return foretold.earliest_ns, foretold.likely_ns, foretold.latest_ns
 
@@ -51,7 +51,7 @@ def test_wear_over_thirty_days_is_found_and_its_limit_foretold() -> None:
     trend = trend_of(points)
     assert trend.significant and trend.slope_per_day == pytest.approx(0.002, rel=0.1)
     now_ns = START_NS + 30 * NS_PER_DAY
-    foretold = reached(trend, 0.1, now_ns)
+    foretold = forecast_limit(trend, 0.1, now_ns)
     days = [(t_ns - START_NS) / NS_PER_DAY for t_ns in times_of(foretold)]
     assert days == sorted(days)
     assert days[0] < 50.0 < days[2]
@@ -61,7 +61,7 @@ def test_wear_over_thirty_days_is_found_and_its_limit_foretold() -> None:
 def test_the_foretold_interval_holds_the_day_on_which_the_limit_is_reached() -> None:
     held = []
     for seed in range(100):
-        foretold = reached(trend_of(series(20, 24, 0.003, seed, 0.5)), 0.12, START_NS + 20 * NS_PER_DAY)
+        foretold = forecast_limit(trend_of(series(20, 24, 0.003, seed, 0.5)), 0.12, START_NS + 20 * NS_PER_DAY)
         earliest_ns, _, latest_ns = times_of(foretold)
         held.append(earliest_ns <= START_NS + 40 * NS_PER_DAY <= latest_ns)
     assert np.mean(held) >= 0.88
@@ -70,11 +70,11 @@ def test_the_foretold_interval_holds_the_day_on_which_the_limit_is_reached() -> 
 def test_a_limit_is_not_foretold_where_it_cannot_be() -> None:
     now_ns = START_NS + 20 * NS_PER_DAY
     rising = trend_of(series(20, 24, 0.003, 3))
-    assert "no trend" in reached(trend_of(series(20, 24, 0.0, 3)), 0.1, now_ns).invalid_reason
-    assert "moves away" in reached(rising, -0.1, now_ns).invalid_reason
-    assert "already reached" in reached(rising, 0.03, now_ns).invalid_reason
-    assert "times as far away" in reached(rising, 3.0, now_ns).invalid_reason
-    assert reached(rising, 0.1, now_ns).invalid_reason == ""
+    assert "no significant trend" in forecast_limit(trend_of(series(20, 24, 0.0, 3)), 0.1, now_ns).unknown_reason
+    assert "moves away" in forecast_limit(rising, -0.1, now_ns).unknown_reason
+    assert "already reached" in forecast_limit(rising, 0.03, now_ns).unknown_reason
+    assert "times as far ahead" in forecast_limit(rising, 3.0, now_ns).unknown_reason
+    assert forecast_limit(rising, 0.1, now_ns).unknown_reason == ""
 
 
 def test_a_third_of_wild_points_does_not_carry_the_slope_away() -> None:

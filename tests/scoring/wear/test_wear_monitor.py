@@ -151,12 +151,15 @@ def test_a_healthy_fan_shows_no_wear(after_eight_days) -> None:
         per_day = worn(HEALTHY, parameter, core)["per_day"]
         assert per_day["low"] < 0.0 < per_day["high"], parameter
     assert worn(HEALTHY, "balance", core)["reached_t_ns"] is None
-    assert "no trend" in worn(HEALTHY, "balance", core)["invalid_reason"]
+    assert "no significant trend" in worn(HEALTHY, "balance", core)["unknown_reason"]
 
 
 def test_what_is_near_is_told_in_health_and_alarms_nobody(after_eight_days) -> None:
     core, _ = after_eight_days
-    assert core.problem() == "fan 1 wears: its balance reaches the limit in about 5 days (4 to 5); look at it"
+    assert (
+        core.problem()
+        == "fan 1 is wearing: its torque balance will reach the limit in about 5 days (4 to 5); inspect it"
+    )
     assert list(live_through(restored(core), 8.5, from_day=8)) == []
 
 
@@ -170,7 +173,7 @@ def test_what_is_far_away_is_not_told() -> None:
 def test_less_than_a_day_foretells_nothing() -> None:
     young = core()
     assert list(live_through(young, 0.9, every_hours=0.25, growth_per_day=0.1, swing=0.0)) == []
-    assert worn(WORN, "balance", young)["invalid_reason"] == "less than a day was seen"
+    assert worn(WORN, "balance", young)["unknown_reason"] == "less than a day was observed"
     assert young.problem() == ""
 
 
@@ -320,5 +323,5 @@ def test_a_fan_that_stands_tells_nothing() -> None:
 def test_a_twin_without_calibration_has_trends_and_no_limit() -> None:
     one = core_of(2)
     list(live_through(one, 1.5, swing=0.0))
-    assert worn(WORN, "balance", one)["invalid_reason"] == "the twin is not calibrated"
+    assert worn(WORN, "balance", one)["unknown_reason"] == "the twin is not calibrated"
     assert worn(WORN, "friction", one)["per_day"]["low"] > 0.0
