@@ -1,9 +1,9 @@
-"""Recorder: keeps everything that goes over the bus in MCAP files.
+"""Recorder: writes all messages on the bus to MCAP files.
 
-Reads   every topic of the table that is to be recorded, of all trays, and the health of all stages
-Writes  nothing on the bus; a recording in one part or several, docs/reference/recordings.md
-Units   as in the messages: bytes are kept as they came
-Timing  a message is safe from a crash, of the machine too, after `flush_interval_s` at most
+Reads   every topic marked as recorded in schemas/topics.py, of all trays, and the health of all stages
+Writes  nothing on the bus; a recording of one or more parts, docs/reference/recordings.md
+Units   as in the messages: their bytes are not changed
+Timing  at most `flush_interval_s` after its receipt a message survives a crash, of the machine too
 """
 
 from __future__ import annotations
@@ -21,23 +21,25 @@ from typing import Protocol
 from pydantic import Field, field_validator
 
 from pipeline.recordings.disk import DiskError
-from pipeline.recordings.metadata import head_of
+from pipeline.recordings.metadata import recording_metadata
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import RecordingError
-from pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
+from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
 from schemas.envelope import Envelope
 from schemas.messages import Health, Message
+from schemas.streams import StreamId
 from schemas.topics import TOPICS
+from schemas.units import NS_PER_S
 
 HELD_BYTES = 16 << 20
-"""What is kept in memory at most while nothing can be recorded."""
+"""At most so many bytes of messages are kept in memory while nothing can be recorded."""
 TICK_NS = 50_000_000
-"""After about this time comes the next tick."""
-LOOK_NS = 1_000_000_000
-"""How often the room on the disk is looked at."""
+"""about the time between ticks"""
+DISK_CHECK_NS = NS_PER_S
+"""how often the free space is checked"""
 ROOM_TO_RESUME = 1 << 20
-"""More than this must be free beyond the minimum, lest recording pauses again at once."""
+"""bytes that must be free beyond the minimum to resume, so that recording does not pause again at once"""
 _LOG = logging.getLogger(__name__)
 
 
@@ -48,31 +50,31 @@ class RecorderConfig(StageConfig):
         default=Path("recording.mcap"),
         description="relative to run_folder; its parts are NAME.mcap, NAME-2.mcap and so on",
     )
-    flush_interval_s: float = Field(default=1.0, gt=0, description="at most this much is lost in a crash")
-    part_bytes: int = Field(default=100_000_000, ge=0, description="a new part begins when one is this large; 0: never")
+    flush_interval_s: float = Field(default=1.0, gt=0, description="a crash loses at most this much")
+    part_bytes: int = Field(default=100_000_000, ge=0, description="a new part begins at this size; 0: never")
     part_s: float = Field(default=0.0, ge=0, description="a new part begins after this time; 0: never")
-    min_free_bytes: int = Field(default=100_000_000, ge=0, description="this much room is left on the disk")
+    min_free_bytes: int = Field(default=100_000_000, ge=0, description="free space to leave on the disk")
     delete_oldest: bool = Field(
         default=False, description="make room by deleting the oldest parts of this recording, instead of pausing"
     )
 
     @field_validator("part_bytes")
     @classmethod
-    def _worth_a_part(cls, value: int) -> int:
+    def _not_too_small(cls, value: int) -> int:
         if 0 < value < 1_000_000:
-            raise ValueError("a part is 1,000,000 bytes at least, or 0 for no limit")
+            raise ValueError("must be 0 (no limit) or at least 1,000,000 bytes")
         return value
 
     @field_validator("part_s")
     @classmethod
-    def _longer_than_a_flush(cls, value: float) -> float:
+    def _not_too_short(cls, value: float) -> float:
         if 0 < value < 1.0:
-            raise ValueError("a part is 1 s at least, or 0 for no limit")
+            raise ValueError("must be 0 (no limit) or at least 1 s")
         return value
 
 
 class OpenPart(Protocol):
-    """What the core needs of a part; see `pipeline.recordings.writing.RecordingWriter`."""
+    """The methods of `pipeline.recordings.writing.RecordingWriter` that the core uses."""
 
     path: Path
     written: Counter[str]
@@ -83,11 +85,11 @@ class OpenPart(Protocol):
     def size(self) -> int: ...  # noqa: D102
     def add(self, envelope: Envelope) -> None: ...  # noqa: D102
     def flush(self) -> None: ...  # noqa: D102
-    def close(self, *, has_ended: bool = False) -> None: ...  # noqa: D102
+    def finish(self, *, has_ended: bool = False) -> None: ...  # noqa: D102
 
 
-class PartsPlace(Protocol):
-    """Where parts begin; see `pipeline.recordings.parts.RecordingParts`."""
+class PartsFolder(Protocol):
+    """The methods of `pipeline.recordings.parts.RecordingParts` that the core uses."""
 
     @property
     def before(self) -> Mapping[StreamId, int]: ...  # noqa: D102
@@ -97,23 +99,23 @@ class PartsPlace(Protocol):
 
 
 class Recorder(Core):
-    """Hands every packet to the part that is open, and begins new ones.
+    """Adds every message to the open part, and begins new parts.
 
-    While nothing can be recorded it keeps what comes, as far as memory allows, and says so; about once a second it
-    looks whether that has passed.
+    While the disk refuses, messages are kept in memory up to HELD_BYTES and the health reports a problem; about once a
+    second the recorder tries to resume.
     """
 
-    def __init__(self, place: PartsPlace, config: RecorderConfig, now_ns: int) -> None:
-        """Begin the first part, at `now_ns`. A disk that is full or has gone is waited for.
+    def __init__(self, parts: PartsFolder, config: RecorderConfig, now_ns: int) -> None:
+        """Begin the first part, at `now_ns`. If the disk is full or gone, wait for it.
 
         Raises:
             RecordingError: nothing can be recorded there.
         """
-        self._place = place
+        self._parts = parts
         self._config = config
         self._part: OpenPart | None = None
-        self._ledger = SequenceLedger(place.before)
-        self._before = place.before
+        self._ledger = SequenceLedger(parts.before)
+        self._before = parts.before
         self._cards: dict[str, Envelope] = {}
         self._own_producer = ""
         self._duplicated: dict[StreamId, int] = {}
@@ -123,10 +125,10 @@ class Recorder(Core):
         self._held_bytes = 0
         self._lost_in_pause = 0
         self._problem = self._paused_because = ""
-        self._now_ns = self._paused_ns = self._began_ns = self._looked_ns = now_ns
+        self._now_ns = self._paused_ns = self._began_ns = self._checked_ns = now_ns
         self._flushed_ns = 0
         self._unflushed_ns: int | None = None
-        """when the oldest message was received that may not be on the disk yet"""
+        """time of receipt of the oldest message that may not be on the disk yet"""
         try:
             shortage = self._shortage(0)
             if not shortage:
@@ -137,34 +139,34 @@ class Recorder(Core):
             self._pause(shortage)
 
     def step(self, item: Envelope) -> Sequence[Message]:
-        """Record one packet."""
+        """Record one message."""
         header = item.message.header
         self._now_ns = max(self._now_ns, item.received_t_ns)
         if item.topic == "twin":
             self._cards[item.key] = item
-        elif header.sequence < self._before.get((item.key, header.producer), 0):  # the bus still had it
-            self._ledger.note_duplicated(item.key, header.producer)
+        elif header.sequence < self._before.get((item.key, header.producer), 0):  # recorded before the restart
+            self._ledger.add_duplicated(item.key, header.producer)
             return ()
         if isinstance(item.message, Health):
-            self._note_duplicated(item.message)
-        self._put(item)
+            self._count_duplicated(item.message)
+        self._record(item)
         return ()
 
     def tick(self, now_ns: int) -> Sequence[Message]:
-        """Flush, begin a new part and look after the disk when it is time."""
-        if now_ns < self._now_ns - LOOK_NS:  # the host's clock was set back: what was due by the old one never would be
-            self._looked_ns = self._began_ns = now_ns
+        """Flush, begin a new part and check the disk when each is due."""
+        if now_ns < self._now_ns - DISK_CHECK_NS:  # the host's clock was set back: restart all intervals
+            self._checked_ns = self._began_ns = now_ns
             self._paused_ns = min(self._paused_ns, now_ns)
-            self._flushed_ns = now_ns - int(self._config.flush_interval_s * 1e9)
+            self._flushed_ns = now_ns - int(self._config.flush_interval_s * NS_PER_S)
             self._unflushed_ns = None if self._unflushed_ns is None else self._flushed_ns  # due at once
         self._now_ns = now_ns
         if self._part and self._is_flush_due():
             self._unflushed_ns, self._flushed_ns = None, now_ns
             self._attempt(self._part.flush)
-        if now_ns - self._looked_ns >= LOOK_NS:
-            self._looked_ns = now_ns
+        if now_ns - self._checked_ns >= DISK_CHECK_NS:
+            self._checked_ns = now_ns
             if self._part:
-                self._watch_room()
+                self._check_disk()
             else:
                 self._resume()
         if self._part and self._is_full(self._part):
@@ -174,7 +176,7 @@ class Recorder(Core):
         return ()
 
     def close(self) -> Sequence[Message]:
-        """Finish the file; what could not be written is lost now."""
+        """Finish the file; messages that could not be written are lost now."""
         if self._held:
             self._resume()
         if self._part:
@@ -189,16 +191,15 @@ class Recorder(Core):
             self._attempt(self._end_part)
 
     def counters(self) -> Mapping[str, int]:
-        """How many messages of each topic are in files for good, how many were lost because they could not be written,
-        and what became of parts."""
+        """Messages of each topic that are on the disk, messages lost because they could not be written, and parts."""
         recorded = self._recorded + (self._part.written if self._part else Counter())
         return {f"recorded_{topic}": count for topic, count in recorded.items()} | self._counts
 
     def problem(self) -> str:
-        """Why nothing is recorded now, if so."""
+        """Why nothing is recorded now; empty if messages are recorded."""
         return self._problem
 
-    def _put(self, envelope: Envelope) -> None:
+    def _record(self, envelope: Envelope) -> None:
         if self._part is None:
             self._hold([envelope])
             return
@@ -210,7 +211,7 @@ class Recorder(Core):
             self._pause(str(error))
 
     def _attempt(self, action: Callable[[], None]) -> None:
-        """Do something that the disk may refuse; then nothing is recorded until it no longer does."""
+        """Do something that the disk may refuse, and pause if it does."""
         try:
             action()
         except RecordingError as error:
@@ -218,15 +219,15 @@ class Recorder(Core):
 
     def _begin(self, about: Mapping[str, str]) -> None:
         self._began_ns = min(self._held[0].received_t_ns, self._now_ns) if self._held else self._now_ns
-        self._part = self._place.begin(self._began_ns, self._ledger, about)
+        self._part = self._parts.begin(self._began_ns, self._ledger, about)
         self._counts["parts"] += 1
         self._problem = ""
         for card in self._cards.values():
             self._part.add(card.received_at(self._began_ns))
 
     def _is_flush_due(self) -> bool:
-        """By the next tick the oldest message would be too old; but behind a backlog, not at every tick."""
-        interval_ns = self._config.flush_interval_s * 1e9
+        """Whether a message would be unflushed for too long at the next tick; not at every tick behind a backlog."""
+        interval_ns = self._config.flush_interval_s * NS_PER_S
         return (
             self._unflushed_ns is not None
             and self._now_ns - self._unflushed_ns >= interval_ns - TICK_NS
@@ -237,72 +238,72 @@ class Recorder(Core):
         config = self._config
         return bool(
             (config.part_bytes and part.size >= config.part_bytes)
-            or (config.part_s and self._now_ns - self._began_ns >= config.part_s * 1e9)
+            or (config.part_s and self._now_ns - self._began_ns >= config.part_s * NS_PER_S)
         )
 
     def _end_part(self, *, has_ended: bool = False) -> None:
-        """End the open part, whatever the disk says. Raises RecordingError as it does."""
+        """Finish the open part. It is closed even if this raises RecordingError."""
         assert self._part
         try:
-            self._part.close(has_ended=has_ended)
+            self._part.finish(has_ended=has_ended)
         finally:
-            self._let_go()
+            self._release_part()
 
-    def _let_go(self) -> None:
+    def _release_part(self) -> None:
         if self._part:
             self._recorded += self._part.written
-            self._ledger = self._ledger.following()
+            self._ledger = self._ledger.for_next_part()
             unwritten, self._part, self._unflushed_ns = self._part.pending, None, None
             self._hold(unwritten)
 
     def _hold(self, unwritten: Sequence[Envelope]) -> None:
-        """Keep messages until they can be recorded; when there are too many, the oldest are lost."""
+        """Keep messages in memory until they can be recorded; beyond HELD_BYTES the oldest are lost."""
         self._held.extend(unwritten)
         self._held_bytes += sum(len(envelope.payload) for envelope in unwritten)
         while self._held_bytes > HELD_BYTES:
             lost = self._held.popleft()
             self._held_bytes -= len(lost.payload)
-            self._ledger.lose(lost.key, lost.message.header.producer, lost.message.header.sequence)
+            self._ledger.add_lost(lost.key, lost.message.header.producer, lost.message.header.sequence)
             self._counts["lost_unwritten"] += 1
             self._lost_in_pause += 1
 
     def _shortage(self, more_bytes: int) -> str:
-        """What is wrong with the room on the disk, if anything; deletes the oldest part if that is allowed.
+        """Why the free space is not enough for `more_bytes`; empty if it is. Deletes the oldest part if allowed.
 
-        One at a time: the room may come a little later. Raises RecordingError if the disk has gone.
+        One part at a time: the space may become free a little later. Raises RecordingError if the disk is gone.
         """
         wanted = self._config.min_free_bytes + more_bytes
-        free = self._place.free_bytes()
+        free = self._parts.free_bytes()
         if free >= wanted:
             return ""
-        deleted = self._place.delete_oldest() if self._config.delete_oldest else None
+        deleted = self._parts.delete_oldest() if self._config.delete_oldest else None
         if deleted is None:
             return (
-                f"{free / 1e6:,.1f} MB are free on the disk, and {wanted / 1e6:,.1f} MB must be "
-                "(see recorder.min_free_bytes): make room, or set recorder.delete_oldest"
+                f"{free / 1e6:,.1f} MB are free on the disk, but {wanted / 1e6:,.1f} MB are required "
+                "(recorder.min_free_bytes): make room, or set recorder.delete_oldest"
             )
         self._counts["parts_deleted"] += 1
-        _LOG.warning("%s: deleted, the oldest part, to make room (recorder.delete_oldest)", deleted)
+        _LOG.warning("%s: the oldest part was deleted to make room (recorder.delete_oldest)", deleted)
         return ""
 
-    def _watch_room(self) -> None:
+    def _check_disk(self) -> None:
         try:
             shortage = self._shortage(0)
         except RecordingError as error:
             shortage = str(error)
         if shortage:
-            with suppress(RecordingError):  # why is known already
+            with suppress(RecordingError):  # the reason is known already
                 self._end_part()
             self._pause(shortage)
 
-    def _pause(self, why: str) -> None:
-        self._let_go()
+    def _pause(self, reason: str) -> None:
+        self._release_part()
         if not self._problem:
             self._paused_ns, self._lost_in_pause = self._now_ns, 0
-            self._paused_because = why
+            self._paused_because = reason
             self._counts["pauses"] += 1
-            _LOG.error("nothing is recorded: %s", why)
-        self._problem = f"NOTHING IS RECORDED: {why}; recording goes on by itself as soon as it can"
+            _LOG.error("NOTHING IS RECORDED: %s", reason)
+        self._problem = f"NOTHING IS RECORDED: {reason}; recording resumes automatically when this is resolved"
 
     def _resume(self) -> None:
         about = {
@@ -321,70 +322,72 @@ class Recorder(Core):
             self._pause(shortage)
             return
         _LOG.warning(
-            "recording goes on after %.1f s; messages lost meanwhile: %d",
-            (self._now_ns - self._paused_ns) / 1e9,
+            "recording resumed after %.1f s; messages lost in between: %d",
+            (self._now_ns - self._paused_ns) / NS_PER_S,
             self._lost_in_pause,
         )
         held, self._held, self._held_bytes = self._held, deque(), 0
         for envelope in held:
-            self._put(envelope)
+            self._record(envelope)
 
-    def _note_duplicated(self, health: Health) -> None:
-        """Our own health, which the runner hands over before anything else, says what the bus brought twice."""
+    def _count_duplicated(self, health: Health) -> None:
+        """Count what the bus delivered twice, from this recorder's own health: the first the runner passes to it."""
         if health.stage != STAGE.name:
             return
         self._own_producer = self._own_producer or health.header.producer
         if health.header.producer == self._own_producer:
             for line in health.inputs:
                 before = self._duplicated.get((line.key, line.producer), 0)
-                if line.producer and line.duplicated > before:  # no name: earlier producers, noted while they had one
-                    self._ledger.note_duplicated(line.key, line.producer, line.duplicated - before)
+                if (
+                    line.producer and line.duplicated > before
+                ):  # without a name: earlier producers, which are counted already
+                    self._ledger.add_duplicated(line.key, line.producer, line.duplicated - before)
                     self._duplicated[line.key, line.producer] = line.duplicated
 
 
 def build(context: Context) -> Parts:
-    """Mend what a killed recorder has left, and begin the first part.
+    """Repair what a killed recorder left, and begin the first part.
 
     Raises:
         StageError: it cannot be written there.
     """
     config: RecorderConfig = context.config
-    metadata, attachments = head_of(context)
+    metadata, attachments = recording_metadata(context)
     metadata["flush_interval_s"] = f"{config.flush_interval_s:g}"
     try:
-        shelf = RecordingParts(context.run_folder / config.file, metadata, attachments, session=secrets.token_hex(4))
-        for recovery in shelf.mended:
+        parts = RecordingParts(context.run_folder / config.file, metadata, attachments, session=secrets.token_hex(4))
+        for recovery in parts.repaired:
             found = recovery.found
             _LOG.warning(
-                "a recorder had been killed; what it has recorded is kept as %s: %d messages; bytes of an unfinished "
-                "chunk thrown away: %d",
+                "a recorder was killed; its recording was repaired and is %s: %d messages; bytes of an unfinished "
+                "chunk discarded: %d",
                 recovery.path,
                 found.messages,
-                found.thrown_away_bytes,
+                found.discarded_bytes,
             )
-        for path in shelf.unreadable:
-            _LOG.warning("a recorder had been killed; what it has left cannot be mended, and is put aside as %s", path)
-        for path in shelf.unmended:
+        for path in parts.unreadable:
+            _LOG.warning("a recorder was killed; its recording cannot be repaired and was renamed to %s", path)
+        for path in parts.unrepaired:
             _LOG.warning(
-                "a recorder had been killed; the disk refuses to mend what it has left, which stays %s: start again "
-                "when it no longer does, or use `fantwin recover`",
+                "a recorder was killed; the disk refuses the repair of its recording, which stays %s: make room and "
+                "start again, or use `fantwin recover`",
                 path,
             )
-        return Parts(Recorder(shelf, config, context.started_t_ns))
+        return Parts(Recorder(parts, config, context.started_t_ns))
     except RecordingError as error:
         raise StageError(f"{error} (recorder.file)") from error
 
 
 def check(context: Context) -> list[str]:
-    """A folder that the file cannot be written in, or a disk that is too full."""
+    """Problems with the folder: it cannot be written, or its disk is too full."""
     folder = (context.run_folder / context.config.file).parent
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
-        return [f"{folder}: {existing} is no folder this user may write in; change run_folder or recorder.file"]
+        return [f"{folder}: {existing} is not a folder that this user can write to; change run_folder or recorder.file"]
     free, wanted = shutil.disk_usage(existing).free, context.config.min_free_bytes
     if free < wanted:
         return [
-            f"{folder}: {free / 1e6:,.1f} MB are free, and nothing is recorded below {wanted / 1e6:,.1f} MB "
+            f"{folder}: {free / 1e6:,.1f} MB are free, but nothing is recorded below {wanted / 1e6:,.1f} MB "
             "(recorder.min_free_bytes): make room"
         ]
     return []
@@ -392,7 +395,7 @@ def check(context: Context) -> list[str]:
 
 STAGE = Stage(
     name="recorder",
-    about="keeps every message, with configuration and twin, in MCAP files",
+    about="records every message, with configuration and twin, in MCAP files",
     reads=tuple(topic.name for topic in TOPICS if topic.recorded),
     writes=(),
     config=RecorderConfig,

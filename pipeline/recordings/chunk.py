@@ -1,4 +1,4 @@
-"""A chunk of a recording while it is filled: message records, compressed together, and the index to go behind them."""
+"""A chunk of a recording: message records that are compressed together, followed by their index."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ _MESSAGE_RECORD = struct.Struct(RECORD.format + MESSAGE.format.removeprefix("<")
 
 
 class FillingChunk:
-    """The chunk that is being filled."""
+    """The chunk to which messages are added."""
 
     def __init__(self) -> None:
         self.size = 0
         self.entries: dict[int, list[int]] = {}
-        """by channel: log time and place of each message, in turns"""
+        """by channel: log time and offset of each message, alternating"""
         self._parts: list[bytes] = []
 
     def append(self, record: bytes) -> None:
-        """Add a record that is no message."""
+        """Add a record that is not a message."""
         self._parts.append(record)
         self.size += len(record)
 
     def add(self, channel: int, sequence: int, log_time_ns: int, publish_time_ns: int, payload: bytes) -> None:
-        """Add a message. MCAP has no time before 1970 (the message itself keeps it), and 32 bits for the sequence."""
+        """Add a message. MCAP has no times before 1970 (the message itself keeps them) and a 32 bit sequence."""
         log_time_ns = max(0, log_time_ns)
         publish_time_ns = max(0, publish_time_ns)
         length = MESSAGE.size + len(payload)
@@ -44,8 +44,8 @@ class FillingChunk:
         entries += (log_time_ns, self.size)
         self.size += RECORD.size + length
 
-    def made(self, offset: int) -> tuple[bytes, ChunkIndex]:
-        """The chunk's record and those of its index behind it, which are to stand at `offset`."""
+    def finish(self, offset: int) -> tuple[bytes, ChunkIndex]:
+        """The records of the chunk and its index, to be written at `offset`, and its entry in the file's index."""
         data = b"".join(self._parts)
         packed = ZstdCompressor().compress(data)
         first_ns = min(min(flat[::2]) for flat in self.entries.values())

@@ -1,4 +1,4 @@
-"""What is in a recording: by its index and its ledger where it has them, and else by going through all of it."""
+"""What is in a recording: by its index and ledger, or, where it lacks them, by going through all of it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.summary import Summary
 
-from pipeline.recordings.disk import unwritten
+from pipeline.recordings.disk import not_being_written
 from pipeline.recordings.reading import METADATA_NAME
 from pipeline.recordings.records import CORRUPT_DATA_ERRORS, MESSAGE, RECORD, chunk_data, parse, records_in
 from pipeline.recordings.scan import Scan, scan
@@ -21,36 +21,37 @@ from pipeline.recordings.sequence_ledger import (
     ENDED,
     LEDGER_NAME,
     StreamCounts,
-    StreamId,
-    accounts_of,
-    before_of,
-    next_of,
-    recovered_of,
+    before_from_metadata,
+    counts_from_metadata,
+    next_sequences,
+    recovered_from_metadata,
 )
 from schemas.codec import CodecError, decode
 from schemas.messages import Health, Message, ModelCard
+from schemas.streams import StreamId
 from schemas.topics import topic_of
 
-BREAKS_OFF = "it breaks off, as after a crash"
-NOTHING_WHOLE = "bytes that are nothing whole"
+TRUNCATED = "it is truncated, as after a crash"
+NOT_A_RECORD = "bytes that belong to no intact record"
 NO_INDEX = "it has no index"
 STILL_WRITTEN = "it is still being written"
 NO_LOSS = frozenset((NO_INDEX, STILL_WRITTEN))
-"""what is said of a file that has lost nothing"""
+"""the damage lines of a file that has lost nothing"""
 
 
 @dataclass(frozen=True)
 class Contents:
-    """Of one file. Times are those of receipt; None where there is no message."""
+    """The contents of one file. Times are times of receipt; None if it has no message."""
 
     path: Path
     size_bytes: int
     metadata: Mapping[str, str]
     attachments: tuple[str, ...]
-    accounts: Mapping[StreamId, StreamCounts]
+    streams: Mapping[StreamId, StreamCounts]
     others: Mapping[str, int]
-    """messages on channels that are none of ours, by topic"""
+    """messages on channels that are not fantwin's, by topic"""
     before: Mapping[StreamId, int]
+    """the sequence number due of each stream at the start of the file"""
     first_ns: int | None
     last_ns: int | None
     messages: int
@@ -58,23 +59,23 @@ class Contents:
     """the last of each key"""
     cards: Mapping[str, ModelCard]
     has_ended: bool
-    """its recorder ended in order with this file"""
+    """the recorder was stopped in order with this file"""
     recovered: tuple[str, ...] = ()
-    """what was lost, or may have been, when it was mended, one line each"""
+    """what an earlier repair reported as lost, one line each"""
     damage: tuple[str, ...] = ()
     """what is wrong with the file, one line each"""
 
     @property
     def next(self) -> dict[StreamId, int]:
-        """With which number each producer should go on after this file."""
-        return next_of(self.before, self.accounts)
+        """The sequence number due of each stream after this file."""
+        return next_sequences(self.before, self.streams)
 
 
 def contents_of(path: Path) -> Contents:
-    """What is in a file. Where it has an index and a ledger, damage in the middle of it does not show.
+    """What is in a file. If it has an index and a ledger, only these are read: damage elsewhere does not show.
 
     Raises:
-        RecordingError: it cannot be read, or is no MCAP file.
+        RecordingError: it cannot be read, or is not an MCAP file.
     """
     try:
         with path.open("rb") as file:
@@ -90,16 +91,16 @@ def contents_of(path: Path) -> Contents:
 
 def _is_being_written(path: Path) -> bool:
     try:
-        with unwritten(path):
+        with not_being_written(path):
             return False
     except BlockingIOError:
         return True
-    except OSError:  # which reading it will tell
+    except OSError:  # reading the file reports it
         return False
 
 
 def continuity(parts: Sequence[Contents]) -> list[str]:
-    """Where parts do not go on from one another as they should, one line each; parts in their order of time."""
+    """Where parts do not continue one another as they should, one line each; parts in their order of time."""
     by_name = {part.path.name: part for part in parts}
     lines = []
     for part in parts:
@@ -108,49 +109,51 @@ def continuity(parts: Sequence[Contents]) -> list[str]:
         if name and earlier is None and part is not parts[0]:  # those before the first were not asked for, or deleted
             lines.append(f"{part.path.name} continues {name}, which is not among these files")
         ends_at = earlier.next if earlier else {}
-        for line, due in part.before.items():
-            ends = ends_at.get(line, due)
+        for stream, due in part.before.items():
+            ends = ends_at.get(stream, due)
             if ends != due:
-                lines.append(f"{part.path.name} goes on at {due} of {' '.join(line)}, but {name} ends before {ends}")
+                lines.append(
+                    f"{part.path.name} starts at message {due} of {' '.join(stream)}, but {name} ends before {ends}"
+                )
     return lines
 
 
 def damage_of(found: Scan) -> tuple[str, ...]:
-    """What is wrong with a file that was gone through, one line each."""
+    """What is wrong with a file that was scanned, one line each."""
     lines = (
-        (not found.is_ended, BREAKS_OFF),
+        (not found.is_ended, TRUNCATED),
         (found.is_ended and not found.has_index, NO_INDEX),
-        (found.thrown_away_bytes, f"{NOTHING_WHOLE}: {found.thrown_away_bytes}"),
+        (found.discarded_bytes, f"{NOT_A_RECORD}: {found.discarded_bytes}"),
         (found.damaged_chunks, f"damaged chunks: {found.damaged_chunks}"),
         (found.damaged_records, f"damaged records: {found.damaged_records}"),
         (found.damaged_attachments, f"damaged attachments: {found.damaged_attachments}"),
         (found.nameless, f"messages of channels without a name: {found.nameless}"),
-        (found.census.undecodable, f"messages that are not what their channel says: {found.census.undecodable}"),
+        (found.counts.undecodable, f"messages that do not have the type of their channel: {found.counts.undecodable}"),
     )
     return tuple(line for is_so, line in lines if is_so)
 
 
 def losses(found: Scan) -> list[str]:
-    """What is missing, or may be, one line each; nothing where nothing is."""
+    """What is missing, or may be, one line each; empty if nothing is."""
     missing = [
-        f"{key}: {messages_as_text(account.missing)} of {producer} missing in between"
-        for (key, producer), account in found.accounts.items()
-        if account.missing
+        f"{key}: {messages_as_text(counts.missing)} of {producer} missing in between"
+        for (key, producer), counts in found.streams.items()
+        if counts.missing
     ]
-    return [*unaccounted(found), *missing]
+    return [*losses_outside_counts(found), *missing]
 
 
-def unaccounted(found: Scan) -> list[str]:
-    """Those of the losses that do not stand in its accounts."""
-    lines = [line for line in damage_of(found) if line not in NO_LOSS | {BREAKS_OFF}]
+def losses_outside_counts(found: Scan) -> list[str]:
+    """The losses that the counts of its streams do not show."""
+    lines = [line for line in damage_of(found) if line not in NO_LOSS | {TRUNCATED}]
     if not found.is_ended:
         flush_s = found.metadata.get("flush_interval_s")
-        may = f"what came in the last {flush_s} s" if flush_s else "what was in the unfinished chunk"
-        lines.insert(0, f"{BREAKS_OFF}: {may} may be missing")
-    for (key, producer), count in found.census.ledger.unrecorded().items() if not found.is_ended else ():
-        lines.append(
-            f"{key}: {messages_as_text(count)} of {producer} published, by its health, after the last one here"
-        )
+        may = f"messages received in the last {flush_s} s" if flush_s else "messages of the unfinished chunk"
+        lines.insert(0, f"{TRUNCATED}: {may} may be missing")
+        lines += [
+            f"{key}: {messages_as_text(count)} of {producer} published after the last one here, according to its health"
+            for (key, producer), count in found.counts.ledger.unrecorded().items()
+        ]
     return [*found.recovered, *lines]
 
 
@@ -162,17 +165,17 @@ def messages_as_text(count: int) -> str:
 def _by_scan(found: Scan) -> Contents:
     return Contents(
         path=found.path,
-        size_bytes=found.walk.size,
+        size_bytes=found.reader.size,
         metadata=found.metadata,
         attachments=tuple(found.attachments),
-        accounts=found.accounts,
-        others={topic: account.messages for topic, account in found.census.others.items()},
+        streams=found.streams,
+        others={topic: counts.messages for topic, counts in found.counts.others.items()},
         before=found.before,
         first_ns=found.index.first_ns,
         last_ns=found.index.last_ns if found.messages else None,
         messages=found.messages,
-        healths=found.census.healths,
-        cards=found.census.cards,
+        healths=found.counts.healths,
+        cards=found.counts.cards,
         has_ended=found.has_ended,
         recovered=found.recovered,
         damage=damage_of(found),
@@ -187,42 +190,42 @@ def _by_index(path: Path, file: BinaryIO) -> Contents | None:
     records = {record.name: record.metadata for record in reader.iter_metadata()}
     if LEDGER_NAME not in records:
         return None
-    statistics = summary.statistics
-    accounts = accounts_of(records[LEDGER_NAME])
-    news = [_last_message(file, summary, number) for number in _channels_of_news(summary)]
+    statistics, ledger = summary.statistics, records[LEDGER_NAME]
+    status = [_last_message(file, summary, number) for number in _status_channels(summary)]
     return Contents(
         path=path,
         size_bytes=path.stat().st_size,
         metadata=records.get(METADATA_NAME, {}),
         attachments=tuple(index.name for index in summary.attachment_indexes),
-        accounts=accounts,
+        streams=counts_from_metadata(ledger),
         others={
             channel.topic: statistics.channel_message_counts.get(number, 0)
             for number, channel in summary.channels.items()
-            if _kind(channel.topic) is None
+            if _message_type(channel.topic) is None
         },
-        before=before_of(records.get(BEFORE_NAME, {})),
+        before=before_from_metadata(records.get(BEFORE_NAME, {})),
         first_ns=statistics.message_start_time if statistics.message_count else None,
         last_ns=statistics.message_end_time if statistics.message_count else None,
         messages=statistics.message_count,
-        healths={key: message for key, message in news if isinstance(message, Health)},
-        cards={key: message for key, message in news if isinstance(message, ModelCard)},
-        has_ended=ENDED in records[LEDGER_NAME],
-        recovered=recovered_of(records[LEDGER_NAME]),
+        healths={key: message for key, message in status if isinstance(message, Health)},
+        cards={key: message for key, message in status if isinstance(message, ModelCard)},
+        has_ended=ENDED in ledger,
+        recovered=recovered_from_metadata(ledger),
     )
 
 
-def _channels_of_news(summary: Summary) -> list[int]:
-    """Those of which the last message says how things stand."""
+def _status_channels(summary: Summary) -> list[int]:
+    """The channels whose last message is shown: health and twin cards."""
     return [
         number
         for number, channel in summary.channels.items()
-        if _kind(channel.topic) in (Health, ModelCard)
-        and any(number in c.message_index_offsets for c in summary.chunk_indexes)
+        if _message_type(channel.topic) in (Health, ModelCard)
+        and any(number in chunk.message_index_offsets for chunk in summary.chunk_indexes)
     ]
 
 
 def _last_message(file: BinaryIO, summary: Summary, number: int) -> tuple[str, Message | None]:
+    """The key of a channel and its last message; None if that cannot be decoded."""
     key = summary.channels[number].topic
     chunk = next(chunk for chunk in reversed(summary.chunk_indexes) if number in chunk.message_index_offsets)
     file.seek(chunk.chunk_start_offset + RECORD.size)
@@ -232,15 +235,15 @@ def _last_message(file: BinaryIO, summary: Summary, number: int) -> tuple[str, M
         for _, opcode, start, end in records_in(data)
         if opcode == Opcode.MESSAGE and MESSAGE.unpack_from(data, start)[0] == number
     ]
-    kind = _kind(key)
-    assert kind is not None
+    message_type = _message_type(key)
+    assert message_type is not None
     try:
-        return key, decode(kind, payloads[-1])
+        return key, decode(message_type, payloads[-1])
     except CodecError:
         return key, None
 
 
-def _kind(topic: str) -> type[Message] | None:
+def _message_type(topic: str) -> type[Message] | None:
     try:
         return topic_of(topic).message
     except KeyError:

@@ -1,4 +1,4 @@
-"""The disk that recordings lie on: files whose writes are whole or not at all, and how much room there is."""
+"""The disk that recordings are on: files that are written whole or not at all, and the free space."""
 
 from __future__ import annotations
 
@@ -11,33 +11,36 @@ from pathlib import Path
 
 from pipeline.recordings.records import RecordingError
 
-_PASSING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENODEV, errno.ENXIO, errno.EROFS, errno.ESTALE)
+_MAY_PASS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENODEV, errno.ENXIO, errno.EROFS, errno.ESTALE)
 
 
 class DiskError(RecordingError):
-    """The disk refuses for now: it is full, or it has gone. It may be there again later."""
+    """The disk is full, or is not there. It may accept writes again later."""
 
 
 def refused(what: str, error: OSError, advice: str) -> RecordingError:
-    """What the system has refused as a recording's error in one line; a `DiskError` where that may pass."""
-    kind = DiskError if error.errno in _PASSING else RecordingError
+    """An error of the operating system as a RecordingError of one line; a DiskError if it may pass."""
+    kind = DiskError if error.errno in _MAY_PASS else RecordingError
     return kind(f"{what}: {error.strerror}; {advice}")
 
 
 class AtomicAppendFile:
-    """A file in which every write is whole or has not been: on a full disk it keeps what it had."""
+    """A file that every write extends completely or not at all: on a full disk it keeps what it had.
+
+    It is locked: one process at a time writes it.
+    """
 
     def __init__(self, path: Path, *, keep: bool = False) -> None:
-        """Open for writing, at its end if its content is to be kept and empty otherwise.
+        """Open for writing: at its end with `keep`, else empty.
 
         Raises:
             BlockingIOError: another process is writing it.
-            OSError: it cannot be opened; with `keep` it must exist.
+            OSError: it cannot be opened, or does not exist and `keep` is set.
         """
         flags = os.O_RDWR | os.O_CLOEXEC | (0 if keep else os.O_CREAT)
         self._descriptor = os.open(path, flags, 0o644)
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # let go of by the system, even after kill -9
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system unlocks it, also after kill -9
             self.size = os.fstat(self._descriptor).st_size if keep else 0
             self.cut(self.size)
         except OSError:
@@ -46,7 +49,7 @@ class AtomicAppendFile:
         self._is_synced = False
 
     def write(self, data: bytes) -> None:
-        """Append. OSError if the system refuses; the file is then as it was."""
+        """Append. OSError if the system refuses; the file is then unchanged."""
         rest = memoryview(data)
         self._is_synced = False
         try:
@@ -58,25 +61,25 @@ class AtomicAppendFile:
         self.size += len(data)
 
     def cut(self, size: int) -> None:
-        """Shorten it to `size` bytes, where the next write goes."""
+        """Shorten it to `size` bytes; the next write goes there."""
         os.ftruncate(self._descriptor, size)
         os.lseek(self._descriptor, size, os.SEEK_SET)
         self.size = size
 
     def sync(self) -> None:
-        """Through to the disk: what has been written survives a power cut."""
+        """Flush to the disk: what has been written then survives a power cut."""
         if not self._is_synced:
             os.fdatasync(self._descriptor)
             self._is_synced = True
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close and unlock it."""
         os.close(self._descriptor)
 
 
 @contextmanager
-def unwritten(path: Path) -> Iterator[None]:
-    """Nobody writes the file as long as the block lasts.
+def not_being_written(path: Path) -> Iterator[None]:
+    """Keep others from writing the file inside the `with` block.
 
     Raises:
         BlockingIOError: another process is writing it.
@@ -91,7 +94,7 @@ def unwritten(path: Path) -> Iterator[None]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Through to the disk: the names in a folder survive a power cut. OSError if that cannot be done."""
+    """Flush a folder to the disk: its file names then survive a power cut. OSError if that fails."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -100,7 +103,7 @@ def sync_folder(folder: Path) -> None:
 
 
 class Disk:
-    """The disk under a folder. Should it be unmounted, its place is not taken for it."""
+    """The disk that a folder is on. Its mount point is not mistaken for it after it was unmounted."""
 
     def __init__(self, folder: Path) -> None:
         """The folder must exist. OSError otherwise."""
@@ -108,7 +111,7 @@ class Disk:
         self._mounted_at = next(place for place in (self._folder, *self._folder.parents) if place.is_mount())
 
     def free_bytes(self) -> int:
-        """How much room there is for this user.
+        """Free space for this user.
 
         Raises:
             DiskError: the disk is not there.
@@ -118,5 +121,5 @@ class Disk:
                 raise DiskError(f"{self._mounted_at}: the disk is no longer mounted; mount it again")
             found = os.statvfs(self._folder)
         except OSError as error:
-            raise DiskError(f"{self._folder}: the folder is gone: {error.strerror}; bring it back") from error
+            raise DiskError(f"{self._folder}: the folder is gone: {error.strerror}; restore it") from error
         return found.f_bavail * found.f_frsize

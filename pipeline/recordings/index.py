@@ -1,6 +1,7 @@
-"""The index of an MCAP file: what was put where, and the ending of the file made of it.
+"""The index of an MCAP file: where everything is, and the end of the file that says so.
 
-Kept while a file is written, and made anew of what a torn one still holds; an ending can so be written at any time.
+It is kept while a file is written, and rebuilt from a truncated file. The end can be written at any time and lists only
+what is on the disk; the Writer of the `mcap` library also counts messages whose chunk the disk refused.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ from mcap.writer import MCAP0_MAGIC
 from pipeline.recordings.records import RECORD, record_bytes
 
 SHORT_ENDING = record_bytes(DataEnd(0), Footer(0, 0, 0)) + MCAP0_MAGIC
-"""Ends a file without a summary: forty bytes, where a summary may need thousands."""
+"""The end of a file without a summary: 40 bytes, where a summary may need thousands."""
 _INDEX_HEAD = struct.Struct("<HI")
 _FOOTER = struct.Struct("<BQQQ")
 
 
 class Index:
-    """What a file holds."""
+    """What a file holds, and where."""
 
     def __init__(self) -> None:
         self.schemas: dict[int, Schema] = {}
@@ -49,8 +50,8 @@ class Index:
         self._attachments: list[McapRecord] = []
         self._metadata: list[McapRecord] = []
 
-    def note_attachment(self, attachment: Attachment, offset: int, length: int) -> None:
-        """An attachment stands at `offset` of the file, `length` bytes with all."""
+    def add_attachment(self, attachment: Attachment, offset: int, length: int) -> None:
+        """Add an attachment whose record is at `offset` and has `length` bytes."""
         self._attachments.append(
             AttachmentIndex(
                 offset=offset,
@@ -63,27 +64,27 @@ class Index:
             )
         )
 
-    def note_metadata(self, metadata: Metadata, offset: int, length: int) -> None:
-        """The same of metadata."""
+    def add_metadata(self, metadata: Metadata, offset: int, length: int) -> None:
+        """Add a metadata record at `offset` of `length` bytes."""
         self._metadata.append(MetadataIndex(offset=offset, length=length, name=metadata.name))
 
-    def forget_metadata(self) -> None:
-        """The last metadata could not be written."""
+    def remove_last_metadata(self) -> None:
+        """Remove the last metadata, which could not be written."""
         self._metadata.pop()
 
-    def note_chunk(self, chunk: ChunkIndex, messages: Mapping[int, int]) -> None:
-        """A chunk with so many messages of each channel."""
+    def add_chunk(self, chunk: ChunkIndex, messages: Mapping[int, int]) -> None:
+        """Add a chunk; messages: how many it has of each channel."""
         self._chunks.append(chunk)
         self.messages.update(messages)
-        self._note_times(chunk.message_start_time, chunk.message_end_time)
+        self._add_times(chunk.message_start_time, chunk.message_end_time)
 
-    def note_loose(self, channel: int, log_time_ns: int) -> None:
-        """A message outside of chunks, as others write them."""
+    def add_unchunked_message(self, channel: int, log_time_ns: int) -> None:
+        """Add a message outside of chunks, as other writers may write them."""
         self.messages[channel] += 1
-        self._note_times(log_time_ns, log_time_ns)
+        self._add_times(log_time_ns, log_time_ns)
 
     def ending(self, offset: int) -> bytes:
-        """The end of the file, which begins at `offset`: end of data, summary, footer, magic."""
+        """The end of a file whose data ends at `offset`: end of data, summary, footer, magic."""
         data_end = record_bytes(DataEnd(0))
         start = offset + len(data_end)
         groups: tuple[tuple[Opcode, Iterable[McapRecord]], ...] = (
@@ -106,7 +107,7 @@ class Index:
         crc = crc32(_FOOTER.pack(Opcode.FOOTER, 20, start, offset_start), crc32(summary))
         return data_end + summary + record_bytes(Footer(start, offset_start, crc)) + MCAP0_MAGIC
 
-    def _note_times(self, first_ns: int, last_ns: int) -> None:
+    def _add_times(self, first_ns: int, last_ns: int) -> None:
         self.first_ns = first_ns if self.first_ns is None else min(self.first_ns, first_ns)
         self.last_ns = max(self.last_ns, last_ns)
 
@@ -125,9 +126,9 @@ class Index:
 
 
 def message_indexes(entries: Mapping[int, list[int]], offset: int) -> tuple[bytes, dict[int, int]]:
-    """The index records that follow a chunk, and where each channel's begins if they stand at `offset`.
+    """The message index records of a chunk that start at `offset`, and the offset of each channel's record.
 
-    entries: by channel, log time and place in the chunk of each message, in turns.
+    entries: by channel, log time and offset in the chunk of each message, alternating.
     """
     parts: list[bytes] = []
     offsets: dict[int, int] = {}

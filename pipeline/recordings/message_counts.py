@@ -1,96 +1,101 @@
-"""The messages of a file, counted: the ledger that follows from them, and what stages and twins said last."""
+"""Counts the messages of a file: its sequence ledger, and the last health of each stage and card of each twin."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
-from schemas.codec import CodecError, decode
+from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header
 from schemas.messages import Health, ModelCard
 from schemas.topics import Topic, topic_of
 
-_HEADER_AT = 2  # of a payload, behind the key and one byte of length: what the header says, the producer first
-_NEVER = b"\x00"
+_PRODUCER_AT = 2  # in a payload, after the header's key and one byte of length: the producer is its first field
+_NOTHING = b"\x00"  # no payload continues so
 
 
 @dataclass(slots=True)
-class _Lane:
-    """A channel, and what its next message most likely begins with."""
+class ChannelState:
+    """A channel, and what its next message is expected to look like."""
 
     key: str
     topic: Topic | None
-    """None: of somebody else"""
-    is_news: bool
+    """None: not a topic of fantwin"""
+    is_status: bool
+    """the last message matters: health or a twin's card"""
     producer: str = ""
-    beginning: bytes = _NEVER
-    """of a header by that producer"""
-    due: int = 0
+    encoded_producer: bytes = _NOTHING
+    next_sequence: int = 0
 
 
 class MessageCounts:
-    """Of one file. Channels and messages are told to it in the order in which they stand there."""
+    """Of one file. Channels and messages are added in file order."""
 
     def __init__(self) -> None:
         self.ledger = SequenceLedger()
         self.others: dict[str, StreamCounts] = {}
-        """messages on channels that are none of ours, by topic"""
+        """messages on channels that are not fantwin's, by topic"""
         self.healths: dict[str, Health] = {}
         """the last of each key"""
         self.cards: dict[str, ModelCard] = {}
         self.undecodable = 0
-        """messages that are not what their channel says"""
-        self._lanes: dict[int, _Lane] = {}
+        """messages that do not have the type of their channel"""
+        self._channels: dict[int, ChannelState] = {}
 
     def knows(self, channel: int) -> bool:
-        """Whether the channel has been described."""
-        return channel in self._lanes
+        """Whether the channel has been added."""
+        return channel in self._channels
 
-    def describe(self, channel: int, key: str) -> None:
-        """A channel has that key as its topic."""
-        lane = self._lanes.get(channel)
-        if lane is None or lane.key != key:
+    def add_channel(self, channel: int, key: str) -> None:
+        """Add a channel whose topic is `key`."""
+        state = self._channels.get(channel)
+        if state is None or state.key != key:
             try:
                 topic = topic_of(key)
             except KeyError:
                 topic = None
-            is_news = topic is not None and topic.message in (Health, ModelCard)
-            self._lanes[channel] = _Lane(key, topic, is_news)
+            is_status = topic is not None and topic.message in (Health, ModelCard)
+            self._channels[channel] = ChannelState(key, topic, is_status)
 
-    def count(self, channel: int, sequence: int, log_time_ns: int, data: bytes, start: int, end: int) -> None:
-        """A message of a described channel, its payload data[start:end]; `sequence` is the one that MCAP has.
+    def add(self, channel: int, sequence: int, received_t_ns: int, data: bytes, start: int, end: int) -> None:
+        """Add a message of a known channel; its payload is data[start:end], `sequence` the one in MCAP's record.
 
-        Of most messages neither header nor content is decoded: same producer, next number, by MCAP's own record.
+        Most messages have the same producer as the one before and the next sequence number: comparing bytes shows
+        that, and nothing is decoded. That makes repairing a file twice as fast.
         """
-        lane = self._lanes[channel]
-        at = start + _HEADER_AT
-        if sequence == lane.due & 0xFFFFFFFF and data.startswith(lane.beginning, at) and data[at - 1] < 0x80:
-            self.ledger.note(lane.key, lane.producer, lane.due, log_time_ns)
-            lane.due += 1
-        elif lane.topic is None:
-            account = self.others.setdefault(lane.key, StreamCounts(first_ns=log_time_ns))
-            account.messages += 1
-            account.last_ns = max(log_time_ns, account.last_ns or 0)
+        state = self._channels[channel]
+        at = start + _PRODUCER_AT
+        if (
+            sequence == state.next_sequence & 0xFFFFFFFF
+            and data.startswith(state.encoded_producer, at)
+            and data[at - 1] < 0x80
+        ):
+            self.ledger.add(state.key, state.producer, state.next_sequence, received_t_ns)
+            state.next_sequence += 1
+        elif state.topic is None:
+            counts = self.others.setdefault(state.key, StreamCounts(first_ns=received_t_ns))
+            counts.messages += 1
+            counts.last_ns = max(received_t_ns, counts.last_ns or 0)
         else:
-            self._decode(lane, lane.topic, log_time_ns, data[start:end])
+            self._decode(state, Envelope(state.key, state.topic.name, data[start:end], received_t_ns))
 
-    def _decode(self, lane: _Lane, topic: Topic, log_time_ns: int, payload: bytes) -> None:
+    def _decode(self, state: ChannelState, envelope: Envelope) -> None:
         try:
-            header = decode_header(Envelope(lane.key, topic.name, payload, log_time_ns))
-            message = decode(topic.message, payload) if lane.is_news else None
+            header = decode_header(envelope)
+            message = envelope.message if state.is_status else None
         except CodecError:
             self.undecodable += 1
             return
-        self.ledger.note(lane.key, header.producer, header.sequence, log_time_ns)
+        self.ledger.add(state.key, header.producer, header.sequence, envelope.received_t_ns)
         if isinstance(message, Health):
-            self.healths[lane.key] = message
-            self.ledger.note_health(message)
+            self.healths[state.key] = message
+            self.ledger.add_health(message)
         elif isinstance(message, ModelCard):
-            self.cards[lane.key] = message
+            self.cards[state.key] = message
         else:
             name = header.producer.encode()
-            beginning = bytes((0x0A, len(name))) + name if 0 < len(name) < 0x80 else _NEVER
-            is_first = payload.startswith(beginning, _HEADER_AT) and payload[0] == 0x0A
-            lane.producer, lane.due = header.producer, header.sequence + 1
-            lane.beginning = beginning if is_first else _NEVER
+            encoded = bytes((0x0A, len(name))) + name if 0 < len(name) < 0x80 else _NOTHING
+            is_first = envelope.payload.startswith(encoded, _PRODUCER_AT) and envelope.payload[0] == 0x0A
+            state.producer, state.next_sequence = header.producer, header.sequence + 1
+            state.encoded_producer = encoded if is_first else _NOTHING

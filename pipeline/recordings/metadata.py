@@ -1,4 +1,4 @@
-"""What stands before the first message of a recorder's recording: what it is about, its configuration and its twins."""
+"""The metadata and attachments of a recorder's recording: site and trays, the configuration, and the twins."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ CONFIGURATION = "configuration.toml"
 _LOG = logging.getLogger(__name__)
 
 
-def head_of(context: Context) -> tuple[dict[str, str], dict[str, bytes]]:
-    """Metadata and attachments of every part: what is needed to read it, and to judge it again, anywhere."""
+def recording_metadata(context: Context) -> tuple[dict[str, str], dict[str, bytes]]:
+    """Metadata and attachments of every part: all that is needed to read it and to score it again, anywhere."""
     metadata = {
         "made_by": f"fantwin {version('fantwin')}",
         "site": context.site,

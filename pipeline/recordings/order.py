@@ -1,4 +1,4 @@
-"""The parts of a recording in order, and each of their messages once."""
+"""The parts of a recording in order, and a check that each message is used once."""
 
 from __future__ import annotations
 
@@ -13,16 +13,14 @@ def in_order(parts: Iterable[Path]) -> list[Path]:
     """The parts of a recording, the earliest first.
 
     Raises:
-        RecordingError: one cannot be read, or is not of a recorder and so a recording in itself.
+        RecordingError: one cannot be read, or was not made by a recorder and so is not a part.
     """
     paths = list(dict.fromkeys(parts))
     if len(paths) > 1:
         for path in paths:
-            if (
-                "source" in read_metadata(path).metadata
-            ):  # its messages are counted from 0, as those of the next one are
+            if "source" in read_metadata(path).metadata:  # its sequence numbers start at 0, as those of the next do
                 raise RecordingError(
-                    f"{path}: made by import or simulate or an offline replay, so no part of another: read it by itself"
+                    f"{path}: made by import, simulate or an offline replay, so it is not a part: read it by itself"
                 )
         paths = _sessions_in_order(paths)
     elif paths:
@@ -31,7 +29,7 @@ def in_order(parts: Iterable[Path]) -> list[Path]:
 
 
 def _sessions_in_order(paths: Iterable[Path]) -> list[Path]:
-    """By the time each session of a recorder began, and in it by part: the host's clock may be set back between two."""
+    """By the start of each recorder session, then by part number: the host's clock may be set back between parts."""
     sessions: dict[str, list[tuple[int, int, Path]]] = {}
     for path in paths:
         metadata = read_metadata(path).metadata
@@ -43,20 +41,20 @@ def _sessions_in_order(paths: Iterable[Path]) -> list[Path]:
 
 
 def _start_ns(path: Path) -> int:
-    """When its first message was received; a file without any may stand anywhere."""
+    """When its first message was received; 0 without any, since its place does not matter then."""
     return next((entry.received_t_ns for entry in read_recording(path)), 0)
 
 
 class Seen:
-    """Which sequence numbers of a producer have come: as stretches, for there are as many as there are gaps."""
+    """The sequence numbers of a stream that have come, as ranges: one more than there are gaps."""
 
     def __init__(self) -> None:
         self._first: list[int] = []
         self._next: list[int] = []
 
     def is_new(self, sequence: int) -> bool:
-        """Whether it comes for the first time; from now on it has come."""
-        at = bisect_right(self._first, sequence)  # the stretch that may hold or touch it is the one before
+        """Add a number. Returns whether it came for the first time."""
+        at = bisect_right(self._first, sequence)  # the range before it may hold or touch it
         if at and sequence < self._next[at - 1]:
             return False
         joins_next = at < len(self._first) and sequence + 1 == self._first[at]

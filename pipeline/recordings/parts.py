@@ -1,7 +1,7 @@
 """The parts of a recorder's recording: NAME.mcap, NAME-2.mcap, NAME-3.mcap and so on, each complete in itself.
 
-A part says in its metadata which one it is, of which session of the recorder, and which part went before. What a killed
-recorder has left is mended, and the parts go on from it.
+The metadata of a part say its number, the session of the recorder, and the part before it. What a killed recorder left
+is repaired, and the next part continues it.
 """
 
 from __future__ import annotations
@@ -15,22 +15,28 @@ from pathlib import Path
 from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.disk import Disk, DiskError, refused, sync_folder
 from pipeline.recordings.reading import RecordingError, read_metadata
-from pipeline.recordings.repair import TORN_SUFFIX, Recovery, free_torn_name, mend
+from pipeline.recordings.repair import (
+    FORMER_ORIGINAL_SUFFIX,
+    ORIGINAL_SUFFIX,
+    Recovery,
+    free_original_name,
+    repair_in_place,
+)
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.recordings.writing import ACTIVE_SUFFIX, RecordingWriter
 
 
 class RecordingParts:
-    """Where the parts of one recording stand, and begin."""
+    """The folder of one recording: its parts so far, and the next one."""
 
     def __init__(self, path: Path, metadata: Mapping[str, str], attachments: Mapping[str, bytes], session: str) -> None:
-        """Mend what a killed recorder has left there.
+        """Repair what a killed recorder left there.
 
         Args:
             path: NAME.mcap.
             metadata: of every part.
-            attachments: the same.
-            session: of the recorder; new at each of its starts.
+            attachments: of every part.
+            session: an id, new at each start of the recorder.
 
         Raises:
             RecordingError: nothing can be recorded there, or another recorder does.
@@ -39,26 +45,26 @@ class RecordingParts:
         self._metadata = dict(metadata) | {"session": session, "recording": path.name}
         self._attachments = attachments
         self._part = 0
-        self.mended: list[Recovery] = []
-        """what killed recorders had left"""
+        self.repaired: list[Recovery] = []
+        """files that killed recorders had left"""
         self.unreadable: list[Path] = []
-        """what they had left and cannot be mended: put aside"""
-        self.unmended: list[Path] = []
-        """what they had left and the disk refuses to mend for now: left as it is"""
+        """such files that cannot be repaired, under their new names"""
+        self.unrepaired: list[Path] = []
+        """such files whose repair the disk refuses for now; left as they are"""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._disk = Disk(path.parent)
-            self._mend()
+            self._repair()
             self._number = max((number for number, _ in self._files()), default=0)
         except OSError as error:
             raise refused(f"{path}: cannot be written", error, "name another file or folder") from error
         last = self._last_part()
         self._continues = last.path.name.removesuffix(ACTIVE_SUFFIX) if last else ""
         self.before = last.next if last else {}
-        """of each key and producer, the sequence number that is due after the last part there is"""
+        """the sequence number due of each stream after the last part"""
 
     def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> RecordingWriter:
-        """Begin the next part, at `t_ns`. about: what is special about it, for its metadata.
+        """Begin the next part, at `t_ns`. about: metadata of this part only.
 
         Raises:
             RecordingError: it cannot be written.
@@ -72,7 +78,7 @@ class RecordingParts:
             **({"continues": self._continues} if self._continues else {}),
             **about,
         }
-        self.free_bytes()  # never beneath the place of a disk that has gone
+        self.free_bytes()  # raises if the disk is gone: do not write to its mount point
         try:
             writer = RecordingWriter(self._name(self._number), metadata, self._attachments, t_ns=t_ns, ledger=ledger)
         except RecordingError:
@@ -83,10 +89,10 @@ class RecordingParts:
         return writer
 
     def free_bytes(self) -> int:
-        """How much room the disk has.
+        """Free space on the disk.
 
         Raises:
-            DiskError: it has gone.
+            DiskError: the disk is gone.
         """
         return self._disk.free_bytes()
 
@@ -103,9 +109,10 @@ class RecordingParts:
         return self._path if number == 1 else self._path.with_stem(f"{self._path.stem}-{number}")
 
     def _files(self) -> list[tuple[int, Path]]:
-        """The parts there are, finished or not or torn, with their numbers."""
+        """All files of parts with their numbers: finished, active, and originals of repaired ones."""
         stem, suffix = re.escape(self._path.stem), re.escape(self._path.suffix)
-        pattern = re.compile(rf"{stem}(?:-(\d+))?{suffix}({re.escape(ACTIVE_SUFFIX)}|{re.escape(TORN_SUFFIX)})?")
+        others = "|".join(map(re.escape, (ACTIVE_SUFFIX, ORIGINAL_SUFFIX, FORMER_ORIGINAL_SUFFIX)))
+        pattern = re.compile(rf"{stem}(?:-(\d+))?{suffix}({others})?")
         matches = ((pattern.fullmatch(path.name), path) for path in self._path.parent.iterdir())
         return [(int(match[1] or 1), path) for match, path in matches if match]
 
@@ -115,30 +122,30 @@ class RecordingParts:
         except RecordingError:
             return False
 
-    def _mend(self) -> None:
+    def _repair(self) -> None:
         for _, path in sorted(self._files()):
             if not path.name.endswith(ACTIVE_SUFFIX):
                 continue
             try:
-                recovery = mend(path)
+                recovery = repair_in_place(path)
             except BlockingIOError as error:
                 raise RecordingError(
                     f"{path}: another recorder is writing it; stop it, or name another file"
                 ) from error
             except DiskError:
-                self.unmended.append(path)
+                self.unrepaired.append(path)
                 continue
             except RecordingError:
-                aside = free_torn_name(path.with_name(path.name.removesuffix(ACTIVE_SUFFIX)))
+                aside = free_original_name(path.with_name(path.name.removesuffix(ACTIVE_SUFFIX)))
                 self.unreadable.append(path.rename(aside))
                 sync_folder(aside.parent)
                 continue
             if recovery:
-                self.mended.append(recovery)
+                self.repaired.append(recovery)
 
     def _last_part(self) -> Contents | None:
-        """The last part of ours."""
+        """The contents of the last part of this recording."""
         for _, path in sorted(self._files(), reverse=True):
-            if (path.suffix == self._path.suffix or path in self.unmended) and self._is_ours(path):
+            if (path.suffix == self._path.suffix or path in self.unrepaired) and self._is_ours(path):
                 return contents_of(path)
         return None

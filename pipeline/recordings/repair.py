@@ -1,56 +1,70 @@
-"""Mending torn recordings: everything whole is kept byte for byte, and a ledger, an index and an end are put behind it.
+"""Repair of truncated and damaged recordings: every intact message is kept, and the file gets a ledger, index and end.
 
-Nothing is taken away before its replacement is on the disk. See docs/reference/recordings.md.
+What a killed recorder left is repaired in place: that needs little room and no copy. Every other repair writes a new
+file. Nothing is removed before its replacement is on the disk. See docs/reference/recordings.md.
 """
 
 from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
+import shutil
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
+from typing import BinaryIO
 
-from mcap.writer import MCAP0_MAGIC
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Chunk, Metadata
+from mcap.writer import MCAP0_MAGIC, Writer
 
-from pipeline.recordings.contents import NOTHING_WHOLE, unaccounted
-from pipeline.recordings.disk import AtomicAppendFile, refused, sync_folder, unwritten
+from pipeline.recordings.contents import NOT_A_RECORD, losses_outside_counts
+from pipeline.recordings.disk import AtomicAppendFile, not_being_written, refused, sync_folder
 from pipeline.recordings.index import SHORT_ENDING
-from pipeline.recordings.reading import RecordingError
+from pipeline.recordings.records import (
+    CORRUPT_DATA_ERRORS,
+    MESSAGE,
+    RecordingError,
+    RecordReader,
+    chunk_data,
+    records_in,
+)
 from pipeline.recordings.scan import Scan, scan
-from pipeline.recordings.writing import ACTIVE_SUFFIX, free_name, write_ending
+from pipeline.recordings.sequence_ledger import LEDGER_NAME, ledger_metadata
+from pipeline.recordings.writing import ACTIVE_SUFFIX, CHUNK_BYTES, free_name, write_ending
 
-TORN_SUFFIX = ".torn"
+ORIGINAL_SUFFIX = ".original"
+FORMER_ORIGINAL_SUFFIX = ".torn"
+"""the same in folders of earlier versions"""
 _UNFINISHED_SUFFIX = ".recovering"
-_COPY_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What became of a file."""
+    """The result of a repair."""
 
     found: Scan
     path: Path
-    """the file that is whole now"""
-    torn: Path | None = None
-    """what the torn one is called now, if it had to make room for the whole one"""
+    """the repaired file"""
+    original: Path | None = None
+    """the new name of the file before the repair, if it had to make room for the repaired one"""
 
 
 def recover(path: Path, output: Path | None = None) -> Recovery:
-    """Make a whole recording of a torn one. A file that is whole already is left as it is, or copied to `output`.
+    """Write a repaired copy of a recording. An intact file is left as it is, or copied to `output`.
 
-    output: without it the whole file takes the name of the torn one (without `.active`), which is kept as NAME.torn.
+    output: without it the repaired file takes the name of the recording (without `.active`), and the file before the
+        repair is kept as NAME.original.
 
     Raises:
-        RecordingError: the file cannot be read, is being written, or holds no whole message, or the other one exists
-            or cannot be written.
+        RecordingError: the file cannot be read, is being written, or holds no intact message; or the output exists or
+            cannot be written.
     """
     if output is not None and output.exists():
         raise RecordingError(f"{output}: exists; name another file with -o")
     try:
-        with unwritten(path):
+        with not_being_written(path):
             return _recover(path, output)
     except BlockingIOError as error:
         raise RecordingError(f"{path}: a recorder is writing it; stop it first") from error
@@ -58,28 +72,28 @@ def recover(path: Path, output: Path | None = None) -> Recovery:
         raise RecordingError(f"{path}: cannot read the recording: {error.strerror}") from error
 
 
-def mend(active: Path) -> Recovery | None:
-    """Make a recording of what a killed recorder has left, in place: that takes little room, and less time than a copy.
+def repair_in_place(active: Path) -> Recovery | None:
+    """Make a recording of what a killed recorder left, and give it the name of one; a damaged file is copied.
 
-    It is given the name of a recording. None where it held no message and was removed.
+    Returns None if the file held no message and was removed.
 
     Raises:
         BlockingIOError: a recorder is writing it.
         OSError: it cannot be written.
-        RecordingError: it cannot be read, or is no recording.
+        RecordingError: it cannot be read, or is not a recording.
     """
     file = AtomicAppendFile(active, keep=True)
     try:
-        found = _scan_of_left_over(active)
+        found = scan(active) if file.size >= len(MCAP0_MAGIC) else None
         if found is None or not (found.messages or found.is_damaged):
             active.unlink()
             return None
-        if not found.is_whole and (found.is_damaged or not found.fits):
+        if found.is_damaged or not (found.is_intact or found.is_laid_out_as_written):
             return _recover(active, None)
-        if not found.is_whole:
-            file.cut(found.solid_end)
+        if not found.is_intact:
+            file.cut(found.data_end)
             try:
-                _end(file, found, before=found.tail)
+                write_ending(file, found.index, _ledger_of(found), before=found.missing_indexes)
             except OSError:
                 with suppress(OSError):
                     file.write(SHORT_ENDING)
@@ -92,30 +106,23 @@ def mend(active: Path) -> Recovery | None:
         file.close()
 
 
-def _scan_of_left_over(active: Path) -> Scan | None:
-    with active.open("rb") as file:
-        begun = file.read(len(MCAP0_MAGIC))
-    return None if len(begun) < len(MCAP0_MAGIC) else scan(active)
-
-
 def _recover(path: Path, output: Path | None) -> Recovery:
     found = scan(path)
-    if found.is_whole and output is None and not path.name.endswith(ACTIVE_SUFFIX):
+    if found.is_intact and output is None and not path.name.endswith(ACTIVE_SUFFIX):
         return Recovery(found, path)
-    if not found.messages and not found.is_whole:
-        raise RecordingError(f"{path}: there is no whole message in it: nothing can be recovered")
+    if not found.messages and not found.is_intact:
+        raise RecordingError(f"{path}: it holds no intact message: nothing can be recovered")
     target = output or _finished_name(path)
-    unfinished = target.with_name(target.name + _UNFINISHED_SUFFIX)
-    torn = None
+    original = None
     try:
-        if found.is_whole and output is None:
+        if found.is_intact and output is None:
             path.rename(target)
             sync_folder(target.parent)
             return Recovery(found, target)
-        _write(unfinished, lambda file: _copy(found, file))
+        unfinished = _written_copy(found, target)
         if output is None:
-            torn = free_torn_name(target)
-            _give_second_name(path, torn)
+            original = free_original_name(target)
+            _add_name(path, original)
         unfinished.replace(target)
         sync_folder(target.parent)
         if output is None and path != target:
@@ -124,62 +131,82 @@ def _recover(path: Path, output: Path | None) -> Recovery:
         is_full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         advice = "make room" if is_full else "name another file with -o"
         raise refused(f"{target}: cannot be written", error, f"{path.name} is left as it was; {advice}") from error
-    return Recovery(found, target, torn)
+    return Recovery(found, target, original)
 
 
-def _give_second_name(path: Path, name: Path) -> None:
-    """So that a kill at any moment leaves it under one of them."""
+def _add_name(path: Path, name: Path) -> None:
+    """Give a file a second name, so that a kill at any moment leaves it under one of the two."""
     try:
         os.link(path, name)
         sync_folder(path.parent)
-    except OSError:  # a disk without links
+    except OSError:  # a file system without links
         path.rename(name)
 
 
-def _write(path: Path, fill: Callable[[AtomicAppendFile], None]) -> None:
-    """Make a file; none if that fails. OSError in that case."""
-    file = AtomicAppendFile(path)
+def _written_copy(found: Scan, target: Path) -> Path:
+    """A repaired copy, on the disk under a temporary name. Raises OSError, and leaves no file then."""
+    unfinished = target.with_name(target.name + _UNFINISHED_SUFFIX)
     try:
-        fill(file)
-        file.sync()
+        with unfinished.open("wb") as file:
+            if found.is_intact:
+                with found.path.open("rb") as source:
+                    shutil.copyfileobj(source, file)
+            else:
+                _write_repaired(found, file)
+            file.flush()
+            os.fsync(file.fileno())
     except BaseException:
-        path.unlink()
+        unfinished.unlink(missing_ok=True)
         raise
-    finally:
-        file.close()
+    return unfinished
 
 
-def _copy(found: Scan, file: AtomicAppendFile) -> None:
-    """All that is whole of a file, and an ending."""
-    if found.is_whole or (found.fits and not found.is_damaged):
-        left = found.walk.size if found.is_whole else found.solid_end
-        with found.path.open("rb") as source:
-            while left and (block := source.read(min(left, _COPY_BYTES))):
-                file.write(block)
-                left -= len(block)
-        if not found.is_whole:
-            _end(file, found, before=found.tail)
-        return
+def _write_repaired(found: Scan, file: BinaryIO) -> None:
+    """Write everything intact in a file, and a ledger that names what was lost."""
+    writer = Writer(file, CHUNK_BYTES)
+    writer.start(found.profile, "fantwin")
+    schemas = {s.id: writer.register_schema(s.name, s.encoding, s.data) for s in found.index.schemas.values()}
+    channels = {
+        c.id: writer.register_channel(c.topic, c.message_encoding, schemas.get(c.schema_id, 0), c.metadata)
+        for c in found.index.channels.values()
+    }
+    for record in RecordReader(found.path):
+        data = b""
+        match record.parsed:
+            case Metadata(name=name, metadata=metadata):
+                if name == LEDGER_NAME:
+                    break
+                writer.add_metadata(name, metadata)
+            case Attachment() as a:
+                writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
+            case Chunk() as chunk:
+                with suppress(*CORRUPT_DATA_ERRORS):
+                    data = chunk_data(chunk)
+            case None if record.opcode == Opcode.MESSAGE:
+                data = record.data
+            case None if record.opcode == Opcode.DATA_END:
+                break
+            case _:
+                pass
+        for _, opcode, start, end in records_in(data):
+            if opcode == Opcode.MESSAGE:
+                channel, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(data, start)
+                if channel in channels:
+                    payload = data[start + MESSAGE.size : end]
+                    writer.add_message(channels[channel], log_time_ns, payload, publish_time_ns, sequence)
+    writer.flush()
+    writer.add_metadata(LEDGER_NAME, _ledger_of(found))
+    writer.finish()
 
-    def keep(data: bytes) -> int:
-        offset = file.size
-        file.write(data)
-        return offset
 
-    file.write(MCAP0_MAGIC)
-    again = scan(found.path, keep)
-    _end(file, again)
+def _ledger_of(found: Scan) -> dict[str, str]:
+    """The ledger of a repaired file, with the losses that its counts do not show.
 
-
-def _end(file: AtomicAppendFile, found: Scan, before: bytes = b"") -> None:
-    """Write an ending that tells what was lost. OSError if the disk refuses."""
-    write_ending(file, found.index, found.accounts, before=before, has_ended=found.has_ended, recovered=_said_of(found))
-
-
-def _said_of(found: Scan) -> list[str]:
-    """The losses that its accounts do not show. An unfinished chunk at the end is told as the end that is lacking."""
-    tail = not found.is_ended and not found.is_damaged
-    return [line for line in unaccounted(found) if not (tail and line.startswith(NOTHING_WHOLE))]
+    The bytes of an unfinished chunk at the end are not listed: the missing end is.
+    """
+    at_the_end_only = not found.is_ended and not found.is_damaged
+    lost = [line for line in losses_outside_counts(found) if not (at_the_end_only and line.startswith(NOT_A_RECORD))]
+    return ledger_metadata(found.streams, has_ended=found.has_ended, recovered=lost)
 
 
 def _finished_name(path: Path) -> Path:
@@ -188,8 +215,8 @@ def _finished_name(path: Path) -> Path:
     return free_name(path.with_name(path.name.removesuffix(ACTIVE_SUFFIX)))
 
 
-def free_torn_name(target: Path) -> Path:
-    """What a torn file is called that has to make room for `target`."""
-    torn = target.with_name(target.name + TORN_SUFFIX)
-    names = chain([torn], (torn.with_name(f"{torn.name}-{number}") for number in count(2)))
+def free_original_name(target: Path) -> Path:
+    """The first free name for a file that has to make room for `target`."""
+    original = target.with_name(target.name + ORIGINAL_SUFFIX)
+    names = chain([original], (original.with_name(f"{original.name}-{number}") for number in count(2)))
     return next(name for name in names if not name.exists())

@@ -1,9 +1,8 @@
-"""Everything a file holds, found by going through all of it: what is there, what is damaged, what must be missing."""
+"""Going through all of a file: what it holds, what is damaged, and what must be missing."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from zlib import crc32
@@ -20,12 +19,10 @@ from pipeline.recordings.reading import METADATA_NAME
 from pipeline.recordings.records import (
     CORRUPT_DATA_ERRORS,
     MESSAGE,
-    RECORD,
     Record,
     RecordReader,
     chunk_data,
     parse,
-    record_bytes,
     records_in,
 )
 from pipeline.recordings.sequence_ledger import (
@@ -34,15 +31,12 @@ from pipeline.recordings.sequence_ledger import (
     LEDGER_NAME,
     SequenceLedger,
     StreamCounts,
-    StreamId,
-    accounts_of,
-    before_of,
-    corrected,
-    recovered_of,
+    before_from_metadata,
+    correct_for_damage,
+    counts_from_metadata,
+    recovered_from_metadata,
 )
-
-Keep = Callable[[bytes], int]
-"""Takes bytes that are to be kept of the file, in order; says where they stand in what is made of it."""
+from schemas.streams import StreamId
 
 
 @dataclass
@@ -50,23 +44,23 @@ class Scan:
     """What was found in a file by `scan`."""
 
     path: Path
-    walk: RecordReader
+    reader: RecordReader
+    profile: str = ""
     index: Index = field(default_factory=Index)
-    """of what was kept"""
-    census: MessageCounts = field(default_factory=MessageCounts)
-    """of the messages that were found"""
+    """of what is intact"""
+    counts: MessageCounts = field(default_factory=MessageCounts)
     recorded: dict[StreamId, StreamCounts] | None = None
-    """the ledger that stands in the file, if it was finished"""
+    """the ledger in the file; None if it was never finished"""
     before: dict[StreamId, int] = field(default_factory=dict)
-    """with which number each producer should go on, by the parts before"""
+    """the sequence number due of each stream at the start of the file, from the parts before it"""
     has_ended: bool = False
-    """its recorder ended in order with this file, and not because something was in its way"""
+    """the recorder was stopped in order with this file, and not by an error"""
     recovered: tuple[str, ...] = ()
-    """what was said to be lost when it was mended before, one line each"""
+    """what an earlier repair reported as lost, one line each"""
     metadata: dict[str, str] = field(default_factory=dict)
     attachments: list[str] = field(default_factory=list)
     is_ended: bool = False
-    """nothing was recorded after what is here: its recorder had come to the end"""
+    """the data has its end: nothing was recorded after what is here"""
     has_index: bool = False
     damaged_chunks: int = 0
     damaged_attachments: int = 0
@@ -74,180 +68,154 @@ class Scan:
     """others"""
     nameless: int = 0
     """messages whose channel was described in a damaged chunk"""
-    thrown_away_bytes: int = 0
-    """of records that are not whole"""
-    fits: bool = True
-    """what is kept stands where it stood, up to `solid_end`; behind that there must be `tail`"""
-    solid_end: int = len(MCAP0_MAGIC)
-    tail: bytes = b""
+    discarded_bytes: int = 0
+    """in records that are not whole"""
+    data_end: int = len(MCAP0_MAGIC)
+    """offset after the last intact chunk or other record of the data"""
+    missing_indexes: bytes = b""
+    """the message indexes of that chunk, which must follow at `data_end`"""
+    is_laid_out_as_written: bool = True
+    """every record is where our own writer puts it: the data can stay where it is when the file is repaired"""
 
     @property
     def is_damaged(self) -> bool:
         """Something in the middle cannot be read."""
         records = self.damaged_chunks + self.damaged_attachments + self.damaged_records
-        return bool(self.walk.damaged_ranges or records or self.nameless)
+        return bool(self.reader.damaged_ranges or records or self.nameless)
 
     @property
-    def is_whole(self) -> bool:
-        """There is nothing to mend."""
-        return self.walk.is_complete and self.has_index and not self.is_damaged
+    def is_intact(self) -> bool:
+        """There is nothing to repair."""
+        return self.reader.is_complete and self.has_index and not self.is_damaged
 
     @property
     def messages(self) -> int:
-        """How many there are, whosever."""
+        """Number of messages, on channels of any origin."""
         return self.index.messages.total()
 
     @property
-    def accounts(self) -> dict[StreamId, StreamCounts]:
-        """The ledger that was kept while it was written, if it is there, less what is damaged; or the one found."""
-        found = self.census.ledger.accounts
+    def streams(self) -> dict[StreamId, StreamCounts]:
+        """The counts of each stream: the ledger in the file, corrected for damage; without a ledger, as found."""
+        found = self.counts.ledger.counts
         if self.recorded is None:
             return found
-        return corrected(self.recorded, found) if self.is_damaged else self.recorded
+        return correct_for_damage(self.recorded, found) if self.is_damaged else self.recorded
 
 
-def scan(path: Path, keep: Keep | None = None) -> Scan:
+def scan(path: Path) -> Scan:
     """Go through a file.
 
-    keep: is given what is to be kept of it behind the magic: whole records up to the end of the data, chunks with an
-        index. Without it, places in `index` are as if all that is damaged had been cut out.
-
     Raises:
-        RecordingError: it cannot be read, or is no MCAP file.
+        RecordingError: it cannot be read, or is not an MCAP file.
     """
-    return _Scanner(path, keep).scan()
+    found = Scan(path, RecordReader(path))
+    scanner = _Scanner(found)
+    footer: Record | None = None
+    for record in found.reader:
+        if found.is_ended:
+            footer = record
+        else:
+            scanner.add(record)
+    reader = found.reader
+    found.has_index = footer is not None and reader.is_complete and _has_valid_summary(path, footer)
+    read_up_to = reader.size if found.is_ended else reader.end
+    found.discarded_bytes += reader.size - read_up_to + sum(end - start for start, end in reader.damaged_ranges)
+    return found
 
 
 class _Scanner:
-    def __init__(self, path: Path, keep: Keep | None) -> None:
-        self._found = Scan(path, RecordReader(path))
-        self._offset = len(MCAP0_MAGIC)
-        self._keep = keep or self._pass_over
-        self._late: Summary | None = None
-        self._made_up: set[int] = set()
-        self._has_begun = False
-        self._past_data = False
+    """Adds the records of the data section to a Scan."""
 
-    def _pass_over(self, data: bytes) -> int:
-        before = self._offset
-        self._offset += len(data)
-        return before
+    def __init__(self, found: Scan) -> None:
+        self._found = found
+        self._summary: Summary | None = None
+        self._nameless: set[int] = set()
 
-    def scan(self) -> Scan:
-        found, walk = self._found, self._found.walk
-        footer: Record | None = None
-        for record in walk:
-            if not self._past_data:
-                self._take(record)
-            else:
-                footer = record
-        found.has_index = footer is not None and walk.is_complete and self._is_index_sound(footer)
-        torn_at = walk.end if not self._past_data else walk.size
-        found.thrown_away_bytes += walk.size - torn_at + sum(end - start for start, end in walk.damaged_ranges)
-        return found
-
-    def _take(self, record: Record) -> None:
+    def add(self, record: Record) -> None:
         found = self._found
         try:
-            self._take_kind(record)
+            self._add(record)
         except CORRUPT_DATA_ERRORS:
-            found.thrown_away_bytes += record.end - record.offset
+            found.discarded_bytes += record.end - record.offset
             found.damaged_chunks += record.opcode == Opcode.CHUNK
             found.damaged_attachments += record.opcode == Opcode.ATTACHMENT
             found.damaged_records += record.opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT)
 
-    def _take_kind(self, record: Record) -> None:
-        opcode, content = record.opcode, record.content
-        if opcode == Opcode.CHUNK:
-            self._take_chunk(record)
-        elif opcode == Opcode.METADATA:
-            self._take_metadata(record)
-        elif opcode == Opcode.ATTACHMENT:
-            self._take_attachment(record)
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self._describe(opcode, content)
-            self._keep_record(record)
-        elif opcode == Opcode.HEADER and not self._has_begun:
-            parse(Header, content)
-            self._keep_record(record)
-        elif opcode == Opcode.MESSAGE:
-            self._take_loose(record)
-        elif opcode == Opcode.DATA_END and len(content) == 4:
-            self._found.is_ended = self._past_data = True
-        elif opcode != Opcode.MESSAGE_INDEX or len(content) != 6 + struct.unpack_from("<HI", content)[1]:
-            raise ValueError("no such record may stand here")  # indexes of messages may, and are made anew
-
-    def _take_loose(self, record: Record) -> None:
-        """A message outside of chunks, as others write them."""
-        channel, sequence, log_time_ns, _ = MESSAGE.unpack_from(record.content)
-        if not self._found.census.knows(channel):
-            raise ValueError("a message of no channel")
-        self._found.census.count(channel, sequence, log_time_ns, record.content, MESSAGE.size, len(record.content))
-        self._found.index.note_loose(channel, log_time_ns)
-        self._keep_record(record)
-
-    def _keep_record(self, record: Record) -> int:
-        if not self._has_begun and record.opcode != Opcode.HEADER:
-            self._keep(record_bytes(Header(profile="", library="fantwin")))
-        self._has_begun = True
-        offset = self._keep(RECORD.pack(record.opcode, len(record.content)) + record.content)
-        self._found.fits &= offset == record.offset
-        self._found.solid_end, self._found.tail = offset + (record.end - record.offset), b""
-        return offset
-
-    def _take_metadata(self, record: Record) -> None:
-        found, metadata = self._found, parse(Metadata, record.content)
-        if metadata.name == LEDGER_NAME:
-            found.recorded = accounts_of(metadata.metadata)
-            found.has_ended = ENDED in metadata.metadata
-            found.recovered = recovered_of(metadata.metadata)
-            found.is_ended = self._past_data = True
+    def _add(self, record: Record) -> None:
+        found, length = self._found, record.end - record.offset
+        if record.opcode == Opcode.MESSAGE_INDEX:
             return
+        expected_offset = found.data_end + len(found.missing_indexes)
+        indexes = b""
+        match record.parsed:
+            case Chunk() as chunk:
+                indexes = self._add_chunk(record, chunk)
+            case Metadata(name=name, metadata=metadata) if name == LEDGER_NAME:
+                found.recorded = counts_from_metadata(metadata)
+                found.has_ended = ENDED in metadata
+                found.recovered = recovered_from_metadata(metadata)
+                found.is_ended = True
+                return
+            case Metadata() as metadata:
+                self._add_metadata(metadata)
+                found.index.add_metadata(metadata, record.offset, length)
+            case Attachment() as attachment:
+                found.attachments.append(attachment.name)
+                found.index.add_attachment(attachment, record.offset, length)
+            case Schema() | Channel() as description:
+                self._describe(description)
+            case Header(profile=profile) if record.offset == len(MCAP0_MAGIC):
+                found.profile = profile
+            case None if record.opcode == Opcode.MESSAGE:
+                self._add_unchunked(record)
+            case None if record.opcode == Opcode.DATA_END and len(record.content) == 4:
+                found.is_ended = True
+                return
+            case _:
+                raise ValueError(f"a record of kind {record.opcode} in the data section, or a damaged one")
+        found.is_laid_out_as_written &= record.offset == expected_offset
+        found.data_end, found.missing_indexes = record.end, indexes
+
+    def _add_metadata(self, metadata: Metadata) -> None:
+        found = self._found
         if metadata.name == METADATA_NAME:
             found.metadata.update(metadata.metadata)
         elif metadata.name == BEFORE_NAME:
-            found.before = before_of(metadata.metadata)
-            found.census.ledger = SequenceLedger(found.before)
-        found.index.note_metadata(metadata, self._keep_record(record), (record.end - record.offset))
+            found.before = before_from_metadata(metadata.metadata)
+            found.counts.ledger = SequenceLedger(found.before)
 
-    def _take_attachment(self, record: Record) -> None:
-        attachment = parse(Attachment, record.content)
-        crc = int.from_bytes(record.content[-4:], "little")
-        if crc and crc != crc32(record.content[:-4]):
-            raise ValueError("an attachment that is not what was written")
-        self._found.attachments.append(attachment.name)
-        self._found.index.note_attachment(attachment, self._keep_record(record), (record.end - record.offset))
+    def _add_unchunked(self, record: Record) -> None:
+        """A message outside of chunks, as other writers may write them."""
+        channel, sequence, received_t_ns, _ = MESSAGE.unpack_from(record.content)
+        if not self._found.counts.knows(channel):
+            raise ValueError("a message without a channel")
+        self._found.counts.add(channel, sequence, received_t_ns, record.content, MESSAGE.size, len(record.content))
+        self._found.index.add_unchunked_message(channel, received_t_ns)
 
-    def _take_chunk(self, record: Record) -> None:
-        assert isinstance(record.parsed, Chunk)
-        chunk = record.parsed
-        data = chunk_data(chunk)
+    def _add_chunk(self, record: Record, chunk: Chunk) -> bytes:
+        """Returns the message indexes that belong after the chunk."""
+        found, data = self._found, chunk_data(chunk)
         entries: dict[int, list[int]] = {}
         for offset, opcode, start, end in records_in(data):
             if opcode == Opcode.MESSAGE:
-                channel, sequence, log_time_ns, _ = MESSAGE.unpack_from(data, start)
+                channel, sequence, received_t_ns, _ = MESSAGE.unpack_from(data, start)
                 flat = entries.get(channel)
                 if flat is None:
                     flat = entries[channel] = []
-                    self._require(channel)
-                flat += (log_time_ns, offset)
-                self._found.census.count(channel, sequence, log_time_ns, data, start + MESSAGE.size, end)
+                    if not found.counts.knows(channel):
+                        self._describe_from_summary(channel)
+                flat += (received_t_ns, offset)
+                found.counts.add(channel, sequence, received_t_ns, data, start + MESSAGE.size, end)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._describe(opcode, data[start:end])
-        self._found.nameless += sum(len(entries[channel]) // 2 for channel in entries.keys() & self._made_up)
-        self._keep_chunk(record, chunk, entries)
-
-    def _keep_chunk(self, record: Record, chunk: Chunk, entries: dict[int, list[int]]) -> None:
-        offset = self._keep_record(record)
-        indexes, offsets = message_indexes(entries, offset + (record.end - record.offset))
-        self._keep(indexes)
-        self._found.tail = indexes
-        self._found.index.note_chunk(
+                self._describe(parse(Schema if opcode == Opcode.SCHEMA else Channel, data[start:end]))
+        found.nameless += sum(len(entries[channel]) // 2 for channel in entries.keys() & self._nameless)
+        indexes, offsets = message_indexes(entries, record.end)
+        found.index.add_chunk(
             ChunkIndex(
                 message_start_time=chunk.message_start_time,
                 message_end_time=chunk.message_end_time,
-                chunk_start_offset=offset,
-                chunk_length=(record.end - record.offset),
+                chunk_start_offset=record.offset,
+                chunk_length=record.end - record.offset,
                 message_index_offsets=offsets,
                 message_index_length=len(indexes),
                 compression=chunk.compression,
@@ -256,46 +224,39 @@ class _Scanner:
             ),
             {channel: len(flat) // 2 for channel, flat in entries.items()},
         )
+        return indexes
 
-    def _describe(self, opcode: int, content: bytes) -> None:
-        index = self._found.index
-        if opcode == Opcode.SCHEMA:
-            schema = parse(Schema, content)
-            index.schemas[schema.id] = schema
-            return
-        channel = parse(Channel, content)
-        index.channels[channel.id] = channel
-        self._found.census.describe(channel.id, channel.topic)
+    def _describe(self, description: Schema | Channel) -> None:
+        if isinstance(description, Schema):
+            self._found.index.schemas[description.id] = description
+        else:
+            self._found.index.channels[description.id] = description
+            self._found.counts.add_channel(description.id, description.topic)
 
-    def _require(self, channel: int) -> None:
-        if not self._found.census.knows(channel):
-            self._describe_late(channel)
+    def _describe_from_summary(self, number: int) -> None:
+        """A channel that was described in a damaged chunk: taken from the summary, or else left without a name."""
+        self._summary = self._summary or summary_of(self._found.path)
+        channel = self._summary.channels.get(number)
+        if channel is None:
+            self._nameless.add(number)
+            channel = Channel(number, f"lost/{number}", "", {}, 0)
+        elif channel.schema_id in self._summary.schemas:
+            self._describe(self._summary.schemas[channel.schema_id])
+        self._describe(channel)
 
-    def _describe_late(self, number: int) -> None:
-        """A channel whose description was in a damaged chunk: as the summary has it, or else without a name."""
-        self._late = self._late or summary_of(self._found.path)
-        known = self._late.channels.get(number)
-        if known is None:
-            self._made_up.add(number)
-        channel = known or Channel(number, f"lost/{number}", "", {}, 0)
-        schema = self._late.schemas.get(channel.schema_id)
-        self._keep(record_bytes(*([schema] if schema else []), channel))
-        for each in (schema, channel):
-            if each:
-                self._describe(Opcode.SCHEMA if each is schema else Opcode.CHANNEL, record_bytes(each)[RECORD.size :])
 
-    def _is_index_sound(self, footer: Record) -> bool:
-        start, _, crc = struct.unpack("<QQI", footer.content)
-        if not start:
-            return False
-        with self._found.path.open("rb") as file:
-            file.seek(start)
-            summary = file.read(max(0, footer.end - 4 - start))
-        return not crc or crc32(summary) == crc
+def _has_valid_summary(path: Path, footer: Record) -> bool:
+    start, _, crc = struct.unpack("<QQI", footer.content)
+    if not start:
+        return False
+    with path.open("rb") as file:
+        file.seek(start)
+        summary = file.read(max(0, footer.end - 4 - start))
+    return not crc or crc32(summary) == crc
 
 
 def summary_of(path: Path) -> Summary:
-    """What stands behind the data of a file; an empty one where there is none, or none that can be read."""
+    """The summary section of a file; an empty one if it has none that can be read."""
     with path.open("rb") as file:
         try:
             return make_reader(file).get_summary() or Summary()

@@ -1,12 +1,12 @@
-"""The account of a recording: of every key and producer, what was recorded, what is missing, what came twice.
+"""The sequence ledger of a recording: how many messages of each stream were recorded, are missing, or came twice.
 
-A producer numbers its messages on a key without gaps, so every hole between the first and the last is a loss.
+See schemas/streams.py for what a stream is and how its gaps are counted.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 
 from schemas.messages import Health
@@ -14,20 +14,23 @@ from schemas.streams import StreamId, StreamState, output_streams
 from schemas.topics import topic_of
 
 LEDGER_NAME = "fantwin.ledger"
-"""the metadata record that holds a finished ledger"""
+"""the metadata record, after the last message, that holds a finished ledger"""
 ENDED = "ended"
-"""its entry that says that the recorder ended in order with this part"""
+"""its entry for a part with which the recorder was stopped in order"""
 RECOVERED = "recovered"
-"""its entry that says what was lost, or may have been, in a file that was mended"""
+"""its entry in a repaired file: what was lost, or may have been"""
 BEFORE_NAME = "fantwin.before"
-"""the one, before the first message, that says with which number each producer should go on"""
+"""the metadata record, before the first message, that holds the sequence number due of each stream"""
 
 
 @dataclass(slots=True)
 class StreamCounts:
-    """Of one key and producer. `missing` counts holes, that before the first message included where it is known what
-    had been recorded before. Sequence numbers and times, of receipt, are of the messages here; None without any.
-    Of a damaged file `last_sequence` is that of the last message that was recorded."""
+    """The messages of one stream in a recording.
+
+    `missing` includes the gap before the first message where the parts before show one. Sequence numbers and times of
+    receipt are those of the messages in the file; None without any. In a damaged file `last_sequence` is that of the
+    last message that was recorded.
+    """
 
     messages: int = 0
     missing: int = 0
@@ -38,77 +41,87 @@ class StreamCounts:
     last_ns: int | None = None
 
 
-_FIGURES = {field.name for field in fields(StreamCounts)}
+_FIELDS = {field.name for field in fields(StreamCounts)}
 
 
 class SequenceLedger:
-    """Kept message by message, in the order in which they are recorded."""
+    """Counts messages in the order in which they are recorded."""
 
     def __init__(self, before: Mapping[StreamId, int] | None = None) -> None:
-        """before: with which sequence number each producer should go on, where parts have gone before."""
-        self.accounts: dict[StreamId, StreamCounts] = {}
+        """before: the sequence number due of each stream, after the parts before this one."""
+        self.counts: dict[StreamId, StreamCounts] = {}
         self._streams = {stream: StreamState(sequence) for stream, sequence in (before or {}).items()}
         self._published: dict[StreamId, int] = {}
 
-    def note(self, key: str, producer: str, sequence: int, log_time_ns: int) -> None:
-        """A message was recorded. A twin's card is written again at the start of each part, and counts once."""
-        line = (key, producer)
-        state = self._state(line)
-        if state.is_duplicate(sequence) and key.endswith("/twin"):
-            return
-        account = self.accounts.get(line)
-        if account is None:
-            account = self.accounts[line] = StreamCounts()
-        if account.messages == 0:
-            account.first_sequence = sequence
-        account.messages += 1
-        if account.first_ns is None or log_time_ns < account.first_ns:  # the host's clock may be set back
-            account.first_ns = log_time_ns
-        if account.last_ns is None or log_time_ns > account.last_ns:
-            account.last_ns = log_time_ns
-        if state.accept(sequence):
-            account.last_sequence = sequence
-        account.missing, account.duplicated = state.missing, state.duplicated
-
     @property
     def next(self) -> dict[StreamId, int]:
-        """The sequence number each producer should go on with."""
+        """The sequence number due of each stream."""
         streams = self._streams.items()
         return {stream: state.next_sequence for stream, state in streams if state.next_sequence is not None}
 
-    def note_health(self, health: Health) -> None:
-        """A health was recorded: it says how much its stage had published by then."""
+    def add(self, key: str, producer: str, sequence: int, received_t_ns: int) -> None:
+        """Count a recorded message. The card of a twin is repeated at the start of each part and counts once."""
+        stream = (key, producer)
+        state = self._state(stream)
+        if state.is_duplicate(sequence) and key.endswith("/twin"):
+            return
+        counts = self.counts.get(stream)
+        if counts is None:
+            counts = self.counts[stream] = StreamCounts()
+        if counts.messages == 0:
+            counts.first_sequence = sequence
+        counts.messages += 1
+        if counts.first_ns is None or received_t_ns < counts.first_ns:  # the host's clock may be set back
+            counts.first_ns = received_t_ns
+        if counts.last_ns is None or received_t_ns > counts.last_ns:
+            counts.last_ns = received_t_ns
+        if state.accept(sequence):
+            counts.last_sequence = sequence
+        counts.missing, counts.duplicated = state.missing, state.duplicated
+
+    def add_health(self, health: Health) -> None:
+        """Use a recorded health: it says how many messages its stage had published."""
         for stream, published in output_streams(health).items():
             self._published[stream] = published
             if published == 0 and _is_recorded(stream[0]):
-                self._state(stream).skip_to(0)  # from its first message on, each is recorded or missing
+                self._state(stream).skip_to(0)  # all its messages are known from here on: recorded or missing
 
-    def lose(self, key: str, producer: str, sequence: int) -> None:
-        """A message came that is not going to be recorded: a hole, as soon as a later one is, or else at the end."""
-        line = (key, producer)
-        state = self._state(line)
+    def add_lost(self, key: str, producer: str, sequence: int) -> None:
+        """A received message will not be recorded: it is missing as soon as a later one is recorded, or at the end."""
+        stream = (key, producer)
+        state = self._state(stream)
         if state.next_sequence is None:
             state.skip_to(sequence)
-        self._published[line] = max(sequence + 1, self._published.get(line, 0))
+        self._published[stream] = max(sequence + 1, self._published.get(stream, 0))
 
-    def note_duplicated(self, key: str, producer: str, count: int = 1) -> None:
-        """Messages came again and were not recorded again."""
+    def add_duplicated(self, key: str, producer: str, count: int = 1) -> None:
+        """Count messages that came again and were not recorded again."""
         state = self._state((key, producer))
         state.duplicated += count
-        self.accounts.setdefault((key, producer), StreamCounts()).duplicated = state.duplicated
+        self.counts.setdefault((key, producer), StreamCounts()).duplicated = state.duplicated
 
     def unrecorded(self) -> dict[StreamId, int]:
-        """How many messages are known to have been published after the last one recorded, above all by healths."""
+        """How many messages of each stream are known (from health, say) to follow the last one recorded."""
         due = self.next
-        behind = {line: published - due.get(line, published) for line, published in self._published.items()}
-        return {line: count for line, count in behind.items() if count > 0}
+        behind = {stream: published - due.get(stream, published) for stream, published in self._published.items()}
+        return {stream: count for stream, count in behind.items() if count > 0}
 
-    def settle(self) -> None:
-        """The session is over: what was published and has not come is missing."""
-        for line in self.unrecorded():
-            state = self._state(line)
-            state.skip_to(self._published[line])
-            self.accounts.setdefault(line, StreamCounts()).missing = state.missing
+    def finish(self) -> None:
+        """End the session: what was published and has not come is missing."""
+        for stream in self.unrecorded():
+            state = self._state(stream)
+            state.skip_to(self._published[stream])
+            self.counts.setdefault(stream, StreamCounts()).missing = state.missing
+
+    def for_next_part(self) -> SequenceLedger:
+        """An empty ledger that continues this one."""
+        ledger = SequenceLedger(self.next)
+        ledger._published = self._published
+        return ledger
+
+    def before_as_metadata(self) -> dict[str, str]:
+        """`next` as a metadata record; meant for the start of a part."""
+        return {" ".join(stream): str(sequence) for stream, sequence in self.next.items()}
 
     def _state(self, stream: StreamId) -> StreamState:
         state = self._streams.get(stream)
@@ -116,84 +129,84 @@ class SequenceLedger:
             state = self._streams[stream] = StreamState()
         return state
 
-    def following(self) -> SequenceLedger:
-        """An empty one for the part after this."""
-        ledger = SequenceLedger(self.next)
-        ledger._published = self._published
-        return ledger
 
-    def before_as_metadata(self) -> dict[str, str]:
-        """`next` as text for a metadata record; only sensible before the first message."""
-        return {" ".join(line): str(sequence) for line, sequence in self.next.items()}
+def ledger_metadata(
+    streams: Mapping[StreamId, StreamCounts], *, has_ended: bool = False, recovered: Sequence[str] = ()
+) -> dict[str, str]:
+    """The ledger as a metadata record: `<key> <producer>` to the counts as JSON.
+
+    recovered: in a repaired file, what was lost or may have been, one line each.
+    """
+    entries = {" ".join(stream): json.dumps(asdict(counts)) for stream, counts in streams.items()}
+    if has_ended:
+        entries[ENDED] = "in order"
+    if recovered:
+        entries[RECOVERED] = json.dumps(list(recovered))
+    return entries
 
 
-def as_metadata(accounts: Mapping[StreamId, StreamCounts]) -> dict[str, str]:
-    """Text for a metadata record: key and producer to the account as JSON."""
-    return {" ".join(line): json.dumps(asdict(account)) for line, account in accounts.items()}
-
-
-def accounts_of(metadata: Mapping[str, str]) -> dict[StreamId, StreamCounts]:
-    """What `as_metadata` has written. Raises ValueError if it is not that."""
-    accounts = {}
+def counts_from_metadata(metadata: Mapping[str, str]) -> dict[StreamId, StreamCounts]:
+    """The counts in a ledger's metadata record. Raises ValueError if it is not one."""
+    streams = {}
     for name, text in metadata.items():
         if name not in (ENDED, RECOVERED):
             values = json.loads(text)
-            if not isinstance(values, dict) or values.keys() != _FIGURES:
-                raise ValueError(f"{name}: no account")
+            if not isinstance(values, dict) or values.keys() != _FIELDS:
+                raise ValueError(f"{name}: not the counts of a stream")
             if not all(value is None or type(value) is int for value in values.values()):
-                raise ValueError(f"{name}: an account of something else than numbers")
-            accounts[_line(name)] = StreamCounts(**values)
-    return accounts
+                raise ValueError(f"{name}: counts that are not whole numbers")
+            streams[_stream(name)] = StreamCounts(**values)
+    return streams
 
 
-def recovered_of(metadata: Mapping[str, str]) -> tuple[str, ...]:
-    """What the ledger of a mended file says of it, one line each. Raises ValueError if it is not that."""
+def recovered_from_metadata(metadata: Mapping[str, str]) -> tuple[str, ...]:
+    """What the ledger of a repaired file reports as lost, one line each. Raises ValueError if it is not that."""
     lines = json.loads(metadata.get(RECOVERED, "[]"))
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
-        raise ValueError(f"{RECOVERED}: no lines")
+        raise ValueError(f"{RECOVERED}: not a list of lines")
     return tuple(lines)
 
 
-def corrected(
+def before_from_metadata(metadata: Mapping[str, str]) -> dict[StreamId, int]:
+    """What `before_as_metadata` has written. Raises ValueError if it is not that."""
+    return {_stream(name): int(text) for name, text in metadata.items()}
+
+
+def correct_for_damage(
     recorded: Mapping[StreamId, StreamCounts], found: Mapping[StreamId, StreamCounts]
 ) -> dict[StreamId, StreamCounts]:
-    """The ledger of a file that has been damaged since: what it says was recorded and is not found is missing."""
-    accounts = dict(found)
-    for line, said in recorded.items():
-        here = found.get(line, StreamCounts())
-        accounts[line] = replace(
-            said,
+    """The ledger of a file that was damaged later: what it says was recorded and is not found is missing."""
+    streams = dict(found)
+    for stream, counts in recorded.items():
+        here = found.get(stream, StreamCounts())
+        streams[stream] = replace(
+            counts,
             messages=here.messages,
-            missing=said.missing + max(0, said.messages - here.messages),
+            missing=counts.missing + max(0, counts.messages - here.messages),
             first_sequence=here.first_sequence,
             first_ns=here.first_ns,
             last_ns=here.last_ns,
         )
-    return accounts
+    return streams
 
 
-def next_of(before: Mapping[StreamId, int], accounts: Mapping[StreamId, StreamCounts]) -> dict[StreamId, int]:
-    """With which number each producer should go on after a part."""
-    last = {line: account.last_sequence for line, account in accounts.items()}
-    return dict(before) | {line: sequence + 1 for line, sequence in last.items() if sequence is not None}
+def next_sequences(before: Mapping[StreamId, int], streams: Mapping[StreamId, StreamCounts]) -> dict[StreamId, int]:
+    """The sequence number due of each stream after a part."""
+    last = {stream: counts.last_sequence for stream, counts in streams.items()}
+    return dict(before) | {stream: sequence + 1 for stream, sequence in last.items() if sequence is not None}
 
 
-def before_of(metadata: Mapping[str, str]) -> dict[StreamId, int]:
-    """What `before_as_metadata` has written. Raises ValueError if it is not that."""
-    return {_line(name): int(text) for name, text in metadata.items()}
-
-
-def add_up(accounts: Iterable[tuple[StreamId, StreamCounts]]) -> dict[str, StreamCounts]:
-    """The accounts of each key together, by key; sequence numbers, which are each producer's own, left out."""
+def sum_by_key(streams: Iterable[tuple[StreamId, StreamCounts]]) -> dict[str, StreamCounts]:
+    """The sum over the producers of each key, without sequence numbers: each producer has its own."""
     found: dict[str, StreamCounts] = {}
-    for (key, _), account in accounts:
+    for (key, _), counts in streams:
         total = found.setdefault(key, StreamCounts())
-        total.messages += account.messages
-        total.missing += account.missing
-        total.duplicated += account.duplicated
-        if account.first_ns is not None and account.last_ns is not None:
-            total.first_ns = min(account.first_ns, total.first_ns if total.first_ns is not None else account.first_ns)
-            total.last_ns = max(account.last_ns, total.last_ns or 0)
+        total.messages += counts.messages
+        total.missing += counts.missing
+        total.duplicated += counts.duplicated
+        if counts.first_ns is not None and counts.last_ns is not None:
+            total.first_ns = min(counts.first_ns, total.first_ns if total.first_ns is not None else counts.first_ns)
+            total.last_ns = max(counts.last_ns, total.last_ns or 0)
     return dict(sorted(found.items()))
 
 
@@ -204,6 +217,6 @@ def _is_recorded(key: str) -> bool:
         return False
 
 
-def _line(name: str) -> StreamId:
+def _stream(name: str) -> StreamId:
     key, _, producer = name.partition(" ")
     return key, producer

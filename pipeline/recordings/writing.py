@@ -1,15 +1,14 @@
-"""Writing recordings: MCAP files, whole at every moment as far as they go.
+"""Writing recordings: MCAP files that are readable at any moment up to the last flush.
 
-Metadata and attachments stand before the first message, so that a file that was torn off still says what it is; the
-ledger stands behind the last. While it is written a file is called NAME.mcap.active. See docs/reference/recordings.md.
+Metadata and attachments come before the first message, so that a truncated file still says what it is; the ledger comes
+after the last. While a file is written it is called NAME.mcap.active. See docs/reference/recordings.md.
 """
 
 from __future__ import annotations
 
-import json
 import mimetypes
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from itertools import chain, count
@@ -27,16 +26,7 @@ from pipeline.recordings.disk import AtomicAppendFile, refused, sync_folder
 from pipeline.recordings.index import SHORT_ENDING, Index
 from pipeline.recordings.reading import METADATA_NAME
 from pipeline.recordings.records import RecordingError, record_bytes
-from pipeline.recordings.sequence_ledger import (
-    BEFORE_NAME,
-    ENDED,
-    LEDGER_NAME,
-    RECOVERED,
-    SequenceLedger,
-    StreamCounts,
-    StreamId,
-    as_metadata,
-)
+from pipeline.recordings.sequence_ledger import BEFORE_NAME, LEDGER_NAME, SequenceLedger, ledger_metadata
 from schemas.codec import proto_type, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Health, Message, newest_t_ns
@@ -44,15 +34,15 @@ from schemas.topics import topic_of
 
 ACTIVE_SUFFIX = ".active"
 CHUNK_BYTES = 64 * 1024
-"""What is not yet in a finished chunk is lost in a crash, and a reader holds one chunk in memory."""
+"""A crash loses what is not in a finished chunk; a reader holds one chunk in memory."""
 UNSYNCED_BYTES = 4 << 20
-"""About so much is held in memory at most until it is through to the disk."""
+"""About the most that is kept in memory until it is flushed to the disk."""
 
 
 class RecordingWriter:
     """Writes one recording. Use it with `with`: an exception inside removes the unfinished file.
 
-    When the disk refuses, the file is ended where it still was whole, and nothing more is written.
+    When the disk refuses a write, the file ends after what is on the disk, and nothing more is written.
     """
 
     def __init__(
@@ -65,31 +55,31 @@ class RecordingWriter:
         overwrite: bool = False,
         ledger: SequenceLedger | None = None,
     ) -> None:
-        """Begin `path`, under its active name. What a killed process has left under that name is lost: see
-        `pipeline.recordings.parts` for what keeps it.
+        """Begin `path`, under its active name. A file that a killed process left under that name is overwritten;
+        `pipeline.recordings.parts` repairs it first.
 
-        Without `overwrite`, a finished file of that name is left alone and this one becomes NAME-2.mcap, and so on.
+        Without `overwrite`, a finished file of that name is kept and this one becomes NAME-2.mcap, and so on.
 
         Args:
             path: NAME.mcap.
-            metadata: what the recording is about, see docs/reference/recordings.md.
+            metadata: about the recording, see docs/reference/recordings.md.
             attachments: name -> content.
-            t_ns: when it begins, ns since 1970.
+            t_ns: time of the attachments, ns since 1970.
             overwrite: replace a finished file.
-            ledger: that goes on from the parts before.
+            ledger: one that continues the parts before.
 
         Raises:
-            DiskError: the disk is full, or has gone.
+            DiskError: the disk is full, or is not there.
             RecordingError: it cannot be written there, or another process is writing it.
         """
         self.path = path
         self.ledger = ledger or SequenceLedger()
         self.written: Counter[str] = Counter()
-        """messages of each topic that are in the file for good: through to the disk"""
+        """messages of each topic that are flushed to the disk"""
         self._filling: list[Envelope] = []
-        """those of the chunk that is not written yet"""
+        """the messages of the chunk that is not written yet"""
         self._unsynced: list[_WrittenChunk] = []
-        """what is written and may not be on the disk yet"""
+        """chunks that are written and may not be on the disk yet"""
         self._unsynced_bytes = 0
         self._overwrite = overwrite
         self._ended = False
@@ -122,28 +112,28 @@ class RecordingWriter:
 
     @property
     def size(self) -> int:
-        """Of the file, in bytes."""
+        """Size of the file in bytes."""
         return self._file.size
 
     @property
     def pending(self) -> list[Envelope]:
-        """The messages that are not in the file for good, in their order."""
+        """The messages that are not flushed to the disk, in order."""
         return [*chain.from_iterable(chunk.messages for chunk in self._unsynced), *self._filling]
 
     def add(self, envelope: Envelope) -> None:
         """Add a message.
 
         Raises:
-            RecordingError: the disk refuses; `pending` then has what did not get into the file.
+            RecordingError: the disk refuses; `pending` then has the messages that are not in the file.
         """
         key, message = envelope.key, envelope.message
-        channel, _ = self._channels.get(key) or self._register(key, type(message))
+        channel, _ = self._channels.get(key) or self._register_channel(key, type(message))
         self._filling.append(envelope)
         self._chunk.add(
             channel, message.header.sequence, envelope.received_t_ns, newest_t_ns(message), envelope.payload
         )
         if self._chunk.size > CHUNK_BYTES:
-            self._close_chunk()
+            self._finish_chunk()
             if self._unsynced_bytes > UNSYNCED_BYTES:
                 self._sync()
 
@@ -152,18 +142,18 @@ class RecordingWriter:
         self.add(Envelope.of(key, message, received_t_ns))
 
     def flush(self) -> None:
-        """Through to the disk: what has been written until now survives a crash, of the machine too.
+        """Flush to the disk: all messages added until now survive a crash, of the machine too.
 
         Raises:
             RecordingError: as in `add`.
         """
-        self._close_chunk()
+        self._finish_chunk()
         self._sync()
 
-    def close(self, *, has_ended: bool = False) -> None:
-        """Finish the file and give it its name, `path`. Does nothing to a file that has already been ended.
+    def finish(self, *, has_ended: bool = False) -> None:
+        """End the file and give it its name, `path`. Does nothing if the file has already ended.
 
-        has_ended: the recorder comes to its end with it; what was published and has not come is then missing.
+        has_ended: the recorder stops with this file; what was published and has not come is then missing.
 
         Raises:
             RecordingError: as in `add`.
@@ -172,12 +162,12 @@ class RecordingWriter:
             return
         self.flush()
         if has_ended:
-            self.ledger.settle()
+            self.ledger.finish()
         try:
-            write_ending(self._file, self._index, self.ledger.accounts, has_ended=has_ended)
+            write_ending(self._file, self._index, ledger_metadata(self.ledger.counts, has_ended=has_ended))
         except OSError as error:
             raise self._end_early(error) from error
-        self._hand_over()
+        self._rename()
 
     def discard(self) -> None:
         """Remove the unfinished file."""
@@ -193,11 +183,11 @@ class RecordingWriter:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if kind is None:
-            self.close()
+            self.finish()
         else:
             self.discard()
 
-    def _register(self, key: str, message_type: type[Message]) -> tuple[int, str]:
+    def _register_channel(self, key: str, message_type: type[Message]) -> tuple[int, str]:
         name = type_name(message_type)
         known = next((schema for schema in self._index.schemas.values() if schema.name == name), None)
         schema = known or Schema(
@@ -216,15 +206,15 @@ class RecordingWriter:
         self._channels[key] = (channel.id, topic_of(key).name)
         return self._channels[key]
 
-    def _close_chunk(self) -> None:
+    def _finish_chunk(self) -> None:
         if not self._filling:
             return
         offset = self._file.size
-        record, index = self._chunk.made(offset)
+        record, index = self._chunk.finish(offset)
         try:
             self._file.write(record)
         except OSError as error:
-            self._sync()  # the chunks before can be saved all the same
+            self._sync()  # the chunks before it are saved all the same
             raise self._end_early(error) from error
         counts = {channel: len(flat) // 2 for channel, flat in self._chunk.entries.items()}
         self._unsynced.append(_WrittenChunk(index, counts, self._filling))
@@ -232,28 +222,28 @@ class RecordingWriter:
         self._chunk, self._filling = FillingChunk(), []
 
     def _sync(self) -> None:
-        """What is written goes through to the disk, and counts from then on."""
+        """Flush what is written to the disk; it counts as recorded from then on."""
         try:
             self._file.sync()
-        except OSError as error:  # the system forgets what it could not write: another attempt would prove nothing
+        except OSError as error:  # the system drops what it could not write: a second attempt proves nothing
             self._take_back()
             raise self._end_early(error) from error
         for chunk in self._unsynced:
-            self._note(chunk)
+            self._count(chunk)
         self._unsynced, self._unsynced_bytes, self._synced_size = [], 0, self._file.size
 
-    def _note(self, chunk: _WrittenChunk) -> None:
-        self._index.note_chunk(chunk.place, chunk.counts)
+    def _count(self, chunk: _WrittenChunk) -> None:
+        self._index.add_chunk(chunk.chunk_index, chunk.counts)
         for envelope in chunk.messages:
             key, message = envelope.key, envelope.message
             header = message.header
-            self.ledger.note(key, header.producer, header.sequence, envelope.received_t_ns)
+            self.ledger.add(key, header.producer, header.sequence, envelope.received_t_ns)
             self.written[self._channels[key][1]] += 1
             if isinstance(message, Health):
-                self.ledger.note_health(message)
+                self.ledger.add_health(message)
 
     def _take_back(self) -> None:
-        """What may not be on the disk is pending again, and no longer in the file."""
+        """Remove what may not be on the disk from the file; it is pending again."""
         self._filling, self._unsynced = self.pending, []
         with suppress(OSError):
             self._file.cut(self._synced_size)
@@ -261,27 +251,27 @@ class RecordingWriter:
     def _write_metadata(self, name: str, values: Mapping[str, str]) -> None:
         metadata = Metadata(name=name, metadata=dict(values))
         record = record_bytes(metadata)
-        self._index.note_metadata(metadata, self._file.size, len(record))
+        self._index.add_metadata(metadata, self._file.size, len(record))
         self._file.write(record)
 
     def _write_attachment(self, attachment: Attachment) -> None:
         record = record_bytes(attachment)
-        self._index.note_attachment(attachment, self._file.size, len(record))
+        self._index.add_attachment(attachment, self._file.size, len(record))
         self._file.write(record)
 
     def _end_early(self, error: OSError) -> RecordingError:
-        """End the file behind what is on the disk, with an index if there is room for one; what to raise."""
+        """End the file after what is on the disk, with an index if there is room. Returns the error to raise."""
         try:
-            write_ending(self._file, self._index, self.ledger.accounts)
+            write_ending(self._file, self._index, ledger_metadata(self.ledger.counts))
         except OSError:
-            with suppress(OSError):  # without it the file is readable all the same, by readers that bear a torn file
+            with suppress(OSError):  # without it the file is still readable, by readers that accept a truncated file
                 self._file.write(SHORT_ENDING)
-        self._hand_over()
+        self._rename()
         return refused(
             f"{self.path}: cannot be written any more", error, "it ends here and is readable: make room on the disk"
         )
 
-    def _hand_over(self) -> None:
+    def _rename(self) -> None:
         self._ended = True
         if not self._overwrite:
             self.path = free_name(self.path)
@@ -297,9 +287,9 @@ class RecordingWriter:
 
 
 class _WrittenChunk(NamedTuple):
-    """What is to be noted of a chunk once it is on the disk."""
+    """A chunk, to be counted once it is on the disk."""
 
-    place: ChunkIndex
+    chunk_index: ChunkIndex
     counts: dict[int, int]
     """messages by channel"""
     messages: list[Envelope]
@@ -313,40 +303,30 @@ def _schema(message_type: type[Message]) -> bytes:
 def write_ending(
     file: AtomicAppendFile,
     index: Index,
-    accounts: Mapping[StreamId, StreamCounts],
+    ledger: Mapping[str, str],
     *,
     before: bytes = b"",
-    has_ended: bool = False,
-    recovered: Sequence[str] = (),
 ) -> None:
     """End a file with `before`, the ledger and the index: all of it, or nothing.
-
-    recovered: of a mended file, what was lost or may have been, one line each.
 
     Raises:
         OSError: the disk refuses.
     """
-    entries = as_metadata(accounts)
-    if has_ended:
-        entries[ENDED] = "in order"
-    if recovered:
-        entries[RECOVERED] = json.dumps(list(recovered))
-    ledger = Metadata(name=LEDGER_NAME, metadata=entries)
-    record = record_bytes(ledger)
-    offset = file.size + len(before)
-    index.note_metadata(ledger, offset, len(record))
-    without = file.size
+    metadata = Metadata(name=LEDGER_NAME, metadata=dict(ledger))
+    record = record_bytes(metadata)
+    size, offset = file.size, file.size + len(before)
+    index.add_metadata(metadata, offset, len(record))
     try:
         file.write(before + record + index.ending(offset + len(record)))
         file.sync()
     except OSError:
-        index.forget_metadata()
-        file.cut(without)
+        index.remove_last_metadata()
+        file.cut(size)
         raise
 
 
 def free_name(path: Path) -> Path:
-    """`path` if there is no such file, or else the first of NAME-2, NAME-3 ... that is free."""
+    """`path`, or if it exists the first of NAME-2, NAME-3 ... that does not."""
     names = chain([path], (path.with_stem(f"{path.stem}-{number}") for number in count(2)))
     return next(name for name in names if not name.exists())
 

@@ -89,14 +89,14 @@ class Part:
             self._refuse()
         for envelope in self.pending:
             header = envelope.message.header
-            self.ledger.note(envelope.key, header.producer, header.sequence, envelope.received_t_ns)
+            self.ledger.add(envelope.key, header.producer, header.sequence, envelope.received_t_ns)
         self.written.update(topic_of(pending.key).name for pending in self.pending)
         self.size += sum(len(pending.payload) for pending in self.pending)
         self.content += self.pending
         self.pending = []
         self.flushes += 1
 
-    def close(self, *, has_ended: bool = False) -> None:
+    def finish(self, *, has_ended: bool = False) -> None:
         self.flush()
         self.closed = "at the end" if has_ended else "and goes on"
 
@@ -216,7 +216,7 @@ def test_it_says_under_which_name_the_recording_of_a_killed_recorder_is_kept(tmp
     writer.path.rename(run.run_folder / "recording.mcap.active")
     with caplog.at_level(logging.WARNING):
         STAGE.build(run).core.close()
-    assert "a recorder had been killed; what it has recorded is kept as" in caplog.text
+    assert "a recorder was killed; its recording was repaired and is" in caplog.text
     assert sorted(p.name for p in run.run_folder.iterdir()) == ["recording-2.mcap", "recording.mcap"]
 
 
@@ -354,8 +354,8 @@ def test_the_part_after_a_pause_tells_the_gap(caplog):
     assert int(told["resumed_t_ns"]) - int(told["paused_t_ns"]) == 4 * SECOND_NS
     assert told["paused_because"].startswith("/mnt: the disk is no longer mounted")
     assert told["lost_in_pause"] == "0"
-    assert "nothing is recorded: /mnt: the disk is no longer mounted" in caplog.text
-    assert "recording goes on after 4.0 s; messages lost meanwhile: 0" in caplog.text
+    assert "NOTHING IS RECORDED: /mnt: the disk is no longer mounted" in caplog.text
+    assert "recording resumed after 4.0 s; messages lost in between: 0" in caplog.text
 
 
 def test_what_does_not_fit_into_memory_during_a_pause_is_lost_and_counted_the_oldest_first(monkeypatch):
@@ -373,7 +373,7 @@ def test_what_does_not_fit_into_memory_during_a_pause_is_lost_and_counted_the_ol
     assert sequences(disk.parts[1]) == list(range(110, 120))
     assert core.counters()["lost_unwritten"] == 10
     assert disk.parts[1].about["lost_in_pause"] == "10"
-    assert disk.parts[1].ledger.accounts[RAW_KEY, "acquisition-1"].missing == 10
+    assert disk.parts[1].ledger.counts[RAW_KEY, "acquisition-1"].missing == 10
 
 
 def test_a_disk_that_refuses_the_last_chunk_is_counted_too():
@@ -393,7 +393,7 @@ def test_with_too_little_room_it_pauses_and_the_part_is_ended_in_order():
     disk.free = 49_000_000
     core.tick(NOW_NS + SECOND_NS)
     assert disk.parts[0].closed == "and goes on"
-    assert core.problem().startswith("NOTHING IS RECORDED: 49.0 MB are free on the disk, and 50.0 MB must be")
+    assert core.problem().startswith("NOTHING IS RECORDED: 49.0 MB are free on the disk, but 50.0 MB are required")
     assert core.counters() == {"recorded_raw": 3, "lost_unwritten": 0, "parts": 1, "pauses": 1}
     disk.free = 50_000_001
     core.tick(NOW_NS + 2 * SECOND_NS)
@@ -426,7 +426,7 @@ def test_the_oldest_parts_go_one_at_a_time_if_they_may(caplog):
             core.tick(NOW_NS + second * SECOND_NS)
     assert disk.oldest == ["r-3.mcap"]
     assert core.counters()["parts_deleted"] == 2
-    assert "r-2.mcap: deleted, the oldest part" in caplog.text
+    assert "r-2.mcap: the oldest part was deleted" in caplog.text
     assert core.problem() == ""
 
 
@@ -471,7 +471,7 @@ def test_each_part_begins_with_the_last_card_of_each_twin():
     assert first == [("ModelCard", 0), ("ModelCard", 1), ("Raw", 0)]
     assert second == [("ModelCard", 1), ("Raw", 1)]
     assert disk.parts[1].content[0].received_t_ns == disk.parts[1].t_ns
-    assert (tray_key("plant", "tray1", "twin"), "twin_integrator-1") not in disk.parts[1].ledger.accounts
+    assert (tray_key("plant", "tray1", "twin"), "twin_integrator-1") not in disk.parts[1].ledger.counts
 
 
 def test_what_a_killed_recorder_has_recorded_already_is_not_recorded_again():
@@ -480,7 +480,7 @@ def test_what_a_killed_recorder_has_recorded_already_is_not_recorded_again():
     record(core, range(5, 10))
     core.close()
     assert sequences(disk.parts[0]) == [7, 8, 9]
-    account = disk.parts[0].ledger.accounts[RAW_KEY, "acquisition-1"]
+    account = disk.parts[0].ledger.counts[RAW_KEY, "acquisition-1"]
     assert (account.messages, account.missing, account.duplicated) == (3, 0, 2)
 
 
@@ -489,7 +489,7 @@ def test_what_was_lost_between_a_killed_recorder_and_the_next_is_in_the_ledger()
     core = recorder(disk)
     record(core, range(10, 12))
     core.close()
-    assert disk.parts[0].ledger.accounts[RAW_KEY, "acquisition-1"].missing == 3
+    assert disk.parts[0].ledger.counts[RAW_KEY, "acquisition-1"].missing == 3
 
 
 def test_what_the_bus_brought_twice_is_in_the_ledger_of_the_part_in_which_it_came():
@@ -501,7 +501,7 @@ def test_what_the_bus_brought_twice_is_in_the_ledger_of_the_part_in_which_it_cam
     core.step(packet(health_of("scorer-1", 70, stage="scorer"), "health", NOW_NS))
     core.step(packet(health_of("recorder-1", 7), "health", NOW_NS))
     core.close()
-    assert [part.ledger.accounts[RAW_KEY, "a"].duplicated for part in disk.parts] == [4, 3]
+    assert [part.ledger.counts[RAW_KEY, "a"].duplicated for part in disk.parts] == [4, 3]
 
 
 @pytest.mark.parametrize("wrong", [{"part_bytes": 1000}, {"part_s": 0.5}, {"part_s": -1}, {"min_free_bytes": -1}])

@@ -137,9 +137,9 @@ class Kills:
             if active.stat().st_size < 8:
                 continue
             found = scan(active)
-            ledger = found.census.ledger
-            due = {key: ledger.next[key, producer] for key, producer in ledger.accounts if producer == PRODUCER}
-            own = found.census.healths.get(health_key(SITE, "recorder", "all"))
+            ledger = found.counts.ledger
+            due = {key: ledger.next[key, producer] for key, producer in ledger.counts if producer == PRODUCER}
+            own = found.counts.healths.get(health_key(SITE, "recorder", "all"))
             has_caught_up = own is not None and own.status == StageStatus.OK
             if has_caught_up and found.index.first_ns is not None:
                 self._killed.append(_Killed(found.index.first_ns, at_ns, due, found.index.last_ns))
@@ -183,7 +183,7 @@ class Kills:
                 if in_memory:
                     outcome.oldest_s = max(outcome.oldest_s, (killed.at_ns - times[in_memory[0]]) / 1e9)
         outcome.counted_missing = sum(
-            account.missing for part in contents for (key, _), account in part.accounts.items() if key in sent_ns
+            account.missing for part in contents for (key, _), account in part.streams.items() if key in sent_ns
         )
         outcome.kills_of_recording = len(self._killed)
         outcome.newest_s = max(((killed.at_ns - killed.newest_ns) / 1e9 for killed in self._killed), default=0.0)

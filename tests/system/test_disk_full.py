@@ -78,7 +78,7 @@ def test_a_disk_that_fills_costs_nothing_that_memory_can_hold(small_disk, caplog
     ballast.write_bytes(bytes(SIZE_BYTES - 3_900_000))
     until(run.core.problem, run)
     assert re.search(
-        r"nothing is recorded: .*recording-\d.mcap: cannot be written any more: No space left", caplog.text
+        r"NOTHING IS RECORDED: .*recording-\d.mcap: cannot be written any more: No space left", caplog.text
     )
     for _ in range(5):
         run.second()
@@ -103,7 +103,7 @@ def test_what_memory_cannot_hold_is_missing_in_the_ledger_message_by_message(sma
     monkeypatch.setattr("stages.recorder.HELD_BYTES", 400_000)
     run = Run(small_disk, min_free_bytes=3_000_000)
     until(run.core.problem, run)
-    assert "MB are free on the disk, and 3.0 MB must be" in run.core.problem()
+    assert "MB are free on the disk, but 3.0 MB are required" in run.core.problem()
     for _ in range(10):
         run.second()
     for path in run.parts():
@@ -115,7 +115,7 @@ def test_what_memory_cannot_hold_is_missing_in_the_ledger_message_by_message(sma
     holes = sum(later - earlier - 1 for earlier, later in pairwise(found))
     contents = contents_of(part)
     lost = run.core.counters()["lost_unwritten"]
-    assert contents.accounts[LINE].missing == holes + (found[0] - contents.before[LINE]) == lost > 0
+    assert contents.streams[LINE].missing == holes + (found[0] - contents.before[LINE]) == lost > 0
     assert contents.metadata["lost_in_pause"] == str(lost)
     assert found[-1] == run.sent - 1
 
@@ -133,7 +133,7 @@ def test_the_disk_stays_bounded_where_the_oldest_parts_may_go(small_disk):
     assert sum(path.stat().st_size for path in run.parts()) < SIZE_BYTES - 3_000_000 + 1_200_000
     for path in run.parts():
         assert_readable(path)
-        assert scan(path).is_whole
+        assert scan(path).is_intact
 
 
 def test_a_disk_that_is_taken_away_is_waited_for_and_its_place_is_not_written_on(small_disk):

@@ -1,4 +1,4 @@
-"""`fantwin info`: what is in a recording, and what is missing in it."""
+"""`fantwin info`: what a recording contains, and what is missing."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ from pipeline.cli.options import JsonOption
 from pipeline.cli.progress import working
 from pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
 from pipeline.recordings.metadata import CONFIGURATION
-from pipeline.recordings.sequence_ledger import StreamCounts, add_up
+from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 from schemas.messages import Health
+from schemas.units import NS_PER_S
 
 
 def info(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="A recording, or the parts of one.")],
     json_output: JsonOption = False,
 ) -> None:
-    """Show what is in a recording: time, trays, twins, topics with what is missing, and what its stages said last.
+    """Show what a recording contains: time, trays, twins, messages of each topic with missing ones, problems of stages.
 
-    Of several parts it is checked too that each goes on where the one before ended. A file without an index is gone
-    through as far as it can be read. Exit code 3 when messages are missing or a file is damaged.
+    Several parts are also checked to continue one another. A file without an index is read in full, as far as
+    possible. Exit code 3 if messages are missing or a file is damaged.
 
     Example: fantwin info runs/recording.mcap
     """
@@ -47,11 +48,11 @@ def info(
 
 
 def as_json(parts: Sequence[Contents], breaks: Sequence[str]) -> dict[str, Any]:
-    """What a machine is told: each file, and the topics of all together."""
-    together = add_up(item for part in parts for item in part.accounts.items())
+    """The output of --json: each file, and the topics of all files together."""
+    together = sum_by_key(item for part in parts for item in part.streams.items())
     return {
         "files": [_part_as_json(part) for part in parts],
-        "topics": {key: _account_as_json(account) for key, account in together.items()},
+        "topics": {key: _counts_as_json(counts) for key, counts in together.items()},
         "continuity": list(breaks),
     }
 
@@ -68,8 +69,8 @@ def _part_as_json(part: Contents) -> dict[str, Any]:
         "attachments": list(part.attachments),
         "has_configuration": _has_configuration(part),
         "twins": {_tray(key): {"twin": c.twin, "kind": c.kind, "sha256": c.sha256} for key, c in part.cards.items()},
-        "topics": {key: _account_as_json(account) for key, account in add_up(part.accounts.items()).items()},
-        "producers": [{"key": key, "producer": producer, **asdict(a)} for (key, producer), a in part.accounts.items()],
+        "topics": {key: _counts_as_json(counts) for key, counts in sum_by_key(part.streams.items()).items()},
+        "producers": [{"key": key, "producer": producer, **asdict(a)} for (key, producer), a in part.streams.items()],
         "other_topics": dict(part.others),
         "stages": {
             _stage(health): {
@@ -85,14 +86,14 @@ def _part_as_json(part: Contents) -> dict[str, Any]:
     }
 
 
-def _account_as_json(account: StreamCounts) -> dict[str, Any]:
+def _counts_as_json(counts: StreamCounts) -> dict[str, Any]:
     return {
-        "messages": account.messages,
-        "missing": account.missing,
-        "duplicated": account.duplicated,
-        "first_ns": account.first_ns,
-        "last_ns": account.last_ns,
-        "rate_hz": _rate_hz(account),
+        "messages": counts.messages,
+        "missing": counts.missing,
+        "duplicated": counts.duplicated,
+        "first_ns": counts.first_ns,
+        "last_ns": counts.last_ns,
+        "rate_hz": _rate_hz(counts),
     }
 
 
@@ -101,46 +102,49 @@ def _show(parts: Iterable[Contents], breaks: Iterable[str]) -> None:
     for part in parts:
         for line in _about(part):
             console.print(line)
-        if part.accounts or part.others:
+        if part.streams or part.others:
             console.print(_table(part))
         for health in sorted(part.healths.values(), key=_stage):
             if health.problem or health.lost:
                 lost = f"; {health.lost} lost" if health.lost else ""
-                console.print(f"[red]{escape(_stage(health))}: {escape(health.problem or 'well')}{lost}[/red]")
+                console.print(
+                    f"[red]{escape(_stage(health))}: {escape(health.problem or 'no problem now')}{lost}[/red]"
+                )
         for line in part.recovered:
-            console.print(f"[red]was mended: {escape(line)}[/red]")
+            console.print(f"[red]repaired earlier: {escape(line)}[/red]")
         for line in part.damage:
-            advice = "" if line == STILL_WRITTEN else "; `fantwin recover` mends it"
+            advice = "" if line == STILL_WRITTEN else "; repair it with `fantwin recover`"
             console.print(f"[red]{escape(line)}{advice}[/red]")
     for line in breaks:
         console.print(f"[red]{escape(line)}[/red]")
 
 
 def _about(part: Contents) -> list[str]:
-    """What is said of a file before its topics."""
-    said = part.metadata
+    """The lines about a file above the table of its topics."""
+    metadata = part.metadata
     lines = [f"[bold]{escape(str(part.path))}[/bold]: {part.size_bytes / 1e6:,.2f} MB, {part.messages} messages"]
     if part.first_ns is not None and part.last_ns is not None:
         lines.append(f"from {_date(part.first_ns)} to {_date(part.last_ns)}: {_duration_s(part):,.1f} s")
-    if not said and not part.accounts:
-        lines.append("not a recording of fantwin: none of its channels is ours")
-    if "part" in said:
-        after = f", continues {said['continues']}" if "continues" in said else ""
-        lines.append(f"part {said['part']} of session {said.get('session', '?')}{after}, site {said.get('site', '?')}")
+    if not metadata and not part.streams:
+        lines.append("not a recording of fantwin: it has no channel of fantwin")
+    if "part" in metadata:
+        after = f", continues {metadata['continues']}" if "continues" in metadata else ""
+        session, site = metadata.get("session", "?"), metadata.get("site", "?")
+        lines.append(f"part {metadata['part']} of session {session}{after}, site {site}")
     with suppress(KeyError, ValueError):  # others may have metadata of these names
-        gap_s = (int(said["resumed_t_ns"]) - int(said["paused_t_ns"])) / 1e9
-        lost, why = said["lost_in_pause"], said["paused_because"]
-        lines.append(f"before it nothing was recorded for {gap_s:,.1f} s; messages lost: {lost}")
-        lines.append(f"  because {why}")
-    for tray in filter(None, said.get("trays", "").split(",")):
-        fans = f", {said[f'fans.{tray}']} fans" if f"fans.{tray}" in said else ""
+        gap_s = (int(metadata["resumed_t_ns"]) - int(metadata["paused_t_ns"])) / NS_PER_S
+        lost, reason = metadata["lost_in_pause"], metadata["paused_because"]
+        lines.append(f"before this part nothing was recorded for {gap_s:,.1f} s; messages lost: {lost}")
+        lines.append(f"  reason: {reason}")
+    for tray in filter(None, metadata.get("trays", "").split(",")):
+        fans = f", {metadata[f'fans.{tray}']} fans" if f"fans.{tray}" in metadata else ""
         lines.append(
-            f"tray {tray}{fans}, speeds in {said.get(f'speed_unit.{tray}') or said.get('speed_unit', 'rad/s')}"
+            f"tray {tray}{fans}, speeds in {metadata.get(f'speed_unit.{tray}') or metadata.get('speed_unit', 'rad/s')}"
         )
     for key, card in part.cards.items():
         lines.append(f"twin of {_tray(key)}: {card.twin}, {card.kind}, sha256 {card.sha256[:12]}")
-    if "source" in said:
-        lines.append(f"made of: {said['source']}")
+    if "source" in metadata:
+        lines.append(f"made from: {metadata['source']}")
     if part.attachments:
         lines.append(f"attached: {', '.join(part.attachments)}")
     return [lines[0], *(escape(line) for line in lines[1:])]
@@ -149,18 +153,18 @@ def _about(part: Contents) -> list[str]:
 def _table(part: Contents) -> Table:
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("topic", overflow="fold")
-    for column in ("messages", "missing", "twice", "first", "last", "per s"):
+    for column in ("messages", "missing", "duplicated", "first", "last", "per s"):
         table.add_column(column, justify="right", no_wrap=True)
-    for key, account in add_up(part.accounts.items()).items():
-        missing = f"[red]{account.missing}[/red]" if account.missing else "0"
-        rate_hz = _rate_hz(account)
+    for key, counts in sum_by_key(part.streams.items()).items():
+        missing = f"[red]{counts.missing}[/red]" if counts.missing else "0"
+        rate_hz = _rate_hz(counts)
         table.add_row(
             escape(key.split("/", 2)[2]),
-            str(account.messages),
+            str(counts.messages),
             missing,
-            str(account.duplicated),
-            _time(account.first_ns),
-            _time(account.last_ns),
+            str(counts.duplicated),
+            _time(counts.first_ns),
+            _time(counts.last_ns),
             "" if rate_hz is None else f"{rate_hz:.1f}",
         )
     for topic, messages in sorted(part.others.items()):
@@ -169,18 +173,18 @@ def _table(part: Contents) -> Table:
 
 
 def _has_lost(part: Contents) -> bool:
-    has_missing = any(account.missing for account in part.accounts.values())
+    has_missing = any(counts.missing for counts in part.streams.values())
     return has_missing or bool(part.recovered) or not NO_LOSS.issuperset(part.damage)
 
 
 def _duration_s(part: Contents) -> float:
-    return (part.last_ns - part.first_ns) / 1e9 if part.last_ns is not None and part.first_ns is not None else 0.0
+    return (part.last_ns - part.first_ns) / NS_PER_S if part.last_ns is not None and part.first_ns is not None else 0.0
 
 
-def _rate_hz(account: StreamCounts) -> float | None:
-    if account.first_ns is None or account.last_ns is None or account.last_ns <= account.first_ns:
+def _rate_hz(counts: StreamCounts) -> float | None:
+    if counts.first_ns is None or counts.last_ns is None or counts.last_ns <= counts.first_ns:
         return None
-    return (account.messages - 1) / ((account.last_ns - account.first_ns) / 1e9)
+    return (counts.messages - 1) / ((counts.last_ns - counts.first_ns) / NS_PER_S)
 
 
 def _has_configuration(part: Contents) -> bool:
@@ -196,8 +200,8 @@ def _stage(health: Health) -> str:
 
 
 def _time(t_ns: int | None) -> str:
-    return "" if t_ns is None else datetime.fromtimestamp(t_ns / 1e9).strftime("%H:%M:%S")
+    return "" if t_ns is None else datetime.fromtimestamp(t_ns / NS_PER_S).strftime("%H:%M:%S")
 
 
 def _date(t_ns: int) -> str:
-    return datetime.fromtimestamp(t_ns / 1e9).isoformat(sep=" ", timespec="milliseconds")
+    return datetime.fromtimestamp(t_ns / NS_PER_S).isoformat(sep=" ", timespec="milliseconds")

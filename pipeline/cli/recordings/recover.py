@@ -1,4 +1,4 @@
-"""`fantwin recover`: a torn recording becomes whole again."""
+"""`fantwin recover`: repairs a truncated or damaged recording."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from pipeline.recordings.contents import losses, messages_as_text
 from pipeline.recordings.repair import Recovery
 from pipeline.recordings.repair import recover as recover_file
 from pipeline.recordings.scan import Scan
-from pipeline.recordings.sequence_ledger import StreamCounts, add_up
+from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
+from schemas.units import NS_PER_S
 
 
 def recover(
-    file: Annotated[Path, typer.Argument(metavar="TORN.mcap", help="What a killed recorder or a bad disk has left.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording that is truncated or damaged.")],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="WHOLE.mcap", help="Recording to write; without it, in place."),
+        typer.Option("-o", "--output", metavar="FILE", help="The repaired recording; without it, the same name."),
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Make a torn recording whole again (end, index, statistics, ledger), and say what is in it and what is missing.
+    """Repair a truncated or damaged recording, and list what it contains and what is missing.
 
-    Without -o the whole recording takes the name of the torn one, which is kept beside it as TORN.mcap.torn. Exit code
-    0: nothing was lost; 3: something was; 1: nothing could be recovered.
+    Without -o the repaired recording takes the name of FILE, which is kept as FILE.original. Exit code 0: nothing was
+    lost; 3: something was lost, or may be; 1: nothing could be recovered.
 
     Example: fantwin recover runs/recording.mcap.active
     """
@@ -46,43 +47,43 @@ def recover(
 
 def _lines(file: Path, recovery: Recovery) -> list[str]:
     found = recovery.found
-    if found.is_whole:
+    if found.is_intact:
         copied = f"; copied to {recovery.path}" if recovery.path != file else ""
-        lines = [f"{file}: is whole already, with {messages_as_text(found.messages)}; nothing to recover{copied}"]
+        lines = [f"{file}: intact, with {messages_as_text(found.messages)}; nothing to recover{copied}"]
     else:
-        kept = f"; the torn file is {recovery.torn}" if recovery.torn else ""
-        lines = [f"{file}: {messages_as_text(found.messages)} are whole again in {recovery.path}{kept}"]
-    for topic, account in _by_topic(found).items():
-        last = f", the last at {_time(account.last_ns)}" if account.last_ns is not None else ""
-        missing = f", {account.missing} missing" if account.missing else ""
-        lines.append(f"  {topic}: {messages_as_text(account.messages)}{missing}{last}")
+        kept = f"; the original is kept as {recovery.original}" if recovery.original else ""
+        lines = [f"{file}: {messages_as_text(found.messages)} recovered in {recovery.path}{kept}"]
+    for topic, counts in _by_topic(found).items():
+        last = f", the last at {_time(counts.last_ns)}" if counts.last_ns is not None else ""
+        missing = f", {counts.missing} missing" if counts.missing else ""
+        lines.append(f"  {topic}: {messages_as_text(counts.messages)}{missing}{last}")
     lost = losses(found)
     return lines + (["lost:", *(f"  {line}" for line in lost)] if lost else ["nothing was lost"])
 
 
 def as_json(file: Path, recovery: Recovery) -> dict[str, Any]:
-    """What a machine is told."""
+    """The output of --json."""
     found = recovery.found
-    unrecorded = {} if found.is_ended else found.census.ledger.unrecorded()
+    unrecorded = {} if found.is_ended else found.counts.ledger.unrecorded()
     return {
         "file": str(file),
-        "whole": str(recovery.path),
-        "torn": str(recovery.torn) if recovery.torn else None,
-        "was_whole": found.is_whole,
+        "output": str(recovery.path),
+        "original": str(recovery.original) if recovery.original else None,
+        "was_intact": found.is_intact,
         "had_ended": found.is_ended,
         "messages": found.messages,
         "topics": {
             topic: {
-                "messages": account.messages,
-                "missing": account.missing,
-                "duplicated": account.duplicated,
-                "first_ns": account.first_ns,
-                "last_ns": account.last_ns,
+                "messages": counts.messages,
+                "missing": counts.missing,
+                "duplicated": counts.duplicated,
+                "first_ns": counts.first_ns,
+                "last_ns": counts.last_ns,
             }
-            for topic, account in _by_topic(found).items()
+            for topic, counts in _by_topic(found).items()
         },
         "published_after_the_last": {f"{key} {producer}": count for (key, producer), count in unrecorded.items()},
-        "thrown_away_bytes": found.thrown_away_bytes,
+        "discarded_bytes": found.discarded_bytes,
         "damaged_chunks": found.damaged_chunks,
         "damaged_attachments": found.damaged_attachments,
         "damaged_records": found.damaged_records,
@@ -91,8 +92,8 @@ def as_json(file: Path, recovery: Recovery) -> dict[str, Any]:
 
 
 def _by_topic(found: Scan) -> dict[str, StreamCounts]:
-    return add_up(found.accounts.items()) | found.census.others
+    return sum_by_key(found.streams.items()) | found.counts.others
 
 
 def _time(t_ns: int) -> str:
-    return datetime.fromtimestamp(t_ns / 1e9).isoformat(sep=" ", timespec="milliseconds")
+    return datetime.fromtimestamp(t_ns / NS_PER_S).isoformat(sep=" ", timespec="milliseconds")

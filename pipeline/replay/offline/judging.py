@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import UserError
-from pipeline.recordings.metadata import head_of
+from pipeline.recordings.metadata import recording_metadata
 from pipeline.recordings.writing import ACTIVE_SUFFIX, RecordingWriter
 from pipeline.replay.offline.offline_pipeline import OfflinePipeline, ReplayedMessage
 from pipeline.replay.offline.plan import TrayPlan, undisturbed
@@ -218,7 +218,7 @@ def _writer(material: ReplayInput, output: Path) -> RecordingWriter:
         if there.exists():
             raise UserError(f"{there}: exists already; name another file with -o, or remove it")
     contexts = [material.contexts(tray)["scorer"] for tray in material.trays]
-    metadata, attachments = head_of(replace(contexts[0], trays=tuple(context.tray for context in contexts)))
+    metadata, attachments = recording_metadata(replace(contexts[0], trays=tuple(context.tray for context in contexts)))
     metadata["source"] = ",".join(path.name for path in material.paths)
     return RecordingWriter(output, metadata, attachments)
 

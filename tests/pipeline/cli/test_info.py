@@ -118,8 +118,8 @@ def test_a_file_that_breaks_off_is_told(tmp_path):
     path = write(tmp_path / "r.mcap", 300)
     path.write_bytes(path.read_bytes()[:40_000])
     (found,) = told(path, exit_code=3)["files"]
-    assert found["damage"][0] == "it breaks off, as after a crash"
-    assert "it breaks off, as after a crash; `fantwin recover` mends it" in fantwin("info", path).stdout
+    assert found["damage"][0] == "it is truncated, as after a crash"
+    assert "it is truncated, as after a crash; repair it with `fantwin recover`" in fantwin("info", path).stdout
 
 
 def test_a_file_that_is_still_being_written_is_shown_as_far_as_it_is_on_the_disk(tmp_path):
@@ -141,8 +141,8 @@ def test_where_there_are_index_and_ledger_not_all_of_the_file_is_read(tmp_path, 
 def test_parts_are_added_up_and_checked_to_go_on_from_one_another(tmp_path):
     place, ledger = shelf(tmp_path), SequenceLedger()
     for first in (0, 10, 23):
-        part(place, range(first, first + 10), ledger).close()
-        ledger = ledger.following()
+        part(place, range(first, first + 10), ledger).finish()
+        ledger = ledger.for_next_part()
     names = [tmp_path / name for name in ("r-3.mcap", "r.mcap", "r-2.mcap")]
     found = told(*names, exit_code=3)
     assert found["topics"][RAW_KEY]["messages"] == 30
@@ -154,8 +154,8 @@ def test_parts_are_added_up_and_checked_to_go_on_from_one_another(tmp_path):
 def test_what_is_left_of_a_ring_of_parts_is_well(tmp_path):
     place, ledger = shelf(tmp_path), SequenceLedger()
     for first in (0, 10, 20):
-        part(place, range(first, first + 10), ledger).close()
-        ledger = ledger.following()
+        part(place, range(first, first + 10), ledger).finish()
+        ledger = ledger.for_next_part()
     assert place.delete_oldest() == "r.mcap"
     assert told(tmp_path / "r-2.mcap", tmp_path / "r-3.mcap")["continuity"] == []
     assert "continues r.mcap" in fantwin("info", tmp_path / "r-2.mcap", tmp_path / "r-3.mcap").stdout
@@ -177,8 +177,8 @@ def test_metadata_of_others_under_our_names_are_passed_over(tmp_path):
 def test_a_part_that_is_not_among_them_is_missed(tmp_path):
     place, ledger = shelf(tmp_path), SequenceLedger()
     for first in (0, 10, 20):
-        part(place, range(first, first + 10), ledger).close()
-        ledger = ledger.following()
+        part(place, range(first, first + 10), ledger).finish()
+        ledger = ledger.for_next_part()
     found = told(tmp_path / "r.mcap", tmp_path / "r-3.mcap", exit_code=3)
     assert found["continuity"] == ["r-3.mcap continues r-2.mcap, which is not among these files"]
     assert "which is not among these" in fantwin("info", tmp_path / "r.mcap", tmp_path / "r-3.mcap").stdout
@@ -186,18 +186,20 @@ def test_a_part_that_is_not_among_them_is_missed(tmp_path):
 
 def test_a_part_that_begins_elsewhere_than_the_one_before_ended_is_told(tmp_path):
     place = shelf(tmp_path)
-    part(place, range(10)).close()
-    part(place, range(12, 20), SequenceLedger({(RAW_KEY, "acquisition-1"): 12})).close()
+    part(place, range(10)).finish()
+    part(place, range(12, 20), SequenceLedger({(RAW_KEY, "acquisition-1"): 12})).finish()
     found = told(tmp_path / "r.mcap", tmp_path / "r-2.mcap", exit_code=3)
-    assert found["continuity"] == [f"r-2.mcap goes on at 12 of {RAW_KEY} acquisition-1, but r.mcap ends before 10"]
+    assert found["continuity"] == [
+        f"r-2.mcap starts at message 12 of {RAW_KEY} acquisition-1, but r.mcap ends before 10"
+    ]
 
 
 def test_a_pause_is_told(tmp_path):
     about = {"paused_t_ns": "1", "resumed_t_ns": "2500000001", "paused_because": "no room", "lost_in_pause": "7"}
-    shelf(tmp_path).begin(0, SequenceLedger(), about).close()
+    shelf(tmp_path).begin(0, SequenceLedger(), about).finish()
     said = fantwin("info", tmp_path / "r.mcap").stdout
-    assert "before it nothing was recorded for 2.5 s; messages lost: 7" in said
-    assert "because no room" in said
+    assert "before this part nothing was recorded for 2.5 s; messages lost: 7" in said
+    assert "reason: no room" in said
 
 
 def test_a_file_of_others_is_told_for_what_it_is(tmp_path):
@@ -211,12 +213,12 @@ def test_a_file_of_others_is_told_for_what_it_is(tmp_path):
     (found,) = told(path)["files"]
     assert (found["topics"], found["other_topics"]) == ({}, {"/camera": 1})
     said = fantwin("info", path).stdout
-    assert "not a recording of fantwin: none of its channels is ours" in said
+    assert "not a recording of fantwin: it has no channel of fantwin" in said
     assert "/camera" in said
 
 
 def test_a_recording_without_messages_is_shown_too(tmp_path):
-    RecordingWriter(tmp_path / "r.mcap", METADATA).close()
+    RecordingWriter(tmp_path / "r.mcap", METADATA).finish()
     (found,) = told(tmp_path / "r.mcap")["files"]
     assert (found["messages"], found["first_ns"], found["duration_s"]) == (0, None, 0.0)
     assert "0 messages" in fantwin("info", tmp_path / "r.mcap").stdout

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
-from pipeline.recordings.contents import BREAKS_OFF, contents_of
+from pipeline.recordings.contents import TRUNCATED, contents_of
 from pipeline.recordings.records import RecordReader
-from pipeline.recordings.repair import mend
+from pipeline.recordings.repair import repair_in_place
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Health, Output, StageStatus
 from schemas.topics import health_key
@@ -34,19 +34,19 @@ def torn(tmp_path, whole) -> Path:
 def test_a_torn_file_is_made_whole_in_place_and_the_loss_is_told(tmp_path, torn):
     done = fantwin("recover", torn)
     assert done.exit_code == 3
-    assert f"{torn}: 20 messages are whole again in {tmp_path / 'r.mcap'}; the torn file is" in done.stdout
+    assert f"{torn}: 20 messages recovered in {tmp_path / 'r.mcap'}; the original is kept as" in done.stdout
     assert f"{RAW_KEY}: 20 messages, the last at 1970" in done.stdout
-    assert "it breaks off, as after a crash: what was in the unfinished chunk may be missing" in done.stdout
+    assert "it is truncated, as after a crash: messages of the unfinished chunk may be missing" in done.stdout
     assert len(read_by_others(tmp_path / "r.mcap")) == 20
-    assert (tmp_path / "r.mcap.torn").exists()
+    assert (tmp_path / "r.mcap.original").exists()
 
 
 def test_it_says_so_to_machines_too(tmp_path, torn):
     done = fantwin("recover", torn, "-o", tmp_path / "out.mcap", "--json")
     told = json.loads(done.stdout)
     assert done.exit_code == 3
-    assert told["whole"] == str(tmp_path / "out.mcap")
-    assert told["torn"] is None
+    assert told["output"] == str(tmp_path / "out.mcap")
+    assert told["original"] is None
     assert told["messages"] == 20
     assert told["topics"][RAW_KEY] == {
         "messages": 20,
@@ -55,7 +55,7 @@ def test_it_says_so_to_machines_too(tmp_path, torn):
         "first_ns": 1000,
         "last_ns": 1019,
     }
-    assert told["thrown_away_bytes"] > 0
+    assert told["discarded_bytes"] > 0
     assert torn.exists(), "with -o the torn file stays what it is"
 
 
@@ -63,7 +63,7 @@ def test_a_whole_file_is_left_alone(whole):
     before = whole.read_bytes()
     done = fantwin("recover", whole)
     assert done.exit_code == 0
-    assert "is whole already, with 41 messages; nothing to recover" in done.stdout
+    assert "intact, with 41 messages; nothing to recover" in done.stdout
     assert "nothing was lost" in done.stdout
     assert whole.read_bytes() == before
 
@@ -120,19 +120,19 @@ def test_what_a_recovered_file_has_lost_info_says_ever_after(tmp_path, number):
     (file,) = told["files"]
     assert (file["recovered"][1:], file["damage"]) == (["damaged chunks: 1"], [])
     assert contents_of(tmp_path / "out.mcap").next[RAW_KEY, "acquisition-1"] == 15
-    assert "was mended: damaged chunks: 1" in fantwin("info", tmp_path / "out.mcap").stdout
+    assert "repaired earlier: damaged chunks: 1" in fantwin("info", tmp_path / "out.mcap").stdout
     assert fantwin("recover", tmp_path / "out.mcap").exit_code == 3, "it still is what it is"
 
 
 def test_what_a_torn_file_may_have_lost_info_says_ever_after(tmp_path, torn):
     assert fantwin("recover", torn, "-o", tmp_path / "out.mcap").exit_code == 3
-    mended = mend(torn)
+    mended = repair_in_place(torn)
     assert mended is not None
     for path in (tmp_path / "out.mcap", mended.path):
         done = fantwin("info", path, "--json")
         assert done.exit_code == 3
         (file,) = json.loads(done.stdout)["files"]
-        assert file["recovered"] == [f"{BREAKS_OFF}: what was in the unfinished chunk may be missing"]
+        assert file["recovered"] == [f"{TRUNCATED}: messages of the unfinished chunk may be missing"]
 
 
 def test_where_the_output_cannot_be_it_says_to_name_another(tmp_path, whole):
@@ -157,8 +157,11 @@ def test_what_a_health_says_was_published_and_is_not_there_is_told(tmp_path):
     writer._file.close()
     done = fantwin("recover", tmp_path / "r.mcap.active")
     assert done.exit_code == 3
-    assert "what came in the last 0.5 s may be missing" in done.stdout
-    assert f"{RAW_KEY}: 3 messages of acquisition-1 published, by its health, after the last one here" in done.stdout
+    assert "messages received in the last 0.5 s may be missing" in done.stdout
+    assert (
+        f"{RAW_KEY}: 3 messages of acquisition-1 published after the last one here, according to its health"
+        in done.stdout
+    )
 
 
 @pytest.mark.parametrize(
@@ -166,7 +169,7 @@ def test_what_a_health_says_was_published_and_is_not_there_is_told(tmp_path):
     [
         (b"", "not a recording (MCAP)"),
         (b"t,u,y\n1,2,3\n", "not a recording (MCAP)"),
-        (b"\x89MCAP0\r\n", "there is no whole message in it: nothing can be recovered"),
+        (b"\x89MCAP0\r\n", "it holds no intact message: nothing can be recovered"),
         (None, "cannot read the recording: No such file or directory"),
     ],
 )

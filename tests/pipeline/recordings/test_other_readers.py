@@ -1,4 +1,4 @@
-"""Recordings in other people's readers: whole ones with index and summary, torn ones as far as each reader goes."""
+"""Recordings in other readers: intact ones with index and summary, truncated ones as far as each reader goes."""
 
 import json
 import shutil
@@ -41,9 +41,9 @@ class Files:
     """A whole recording, what a killed recorder left of it, and how many messages of each key are in each."""
 
     whole: Path
-    torn: Path
+    truncated: Path
     in_whole: Counter[str]
-    in_torn: Counter[str]
+    in_truncated: Counter[str]
 
 
 def messages() -> list[Message]:
@@ -66,9 +66,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
             if number == RAWS + 10:
                 writer.flush()
             if number == RAWS + 15:  # what is on the disk at this moment is what a kill -9 would leave
-                shutil.copy(folder / f"r.mcap{ACTIVE_SUFFIX}", folder / "torn.mcap")
+                shutil.copy(folder / f"r.mcap{ACTIVE_SUFFIX}", folder / "truncated.mcap")
                 raise KeyboardInterrupt
-    return Files(folder / "whole.mcap", folder / "torn.mcap", Counter(keys), Counter(keys[: RAWS + 11]))
+    return Files(folder / "whole.mcap", folder / "truncated.mcap", Counter(keys), Counter(keys[: RAWS + 11]))
 
 
 def run(*words: object, code: int = 0) -> str:
@@ -107,14 +107,14 @@ def test_mcap_finds_one_topic_and_a_stretch_of_time_by_the_index(files):
 
 def test_mcap_reads_all_of_a_torn_file_that_reached_the_disk_before_it_says_that_it_is_torn(files):
     found: Counter[str] = Counter()
-    with files.torn.open("rb") as file, pytest.raises((McapError, struct.error)):
+    with files.truncated.open("rb") as file, pytest.raises((McapError, struct.error)):
         for _, channel, _ in NonSeekingReader(file).iter_messages(log_time_order=False):
             found[channel.topic] += 1
-    assert found == files.in_torn
+    assert found == files.in_truncated
 
 
 def test_mcap_finds_no_index_in_a_torn_file(files):
-    with files.torn.open("rb") as file, pytest.raises(McapError):
+    with files.truncated.open("rb") as file, pytest.raises(McapError):
         make_reader(file).get_summary()
 
 
@@ -204,7 +204,7 @@ def test_rerun_reads_every_message_with_its_fields(files, tmp_path):
 
 @needs_rerun
 def test_rerun_recovers_from_a_torn_file_what_reached_the_disk(files, tmp_path):
-    assert "PROBLEM" not in run(RERUN, "mcap", "check", "--recover", files.torn)
-    run(RERUN, "mcap", "convert", "--recover", files.torn, "--application-id", "fantwin", "-o", tmp_path / "r.rrd")
+    assert "PROBLEM" not in run(RERUN, "mcap", "check", "--recover", files.truncated)
+    run(RERUN, "mcap", "convert", "--recover", files.truncated, "--application-id", "fantwin", "-o", tmp_path / "r.rrd")
     found = rerun_rows(tmp_path / "r.rrd")
-    assert {entity: len(rows) for entity, rows in found.items()} == {f"/{k}": n for k, n in files.in_torn.items()}
+    assert {entity: len(rows) for entity, rows in found.items()} == {f"/{k}": n for k, n in files.in_truncated.items()}

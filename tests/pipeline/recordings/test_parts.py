@@ -44,8 +44,8 @@ def test_parts_are_numbered_and_say_which_went_before(tmp_path):
     place = shelf(tmp_path)
     ledger = SequenceLedger()
     for first in (0, 10, 20):
-        part(place, range(first, first + 10), ledger).close()
-        ledger = ledger.following()
+        part(place, range(first, first + 10), ledger).finish()
+        ledger = ledger.for_next_part()
     assert names(tmp_path) == ["r-2.mcap", "r-3.mcap", "r.mcap"]
     said = [read_metadata(tmp_path / name).metadata for name in ("r.mcap", "r-2.mcap", "r-3.mcap")]
     assert [(m["part"], m["session"], m.get("continues")) for m in said] == [
@@ -60,7 +60,7 @@ def test_parts_are_numbered_and_say_which_went_before(tmp_path):
 def test_each_part_is_complete_in_itself(tmp_path):
     place = shelf(tmp_path)
     for _ in range(2):
-        part(place, [0]).close()
+        part(place, [0]).finish()
     for name in ("r.mcap", "r-2.mcap"):
         head = read_metadata(tmp_path / name)
         assert head.metadata["site"] == "plant"
@@ -69,27 +69,27 @@ def test_each_part_is_complete_in_itself(tmp_path):
 
 def test_an_open_part_is_called_active(tmp_path):
     place = shelf(tmp_path)
-    part(place).close()
+    part(place).finish()
     writer = part(place)
     assert names(tmp_path) == ["r-2.mcap.active", "r.mcap"]
-    writer.close()
+    writer.finish()
 
 
 def test_the_oldest_part_is_deleted_first_and_its_name_is_not_given_again(tmp_path):
     place = shelf(tmp_path)
     for _ in range(11):
-        part(place, [0]).close()
+        part(place, [0]).finish()
     assert [place.delete_oldest() for _ in range(10)] == ["r.mcap", *(f"r-{n}.mcap" for n in range(2, 11))]
     assert place.delete_oldest() == "r-11.mcap"
     assert place.delete_oldest() is None
-    part(place).close()
+    part(place).finish()
     assert names(tmp_path) == ["r-12.mcap"]
 
 
 def test_only_parts_of_this_recording_are_deleted(tmp_path):
     write(tmp_path / "r.mcap", 3)  # an import, say
     (tmp_path / "r-2.mcap").write_bytes(b"not ours")
-    RecordingParts(tmp_path / "r-3.mcap", {}, {}, "other").begin(0, SequenceLedger(), {}).close()
+    RecordingParts(tmp_path / "r-3.mcap", {}, {}, "other").begin(0, SequenceLedger(), {}).finish()
     assert shelf(tmp_path).delete_oldest() is None
     assert len(names(tmp_path)) == 3
 
@@ -98,20 +98,20 @@ def test_the_part_that_is_open_is_not_deleted(tmp_path):
     place = shelf(tmp_path)
     writer = part(place)
     assert place.delete_oldest() is None
-    writer.close()
+    writer.finish()
 
 
 def test_a_new_recorder_takes_a_number_above_all_there_are(tmp_path):
     for name in ("r.mcap", "r-7.mcap", "r-9.mcap.torn"):
         (tmp_path / name).touch()
-    part(shelf(tmp_path)).close()
+    part(shelf(tmp_path)).finish()
     assert "r-10.mcap" in names(tmp_path)
 
 
 def test_what_a_killed_recorder_left_is_mended_and_gone_on_from(tmp_path):
     kill_a_recorder(tmp_path / "r.mcap", flushed=40)
     place = shelf(tmp_path, "s2")
-    assert [(recovery.path.name, recovery.found.messages) for recovery in place.mended] == [("r.mcap", 40)]
+    assert [(recovery.path.name, recovery.found.messages) for recovery in place.repaired] == [("r.mcap", 40)]
     assert sequences(tmp_path / "r.mcap") == list(range(40))
     assert read_recording(tmp_path / "r.mcap").damage == ""
     assert contents_of(tmp_path / "r.mcap").damage == ()
@@ -124,32 +124,32 @@ def test_the_first_part_after_a_killed_recorder_continues_its_last(tmp_path):
     killed(killed_writer)
     place = shelf(tmp_path, "s2")
     assert place.before == {LINE: 40}
-    part(place, [45]).close()
+    part(place, [45]).finish()
     head = read_metadata(tmp_path / "r-2.mcap").metadata
     assert (head["session"], head["part"], head["continues"]) == ("s2", "1", "r.mcap")
-    assert contents_of(tmp_path / "r-2.mcap").accounts[LINE].missing == 5
+    assert contents_of(tmp_path / "r-2.mcap").streams[LINE].missing == 5
 
 
 def test_a_recorder_killed_while_it_had_no_part_open_is_gone_on_from_too(tmp_path):
-    part(shelf(tmp_path), range(40)).close()  # it paused, and was killed
+    part(shelf(tmp_path), range(40)).finish()  # it paused, and was killed
     assert shelf(tmp_path, "s2").before == {LINE: 40}
 
 
 def test_a_recorder_that_ended_in_order_is_gone_on_from_as_well(tmp_path):
-    part(shelf(tmp_path), range(40)).close(has_ended=True)
+    part(shelf(tmp_path), range(40)).finish(has_ended=True)
     place = shelf(tmp_path, "s2")
     assert place.before == {LINE: 40}
-    part(place, [45]).close()
+    part(place, [45]).finish()
     assert read_metadata(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
-    assert contents_of(tmp_path / "r-2.mcap").accounts[LINE].missing == 5
+    assert contents_of(tmp_path / "r-2.mcap").streams[LINE].missing == 5
 
 
 def test_a_file_of_others_with_a_higher_number_does_not_hide_the_last_part(tmp_path):
-    part(shelf(tmp_path), range(40)).close()
+    part(shelf(tmp_path), range(40)).finish()
     write(tmp_path / "r-9.mcap", 3)
     place = shelf(tmp_path, "s2")
     assert place.before == {LINE: 40}
-    part(place).close()
+    part(place).finish()
     assert read_metadata(tmp_path / "r-10.mcap").metadata["continues"] == "r.mcap"
 
 
@@ -164,8 +164,8 @@ def test_a_left_over_whose_only_chunk_is_damaged_is_put_aside_and_not_deleted(tm
     kill_a_recorder(tmp_path / "r.mcap", flushed=5)
     damage_a_chunk(tmp_path / "r.mcap.active", 0)
     content = (tmp_path / "r.mcap.active").read_bytes()
-    assert shelf(tmp_path).unreadable == [tmp_path / "r.mcap.torn"]
-    assert (tmp_path / "r.mcap.torn").read_bytes() == content
+    assert shelf(tmp_path).unreadable == [tmp_path / "r.mcap.original"]
+    assert (tmp_path / "r.mcap.original").read_bytes() == content
 
 
 def test_a_damaged_left_over_that_a_full_disk_keeps_from_being_mended_is_gone_on_from(tmp_path):
@@ -175,16 +175,16 @@ def test_a_damaged_left_over_that_a_full_disk_keeps_from_being_mended_is_gone_on
     damage_a_chunk(tmp_path / "r.mcap.active", 1)
     with disk_of(100):
         place = shelf(tmp_path, "s2")
-    assert (place.unmended, place.unreadable, place.mended) == ([tmp_path / "r.mcap.active"], [], [])
+    assert (place.unrepaired, place.unreadable, place.repaired) == ([tmp_path / "r.mcap.active"], [], [])
     assert place.before == {LINE: 3000}
-    part(place, [3000]).close()
+    part(place, [3000]).finish()
     assert read_metadata(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
-    assert shelf(tmp_path, "s3").mended[0].path == tmp_path / "r.mcap"
+    assert shelf(tmp_path, "s3").repaired[0].path == tmp_path / "r.mcap"
 
 
 def test_a_left_over_without_any_message_is_not_kept(tmp_path):
     kill_a_recorder(tmp_path / "r.mcap", flushed=0)
-    assert shelf(tmp_path).mended == []
+    assert shelf(tmp_path).repaired == []
     assert names(tmp_path) == []
 
 
@@ -202,7 +202,7 @@ def test_a_recording_that_is_being_written_is_not_touched(tmp_path):
     writer = part(shelf(tmp_path), [0])
     with pytest.raises(RecordingError, match="r.mcap.active: another recorder is writing it; stop it"):
         shelf(tmp_path)
-    writer.close()
+    writer.finish()
     assert sequences(tmp_path / "r.mcap") == [0]
 
 
@@ -210,10 +210,10 @@ def test_a_recording_that_is_being_written_is_not_touched(tmp_path):
 def test_a_left_over_that_is_no_recording_is_put_aside(tmp_path, content):
     (tmp_path / "r.mcap.active").write_bytes(content)
     place = shelf(tmp_path)
-    assert place.unreadable == [tmp_path / "r.mcap.torn"]
+    assert place.unreadable == [tmp_path / "r.mcap.original"]
     assert place.unreadable[0].read_bytes() == content
-    part(place).close()
-    assert names(tmp_path) == ["r-2.mcap", "r.mcap.torn"]
+    part(place).finish()
+    assert names(tmp_path) == ["r-2.mcap", "r.mcap.original"]
 
 
 def test_the_room_of_a_disk_is_what_is_left_on_it(small_disk):
@@ -225,7 +225,7 @@ def test_the_room_of_a_disk_is_what_is_left_on_it(small_disk):
 
 def test_the_place_of_a_disk_that_was_unmounted_is_not_taken_for_it(small_disk):
     place = shelf(small_disk)
-    part(place, [0]).close()
+    part(place, [0]).finish()
     unmount(small_disk)
     for use in (place.free_bytes, lambda: part(place)):
         with pytest.raises(DiskError, match="disk: the disk is no longer mounted; mount it again"):

@@ -23,7 +23,7 @@ from pipeline.recordings import writing
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.disk import AtomicAppendFile, DiskError
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.sequence_ledger import StreamCounts, accounts_of
+from pipeline.recordings.sequence_ledger import StreamCounts, counts_from_metadata
 from pipeline.recordings.writing import ACTIVE_SUFFIX, CHUNK_BYTES, RecordingWriter
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Array, Command, Header, Message, Raw, Severity
@@ -114,7 +114,7 @@ def test_the_unit_of_speed_is_that_of_the_tray_or_of_the_recording_or_radians(tm
         ({"speed_unit": "rpm"}, "rpm"),
         ({"speed_unit": "rpm", "speed_unit.tray1": "hz"}, "hz"),
     ):
-        RecordingWriter(path, metadata, overwrite=True).close()
+        RecordingWriter(path, metadata, overwrite=True).finish()
         assert read_metadata(path).speed_unit("tray1") == unit
 
 
@@ -154,14 +154,14 @@ def test_a_recording_is_called_active_until_it_is_finished(tmp_path):
     path = tmp_path / "r.mcap"
     writer = RecordingWriter(path, {})
     assert [p.name for p in tmp_path.iterdir()] == ["r.mcap.active"]
-    writer.close()
+    writer.finish()
     assert [p.name for p in tmp_path.iterdir()] == ["r.mcap"]
 
 
 def test_closing_twice_is_closing_once(tmp_path):
     writer = RecordingWriter(tmp_path / "r.mcap", {})
-    writer.close()
-    writer.close()
+    writer.finish()
+    writer.finish()
     assert list(read_recording(writer.path)) == []
 
 
@@ -228,7 +228,7 @@ def test_what_is_counted_as_written_is_in_the_file(tmp_path):
             assert writer.written["raw"] + len(writer.pending) == sequence + 1
     writer.flush()
     assert (writer.written["raw"], len(writer.pending)) == (600, 0)
-    writer.close()
+    writer.finish()
 
 
 def test_what_is_flushed_is_through_to_the_disk_and_so_is_the_name(tmp_path, monkeypatch):
@@ -241,7 +241,7 @@ def test_what_is_flushed_is_through_to_the_disk_and_so_is_the_name(tmp_path, mon
     writer.flush()
     writer.flush()
     assert synced == [tmp_path, writer.size], "once, as long as there is nothing new"
-    writer.close()
+    writer.finish()
     assert synced[2:] == [(tmp_path / "r.mcap").stat().st_size, tmp_path]
 
 
@@ -266,7 +266,7 @@ def test_a_disk_that_fails_to_sync_is_told_and_the_file_ends_readable(tmp_path, 
     reading = read_recording(tmp_path / "r.mcap")
     assert [entry.message.header.sequence for entry in reading] == list(range(500)), "what was on the disk before"
     assert [pending.message.header.sequence for pending in writer.pending] == list(range(500, 1001))
-    assert (writer.written["raw"], contents_of(writer.path).accounts[RAW_KEY, "acquisition-1"].messages) == (500, 500)
+    assert (writer.written["raw"], contents_of(writer.path).streams[RAW_KEY, "acquisition-1"].messages) == (500, 500)
     assert reading.damage == ""
     with (tmp_path / "r.mcap").open("rb") as file:
         assert (make_reader(file).get_summary() is None) == for_ever
@@ -345,7 +345,7 @@ def test_the_ledger_stands_in_the_file(tmp_path):
             writer.add_message(RAW_KEY, raw(sequence), 1000 + sequence)
     with path.open("rb") as file:
         records = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
-    assert accounts_of(records["fantwin.ledger"]) == {
+    assert counts_from_metadata(records["fantwin.ledger"]) == {
         (RAW_KEY, "acquisition-1"): StreamCounts(
             3, 2, 0, first_sequence=3, last_sequence=7, first_ns=1003, last_ns=1007
         )
@@ -365,7 +365,7 @@ def test_an_ending_that_is_refused_at_first_is_in_the_index_once(tmp_path, monke
 
     monkeypatch.setattr(AtomicAppendFile, "write", refuse_once)
     with pytest.raises(DiskError):
-        writer.close()
+        writer.finish()
     with (tmp_path / "r.mcap").open("rb") as file:
         names = [record.name for record in make_reader(file).iter_metadata()]
     assert names == ["fantwin", "fantwin.ledger"]

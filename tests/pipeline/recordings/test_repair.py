@@ -19,7 +19,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from pipeline.recordings.contents import contents_of, damage_of
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from pipeline.recordings.records import RECORD, RecordReader
-from pipeline.recordings.repair import mend, recover
+from pipeline.recordings.repair import recover, repair_in_place
 from pipeline.recordings.scan import scan
 from pipeline.recordings.sequence_ledger import StreamCounts
 from pipeline.recordings.writing import RecordingWriter
@@ -94,7 +94,7 @@ def test_a_file_torn_at_any_byte_is_whole_again_up_to_its_last_whole_chunk(tmp_p
     recover(torn, output)
     assert read_by_others(output) == read_by_others(whole)[:expected]
     assert read_metadata(output) == read_metadata(whole)
-    assert scan(output).is_whole
+    assert scan(output).is_intact
     assert torn.read_bytes() == content[:size]
 
 
@@ -106,14 +106,17 @@ def test_what_a_killed_recorder_has_left_is_mended_in_place_with_the_same_result
     for path in tmp_path.iterdir():
         path.unlink()
     active.write_bytes(content[:size])
-    mended = mend(active)
+    mended = repair_in_place(active)
     assert not active.exists()
     (tmp_path / "torn.mcap").write_bytes(content[:size])
     if mended is None:
         assert not any(end <= size for end, _ in chunk_ends(whole))
         return
     recover(tmp_path / "torn.mcap", output)
-    assert mended.path.read_bytes() == output.read_bytes()
+    assert read_by_others(mended.path) == read_by_others(output)
+    in_place, copy = contents_of(mended.path), contents_of(output)
+    assert (in_place.streams, in_place.recovered) == (copy.streams, copy.recovered)
+    assert read_metadata(mended.path) == read_metadata(output)
     assert mended.path.name == "a.mcap"
 
 
@@ -122,12 +125,12 @@ def test_a_kill_at_any_byte_of_mending_costs_nothing_either(tmp_path, whole):
     torn = whole.read_bytes()[: chunk_ends(whole)[5][0] + 7]
     active = tmp_path / "r.mcap.active"
     active.write_bytes(torn)
-    first = mend(active)
+    first = repair_in_place(active)
     assert first is not None
     mended = first.path.read_bytes()
     for size in range(chunk_ends(whole)[5][0], len(mended), 37):
         active.write_bytes(mended[:size])
-        again = mend(active)
+        again = repair_in_place(active)
         assert again is not None
         assert again.path.read_bytes() == mended
         again.path.unlink()
@@ -138,12 +141,12 @@ def test_in_place_the_torn_file_is_kept_beside_the_whole_one(tmp_path, whole):
     torn.write_bytes(whole.read_bytes()[:-300])
     before = torn.read_bytes()
     recovery = recover(torn)
-    assert (recovery.path, recovery.torn) == (torn, tmp_path / "r.mcap.torn")
-    assert recovery.torn is not None and recovery.torn.read_bytes() == before
+    assert (recovery.path, recovery.original) == (torn, tmp_path / "r.mcap.original")
+    assert recovery.original is not None and recovery.original.read_bytes() == before
     assert len(read_by_others(torn)) == 41
     torn.write_bytes(before)
-    assert recover(torn).torn == tmp_path / "r.mcap.torn-2"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["r.mcap", "r.mcap.torn", "r.mcap.torn-2"]
+    assert recover(torn).original == tmp_path / "r.mcap.original-2"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["r.mcap", "r.mcap.original", "r.mcap.original-2"]
 
 
 def test_what_is_still_called_active_gets_the_name_of_a_recording(tmp_path, whole):
@@ -151,7 +154,7 @@ def test_what_is_still_called_active_gets_the_name_of_a_recording(tmp_path, whol
     (tmp_path / "r.mcap.active").write_bytes(whole.read_bytes()[:-300])
     recovery = recover(tmp_path / "r.mcap.active")
     assert recovery.path == tmp_path / "r-2.mcap"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["r-2.mcap", "r-2.mcap.torn", "r.mcap"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r-2.mcap", "r-2.mcap.original", "r.mcap"]
 
 
 @pytest.mark.parametrize("less", [0, 300])
@@ -187,7 +190,7 @@ def test_a_file_that_is_whole_is_left_alone_or_copied(tmp_path, whole):
     path = tmp_path / "r.mcap"
     path.write_bytes(whole.read_bytes())
     inode = path.stat().st_ino
-    assert recover(path).found.is_whole
+    assert recover(path).found.is_intact
     assert (path.stat().st_ino, sorted(p.name for p in tmp_path.iterdir())) == (inode, ["r.mcap"])
     recover(path, tmp_path / "copy.mcap")
     assert (tmp_path / "copy.mcap").read_bytes() == whole.read_bytes()
@@ -196,12 +199,12 @@ def test_a_file_that_is_whole_is_left_alone_or_copied(tmp_path, whole):
 def test_the_ledger_of_a_file_that_was_finished_but_for_its_index_is_kept(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
         writer.add_message(RAW_KEY, raw(0), 1)
-        writer.ledger.note_duplicated(*LINE, 7)
+        writer.ledger.add_duplicated(*LINE, 7)
     path = writer.path
     path.write_bytes(path.read_bytes()[:-40])
     found = recover(path).found
     assert found.is_ended
-    assert contents_of(path).accounts[LINE].duplicated == 7
+    assert contents_of(path).streams[LINE].duplicated == 7
 
 
 def test_holes_are_told_and_stand_in_the_new_ledger(tmp_path):
@@ -211,7 +214,7 @@ def test_holes_are_told_and_stand_in_the_new_ledger(tmp_path):
     writer.flush()
     writer._file.close()
     recovery = recover(tmp_path / "r.mcap.active")
-    assert contents_of(recovery.path).accounts[LINE] == StreamCounts(3, 3, 0, 0, 5, 1000, 1005)
+    assert contents_of(recovery.path).streams[LINE] == StreamCounts(3, 3, 0, 0, 5, 1000, 1005)
 
 
 @settings(max_examples=100, suppress_health_check=NO_CHECK)
@@ -228,7 +231,7 @@ def test_a_changed_byte_anywhere_costs_its_record_only(tmp_path, whole, at, valu
     recover(path, output)
     messages = read_by_others(output)
     assert len(messages) >= 41 - 6, "at most one chunk"
-    assert scan(output).is_whole or scan(output).nameless
+    assert scan(output).is_intact or scan(output).nameless
     assert {name for name, _ in messages} <= {RAW_KEY, ALARM_KEY, "lost/1"}
 
 
@@ -246,9 +249,9 @@ def test_a_damaged_length_costs_one_chunk_though_it_fits_into_the_file(tmp_path,
     chunks = len(records)
     found = recover(path).found
     lost = before - found.messages
-    assert found.walk.damaged_ranges
+    assert found.reader.damaged_ranges
     assert (0 < lost < 2 * before / chunks) if opcode == Opcode.CHUNK else lost == 0
-    assert contents_of(path).accounts[LINE].missing == lost
+    assert contents_of(path).streams[LINE].missing == lost
 
 
 def test_after_a_damaged_length_the_next_whole_chunk_is_found(tmp_path, whole):
@@ -262,9 +265,9 @@ def test_after_a_damaged_length_the_next_whole_chunk_is_found(tmp_path, whole):
     path.write_bytes(content)
     found = recover(path).found
     assert len(read_by_others(path)) == 36
-    (stretch,) = found.walk.damaged_ranges
+    (stretch,) = found.reader.damaged_ranges
     assert stretch == (third, summary.chunk_indexes[3].chunk_start_offset)
-    assert contents_of(path).accounts[LINE].missing == 5
+    assert contents_of(path).streams[LINE].missing == 5
 
 
 def test_a_sector_of_zeros_costs_the_chunks_it_touches(tmp_path):
@@ -280,8 +283,8 @@ def test_a_sector_of_zeros_costs_the_chunks_it_touches(tmp_path):
     sequences = [entry.message.header.sequence for entry in read_recording(path, topics=("raw",))]
     holes = sum(later - earlier - 1 for earlier, later in pairwise(sequences))
     assert (sequences[0], sequences[-1]) == (0, 999)
-    assert 0 < holes == 1000 - len(sequences) == found.census.ledger.accounts[LINE].missing
-    assert scan(path).is_whole
+    assert 0 < holes == 1000 - len(sequences) == found.counts.ledger.counts[LINE].missing
+    assert scan(path).is_intact
 
 
 def test_a_channel_that_was_described_in_a_damaged_chunk_is_found_in_the_summary_or_kept_without_a_name(
@@ -328,7 +331,7 @@ def test_a_disk_that_is_full_costs_a_killed_recorder_s_file_only_its_index(tmp_p
     active = tmp_path / "r.mcap.active"
     active.write_bytes(whole.read_bytes()[: chunk_ends(whole)[4][0] + 100])
     with disk_of(active.stat().st_size):
-        mended = mend(active)
+        mended = repair_in_place(active)
     assert mended is not None
     assert len(list(read_recording(mended.path))) == 26
     recover(mended.path)
@@ -365,10 +368,10 @@ def test_a_torn_file_of_others_is_mended_too(tmp_path, chunked, compression):
         writer.finish()
     with path.open("rb") as file:
         all_of_it = [message.log_time for _, _, message in make_reader(file).iter_messages()]
-    assert recover(path).found.is_whole
+    assert recover(path).found.is_intact
     path.write_bytes(path.read_bytes()[:3000])
     found = recover(path).found
-    assert found.census.others["/pose"].messages == found.messages > 20
+    assert found.counts.others["/pose"].messages == found.messages > 20
     with path.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()

@@ -8,22 +8,22 @@ from hypothesis import strategies as st
 from pipeline.recordings.sequence_ledger import (
     SequenceLedger,
     StreamCounts,
-    accounts_of,
-    add_up,
-    as_metadata,
-    before_of,
-    corrected,
-    next_of,
+    before_from_metadata,
+    correct_for_damage,
+    counts_from_metadata,
+    ledger_metadata,
+    next_sequences,
+    sum_by_key,
 )
 from schemas.messages import Header, Health, Output, StageStatus
 
 KEY, TWIN_KEY = "fantwin/plant/tray1/raw", "fantwin/plant/tray1/twin"
 
 
-def noted(sequences, before=None, key=KEY, producer="a") -> SequenceLedger:
+def counted(sequences, before=None, key=KEY, producer="a") -> SequenceLedger:
     ledger = SequenceLedger(before)
     for sequence in sequences:
-        ledger.note(key, producer, sequence, 1000 + sequence)
+        ledger.add(key, producer, sequence, 1000 + sequence)
     return ledger
 
 
@@ -41,112 +41,112 @@ def health(producer: str, published: int, key: str = KEY) -> Health:
 
 
 def test_holes_are_missing():
-    assert noted([3, 4, 8, 9]).accounts[KEY, "a"] == StreamCounts(4, 3, 0, 3, 9, 1003, 1009)
+    assert counted([3, 4, 8, 9]).counts[KEY, "a"] == StreamCounts(4, 3, 0, 3, 9, 1003, 1009)
 
 
 def test_what_a_producer_sent_before_it_was_known_is_no_loss():
-    assert noted([500]).accounts[KEY, "a"].missing == 0
+    assert counted([500]).counts[KEY, "a"].missing == 0
 
 
 def test_a_hole_between_two_parts_is_missing_in_the_second():
-    first = noted(range(10))
-    second = first.following()
-    second.note(KEY, "a", 14, 1014)
-    assert (first.accounts[KEY, "a"].missing, second.accounts[KEY, "a"].missing) == (0, 4)
+    first = counted(range(10))
+    second = first.for_next_part()
+    second.add(KEY, "a", 14, 1014)
+    assert (first.counts[KEY, "a"].missing, second.counts[KEY, "a"].missing) == (0, 4)
 
 
 def test_repeated_messages_are_counted_and_make_no_hole():
-    account = noted([0, 1, 2, 1, 3]).accounts[KEY, "a"]
+    account = counted([0, 1, 2, 1, 3]).counts[KEY, "a"]
     assert (account.messages, account.missing, account.duplicated, account.last_sequence) == (5, 0, 1, 3)
 
 
 def test_a_card_that_is_written_again_at_the_start_of_a_part_counts_once():
-    assert noted([1, 2], before={(TWIN_KEY, "a"): 2}, key=TWIN_KEY).accounts[TWIN_KEY, "a"].messages == 1
+    assert counted([1, 2], before={(TWIN_KEY, "a"): 2}, key=TWIN_KEY).counts[TWIN_KEY, "a"].messages == 1
 
 
 def test_every_producer_has_an_account_of_its_own_and_a_key_the_sum():
-    ledger = noted([0, 1, 4])
-    ledger.note(KEY, "b", 7, 5000)
-    ledger.note_duplicated(KEY, "b", 3)
-    assert add_up(ledger.accounts.items()) == {KEY: StreamCounts(4, 2, 3, None, None, 1000, 5000)}
+    ledger = counted([0, 1, 4])
+    ledger.add(KEY, "b", 7, 5000)
+    ledger.add_duplicated(KEY, "b", 3)
+    assert sum_by_key(ledger.counts.items()) == {KEY: StreamCounts(4, 2, 3, None, None, 1000, 5000)}
 
 
 def test_messages_that_will_not_be_recorded_are_missing_once_a_later_one_is():
-    ledger = noted([0, 1])
+    ledger = counted([0, 1])
     for sequence in (2, 3, 2):
-        ledger.lose(KEY, "a", sequence)
-    ledger.note(KEY, "a", 5, 1)
-    ledger.settle()
-    assert ledger.accounts[KEY, "a"].missing == 3
+        ledger.add_lost(KEY, "a", sequence)
+    ledger.add(KEY, "a", 5, 1)
+    ledger.finish()
+    assert ledger.counts[KEY, "a"].missing == 3
 
 
 def test_messages_that_will_not_be_recorded_are_missing_at_the_end_if_no_later_one_came():
-    ledger = noted([0, 1])
-    ledger.lose(KEY, "a", 3)
-    ledger.lose(KEY, "b", 7)
-    last = ledger.following().following()
-    last.settle()
-    assert ledger.accounts[KEY, "a"].missing == 0
-    assert {line: account.missing for line, account in last.accounts.items()} == {(KEY, "a"): 2, (KEY, "b"): 1}
+    ledger = counted([0, 1])
+    ledger.add_lost(KEY, "a", 3)
+    ledger.add_lost(KEY, "b", 7)
+    last = ledger.for_next_part().for_next_part()
+    last.finish()
+    assert ledger.counts[KEY, "a"].missing == 0
+    assert {line: account.missing for line, account in last.counts.items()} == {(KEY, "a"): 2, (KEY, "b"): 1}
 
 
 def test_where_a_part_should_have_begun_is_where_the_one_before_ended_whatever_was_lost():
-    ledger = noted([0, 1]).following()
-    ledger.lose(KEY, "a", 5)
-    assert before_of(ledger.before_as_metadata()) == {(KEY, "a"): 2}
+    ledger = counted([0, 1]).for_next_part()
+    ledger.add_lost(KEY, "a", 5)
+    assert before_from_metadata(ledger.before_as_metadata()) == {(KEY, "a"): 2}
 
 
 def test_what_a_stage_says_it_has_published_and_never_came_is_unrecorded():
-    ledger = noted([0, 1, 2])
-    ledger.note_health(health("a", 3))
+    ledger = counted([0, 1, 2])
+    ledger.add_health(health("a", 3))
     assert ledger.unrecorded() == {}
-    ledger.note_health(health("a", 5))
+    ledger.add_health(health("a", 5))
     assert ledger.unrecorded() == {(KEY, "a"): 2}
-    ledger.settle()
-    assert ledger.accounts[KEY, "a"].missing == 2
+    ledger.finish()
+    assert ledger.counts[KEY, "a"].missing == 2
     assert ledger.unrecorded() == {}
 
 
 def test_of_a_producer_of_which_nothing_was_recorded_nothing_is_missing():
     ledger = SequenceLedger()
-    ledger.note_health(health("a", 500))
-    ledger.settle()
-    assert ledger.accounts == {}
+    ledger.add_health(health("a", 500))
+    ledger.finish()
+    assert ledger.counts == {}
 
 
 def test_of_a_producer_that_was_there_before_its_first_message_all_are_accounted_for():
     ledger = SequenceLedger()
-    ledger.note_health(health("a", 0))
-    ledger.note(KEY, "a", 3, 1)
-    assert ledger.accounts[KEY, "a"].missing == 3
+    ledger.add_health(health("a", 0))
+    ledger.add(KEY, "a", 3, 1)
+    assert ledger.counts[KEY, "a"].missing == 3
     ledger = SequenceLedger()
-    ledger.note_health(health("a", 0))
-    ledger.note_health(health("a", 5))
-    ledger.settle()
-    assert ledger.accounts[KEY, "a"] == StreamCounts(missing=5)
+    ledger.add_health(health("a", 0))
+    ledger.add_health(health("a", 5))
+    ledger.finish()
+    assert ledger.counts[KEY, "a"] == StreamCounts(missing=5)
 
 
 def test_what_is_never_recorded_is_never_missing():
     ledger = SequenceLedger()
     for published in (0, 5):
-        ledger.note_health(health("a", published, "fantwin/plant/tray1/clock"))
-        ledger.note_health(health("a", published, "fantwin/something/else"))
-    ledger.settle()
-    assert ledger.accounts == {}
+        ledger.add_health(health("a", published, "fantwin/plant/tray1/clock"))
+        ledger.add_health(health("a", published, "fantwin/something/else"))
+    ledger.finish()
+    assert ledger.counts == {}
 
 
 def test_times_are_the_first_and_the_last_also_where_the_clock_was_set_back():
     ledger = SequenceLedger()
     for sequence, t_ns in enumerate((50, 90, 10, 20)):
-        ledger.note(KEY, "a", sequence, t_ns)
-    account = ledger.accounts[KEY, "a"]
+        ledger.add(KEY, "a", sequence, t_ns)
+    account = ledger.counts[KEY, "a"]
     assert (account.first_ns, account.last_ns) == (10, 90)
 
 
 def test_of_a_file_that_was_damaged_later_what_was_recorded_and_is_not_found_is_missing():
-    recorded = noted([0, 1, 5, 6]).accounts | noted([7, 8], producer="b").accounts
-    found = noted([5]).accounts
-    assert corrected(recorded, found) == {
+    recorded = counted([0, 1, 5, 6]).counts | counted([7, 8], producer="b").counts
+    found = counted([5]).counts
+    assert correct_for_damage(recorded, found) == {
         (KEY, "a"): StreamCounts(1, 3 + 3, 0, 5, 6, 1005, 1005),
         (KEY, "b"): StreamCounts(missing=2, last_sequence=8),
     }
@@ -154,7 +154,7 @@ def test_of_a_file_that_was_damaged_later_what_was_recorded_and_is_not_found_is_
 
 @given(st.lists(st.integers(0, 30), min_size=1), st.integers(0, 30))
 def test_each_number_up_to_the_last_is_there_or_missing_and_each_message_is_new_or_twice(sequences, due):
-    account = noted(sequences, before={(KEY, "a"): due}).accounts[KEY, "a"]
+    account = counted(sequences, before={(KEY, "a"): due}).counts[KEY, "a"]
     new = account.messages - account.duplicated
     last = max(sequences)
     assert new + account.missing == max(0, last + 1 - due)
@@ -163,26 +163,26 @@ def test_each_number_up_to_the_last_is_there_or_missing_and_each_message_is_new_
 
 @given(st.sets(st.integers(0, 40)), st.sets(st.integers(0, 40)))
 def test_parts_together_have_the_account_of_the_whole(first, second):
-    whole = noted(sorted(first) + sorted(n + 41 for n in second))
-    one = noted(sorted(first))
-    other = one.following()
+    whole = counted(sorted(first) + sorted(n + 41 for n in second))
+    one = counted(sorted(first))
+    other = one.for_next_part()
     for sequence in sorted(second):
-        other.note(KEY, "a", sequence + 41, 1041 + sequence)
-    parts = [ledger.accounts.get((KEY, "a"), StreamCounts()) for ledger in (one, other)]
-    total = whole.accounts.get((KEY, "a"), StreamCounts())
+        other.add(KEY, "a", sequence + 41, 1041 + sequence)
+    parts = [ledger.counts.get((KEY, "a"), StreamCounts()) for ledger in (one, other)]
+    total = whole.counts.get((KEY, "a"), StreamCounts())
     assert sum(part.messages for part in parts) == total.messages
     assert sum(part.missing for part in parts) == total.missing
 
 
 def test_it_is_read_back_as_it_was_written():
-    ledger = noted([0, 5])
-    ledger.note(KEY, "b", 7, 1)
-    assert accounts_of(as_metadata(ledger.accounts)) == ledger.accounts
-    assert before_of(ledger.before_as_metadata()) == ledger.next == {(KEY, "a"): 6, (KEY, "b"): 8}
+    ledger = counted([0, 5])
+    ledger.add(KEY, "b", 7, 1)
+    assert counts_from_metadata(ledger_metadata(ledger.counts)) == ledger.counts
+    assert before_from_metadata(ledger.before_as_metadata()) == ledger.next == {(KEY, "a"): 6, (KEY, "b"): 8}
 
 
 def test_the_next_part_goes_on_after_the_last_message_that_was_recorded():
-    ledger = noted([0, 5], before={(KEY, "c"): 9})
-    ledger.lose(KEY, "a", 6)
-    ledger.settle()
-    assert next_of({(KEY, "c"): 9}, ledger.accounts) == {(KEY, "a"): 6, (KEY, "c"): 9}
+    ledger = counted([0, 5], before={(KEY, "c"): 9})
+    ledger.add_lost(KEY, "a", 6)
+    ledger.finish()
+    assert next_sequences({(KEY, "c"): 9}, ledger.counts) == {(KEY, "a"): 6, (KEY, "c"): 9}
