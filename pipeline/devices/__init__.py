@@ -1,1 +1,1 @@
-"""Where samples come from: serial ports, simulated devices and measured tables."""
+"""Where samples come from: sources, serial lines, simulated devices, measured tables, and the time of a sample."""

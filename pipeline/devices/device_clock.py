@@ -1,14 +1,14 @@
-"""The time of a sample: from the device's wrapping 32-bit clock to the host's clock.
+"""The time of a sample: from the wrapping 32-bit clock of the device to host time.
 
-The host's time of receipt is the sample's time plus a delay that is never negative, often milliseconds, sometimes far
-more. So the offset `receipt - device clock` is bounded from below by a straight line, whose slope is the drift of the
-device's clock and whose height is the smallest delay. The line is the edge of the lower convex hull below the mean of
-the points: of all lines under all points it lies highest on average (Moon, Skelly and Towsley, Estimation and removal
-of clock skew from network delay measurements, INFOCOM 1999; by hull: Zhang, Liu and Xia, INFOCOM 2002). It runs over a
-sliding window, one point (the least delayed sample) a bucket.
+The host time of receipt is the time of the sample plus a delay that is never negative, often milliseconds, sometimes
+far more. The offset `receipt - device clock` is therefore bounded from below by a straight line. Its slope is the drift
+of the device clock, its height the smallest delay. It is estimated as the edge of the lower convex hull below the mean
+of the points: of all lines under all points this one is highest on average (Moon, Skelly and Towsley, Estimation and
+removal of clock skew from network delay measurements, INFOCOM 1999; by hull: Zhang, Liu and Xia, INFOCOM 2002). The
+points are those of a sliding window, one (the least delayed sample) per bucket.
 
-Times never jump to a better line: they approach it slowly, so that differences of neighbouring samples stay those of
-the device's clock. docs/explanation/time.md derives this and gives what was measured.
+Times never jump to a new line. They approach it slowly, so that the time between neighbouring samples stays that of
+the device clock. docs/explanation/time.md has the derivation and measurements.
 """
 
 from __future__ import annotations
@@ -21,47 +21,49 @@ from schemas.units import NS_PER_S
 UINT32 = 1 << 32
 NS_PER_US = 1_000
 
-BUCKET_NS = NS_PER_S  # device time over which one least delayed sample is kept, and between two fits of the line
-WINDOW_BUCKETS = 60  # long enough to see a drift of some ppm, short enough to follow the temperature
-DRIFT_SPAN_NS = 10 * NS_PER_S  # points that span less say nothing of the drift
+BUCKET_NS = NS_PER_S  # device time of one bucket: it keeps its least delayed sample; the line is fitted at its end
+WINDOW_BUCKETS = 60  # long enough to estimate a drift of a few ppm, short enough to follow the temperature
+DRIFT_SPAN_NS = 10 * NS_PER_S  # points that span less do not determine the drift
 MAX_DRIFT = 0.02  # a ceramic resonator is within 0.5 %, an RC oscillator within 2 %
 SLEW_TIME_NS = 20 * NS_PER_S  # time constant with which times approach the line
-MAX_SLEW = 0.01  # so much faster or slower than the device's clock at most
-JUMP_NS = NS_PER_S  # a disagreement beyond this is a clock that was set or restarted, not a delay
-LATE_BUCKETS = 5  # every sample that late for so many buckets: the host's clock was set forward
-LONGEST_SILENCE_NS = 600 * NS_PER_S  # after this the 32-bit clock may have wrapped unseen (it does in 71 minutes)
+MAX_SLEW = 0.01  # largest relative correction
+JUMP_NS = NS_PER_S  # a larger disagreement means a clock that was set or restarted, not a delay
+LATE_BUCKETS = 5  # if every sample is late for so many buckets, the host clock was set forward
+LONGEST_SILENCE_NS = (
+    600 * NS_PER_S
+)  # after this the 32-bit clock may have wrapped unnoticed (it wraps every 71 minutes)
 
 Point = tuple[int, int]
 """Device time and offset (receipt - device time), both ns."""
 
 
 class DeviceClock:
-    """Maps one device's clock to the host's. Fed sample by sample, so that blocks make no difference.
+    """Maps the clock of one device to host time, sample by sample, so that message sizes make no difference.
 
-    A *segment* is a stretch over which the device's clock ran on; in each, times are continuous. It ends when the
-    device restarts, when either clock is set by more than a second, or after ten minutes of silence.
+    A *segment* is a period of uninterrupted device time; within it, times are continuous. It ends when the device
+    restarts, when either clock is set by more than a second, or after ten minutes without samples.
     """
 
     def __init__(self) -> None:
         self.segments = 0
-        """How many segments have begun; one in a device's life is normal."""
+        """Number of segments so far; 1 if nothing was interrupted."""
         self.drift = 0.0
-        """How much slower than the host's the device's clock is, relative: 1e-6 is 1 ppm."""
-        self._last_us = 0  # of the newest sample, as the device gave it
+        """Relative slowness of the device clock against host time: 1e-6 is 1 ppm."""
+        self._last_us = 0  # of the newest sample, as received
         self._device_ns = 0  # the same, unwrapped, from the start of the segment
         self._receive_t_ns = 0
         self._points: deque[Point] = deque(maxlen=WINDOW_BUCKETS)
         self._lowest: Point = (0, 0)  # of the bucket being filled
         self._late_buckets = 0
-        self._from_device_ns = 0  # where the present piece of the mapping starts
+        self._from_device_ns = 0  # start of the current piece of the mapping
         self._from_t_ns = 0
         self._slew = 0.0
 
     def to_host_ns(self, device_clock_us: int, receive_t_ns: int) -> int:
-        """The host's time (ns since the epoch) at which the sample was taken, up to the smallest delay of the line.
+        """Host time (ns since the epoch) at which the sample was measured, plus the smallest delay.
 
-        device_clock_us: the device's clock, wrapping at 2^32. A sample that is not newer than the newest one is given
-        its place among the others and changes nothing.
+        device_clock_us: modulo 2^32. A sample that is not newer than the newest one gets its time from the current
+        mapping and does not change it.
         """
         if self.segments == 0 or receive_t_ns - self._receive_t_ns > LONGEST_SILENCE_NS:
             return self._begin(device_clock_us, receive_t_ns)
@@ -71,7 +73,7 @@ class DeviceClock:
         if step_us <= 0:
             is_old = -step_us * NS_PER_US < JUMP_NS or receive_t_ns < self._receive_t_ns
             return t_ns if is_old else self._begin(device_clock_us, receive_t_ns)
-        if t_ns - receive_t_ns > JUMP_NS:  # taken long after it was received: not the clock we knew
+        if t_ns - receive_t_ns > JUMP_NS:  # measured long after its receipt: another clock
             return self._begin(device_clock_us, receive_t_ns)
         self._last_us, self._device_ns, self._receive_t_ns = device_clock_us, device_ns, receive_t_ns
         if device_ns - self._from_device_ns >= BUCKET_NS:
@@ -94,12 +96,12 @@ class DeviceClock:
 
     def _map(self, device_ns: int) -> int:
         elapsed_ns = device_ns - self._from_device_ns
-        # The slew was meant for one bucket; a silence must not carry it on.
+        # The slew is meant for one bucket; it must not grow while no samples arrive.
         correction_ns = self.drift * elapsed_ns + self._slew * min(elapsed_ns, BUCKET_NS)
         return self._from_t_ns + elapsed_ns + round(correction_ns)
 
     def _end_bucket(self, device_ns: int, t_ns: int) -> None:
-        """Begin a new piece of the mapping at this sample, without a jump, with the slope the points now ask for."""
+        """Start a new piece of the mapping at this sample, without a jump, with the slope of the new line."""
         lowest_device_ns, lowest_offset_ns = self._lowest
         late = lowest_offset_ns + lowest_device_ns - self._map(lowest_device_ns) > JUMP_NS
         self._late_buckets = self._late_buckets + 1 if late else 0
@@ -115,7 +117,7 @@ class DeviceClock:
 
 
 def line_below(points: Sequence[Point], at_ns: int, drift: float) -> tuple[float, float]:
-    """The line below all points, highest at their mean: its slope, and its height (ns) at device time `at_ns`.
+    """The line below all points that is highest at their mean: slope, and height (ns) at device time `at_ns`.
 
     points: at least one, by rising device time. If they span too little time, the slope is `drift`.
     """
@@ -138,7 +140,7 @@ def line_below(points: Sequence[Point], at_ns: int, drift: float) -> tuple[float
 
 
 def _turns_up(x: list[float], y: list[float], a: int, b: int, c: int) -> bool:
-    """Whether the slope grows from a-b to b-c."""
+    """Whether the slope of b-c is larger than that of a-b."""
     return (y[b] - y[a]) * (x[c] - x[b]) < (y[c] - y[b]) * (x[b] - x[a])
 
 

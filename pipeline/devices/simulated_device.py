@@ -1,7 +1,7 @@
-"""A device that is not there: a pseudo-terminal that speaks the wire protocol in real time.
+"""A simulated device: a pseudo-terminal that speaks the wire protocol in real time.
 
-`play` is the device's main loop. It never blocks and never waits for its reader: what nobody takes is counted, and
-keeps its sequence number, so that a reader sees the gap. What the samples are is the device's own affair (`Device`).
+`play` is its main loop. It never blocks and never waits for the reader: samples that nobody reads are counted and keep
+their sequence numbers, so that a reader sees the gap. The samples themselves come from a `Device`.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from pipeline.errors import UserError
 from schemas import wire
 
 LATE_S = 0.02
-"""A sample sent later than this after it was due counts as late."""
+"""A sample sent this much after its time counts as late."""
 DRAIN_LIMIT_S = 3.0
 _DRAINED_FOR_S = 0.1
-_LOOK_S = 0.01
-# A reader that has just opened the port may still throw away what has come so far, as serial libraries do.
-_SETTLE_S = 0.25
+_POLL_S = 0.01
+# Serial libraries discard what arrived before a port was opened.
+_READER_DELAY_S = 0.25
 _READ_BYTES = 4096
 
 
 class DeviceSample(Protocol):
-    """What a device has measured at t_s, seconds since it began. A lost one is not to be sent."""
+    """A measurement at t_s, seconds since the device started. A lost one must not be sent."""
 
     @property
     def t_s(self) -> float: ...  # noqa: D102
@@ -54,15 +54,15 @@ class DeviceSample(Protocol):
 
 
 class Device(Protocol):
-    """Something that gives samples, one after the other, and takes commands."""
+    """Gives samples one after the other, and takes commands."""
 
     @property
     def fans(self) -> int:
-        """How many fans every sample carries."""
+        """Number of fans in every sample."""
         ...
 
     def due_s(self) -> float | None:
-        """When the next sample is due, seconds since the device began; None after the last."""
+        """Time of the next sample, seconds since the device started; None after the last."""
         ...
 
     def take(self) -> DeviceSample:
@@ -70,26 +70,25 @@ class Device(Protocol):
         ...
 
     def command(self, values: NDArray[np.float64]) -> None:
-        """Commands (fans,) that came down the line; NaN leaves a fan as it is."""
+        """Commands (fans,) from the host; NaN leaves a fan unchanged."""
         ...
 
     def set_point(self, values_rad_s: NDArray[np.float64]) -> None:
-        """Set-points (fans,) that came down the line, rad/s; NaN leaves a fan as it is."""
+        """Set-points (fans,) from the host, rad/s; NaN leaves a fan unchanged."""
         ...
 
 
 class PseudoTerminal:
-    """The device's end of a line. Its other end is a path, `port`, that any serial library can open.
+    """The device end of a serial line. The host end is a path, `port`, that any serial library can open.
 
-    It holds no descriptor of the other end, so that it knows whether somebody else does; a reader that dies leaves
-    the line as it is, for the next one.
+    It does not keep the host end open itself, so that it can see whether a reader does. The line survives its reader.
     """
 
     def __init__(self, link: Path | None = None) -> None:
-        """Open a line; `link` becomes a symbolic link to its path, and is removed again by `close`.
+        """Open a line; `link` becomes a symbolic link to its port until `close`.
 
         Raises:
-            UserError: the link cannot be made, or something that is no link stands in its place.
+            UserError: the link cannot be created, or another kind of file has its name.
         """
         self._master, slave = os.openpty()
         tty.setraw(slave)
@@ -107,20 +106,20 @@ class PseudoTerminal:
                 os.close(self._master)
                 raise
 
-    def somebody_reads(self) -> bool:
-        """Whether any process holds the other end open."""
+    def has_reader(self) -> bool:
+        """Whether a process holds the host end open."""
         return not any(events & select.POLLHUP for _, events in self._poll.poll(0))
 
     def write(self, data: bytes) -> bool:
-        """Send a frame if somebody is there to read it and the system has room; never half of one."""
-        if not self.somebody_reads() or not self.flush():
+        """Send a frame if there is a reader and the system has room; never a part of one."""
+        if not self.has_reader() or not self.flush():
             return False
         written = self._write(data)
         self._pending = data[written:] if written else b""
         return written > 0
 
     def flush(self) -> bool:
-        """Send the rest of a frame that found room for its beginning only; whether none is left."""
+        """Send the rest of a frame that was written in part; returns whether none is left."""
         if self._pending:
             self._pending = self._pending[self._write(self._pending) :]
         return not self._pending
@@ -132,38 +131,38 @@ class PseudoTerminal:
             return 0
 
     def wait(self, timeout_s: float) -> bytes:
-        """What comes down the line, at the latest after timeout_s; empty at once if nobody holds the other end."""
+        """Bytes from the host within timeout_s; empty at once if there is no reader."""
         if not select.select([self._master], [], [], timeout_s)[0]:
             return b""
         try:
             return os.read(self._master, _READ_BYTES)
         except OSError as error:
-            if error.errno != errno.EIO:  # nobody holds the other end
+            if error.errno != errno.EIO:  # no reader
                 raise
             return b""
 
     def drain(self, limit_s: float) -> int:
-        """Wait until the reader has taken everything; bytes it had not taken after limit_s, or when it left."""
-        if not self.somebody_reads():
+        """Wait until the reader has read everything; returns the bytes unread after limit_s, or when it closed."""
+        if not self.has_reader():
             return len(self._pending)
         deadline_s = time.monotonic() + limit_s
-        # Only the other end tells how much waits there to be read.
+        # Only the host end says how many bytes wait to be read.
         slave = os.open(self.port, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
         try:
             empty_since_s = None
             while True:
                 now_s = time.monotonic()
                 left = _readable_bytes(slave) if self.flush() else 1
-                # The system hands bytes on in portions: empty means empty for a while.
+                # The system passes bytes on in portions, so the line has to stay empty for a while.
                 empty_since_s = (empty_since_s or now_s) if left == 0 else None
                 if now_s > deadline_s or (empty_since_s is not None and now_s - empty_since_s > _DRAINED_FOR_S):
                     return left + len(self._pending)
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_S)
         finally:
             os.close(slave)
 
     def close(self) -> None:
-        """Let the device vanish: the reader sees the end of the line, and the link is gone."""
+        """Close the line, as if the device was unplugged, and remove the link."""
         os.close(self._master)
         if self._link and self._link.is_symlink() and str(self._link.readlink()) == self.port:
             self._link.unlink()
@@ -171,13 +170,13 @@ class PseudoTerminal:
 
 def _make_link(link: Path, port: str) -> None:
     if link.exists() and not link.is_symlink():
-        raise UserError(f"{link}: is there already and is no symbolic link; name another with --link")
+        raise UserError(f"{link}: exists and is not a symbolic link; name another with --link")
     unfinished = link.with_name(f"{link.name}.{os.getpid()}")
     try:
         unfinished.symlink_to(port)
         unfinished.replace(link)
     except OSError as error:
-        raise UserError(f"{link}: the link cannot be made: {error.strerror}; name another with --link") from error
+        raise UserError(f"{link}: cannot create the link: {error.strerror}; name another with --link") from error
 
 
 def _readable_bytes(slave: int) -> int:
@@ -187,34 +186,34 @@ def _readable_bytes(slave: int) -> int:
 
 
 @dataclass
-class Played:
-    """What became of the samples."""
+class PlaybackCounts:
+    """Counts of a finished or running playback."""
 
     start_ns: int | None = None
-    """epoch time of the device's t_s = 0; None if it never began"""
+    """epoch time of t_s = 0; None before the start"""
     samples_sent: int = 0
     samples_dropped: int = 0
     """simulated losses"""
     samples_unsent: int = 0
-    """nobody read the line, or not fast enough"""
+    """no reader, or one that was too slow"""
     samples_late: int = 0
     worst_lateness_s: float = 0.0
     commands_received: int = 0
     set_points_received: int = 0
     commands_refused: int = 0
-    """pieces of the stream down the line that are no frame for this device"""
+    """pieces of the stream from the host that are not a frame for this device"""
     bytes_unread: int = 0
-    """sent, but still in the line when it was closed"""
+    """sent, but unread when the line was closed"""
 
 
 def wait_for_reader(line: PseudoTerminal, stop: threading.Event) -> None:
-    """Return when somebody has opened the line and kept it open, or when asked to stop."""
+    """Return when a reader has opened the line and kept it open, or when `stop` is set."""
     while not stop.is_set():
-        if line.somebody_reads():
-            stop.wait(_SETTLE_S)
-            if line.somebody_reads():
+        if line.has_reader():
+            stop.wait(_READER_DELAY_S)
+            if line.has_reader():
                 return
-        stop.wait(_LOOK_S)
+        stop.wait(_POLL_S)
 
 
 def play(
@@ -223,21 +222,21 @@ def play(
     protocol: wire.Protocol,
     rad_s_per_unit: float,
     stop: threading.Event,
-    began: Callable[[int], Any] = lambda _start_ns: None,
-) -> Played:
-    """Send every sample when it is due, by a schedule that does not drift, until the last one or until `stop`.
+    on_start: Callable[[int], Any] = lambda _start_ns: None,
+) -> PlaybackCounts:
+    """Send every sample at its time, by a schedule that does not drift, until the last one or until `stop` is set.
 
-    rad_s_per_unit: the line's unit of speed. began: told the epoch time in ns of the device's t_s = 0. A process
-    that was held up sends what it missed as fast as it can; the samples keep their own times.
+    rad_s_per_unit: unit of speed on the line. on_start: called with the epoch time of t_s = 0, ns. After a delay of the
+    process, missed samples are sent as fast as possible; they keep their times.
     """
-    played = Played()
+    played = PlaybackCounts()
     decoder = wire.Decoder(protocol, device.fans, end="device")
     if stop.is_set():
         return played
     start_s, played.start_ns = time.monotonic(), time.time_ns()
-    began(played.start_ns)
+    on_start(played.start_ns)
     while (due_s := device.due_s()) is not None:
-        _listen_until(start_s + due_s, device, line, decoder, rad_s_per_unit, stop, played)
+        _receive_until(start_s + due_s, device, line, decoder, rad_s_per_unit, stop, played)
         if stop.is_set():
             break
         lateness_s = time.monotonic() - start_s - due_s
@@ -259,16 +258,16 @@ def _frame(sample: DeviceSample, rad_s_per_unit: float) -> wire.Sample:
     return wire.Sample(sample.clock_us, sample.sequence, tuple(sample.command.tolist()), tuple(speed.tolist()))
 
 
-def _listen_until(
+def _receive_until(
     deadline_s: float,
     device: Device,
     line: PseudoTerminal,
     decoder: wire.Decoder,
     rad_s_per_unit: float,
     stop: threading.Event,
-    played: Played,
+    played: PlaybackCounts,
 ) -> None:
-    """Take what comes down the line until deadline_s (monotonic), and look at least once."""
+    """Pass frames from the host to the device until deadline_s (monotonic); reads at least once."""
     while not stop.is_set():
         left_s = min(max(deadline_s - time.monotonic(), 0.0), 0.1)
         data = line.wait(left_s)
@@ -284,5 +283,5 @@ def _listen_until(
         left_s = deadline_s - time.monotonic()
         if left_s <= 0.0:
             return
-        if not data and not line.somebody_reads():
+        if not data and not line.has_reader():
             stop.wait(min(left_s, 0.1))

@@ -1,4 +1,4 @@
-"""A measured table played as if a device measured it now: each sample at its own time, gaps and all."""
+"""A measured table played back as a device: each row at its own time, gaps included."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.devices.measured_table import Table
 from pipeline.errors import UserError
+from schemas.units import NS_PER_S
 
 
 @dataclass(frozen=True)
@@ -24,24 +25,23 @@ class TableSample:
 
 
 class TableDevice:
-    """A `Device` (see pipeline.devices.simulated_device) that gives the rows of a table. Commands sent to it change
-    nothing."""
+    """A `Device` (pipeline.devices.simulated_device) that gives the rows of a table and ignores commands."""
 
     def __init__(self, table: Table, from_s: float, to_s: float) -> None:
-        """Rows from `from_s` up to, not including, `to_s`, in seconds since the table's first.
+        """Rows with from_s <= t < to_s, t in seconds since the first row of the table.
 
         Raises:
-            UserError: there is no row between them.
+            UserError: there is no such row.
         """
-        since_first_s = (table.t_ns - table.t_ns[0]) / 1e9
+        since_first_s = (table.t_ns - table.t_ns[0]) / NS_PER_S
         rows = (since_first_s >= from_s) & (since_first_s < to_s)
         if not rows.any():
             raise UserError(
-                f"{table.path}: no row from {from_s:g} s to {to_s:g} s; it is {table.duration_s:g} s long, "
+                f"{table.path}: no row from {from_s:g} s to {to_s:g} s; the table is {table.duration_s:g} s long; "
                 "see --from and --to"
             )
         t_ns = table.t_ns[rows]
-        self._t_s = (t_ns - t_ns[0]) / 1e9
+        self._t_s = (t_ns - t_ns[0]) / NS_PER_S
         self._clock_us = (t_ns - t_ns[0]) // 1000 % 2**32
         self._command = table.command[rows]
         self._speed_rad_s = table.speed_rad_s[rows]
@@ -49,7 +49,7 @@ class TableDevice:
         self.fans = table.fans
 
     def due_s(self) -> float | None:
-        """When the next row is due, s since the first; None after the last."""
+        """Time of the next row, s since the first; None after the last."""
         return float(self._t_s[self._next]) if self._next < len(self._t_s) else None
 
     def take(self) -> TableSample:
@@ -61,7 +61,7 @@ class TableDevice:
         )
 
     def command(self, values: NDArray[np.float64]) -> None:
-        """What was measured is measured: nothing changes."""
+        """Ignored: a measured table does not react."""
 
     def set_point(self, values_rad_s: NDArray[np.float64]) -> None:
-        """What was measured is measured: nothing changes."""
+        """Ignored: a measured table does not react."""

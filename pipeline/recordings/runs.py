@@ -1,6 +1,7 @@
-"""A recording as the model maker wants it: time, command and speed of one tray as arrays.
+"""A recording as input for training: time, command and speed of one tray as arrays.
 
-A sample's time is found as in the pipeline, from the device's clock where there is one (pipeline.devices.device_clock).
+The time of a sample is computed as in the pipeline, from the device clock if there is one
+(pipeline.devices.device_clock).
 """
 
 from __future__ import annotations
@@ -13,23 +14,24 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.devices.device_clock import DeviceClock
-from pipeline.devices.measured_table import held
+from pipeline.devices.measured_table import hold_last
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from schemas.messages import Array, Raw
+from schemas.units import NS_PER_S
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedRun:
-    """A stretch of a tray's raw samples over which the device's clock ran on."""
+    """Raw samples of a tray over one segment of its device clock."""
 
     path: Path
     tray: str
     t_s: Array
-    """(n,) strictly increasing, since the recording's first sample of this tray"""
+    """(n,) strictly increasing, since the first sample of this tray in the recording"""
     command: Array
     """(n, fans), never NaN"""
     speed_rad_s: Array
-    """(n, fans), NaN where the tacho gave none"""
+    """(n, fans), NaN where the tacho gave no reading"""
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,9 @@ class RecordedTray:
 
     runs: tuple[RecordedRun, ...]
     speed_unit: str
-    """in which people are shown its speeds"""
+    """unit in which its speeds are displayed"""
     damage: str
-    """one line on what of the file could not be read; empty when all could"""
+    """what of the file could not be read, in one line; empty if all of it was read"""
 
 
 def read_runs(
@@ -52,10 +54,10 @@ def read_runs(
 ) -> RecordedTray:
     """The raw samples of a tray with from_s <= t_s < to_s.
 
-    tray: needed only where there are several. fans: which, counted from 0; None for all.
+    tray: needed only if the recording has several. fans: counted from 0; None for all.
 
     Raises:
-        RecordingError: the file cannot be read, or holds no such samples.
+        RecordingError: the file cannot be read, or has no such samples.
     """
     reading = read_recording(path, topics=("raw",))
     by_tray: dict[str, list[Raw]] = {}
@@ -64,14 +66,14 @@ def read_runs(
         if tray is None or entry.message.header.tray == tray:
             by_tray.setdefault(entry.message.header.tray, []).append(entry.message)
     if not by_tray:
-        raise RecordingError(f"{path}: no raw samples{f' of a tray {tray!r}' if tray else ''} in this recording")
+        raise RecordingError(f"{path}: no raw samples{f' of tray {tray!r}' if tray else ''} in this recording")
     if len(by_tray) > 1:
-        raise RecordingError(f"{path}: several trays, {', '.join(sorted(by_tray))}: say which with --tray")
+        raise RecordingError(f"{path}: several trays, {', '.join(sorted(by_tray))}: choose one with --tray")
     ((name, messages),) = by_tray.items()
     segments = [segment for segment in _segments(path, messages) if len(segment[0])]
     start_ns = segments[0][0][0] if segments else 0
     runs = [
-        _run(path, name, (t_ns - start_ns) / 1e9, command, speed_rad_s, fans, from_s, to_s)
+        _run(path, name, (t_ns - start_ns) / NS_PER_S, command, speed_rad_s, fans, from_s, to_s)
         for t_ns, command, speed_rad_s in segments
     ]
     runs = [run for run in runs if len(run.t_s) > 1]
@@ -85,10 +87,12 @@ Columns = tuple[Array, Array, Array]
 
 
 def _segments(path: Path, messages: Sequence[Raw]) -> list[Columns]:
-    """The samples in order, parted wherever the device's clock began anew."""
+    """The samples by rising time, one item per segment of the device clock."""
     fans = {message.fans for message in messages}
     if len(fans) > 1:
-        raise RecordingError(f"{path}: the number of fans changes from {' to '.join(map(str, sorted(fans)))}: split it")
+        raise RecordingError(
+            f"{path}: the number of fans changes from {' to '.join(map(str, sorted(fans)))}: split the recording there"
+        )
     clock = DeviceClock()
     segments: list[tuple[list[int], list[Array], list[Array]]] = []
     for message in messages:
@@ -105,9 +109,9 @@ def _segments(path: Path, messages: Sequence[Raw]) -> list[Columns]:
 
 
 def _in_order(t_ns: Array, command: Array, speed_rad_s: Array) -> Columns:
-    """The samples by rising time; of one time, the first that came, and only from the first known command on."""
+    """Samples by rising time from the first known command on; of samples with the same time, the first received."""
     t_ns, first = np.unique(t_ns, return_index=True)
-    command = held(command[first])
+    command = hold_last(command[first])
     known = ~np.any(np.isnan(command), axis=1)
     return t_ns[known], command[known], speed_rad_s[first][known]
 
@@ -125,6 +129,6 @@ def _run(
     if fans is None:
         fans = range(command.shape[1])
     if not all(0 <= fan < command.shape[1] for fan in fans):
-        raise RecordingError(f"{path}: it has fans 0 to {command.shape[1] - 1}; see --fans")
+        raise RecordingError(f"{path}: the tray has fans 0 to {command.shape[1] - 1}; see --fans")
     wanted = (t_s >= from_s) & (t_s < to_s)
     return RecordedRun(path, tray, t_s[wanted], command[wanted][:, fans], speed_rad_s[wanted][:, fans])

@@ -1,4 +1,4 @@
-"""A simulated device's samples straight into a recording, as fast as they come: material to train twins on."""
+"""Samples of a simulated device written directly to a recording, faster than real time: data to train twins on."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from pipeline.devices.simulated_device import Device, DeviceSample, Played
+from pipeline.devices.simulated_device import Device, DeviceSample, PlaybackCounts
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Raw
 from schemas.topics import tray_key
+from schemas.units import NS_PER_S
 
 SITE, TRAY, PRODUCER = "simulated", "tray1", "simulate"
-_SAMPLES_A_MESSAGE = 100
+SAMPLES_PER_MESSAGE = 100
 
 
-def record(device: Device, path: Path, epoch_ns: int, duration_s: float, speed_unit: str) -> Played:
-    """Write all samples of a device as Raw messages; the file depends on nothing but the arguments.
+def record(device: Device, path: Path, epoch_ns: int, duration_s: float, speed_unit: str) -> PlaybackCounts:
+    """Write all samples of a device as Raw messages; equal arguments give equal bytes.
 
-    epoch_ns: time of the device's t_s = 0; a sample counts as received when it was measured. duration_s: for the
-    progress shown on stderr. speed_unit: that people are to be shown; samples are in rad/s. A finished recording of
-    that name is replaced.
+    epoch_ns: time of t_s = 0; the time of receipt of a sample is that of its measurement. duration_s: for the progress
+    on stderr. speed_unit: unit to display speeds in; samples are in rad/s. An existing recording is replaced.
 
     Raises:
         RecordingError: it cannot be written.
     """
-    played = Played(start_ns=epoch_ns)
+    played = PlaybackCounts(start_ns=epoch_ns)
     metadata = {
         "made_by": f"fantwin {version('fantwin')}",
         "source": "simulated tray",
@@ -50,8 +50,8 @@ def record(device: Device, path: Path, epoch_ns: int, duration_s: float, speed_u
     return played
 
 
-def _blocks(device: Device, played: Played) -> Iterator[list[DeviceSample]]:
-    """The samples that are not lost, in blocks of `_SAMPLES_A_MESSAGE`; the last may be shorter."""
+def _blocks(device: Device, played: PlaybackCounts) -> Iterator[list[DeviceSample]]:
+    """The samples that are not lost, in blocks of `SAMPLES_PER_MESSAGE`; the last one may be shorter."""
     block: list[DeviceSample] = []
     while device.due_s() is not None:
         sample = device.take()
@@ -59,7 +59,7 @@ def _blocks(device: Device, played: Played) -> Iterator[list[DeviceSample]]:
             played.samples_dropped += 1
             continue
         block.append(sample)
-        if len(block) == _SAMPLES_A_MESSAGE:
+        if len(block) == SAMPLES_PER_MESSAGE:
             yield block
             block = []
     if block:
@@ -70,7 +70,7 @@ def _raw(fans: int, block: list[DeviceSample], epoch_ns: int, sequence: int) -> 
     return Raw(
         header=Header(PRODUCER, sequence, TRAY),
         fans=fans,
-        host_receive_t_ns=np.array([epoch_ns + round(sample.t_s * 1e9) for sample in block], np.int64),
+        host_receive_t_ns=np.array([epoch_ns + round(sample.t_s * NS_PER_S) for sample in block], np.int64),
         device_clock_us=np.array([sample.clock_us for sample in block], np.uint32),
         device_sequence=np.array([sample.sequence for sample in block], np.uint32),
         command=np.stack([sample.command for sample in block]),

@@ -73,6 +73,6 @@ def test_an_unknown_profile_names_the_nearest() -> None:
         excitation("chrip", 1, 0)
 
 
-def test_a_range_that_is_none_is_refused() -> None:
+def test_an_empty_range_is_refused() -> None:
     with pytest.raises(SimulationError, match=r"commands from 0.5 to 0.5"):
         excitation("manual", 1, 0, low=0.5, high=0.5)

@@ -31,12 +31,12 @@ def speeds(*faults: str, duty: float = 0.6) -> np.ndarray:
         "supply:fan=0,start=5,stop=8,size=0.8",
     ],
 )
-def test_what_brakes_a_fan_slows_it_and_its_neighbour_and_its_past_do_not_feel_it(fault: str) -> None:
+def test_a_braking_fault_slows_only_its_fan_and_only_while_it_is_active(fault: str) -> None:
     run = speeds(fault)
     lag = run[:, 1] - run[:, 0]
     assert np.all(lag[:501] == 0.0)
     assert lag[800] > 20.0
-    assert abs(lag[-1]) < 0.2 * lag[800]  # and when it is gone, the fan comes back
+    assert abs(lag[-1]) < 0.2 * lag[800]  # it recovers after the fault
 
 
 def test_an_opened_inlet_and_a_raised_supply_speed_the_fan_up() -> None:
@@ -50,7 +50,7 @@ def test_the_size_orders_the_effect() -> None:
     assert ends[0] == speeds()[-1, 0]
 
 
-def test_a_braked_fan_that_stands_is_not_driven_backwards() -> None:
+def test_a_brake_does_not_drive_a_standing_fan_backwards() -> None:
     assert np.all(speeds("rotor:fan=0,size=20", duty=0.5)[:, 0] == 0.0)
 
 
@@ -59,7 +59,7 @@ def test_wear_grows_slowly_from_nothing() -> None:
     assert [round(fault.size_at(t), 6) for t in (10.0, 15.0, 20.0, 30.0)] == [0.0, 0.2, 0.4, 0.8]
 
 
-def test_a_stuck_tacho_repeats_its_last_reading_and_lets_go() -> None:
+def test_a_stuck_tacho_repeats_its_last_reading_until_the_fault_ends() -> None:
     run = speeds("tacho-stuck:fan=0,start=1,stop=3")
     assert np.all(run[100:300, 0] == run[99, 0])
     assert run[99, 0] != run[100, 1]
@@ -88,7 +88,7 @@ def test_several_faults_of_one_fan_add_up() -> None:
     assert not tacho_faults(faults, 2, 1.0).stuck.any()
 
 
-def test_the_tray_tells_when_a_fault_really_began_and_ended() -> None:
+def test_the_tray_reports_when_a_fault_really_began_and_ended() -> None:
     fault = parse_fault("inlet:fan=0,start=1.003,stop=2.001")
     tray = SimulatedTray(replace(QUIET, faults=(fault, parse_fault("rotor:fan=1,start=5"))))
     assert tray.happened(0) == (None, None)
@@ -124,7 +124,7 @@ def test_a_fault_is_read_from_the_command_line() -> None:
         ("rotor:fan=1,size=nan", "must be finite"),
     ],
 )
-def test_a_wrong_fault_is_told_in_one_line_that_says_which_part(text: str, message: str) -> None:
+def test_a_wrong_fault_is_a_one_line_error_that_names_the_part(text: str, message: str) -> None:
     with pytest.raises(SimulationError, match=message) as caught:
         parse_fault(text)
     assert text in str(caught.value)

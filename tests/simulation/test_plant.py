@@ -86,7 +86,7 @@ def just_enough_for(torque_v: float) -> float:
     return dead + torque_v / 12.0 * (full - dead)
 
 
-def test_a_rotor_below_breakaway_stands_exactly_still_and_above_it_goes() -> None:
+def test_a_rotor_stands_exactly_still_below_breakaway_and_starts_above_it() -> None:
     breakaway_v = float(fan(ONE, 0).breakaway_v)
     assert settle(just_enough_for(0.98 * breakaway_v)) == 0.0
     assert settle(just_enough_for(1.02 * breakaway_v)) > 1.0
@@ -123,7 +123,7 @@ def test_the_current_lags_by_its_time_constant() -> None:
     assert state.current_v[0] == pytest.approx(12.0 * (1.0 - np.exp(-1.0)), rel=1e-9)
 
 
-def test_fans_differ_by_the_spread_and_the_seed_says_how() -> None:
+def test_fans_vary_by_the_spread_and_the_seed_determines_how() -> None:
     tray = tray_of_fans(2000, seed=3, spread=0.03)
     assert np.std(tray.J) / 0.0148 == pytest.approx(0.03, rel=0.1)
     assert np.mean(tray.C_D) == pytest.approx(5.4772e-6, rel=0.01)
@@ -147,7 +147,7 @@ def test_the_tacho_reads_in_steps_with_the_noise_it_was_given() -> None:
     assert readings.mean() == pytest.approx(500.0, abs=0.1)
 
 
-def test_the_tacho_reads_zero_of_a_fan_that_stands_and_never_a_negative_speed() -> None:
+def test_the_tacho_reads_zero_at_standstill_and_never_a_negative_speed() -> None:
     rng = np.random.default_rng(1)
     assert np.all(Tacho().read(np.zeros(100), rng) == 0.0)
     slow = Tacho(noise_rad_s=4.0).read(np.full(1000, -3.0), rng)
@@ -155,7 +155,7 @@ def test_the_tacho_reads_zero_of_a_fan_that_stands_and_never_a_negative_speed() 
     assert slow.max() > 0.0
 
 
-def test_the_device_clock_wraps_at_32_bits_and_drifts_as_told() -> None:
+def test_the_device_clock_wraps_at_32_bits_and_drifts_as_set() -> None:
     assert DeviceClock().at(4294.967295) == 2**32 - 1
     assert DeviceClock().at(4294.967296) == 0
     assert DeviceClock(drift_ppm=50.0).at(1000.0) == 1_000_050_000
@@ -192,7 +192,7 @@ def test_the_same_fans_can_be_run_with_other_commands() -> None:
     )
 
 
-def test_a_lost_sample_takes_its_sequence_number_with_it() -> None:
+def test_a_lost_sample_uses_up_its_sequence_number() -> None:
     samples = samples_of(TraySettings(fans=1, duration_s=20.0, lost=0.1))
     assert [s.sequence for s in samples] == list(range(2000))
     assert sum(s.lost for s in samples) == pytest.approx(200, abs=45)
@@ -217,7 +217,7 @@ def test_a_command_over_the_line_overrides_the_profile_of_its_fan_alone() -> Non
     assert tray.take().command[1] == 1.0
 
 
-def test_a_fan_given_a_set_point_reaches_it_and_a_command_takes_it_back() -> None:
+def test_a_fan_with_a_set_point_reaches_it_and_a_command_ends_it() -> None:
     tray = SimulatedTray(TraySettings(fans=2, duration_s=60.0))
     tray.set_point(np.array([400.0, np.nan]))
     samples = [tray.take() for _ in range(2000)]

@@ -36,7 +36,7 @@ def make_core(link: FakeLink | None = None, block_size: int = 1, **tray: object)
 
 
 def sample(sequence: int | None, clock_us: int | None = None, speed: float = 100.0, command: float = 0.5) -> Sample:
-    """A sample of two fans; the clock goes with the sequence unless told."""
+    """A sample of two fans; the clock follows the sequence unless given."""
     if clock_us is None and sequence is not None:
         clock_us = sequence * 10_000 % 2**32
     return Sample(clock_us, sequence, (command, 0.25), (speed, 50.0))
@@ -86,7 +86,7 @@ def test_a_block_holds_as_many_samples_as_asked_for_and_the_rest_comes_at_the_en
     assert core.close() == []
 
 
-def test_an_incomplete_block_waits_only_so_long() -> None:
+def test_an_incomplete_block_waits_for_a_limited_time() -> None:
     core = make_core(block_size=4)
     feed(core, [sample(0)], t_ns=S)
     assert core.tick(S + S // 4) == []
@@ -94,7 +94,7 @@ def test_an_incomplete_block_waits_only_so_long() -> None:
     assert core.tick(9 * S) == []
 
 
-def test_an_incomplete_block_is_handed_out_when_the_line_goes_down() -> None:
+def test_an_incomplete_block_is_published_when_the_line_goes_down() -> None:
     core = make_core(block_size=4)
     feed(core, [sample(0)])
     assert [raw.device_sequence.tolist() for raw in core.step(LinkDown("gone"))] == [[0]]
@@ -117,7 +117,7 @@ def test_a_missing_reading_stays_missing_and_is_counted() -> None:
 
 
 @pytest.mark.parametrize("speed", [1001.0, -1001.0, math.inf, -math.inf])
-def test_an_absurd_speed_costs_that_fan_its_reading_and_nothing_else(speed: float) -> None:
+def test_an_absurd_speed_removes_the_reading_of_that_fan_only(speed: float) -> None:
     core = make_core(speed_max=1000)
     (raw,) = feed(core, [sample(0, speed=speed)])
     assert np.isnan(raw.speed_rad_s).tolist() == [[True, False]]
@@ -126,7 +126,7 @@ def test_an_absurd_speed_costs_that_fan_its_reading_and_nothing_else(speed: floa
     assert core.counters()["no_speed"] == 0
 
 
-def test_an_absurd_command_costs_the_sample_and_shows_as_a_loss() -> None:
+def test_an_absurd_command_removes_the_sample_and_shows_as_a_loss() -> None:
     core = make_core(command_max=0.9)
     frames = [sample(0), sample(1, command=0.91), sample(2)]
     assert [raw.device_sequence.tolist() for raw in feed(core, frames)] == [[0], [2]]
@@ -134,7 +134,7 @@ def test_an_absurd_command_costs_the_sample_and_shows_as_a_loss() -> None:
     assert core.counters()["lost_on_line"] == 1
 
 
-def test_the_largest_command_is_not_absurd_for_being_rounded_to_float32() -> None:
+def test_a_limit_rounded_to_float32_is_still_within_the_limit() -> None:
     assert float(np.float32(0.1)) > 0.1
     assert len(feed(make_core(command_max=0.5, command_min=-0.1), [sample(0, command=-0.1)])) == 1
 
@@ -145,7 +145,7 @@ def test_missing_sequence_numbers_are_counted_as_lost() -> None:
     assert core.counters()["lost_on_line"] == 6
 
 
-def test_what_came_before_we_listened_is_not_lost() -> None:
+def test_samples_from_before_the_first_one_received_are_not_lost() -> None:
     core = make_core()
     feed_sequences(core, [1_000_000])
     assert core.counters().get("lost_on_line", 0) == 0
@@ -181,14 +181,14 @@ def test_the_device_clock_may_wrap() -> None:
 
 
 @pytest.mark.parametrize("last", [100, 1_000_000, 3_000_000_000, 4_000_000_000])
-def test_a_device_that_begins_anew_is_not_a_loss_of_four_billion(last: int) -> None:
+def test_a_device_restart_is_not_a_loss_of_four_billion(last: int) -> None:
     core = make_core()
     assert feed_sequences(core, [last, last + 1, 0, 1, 2]) == [last, last + 1, 0, 1, 2]
     assert core.counters()["device_restarts"] == 1
     assert core.counters().get("lost_on_line", 0) == 0
 
 
-def test_a_device_that_begins_anew_right_after_its_start_is_not_taken_for_repeats() -> None:
+def test_a_device_restart_right_after_its_start_does_not_look_like_repeats() -> None:
     core = make_core()
     feed_sequences(core, [0, 1, 2])
     core.step(LinkDown("reset"))
@@ -197,7 +197,7 @@ def test_a_device_that_begins_anew_right_after_its_start_is_not_taken_for_repeat
     assert core.counters()["device_restarts"] == 1
 
 
-def test_what_the_device_measured_while_the_line_was_down_is_counted_as_lost() -> None:
+def test_samples_measured_while_the_line_was_down_are_counted_as_lost() -> None:
     core = make_core()
     feed_sequences(core, [0, 1, 2])
     core.step(ReceivedBytes(encode("binary", sample(3))[:20], S))
@@ -211,7 +211,7 @@ def test_what_the_device_measured_while_the_line_was_down_is_counted_as_lost() -
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_faulty_frames_are_counted_by_kind_and_good_ones_go_on(protocol: Protocol) -> None:
+def test_faulty_frames_are_counted_by_kind_and_valid_ones_pass(protocol: Protocol) -> None:
     core = make_core(protocol=protocol)
     bad = b"\0\x05torn\0" if protocol == "binary" else b"what is this\n"
     wrong = encode(protocol, Sample(1, 1, (0.5,), (1.0,)))
@@ -230,7 +230,7 @@ def command(*values: float, set_point: tuple[float, ...] = (), fans: int = 2) ->
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_commands_and_set_points_go_down_the_line_in_the_tray_s_unit(protocol: Protocol) -> None:
+def test_commands_and_set_points_are_sent_in_the_unit_of_the_tray(protocol: Protocol) -> None:
     link = FakeLink()
     core = make_core(link, protocol=protocol, speed_unit="rpm")
     core.step(command(0.75, math.nan, set_point=(math.nan, 2 * math.pi)))
@@ -261,7 +261,7 @@ def test_a_command_that_the_tray_cannot_carry_out_is_refused_as_a_whole_and_coun
     assert core.counters()["refused_commands"] == 1
 
 
-def test_a_command_that_the_line_did_not_take_is_counted_as_lost() -> None:
+def test_a_command_that_was_not_written_is_counted_as_lost() -> None:
     link = FakeLink()
     link.up = False
     core = make_core(link)
@@ -309,7 +309,7 @@ def test_a_line_without_a_valid_frame_is_a_problem_that_says_what_to_check() -> 
     assert problem.endswith("check baud = 115200, protocol = 'binary', fans = 2 of the [[tray]]")
 
 
-def test_a_line_of_mostly_faulty_frames_is_a_problem_although_some_are_good() -> None:
+def test_mostly_faulty_frames_are_a_problem_although_some_are_valid() -> None:
     core = make_core()
     for i in range(30):
         feed(core, [sample(i)])

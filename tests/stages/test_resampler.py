@@ -105,7 +105,7 @@ def test_the_command_is_that_of_the_last_sample_at_or_before() -> None:
     assert grid.command[:, 0].tolist() == [1, 1, 2, 2, 3, 4]
 
 
-def test_a_grid_sample_leaves_with_the_first_raw_sample_at_or_after_it() -> None:
+def test_a_grid_sample_is_published_with_the_first_raw_sample_at_or_after_it() -> None:
     core = ResamplerCore(1, ResamplerConfig())
     steps = [core.step(raw(at(t), np.zeros(1))) for t in (0.001, 0.009, 0.0101, 0.02)]
     assert [[seconds_of(g.t_ns).round(3).tolist() for g in grids] for grids in steps] == [[], [], [[0.01]], [[0.02]]]
@@ -120,7 +120,7 @@ def test_blocks_have_the_size_asked_for() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(-3 * STEP_NS, 12 * STEP_NS), min_size=1, max_size=80))
-def test_whatever_the_times_the_grid_rises_without_a_repeat_and_never_bridges_a_gap(steps: list[int]) -> None:
+def test_for_any_sample_times_the_grid_rises_without_repeats_and_never_bridges_a_gap(steps: list[int]) -> None:
     t_ns = EPOCH_NS + np.cumsum(steps)
     core = ResamplerCore(1, ResamplerConfig())
     grids = [*core.step(raw(t_ns, np.arange(0.0, len(t_ns)))), *core.close()]
@@ -142,7 +142,7 @@ def test_repeated_and_out_of_order_samples_are_dropped_and_counted() -> None:
     assert (core.counters()["repeated"], core.counters()["out_of_order"]) == (1, 1)
 
 
-def test_a_gap_is_said_to_be_one_while_the_command_stays_what_it_was() -> None:
+def test_a_gap_is_marked_and_holds_the_command() -> None:
     grid, core = run([raw(at(0.0, 0.01, 0.2, 0.21), np.ones(4), np.array([1.0, 2.0, 3.0, 3.0]))])
     assert (
         grid.invalid_reason[:, 0].tolist()
@@ -153,14 +153,14 @@ def test_a_gap_is_said_to_be_one_while_the_command_stays_what_it_was() -> None:
     assert (core.counters()["gaps"], core.counters()["grid_samples_in_gaps"]) == (1, 18)
 
 
-def test_a_span_of_just_the_limit_is_bridged() -> None:
+def test_a_gap_of_exactly_the_limit_is_bridged() -> None:
     grid, core = run([raw(at(0.0, 0.1, 0.2001), np.zeros(3))])
     assert grid.valid[:11].all()
     assert not grid.valid[11:].any()
     assert core.counters()["gaps"] == 1
 
 
-def test_a_long_silence_is_shown_for_a_while_and_then_the_grid_ends() -> None:
+def test_after_a_long_silence_the_grid_ends() -> None:
     grid, core = run([raw(at(0.0, 3600.0, 3600.01), np.zeros(3))])
     why = grid.invalid_reason[:, 0].tolist()
     assert (
@@ -174,7 +174,7 @@ def _ticks(core: ResamplerCore, from_s: float, to_s: float, step_s: float = 0.05
     return [grid for t in np.arange(from_s, to_s, step_s) for grid in core.tick(int(at(t)[0]))]
 
 
-def test_what_is_said_during_a_silence_is_what_a_replay_says_after_it() -> None:
+def test_a_replay_gives_the_grid_that_was_published_during_a_silence() -> None:
     messages = [raw(at(0.0, 0.01), np.ones(2)), raw(at(3.0, 3.01), np.ones(2))]
     core = ResamplerCore(1, ResamplerConfig())
     live = [*core.step(messages[0]), *_ticks(core, 0.01, 2.9)]
@@ -184,7 +184,7 @@ def test_what_is_said_during_a_silence_is_what_a_replay_says_after_it() -> None:
     assert_same(joined(live), replayed)
 
 
-def test_nothing_is_said_before_the_watermark_and_nothing_beyond_the_end() -> None:
+def test_nothing_is_published_before_the_watermark_or_beyond_the_end() -> None:
     core = ResamplerCore(1, ResamplerConfig())
     core.step(raw(at(0.0), np.ones(1)))
     assert _ticks(core, 0.0, 0.5) == []
@@ -197,7 +197,7 @@ def test_nothing_is_said_before_the_watermark_and_nothing_beyond_the_end() -> No
     assert core.problem() == told  # a state and no stopwatch: whoever tells changes must not tell it every second
 
 
-def test_a_host_that_stood_still_does_not_take_that_for_silence() -> None:
+def test_a_stalled_host_is_not_a_silent_source() -> None:
     core = ResamplerCore(1, ResamplerConfig())
     core.step(raw(at(0.0), np.ones(1)))
     assert _ticks(core, 0.0, 0.2) == []
@@ -205,7 +205,7 @@ def test_a_host_that_stood_still_does_not_take_that_for_silence() -> None:
     assert joined(core.step(raw(at(0.01, 0.02), np.ones(2)))).valid.all()
 
 
-def test_samples_that_come_end_a_silence() -> None:
+def test_new_samples_end_a_silence() -> None:
     core = ResamplerCore(1, ResamplerConfig())
     core.step(raw(at(0.0), np.ones(1)))
     assert _ticks(core, 0.0, 0.4) == []
@@ -213,13 +213,13 @@ def test_samples_that_come_end_a_silence() -> None:
     assert _ticks(core, 0.4, 0.85) == []
 
 
-def test_a_block_that_is_not_full_leaves_at_the_watermark() -> None:
+def test_an_incomplete_block_is_published_at_the_watermark() -> None:
     core = ResamplerCore(1, ResamplerConfig(block_size=50))
     assert core.step(raw(at(0.0, 0.01), np.ones(2))) == []
     assert joined(_ticks(core, 0.0, 0.56)).t_ns[:2].tolist() == at(0.0, 0.01).tolist()
 
 
-def test_a_sample_that_comes_after_its_time_was_given_up_is_lost_and_counted() -> None:
+def test_a_sample_that_arrives_after_its_grid_time_was_published_is_counted_as_lost() -> None:
     core = ResamplerCore(1, ResamplerConfig())
     core.step(raw(at(0.0), np.ones(1)))
     given_up = joined(_ticks(core, 0.0, 0.7))
@@ -235,7 +235,7 @@ def test_a_missing_reading_of_one_fan_is_interpolated_and_the_others_are_untouch
     assert grid.valid.all()
 
 
-def test_a_reading_missing_for_longer_than_the_limit_is_said_to_be_missing() -> None:
+def test_a_reading_missing_for_longer_than_the_limit_is_marked_as_missing() -> None:
     times_s = np.arange(31) / 100
     speed = np.stack([times_s, np.where((times_s > 0.055) & (times_s < 0.195), NAN, 1.0)], axis=1)
     grid, _ = run([raw(at(*times_s), speed, fans=2)], fans=2)
@@ -246,7 +246,7 @@ def test_a_reading_missing_for_longer_than_the_limit_is_said_to_be_missing() -> 
     assert np.isnan(grid.speed_rad_s[missing, 1]).all()
 
 
-def test_readings_too_far_apart_are_not_joined_though_the_line_was_never_silent() -> None:
+def test_readings_too_far_apart_are_not_interpolated_though_samples_kept_arriving() -> None:
     speed = np.array([[0.0, 0.0], [6.0, NAN], [13.0, 13.0]])
     grid, _ = run([raw(at(0.0, 0.06, 0.13), speed, fans=2)], fans=2)
     assert grid.valid[:, 0].all()
@@ -255,7 +255,7 @@ def test_readings_too_far_apart_are_not_joined_though_the_line_was_never_silent(
     ]
 
 
-def test_a_tacho_that_fails_holds_up_the_others_for_the_gap_limit_once() -> None:
+def test_a_tacho_that_fails_delays_the_others_once_by_the_gap_limit() -> None:
     core = ResamplerCore(2, ResamplerConfig())
     sizes = [
         sum(len(g.t_ns) for g in core.step(raw(at(k / 100), np.array([[1.0, 1.0 if k < 10 else NAN]]), fans=2)))
@@ -264,7 +264,7 @@ def test_a_tacho_that_fails_holds_up_the_others_for_the_gap_limit_once() -> None
     assert sizes == [1] * 10 + [0] * 10 + [11] + [1] * 19
 
 
-def test_what_waits_for_a_reading_leaves_when_the_stage_is_closed() -> None:
+def test_samples_waiting_for_a_reading_are_published_when_the_stage_closes() -> None:
     grid, _ = run([raw(at(0.0, 0.01), np.array([[1.0, 1.0], [1.0, NAN]]), fans=2)], fans=2)
     assert grid.invalid_reason.tolist() == [
         [InvalidReason.NONE, InvalidReason.NONE],
@@ -272,7 +272,7 @@ def test_what_waits_for_a_reading_leaves_when_the_stage_is_closed() -> None:
     ]
 
 
-def test_a_fan_without_a_tacho_does_not_hold_up_the_others() -> None:
+def test_a_fan_without_a_tacho_does_not_delay_the_others() -> None:
     core = ResamplerCore(2, ResamplerConfig())
     for k in range(50):
         grids = core.step(raw(at(k / 100), np.array([[1.0, NAN]]), fans=2))
@@ -320,7 +320,7 @@ def test_the_device_clock_gives_the_speed_that_receive_times_would_blur() -> Non
     assert core.counters()["clock_restarts"] == 0
 
 
-def test_a_restarted_resampler_lands_on_the_same_grid() -> None:
+def test_a_restarted_resampler_has_the_same_grid() -> None:
     message, _ = _with_clock(40, drift=100e-6, seed=6)
     whole, _ = run([message])
     again, _ = run(list(split(message, 1000))[3:])
@@ -331,7 +331,7 @@ def test_a_restarted_resampler_lands_on_the_same_grid() -> None:
     assert np.abs(whole.speed_rad_s[same] - again.speed_rad_s[later]).max() < 3.0
 
 
-def test_raw_messages_handed_over_again_change_nothing() -> None:
+def test_repeated_raw_messages_change_nothing() -> None:
     message, _ = _with_clock(20, drift=100e-6, seed=7)
     parts = list(split(message, 100))
     once, _ = run(parts)
@@ -343,7 +343,7 @@ def test_raw_messages_handed_over_again_change_nothing() -> None:
     )
 
 
-def test_samples_of_another_number_of_fans_are_lost_and_said_to_be() -> None:
+def test_samples_of_another_number_of_fans_are_counted_and_reported() -> None:
     core = ResamplerCore(2, ResamplerConfig())
     assert core.step(raw(at(0.0, 0.01), np.zeros(2), fans=3)) == []
     assert core.counters()["lost_wrong_fan_count"] == 2
@@ -369,7 +369,7 @@ def sent(producer: str, first: int, count: int, start_s: float, clock: bool = Tr
 
 @pytest.mark.parametrize("clock", [True, False])
 @pytest.mark.parametrize("first", [0, 2**32 - 53])
-def test_what_the_device_sent_while_acquisition_was_dead_is_counted_by_its_sequence(clock: bool, first: int) -> None:
+def test_samples_sent_while_acquisition_was_down_are_counted_by_their_sequence(clock: bool, first: int) -> None:
     _, core = run([sent("a", first, 50, 0.0, clock), sent("b", first + 97, 50, 0.97, clock)])
     assert core.counters()["lost_between_sessions"] == 47
 
@@ -380,8 +380,8 @@ def test_what_the_device_sent_while_acquisition_was_dead_is_counted_by_its_seque
         ("goes on without a gap", [sent("a", 0, 50, 0.0), sent("b", 50, 50, 0.5)]),
         ("brings some again", [sent("a", 0, 50, 0.0), sent("b", 40, 60, 0.4)]),
         ("is the same session, which counts for itself", [sent("a", 0, 50, 0.0), sent("a", 60, 50, 0.6)]),
-        ("device began anew", [sent("a", 0, 50, 5.0), sent("b", 60, 50, 6.0, clock_start_us=-6_000_000)]),
-        ("device began anew, without a clock", [sent("a", 900, 50, 0.0, False), sent("b", 0, 50, 0.6, False)]),
+        ("device restarted", [sent("a", 0, 50, 5.0), sent("b", 60, 50, 6.0, clock_start_us=-6_000_000)]),
+        ("device restarted, without a clock", [sent("a", 900, 50, 0.0, False), sent("b", 0, 50, 0.6, False)]),
         ("first there is", [sent("b", 4000, 50, 0.0)]),
     ],
 )
@@ -399,7 +399,7 @@ def moved(message: Raw, by_s: float) -> Raw:
 
 
 @pytest.mark.parametrize("producer", ["a", "b"], ids=["running on", "acquisition restarted"])
-def test_a_clock_set_back_is_lost_and_said_until_it_has_caught_up(producer: str) -> None:
+def test_samples_of_a_clock_set_back_are_counted_and_reported_until_it_has_caught_up(producer: str) -> None:
     message = raw(at(0.0, 0.01), np.zeros(2))
     core = ResamplerCore(1, ResamplerConfig())
     core.step(stamped(message, "a", 0))
@@ -416,7 +416,7 @@ def test_a_clock_set_back_is_lost_and_said_until_it_has_caught_up(producer: str)
     assert core.problem() == ""
 
 
-def test_one_time_far_in_the_future_is_said_as_a_clock_set_back() -> None:
+def test_one_time_far_in_the_future_is_reported_as_a_clock_set_back() -> None:
     message = raw(at(0.0, 0.01), np.zeros(2))
     core = ResamplerCore(1, ResamplerConfig())
     for sequence, by_s in enumerate((0, 1e8, 1)):
@@ -424,7 +424,7 @@ def test_one_time_far_in_the_future_is_said_as_a_clock_set_back() -> None:
     assert "set back by 99999999 s" in core.problem()
 
 
-def test_what_the_bus_hands_again_or_late_from_an_ended_session_is_no_clock_set_back() -> None:
+def test_messages_repeated_or_late_from_an_ended_session_are_not_a_clock_set_back() -> None:
     message = raw(at(0.0, 0.01), np.zeros(2))
     core = ResamplerCore(1, ResamplerConfig())
     core.step(stamped(message, "a", 0))
@@ -446,7 +446,7 @@ def test_a_late_message_of_an_ended_session_counts_no_loss_between_sessions() ->
     assert core.counters()["lost_between_sessions"] == 8
 
 
-def test_another_number_of_fans_is_said_only_until_the_right_one_comes() -> None:
+def test_another_number_of_fans_is_reported_until_the_right_one_arrives() -> None:
     core = ResamplerCore(1, ResamplerConfig())
     core.step(raw(at(0.0), np.zeros(1), fans=2))
     assert "raw samples of 2 fans" in core.problem()

@@ -159,7 +159,7 @@ def test_the_grid_rate_changes_the_prediction_by_the_integration_error_only(tmp_
     assert difference_rad_s(0.05, 5) / lagged == pytest.approx(24 / 3, rel=0.1)
 
 
-def test_the_prediction_is_never_corrected_by_what_is_measured() -> None:
+def test_the_prediction_is_never_corrected_by_a_measurement() -> None:
     command = stairs(500)
     measured = np.zeros(500)
     other = measured.copy()
@@ -185,12 +185,12 @@ def test_the_free_run_is_the_model_run_from_the_mean_of_the_first_readings() -> 
     )
 
 
-def test_a_free_run_is_not_judged_while_it_warms_up() -> None:
+def test_a_free_run_is_not_valid_while_it_warms_up() -> None:
     prediction = feed(core_of(warm_up_s=0.5, start_samples=2), [grid_of(stairs(100))])
     assert prediction.invalid_reason[:, 0].tolist() == [InvalidReason.WARMING_UP] * 51 + [InvalidReason.NONE] * 49
 
 
-def test_a_short_silence_is_run_through_on_the_held_command() -> None:
+def test_a_free_run_continues_through_a_short_silence_on_the_held_command() -> None:
     command = np.concatenate([np.full(100, 40.0), np.full(50, 40.0), np.full(100, 70.0)])
     without = feed(core_of(), [grid_of(command)])
     core = core_of()
@@ -202,7 +202,7 @@ def test_a_short_silence_is_run_through_on_the_held_command() -> None:
     assert core.counters()["free_runs"] == 1
 
 
-def test_a_long_silence_ends_the_free_run_and_a_new_one_begins_when_the_line_returns() -> None:
+def test_a_long_silence_ends_the_free_run_and_a_new_one_starts_after_it() -> None:
     core = core_of(warm_up_s=0.1)
     grids = [
         grid_of(np.full(100, 40.0)),
@@ -217,7 +217,7 @@ def test_a_long_silence_ends_the_free_run_and_a_new_one_begins_when_the_line_ret
     assert core.counters()["free_runs"] == 2
 
 
-def test_lost_grid_samples_are_counted_and_run_through() -> None:
+def test_lost_grid_samples_are_counted_and_simulated() -> None:
     grid = grid_of(np.full(300, 40.0))
     whole = feed(core_of(), [grid])
     core = core_of()
@@ -226,14 +226,14 @@ def test_lost_grid_samples_are_counted_and_run_through() -> None:
     np.testing.assert_allclose(holed.predicted_speed_rad_s[100:], whole.predicted_speed_rad_s[120:], rtol=1e-12)
 
 
-def test_a_large_loss_starts_the_free_run_anew() -> None:
+def test_a_large_loss_restarts_the_free_run() -> None:
     core = core_of()
     feed(core, [grid_of(np.full(100, 40.0)), grid_of(np.full(100, 40.0), np.full(100, 7.0), first=200)])
     assert core.counters()["lost_grid_samples"] == 100
     assert core.counters()["free_runs"] == 2
 
 
-def test_a_jump_that_the_resampler_announced_is_no_loss() -> None:
+def test_a_gap_that_the_resampler_announced_is_not_a_loss() -> None:
     core = core_of()
     later = grid_of(np.full(100, 40.0), first=1_000_000)
     feed(core, [grid_of(np.full(100, 40.0)), silent(500, 100, 40.0, InvalidReason.STALE), later])
@@ -241,7 +241,7 @@ def test_a_jump_that_the_resampler_announced_is_no_loss() -> None:
     assert core.counters()["free_runs"] == 2
 
 
-def test_samples_that_were_seen_are_dropped_and_counted() -> None:
+def test_repeated_samples_are_dropped_and_counted() -> None:
     grid = grid_of(stairs(300))
     whole = feed(core_of(), [grid])
     core = core_of()
@@ -251,7 +251,7 @@ def test_samples_that_were_seen_are_dropped_and_counted() -> None:
     np.testing.assert_allclose(again.predicted_speed_rad_s, whole.predicted_speed_rad_s, rtol=1e-12)
 
 
-def test_a_command_outside_what_the_twin_was_made_from_is_not_judged() -> None:
+def test_a_command_outside_the_training_range_is_not_valid() -> None:
     core = core_of()
     prediction = feed(core, [grid_of(np.array([40.0, 104.9, 105.1, -5.1, -4.9]))])
     out = InvalidReason.OUT_OF_RANGE
@@ -276,17 +276,17 @@ def test_after_a_command_out_of_range_or_too_small_to_turn_the_rotor_the_twin_mu
     assert why_not_of([out, out, 40.0, 10.0, 40.0, 40.0]) == [beyond, beyond, young, young, good, good]
 
 
-def test_after_a_command_that_is_not_known_it_need_not() -> None:
+def test_after_an_unknown_command_the_twin_need_not_settle() -> None:
     assert why_not_of([NAN, 40.0, np.inf, 40.0]) == [InvalidReason.OUT_OF_RANGE, InvalidReason.NONE] * 2
 
 
-def test_it_must_settle_over_the_end_of_a_block_as_well() -> None:
+def test_the_twin_must_settle_across_the_end_of_a_block_too() -> None:
     core = core_of(twin_with_friction(10.0), warm_up_s=0.03)
     grid = grid_of(np.array([40.0] * 5 + [0.0] + [40.0] * 4))
     assert feed(core, split(grid, 6)).valid[:, 0].tolist() == [False] * 3 + [True] * 2 + [False] * 3 + [True] * 2
 
 
-def test_a_friction_amidst_the_commands_of_a_fan_that_was_held_at_one_speed_is_no_dead_zone() -> None:
+def test_friction_within_the_commands_of_a_fan_held_at_one_speed_is_not_a_dead_zone() -> None:
     held = twin_with_friction(25.6)
     held = replace(held, card=replace(held.card, command_range=(24.5, 27.3)))
     prediction = feed(core_of(held), [grid_of(np.full(100, 25.0), np.full(100, 31.0))])
@@ -294,7 +294,7 @@ def test_a_friction_amidst_the_commands_of_a_fan_that_was_held_at_one_speed_is_n
     assert np.isfinite(prediction.torque_balance_command[40:]).all()
 
 
-def test_without_friction_a_small_or_reversed_command_is_as_good_as_any() -> None:
+def test_without_friction_a_small_or_reversed_command_is_valid() -> None:
     reversing = physical_twin(command_range=(-100.0, 100.0))
     assert feed(core_of(reversing), [grid_of(np.array([40.0, 0.0, -50.0, -104.0]))]).valid.all()
 
@@ -309,7 +309,7 @@ def test_an_unknown_command_of_one_fan_never_reaches_the_graph_and_leaves_the_ot
     assert np.isnan(prediction.predicted_speed_rad_s[151:170, 0]).all()
 
 
-def test_a_twin_that_diverges_is_not_judged_and_is_started_anew() -> None:
+def test_a_twin_that_diverges_is_not_valid_and_is_restarted() -> None:
     twin = physical_twin()
     unstable = TwinFile(**{**vars(twin), "advance": lambda s, c, h: (np.where(c > 50, np.inf, c), s)})
     core = core_of(unstable)
@@ -325,7 +325,7 @@ def test_a_twin_that_diverges_is_not_judged_and_is_started_anew() -> None:
     assert (core.counters()["diverged"], core.counters()["free_runs"]) == (1, 2)
 
 
-def test_a_fan_whose_twin_diverged_never_feeds_the_graph_what_is_no_number() -> None:
+def test_a_fan_whose_twin_diverged_never_feeds_nan_to_the_graph() -> None:
     def advance(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
         assert np.isfinite(state).all()
         speed = np.where(command > 50, np.inf, command)

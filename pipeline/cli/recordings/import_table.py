@@ -1,4 +1,4 @@
-"""`fantwin import`: a measured table becomes a recording."""
+"""`fantwin import`: turns a measured table into a recording."""
 
 from __future__ import annotations
 
@@ -20,36 +20,38 @@ from schemas.messages import Header, Raw
 from schemas.topics import RESERVED_TRAY_NAMES, tray_key
 
 SITE = "imported"
-SAMPLES_A_MESSAGE = 100
+SAMPLES_PER_MESSAGE = 100
 
 
 def import_table(
-    file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Measured table: text, columns with names.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE.csv", help="Measured table: a text file whose first line names the columns.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="REC.mcap", help="Recording to write.")],
     command: Annotated[
-        list[str], typer.Option(metavar="COLUMN", help="Command; one for all fans, or one for each. Repeatable.")
+        list[str], typer.Option(metavar="COLUMN", help="Command column: one for all fans, or one per fan. Repeatable.")
     ],
     speed: Annotated[
         list[str],
         typer.Option(
             metavar="COLUMN[:UNIT]",
-            help="Speed of a fan in rpm, hz, deg/s or rad/s (if not given). Repeatable: more fans.",
+            help="Speed column, one per fan. Units: rpm, hz, deg/s, rad/s (default). Repeatable.",
         ),
     ],
     time: Annotated[
         str | None,
-        typer.Option(metavar="COLUMN[:UNIT]", help="Time in ms, us, ns, s or iso; if not given, numbers are s."),
+        typer.Option(metavar="COLUMN[:UNIT]", help="Time column. Units: s (default), ms, us, ns, iso (dates)."),
     ] = None,
     period: Annotated[
-        str | None, typer.Option(metavar="TIME", help="Time between samples where no column has it, e.g. 10ms.")
+        str | None, typer.Option(metavar="TIME", help="Time between rows of a table without a time column, e.g. 10ms.")
     ] = None,
     tray: Annotated[str, typer.Option(help="Name of the tray in the recording.")] = "tray1",
     force: Annotated[bool, typer.Option("--force", help="Replace an existing recording.")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Turn a measured table into a recording: the one data format for training, evaluation and replay.
+    """Turn a measured table into a recording, the data format of training, evaluation and replay.
 
-    What is odd in the table (repeated times, gaps, empty cells) is counted and told, never filled in.
+    Irregularities (repeated times, gaps, empty cells) are counted and reported; speeds are never filled in.
 
     Example: fantwin import FILE.csv --time t:s --command u --speed y:rpm -o REC.mcap
     """
@@ -60,17 +62,17 @@ def import_table(
     table = read_table(file, time, command, speed, period=period)
     write_table(table, output, tray)
     if json_output:
-        typer.echo(json.dumps(account(table, output)))
+        typer.echo(json.dumps(import_summary(table, output)))
         return
     fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"
-    step = f"{table.median_step_s * 1e3:.3g} ms apart (median)"
-    typer.echo(f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {step}")
+    period = f"{table.median_period_s * 1e3:.3g} ms apart (median)"
+    typer.echo(f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {period}")
     for note in (*filter(None, [table.assumed]), *table.notes):
         typer.echo(f"  {note}")
 
 
 def write_table(table: Table, output: Path, tray: str) -> None:
-    """Write a table's samples as raw messages; each counts as received at its own time.
+    """Write the samples of a table as raw messages; the time of receipt is the time in the table.
 
     Raises:
         RecordingError: it cannot be written.
@@ -83,8 +85,8 @@ def write_table(table: Table, output: Path, tray: str) -> None:
         "speed_unit": table.speed_unit,
     }
     with RecordingWriter(output, metadata, t_ns=int(table.t_ns[0]), overwrite=True) as writer:
-        for sequence, first in enumerate(range(0, len(table.t_ns), SAMPLES_A_MESSAGE)):
-            rows = slice(first, first + SAMPLES_A_MESSAGE)
+        for sequence, first in enumerate(range(0, len(table.t_ns), SAMPLES_PER_MESSAGE)):
+            rows = slice(first, first + SAMPLES_PER_MESSAGE)
             raw = Raw(
                 header=Header("import", sequence, tray),
                 fans=table.fans,
@@ -95,16 +97,16 @@ def write_table(table: Table, output: Path, tray: str) -> None:
             writer.add_message(tray_key(SITE, tray, "raw"), raw, int(table.t_ns[rows][-1]))
 
 
-def account(table: Table, output: Path) -> dict[str, object]:
-    """What a machine is told of an import."""
+def import_summary(table: Table, output: Path) -> dict[str, object]:
+    """The JSON output of an import."""
     return {
         "recording": str(output),
         "samples": len(table.t_ns),
         "fans": table.fans,
         "duration_s": table.duration_s,
-        "median_rate_hz": 1 / table.median_step_s,
+        "median_rate_hz": 1 / table.median_period_s,
         "speed_unit": table.speed_unit,
         "assumed": table.assumed,
         "gaps": table.gaps,
-        **asdict(table.mended),
+        **asdict(table.repairs),
     }

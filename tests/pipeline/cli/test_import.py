@@ -48,44 +48,44 @@ def test_the_recording_holds_the_numbers_of_the_table(tmp_path):
     np.testing.assert_allclose(speed_rad_s / (2 * np.pi / 60), values[:, 2:], rtol=1e-14)
 
 
-def test_a_machine_is_told_the_counts(tmp_path):
+def test_json_output_has_the_counts(tmp_path):
     path, values = measured(tmp_path)
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines[:100], lines[99], *lines[400:]]) + "\n")
     result = fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--json")
-    told = json.loads(result.stdout)
-    assert told["samples"] == 1234 - 300
-    assert (told["rows"], told["repeated"], told["gaps"], told["fans"]) == (935, 1, 1, 2)
-    assert told["duration_s"] == pytest.approx(values[-1, 0] - values[0, 0])
-    assert told["median_rate_hz"] == pytest.approx(100, rel=0.02)
-    assert told["speed_unit"] == "rpm"
+    summary = json.loads(result.stdout)
+    assert summary["samples"] == 1234 - 300
+    assert (summary["rows"], summary["repeated"], summary["gaps"], summary["fans"]) == (935, 1, 1, 2)
+    assert summary["duration_s"] == pytest.approx(values[-1, 0] - values[0, 0])
+    assert summary["median_rate_hz"] == pytest.approx(100, rel=0.02)
+    assert summary["speed_unit"] == "rpm"
 
 
-def test_units_that_nobody_gave_are_told_with_how_to_give_them(tmp_path):
+def test_units_that_were_not_given_are_reported_with_their_option(tmp_path):
     path, _ = measured(tmp_path)
     for given, said in (
         (
             ("--time", "t", "--command", "u", "--speed", "y1"),
-            "times in s and speeds in rad/s assumed; otherwise give it, such as --time t:ms and --speed y1:rpm",
+            "times in s and speeds in rad/s assumed; if that is wrong, use for example --time t:ms and --speed y1:rpm",
         ),
         (
             ("--time", "t:s", "--command", "u", "--speed", "y1"),
-            "speeds in rad/s assumed; otherwise give it, such as --speed y1:rpm",
+            "speeds in rad/s assumed; if that is wrong, use for example --speed y1:rpm",
         ),
         (
             ("--time", "t", "--command", "u", "--speed", "y1:rpm"),
-            "times in s assumed; otherwise give it, such as --time t:ms",
+            "times in s assumed; if that is wrong, use for example --time t:ms",
         ),
     ):
         words = ("import", path, *given, "-o", tmp_path / "r.mcap", "--force")
-        assert fantwin(*words).stdout.splitlines()[1] == f"  no unit was given: {said}"
-        assert json.loads(fantwin(*words, "--json").stdout)["assumed"] == f"no unit was given: {said}"
+        assert fantwin(*words).stdout.splitlines()[1] == f"  no unit given, {said}"
+        assert json.loads(fantwin(*words, "--json").stdout)["assumed"] == f"no unit given, {said}"
     words = ("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--force")
     assert "assumed" not in fantwin(*words).stdout
     assert json.loads(fantwin(*words, "--json").stdout)["assumed"] == ""
 
 
-def test_the_recording_says_unit_source_and_tray(tmp_path):
+def test_the_recording_has_unit_source_and_tray_in_its_metadata(tmp_path):
     path, _ = measured(tmp_path)
     fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--tray", "bench-2")
     head = read_metadata(tmp_path / "r.mcap")
@@ -130,12 +130,12 @@ def test_a_table_that_cannot_be_read_leaves_no_recording(tmp_path):
 
 
 @pytest.mark.parametrize("tray", ["a/b", "", "health", "tray 1"])
-def test_a_name_that_no_key_can_have_is_refused(tmp_path, tray):
+def test_a_tray_name_that_cannot_be_part_of_a_key_is_refused(tmp_path, tray):
     path, _ = measured(tmp_path)
     assert "use letters, digits" in said_instead("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--tray", tray)
 
 
-def test_the_model_maker_gets_the_numbers_of_the_table(tmp_path):
+def test_training_reads_the_numbers_of_the_table(tmp_path):
     path, values = measured(tmp_path)
     fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap")
     found = read_runs(tmp_path / "r.mcap", fans=[1], from_s=2.0, to_s=6.0)

@@ -79,7 +79,7 @@ class Reader:
 
     def read_until(self, samples: int) -> None:
         while len(self.samples) < samples:
-            assert self.read_some(), "the device has gone"
+            assert self.read_some(), "the device is gone"
 
     def read_all(self) -> None:
         while self.read_some():
@@ -133,7 +133,7 @@ def test_simulated_losses_are_gaps_in_the_sequence(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_asked_to_stop_it_completes_the_truth_and_takes_the_link_away(tmp_path: Path, number: int) -> None:
+def test_when_stopped_it_completes_the_truth_and_removes_the_link(tmp_path: Path, number: int) -> None:
     with simulated(tmp_path, "--wait-for-reader", "--fault", "rotor:fan=0,start=0") as process:
         reader = Reader(tmp_path / "tray")
         reader.read_until(5)
@@ -150,7 +150,7 @@ def test_asked_to_stop_it_completes_the_truth_and_takes_the_link_away(tmp_path: 
     assert not (tmp_path / "tray").is_symlink()
 
 
-def test_asked_to_stop_before_anybody_reads_it_says_that_nothing_happened(tmp_path: Path) -> None:
+def test_when_stopped_before_anybody_reads_the_truth_is_that_nothing_happened(tmp_path: Path) -> None:
     with simulated(tmp_path, "--wait-for-reader", "--fault", "rotor:fan=0,start=0") as process:
         process.send_signal(signal.SIGINT)
         assert process.wait(10.0) == 0
@@ -161,7 +161,7 @@ def test_asked_to_stop_before_anybody_reads_it_says_that_nothing_happened(tmp_pa
     assert truth["faults"][0]["start_ns"] is None
 
 
-def test_what_nobody_reads_is_counted_and_a_later_reader_sees_the_gap(tmp_path: Path) -> None:
+def test_samples_nobody_reads_are_counted_and_a_later_reader_sees_the_gap(tmp_path: Path) -> None:
     with simulated(tmp_path, "--wait-for-reader", "--duration", "1.5") as process:
         first = Reader(tmp_path / "tray")
         first.read_until(10)
@@ -179,7 +179,7 @@ def test_what_nobody_reads_is_counted_and_a_later_reader_sees_the_gap(tmp_path: 
     assert truth["samples_unsent"] > 50
 
 
-def test_commands_and_set_points_come_back_up_the_line(tmp_path: Path) -> None:
+def test_commands_and_set_points_show_in_the_samples(tmp_path: Path) -> None:
     with simulated(tmp_path, "--fans", "2", "--wait-for-reader", "--speed-unit", "rpm", "--noise", "0") as process:
         reader = Reader(tmp_path / "tray", fans=2)
         reader.read_until(1)
@@ -224,7 +224,7 @@ def line() -> Iterator[PseudoTerminal]:
     terminal.close()
 
 
-def test_a_full_line_does_not_block_and_tears_no_frame(line: PseudoTerminal) -> None:
+def test_a_full_line_does_not_block_and_truncates_no_frame(line: PseudoTerminal) -> None:
     decoder = wire.Decoder("binary", 64)
     received: list[wire.Frame | wire.Fault] = []
     port = os.open(line.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -252,20 +252,22 @@ def test_a_full_line_does_not_block_and_tears_no_frame(line: PseudoTerminal) -> 
     assert all(isinstance(frame, wire.Sample) for frame in received)
 
 
-def test_a_device_held_up_sends_all_it_missed_and_says_how_late_it_was(line: PseudoTerminal) -> None:
+def test_a_delayed_device_sends_all_it_missed_and_reports_how_late_it_was(line: PseudoTerminal) -> None:
     port = serial.Serial(line.port, timeout=5.0)
     bytes_to_come = 30 * len(wire.encode("binary", wire.Sample(7, 1, (0.0,) * 2, (1.0,) * 2)))
     reader = threading.Thread(target=port.read, args=(bytes_to_come,))
     reader.start()
     nobody_stops_it = threading.Event()
-    played = play(Burst(30, fans=2), line, "binary", 1.0, nobody_stops_it, began=lambda _: nobody_stops_it.wait(0.05))
+    played = play(
+        Burst(30, fans=2), line, "binary", 1.0, nobody_stops_it, on_start=lambda _: nobody_stops_it.wait(0.05)
+    )
     reader.join(10.0)
     port.close()
     assert played.samples_sent == played.samples_late == 30
     assert played.worst_lateness_s >= 0.05
 
 
-def test_garbage_down_the_line_is_counted_and_does_no_harm(line: PseudoTerminal) -> None:
+def test_garbage_from_the_host_is_counted_and_harmless(line: PseudoTerminal) -> None:
     port = os.open(line.port, os.O_RDWR | os.O_NOCTTY)
     os.write(port, b"\0hello\0" + wire.encode("binary", wire.CommandFrame((0.5, KEEP))))
     device = Burst(1, fans=2)
@@ -279,8 +281,8 @@ def test_garbage_down_the_line_is_counted_and_does_no_harm(line: PseudoTerminal)
     assert device.commands[0][0] == 0.5
 
 
-def test_waiting_for_a_reader_ends_when_there_is_one_and_when_asked_to_stop(line: PseudoTerminal) -> None:
-    assert not line.somebody_reads()
+def test_waiting_for_a_reader_ends_when_there_is_one_or_when_stopped(line: PseudoTerminal) -> None:
+    assert not line.has_reader()
     stop = threading.Event()
     waiting = threading.Thread(target=wait_for_reader, args=(line, stop))
     waiting.start()
@@ -289,12 +291,12 @@ def test_waiting_for_a_reader_ends_when_there_is_one_and_when_asked_to_stop(line
     assert not waiting.is_alive()
     assert not stop.is_set()
     os.close(port)
-    assert not line.somebody_reads()
+    assert not line.has_reader()
     stop.set()
     wait_for_reader(line, stop)
 
 
-def test_who_opens_the_line_for_a_moment_only_is_no_reader(line: PseudoTerminal) -> None:
+def test_a_program_that_opens_the_line_only_for_a_moment_is_not_a_reader(line: PseudoTerminal) -> None:
     ports = [os.open(line.port, os.O_RDONLY | os.O_NOCTTY)]
 
     class LeavesAtOnce(threading.Event):
@@ -312,7 +314,7 @@ def test_who_opens_the_line_for_a_moment_only_is_no_reader(line: PseudoTerminal)
     assert stop.is_set()
 
 
-def test_the_end_waits_for_the_reader_and_tells_what_it_did_not_take(
+def test_the_end_waits_for_the_reader_and_reports_what_it_did_not_read(
     line: PseudoTerminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = os.open(line.port, os.O_RDWR | os.O_NOCTTY)
@@ -330,7 +332,7 @@ def test_the_end_waits_for_the_reader_and_tells_what_it_did_not_take(
 def test_a_link_never_replaces_a_file_but_does_replace_a_stale_link(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("mine")
-    with pytest.raises(UserError, match="is there already and is no symbolic link"):
+    with pytest.raises(UserError, match="exists and is not a symbolic link"):
         PseudoTerminal(file)
     assert file.read_text() == "mine"
     link = tmp_path / "tray"
@@ -357,7 +359,7 @@ def test_a_link_never_replaces_a_file_but_does_replace_a_stale_link(tmp_path: Pa
         ({"truth": Path("/nowhere/truth.json")}, "/nowhere/truth.json: cannot be written"),
     ],
 )
-def test_a_wrong_option_is_told_in_one_line(options: dict, message: str) -> None:
+def test_a_wrong_option_is_a_one_line_error(options: dict, message: str) -> None:
     with pytest.raises(UserError, match=message) as caught:
         simulate(**options)
     assert "\n" not in str(caught.value)
@@ -424,10 +426,10 @@ def test_a_measured_file_is_played_at_its_own_times_in_its_own_units(tmp_path: P
     assert (truth["complete"], truth["samples_sent"], truth["faults"]) == (True, 4, [])
 
 
-def test_a_part_of_a_file_that_holds_nothing_is_refused(tmp_path: Path) -> None:
+def test_a_part_of_a_file_without_rows_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_text(TABLE)
-    with pytest.raises(UserError, match=r"no row from 100 s to inf s; it is 8 s long"):
+    with pytest.raises(UserError, match=r"no row from 100 s to inf s; the table is 8 s long"):
         TableDevice(read_table(path, "t ms:ms", ["duty"], ["rpm:rpm"]), 100.0, float("inf"))
 
 

@@ -80,14 +80,14 @@ def test_receive_time_alone_would_be_far_worse() -> None:
     assert np.abs(line.error_ns()).max() < 5 * MS
 
 
-def test_neighbours_keep_their_distance_to_some_ppm() -> None:
+def test_neighbouring_samples_keep_their_distance_within_a_few_ppm() -> None:
     line = sampled(300, jitter_ms=2.0, stall_share=0.02)
     stretch = np.diff(line.mapped()) / STEP_NS - 1
     assert np.abs(stretch[6_000:]).max() < 60e-6  # two minutes of a better line arriving are over
     assert np.abs(stretch).max() < 500e-6
 
 
-def test_a_better_line_is_approached_and_never_jumped_to() -> None:
+def test_times_approach_a_new_line_and_never_jump_to_it() -> None:
     late = Line(*(np.array([v]) for v in (EPOCH_NS, 0, EPOCH_NS + 400 * MS)))  # the first sample hung in a buffer
     line = sampled(120, jitter_ms=0.1, starts_ns=EPOCH_NS + STEP_NS, clock_starts_us=10_000)
     error_ns = joined(late, line).error_ns()
@@ -96,7 +96,7 @@ def test_a_better_line_is_approached_and_never_jumped_to() -> None:
     assert np.abs(error_ns[-1_000:]).max() < 20 * MS
 
 
-def test_the_clock_wraps_unnoticed() -> None:
+def test_a_wrap_of_the_clock_makes_no_difference() -> None:
     clock = DeviceClock()
     error_ns = sampled(30, jitter_ms=0.1, clock_starts_us=UINT32 - 15_000_000).error_ns(clock)
     assert clock.segments == 1
@@ -122,7 +122,7 @@ def test_a_silence_in_which_the_clock_may_have_wrapped_begins_a_new_segment() ->
     assert clock.segments == 2
 
 
-def test_a_silence_does_not_carry_a_correction_on() -> None:
+def test_a_correction_does_not_grow_while_no_samples_arrive() -> None:
     late = Line(*(np.array([v]) for v in (EPOCH_NS, 0, EPOCH_NS + 400 * MS)))
     before = sampled(5, jitter_ms=0.1, starts_ns=EPOCH_NS + STEP_NS, clock_starts_us=10_000)
     after = sampled(5, jitter_ms=0.1, starts_ns=EPOCH_NS + 300 * NS_PER_S, clock_starts_us=300_000_000)

@@ -26,7 +26,7 @@ def test_a_plain_table_is_read_as_it_is(tmp_path):
     assert read.command.tolist() == [[1.0], [2.0], [3.0]]
     assert read.speed_rad_s.tolist() == [[10.0], [20.0], [30.0]]
     assert read.notes == ()
-    assert (read.fans, read.duration_s, read.median_step_s, read.gaps) == (1, 0.03, 0.015, 0)
+    assert (read.fans, read.duration_s, read.median_period_s, read.gaps) == (1, 0.03, 0.015, 0)
 
 
 @pytest.mark.parametrize(
@@ -76,28 +76,28 @@ def test_a_table_in_utf_16_is_read(tmp_path):
 
 
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
-def test_commas_semicolons_and_tabs_part_columns(tmp_path, delimiter):
+def test_commas_semicolons_and_tabs_separate_columns(tmp_path, delimiter):
     read = table(tmp_path, "t,u,y\n0,1,10\n1,2,20\n".replace(",", delimiter))
     assert read.command.tolist() == [[1.0], [2.0]]
 
 
-def test_decimal_commas_are_read_where_semicolons_part_columns(tmp_path):
+def test_decimal_commas_are_read_where_semicolons_separate_columns(tmp_path):
     read = table(tmp_path, "t;u;y\n0,5;1,25;10\n1,5;2;20,75\n")
     assert read.t_ns.tolist() == [500_000_000, 1_500_000_000]
     assert read.command.tolist() == [[1.25], [2.0]]
     assert read.speed_rad_s.tolist() == [[10.0], [20.75]]
 
 
-def test_rows_of_one_time_become_their_mean_speed_and_last_command(tmp_path):
+def test_rows_with_the_same_time_become_their_mean_speed_and_last_command(tmp_path):
     read = table(tmp_path, "t,u,y\n0,1,10\n1,2,20\n1,3,30\n1,4,\n2,5,50\n")
     assert read.t_ns.tolist() == [0, 1_000_000_000, 2_000_000_000]
     assert read.speed_rad_s.tolist() == [[10.0], [25.0], [50.0]]
     assert read.command.tolist() == [[1.0], [4.0], [5.0]]
-    assert read.mended.repeated == 2
-    assert "2 rows repeat the time of another" in read.notes[0]
+    assert read.repairs.repeated == 2
+    assert "2 rows with the time of another" in read.notes[0]
 
 
-def test_a_time_column_too_coarse_for_its_rows_is_told(tmp_path):
+def test_a_time_column_that_is_too_coarse_is_reported(tmp_path):
     rows = "".join(f"{k // 10},1,{k}\n" for k in range(40))
     read = table(tmp_path, "t,u,y\n" + rows)
     assert any("too coarse" in note for note in read.notes)
@@ -107,7 +107,7 @@ def test_rows_slightly_out_of_order_are_sorted_and_counted(tmp_path):
     read = table(tmp_path, "t,u,y\n0,1,10\n0.2,3,30\n0.1,2,20\n0.3,4,40\n")
     assert read.t_ns.tolist() == [0, 100_000_000, 200_000_000, 300_000_000]
     assert read.command[:, 0].tolist() == [1, 2, 3, 4]
-    assert read.mended.out_of_order == 1
+    assert read.repairs.out_of_order == 1
 
 
 def test_a_clock_that_was_set_back_is_refused_with_its_row(tmp_path):
@@ -124,24 +124,24 @@ def test_gaps_are_counted_and_not_filled(tmp_path):
 def test_speeds_that_were_not_measured_stay_missing(tmp_path):
     read = table(tmp_path, "t,u,y\n0,1,10\n1,1,\n2,1,nan\n3,1,inf\n4,1,oops\n5,1\n6,1,70\n")
     np.testing.assert_array_equal(read.speed_rad_s[:, 0], [10, *[np.nan] * 5, 70])
-    assert read.mended.speeds_missing == 5
+    assert read.repairs.speeds_missing == 5
 
 
-def test_a_missing_command_is_held_and_rows_before_the_first_are_left_out(tmp_path):
+def test_a_missing_command_is_held_and_rows_before_the_first_are_dropped(tmp_path):
     read = table(tmp_path, "t,u,y\n0,,10\n1,5,20\n2,,30\n3,7,40\n")
     assert read.t_ns.tolist() == [1_000_000_000, 2_000_000_000, 3_000_000_000]
     assert read.command[:, 0].tolist() == [5, 5, 7]
-    assert (read.mended.before_command, read.mended.commands_held) == (1, 1)
+    assert (read.repairs.before_command, read.repairs.commands_held) == (1, 1)
 
 
-def test_rows_whose_time_cannot_be_read_are_left_out_and_counted(tmp_path):
+def test_rows_whose_time_cannot_be_read_are_dropped_and_counted(tmp_path):
     read = table(tmp_path, "t,u,y\n0,1,10\n,2,20\n?,3,30\n1,4,40\n")
     assert read.command[:, 0].tolist() == [1, 4]
-    assert read.mended.without_time == 2
+    assert read.repairs.without_time == 2
 
 
-def test_empty_lines_are_no_rows(tmp_path):
-    assert table(tmp_path, "t,u,y\n0,1,10\n\n1,2,20\n\n").mended.rows == 2
+def test_empty_lines_are_not_rows(tmp_path):
+    assert table(tmp_path, "t,u,y\n0,1,10\n\n1,2,20\n\n").repairs.rows == 2
 
 
 def test_several_fans_have_a_command_each(tmp_path):
@@ -165,7 +165,9 @@ def test_dates_and_periods_need_no_unit_and_a_name_with_blanks_is_quoted(tmp_pat
     dates = "t,u,y\n2019-11-05 17:14:08,1,10\n2019-11-05 17:14:09,2,20\n"
     assert table(tmp_path, dates, speed=["y:rpm"]).assumed == ""
     read = table(tmp_path, "the u,the y\n1,10\n2,20\n", None, ["the u"], ["the y"], "10ms")
-    assert read.assumed == "no unit was given: speeds in rad/s assumed; otherwise give it, such as --speed 'the y:rpm'"
+    assert (
+        read.assumed == "no unit given, speeds in rad/s assumed; if that is wrong, use for example --speed 'the y:rpm'"
+    )
 
 
 def test_a_column_whose_name_has_a_colon_is_found(tmp_path):
@@ -182,7 +184,7 @@ def test_a_column_whose_name_has_a_colon_is_found(tmp_path):
         ({"time": "tt"}, "did you mean 't'"),
         ({"speed": ("y:rmp",)}, "unknown unit 'rmp'; known: rad/s, rpm, hz, deg/s"),
         ({"time": "t:min"}, "unknown unit 'min'; known: s, ms, us, ns, iso"),
-        ({"command": ("u:V",)}, "a command has none"),
+        ({"command": ("u:V",)}, "a command has no unit"),
         ({"time": None}, "needs --time COLUMN"),
         ({"time": None, "period": "10"}, "with its unit"),
         ({"time": None, "period": "0ms"}, "with its unit"),
@@ -191,7 +193,7 @@ def test_a_column_whose_name_has_a_colon_is_found(tmp_path):
         ({"speed": ("y:rpm", "y:hz")}, "speeds in rpm, hz: give all in one unit"),
     ],
 )
-def test_a_wrong_description_of_the_table_is_told_in_one_line(tmp_path, arguments, said):
+def test_a_wrong_description_of_the_table_is_a_one_line_error(tmp_path, arguments, said):
     with pytest.raises(UserError, match=said) as raised:
         table(tmp_path, "t,u,y\n0,1,10\n1,2,20\n", **arguments)
     assert "\n" not in str(raised.value)
@@ -201,26 +203,26 @@ def test_a_wrong_description_of_the_table_is_told_in_one_line(tmp_path, argument
     ("content", "said"),
     [
         ("", "must name the columns"),
-        ("t,u,y\n", "holds no time|holds no number|fewer than two"),
+        ("t,u,y\n", "has no times|has no numbers|fewer than two"),
         ("t,u,y\n0,1,10\n", "fewer than two"),
-        ("t,u,y\nthen,1,10\nnow,1,10\n", "holds no time in iso, but for example 'then'"),
-        ("t,u,y\n0,1,fast\n1,1,slow\n", "'y' holds no number, but for example 'fast'"),
+        ("t,u,y\nthen,1,10\nnow,1,10\n", "has no times in iso, but for example 'then'"),
+        ("t,u,y\n0,1,fast\n1,1,slow\n", "'y' has no numbers, but for example 'fast'"),
         ("t,u,u,y\n0,1,1,10\n1,1,1,10\n", "2 columns are called 'u'"),
-        (b"MATLAB 5.0 MAT-file\0\0\0\1", "not a text file of columns"),
+        (b"MATLAB 5.0 MAT-file\0\0\0\1", "not a text file with columns"),
     ],
 )
-def test_a_file_that_is_no_such_table_is_told_in_one_line(tmp_path, content, said):
+def test_a_file_that_is_not_such_a_table_is_a_one_line_error(tmp_path, content, said):
     with pytest.raises(UserError, match=said) as raised:
         table(tmp_path, content)
     assert "\n" not in str(raised.value)
 
 
-def test_a_missing_file_is_told_in_one_line(tmp_path):
+def test_a_missing_file_is_a_one_line_error(tmp_path):
     with pytest.raises(UserError, match=r"nowhere\.csv: cannot read the table: No such file"):
         read_table(tmp_path / "nowhere.csv", "t", ["u"], ["y"])
 
 
-def test_what_csv_writes_with_quotes_is_read(tmp_path):
+def test_quoted_cells_are_read(tmp_path):
     path = tmp_path / "quoted.csv"
     with path.open("w", newline="") as file:
         writer = csv.writer(file, quoting=csv.QUOTE_ALL)
@@ -230,11 +232,11 @@ def test_what_csv_writes_with_quotes_is_read(tmp_path):
 
 @pytest.mark.parametrize(("unit", "finer"), [("", "ms"), (":s", "ms"), (":ms", "us")])
 @pytest.mark.parametrize("fraction", ["", ".5"])
-def test_times_read_in_too_large_a_unit_are_told_with_the_unit_to_try(tmp_path, unit, finer, fraction):
+def test_times_read_in_too_large_a_unit_are_an_error_that_names_the_unit_to_try(tmp_path, unit, finer, fraction):
     t = f"1700000000123{'' if finer == 'ms' else '000'}{fraction}"
-    with pytest.raises(UserError, match=rf"beyond the year 2116: is it in ms, us or ns\? write --time t:{finer}"):
+    with pytest.raises(UserError, match=rf"beyond the year 2116: is it in ms, us or ns\? use --time t:{finer}"):
         table(tmp_path, f"t,u,y\n{t},1,10\n{t},2,20\n", time=f"t{unit}")
 
 
-def test_a_time_too_large_for_a_float_is_no_time(tmp_path):
-    assert table(tmp_path, "t,u,y\n0,1,10\n1e305,1,10\n1,2,20\n").mended.without_time == 1
+def test_a_time_too_large_for_a_float_is_not_a_time(tmp_path):
+    assert table(tmp_path, "t,u,y\n0,1,10\n1e305,1,10\n1,2,20\n").repairs.without_time == 1

@@ -1,4 +1,4 @@
-"""The serial adapter on real pseudo-terminals: it waits, reads, writes, loses the device and finds it again."""
+"""The serial adapter on real pseudo-terminals: it waits, reads, writes, and reopens it when the device returns."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def line(device: Device) -> Iterator[SerialPort]:
     line.stop()
 
 
-def test_bytes_come_with_the_host_s_time_after_word_that_the_line_is_up(device: Device, line: SerialPort) -> None:
+def test_bytes_carry_the_host_time_and_follow_a_link_up(device: Device, line: SerialPort) -> None:
     device.plug_in()
     items = Items()
     line.start(items.queue.put)
@@ -121,7 +121,7 @@ def test_every_byte_value_passes_unchanged_in_both_directions(device: Device, li
     assert device.receive(512) == everything
 
 
-def test_a_port_that_is_not_there_yet_is_told_once_and_waited_for(device: Device, line: SerialPort) -> None:
+def test_a_port_that_does_not_exist_yet_is_reported_once_and_waited_for(device: Device, line: SerialPort) -> None:
     items = Items()
     line.start(items.queue.put)
     assert items.next(LinkDown).reason == "no such port; waiting for it; check [[tray]] port"
@@ -132,7 +132,7 @@ def test_a_port_that_is_not_there_yet_is_told_once_and_waited_for(device: Device
     assert items.bytes(4) == b"here"
 
 
-def test_what_is_not_a_serial_port_is_told_and_waited_for(device: Device, line: SerialPort) -> None:
+def test_a_file_that_is_not_a_serial_port_is_reported_and_waited_for(device: Device, line: SerialPort) -> None:
     device.path.write_text("a file")
     items = Items()
     line.start(items.queue.put)
@@ -140,12 +140,12 @@ def test_what_is_not_a_serial_port_is_told_and_waited_for(device: Device, line: 
     assert reason.startswith("cannot be opened (")
     assert reason.endswith("check [[tray]] port and baud")
     device.path.unlink()
-    assert items.next(LinkDown).reason.startswith("no such port"), "another reason is told too"
+    assert items.next(LinkDown).reason.startswith("no such port"), "another reason is reported too"
     device.plug_in()
     items.next(LinkUp)
 
 
-def test_a_port_in_use_is_told_and_taken_when_it_is_free(device: Device, line: SerialPort) -> None:
+def test_a_port_in_use_is_reported_and_opened_when_it_is_free(device: Device, line: SerialPort) -> None:
     device.plug_in()
     first, items = Items(), Items()
     other = SerialPort(str(device.path), 115200)
@@ -182,7 +182,7 @@ def test_stop_delivers_what_had_arrived_and_then_nothing_more(device: Device) ->
 
     def deliver(item: LinkUp | LinkDown | ReceivedBytes) -> None:
         items.queue.put(item)
-        if isinstance(item, ReceivedBytes) and not stopper.ident:  # as a stage that is behind while it is told to stop
+        if isinstance(item, ReceivedBytes) and not stopper.ident:  # as a stage that is behind when it is stopped
             device.send(data)
             stopper.start()
             assert line._stopping.wait(TIMEOUT_S)
@@ -230,7 +230,9 @@ def test_a_device_that_takes_no_bytes_makes_write_say_so_instead_of_blocking(dev
     assert not all(line.write(bytes(4096)) for _ in range(100)), "a terminal holds less than that"
 
 
-def test_samples_go_on_after_the_device_was_away_and_health_says_so_meanwhile(device: Device, line: SerialPort) -> None:
+def test_samples_continue_after_the_device_was_away_and_health_reports_it_meanwhile(
+    device: Device, line: SerialPort
+) -> None:
     tray = TrayConfig(name="bench", fans=1, source=SerialConfig(port=str(device.path)))
     core = SerialCore(tray, AcquisitionConfig(), line, started_t_ns=time.time_ns())
     items = Items()

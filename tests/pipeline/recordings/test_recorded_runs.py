@@ -35,7 +35,7 @@ def raw(host_ns, clock_us=(), command=None, speed=None, tray="tray1", fans=1) ->
     )
 
 
-def test_the_devices_clock_tells_the_time_also_when_it_wraps(tmp_path):
+def test_the_device_clock_gives_the_time_also_when_it_wraps(tmp_path):
     rng = np.random.default_rng(1)
     clock_us = (2**32 - 500_000 + np.arange(100) * 10_000) % 2**32
     received_ns = START_NS + np.arange(100) * 10_000_000 + rng.integers(0, 5_000_000, 100)
@@ -43,7 +43,7 @@ def test_the_devices_clock_tells_the_time_also_when_it_wraps(tmp_path):
     np.testing.assert_allclose(run.t_s, np.arange(100) * 0.01, rtol=0, atol=2e-4)
 
 
-def test_without_a_devices_clock_the_time_is_that_of_receipt(tmp_path):
+def test_without_a_device_clock_the_time_is_that_of_receipt(tmp_path):
     (run,) = read_runs(record(tmp_path / "r.mcap", raw([START_NS, START_NS + 7, START_NS + 10**9]))).runs
     np.testing.assert_allclose(run.t_s, [0, 7e-9, 1], rtol=0, atol=1e-12)
 
@@ -56,7 +56,7 @@ def test_a_device_that_restarts_begins_a_run(tmp_path):
     assert second.t_s[0] == pytest.approx(1.0)
 
 
-def test_samples_that_came_twice_count_once_and_late_ones_find_their_place(tmp_path):
+def test_repeated_samples_count_once_and_late_ones_are_sorted_in(tmp_path):
     clock_us = np.array([0, 10_000, 10_000, 30_000, 20_000, 40_000])
     speed = [[0.0], [1.0], [1.0], [3.0], [2.0], [4.0]]
     (run,) = read_runs(record(tmp_path / "r.mcap", raw(START_NS + clock_us * 1000, clock_us, speed=speed))).runs
@@ -77,23 +77,23 @@ def test_a_tray_is_chosen_where_there_are_several(tmp_path):
     times = START_NS + np.arange(3) * 10**7
     path = record(tmp_path / "r.mcap", raw(times, tray="a"), raw(times, tray="b", fans=2))
     assert read_runs(path, tray="b").runs[0].command.shape == (3, 2)
-    with pytest.raises(RecordingError, match="several trays, a, b: say which with --tray"):
+    with pytest.raises(RecordingError, match="several trays, a, b: choose one with --tray"):
         read_runs(path)
-    with pytest.raises(RecordingError, match="no raw samples of a tray 'c'"):
+    with pytest.raises(RecordingError, match="no raw samples of tray 'c'"):
         read_runs(path, tray="c")
 
 
-def test_parts_and_fans_that_are_not_there_are_told(tmp_path):
+def test_parts_and_fans_that_do_not_exist_are_an_error(tmp_path):
     path = record(tmp_path / "r.mcap", raw(START_NS + np.arange(3) * 10**7))
     with pytest.raises(RecordingError, match="fewer than two raw samples from 5 s to inf s"):
         read_runs(path, from_s=5.0)
-    with pytest.raises(RecordingError, match="it has fans 0 to 0; see --fans"):
+    with pytest.raises(RecordingError, match="the tray has fans 0 to 0; see --fans"):
         read_runs(path, fans=[1])
     with pytest.raises(RecordingError, match="no raw samples in this recording"):
         read_runs(record(tmp_path / "empty.mcap"))
 
 
-def test_a_tray_that_changes_its_number_of_fans_is_told(tmp_path):
+def test_a_tray_that_changes_its_number_of_fans_is_an_error(tmp_path):
     times = START_NS + np.arange(3) * 10**7
     with pytest.raises(RecordingError, match="the number of fans changes from 1 to 2"):
         read_runs(record(tmp_path / "r.mcap", raw(times), raw(times + 10**9, fans=2)))
