@@ -69,22 +69,24 @@ class RecordingPlayback:
         damage: list[str] = []
         for file in self.files:
             reading = read_recording(file, self._topics)
-            for entry in reading:
-                header = entry.message.header
-                if not seen.setdefault((entry.key, header.producer), Seen()).is_new(header.sequence):
-                    continue  # the part before this one had it, too
-                if self._end_ns is not None and entry.received_t_ns > self._end_ns:
-                    if entry.received_t_ns > self._end_ns + OUT_OF_ORDER_NS:
-                        return
-                    continue
-                if entry.received_t_ns >= self._start_ns:
-                    yield from carried.values()
-                    carried.clear()
-                    yield entry
-                elif entry.topic == CARRIED:
-                    carried[entry.key] = entry.received_at(self._start_ns)
-            damage += filter(None, [reading.damage])
-            self.damage = tuple(damage)
+            try:
+                for entry in reading:
+                    header = entry.message.header
+                    if not seen.setdefault((entry.key, header.producer), Seen()).is_new(header.sequence):
+                        continue  # the part before this one had it, too
+                    if self._end_ns is not None and entry.received_t_ns > self._end_ns:
+                        if entry.received_t_ns > self._end_ns + OUT_OF_ORDER_NS:
+                            return
+                        continue
+                    if entry.received_t_ns >= self._start_ns:
+                        yield from carried.values()
+                        carried.clear()
+                        yield entry
+                    elif entry.topic == CARRIED:
+                        carried[entry.key] = entry.received_at(self._start_ns)
+            finally:  # also when the stretch ends or playback stops before the end of the file
+                damage += filter(None, [reading.damage])
+                self.damage = tuple(damage)
 
     def rounds(self) -> Iterator[tuple[int, Envelope]]:
         """Round after round without end, each with its number; times are shifted so that they never run back."""

@@ -146,6 +146,22 @@ def test_a_torn_part_is_played_as_far_as_it_goes_and_told(tmp_path):
     assert reel.end_s() is None
 
 
+def test_damage_before_the_end_of_a_stretch_is_reported(tmp_path, monkeypatch):
+    """Playback stops reading the file some seconds after the stretch; what it could not read until then counts."""
+    path = tmp_path / "damaged.mcap"
+    monkeypatch.setattr("pipeline.recordings.writing.CHUNK_BYTES", 4096)
+    write_raw(path, 4000, fans=1)
+    content = bytearray(path.read_bytes())
+    at = len(content) // 8
+    content[at] ^= 0xFF
+    path.write_bytes(content)
+    playback = RecordingPlayback([path], ("raw",), 0.0, 15.0)
+    played = sequences(playback)
+    assert 1000 < len(played) < 1501 and played[-1] == 1500
+    (line,) = playback.damage
+    assert "damaged.mcap: damaged chunks left out: " in line
+
+
 def test_files_without_a_message_or_that_are_no_recording_are_one_line(tmp_path):
     empty = part(tmp_path / "empty.mcap", range(0))
     with pytest.raises(RecordingError, match="no message"):
