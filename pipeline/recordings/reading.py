@@ -36,7 +36,7 @@ METADATA_NAME = "fantwin"
 class Reading:
     """The messages of a file in the order they were recorded; one chunk at a time is in memory.
 
-    What cannot be read is skipped and counted. The counts are final once an iteration has ended.
+    What cannot be read is skipped and counted. The counts are those up to the newest message of the iteration.
     """
 
     path: Path
@@ -74,8 +74,10 @@ class Reading:
         """The messages as bytes; `Envelope.message` decodes one, and may raise CodecError."""
         self.truncated, self.damaged_chunks = False, 0
         channels: dict[int, tuple[str, str]] = {}
+        corrupt = 0
         reader = RecordReader(self.path)
         for record in reader:
+            self.damaged_chunks = corrupt + len(reader.damaged_ranges)
             try:
                 if isinstance(record.parsed, Chunk):
                     envelopes = self._envelopes(chunk_data(record.parsed), channels)
@@ -84,11 +86,11 @@ class Reading:
                 else:
                     continue
             except CORRUPT_DATA_ERRORS:
-                self.damaged_chunks += 1
+                corrupt += 1
             else:
                 yield from envelopes
         self.truncated = not reader.is_complete
-        self.damaged_chunks += len(reader.damaged_ranges)
+        self.damaged_chunks = corrupt + len(reader.damaged_ranges)
 
     def _envelopes(self, data: bytes, channels: dict[int, tuple[str, str]]) -> list[Envelope]:
         """The wanted messages in the records of a chunk; their channels are added to `channels`."""

@@ -20,12 +20,12 @@ from rich.text import Text
 
 from pipeline.cli.options import JsonOption, SetOption
 from pipeline.replay.live.keyboard import Keys
-from pipeline.replay.live.listeners import FROM
 from pipeline.replay.live.pace import Pace
 from pipeline.replay.live.player import Progress
 from pipeline.replay.live.publishing import Outcome, publish
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from pipeline.replay.resolve_config import resolve_config
+from pipeline.replay.stage_chain import replay_starts
 from pipeline.runtime.signals import stop_on_signals
 from schemas.topics import TOPICS
 
@@ -67,8 +67,8 @@ def replay(
         str | None,
         typer.Option(
             "--from",
-            metavar="|".join(FROM),
-            help="Publish only what the stages after it need; they judge it anew.",
+            metavar="TOPIC",
+            help="Publish only what the stages that read TOPIC need (raw, grid or prediction); they decide again.",
             rich_help_panel=_VIEWING,
         ),
     ] = None,
@@ -165,9 +165,10 @@ def _chosen_topics(topics: str | None, from_topic: str | None) -> tuple[str, ...
     if from_topic is not None:
         if topics is not None:
             raise typer.BadParameter("--topics or --from, not both", param_hint="--from")
-        if from_topic not in FROM:
-            raise typer.BadParameter(f"{from_topic!r} is none of {', '.join(FROM)}", param_hint="--from")
-        return FROM[from_topic]
+        starts = replay_starts()
+        if from_topic not in starts:
+            raise typer.BadParameter(f"{from_topic!r} is none of {', '.join(starts)}", param_hint="--from")
+        return starts[from_topic]
     if topics is None:
         return REPLAYED
     chosen = tuple(topics.split(","))

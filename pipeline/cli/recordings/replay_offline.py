@@ -18,9 +18,9 @@ from rich.table import Table
 
 from pipeline.errors import UserError
 from pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, episodes
-from pipeline.replay.offline.judging import CannotCompareError, JudgedTray, judge
+from pipeline.replay.offline.judging import JudgedTray, judge
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
-from pipeline.replay.offline.verify import when
+from pipeline.replay.offline.verify import CannotCompareError, format_utc
 
 EXIT_DIFFERS, EXIT_CANNOT_COMPARE, EXIT_LOST = 1, 2, 3
 _SHOWN = 40
@@ -49,15 +49,15 @@ def run_offline(
     """
     began_s = time.monotonic()
     try:
-        with open_replay_input(files, config, overrides, twin, from_s, to_s) as material:
-            if verify and not material.is_as_recorded:
+        with open_replay_input(files, config, overrides, twin, from_s, to_s) as replay_input:
+            if verify and not replay_input.is_as_recorded:
                 raise CannotCompareError(
                     f"{files[0]}: --verify compares with the recording: leave out --twin, -c and --set, and give a "
                     "recording that holds its configuration"
                 )
-            trays = _judged(material, output, verify)
+            trays = _judged(replay_input, output, verify)
             took_s = time.monotonic() - began_s
-            result = _result(material, trays, took_s)
+            result = _result(replay_input, trays, took_s)
     except UserError as error:
         if not verify:
             raise
@@ -76,7 +76,7 @@ def run_offline(
         raise typer.Exit(EXIT_LOST)
 
 
-def _judged(material: ReplayInput, output: Path | None, verify: bool) -> list[JudgedTray]:
+def _judged(replay_input: ReplayInput, output: Path | None, verify: bool) -> list[JudgedTray]:
     columns = (SpinnerColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         task = shown.add_task("reading what the stages were fed")
@@ -86,10 +86,10 @@ def _judged(material: ReplayInput, output: Path | None, verify: bool) -> list[Ju
             since_s = (t_ns - first.setdefault(tray, t_ns)) / 1e9
             shown.update(task, description=f"judging {tray}: {since_s:.0f} s of it")
 
-        return judge(material, output, verify, progress)
+        return judge(replay_input, output, verify, progress)
 
 
-def _result(material: ReplayInput, trays: Sequence[JudgedTray], took_s: float) -> dict[str, Any]:
+def _result(replay_input: ReplayInput, trays: Sequence[JudgedTray], took_s: float) -> dict[str, Any]:
     now = episodes(alarm for tray in trays for alarm in tray.alarms)
     judged_s = sum(tray.hours for tray in trays) * 3600
     result: dict[str, Any] = {
@@ -101,7 +101,7 @@ def _result(material: ReplayInput, trays: Sequence[JudgedTray], took_s: float) -
         "not_judged": {tray.tray: dict(tray.not_judged.most_common()) for tray in trays},
         "counts": {tray.tray: dict(sorted(tray.counts.items())) for tray in trays},
         "restarts": sum(tray.plan.restarts for tray in trays),
-        "damage": list(material.damage.values()),
+        "damage": list(replay_input.damage.values()),
         "took_s": took_s,
         "times_real_time": judged_s / took_s if took_s else math.inf,
     }
@@ -118,7 +118,7 @@ def _result(material: ReplayInput, trays: Sequence[JudgedTray], took_s: float) -
             "alarms_not_recorded": sum(one.alarms_not_recorded for one in compared),
             "differences": [line for one in compared for line in one.named],
         }
-    elif not material.is_as_recorded and any(tray.recorded_alarms for tray in trays):
+    elif not replay_input.is_as_recorded and any(tray.recorded_alarms for tray in trays):
         within = [
             alarm for tray in trays for alarm in tray.recorded_alarms if tray.start_ns <= alarm.t_ns <= tray.end_ns
         ]
@@ -186,7 +186,7 @@ def _tell_verified(found: dict[str, Any], console: Console) -> None:
 def _list(console: Console, title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> None:
     if not alarms:
         return
-    console.print(_table(f"{title}, s since {when(start_ns)}", alarms[:_SHOWN], start_ns))
+    console.print(_table(f"{title}, s since {format_utc(start_ns)}", alarms[:_SHOWN], start_ns))
     if len(alarms) > _SHOWN:
         console.print(f"and {len(alarms) - _SHOWN} more; all with --json")
 

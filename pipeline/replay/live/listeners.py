@@ -12,14 +12,12 @@ from pipeline.bus.session import Bus
 from pipeline.config.registry import STAGES
 from pipeline.launch.loss_accounting import label
 from pipeline.launch.watcher import StageView, Watcher
+from pipeline.replay.stage_chain import replay_starts
 from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.stage import Stage, load_stage
 from schemas.messages import Health
 from schemas.streams import StreamId, input_streams, output_streams
 from schemas.topics import alive_key
-
-FROM: dict[str, tuple[str, ...]] = {"raw": ("raw",), "grid": ("grid",), "prediction": ("prediction", "twin")}
-"""What the stages after one of these topics need"""
 
 _LOOK_S = 0.02
 _NOBODY_S = 2.0  # within which somebody is met; stages whose first peer has died try its endpoint every second
@@ -71,7 +69,7 @@ def conflict(present: Collection[Present], topics: Collection[str], trays: Colle
 
 def _other_start(present: Collection[Present]) -> str:
     """From where to replay so that stages which are there have something to do, and none of them does it, too."""
-    for start, topics in FROM.items():
+    for start, topics in replay_starts().items():
         written = any(topic in each.stage.writes for each in present for topic in topics)
         if not written and any(start in each.stage.reads for each in present if each.stage.writes):
             return start

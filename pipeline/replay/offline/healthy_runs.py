@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.replay.offline.offline_pipeline import OfflinePipeline
-from pipeline.replay.offline.plan import undisturbed
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
@@ -92,10 +90,7 @@ class HealthyRuns:
         with open_replay_input([path], None, self._overrides, self._twin) as material:
             for tray in material.trays:
                 name = tray.name
-                chain = OfflinePipeline(
-                    material.contexts(tray), lambda name=name: material.raw(name), undisturbed(), lambda _message: None
-                )
-                yield HealthyRun(path, name, tray.fans), map(samples_of, chain.predictions())
+                yield HealthyRun(path, name, tray.fans), map(samples_of, material.pipeline(name).predictions())
 
 
 class _Kept:

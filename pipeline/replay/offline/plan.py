@@ -1,255 +1,244 @@
-"""What every session of every stage was fed, read from a recording: the causes that its messages carry.
+"""Which input each session of each stage consumed, as the input positions of its outputs tell.
 
-A stage that was killed begins anew, catches up with what its producers still keep, and so takes some messages again
-that its predecessor had taken. A replay that is to decide the same must do the same. Times are those of grid samples,
-which name the rows of grids, predictions and scores alike; raw messages are named by their sequence.
+A stage that was killed restarts and takes again the messages that its producers still keep. A replay that is to make
+the same decisions has to feed each session what the recorded session consumed. Raw messages are identified by their
+sequence number; samples of grids, predictions and scores by their time.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from pipeline.replay.stage_chain import StageChain
 from schemas import fan_pb2
+from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header
 from schemas.messages import Alarm, Grid, Message, Prediction, Request, Score, ScorerSnapshot
 
-CHAIN = {"resampler": "grid", "twin_integrator": "prediction", "scorer": "score"}
-"""The stages that decide, in the order of the data, and the topic whose rows tell what each was fed."""
-
-SIDE_TOPICS = ("alarm", "snapshot", "request")
+BEGINNING = -(2**63)
 
 
 @dataclass
-class RawSpan:
-    """Messages first..last of one producer of raw samples, "" for all of them; None: to the end."""
+class Span:
+    """Input of one producer, from `first` to `last`, both included: sequence numbers of raw messages, times in ns of
+    samples."""
 
     producer: str
+    """"" is any producer of raw messages"""
     first: int
     last: int | None
-    known: int = -1
-    """the newest that was certainly taken"""
+    """None: to the end"""
+    last_known: int = -1
+    """the newest raw message that was certainly consumed"""
+    wanted_again_from: int | None = None
+    """the earliest sample that a later span of this producer contains; None: there is no such span"""
 
 
 @dataclass
-class RowSpan:
-    """Rows first_t_ns..last_t_ns of one producer; None: from the beginning, to the end."""
+class Session:
+    """One run of a stage's process, and what it consumed."""
 
     producer: str
-    first_t_ns: int | None
-    last_t_ns: int | None
-
-
-@dataclass
-class ResamplerSession:
-    """A session of the resampler. `passed`: after which raw message of a producer time passed, and to which sample."""
-
-    producer: str
-    spans: list[RawSpan] = field(default_factory=list)
-    passed: dict[tuple[str, int], int] = field(default_factory=dict)
+    spans: list[Span] = field(default_factory=list)
+    began_before: bool = False
+    """it had consumed input before its first recorded output"""
+    timer_outputs: dict[tuple[str, int], int] = field(default_factory=dict)
+    """of the first stage: after which raw message (producer, sequence) a timer made it emit samples, and until when"""
     is_guessed: bool = False
-    """some messages never came to it, and which is not known for certain"""
+    """some raw messages never reached it, and the recording does not say which"""
+    snapshot: ScorerSnapshot | None = None
+    """what it was restored from"""
+    requests: list[tuple[int, Request]] = field(default_factory=list)
+    """operators' requests, each with the time of the sample after which it was answered, in order"""
+    last_t_ns: int = 0
+    """time of the newest sample in its recorded output"""
+    next_sequence: int = 0
+    position: fan_pb2.InputPosition | None = None
+    """of its newest recorded output"""
 
-
-@dataclass
-class RowSession:
-    """A session of a stage that takes rows."""
-
-    producer: str
-    spans: list[RowSpan] = field(default_factory=list)
+    @property
+    def can_be_repeated(self) -> bool:
+        """Whether the recording holds the state that it began with."""
+        return self.snapshot is not None or not self.began_before
 
 
 @dataclass
 class TrayPlan:
-    """All sessions of one tray, in the order they came."""
+    """All sessions of one tray's stages."""
 
-    resampler: list[ResamplerSession]
-    twin_integrator: list[RowSession]
-    scorer: list[RowSession]
-    began_before: set[str]
-    """sessions that had taken something before the recording begins: they cannot be made the same again"""
-    last_scored_t_ns: dict[str, int]
-    """of each session of the scorer, the newest sample whose score is recorded"""
-    snapshots: dict[str, ScorerSnapshot] = field(default_factory=dict)
-    """what sessions of the scorer began with"""
-    is_as_recorded: bool = True
-    """what is judged by is the recording's own; else a session goes on from what the one before finds now"""
-    requests: dict[str, list[tuple[int, Request]]] = field(default_factory=dict)
-    """of each session of the scorer: what operators asked for, and after which sample, in order"""
+    sessions: dict[str, list[Session]]
+    """by stage in the order of the chain, each list in the order the sessions began"""
+    uses_recorded_snapshots: bool = True
+    """False, with another twin or configuration: a session is restored from what the replayed one before it left"""
+
+    @property
+    def first(self) -> list[Session]:
+        """The sessions of the stage that reads raw samples."""
+        return next(iter(self.sessions.values()))
+
+    @property
+    def last(self) -> list[Session]:
+        """The sessions of the stage that makes the decisions."""
+        return list(self.sessions.values())[-1]
 
     @property
     def restarts(self) -> int:
         """How many sessions followed another one."""
-        return sum(len(sessions) - 1 for sessions in (self.resampler, self.twin_integrator, self.scorer))
+        return sum(len(sessions) - 1 for sessions in self.sessions.values())
 
 
-def undisturbed() -> TrayPlan:
-    """One session of each stage that takes everything there is."""
-    rows = [RowSession("", [RowSpan("", None, None)])]
-    return TrayPlan([ResamplerSession("", [RawSpan("", 0, None)])], rows, rows, set(), {})
+def undisturbed_plan(chain: StageChain) -> TrayPlan:
+    """One session of each stage, which consumes everything there is."""
+    first, *others = (stage.name for stage in chain.stages)
+    raw = Session("", [Span("", 0, None)])
+    return TrayPlan({first: [raw]} | {name: [Session("", [Span("", BEGINNING, None)])] for name in others})
 
 
-class UnplannedError(Exception):
-    """A recording whose messages do not say what they were made of."""
+class NoInputPositionError(Exception):
+    """An output does not say which input it was made from."""
 
 
-class Planner:
-    """Takes the packets of one tray of `CHAIN`'s topics, in the order they were recorded."""
+class PlanReader:
+    """Reads a tray's outputs and side topics, in the order they were recorded."""
 
-    def __init__(self) -> None:
-        self._books = {topic: _Book(topic) for topic in CHAIN.values()}
-
-    def note(self, packet: Envelope) -> None:
-        """Take the next one.
-
-        Raises:
-            UnplannedError: it does not say what it was made of.
-            CodecError: it cannot be decoded.
-        """
-        self._books[packet.topic].note(packet)
-
-    def plan(self) -> TrayPlan | None:
-        """The sessions; None where what is recorded does not tell all of them."""
-        grids, predictions, scores = (list(book.sessions.values()) for book in self._books.values())
-        if not all(session.spans for session in (*predictions, *scores)):
-            return None  # of another version: their rows cannot be read
-        for made, fed in ((predictions, grids), (scores, predictions)):
-            known = {session.producer for session in fed}
-            if not made or not all(span.producer in known for session in made for span in session.spans):
-                return None
-        plan = TrayPlan(
-            [ResamplerSession(s.producer, s.raw_spans, s.passed, s.is_guessed) for s in grids],
-            [RowSession(session.producer, session.spans) for session in predictions],
-            [RowSession(session.producer, session.spans) for session in scores],
-            {session.producer for session in (*predictions, *scores) if session.began_before},
-            {session.producer: session.newest_t_ns for session in scores},
-        )
-        _open_the_ends(plan)
-        return plan
-
-
-class SideInputs:
-    """What the scorer was given besides predictions; its own answers tell when."""
-
-    def __init__(self) -> None:
-        self.snapshots: dict[str, ScorerSnapshot] = {}
+    def __init__(self, chain: StageChain) -> None:
+        self._stages = {topic: stage.name for stage, topic in zip(chain.stages, chain.outputs, strict=True)}
+        self._first = chain.stages[0].name
+        self._sessions: dict[str, dict[str, Session]] = {stage.name: {} for stage in chain.stages}
+        self._snapshots: dict[str, ScorerSnapshot] = {}
         self._requests: dict[str, Request] = {}
         self._answers: dict[tuple[str, str], tuple[int, int]] = {}
+        self._has_positions = True
+        self.alarms: dict[tuple[str, int], Alarm] = {}
+        """the recorded alarms by producer and sequence, each once"""
+        self.undecodable = 0
 
-    def note(self, message: Message) -> None:
-        """Take the next message of the topics `memory`, `request` and `alarm`."""
-        producer, sequence = message.header.producer, message.header.sequence
-        if isinstance(message, ScorerSnapshot) and message.restored:
-            self.snapshots.setdefault(producer, message)
-        elif isinstance(message, Request):
-            self._requests[f"{producer}/{sequence}"] = message
-        elif isinstance(message, Alarm) and message.request:
-            self._answers.setdefault((producer, message.request), (sequence, message.t_ns))
+    def add(self, envelope: Envelope) -> None:
+        """Read the next message."""
+        try:
+            if envelope.topic not in self._stages:
+                self._add_side(envelope.message)
+            elif self._has_positions:
+                self._add_output(envelope)
+        except NoInputPositionError:
+            self._has_positions = False
+        except CodecError:
+            self.undecodable += 1
 
-    def add_to(self, plan: TrayPlan, *, is_as_recorded: bool) -> None:
-        """Tell a plan of them. A session that began with a memory needs nothing of what came before it."""
-        plan.snapshots = self.snapshots
-        plan.is_as_recorded = is_as_recorded
-        plan.began_before -= set(self.snapshots)
-        for (producer, name), (_, t_ns) in sorted(self._answers.items(), key=lambda answer: answer[1]):
-            if name in self._requests:
-                plan.requests.setdefault(producer, []).append((t_ns, self._requests[name]))
+    def plan(self) -> TrayPlan | None:
+        """The sessions; None where the recording does not say what all of them consumed."""
+        plan = TrayPlan({stage: list(sessions.values()) for stage, sessions in self._sessions.items()})
+        producing, *consuming = plan.sessions.values()
+        for sessions in consuming:
+            producers = {session.producer for session in producing}
+            if not sessions or not all(session.spans for session in sessions):
+                return None
+            if not all(span.producer in producers for session in sessions for span in session.spans):
+                return None
+            producing = sessions
+        if not self._has_positions:
+            return None
+        _open_ends(plan)
+        _find_repeats(plan)
+        self._add_sides(plan)
+        return plan
 
-
-@dataclass
-class _Session:
-    """What is known of one session from its outputs so far."""
-
-    producer: str
-    began_before: bool
-    spans: list[RowSpan]
-    raw_spans: list[RawSpan]
-    passed: dict[tuple[str, int], int]
-    next_sequence: int = 0
-    newest_t_ns: int = 0
-    cause_producer: str = ""
-    cause_sequence: int = 0
-    taken: int = 0
-    is_guessed: bool = False
-
-
-class _Book:
-    """Follows the outputs of one topic."""
-
-    def __init__(self, topic: str) -> None:
-        self._topic = topic
-        self.sessions: dict[str, _Session] = {}
-
-    def note(self, packet: Envelope) -> None:
-        header = decode_header(packet)
+    def _add_output(self, envelope: Envelope) -> None:
+        header = decode_header(envelope)
         if not header.HasField("input_position"):
-            raise UnplannedError
-        position = header.input_position
-        session = self.sessions.get(header.producer)
+            raise NoInputPositionError
+        stage = self._stages[envelope.topic]
+        position, sessions = header.input_position, self._sessions[stage]
+        session = sessions.get(header.producer)
         if session is None:
-            session = self.sessions[header.producer] = _Session(
-                producer=header.producer,
-                # the resampler takes raw messages that give no grid yet, the others answer the first at once
-                began_before=self._topic != "grid" and position.consumed_count > 1,
-                spans=[],
-                raw_spans=[
-                    RawSpan(
-                        position.producer, max(0, position.sequence - position.consumed_count + 1), position.sequence
-                    )
-                ],
-                passed={},
-            )
+            # the first stage consumes messages without making output; the others answer the first message at once
+            began_before = stage != self._first and position.consumed_count > 1
+            session = sessions[header.producer] = Session(header.producer, began_before=began_before)
         elif header.sequence < session.next_sequence:
-            return  # a part that overlaps the one before
+            return  # this part of the recording overlaps the one before
+        if stage == self._first:
+            _extend_by_messages(session, position, envelope)
         else:
-            self._follow_raw(session, position)
-        if self._topic == "grid":
-            if position.from_timer:
-                session.passed[position.producer, position.sequence] = packet.newest_t_ns
-        else:
-            self._follow_rows(session, position, packet)
-        session.raw_spans[-1].known = position.sequence
-        session.next_sequence, session.newest_t_ns = header.sequence + 1, packet.newest_t_ns
-        session.cause_producer, session.cause_sequence, session.taken = (
-            position.producer,
-            position.sequence,
-            position.consumed_count,
-        )
+            _extend_by_samples(session, position, envelope)
+        session.position = position
+        session.next_sequence, session.last_t_ns = header.sequence + 1, envelope.newest_t_ns
 
-    def _follow_raw(self, session: _Session, position: fan_pb2.InputPosition) -> None:
-        span = session.raw_spans[-1]
-        if position.producer == span.producer and position.contiguous_from <= session.cause_sequence + 1:
-            span.last = position.sequence
-            return
-        # Some never came, or another producer has followed. Before `since` there were some of the former that gave
-        # nothing: those right after the last, unless there was more than one hole.
-        before = position.consumed_count - session.taken - (position.sequence - position.contiguous_from + 1)
-        session.is_guessed |= before != 0
-        span.last = session.cause_sequence + max(before, 0)
-        session.raw_spans.append(RawSpan(position.producer, position.contiguous_from, position.sequence))
+    def _add_side(self, message: Message) -> None:
+        header = message.header
+        if isinstance(message, ScorerSnapshot) and message.restored:
+            self._snapshots.setdefault(header.producer, message)
+        elif isinstance(message, Request):
+            self._requests[f"{header.producer}/{header.sequence}"] = message
+        elif isinstance(message, Alarm):
+            self.alarms.setdefault((header.producer, header.sequence), message)
+            if message.request:
+                self._answers.setdefault((header.producer, message.request), (header.sequence, message.t_ns))
 
-    def _follow_rows(self, session: _Session, position: fan_pb2.InputPosition, packet: Envelope) -> None:
-        goes_on = position.producer == session.cause_producer and position.contiguous_from <= session.cause_sequence + 1
-        if not session.spans or not goes_on:
-            message = packet.message
-            assert isinstance(message, Grid | Prediction | Score)
-            session.spans.append(RowSpan(position.producer, int(message.t_ns[0]), packet.newest_t_ns))
-        else:
-            session.spans[-1].last_t_ns = packet.newest_t_ns
+    def _add_sides(self, plan: TrayPlan) -> None:
+        sessions = {session.producer: session for session in plan.last}
+        for producer, session in sessions.items():
+            session.snapshot = self._snapshots.get(producer)
+        for (producer, name), (_, t_ns) in sorted(self._answers.items(), key=lambda answer: answer[1]):
+            if name in self._requests and producer in sessions:
+                sessions[producer].requests.append((t_ns, self._requests[name]))
 
 
-def _open_the_ends(plan: TrayPlan) -> None:
-    """Let sessions make more than was recorded of them, as far as anyone wants it.
+def _extend_by_messages(session: Session, position: fan_pb2.InputPosition, envelope: Envelope) -> None:
+    before = session.position
+    if before is None:
+        first = max(0, position.sequence - position.consumed_count + 1)
+        session.spans.append(Span(position.producer, first, position.sequence))
+    elif _continues(before, position):
+        session.spans[-1].last = position.sequence
+    else:
+        # Some messages never arrived, or another producer follows. The consumed messages that the counts show before
+        # `contiguous_from` were those right after the last known one, unless there was more than one gap.
+        newly_contiguous = position.sequence - position.contiguous_from + 1
+        earlier = position.consumed_count - before.consumed_count - newly_contiguous
+        session.is_guessed |= earlier != 0
+        session.spans[-1].last = before.sequence + max(earlier, 0)
+        session.spans.append(Span(position.producer, position.contiguous_from, position.sequence))
+    session.spans[-1].last_known = position.sequence
+    if position.from_timer:
+        session.timer_outputs[position.producer, position.sequence] = envelope.newest_t_ns
 
-    The last messages of a session that was killed may have reached the scorer and not the recorder. And what the last
-    sessions had still before them when the recording ended is judged all the same.
+
+def _extend_by_samples(session: Session, position: fan_pb2.InputPosition, envelope: Envelope) -> None:
+    before = session.position
+    if before and _continues(before, position):
+        session.spans[-1].last = envelope.newest_t_ns
+    else:
+        message = envelope.message
+        assert isinstance(message, Grid | Prediction | Score)
+        session.spans.append(Span(position.producer, int(message.t_ns[0]), envelope.newest_t_ns))
+
+
+def _continues(before: fan_pb2.InputPosition, position: fan_pb2.InputPosition) -> bool:
+    """Whether nothing is missing between two positions."""
+    return position.producer == before.producer and position.contiguous_from <= before.sequence + 1
+
+
+def _open_ends(plan: TrayPlan) -> None:
+    """Let sessions produce more than was recorded of them, as far as the next stage wants it.
+
+    The last messages of a killed session may have reached the next stage and not the recorder. What the last sessions
+    had not yet consumed when the recording ended is judged as well.
     """
-    for session in plan.resampler:
+    *producing, deciding = plan.sessions.values()
+    for session in (*(session for sessions in producing for session in sessions), deciding[-1]):
         session.spans[-1].last = None
-    for session in (*plan.twin_integrator, plan.scorer[-1]):
-        session.spans[-1].last_t_ns = None
-    for sessions, feeding in ((plan.twin_integrator, plan.resampler), (plan.scorer, plan.twin_integrator)):
-        spans = sessions[-1].spans
-        names = [session.producer for session in feeding]
+    for sessions, consuming in zip(producing, [*producing[1:], deciding], strict=True):
+        spans = consuming[-1].spans
+        names = [session.producer for session in sessions]
         if spans[-1].producer in names:
-            spans += [RowSpan(name, None, None) for name in names[names.index(spans[-1].producer) + 1 :]]
+            spans += [Span(name, BEGINNING, None) for name in names[names.index(spans[-1].producer) + 1 :]]
+
+
+def _find_repeats(plan: TrayPlan) -> None:
+    """Set `wanted_again_from` of every span of samples."""
+    for sessions in list(plan.sessions.values())[1:]:
+        wanted: dict[str, int] = {}
+        for span in reversed([span for session in sessions for span in session.spans]):
+            span.wanted_again_from = wanted.get(span.producer)
+            wanted[span.producer] = min(span.first, wanted.get(span.producer, span.first))

@@ -1,10 +1,10 @@
-"""What a recording is judged by again: its raw samples, the configuration and the twins, its own or others."""
+"""What an offline replay judges: a recording's raw samples, with its own configuration and twins or with others."""
 
 from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,12 +14,14 @@ from pipeline.config.models import Config, TrayConfig
 from pipeline.recordings.order import in_order
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
 from pipeline.replay.default_config import default_config, first_raw
-from pipeline.replay.offline.plan import CHAIN, SIDE_TOPICS, Planner, SideInputs, TrayPlan, UnplannedError
+from pipeline.replay.offline.offline_pipeline import OfflinePipeline
+from pipeline.replay.offline.plan import PlanReader, TrayPlan, undisturbed_plan
+from pipeline.replay.offline.raw_blocks import RawBlocks
 from pipeline.replay.resolve_config import attached_config
+from pipeline.replay.stage_chain import StageChain, decision_chain
 from pipeline.runtime.stage import Context
-from schemas.codec import CodecError
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Raw
+from schemas.messages import Alarm, Message, Raw
 
 
 @dataclass
@@ -27,89 +29,81 @@ class ReplayInput:
     """A recording of one or several parts, ready to be judged."""
 
     paths: tuple[Path, ...]
-    head: RecordingMetadata
+    metadata: RecordingMetadata
     config: Config
     twins: dict[str, Path]
-    """of each tray"""
+    """by tray"""
     is_as_recorded: bool
     """configuration and twins are those of the recording"""
     is_same_grid: bool
-    """at least the grid of time is"""
+    """at least the resampler's settings are"""
     started_t_ns: int
-    """when its recording began"""
-    from_s: float = 0.0
-    to_s: float = math.inf
-    """the part of the recording that is judged, since its first raw sample"""
+    """when the recording began"""
+    stages: StageChain
+    start_s: float = 0.0
+    end_s: float = math.inf
+    """the part that is judged, in seconds since the tray's first raw sample"""
     damage: dict[Path, str] = field(default_factory=dict)
+    """what could not be read of a file, one line"""
 
     @property
     def is_part(self) -> bool:
-        """Not all of the recording is judged."""
-        return self.from_s > 0 or self.to_s < math.inf
+        """Whether only a part of the recording is judged."""
+        return self.start_s > 0 or self.end_s < math.inf
 
     @property
     def trays(self) -> tuple[TrayConfig, ...]:
         """The trays that are judged."""
         return self.config.trays
 
-    def packets(self, tray: str, topics: Iterable[str]) -> Iterator[Envelope]:
-        """The packets of a tray, in the order they were recorded."""
+    def envelopes(self, tray: str, topics: Iterable[str]) -> Iterator[Envelope]:
+        """The undecoded messages of a tray, in the order they were recorded."""
         for path in self.paths:
             reading = read_recording(path, tuple(topics), tray)
             yield from reading.undecoded()
             if reading.damage:
                 self.damage[path] = reading.damage
 
-    def raw(self, tray: str) -> Iterator[Envelope]:
-        """Its raw packets."""
-        return self.packets(tray, ("raw",))
+    def read_plan(self, tray: str) -> tuple[TrayPlan | None, list[Alarm]]:
+        """What each session of a tray's stages consumed, and the recorded alarms, each once.
 
-    def survey(self, tray: str) -> tuple[TrayPlan | None, list[Alarm]]:
-        """What the sessions of a tray were fed, and the alarms that are recorded, each once.
-
-        The plan is None where the recording does not say, or where another grid or a part only is wanted.
+        The plan is None where the recording does not say, and where another grid or only a part is to be judged.
         """
-        alarms: dict[tuple[str, int], Alarm] = {}
-        undecodable = 0
-        planner: Planner | None = Planner()
-        side = SideInputs()
-        for packet in self.packets(tray, (*CHAIN.values(), *SIDE_TOPICS)):
-            try:
-                if packet.topic in SIDE_TOPICS:
-                    message = packet.message
-                    side.note(message)
-                    if isinstance(message, Alarm):
-                        alarms.setdefault((message.header.producer, message.header.sequence), message)
-                elif planner:
-                    planner.note(packet)
-            except UnplannedError:
-                planner = None
-            except CodecError:
-                undecodable += 1
-        if undecodable:
-            self.damage[self.paths[0]] = f"{self.paths[0]}: messages left out that cannot be decoded: {undecodable}"
-        usable = planner is not None and self.is_same_grid and not self.is_part
-        plan = planner.plan() if planner and usable else None
+        reader = PlanReader(self.stages)
+        for envelope in self.envelopes(tray, (*self.stages.outputs, *self.stages.side_topics)):
+            reader.add(envelope)
+        if reader.undecodable:
+            line = f"{self.paths[0]}: messages left out that cannot be decoded: {reader.undecodable}"
+            self.damage[self.paths[0]] = line
+        plan = reader.plan() if self.is_same_grid and not self.is_part else None
         if plan:
-            side.add_to(plan, is_as_recorded=self.is_as_recorded)
-        return plan, list(alarms.values())
+            plan.uses_recorded_snapshots = self.is_as_recorded
+        return plan, list(reader.alarms.values())
 
-    def contexts(self, tray: TrayConfig) -> dict[str, Context]:
-        """What the stages of a tray are built from."""
+    def pipeline(
+        self, tray: str, plan: TrayPlan | None = None, observe: Callable[[Message], None] = lambda _message: None
+    ) -> OfflinePipeline:
+        """The stages of a tray, ready to run. Without a plan, one session of each judges everything."""
+        raw = RawBlocks(lambda: self.envelopes(tray, ("raw",)), observe, (self.start_s, self.end_s))
+        contexts = self.contexts(self.config.tray(tray))
+        return OfflinePipeline(self.stages, contexts, raw, plan or undisturbed_plan(self.stages), observe)
+
+    def contexts(self, tray: TrayConfig) -> list[Context]:
+        """What each stage of a tray is built from, in the order of the chain."""
         with_twin = tray.model_copy(update={"twin": self.twins[tray.name].resolve()})
-        return {
-            stage: Context(
+        return [
+            Context(
                 site=self.config.site,
                 trays=(with_twin,),
-                config=self.config.sections[stage],
+                config=self.config.sections[stage.name],
                 folder=self.config.folder,
                 run_folder=self.config.run_folder,
                 started_t_ns=self.started_t_ns,
                 configuration_text=self.config.text,
                 overrides=self.config.overrides,
             )
-            for stage in CHAIN
-        }
+            for stage in self.stages.stages
+        ]
 
 
 @contextmanager
@@ -118,68 +112,70 @@ def open_replay_input(
     config: Path | None,
     overrides: Sequence[str],
     twin: Path | None,
-    from_s: float = 0.0,
-    to_s: float = math.inf,
+    start_s: float = 0.0,
+    end_s: float = math.inf,
 ) -> Iterator[ReplayInput]:
-    """Open the parts of a recording, to be judged by its own configuration and twins, or by others.
+    """Open the parts of a recording, to be judged with its own configuration and twins, or with others.
 
-    config: another configuration. overrides: keys set on top, as `key=value`. twin: of all trays.
+    config: another configuration. overrides: keys set on top, as `key=value`. twin: for all trays.
 
     Raises:
-        RecordingError: a part cannot be read, or holds no raw samples, or no twin and none is given.
-        ConfigError: the configuration cannot be used, or does not know a tray of the recording.
+        RecordingError: a part cannot be read, there are no raw samples, or there is no twin and none is given.
+        ConfigError: the configuration cannot be used, or does not have a tray of the recording.
         StageError: a twin cannot be used.
     """
     if twin is not None and not twin.is_file():
         raise RecordingError(f"{twin}: there is no such twin; correct --twin")
     ordered = tuple(in_order(paths))
-    head = read_metadata(ordered[0])
+    metadata = read_metadata(ordered[0])
     for path in ordered[1:]:
-        _refuse_another_run(ordered[0], head, path)
-    first = first_raw(ordered, head)
+        _refuse_another_run(ordered[0], metadata, path)
+    first = first_raw(ordered, metadata)
+    stages = decision_chain()
     with tempfile.TemporaryDirectory() as folder:
-        recorded = _recorded_twins(head, Path(folder), first)
-        own = attached_config(ordered[0], head, CHAIN)
+        recorded = _recorded_twins(metadata, Path(folder), first)
+        attached = attached_config(ordered[0], metadata, stages.names)
         if config is not None:
-            base = load_config(config, overrides, CHAIN)
-        elif own is not None:
-            base = attached_config(ordered[0], head, CHAIN, overrides) or own
+            base = load_config(config, overrides, stages.names)
+        elif attached is not None:
+            base = attached_config(ordered[0], metadata, stages.names, overrides) or attached
         else:
             any_twin = twin or next(iter(recorded.values()), None)
             if any_twin is None:
                 raise RecordingError(f"{ordered[0]}: no twin in this recording: name one with --twin FILE.onnx")
-            base = default_config(ordered[0], head, first, any_twin, overrides, CHAIN)
+            base = default_config(ordered[0], metadata, first, any_twin, overrides, stages.names)
         trays = tuple(base.tray(name) for name in first)
         yield ReplayInput(
             paths=ordered,
-            head=head,
+            metadata=metadata,
             config=replace(base, trays=trays),
-            twins={tray.name: _twin_of(tray, base, own, recorded, twin, ordered[0]) for tray in trays},
-            started_t_ns=_started_t_ns(ordered[0], head, first),
-            is_as_recorded=own is not None and config is None and not overrides and twin is None,
-            is_same_grid=own is not None and base.sections["resampler"] == own.sections["resampler"],
-            from_s=from_s,
-            to_s=to_s,
+            twins={tray.name: _twin_of(tray, base, attached, recorded, twin, ordered[0]) for tray in trays},
+            started_t_ns=_started_t_ns(ordered[0], metadata, first),
+            is_as_recorded=attached is not None and config is None and not overrides and twin is None,
+            is_same_grid=attached is not None and base.sections["resampler"] == attached.sections["resampler"],
+            stages=stages,
+            start_s=start_s,
+            end_s=end_s,
         )
 
 
-def _refuse_another_run(first: Path, head: RecordingMetadata, path: Path) -> None:
-    """Parts of one recording have one site, one configuration and one twin."""
+def _refuse_another_run(first: Path, metadata: RecordingMetadata, path: Path) -> None:
+    """The parts of one recording have one site, one configuration and one twin."""
     other = read_metadata(path)
     for what, key in (("site", "site"), ("keys set on the command line", "overrides")):
-        if head.metadata.get(key) != other.metadata.get(key):
+        if metadata.metadata.get(key) != other.metadata.get(key):
             raise RecordingError(f"{first} and {path} are of two runs: they differ in {what}; judge them one by one")
-    if dict(head.attachments) != dict(other.attachments):
+    if dict(metadata.attachments) != dict(other.attachments):
         raise RecordingError(
-            f"{first} and {path} are of two runs: configuration or twin are not the same; judge them one by one"
+            f"{first} and {path} are of two runs: they differ in configuration or twin; judge them one by one"
         )
 
 
-def _recorded_twins(head: RecordingMetadata, folder: Path, trays: Iterable[str]) -> dict[str, Path]:
-    """The twins of the trays that are judged, written where they can be loaded from."""
+def _recorded_twins(metadata: RecordingMetadata, folder: Path, trays: Iterable[str]) -> dict[str, Path]:
+    """The attached twins of the trays, written to files that can be loaded."""
     twins = {}
     for number, tray in enumerate(trays):
-        content = head.attachments.get(f"{tray}.onnx")
+        content = metadata.attachments.get(f"{tray}.onnx")
         if content is not None:
             twins[tray] = folder / f"{number}.onnx"
             twins[tray].write_bytes(content)
@@ -187,12 +183,12 @@ def _recorded_twins(head: RecordingMetadata, folder: Path, trays: Iterable[str])
 
 
 def _twin_of(
-    tray: TrayConfig, base: Config, own: Config | None, recorded: dict[str, Path], twin: Path | None, path: Path
+    tray: TrayConfig, base: Config, attached: Config | None, recorded: dict[str, Path], twin: Path | None, path: Path
 ) -> Path:
-    """The twin that was named, else that of another configuration or a key, else the recording's own."""
+    """The twin that was given, else that of another configuration or of a key, else the recorded one."""
     if twin is not None:
         return twin
-    as_recorded = own is not None and base.path == own.path and tray.twin == own.tray(tray.name).twin
+    as_recorded = attached is not None and base.path == attached.path and tray.twin == attached.tray(tray.name).twin
     if not as_recorded and tray.twin is not None:
         return tray.twin if tray.twin.is_absolute() else base.folder / tray.twin
     if tray.name in recorded:
@@ -200,8 +196,8 @@ def _twin_of(
     raise RecordingError(f"{path}: no twin of {tray.name} in this recording: name one with --twin FILE.onnx")
 
 
-def _started_t_ns(path: Path, head: RecordingMetadata, first: Mapping[str, Sequence[Raw]]) -> int:
-    started = head.metadata.get("started_t_ns")
+def _started_t_ns(path: Path, metadata: RecordingMetadata, first: Mapping[str, Sequence[Raw]]) -> int:
+    started = metadata.metadata.get("started_t_ns")
     if started is None:
         return min(int(message.host_receive_t_ns[0]) for messages in first.values() for message in messages[:1])
     try:

@@ -1,65 +1,135 @@
-"""Are the scores and alarms that were made anew those of the recording, to the bit?"""
+"""Comparing replayed scores and alarms with the recorded ones, to the bit."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
+from pipeline.errors import UserError
+from pipeline.replay.offline.plan import Session, TrayPlan
 from schemas.blocks import cut
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header, decode_together
 from schemas.fields import columns
 from schemas.messages import Alarm, Array, Message, Score
+from schemas.units import NS_PER_S
 
-NAMED = 5
-"""so many differences are told"""
-_TOGETHER = 512
-_OF_A_SAMPLE = tuple(name for name, column in columns(Score).items() if column.by_sample and name != "t_ns")
+MAX_NAMED = 5
+"""differences that are described"""
+_BLOCK_MESSAGES = 512
+_SAMPLE_COLUMNS = tuple(name for name, column in columns(Score).items() if column.by_sample and name != "t_ns")
+
+
+class CannotCompareError(UserError):
+    """The replay cannot be compared with the recording."""
 
 
 @dataclass
 class Comparison:
-    """Of one tray. Rows are samples of the tray."""
+    """The result for one tray. Samples are those of the tray, with all fans."""
 
     tray: str
     equal: int = 0
     different: int = 0
-    """made anew and not the same"""
+    """replayed, and not equal"""
     not_made: int = 0
-    """recorded, and not made anew"""
+    """recorded, and not replayed"""
     not_recorded: int = 0
-    """made anew, and not in the recording: what was under way when it ended, or was lost"""
+    """replayed, and not in the recording: in flight when it ended, or lost"""
     alarms_equal: int = 0
     alarms_different: int = 0
     alarms_not_recorded: int = 0
-    """made anew beyond the last score that is recorded of their session"""
+    """replayed, and later than the last recorded score of their session"""
     named: list[str] = field(default_factory=list)
     """the first differences, a line each"""
 
     @property
     def is_equal(self) -> bool:
-        """Nothing differs."""
+        """Whether nothing differs."""
         return not (self.different or self.not_made or self.alarms_different)
 
     def name(self, difference: str) -> None:
-        """Note a difference, if it is one of the first."""
-        if len(self.named) < NAMED:
+        """Describe a difference, if it is one of the first."""
+        if len(self.named) < MAX_NAMED:
             self.named.append(difference)
+
+
+def refuse_unverifiable(where: str, plan: TrayPlan | None, *, is_part: bool) -> None:
+    """Check, before the replay, that the decisions can be repeated.
+
+    Raises:
+        CannotCompareError: they cannot.
+    """
+    if is_part:
+        raise CannotCompareError(f"{where}: a part of a run cannot be compared: leave out --start and --end")
+    if plan is None:
+        raise CannotCompareError(f"{where}: no scores that say what they were made of: nothing to compare with")
+    sessions = [session for sessions in plan.sessions.values() for session in sessions]
+    began_before = sorted(session.producer for session in sessions if not session.can_be_repeated)
+    if began_before:
+        raise CannotCompareError(
+            f"{where}: the recording begins in the middle of {', '.join(began_before)}: "
+            "name the parts before it as well"
+        )
+
+
+class TrayVerifier:
+    """Compares what a replay of one tray makes with the recording, session by session."""
+
+    def __init__(self, tray: str, read_scores: Callable[[], Iterable[Envelope]]) -> None:
+        """read_scores: the recorded scores of the tray, from the beginning at each call."""
+        self._read_scores = read_scores
+        self._producer: str | None = None
+        self._recorded: RecordedSession | None = None
+        self._visited: set[str] = set()
+        self._found = Comparison(tray)
+
+    def add(self, producer: str, score: Score) -> None:
+        """Compare the next replayed scores, of the recorded session `producer`."""
+        if self._recorded is None or producer != self._producer:
+            self._end_session()
+            self._recorded = self._begin_session(producer)
+        compare_scores(score, self._recorded, self._found)
+
+    def finish(self, sessions: Sequence[Session], alarms: Sequence[Alarm], recorded: Sequence[Alarm]) -> Comparison:
+        """Compare what is left, and the alarms; the result."""
+        self._end_session()
+        for session in sessions:
+            if session.producer not in self._visited:
+                self._recorded = self._begin_session(session.producer)
+                self._end_session()
+            replayed, known = (
+                [alarm for alarm in listed if alarm.header.producer == session.producer]
+                for listed in (alarms, recorded)
+            )
+            compare_alarms(replayed, known, session.last_t_ns, self._found)
+        return self._found
+
+    def _begin_session(self, producer: str) -> RecordedSession:
+        self._producer = producer
+        self._visited.add(producer)
+        return RecordedSession(self._read_scores(), producer)
+
+    def _end_session(self) -> None:
+        if self._recorded:
+            for block in self._recorded.until(None):
+                count_not_made(block.t_ns, self._found)
+        self._recorded = None
 
 
 class RecordedSession:
     """The recorded scores of one session of the scorer, in order, each once."""
 
-    def __init__(self, packets: Iterable[Envelope], producer: str) -> None:
-        self._blocks = _scores(packets, producer)
+    def __init__(self, envelopes: Iterable[Envelope], producer: str) -> None:
+        self._blocks = _scores(envelopes, producer)
         self._rest: Score | None = next(self._blocks, None)
 
     def until(self, t_ns: int | None) -> Iterator[Score]:
-        """The next rows up to a time, both included; None: all that are left."""
+        """The next samples up to and including a time; None: all that are left."""
         while self._rest is not None:
             block = self._rest
             last = len(block.t_ns) if t_ns is None else int(np.searchsorted(block.t_ns, t_ns, side="right"))
@@ -72,20 +142,20 @@ class RecordedSession:
 
 
 def compare_scores(made: Score, recorded: RecordedSession, found: Comparison) -> None:
-    """Hold a block of scores against what was recorded up to its last sample."""
+    """Compare a block of scores with the recorded ones up to its last sample."""
     taken = 0
     for block in recorded.until(int(made.t_ns[-1])):
         at = np.searchsorted(made.t_ns, block.t_ns)
         is_made = (at < len(made.t_ns)) & (made.t_ns[np.minimum(at, len(made.t_ns) - 1)] == block.t_ns)
-        note_not_made(block.t_ns[~is_made], found)
+        count_not_made(block.t_ns[~is_made], found)
         rows = at[is_made]
         taken += len(rows)
         different = np.zeros(len(rows), np.bool_)
         if block.fans != made.fans:
             different[:] = True
-            found.name(f"{found.tray}: {made.fans} fans made, {block.fans} recorded")
+            found.name(f"{found.tray}: {made.fans} fans replayed, {block.fans} recorded")
         else:
-            for name in _OF_A_SAMPLE:
+            for name in _SAMPLE_COLUMNS:
                 differs = _differ(getattr(made, name)[rows], getattr(block, name)[is_made])
                 if differs.any():
                     _name_first(found, name, block.t_ns[is_made], differs, made, block, rows, is_made)
@@ -95,17 +165,17 @@ def compare_scores(made: Score, recorded: RecordedSession, found: Comparison) ->
     found.not_recorded += len(made.t_ns) - taken
 
 
-def note_not_made(t_ns: Array, found: Comparison) -> None:
-    """Note rows that were recorded and that no stage made anew."""
+def count_not_made(t_ns: Array, found: Comparison) -> None:
+    """Count samples that were recorded and not replayed."""
     if len(t_ns):
         found.not_made += len(t_ns)
-        found.name(f"{found.tray}: {when(int(t_ns[0]))}: recorded and not made anew, {len(t_ns)} samples")
+        found.name(f"{found.tray}: {format_utc(int(t_ns[0]))}: recorded and not replayed, {len(t_ns)} samples")
 
 
 def compare_alarms(made: Iterable[Alarm], recorded: Iterable[Alarm], last_scored_t_ns: int, found: Comparison) -> None:
-    """Hold the alarms of one session against those recorded: each is named by fan, time, transition and request.
+    """Compare the alarms of one session with the recorded ones, matched by fan, time, transition and request.
 
-    An alarm leaves right after its score: of the last score that was recorded it may be missing, and after that it is.
+    An alarm is published right after its score, so those of the last recorded score may be missing in the recording.
     """
     left = {(alarm.fan, alarm.t_ns, alarm.transition, alarm.request): alarm for alarm in recorded}
     for alarm in made:
@@ -114,38 +184,38 @@ def compare_alarms(made: Iterable[Alarm], recorded: Iterable[Alarm], last_scored
             found.alarms_equal += 1
         elif other is not None:
             found.alarms_different += 1
-            found.name(f"{found.tray}: alarm {_said(alarm)} made, {other.message!r} recorded")
+            found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, {other.message!r} recorded")
         elif alarm.t_ns >= last_scored_t_ns:
             found.alarms_not_recorded += 1
         else:
             found.alarms_different += 1
-            found.name(f"{found.tray}: alarm {_said(alarm)} made, none recorded")
+            found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, none recorded")
     for alarm in left.values():
         found.alarms_different += 1
-        found.name(f"{found.tray}: alarm {_said(alarm)} recorded, none made")
+        found.name(f"{found.tray}: alarm {_describe(alarm)} recorded, none replayed")
 
 
-def when(t_ns: int) -> str:
-    """A time as people read it."""
-    return datetime.fromtimestamp(t_ns / 1e9, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+def format_utc(t_ns: int) -> str:
+    """A time in ns since the epoch as UTC in ISO 8601, to the millisecond."""
+    return datetime.fromtimestamp(t_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def _scores(packets: Iterable[Envelope], producer: str) -> Iterator[Score]:
+def _scores(envelopes: Iterable[Envelope], producer: str) -> Iterator[Score]:
     waiting: list[bytes] = []
-    following = 0
-    for packet in packets:
-        header = decode_header(packet)
-        if header.producer == producer and header.sequence >= following:
-            following = header.sequence + 1
-            waiting.append(packet.payload)
-            if len(waiting) == _TOGETHER:
+    next_sequence = 0
+    for envelope in envelopes:
+        header = decode_header(envelope)
+        if header.producer == producer and header.sequence >= next_sequence:
+            next_sequence = header.sequence + 1
+            waiting.append(envelope.payload)
+            if len(waiting) == _BLOCK_MESSAGES:
                 yield from decode_together(Score, waiting)
                 waiting = []
     yield from decode_together(Score, waiting)
 
 
 def _differ(one: Array, other: Array) -> Array:
-    """(n, fans): which values are not the same to the bit; every NaN is the same."""
+    """(n, fans): which values differ in any bit; all NaN are equal."""
     if one.dtype.kind != "f":
         return one != other
     bits = np.ascontiguousarray(one).view(np.int64) != np.ascontiguousarray(other).view(np.int64)
@@ -159,7 +229,7 @@ def _name_first(
     one = getattr(made, name)[rows][row, fan]
     other = getattr(block, name)[is_made][row, fan]
     found.name(
-        f"{found.tray}: {when(int(t_ns[row]))}, fan {fan}: {name} {one!s} made, {other!s} recorded "
+        f"{found.tray}: {format_utc(int(t_ns[row]))}, fan {fan}: {name} {one!s} replayed, {other!s} recorded "
         f"(in {int(differs.any(axis=1).sum())} of {len(rows)} samples from here on)"
     )
 
@@ -168,5 +238,5 @@ def _without_header(message: Message) -> tuple[Any, ...]:
     return tuple(getattr(message, f.name) for f in fields(message) if f.name != "header")
 
 
-def _said(alarm: Alarm) -> str:
-    return f"{alarm.transition.name.lower()} at {when(alarm.t_ns)}, {alarm.message!r},"
+def _describe(alarm: Alarm) -> str:
+    return f"{alarm.transition.name.lower()} at {format_utc(alarm.t_ns)}, {alarm.message!r},"

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.offline.alarm_episodes import episodes
-from pipeline.replay.offline.judging import CannotCompareError, JudgedTray, judge
+from pipeline.replay.offline.judging import JudgedTray, judge
 from pipeline.replay.offline.replay_input import open_replay_input
+from pipeline.replay.offline.verify import CannotCompareError
 from schemas import fan_pb2
 from schemas.messages import Action, Alarm, Score, Transition
 from tests.support.killed_site import CHAIN, Site
@@ -23,8 +24,8 @@ from tests.support.twin_files import write_twin
 
 
 def verified(*paths: Path) -> JudgedTray:
-    with open_replay_input(paths, None, (), None) as material:
-        (tray,) = judge(material, None, verify=True)
+    with open_replay_input(paths, None, (), None) as replay_input:
+        (tray,) = judge(replay_input, None, verify=True)
     assert tray.comparison
     return tray
 
@@ -67,7 +68,7 @@ def test_samples_that_time_had_given_up_are_given_up_again(tmp_path):
     site.fall_silent(1.5)
     site.run(200)
     tray = verified(site.finished())
-    assert tray.plan.resampler[0].passed, "the silence was long enough for the resampler to go on without samples"
+    assert tray.plan.first[0].timer_outputs, "the silence was long enough for the resampler to go on without samples"
     assert tray.counts["lost_too_late"] > 0
     assert made_equal(tray) > 400
 
@@ -154,7 +155,7 @@ def test_a_restarted_scorer_goes_on_from_what_it_remembers_and_so_does_a_replay(
     assert len([alarm for alarm in alarms if alarm.request]) == 2, "what was answered is not answered again"
     tray = verified(path)
     assert made_equal(tray) > 550
-    assert tray.plan.snapshots.keys() == {successor}
+    assert [s.producer for s in tray.plan.last if s.snapshot] == [successor]
     assert tray.comparison and tray.comparison.alarms_equal == len(alarms)
     found = episodes(tray.alarms)
     assert found == episodes(alarms)
@@ -194,8 +195,8 @@ def test_with_other_limits_a_session_goes_on_from_what_the_one_before_finds_now(
     site.run(215)
     site.kill("scorer")
     site.run(100)
-    with open_replay_input([site.finished()], None, ("scorer.limit_factor=1000",), None) as material:
-        (tray,) = judge(material, None, verify=False)
+    with open_replay_input([site.finished()], None, ("scorer.limit_factor=1000",), None) as replay_input:
+        (tray,) = judge(replay_input, None, verify=False)
     assert any(alarm.transition == Transition.REPUBLISHED for alarm in tray.recorded_alarms)
     assert tray.alarms == []
     assert tray.counts["snapshots_of_another_twin"] == 0
@@ -207,8 +208,8 @@ def test_with_another_twin_a_restart_costs_no_commissioning(tmp_path):
     site.kill("scorer")
     site.run(100)
     other = write_twin(tmp_path / "other.onnx", fans=1)
-    with open_replay_input([site.finished()], None, (), other) as material:
-        (tray,) = judge(material, None, verify=False)
+    with open_replay_input([site.finished()], None, (), other) as replay_input:
+        (tray,) = judge(replay_input, None, verify=False)
     assert tray.plan.restarts == 1
     assert tray.counts["snapshots_of_another_twin"] == 0
 
@@ -217,12 +218,12 @@ def test_with_another_twin_a_restart_costs_no_commissioning(tmp_path):
 def test_a_recording_of_another_version_is_judged_from_its_raw_samples(tmp_path, lacks, is_planned):
     site = Site(tmp_path, 1)
     site.run(300)
-    with open_replay_input([site.finished()], None, (), None) as material:
-        packets = list(material.packets("tray1", ("grid", "prediction", "score", "raw")))
-        old = [p if p.topic != "prediction" else replace(p, payload=_without(lacks, p.payload)) for p in packets]
-        material.packets = lambda tray, topics: (p for p in old if p.topic in topics)  # type: ignore[method-assign]
-        plan, _ = material.survey("tray1")
-        (tray,) = judge(material, None, verify=False)
+    with open_replay_input([site.finished()], None, (), None) as replay_input:
+        envelopes = list(replay_input.envelopes("tray1", ("grid", "prediction", "score", "raw")))
+        old = [p if p.topic != "prediction" else replace(p, payload=_without(lacks, p.payload)) for p in envelopes]
+        replay_input.envelopes = lambda tray, topics: (p for p in old if p.topic in topics)  # type: ignore[method-assign]
+        plan, _ = replay_input.read_plan("tray1")
+        (tray,) = judge(replay_input, None, verify=False)
     assert (plan is not None) == is_planned
     assert tray.judged > 200
 
@@ -303,8 +304,8 @@ def test_grids_of_a_session_that_are_nowhere_leave_nothing_to_compare(tmp_path):
     no_grid = changed(site.finished(), tmp_path / "no.mcap", lambda e: None if e.topic == "grid" else e.message)
     with pytest.raises(CannotCompareError, match="nothing to compare with"):
         verified(no_grid)
-    with open_replay_input([no_grid], None, (), None) as material:
-        (tray,) = judge(material, None, verify=False)
+    with open_replay_input([no_grid], None, (), None) as replay_input:
+        (tray,) = judge(replay_input, None, verify=False)
     assert tray.judged > 200
 
 
@@ -322,14 +323,14 @@ def test_an_undecodable_alarm_costs_that_alarm_only(tmp_path):
     site.run(600)
     path = site.finished()
     alarms = recorded(path, "alarm")
-    with open_replay_input([path], None, (), None) as material:
-        packets = list(material.packets("tray1", ("grid", "prediction", "score", "alarm")))
-        first = next(n for n, packet in enumerate(packets) if packet.topic == "alarm")
-        packets[first] = replace(packets[first], payload=b"\xff\xff")
-        material.packets = lambda tray, topics: iter(packets)  # type: ignore[method-assign]
-        plan, found = material.survey("tray1")
+    with open_replay_input([path], None, (), None) as replay_input:
+        envelopes = list(replay_input.envelopes("tray1", ("grid", "prediction", "score", "alarm")))
+        first = next(n for n, envelope in enumerate(envelopes) if envelope.topic == "alarm")
+        envelopes[first] = replace(envelopes[first], payload=b"\xff\xff")
+        replay_input.envelopes = lambda tray, topics: iter(envelopes)  # type: ignore[method-assign]
+        plan, found = replay_input.read_plan("tray1")
     assert plan and len(found) == len(alarms) - 1
-    assert "cannot be decoded: 1" in next(iter(material.damage.values()))
+    assert "cannot be decoded: 1" in next(iter(replay_input.damage.values()))
 
 
 @pytest.mark.parametrize("topic", ["grid", "prediction"])
@@ -428,9 +429,9 @@ def test_another_twin_is_a_what_if(tmp_path):
     site.run(600)
     path = site.finished()
     other = write_twin(tmp_path / "other.onnx", fans=1)
-    with open_replay_input([path], None, (), other) as material:
-        assert not material.is_as_recorded
-        (tray,) = judge(material, None, verify=False)
+    with open_replay_input([path], None, (), other) as replay_input:
+        assert not replay_input.is_as_recorded
+        (tray,) = judge(replay_input, None, verify=False)
     assert tray.samples == sum(len(score.t_ns) for score in recorded(path, "score"))
     assert 1 not in {alarm.fan for alarm in tray.recorded_alarms}
     assert {alarm.fan for alarm in tray.alarms} == {0, 1, 2}, "it is of another fan"
@@ -439,8 +440,8 @@ def test_another_twin_is_a_what_if(tmp_path):
 def test_another_threshold_is_a_what_if(tmp_path):
     site = Site(tmp_path, seed=1)
     site.run(600)
-    with open_replay_input([site.finished()], None, ("scorer.alarm_sigmas=1000",), None) as material:
-        (tray,) = judge(material, None, verify=False)
+    with open_replay_input([site.finished()], None, ("scorer.alarm_sigmas=1000",), None) as replay_input:
+        (tray,) = judge(replay_input, None, verify=False)
     assert tray.recorded_alarms and not tray.alarms
 
 
@@ -450,15 +451,15 @@ def test_the_output_is_a_recording_that_is_decided_the_same(tmp_path):
     site.kill("scorer")
     site.run(100)
     path, out = site.finished(), tmp_path / "out.mcap"
-    with open_replay_input([path], None, (), None) as material:
-        (tray,) = judge(material, out, verify=False)
+    with open_replay_input([path], None, (), None) as replay_input:
+        (tray,) = judge(replay_input, out, verify=False)
     raw = sum(len(message.host_receive_t_ns) for message in recorded(out, "raw"))
     assert raw == sum(len(message.host_receive_t_ns) for message in recorded(path, "raw"))
     scores = [score for score in recorded(out, "score") if isinstance(score, Score)]
     assert len({t_ns for score in scores for t_ns in score.t_ns.tolist()}) == tray.samples
-    with open_replay_input([out], None, (), None) as material:
-        (again,) = judge(material, None, verify=False)
-    assert again.samples == tray.samples and material.is_as_recorded
+    with open_replay_input([out], None, (), None) as replay_input:
+        (again,) = judge(replay_input, None, verify=False)
+    assert again.samples == tray.samples and replay_input.is_as_recorded
 
 
 DATA = Path(__file__).parents[2] / "support" / "data"
@@ -475,7 +476,7 @@ def test_a_snapshot_in_an_older_recording_is_restored_and_its_replay_is_equal():
     """golden-restart.mcap was recorded when snapshots had other JSON keys. An active alarm was acknowledged, a fan
     shelved and another one out of service when its scorer was killed and restored from such a snapshot."""
     tray = verified(DATA / "golden-restart.mcap")
-    assert len(tray.plan.snapshots) == 1 and tray.plan.restarts == 1
+    assert [session.snapshot is not None for session in tray.plan.last] == [False, True] and tray.plan.restarts == 1
     assert made_equal(tray) == 293
     assert tray.comparison and tray.comparison.alarms_equal == 9
     restored = [alarm for alarm in tray.alarms if alarm.transition == Transition.REPUBLISHED]

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.records import ChunkIndex
 
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.writing import RecordingWriter
@@ -146,20 +148,28 @@ def test_a_torn_part_is_played_as_far_as_it_goes_and_told(tmp_path):
     assert reel.end_s() is None
 
 
-def test_damage_before_the_end_of_a_stretch_is_reported(tmp_path, monkeypatch):
+@pytest.mark.parametrize("what", ["the content of a chunk", "the length of a record"])
+def test_damage_before_the_end_of_a_stretch_is_reported(tmp_path, monkeypatch, what):
     """Playback stops reading the file some seconds after the stretch; what it could not read until then counts."""
     path = tmp_path / "damaged.mcap"
     monkeypatch.setattr("pipeline.recordings.writing.CHUNK_BYTES", 4096)
     write_raw(path, 4000, fans=1)
     content = bytearray(path.read_bytes())
-    at = len(content) // 8
-    content[at] ^= 0xFF
+    (chunk, *_) = (chunk for chunk in chunk_indexes(path) if chunk.message_start_time > START_NS + 5 * 10**9)
+    content[chunk.chunk_start_offset + (100 if what == "the content of a chunk" else 8)] ^= 0xFF
     path.write_bytes(content)
     playback = RecordingPlayback([path], ("raw",), 0.0, 15.0)
     played = sequences(playback)
     assert 1000 < len(played) < 1501 and played[-1] == 1500
     (line,) = playback.damage
     assert "damaged.mcap: damaged chunks left out: " in line
+
+
+def chunk_indexes(path: Path) -> list[ChunkIndex]:
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary
+    return summary.chunk_indexes
 
 
 def test_files_without_a_message_or_that_are_no_recording_are_one_line(tmp_path):

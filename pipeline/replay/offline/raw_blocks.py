@@ -1,0 +1,128 @@
+"""A tray's recorded raw samples, in blocks, as each session of the first stage consumed them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import numpy as np
+
+from pipeline.replay.offline.plan import Session, Span
+from schemas.blocks import cut
+from schemas.envelope import Envelope
+from schemas.fast_decode import decode_header, decode_together
+from schemas.messages import Message, Raw
+from schemas.units import NS_PER_S
+
+BLOCK_SIZE = 512
+"""messages or samples that a stage is given at once"""
+
+
+class RawBlocks:
+    """Reads the raw messages once for each session, and counts those that are missing."""
+
+    def __init__(
+        self,
+        read: Callable[[], Iterable[Envelope]],
+        observe: Callable[[Message], None],
+        stretch_s: tuple[float, float] = (0.0, math.inf),
+    ) -> None:
+        """read: the tray's raw messages in the order they were recorded, from the beginning at each call. observe: is
+        given each sample once. stretch_s: the part to read, in seconds since the first sample."""
+        self._read = read
+        self._observe = observe
+        self._stretch_s = stretch_s
+        self._first_t_ns: int | None = None
+        self._next_new: dict[str, int] = {}
+        """of each producer: the first sequence number that no session has consumed yet"""
+        self._gaps: dict[tuple[str, int], int] = {}
+        """missing messages, by producer and first sequence number"""
+
+    @property
+    def missing(self) -> int:
+        """Raw messages that a stage consumed, or that lie between recorded ones, and that are not in the recording."""
+        return sum(self._gaps.values())
+
+    def of(self, session: Session) -> Iterator[tuple[Raw, int | None]]:
+        """The blocks of a session. A block ends where a timer made the session emit samples; then until which time."""
+        waiting: list[bytes] = []
+        kind: tuple[str, bool] | None = None  # of the waiting messages: their producer, and whether they are new
+        for producer, sequence, payload in self._messages(session.spans):
+            is_new = sequence >= self._next_new.get(producer, 0)
+            if (producer, is_new) != kind or len(waiting) >= BLOCK_SIZE:
+                yield from self._decoded(waiting, kind)
+                waiting, kind = [], (producer, is_new)
+            if is_new:
+                self._next_new[producer] = sequence + 1
+            waiting.append(payload)
+            until_t_ns = session.timer_outputs.get((producer, sequence))
+            if until_t_ns is not None:
+                *blocks, (last, _) = self._decoded(waiting, kind)
+                yield from blocks
+                yield last, until_t_ns
+                waiting = []
+        yield from self._decoded(waiting, kind)
+
+    def _decoded(self, payloads: Sequence[bytes], kind: tuple[str, bool] | None) -> Iterator[tuple[Raw, None]]:
+        for block in decode_together(Raw, payloads):
+            wanted = self._in_stretch(block)
+            if kind and kind[1]:
+                self._observe(wanted)
+            if len(wanted.host_receive_t_ns):
+                yield wanted, None
+
+    def _in_stretch(self, block: Raw) -> Raw:
+        if self._stretch_s == (0.0, math.inf) or not len(block.host_receive_t_ns):
+            return block
+        if self._first_t_ns is None:
+            self._first_t_ns = int(block.host_receive_t_ns[0])
+        since_s = (block.host_receive_t_ns - self._first_t_ns) / NS_PER_S
+        inside = np.flatnonzero((since_s >= self._stretch_s[0]) & (since_s < self._stretch_s[1]))
+        return cut(block, int(inside[0]), int(inside[-1]) + 1) if len(inside) else cut(block, 0, 0)
+
+    def _messages(self, spans: Sequence[Span]) -> Iterator[tuple[str, int, bytes]]:
+        """Producer, sequence number and bytes of the raw messages of spans, each once.
+
+        Spans only go forward. An open span continues with whichever producer follows. Gaps are counted.
+        """
+        next_sequence: dict[str, int] = {}
+        number, has_begun = 0, not spans[0].producer
+        due: dict[str, int] = {spans[0].producer: spans[0].first} if spans[0].producer else {}
+        for envelope in self._read():
+            header = decode_header(envelope)
+            producer, sequence = header.producer, header.sequence
+            if sequence < next_sequence.get(producer, 0):
+                continue  # this part of the recording overlaps the one before
+            next_sequence[producer] = sequence + 1
+            while not _contains(spans[number], producer, sequence) and _is_later(spans, number, producer, sequence):
+                self._count_gap(spans[number].producer, due, spans[number].last_known + 1)
+                number += 1
+                has_begun = False
+                due[spans[number].producer] = spans[number].first
+            span = spans[number]
+            if _contains(span, producer, sequence):
+                has_begun = True
+            elif producer == span.producer or not has_begun or span.last is not None:
+                continue
+            self._count_gap(producer, due, sequence)
+            due[producer] = sequence + 1
+            yield producer, sequence, envelope.payload
+        for span in spans[number:]:
+            if span.producer:
+                due[span.producer] = max(due.get(span.producer, 0), span.first)
+                self._count_gap(span.producer, due, span.last_known + 1)
+
+    def _count_gap(self, producer: str, due: dict[str, int], end: int) -> None:
+        """Count the producer's messages from the one that is due up to `end`, which is not one of them."""
+        first = due.get(producer, end)
+        if end > first:
+            self._gaps[producer, first] = max(self._gaps.get((producer, first), 0), end - first)
+
+
+def _contains(span: Span, producer: str, sequence: int) -> bool:
+    return producer == span.producer and span.first <= sequence and (span.last is None or sequence <= span.last)
+
+
+def _is_later(spans: Sequence[Span], number: int, producer: str, sequence: int) -> bool:
+    """Whether a message belongs to a later span, so that this one is over."""
+    return any(span.producer == producer and sequence >= span.first for span in spans[number + 1 :])

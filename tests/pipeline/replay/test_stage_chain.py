@@ -1,0 +1,54 @@
+"""The graph of stages is derived from what they read and write; nothing lists it a second time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from pipeline.config.registry import STAGES
+from pipeline.replay.stage_chain import decision_chain, derive_chain, derive_starts, replay_starts
+from pipeline.runtime.stage import load_stage
+from schemas.topics import BY_NAME
+
+REGISTERED = [load_stage(name) for name in STAGES]
+
+
+@pytest.fixture
+def smoother(monkeypatch):
+    """A toy stage with two toy topics."""
+    for name in ("smooth_grid", "smoothing"):
+        monkeypatch.setitem(BY_NAME, name, replace(BY_NAME["grid"], name=name))
+    return replace(load_stage("resampler"), name="smoother", reads=("grid",), writes=("smooth_grid", "smoothing"))
+
+
+def test_the_chain_leads_from_raw_samples_to_scores():
+    chain = decision_chain()
+    assert [stage.name for stage in chain.stages] == ["resampler", "twin_integrator", "scorer"]
+    assert chain.outputs == ("grid", "prediction", "score")
+    assert set(chain.side_topics) == {"request", "alarm", "snapshot"}
+
+
+def test_a_new_stage_is_placed_by_what_it_reads_and_writes(smoother):
+    integrator = replace(load_stage("twin_integrator"), reads=("smooth_grid",))
+    stages = [smoother, integrator, *(stage for stage in REGISTERED if stage.name != "twin_integrator")]
+    chain = derive_chain(stages)
+    assert [stage.name for stage in chain.stages] == ["resampler", "smoother", "twin_integrator", "scorer"]
+    assert chain.outputs == ("grid", "smooth_grid", "prediction", "score")
+    assert derive_starts(stages)["smooth_grid"] == ("smooth_grid", "smoothing")
+
+
+def test_a_stage_beside_the_chain_changes_nothing(smoother):
+    assert derive_chain([*REGISTERED, smoother]) == decision_chain()
+
+
+def test_a_replay_starts_with_all_topics_of_the_stage_that_it_stands_for():
+    assert replay_starts() == {"raw": ("raw",), "grid": ("grid",), "prediction": ("prediction", "twin")}
+
+
+def test_stages_that_do_not_lead_from_raw_samples_to_scores_are_refused():
+    without_integrator = [stage for stage in REGISTERED if stage.name != "twin_integrator"]
+    circle = replace(load_stage("resampler"), reads=("prediction",))
+    for stages in (without_integrator, [*REGISTERED, circle]):
+        with pytest.raises(ValueError, match="look at what writes 'prediction'"):
+            derive_chain(stages)
