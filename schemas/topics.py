@@ -1,6 +1,6 @@
-"""The one table of topics: what is published where, by whom it is kept, and which message it is.
+"""The table of topics: name, message type, rate, and whether it is recorded; and the keys on the bus.
 
-Recorder, health, viewer and documents derive from it.
+Recorder, health, viewer and documentation derive from it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ RESERVED_TRAY_NAMES = (HEALTH_CHUNK, ALIVE_CHUNK)
 
 @dataclass(frozen=True)
 class Topic:
-    """One row. `history` is how many messages a producer keeps for those who missed them."""
+    """One topic. A producer keeps its last `history` messages for consumers that missed them."""
 
     name: str
     message: type[Message]
@@ -42,7 +42,7 @@ class Topic:
 
     @property
     def is_rare(self) -> bool:
-        """Said once, when it changes: nobody can do without, and asking for it again costs nothing."""
+        """Published only on change: every consumer needs each message, and asking for it again is cheap."""
         return self.rate == ON_CHANGE
 
 
@@ -50,18 +50,23 @@ TOPICS: tuple[Topic, ...] = (
     Topic("raw", Raw, "as the device sends, often 100 Hz", True, 1024, "samples as the device sent them"),
     Topic("grid", Grid, "the grid's rate over the block size", True, 1024, "samples on a uniform grid"),
     Topic("prediction", Prediction, "as grid", True, 1024, "the healthy twin beside the measurement"),
-    Topic("score", Score, "as prediction", True, 1024, "judged samples, ready to draw"),
-    Topic("alarm", Alarm, ON_CHANGE, True, 1024, "what happened to an alarm"),
-    Topic("request", Request, ON_CHANGE, True, 64, "what an operator wants of the alarms"),
-    Topic("snapshot", ScorerSnapshot, "on change, and each minute", True, 4, "what a scorer must not forget"),
-    Topic("command", Command, ON_CHANGE, True, 64, "what is wanted of the fans"),
+    Topic("score", Score, "as prediction", True, 1024, "scored samples, ready to draw"),
+    Topic("alarm", Alarm, ON_CHANGE, True, 1024, "transitions of alarms"),
+    Topic("request", Request, ON_CHANGE, True, 64, "requests of operators about alarms"),
+    Topic("snapshot", ScorerSnapshot, "on change, and each minute", True, 4, "state of a scorer for a restart"),
+    Topic("command", Command, ON_CHANGE, True, 64, "commands and set points for the fans"),
     Topic("twin", ModelCard, ON_CHANGE, True, 8, "the twin in force"),
-    Topic("clock", Clock, "20 Hz", False, 1, "the time of a replay"),
-    Topic("health", Health, "1 Hz for each stage", True, 8, "how a stage is"),
+    Topic("clock", Clock, "20 Hz", False, 1, "position of a replay"),
+    Topic("health", Health, "1 Hz for each stage", True, 8, "status and losses of a stage"),
 )
 BY_NAME = {topic.name: topic for topic in TOPICS}
 FORMER_NAMES = {"memory": "snapshot"}
-"""what topics were called in recordings of earlier versions"""
+"""names of topics in the keys of older recordings, which are still read"""
+
+
+def current_name(topic: str) -> str:
+    """The name of a topic today, given a name that it has or had."""
+    return FORMER_NAMES.get(topic, topic)
 
 
 def tray_key(site: str, tray: str, topic: str) -> str:
@@ -80,14 +85,14 @@ def alive_key(site: str, stage: str, instance: str) -> str:
 
 
 def topic_of(key: str) -> Topic:
-    """The topic a key belongs to.
+    """The topic of a key.
 
     Raises:
-        KeyError: not a key of ours.
+        KeyError: no topic of fantwin has such a key.
     """
     parts = key.split("/")
     if len(parts) == 5 and parts[0] == ROOT and parts[2] == HEALTH_CHUNK:
         return BY_NAME["health"]
     if len(parts) == 4 and parts[0] == ROOT:
-        return BY_NAME[FORMER_NAMES.get(parts[3], parts[3])]
+        return BY_NAME[current_name(parts[3])]
     raise KeyError(key)

@@ -1,10 +1,10 @@
-"""Viewer: shows live what the twin says, what was measured and what was decided, in Rerun.
+"""Viewer: shows twin, measurement, states and alarms live in Rerun.
 
-Reads `score`, `alarm`, `twin` and `health`; writes nothing. One core serves all trays. Speeds are shown in the
-tray's own unit. Samples are collected and drawn twice a second, because a call into Rerun costs much and a row in
-it costs nothing. In time there are samples and alarms only, at the samples' own times: what is told in the host's time
-goes to a page without time, else a replay of yesterday would lie far from the newest time that a viewer follows.
-This stage alone may drop: the runner holds a bounded queue before it and counts what it lets go.
+Reads `score`, `alarm`, `twin` and `health`; writes nothing. One core serves all trays. Speeds are shown in the unit of
+the tray. Samples are collected and drawn twice a second, because a call into Rerun is expensive and a row in it is
+cheap. Only samples and alarms are on the time line, at the time of the sample. Reports in host time go to a page
+without time; otherwise a replay of yesterday would lie far from the newest time, which viewers follow.
+Only this stage may drop messages: the runner keeps a bounded queue in front of it and counts what it drops.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from pipeline.viewing.trace import Trace, state_changes, state_name, trace_of
 from schemas.messages import Alarm, Array, Health, Message, ModelCard, Score, Severity, Transition
 from scoring.alarms.current_alarms import CurrentAlarm
 
-NO_RERUN = f"the viewer needs the extra `view`: take viewer out of launcher.stages; or {how_to_install('view')}"
+NO_RERUN = f"the viewer needs the extra `view`: take viewer out of launcher.stages, or {how_to_install('view')}"
 FLUSH_PERIOD_NS = 500_000_000
-REPEAT_STATES_NS = 5_000_000_000  # a viewer that joins late gets no state older than this
-PAGE_PERIOD_NS = 5_000_000_000  # at least, between two pages: what has no time is never dropped for being old
-SAMPLES_HELD = 4096  # of a tray, when a replay outruns the ticks
+REPEAT_STATES_NS = 5_000_000_000  # a viewer that joins late finds a state at most this old
+PAGE_PERIOD_NS = 5_000_000_000  # minimum between two pages: Rerun never drops data without a time, however old
+SAMPLES_HELD = 4096  # samples kept per tray, when a replay is faster than the ticks
 
 
 class ViewerConfig(StageConfig):
@@ -39,26 +39,26 @@ class ViewerConfig(StageConfig):
 
     file: str = Field(
         default="view.rrd",
-        description='file in run_folder that keeps the view; an older one is left alone, view-2.rrd written; "": none',
+        description='file in run_folder for the view; an older file is kept, and view-2.rrd is written; "": no file',
     )
     serve: bool = Field(default=True, description="serve live viewers on this host (127.0.0.1)")
     grpc_port: int = Field(default=9876, ge=1, le=65535, description="port of the data, for native and browser viewer")
     web_port: int = Field(default=9090, ge=0, le=65535, description="port of the browser viewer's page; 0: no page")
-    window_s: float = Field(default=30.0, gt=0, description="how much the rolling window shows")
+    window_s: float = Field(default=30.0, gt=0, description="length of the rolling window, s")
     memory_limit: str = Field(
         default="256MB", pattern=r"^\d+(MB|GB|MiB|GiB)$", description="history kept for viewers that join late"
     )
 
 
 class ViewSink(Protocol):
-    """Where a view goes. Times in ns since the epoch."""
+    """Destination of a view. Times are ns since the epoch."""
 
     def draw(self, trace: Trace) -> None:
         """Show the next stretch of a tray."""
         ...
 
     def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
-        """Colour a fan's lane from each time on."""
+        """Set the state of a fan's lane from each time on."""
         ...
 
     def log(self, tray: str, t_ns: int, level: str, text: str) -> None:
@@ -66,44 +66,44 @@ class ViewSink(Protocol):
         ...
 
     def show_stages(self, page: str) -> None:
-        """Show this page (Markdown) on the stages in place of the one before."""
+        """Replace the page about the stages with this Markdown text."""
         ...
 
     def flush(self) -> None:
-        """Write out what has been handed over, so that it outlives this process."""
+        """Write what has been sent, so that it survives a crash of this process."""
         ...
 
     def close(self) -> None:
-        """Write out everything and let go."""
+        """Write everything and close."""
         ...
 
 
 def alarm_line(alarm: Alarm) -> tuple[str, str]:
-    """Level and text of what happened to an alarm, for people."""
-    happened = alarm.transition.name.lower().replace("_", " ")
+    """Level and text of an alarm's transition, for the log."""
+    happened = alarm.transition.words
     if alarm.severity == Severity.NONE and alarm.transition == Transition.REPUBLISHED:
         states = CurrentAlarm(alarm, alarm.message, (), "").states()
         return "INFO", f"{happened} ({', '.join(states)}): {alarm.message}"
     if alarm.transition not in (Transition.RAISED, Transition.SEVERITY, Transition.REPUBLISHED):
         return "INFO", f"{happened}: {alarm.message}"
     level = "ERROR" if alarm.severity == Severity.ALARM else "WARN"
-    return level, f"{alarm.severity.name.lower()} {happened}: {alarm.message}"
+    return level, f"{alarm.severity.words} {happened}: {alarm.message}"
 
 
 @dataclass(slots=True)
 class _TrayView:
-    """What the core remembers of one tray between two flushes."""
+    """State of one tray between two flushes."""
 
     config: TrayConfig
     scores: list[Score] = field(default_factory=list)
     samples: int = 0
     states: dict[int, str] = field(default_factory=dict)
-    wrong_fans: int = 0  # of the last score, if they are not those of the configuration
+    wrong_fans: int = 0  # fans of the last score, if not the configured number
     repeated_t_ns: int = 0
 
 
 class ViewerCore(Core):
-    """Collects scores and hands them to a sink in few, long pieces."""
+    """Collects scores and passes them to a sink in few, long pieces."""
 
     def __init__(self, trays: Sequence[TrayConfig], sink: ViewSink) -> None:
         self._views = {tray.name: _TrayView(tray) for tray in trays}
@@ -117,24 +117,24 @@ class ViewerCore(Core):
         self._counts: Counter[str] = Counter()
 
     def step(self, item: Message) -> Sequence[Message]:
-        """Remember a score, write an alarm into the log, note a twin or the health of a stage for the page."""
+        """Keep a score for the next flush, log an alarm, add a twin or the health of a stage to the page."""
         if isinstance(item, Health):
-            self._page.note_health(item)
+            self._page.add_health(item)
             return ()
         view = self._views.get(item.header.tray)
         if view is None:
             self._counts["unknown_tray"] += 1
             return ()
         if isinstance(item, Score):
-            self._note_score(view, item)
+            self._add_score(view, item)
         elif isinstance(item, Alarm):
             self._sink.log(view.config.name, item.t_ns, *alarm_line(item))
         elif isinstance(item, ModelCard):
-            self._page.note_twin(view.config.name, item)
+            self._page.add_twin(view.config.name, item)
         return ()
 
     def tick(self, now_ns: int) -> Sequence[Message]:
-        """Draw what has come since the last flush, twice a second."""
+        """Draw the samples since the last flush, twice a second."""
         self._now_ns = now_ns
         if now_ns - self._flushed_t_ns >= FLUSH_PERIOD_NS:
             self._flushed_t_ns = now_ns
@@ -144,7 +144,7 @@ class ViewerCore(Core):
         return ()
 
     def close(self) -> Sequence[Message]:
-        """Draw the rest and finish the file."""
+        """Draw the remaining samples and close the file."""
         self._show_stages()
         self._flush_all()
         self._sink.close()
@@ -155,19 +155,19 @@ class ViewerCore(Core):
         self._sink.close()
 
     def counters(self) -> Mapping[str, int]:
-        """Samples drawn; scores of another number of fans, and messages of another tray, than the configuration's."""
+        """Samples drawn, scores with another number of fans, and messages of trays that are not configured."""
         return {"samples_drawn": self._samples_drawn, "wrong_fan_count": 0, **self._counts}
 
     def problem(self) -> str:
-        """Says when scores do not fit the configuration."""
+        """Scores with another number of fans than configured; empty if there are none."""
         for name, view in self._views.items():
             if view.wrong_fans:
                 return (
-                    f"scores of {view.wrong_fans} fans, [[tray]] {name} says fans = {view.config.fans}: correct `fans`"
+                    f"scores have {view.wrong_fans} fans, [[tray]] {name} has fans = {view.config.fans}: correct `fans`"
                 )
         return ""
 
-    def _note_score(self, view: _TrayView, score: Score) -> None:
+    def _add_score(self, view: _TrayView, score: Score) -> None:
         if score.fans != view.config.fans:
             self._counts["wrong_fan_count"] += 1
             view.wrong_fans = score.fans
@@ -211,7 +211,7 @@ class ViewerCore(Core):
 
 
 def build(context: Context) -> Parts:
-    """Open the file, serve the viewers.
+    """Open the file and serve the viewers.
 
     Raises:
         StageError: Rerun is not installed, a port is taken, or the file cannot be written.
@@ -237,13 +237,13 @@ def build(context: Context) -> Parts:
 
 
 def check(context: Context) -> list[str]:
-    """A missing extra, and ports that are taken."""
+    """Report a missing extra and ports that are taken."""
     config: ViewerConfig = context.config
     problems = [] if importlib.util.find_spec("rerun") else [NO_RERUN]
     ports = {"grpc_port": config.grpc_port, "web_port": config.web_port} if config.serve else {}
     for key, port in ports.items():
         try:
-            check_free(port, key)
+            check_free(port, f"viewer.{key}", "viewer.serve = false")
         except StageError as error:
             problems.append(str(error))
     return problems

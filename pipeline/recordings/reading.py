@@ -24,7 +24,7 @@ from pipeline.recordings.records import (
 )
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
-from schemas.topics import topic_of
+from schemas.topics import current_name, topic_of
 
 __all__ = ["METADATA_NAME", "Reading", "RecordingError", "RecordingMetadata", "read_metadata", "read_recording"]
 
@@ -127,7 +127,7 @@ def read_recording(path: Path, topics: Collection[str] | None = None, tray: str 
         RecordingError: the file cannot be opened or is not a recording.
     """
     next(iter(RecordReader(path)), None)
-    return Reading(path, topics, tray)
+    return Reading(path, None if topics is None else {current_name(topic) for topic in topics}, tray)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
-"""bands.png: what a tray's fans did beside their healthy twins, from a recording.
+"""bands.png: the fans of a tray beside their healthy twins, from a recording.
 
-One panel a fan: measured speed, prediction, the band of two standard deviations, red above and below it while an
-alarm was active, samples outside it as red dots; beneath, a lane of states and, where known, the true fault.
+One panel per fan shows measured speed, prediction, the band of two standard deviations, samples outside it as red dots,
+and red zones above and below the band while an alarm was active. A lane below shows the states and, if known, the true
+fault.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from pipeline.errors import UserError
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.viewing.trace import Trace, state_changes, trace_of
 from schemas.messages import Array, Score
-from schemas.units import SpeedUnit
+from schemas.units import NS_PER_S, SpeedUnit
 
-MOST_PANELS = 12
+MAX_PANELS = 12
 PANEL_HEIGHT_IN, LANE_HEIGHT_IN, WIDTH_IN = 2.3, 0.2, 12.0
-BETWEEN_IN, HEAD_IN, FOOT_IN = 0.5, 1.25, 0.6
+BETWEEN_IN, HEADER_IN, FOOT_IN = 0.5, 1.25, 0.6
 
 MEASURED, TWIN, BAND, ZONE, OUTSIDE, FAULT = "#454545", "#006e30", "#8fd9a8", "#f4a3a3", "#d62020", "#4a4a8a"
 STATE_COLORS = {
@@ -43,7 +44,7 @@ UNKNOWN_COLOR = "#a9a9a9"
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault that was really there, by the account of who made it."""
+    """A true fault of a simulated fan."""
 
     kind: str
     fan: int
@@ -60,18 +61,18 @@ def plot_recording(
     speed_unit: SpeedUnit | None = None,
     truth: Path | None = None,
 ) -> list[int]:
-    """Plot one tray of a recording (or of the parts of one) and give the fans that were drawn.
+    """Plot one tray of a recording and return the fans that were drawn.
 
     Args:
-        recordings: the parts, any order.
-        output: the picture; its ending chooses the format.
-        tray: may be left out where there is one.
-        fans: counted from 0; those with an alarm and one without if not given.
-        speed_unit: of the axis; the one the recording names if not given.
-        truth: the sidecar of a simulated tray, with `faults[]` of `kind, fan, start_ns, stop_ns`.
+        recordings: a recording, or its parts in any order.
+        output: the picture; its suffix chooses the format.
+        tray: required if there are several.
+        fans: counted from 0; by default those with an alarm and one without.
+        speed_unit: unit of the axis; by default the display unit of the recording.
+        truth: the truth file of a simulated tray, with `faults[]` of `kind, fan, start_ns, stop_ns`.
 
     Raises:
-        UserError: no scores, no such tray or fan, or a sidecar that cannot be read.
+        UserError: no scores, no such tray or fan, or a truth file that cannot be read.
     """
     trace = read_trace(recordings, tray, speed_unit)
     faults = read_faults(truth) if truth is not None else ()
@@ -82,7 +83,7 @@ def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUn
     """The scores of one tray, in order of time.
 
     Raises:
-        UserError: there are none, or several trays and none chosen.
+        UserError: there are no scores, or several trays and none is chosen.
     """
     scores: dict[str, list[Score]] = {}
     for path in recordings:
@@ -92,43 +93,43 @@ def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUn
                 scores.setdefault(entry.message.header.tray, []).append(entry.message)
     where = ", ".join(str(path) for path in recordings)
     if not scores:
-        raise UserError(f"{where}: holds no scores to plot; were twin_integrator and scorer running?")
+        raise UserError(f"{where}: holds no scores to plot; did twin_integrator and scorer run?")
     if tray is None:
         if len(scores) > 1:
-            raise UserError(f"{where}: holds several trays, say which with --tray: {', '.join(sorted(scores))}")
+            raise UserError(f"{where}: there are several trays; choose one with --tray: {', '.join(sorted(scores))}")
         (tray,) = scores
     if tray not in scores:
         raise UserError(f"{where}: holds no tray called {tray!r}; there are {', '.join(sorted(scores))}")
     chosen = sorted(scores[tray], key=lambda score: int(score.t_ns[0]))
     if len({score.fans for score in chosen}) > 1:
-        raise UserError(f"{where}: {tray} changed its number of fans on the way; plot the parts one by one")
-    return trace_of(tray, chosen, speed_unit or _unit_people_are_shown(recordings[0], tray))
+        raise UserError(f"{where}: {tray} changes its number of fans; plot the parts one by one")
+    return trace_of(tray, chosen, speed_unit or _display_unit(recordings[0], tray))
 
 
-def _unit_people_are_shown(recording: Path, tray: str) -> SpeedUnit:
+def _display_unit(recording: Path, tray: str) -> SpeedUnit:
     return "rpm" if read_metadata(recording).speed_unit(tray) == "rpm" else "rad/s"
 
 
 def read_faults(path: Path) -> list[Fault]:
-    """The faults of a simulated tray's sidecar.
+    """The faults in the truth file of a simulated tray.
 
     Raises:
-        UserError: it is missing or is not one.
+        UserError: the file is missing or invalid.
     """
     try:
         faults = json.loads(path.read_text(encoding="utf-8"))["faults"]
         return [Fault(str(f["kind"]), int(f["fan"]), int(f["start_ns"]), int(f["stop_ns"])) for f in faults]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: no account of faults ({error}); `fantwin simulate` writes one") from error
+        raise UserError(f"{path}: not a truth file ({error}); `fantwin simulate` writes one") from error
 
 
 def plot_bands(
     trace: Trace, output: Path, *, fans: Sequence[int] | None = None, faults: Iterable[Fault] = ()
 ) -> list[int]:
-    """Draw a trace and give the fans that were drawn; see `plot_recording`.
+    """Draw a trace and return the fans that were drawn; see `plot_recording`.
 
     Raises:
-        UserError: a fan that the tray does not have, or a format that cannot be written.
+        UserError: the tray does not have a fan, or the format cannot be written.
     """
     shown = _chosen_fans(trace, fans)
     with mpl.rc_context({"font.size": 9.5, "axes.spines.top": False, "axes.spines.right": False}):
@@ -148,23 +149,23 @@ def _chosen_fans(trace: Trace, fans: Sequence[int] | None) -> list[int]:
         return list(fans)
     alarmed = trace.in_alarm.any(axis=0)
     healthy = np.flatnonzero(~alarmed)[:1].tolist()
-    return sorted(np.flatnonzero(alarmed)[:MOST_PANELS].tolist() + healthy)
+    return sorted(np.flatnonzero(alarmed)[:MAX_PANELS].tolist() + healthy)
 
 
 def _figure(trace: Trace, fans: Sequence[int], faults: Sequence[Fault]) -> Figure:
     lanes_in = LANE_HEIGHT_IN * (2 if faults else 1)
     block_in = PANEL_HEIGHT_IN + lanes_in
-    height = HEAD_IN + FOOT_IN + len(fans) * (block_in + BETWEEN_IN) - BETWEEN_IN
+    height = HEADER_IN + FOOT_IN + len(fans) * (block_in + BETWEEN_IN) - BETWEEN_IN
     figure = Figure(figsize=(WIDTH_IN, height))
     FigureCanvasAgg(figure)
-    _draw_head(figure, trace, fans, with_truth=bool(faults))
+    _draw_header(figure, trace, fans, with_truth=bool(faults))
     outer = figure.add_gridspec(
         len(fans),
         1,
         hspace=BETWEEN_IN / block_in,
         left=0.085,
         right=0.985,
-        top=1 - HEAD_IN / height,
+        top=1 - HEADER_IN / height,
         bottom=FOOT_IN / height,
     )
     for row, fan in enumerate(fans):
@@ -182,8 +183,8 @@ def _figure(trace: Trace, fans: Sequence[int], faults: Sequence[Fault]) -> Figur
     return figure
 
 
-def _draw_head(figure: Figure, trace: Trace, fans: Sequence[int], *, with_truth: bool) -> None:
-    """Title, and beneath it a row of what is drawn and a row of states: outside the panels, so they cover nothing."""
+def _draw_header(figure: Figure, trace: Trace, fans: Sequence[int], *, with_truth: bool) -> None:
+    """Draw the title, and below it a legend of series and one of states, outside the panels."""
     height = figure.get_figheight()
     title = f"{trace.tray}: fan speed beside the healthy twin"
     figure.suptitle(title, x=0.085, ha="left", y=1 - 0.12 / height, va="top", size=14)
@@ -243,7 +244,7 @@ def _draw_lanes(axes: Axes, trace: Trace, fan: int, faults: Sequence[Fault], *, 
 
 
 def _title(trace: Trace, fan: int, faults: Sequence[Fault]) -> str:
-    """What happened to a fan, in words."""
+    """The title of a panel: the fan, its faults and its alarms."""
     parts = [f"fan {fan}"]
     changes_ns, names = state_changes(trace, fan, None)
     raised = [t for t, name in zip(changes_ns, names, strict=True) if name == "alarm"]
@@ -252,29 +253,29 @@ def _title(trace: Trace, fan: int, faults: Sequence[Fault]) -> str:
     for fault in faults:
         text = f"{fault.kind.replace('_', ' ').replace('-', ' ')} at {_seconds(trace, np.array(fault.start_ns)):.1f} s"
         first = next((t for t in raised if fault.start_ns <= t <= fault.stop_ns), None)
-        parts.append(text + (f", alarm {(first - fault.start_ns) / 1e9:.2f} s later" if first else ", no alarm"))
+        parts.append(text + (f", alarm {(first - fault.start_ns) / NS_PER_S:.2f} s later" if first else ", no alarm"))
     if not faults and raised:
         parts.append("alarm at " + ", ".join(f"{_seconds(trace, t):.1f} s" for t in raised[:4]))
     return "   ".join(parts)
 
 
 def _limits(measured: Array, low: Array, high: Array) -> tuple[float, float]:
-    """Where the axis ends: everything drawn, and a little air."""
+    """Limits of the axis: everything drawn, with a margin."""
     values = np.concatenate([measured, low, high])
     values = values[np.isfinite(values)]
     bottom, top = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
-    air = 0.08 * (top - bottom) or 1.0
-    return bottom - air, top + air
+    margin = 0.08 * (top - bottom) or 1.0
+    return bottom - margin, top + margin
 
 
 def _gaps(t_ns: Array) -> Array:
-    """Where samples are missing: index of the first sample after each gap. Nothing is drawn across one."""
+    """Index of the first sample after each gap in time. No line is drawn across a gap."""
     steps = np.diff(t_ns)
     return np.flatnonzero(steps > 2.5 * np.median(steps)) + 1 if len(steps) else np.zeros(0, np.int64)
 
 
 def _seconds(trace: Trace, t_ns: Any) -> Any:
-    return (t_ns - trace.t_ns[0]) / 1e9
+    return (t_ns - trace.t_ns[0]) / NS_PER_S
 
 
 def _state_color(name: str) -> str:
@@ -296,6 +297,6 @@ def _state_handles(trace: Trace, fans: Sequence[int]) -> list[Patch]:
     seen = {name for fan in fans for name in state_changes(trace, fan, None)[1]}
     handles = [Patch(color=color, lw=0, label=name) for name, color in STATE_COLORS.items() if name in seen]
     if any(name.startswith("unknown") for name in seen):
-        handles.append(Patch(color=UNKNOWN_COLOR, lw=0, label="unknown: not judged"))
+        handles.append(Patch(color=UNKNOWN_COLOR, lw=0, label="unknown: not scored"))
     handles[0].set_label(f"state: {handles[0].get_label()}")
     return handles

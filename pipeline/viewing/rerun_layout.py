@@ -1,7 +1,6 @@
-"""How a view is laid out in Rerun: a tab for each tray, a plot for each fan, state lanes, alarms; and the stages.
+"""The layout of a view in Rerun: for each tray a tab with plots, state lanes and alarm log, and a tab for the stages.
 
-Measured with Rerun 0.41; see docs/how-to/viewing.md. The only modules that import rerun are this, `rerun_sink` and
-`rerun_picture`.
+Measured with Rerun 0.41; see docs/how-to/viewing.md. Only this module, `rerun_sink` and `rerun_picture` import rerun.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from schemas.units import SpeedUnit
 
 TIMELINE = "time"
 STAGES_PATH = "stages"
-FANS_ON_A_PAGE = 8  # a page of a hundred plots is drawn seven times a second only
-MARGIN_FOR_LEGEND = {1: 0.12, 2: 0.25, 4: 0.45}  # columns of plots -> share of the window kept free at its right
+FANS_ON_A_PAGE = 8  # Rerun draws a page of a hundred plots only seven times a second
+MARGIN_FOR_LEGEND = {1: 0.12, 2: 0.25, 4: 0.45}  # columns of plots -> share of the window kept free at the right
 
 LINE_WIDTH = 1.2
 WHITE = (235, 235, 235)
@@ -39,7 +38,7 @@ UNKNOWN_COLOR = (110, 110, 110)
 
 @dataclass(frozen=True)
 class TrayLayout:
-    """What of a tray is shown: `fans` are numbers counted from 0."""
+    """The fans of a tray that are shown, counted from 0, and their unit of speed."""
 
     name: str
     fans: Sequence[int]
@@ -47,7 +46,7 @@ class TrayLayout:
 
 
 def fan_path(tray: str, fan: int, part: str) -> str:
-    """Entity of one fan: parts are `speed` (measured, twin), `alarm_zone`, `outside` and `not_judged`."""
+    """Entity of one fan: `part` is `speed` (measured, twin), `alarm_zone`, `outside` or `not_scored`."""
     return f"{tray}/fan_{fan}/{part}"
 
 
@@ -62,7 +61,7 @@ def log_path(tray: str) -> str:
 
 
 def speed_style(unit: SpeedUnit, width: float) -> rr.Measurements:
-    """Style of the two series of a fan's `speed`: measured line, and twin with its band; width 0 leaves the band."""
+    """Style of the two series of a fan's `speed`, measured and twin with band; width 0 shows the band only."""
     return rr.Measurements.from_fields(
         names=[f"measured ({unit})", f"twin ± 2σ ({unit})"],
         colors=[WHITE, GREEN],
@@ -71,7 +70,7 @@ def speed_style(unit: SpeedUnit, width: float) -> rr.Measurements:
 
 
 def log_styles(recording: rr.RecordingStream, tray: TrayLayout) -> None:
-    """Log what never changes: names, colours and widths of every series of a tray."""
+    """Log the static names, colours and widths of every series of a tray."""
     for fan in tray.fans:
         zone = rr.Measurements.from_fields(names=["alarm zone"] * 2, colors=[RED] * 2, widths=[0.0, 0.0])
         recording.log(fan_path(tray.name, fan, "speed"), speed_style(tray.speed_unit, LINE_WIDTH), static=True)
@@ -82,8 +81,8 @@ def log_styles(recording: rr.RecordingStream, tray: TrayLayout) -> None:
             static=True,
         )
         recording.log(
-            fan_path(tray.name, fan, "not_judged"),
-            rr.SeriesLines(names="not judged", colors=GREY, widths=LINE_WIDTH),
+            fan_path(tray.name, fan, "not_scored"),
+            rr.SeriesLines(names="not scored", colors=GREY, widths=LINE_WIDTH),
             static=True,
         )
         names = state_names()
@@ -95,8 +94,10 @@ def log_styles(recording: rr.RecordingStream, tray: TrayLayout) -> None:
 
 
 def blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_picture: bool = False) -> rrb.Blueprint:
-    """The whole layout, with a window of `window_s` that follows the newest data. A picture has no panels,
-    and nothing in it is later than the cursor."""
+    """The whole layout, with a window of `window_s` seconds that follows the newest data.
+
+    A picture has no panels and shows nothing later than the cursor.
+    """
     tabs: list[rrb.Container | rrb.View] = [_tray_tab(tray, window_s, for_picture) for tray in trays]
     if not for_picture:
         tabs.append(rrb.TextDocumentView(origin=f"/{STAGES_PATH}", name="stages"))
@@ -141,12 +142,12 @@ def _fan_view(tray: TrayLayout, fan: int, axis: rrb.TimeAxis, past: rrb.VisibleT
     fill, lines = speed_style(tray.speed_unit, 0.0), speed_style(tray.speed_unit, LINE_WIDTH)
     return rrb.TimeSeriesView(
         origin=f"/{tray.name}/fan_{fan}",
-        contents=[f"/{fan_path(tray.name, fan, part)}" for part in ("speed", "alarm_zone", "outside", "not_judged")],
+        contents=[f"/{fan_path(tray.name, fan, part)}" for part in ("speed", "alarm_zone", "outside", "not_scored")],
         name=f"{tray.name} / fan {fan} speed ({tray.speed_unit})",
         axis_x=axis,
         time_ranges=past,
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
-        # One band is faint: the same data drawn twice makes it solid, and costs no bytes.
+        # A single band is faint. Drawing the same data twice makes it solid and sends no more bytes.
         overrides={speed: [fill.visualizer(), lines.visualizer()]},
     )
 
@@ -156,14 +157,14 @@ def _log_view(tray: str) -> rrb.TextLogView:
         origin=f"/{log_path(tray)}",
         name=f"{tray} / alarm log",
         columns=TextLogColumns(
-            timeline_columns=[TimelineColumn(TIMELINE, visible=False)],  # too narrow to read: lines bear their time
+            timeline_columns=[TimelineColumn(TIMELINE, visible=False)],  # too narrow to read: lines begin with it
             text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
         ),
     )
 
 
 def _rolling(window_s: float, margin: float) -> rrb.TimeAxis:
-    """A window that follows the cursor; `margin` of it stays empty at its right."""
+    """A window that follows the cursor; the share `margin` of it stays empty at the right."""
     cursor = rrb.TimeRangeBoundary.cursor_relative
     return rrb.TimeAxis(view_range=rr.TimeRange(start=cursor(seconds=-window_s), end=cursor(seconds=margin * window_s)))
 

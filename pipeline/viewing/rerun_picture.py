@@ -1,6 +1,6 @@
-"""Pictures of a view without a display: a headless Rerun viewer draws an .rrd and hands back what it shows.
+"""Pictures of a view without a display: a headless Rerun viewer draws an .rrd file and returns a screenshot.
 
-Needs a Vulkan driver; on a machine without a graphics card Mesa's software one will do.
+Needs a Vulkan driver; without a graphics card, Mesa's software driver works.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from pipeline.errors import UserError
 from pipeline.viewing.rerun_layout import TIMELINE, TrayLayout, blueprint
 from pipeline.viewing.rerun_sink import APPLICATION, LOOPBACK, rerun_program
 from schemas.messages import Array
-from schemas.units import SpeedUnit
+from schemas.units import NS_PER_S, SpeedUnit
 
 SIZE = (1920, 1080)
 TOP_BAR_SHARE = 0.035  # of the height; it stays, empty, when it is hidden
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 POLL_S = 0.2
-NOTICE_S = 6.0  # the viewer shows a notice on where it listens, over a corner of the window, for about five seconds
+NOTICE_S = 6.0  # for about five seconds the viewer covers a corner of the window with a notice
 _DRIVER_FOLDERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
 _DRIVER_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES", "VK_ADD_DRIVER_FILES")
 
 
 class PictureError(UserError):
-    """A picture cannot be drawn: one line that says why and what to do."""
+    """A picture cannot be drawn; the message says why and what to do."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What was drawn: the PNG of the window, the names of its views, and what each complains about."""
+    """A PNG of the window, and the warnings of each view by name."""
 
     png: bytes
     reports: dict[str, list[str]]
 
 
 @dataclass(frozen=True)
-class _View:
-    """What an .rrd of ours holds."""
+class _Rrd:
+    """The contents of a view file."""
 
     chunks: Sequence[Chunk]
     trays: dict[str, tuple[list[int], SpeedUnit]]
@@ -62,7 +62,7 @@ class _View:
 
 
 def has_vulkan_driver() -> bool:
-    """Whether the headless viewer can draw here. Elsewhere than on Linux the system itself brings what it needs."""
+    """Whether the headless viewer can draw here. Other systems than Linux have what it needs."""
     if sys.platform != "linux":
         return True
     named = [Path(path) for name in _DRIVER_VARIABLES for path in os.environ.get(name, "").split(":") if path]
@@ -80,14 +80,14 @@ def draw_picture(
     window_s: float = 30.0,
     view: str | None = None,
 ) -> Picture:
-    """Draw a view kept by the viewer stage.
+    """Draw a view file written by the viewer stage.
 
     Args:
         rrd: the file.
         tray: which tray; may be left out where there is one.
         fans: which fans, counted from 0; the first eight if not given.
-        at_s: the picture ends so many seconds after the file's first sample; at its last one if not given.
-        window_s: how much of the time before that is shown.
+        at_s: end of the picture, s after the first sample of the file; its last sample if not given.
+        window_s: length of time shown, s.
         view: part of the name of the one view to draw; the whole window if not given.
 
     Raises:
@@ -97,16 +97,16 @@ def draw_picture(
         raise PictureError(
             "no Vulkan driver found, which the headless viewer needs: apt-get install mesa-vulkan-drivers"
         )
-    kept = _read(rrd)
-    layout = _layout(rrd, kept, tray, fans)
-    end_ns = kept.last_ns if at_s is None else kept.first_ns + round(at_s * 1e9)
+    contents = _read(rrd)
+    layout = _layout(rrd, contents, tray, fans)
+    end_ns = contents.last_ns if at_s is None else contents.first_ns + round(at_s * NS_PER_S)
     with _headless_viewer() as viewer:
         began_s = time.monotonic()
         recording = rr.RecordingStream(APPLICATION)
         recording.connect_grpc(viewer.url, default_blueprint=blueprint([layout], window_s, for_picture=True))
-        recording.send_chunks(kept.chunks)
+        recording.send_chunks(contents.chunks)
         recording.flush()
-        _wait_until_loaded(viewer, kept.last_ns)
+        _wait_until_loaded(viewer, contents.last_ns)
         viewer.set_time(TIMELINE, timestamp=np.datetime64(end_ns, "ns"), play_state="paused")
         state = viewer.get_state()
         chosen = None
@@ -117,13 +117,13 @@ def draw_picture(
                 raise PictureError(f"{rrd}: no view called {view!r}; there are {names}")
         if chosen is None:
             time.sleep(max(0.0, began_s + NOTICE_S - time.monotonic()))
-        png = _settled_screenshot(viewer, chosen)
+        png = _stable_screenshot(viewer, chosen)
         reports = {shown.name: [str(report) for report in shown.reports] for shown in viewer.get_state().views}
         recording.disconnect()
     return Picture(png if chosen else _without_top_bar(png), reports)
 
 
-def _read(rrd: Path) -> _View:
+def _read(rrd: Path) -> _Rrd:
     if not rrd.is_file():
         raise PictureError(f"{rrd}: no such file; the viewer stage writes view.rrd into run_folder")
     try:
@@ -131,7 +131,7 @@ def _read(rrd: Path) -> _View:
             warnings.filterwarnings("ignore", message=".*no footer")
             chunks = list(RrdReader(rrd).stream())
     except (RuntimeError, ValueError, OSError) as error:
-        raise PictureError(f"{rrd}: not a file of Rerun's: {error}") from error
+        raise PictureError(f"{rrd}: not a Rerun file: {error}") from error
     trays: dict[str, tuple[list[int], SpeedUnit]] = {}
     times: list[Array] = []
     for chunk in chunks:
@@ -148,17 +148,17 @@ def _read(rrd: Path) -> _View:
     if not times:
         raise PictureError(f"{rrd}: holds no speeds drawn by the viewer stage")
     all_times = np.concatenate(times)
-    return _View(chunks, trays, int(all_times.min()), int(all_times.max()))
+    return _Rrd(chunks, trays, int(all_times.min()), int(all_times.max()))
 
 
-def _layout(rrd: Path, kept: _View, tray: str | None, fans: Sequence[int] | None) -> TrayLayout:
+def _layout(rrd: Path, contents: _Rrd, tray: str | None, fans: Sequence[int] | None) -> TrayLayout:
     if tray is None:
-        if len(kept.trays) > 1:
-            raise PictureError(f"{rrd}: several trays, say which with --tray: {', '.join(kept.trays)}")
-        (tray,) = kept.trays
-    if tray not in kept.trays:
-        raise PictureError(f"{rrd}: no tray called {tray!r}; there are {', '.join(kept.trays)}")
-    known, unit = kept.trays[tray]
+        if len(contents.trays) > 1:
+            raise PictureError(f"{rrd}: there are several trays; choose one with --tray: {', '.join(contents.trays)}")
+        (tray,) = contents.trays
+    if tray not in contents.trays:
+        raise PictureError(f"{rrd}: no tray called {tray!r}; there are {', '.join(contents.trays)}")
+    known, unit = contents.trays[tray]
     for fan in fans or ():
         if fan not in known:
             raise PictureError(f"{rrd}: {tray} has no fan {fan}; it has fans {min(known)} to {max(known)}")
@@ -167,26 +167,26 @@ def _layout(rrd: Path, kept: _View, tray: str | None, fans: Sequence[int] | None
 
 @contextmanager
 def _headless_viewer() -> Iterator[ViewerClient]:
-    """A viewer of our own on a free loopback port, quiet, gone at the end."""
+    """A new viewer on a free loopback port, ended on exit."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         port = probe.getsockname()[1]
     size = f"{SIZE[0]}x{SIZE[1]}"
     command = [rerun_program(), "--headless", "--bind", LOOPBACK, "--port", str(port), "--window-size", size]
-    with tempfile.TemporaryFile() as complaints:
+    with tempfile.TemporaryFile() as output:
         process = subprocess.Popen(
             [*command, "--hide-welcome-screen", "--expect-data-soon"],
-            stdout=complaints,
-            stderr=complaints,
+            stdout=output,
+            stderr=output,
             env={**os.environ, "RERUN_APP_ONLY": "true", "RUST_LOG": "error"},
         )
         try:
             yield _connect(process, port)
         except (ConnectionError, RuntimeError) as error:
-            complaints.seek(0)
-            said = complaints.read().decode(errors="replace").strip().splitlines()
+            output.seek(0)
+            lines = output.read().decode(errors="replace").strip().splitlines()
             raise PictureError(
-                f"the headless viewer failed: {error}; it said: {said[-1] if said else 'nothing'}"
+                f"the headless viewer failed: {error}; its output: {lines[-1] if lines else 'none'}"
             ) from error
         finally:
             process.terminate()
@@ -194,7 +194,7 @@ def _headless_viewer() -> Iterator[ViewerClient]:
 
 
 def _connect(process: subprocess.Popen[bytes], port: int) -> ViewerClient:
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while process.poll() is None and time.monotonic() < deadline:
         with socket.socket() as probe:
             if probe.connect_ex((LOOPBACK, port)) == 0:
@@ -204,20 +204,20 @@ def _connect(process: subprocess.Popen[bytes], port: int) -> ViewerClient:
 
 
 def _wait_until_loaded(viewer: ViewerClient, last_ns: int) -> None:
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline:
         state = viewer.get_state()
         ends = [line.end for entry in state.recordings for line in entry.timelines if line.name == TIMELINE]
-        # Rerun's own account of a time is that of a float.
+        # Rerun reports times rounded to floating point.
         if state.views and any(end is not None and end >= last_ns - 1_000 for end in ends):
             return
         time.sleep(POLL_S)
-    raise ConnectionError(f"it did not load the file in {PATIENCE_S:.0f} s")
+    raise ConnectionError(f"it did not load the file in {TIMEOUT_S:.0f} s")
 
 
-def _settled_screenshot(viewer: ViewerClient, view_id: str | None) -> bytes:
-    """The first screenshot that looks like the one before it."""
-    deadline = time.monotonic() + PATIENCE_S
+def _stable_screenshot(viewer: ViewerClient, view_id: str | None) -> bytes:
+    """The first screenshot that equals the one before it."""
+    deadline = time.monotonic() + TIMEOUT_S
     before = viewer.take_screenshot(view_id)
     while time.monotonic() < deadline:
         time.sleep(POLL_S)
@@ -225,7 +225,7 @@ def _settled_screenshot(viewer: ViewerClient, view_id: str | None) -> bytes:
         if now == before:
             return now
         before = now
-    raise ConnectionError(f"the picture did not settle in {PATIENCE_S:.0f} s")
+    raise ConnectionError(f"the picture still changed after {TIMEOUT_S:.0f} s")
 
 
 def _without_top_bar(png: bytes) -> bytes:

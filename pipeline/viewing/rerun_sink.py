@@ -1,7 +1,7 @@
-"""The viewer's adapter: a Rerun recording that goes to a file and to live viewers on this host.
+"""The viewer's sink: a Rerun recording that goes to a file and to live viewers on this host.
 
-One entity a fan, its series side by side in it, one `send_columns` a flush. Zones, outside samples and samples that
-are not judged are sent only where there are any.
+Each fan has one entity with its series side by side, and one `send_columns` per flush. Alarm zones, samples outside the
+band and samples without a score are sent only if there are any.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-os.environ.setdefault(
-    "RUST_LOG", "warn,re_log_encoding=error"
-)  # else every start warns that we chose to have no footer
+os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")  # otherwise every start warns of the missing footer
 import rerun as rr
 
 from pipeline.config.models import TrayConfig
@@ -38,23 +36,23 @@ from schemas.messages import Array
 
 APPLICATION = "fantwin"
 ZONE_HEIGHT = 2.0  # of an alarm zone, in half heights of the band
-# Rerun's own page server in a shell that ends with us, however we end: the pipe to its standard input closes.
+# Rerun's page server runs in a shell that ends with this process, even when it is killed: the pipe to its input closes.
 _PAGE_SCRIPT = '"$@" >/dev/null 2>&1 & cat >/dev/null; kill $!'
 
 
 def rerun_program() -> Path:
-    """Rerun's own program, which comes with its package (the `rerun` on the path is a wrapper around it)."""
+    """Path of Rerun's executable inside its package; the `rerun` on the path is a wrapper around it."""
     spec = importlib.util.find_spec("rerun_cli")
-    assert spec is not None and spec.origin is not None, "rerun-sdk always brings rerun_cli"
+    assert spec is not None and spec.origin is not None, "rerun-sdk contains rerun_cli"
     folder = Path(spec.origin).parent
     return folder / "Rerun.app/Contents/MacOS/Rerun" if sys.platform == "darwin" else folder / "rerun"
 
 
 def unused_path(path: Path) -> Path:
-    """`path`, or the first of path-2, path-3 ... that does not exist; created empty, so that it is ours.
+    """Create and return `path`, or the first of path-2, path-3 ... that does not exist.
 
     Raises:
-        StageError: it cannot be created.
+        StageError: the file cannot be created.
     """
     candidate, number = path, 1
     try:
@@ -83,20 +81,20 @@ class RerunSink:
         web_port: int | None,
         memory_limit: str,
     ) -> None:
-        """Open what is asked for: `file`, a server of data at `grpc_port`, a page for browsers at `web_port`.
+        """Open `file`, a data server at `grpc_port` and a page for browsers at `web_port`; None leaves one out.
 
         Raises:
             StageError: the file cannot be written, or a port is taken.
         """
         for key, port in (("grpc_port", grpc_port), ("web_port", web_port)):
             if port is not None:
-                check_free(port, key)
+                check_free(port, f"viewer.{key}", "viewer.serve = false")
         layouts = [TrayLayout(tray.name, range(tray.fans), tray.speed_unit) for tray in trays]
         self._recording = rr.RecordingStream(APPLICATION)
-        self._zone_is_open: set[str] = set()
+        self._open_paths: set[str] = set()
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
         if file is not None:
-            # Without a footer nothing is kept in memory for it, and the file opens after a crash, too.
+            # Without a footer, memory does not grow with the file, and the file can be opened after a crash.
             sinks.append(rr.FileSink(unused_path(file), write_footer=False))
         if grpc_port is not None:
             server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=memory_limit)
@@ -105,7 +103,7 @@ class RerunSink:
         self._recording.send_recording_name(f"{name} {np.datetime64(started_t_ns, 'ns').astype('datetime64[s]')} UTC")
         for layout in layouts:
             log_styles(self._recording, layout)
-        self._recording.flush()  # the styles are in the file before anything that could be killed
+        self._recording.flush()  # the styles reach the file first, so that the file of a killed viewer has them
         self._page = _serve_page(web_port, grpc_port) if web_port is not None and grpc_port is not None else None
 
     def draw(self, trace: Trace) -> None:
@@ -114,7 +112,7 @@ class RerunSink:
             self._draw_fan(trace, fan)
 
     def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
-        """Colour a fan's lane from each time on."""
+        """Set the state of a fan's lane from each time on."""
         self._send(state_path(tray, fan), t_ns, rr.StateChange.columns(state=list(names)))
 
     def log(self, tray: str, t_ns: int, level: str, text: str) -> None:
@@ -124,15 +122,15 @@ class RerunSink:
         self._send(log_path(tray), times, rr.TextLog.columns(text=[f"{clock}  {text}"], level=[level]))
 
     def show_stages(self, page: str) -> None:
-        """Replace the page on the stages. It has no time, so it moves no cursor that follows the newest time."""
+        """Replace the page about the stages. It has no time and so does not move a cursor that follows the newest."""
         self._recording.log(STAGES_PATH, rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN), static=True)
 
     def flush(self) -> None:
-        """Hand everything to the system: it outlives this process, however that ends."""
+        """Pass everything to the operating system, so that it survives a crash of this process."""
         self._recording.flush()
 
     def close(self) -> None:
-        """Write out everything, stop serving."""
+        """Write everything and stop serving."""
         self._recording.flush()
         self._recording.disconnect()
         if self._page is not None:
@@ -142,8 +140,8 @@ class RerunSink:
 
     def _draw_fan(self, trace: Trace, fan: int) -> None:
         measured, predicted, half_width = trace.measured[:, fan], trace.predicted[:, fan], trace.half_width[:, fan]
-        judged = trace.valid[:, fan]
-        shown = np.stack([np.where(judged, measured, np.nan), predicted], axis=1)
+        scored = trace.valid[:, fan]
+        shown = np.stack([np.where(scored, measured, np.nan), predicted], axis=1)
         variances = np.stack([np.zeros_like(half_width), half_width**2], axis=1)
         self._send_measurements(fan_path(trace.tray, fan, "speed"), trace.t_ns, shown, variances)
         self._draw_zone(trace, fan)
@@ -151,30 +149,30 @@ class RerunSink:
         if outside.any():
             columns = rr.Scalars.columns(scalars=measured[outside])
             self._send(fan_path(trace.tray, fan, "outside"), trace.t_ns[outside], columns)
-        self._send_where(fan_path(trace.tray, fan, "not_judged"), trace.t_ns, np.where(judged, np.nan, measured))
+        self._send_where(fan_path(trace.tray, fan, "not_scored"), trace.t_ns, np.where(scored, np.nan, measured))
 
     def _draw_zone(self, trace: Trace, fan: int) -> None:
-        """Red above and below the band while an alarm is active."""
+        """Send the red zones above and below the band while an alarm is active."""
         path = fan_path(trace.tray, fan, "alarm_zone")
         half_width = trace.half_width[:, fan]
         zone = np.where(trace.in_alarm[:, fan], trace.predicted[:, fan], np.nan)
-        if not self._is_worth_sending(path, zone):
+        if not self._has_news(path, zone):
             return
         half_height = half_width * ZONE_HEIGHT / 2
         middles = np.stack([zone + half_width + half_height, zone - half_width - half_height], axis=1)
         self._send_measurements(path, trace.t_ns, middles, np.stack([half_height**2] * 2, axis=1))
 
     def _send_where(self, path: str, t_ns: Array, values: Array) -> None:
-        if self._is_worth_sending(path, values):
+        if self._has_news(path, values):
             self._send(path, t_ns, rr.Scalars.columns(scalars=values))
 
-    def _is_worth_sending(self, path: str, values: Array) -> bool:
-        """Whether there is anything but NaN, or something open that NaN must end, lest a line be drawn on."""
-        was_open = path in self._zone_is_open
+    def _has_news(self, path: str, values: Array) -> bool:
+        """Whether there are values, or a NaN is needed to end the line or zone that is still open."""
+        was_open = path in self._open_paths
         if np.isfinite(values[-1]):
-            self._zone_is_open.add(path)
+            self._open_paths.add(path)
         else:
-            self._zone_is_open.discard(path)
+            self._open_paths.discard(path)
         return was_open or bool(np.isfinite(values).any())
 
     def _send_measurements(self, path: str, t_ns: Array, values: Array, variances: Array) -> None:
@@ -187,8 +185,8 @@ class RerunSink:
 
 
 def _serve_page(web_port: int, grpc_port: int) -> subprocess.Popen[bytes]:
-    """The browser viewer's page, on the loopback only (the call in Rerun's package listens on all interfaces)."""
+    """Serve the browser viewer's page on the loopback only; the call in Rerun's package listens on all interfaces."""
     data = f"rerun+http://{LOOPBACK}:{grpc_port}/proxy"
     page = [rerun_program(), "--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(web_port), data]
-    # A session of its own: Ctrl-C must not reach the shell before it has ended the server.
+    # A separate session keeps Ctrl-C from the shell, which must end the server first.
     return subprocess.Popen(["sh", "-c", _PAGE_SCRIPT, "sh", *page], stdin=subprocess.PIPE, start_new_session=True)

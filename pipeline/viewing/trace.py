@@ -1,4 +1,4 @@
-"""What is drawn of a tray: scores put end to end, in the unit that people are shown. Shared by viewer and plots."""
+"""The data drawn for a tray: scores joined in time, in the tray's display unit. Shared by viewer and plots."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from schemas.fields import LARGEST_ENUM_VALUE
 from schemas.messages import Array, FanState, InvalidReason, Score
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
@@ -19,9 +20,9 @@ class Trace:
 
     Attributes:
         t_ns: (n,) time of the samples, ns since the epoch.
-        measured: NaN where the tacho gave none.
-        predicted, half_width: the twin and half the height of its band, NaN where a sample is not judged.
-        outside: the sample was judged and lies outside the band.
+        measured: NaN without a tacho reading.
+        predicted, half_width: the twin and half the height of its band; NaN if the sample is not scored.
+        outside: the sample is scored and lies outside the band.
         in_alarm: an alarm was active at the sample.
         state, invalid_reason: `FanState` and `InvalidReason`.
     """
@@ -40,12 +41,12 @@ class Trace:
 
     @property
     def fans(self) -> int:
-        """How many fans the tray has."""
+        """Number of fans of the tray."""
         return self.measured.shape[1]
 
 
 def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit) -> Trace:
-    """Put the scores of one tray end to end; `scores` must not be empty and must have the same number of fans."""
+    """Join the scores of one tray. `scores` must not be empty and must have the same number of fans."""
     scale = 1.0 / RAD_S_PER_UNIT[speed_unit]
 
     def column(name: str) -> Array:
@@ -69,22 +70,21 @@ def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit) -> Trace
 
 
 def state_name(state: int, invalid_reason: int) -> str:
-    """A state as people read it; an unknown state says why: `unknown: gap`."""
-    if state != FanState.UNKNOWN:
-        return FanState(state).name.lower()
-    reason = InvalidReason(invalid_reason).name.lower().replace("_", " ")
-    return "unknown" if invalid_reason == InvalidReason.NONE else f"unknown: {reason}"
+    """A state in words; UNKNOWN with its reason: `unknown: gap`. A value of a newer scorer reads `unknown (9)`."""
+    if state != FanState.UNKNOWN or invalid_reason == InvalidReason.NONE:
+        return FanState(state).words
+    return f"unknown: {InvalidReason(invalid_reason).words}"
 
 
 def state_names() -> list[str]:
-    """Every name `state_name` can give, in the order of severity a legend wants."""
-    judged = [state.name.lower() for state in FanState if state != FanState.UNKNOWN]
-    return judged + [state_name(FanState.UNKNOWN, why) for why in InvalidReason]
+    """Every name that `state_name` gives for known values, in the order of a legend."""
+    known = [state.words for state in FanState if state != FanState.UNKNOWN]
+    return known + [state_name(FanState.UNKNOWN, reason) for reason in InvalidReason]
 
 
 def state_changes(trace: Trace, fan: int, previous: str | None) -> tuple[Array, list[str]]:
-    """When a fan's state changed, and to what: times (k,) in ns, k names. `previous` is the state before the trace."""
-    codes = trace.state[:, fan].astype(np.int64) * len(InvalidReason) + np.where(
+    """Times (k,) in ns of a fan's state changes, and the k new names. `previous` is the state before the trace."""
+    codes = trace.state[:, fan].astype(np.int64) * (LARGEST_ENUM_VALUE + 1) + np.where(
         trace.state[:, fan] == FanState.UNKNOWN, trace.invalid_reason[:, fan], 0
     )
     first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))

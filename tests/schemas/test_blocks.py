@@ -85,7 +85,7 @@ def test_samples_are_joined_in_the_order_given_under_the_first_header() -> None:
     }
 
 
-def test_rows_are_counted_as_in_python() -> None:
+def test_samples_are_counted_as_in_python_slices() -> None:
     part = cut(raw(5), 1, 3)
     assert (part.host_receive_t_ns.tolist(), part.device_clock_us.tolist()) == ([1, 2], [1, 2])
     assert cut(raw(5, clock=False), 1, 3).device_clock_us.tolist() == []
@@ -114,19 +114,19 @@ def test_predictions_of_one_twin_are_joined_although_each_brings_its_own_sigma()
     assert join([prediction(), prediction()]).sigma_rad_s.tolist() == [1.0]
 
 
-def test_some_samples_of_a_message_are_chosen() -> None:
+def test_samples_of_a_message_are_selected() -> None:
     some = select(raw(3, clock=False), np.array([True, False, True]))
     assert (some.host_receive_t_ns.tolist(), some.device_sequence.tolist()) == ([0, 2], [0, 2])
     assert (some.command.shape, some.device_clock_us.tolist()) == ((2, 1), [])
 
 
-def test_nothing_is_no_message() -> None:
+def test_joining_no_messages_is_refused() -> None:
     with pytest.raises(ValueError, match="no messages"):
         join([])
 
 
 @pytest.mark.parametrize(("first", "end"), [(-1, 1), (0, 3), (2, 1)])
-def test_rows_that_are_not_there_are_refused(first: int, end: int) -> None:
+def test_samples_that_do_not_exist_are_refused(first: int, end: int) -> None:
     with pytest.raises(ValueError, match="Grid without samples"):
         cut(grid(2), first, end)
     with pytest.raises(ValueError, match="Command without samples"):

@@ -7,23 +7,29 @@ import pytest
 from pipeline.config.registry import STAGES
 from pipeline.runtime.stage import load_stage
 from schemas.messages import MESSAGE_TYPES
-from schemas.topics import BY_NAME, RESERVED_TRAY_NAMES, TOPICS, alive_key, health_key, topic_of, tray_key
+from schemas.topics import BY_NAME, FORMER_NAMES, RESERVED_TRAY_NAMES, TOPICS, alive_key, health_key, topic_of, tray_key
 
 CONTRACT = Path(__file__).parents[2] / "docs" / "reference" / "messages.md"
 
 
-def test_every_message_has_one_topic_and_every_topic_one_message():
+def test_every_message_type_has_exactly_one_topic():
     assert [topic.message for topic in TOPICS] == list(MESSAGE_TYPES)
     assert len(BY_NAME) == len(TOPICS)
 
 
 @pytest.mark.parametrize("topic", [t for t in TOPICS if t.name != "health"], ids=lambda t: t.name)
-def test_a_trays_key_leads_back_to_its_topic(topic):
+def test_the_topic_of_a_tray_key_is_found(topic):
     assert topic_of(tray_key("plant", "tray1", topic.name)) is topic
 
 
-def test_the_key_of_a_health_leads_back_to_health():
+def test_the_topic_of_a_health_key_is_health():
     assert topic_of(health_key("plant", "scorer", "all")) is BY_NAME["health"]
+
+
+@pytest.mark.parametrize(("former", "topic"), FORMER_NAMES.items())
+def test_the_topic_of_a_key_in_an_older_recording_is_found(former, topic):
+    assert former not in BY_NAME
+    assert topic_of(tray_key("plant", "tray1", former)) is BY_NAME[topic]
 
 
 @pytest.mark.parametrize(
@@ -42,7 +48,7 @@ def test_a_foreign_key_is_no_topic(key):
         topic_of(key)
 
 
-def test_a_tray_cannot_bear_a_name_that_keys_need():
+def test_the_fixed_parts_of_keys_are_reserved_tray_names():
     assert health_key("s", "x", "y").split("/")[2] in RESERVED_TRAY_NAMES
     assert alive_key("s", "x", "y").split("/")[2] in RESERVED_TRAY_NAMES
 
@@ -54,12 +60,12 @@ def test_a_stage_reads_and_writes_topics_of_the_table(name):
     assert set(stage.reads) | set(stage.writes) <= set(BY_NAME)
 
 
-def test_every_topic_that_is_to_be_recorded_is_read_by_the_recorder():
+def test_the_recorder_reads_every_recorded_topic():
     assert set(load_stage("recorder").reads) == {topic.name for topic in TOPICS if topic.recorded}
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda t: t.name)
-def test_a_topic_stands_in_the_contract(topic):
+def test_every_topic_is_in_the_reference(topic):
     text = CONTRACT.read_text(encoding="utf-8")
     assert f"`{topic.name}`" in text
     assert topic.message.__name__ in text

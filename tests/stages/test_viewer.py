@@ -17,6 +17,7 @@ import pytest
 
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import Context, Core, StageError
+from pipeline.viewing.loopback import check_free
 from pipeline.viewing.trace import Trace
 from schemas.messages import (
     Alarm,
@@ -100,22 +101,23 @@ def play(core: Core, scores: Sequence[Score]) -> None:
     ("more", "level", "text"),
     [
         ({"transition": Transition.RAISED}, "WARN", "warning raised: so"),
-        ({"transition": Transition.REPUBLISHED, "severity": Severity.ALARM}, "ERROR", "alarm restated: so"),
+        ({"transition": Transition.REPUBLISHED, "severity": Severity.ALARM}, "ERROR", "alarm republished: so"),
         ({"transition": Transition.CLEARED, "active": False}, "INFO", "cleared: so"),
+        ({"transition": Transition(88)}, "INFO", "unknown (88): so"),
         (
             {"transition": Transition.REPUBLISHED, "active": False, "severity": Severity.NONE, "suppressed": True},
             "INFO",
-            "restated (never raised, suppressed): so",
+            "republished (never raised, suppressed): so",
         ),
     ],
 )
-def test_the_log_says_what_happened_to_an_alarm_and_how_bad_it_is(more: dict[str, Any], level: str, text: str) -> None:
-    told = {"fan": 0, "active": True, "severity": Severity.WARNING, "t_ns": 1, "onset_t_ns": 1, "acknowledged": True}
-    told |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "so", "confirmed": True}
-    assert alarm_line(Alarm(**told | more)) == (level, text)
+def test_the_log_shows_transition_and_severity_of_an_alarm(more: dict[str, Any], level: str, text: str) -> None:
+    fields = {"fan": 0, "active": True, "severity": Severity.WARNING, "t_ns": 1, "onset_t_ns": 1, "acknowledged": True}
+    fields |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": "so", "confirmed": True}
+    assert alarm_line(Alarm(**fields | more)) == (level, text)
 
 
-def test_samples_are_drawn_twice_a_second_and_none_is_left_out_or_drawn_twice() -> None:
+def test_samples_are_drawn_twice_a_second_and_each_exactly_once() -> None:
     sink = FakeSink()
     scores, _ = made_up_tray(seconds=10, block=5)
     core = core_of(sink)
@@ -130,7 +132,7 @@ def test_samples_are_drawn_twice_a_second_and_none_is_left_out_or_drawn_twice() 
     assert core.counters()["samples_drawn"] == 1000
 
 
-def test_without_ticks_no_more_than_a_bound_is_held() -> None:
+def test_without_ticks_a_bounded_number_of_samples_is_held() -> None:
     sink = FakeSink()
     scores, _ = made_up_tray(seconds=100, fans=1, block=64, gap_fan=None, faulty_fan=None)
     core = core_of(sink, fans=1)
@@ -139,7 +141,7 @@ def test_without_ticks_no_more_than_a_bound_is_held() -> None:
     assert [len(trace.t_ns) for trace in sink.traces] == [SAMPLES_HELD, SAMPLES_HELD]
 
 
-def test_a_lane_follows_the_states_to_the_sample_and_says_why_a_state_is_unknown() -> None:
+def test_a_lane_follows_the_states_to_the_sample_and_shows_the_reason_of_an_unknown_state() -> None:
     sink = FakeSink()
     scores, _ = made_up_tray(seconds=4, fans=2, faulty_fan=0, fault_s=(1.0, 2.0), gap_fan=1, gap_s=(2.5, 3.0))
     play(core_of(sink, fans=2), scores)
@@ -158,7 +160,29 @@ def test_a_change_of_reason_is_a_change_of_state() -> None:
     assert sink.lane(0) == [(0, "unknown: warming up"), (0.04, "unknown: saturated")]
 
 
-def test_a_steady_state_is_told_again_for_viewers_that_join_late() -> None:
+def test_states_and_reasons_of_a_newer_scorer_are_shown_with_their_number() -> None:
+    sink = FakeSink()
+    (score,), _ = made_up_tray(seconds=0.1, fans=1, faulty_fan=None, gap_fan=None)
+    state = np.array([[FanState.UNKNOWN]] * 3 + [[FanState.NORMAL]] * 3 + [[99]] * 4, np.uint8)
+    reason = np.array([[len(InvalidReason)]] * 3 + [[InvalidReason.NONE]] * 7, np.uint8)
+    core = core_of(sink, fans=1)
+    core.step(changed(score, state=state, invalid_reason=reason, valid=reason == 0))
+    core.close()
+    assert sink.lane(0) == [(0, "unknown: unknown (8)"), (0.03, "normal"), (0.06, "unknown (99)")]
+
+
+def test_a_taken_port_is_reported_under_the_setting_that_names_it() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(StageError, match=rf"^board\.port: port {port} on .* is taken .*; set another one$"):
+            check_free(port, "board.port")
+        with pytest.raises(StageError, match="; set another one, or board.serve = false$"):
+            check_free(port, "board.port", "board.serve = false")
+
+
+def test_a_steady_state_is_sent_again_for_viewers_that_join_late() -> None:
     sink = FakeSink()
     scores, _ = made_up_tray(seconds=16, fans=1, faulty_fan=None, gap_fan=None)
     play(core_of(sink, fans=1), scores)
@@ -167,7 +191,7 @@ def test_a_steady_state_is_told_again_for_viewers_that_join_late() -> None:
     assert (np.diff(times)[1:] * 1e9 >= REPEAT_STATES_NS).all()
 
 
-def test_what_is_not_judged_has_no_band_and_is_never_outside_it() -> None:
+def test_a_sample_without_a_score_has_no_band_and_is_never_outside_it() -> None:
     sink = FakeSink()
     scores, _ = made_up_tray(seconds=4, fans=2, faulty_fan=None, gap_fan=1, gap_s=(1.0, 2.0))
     lying = [changed(score, outside=np.ones_like(score.outside)) for score in scores]
@@ -208,7 +232,7 @@ def test_alarms_go_to_the_log_of_their_tray_at_the_samples_time() -> None:
     assert "alarm raised" in sink.lines[0][3] and "cleared" in sink.lines[1][3]
 
 
-def test_what_the_stages_and_the_twin_say_is_a_page_that_is_replaced_when_it_changes() -> None:
+def test_health_and_twins_are_a_page_that_is_replaced_when_it_changes() -> None:
     sink = FakeSink()
     core = core_of(sink)
     core.step(health())
@@ -223,7 +247,7 @@ def test_what_the_stages_and_the_twin_say_is_a_page_that_is_replaced_when_it_cha
     assert "f40" not in sink.pages[0] and "f40" in sink.pages[1] and "the port is gone" in sink.pages[1]
 
 
-def test_pages_that_change_all_the_time_are_shown_now_and_then_and_the_last_one_always() -> None:
+def test_a_page_that_changes_often_is_shown_at_intervals_and_at_the_end() -> None:
     sink = FakeSink()
     core = core_of(sink)
     for tenth in range(200):
@@ -234,7 +258,7 @@ def test_pages_that_change_all_the_time_are_shown_now_and_then_and_the_last_one_
     assert len(sink.pages) == 5 and "problem 199" in sink.pages[-1]
 
 
-def test_scores_that_do_not_fit_the_configuration_are_counted_and_told() -> None:
+def test_scores_that_do_not_fit_the_configuration_are_counted_and_reported() -> None:
     sink = FakeSink()
     core = core_of(sink, fans=4)
     scores, _ = made_up_tray(seconds=1, fans=3)
@@ -246,7 +270,7 @@ def test_scores_that_do_not_fit_the_configuration_are_counted_and_told() -> None
     assert "fans" in core.problem()
 
 
-def test_without_the_extra_the_stage_loads_and_building_it_says_what_to_install(
+def test_without_the_extra_the_stage_loads_and_build_names_the_package(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
@@ -287,7 +311,7 @@ def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp
     assert [row["TextLog:level"][0] for _, row in rows["/tray1/log"]] == ["ERROR", "INFO"]
 
 
-def test_a_recording_of_long_ago_is_all_there_is_in_time_whatever_the_stages_say_today(tmp_path: Path) -> None:
+def test_a_replay_of_an_old_recording_has_no_data_at_the_host_time(tmp_path: Path) -> None:
     scores, alarms = made_up_tray(seconds=2)
     core = build(context(tmp_path)).core
     for number, item in enumerate((health(), card(), *scores, *alarms, health(lost=3, problem="two | *lines*"))):
@@ -322,7 +346,7 @@ def test_an_alarm_zone_lies_beyond_the_band_on_both_sides_and_ends_with_the_alar
     assert "/tray1/fan_0/alarm_zone" not in rows
 
 
-def test_a_zone_that_fills_a_flush_to_its_end_is_ended_by_the_next_one(tmp_path: Path) -> None:
+def test_a_zone_open_at_the_end_of_a_flush_is_ended_by_the_next_one(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=0.3, fans=1, faulty_fan=None, gap_fan=None)
     in_alarm = np.full((10, 1), FanState.ALARM, np.uint8)
     core = build(context(tmp_path, fans=1)).core
@@ -335,7 +359,7 @@ def test_a_zone_that_fills_a_flush_to_its_end_is_ended_by_the_next_one(tmp_path:
     assert drawn == [True] * 10 + [False] * 10
 
 
-def test_samples_that_are_not_judged_leave_a_hole_in_measured_and_are_kept_apart_in_grey(tmp_path: Path) -> None:
+def test_samples_without_a_score_are_drawn_apart_in_grey(tmp_path: Path) -> None:
     (score,), _ = made_up_tray(seconds=0.2, fans=1, block=20, faulty_fan=None, gap_fan=None)
     valid = np.ones((20, 1), bool)
     valid[5:10] = False
@@ -343,14 +367,14 @@ def test_samples_that_are_not_judged_leave_a_hole_in_measured_and_are_kept_apart
     core.step(changed(score, valid=valid))
     core.close()
     rows = rows_of(tmp_path / "view.rrd")
-    judged = np.array([row["Measurements:values"][0] for _, row in rows["/tray1/fan_0/speed"]])
-    grey = np.array([row["Scalars:scalars"][0] for _, row in rows["/tray1/fan_0/not_judged"]])
-    assert np.isfinite(judged).tolist() == valid[:, 0].tolist()
+    scored = np.array([row["Measurements:values"][0] for _, row in rows["/tray1/fan_0/speed"]])
+    grey = np.array([row["Scalars:scalars"][0] for _, row in rows["/tray1/fan_0/not_scored"]])
+    assert np.isfinite(scored).tolist() == valid[:, 0].tolist()
     np.testing.assert_array_equal(grey[5:10], score.measured_speed_rad_s[5:10, 0])
     assert np.isnan(np.delete(grey, np.arange(5, 10))).all()
 
 
-def test_a_view_that_exists_is_left_alone(tmp_path: Path) -> None:
+def test_an_existing_view_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "view.rrd").write_bytes(b"earlier")
     for _ in range(2):
         build(context(tmp_path)).core.close()
@@ -358,7 +382,7 @@ def test_a_view_that_exists_is_left_alone(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["view-2.rrd", "view-3.rrd", "view.rrd"]
 
 
-def test_a_file_that_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_written_is_a_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(StageError, match="cannot write the view") as caught:
         build(context(tmp_path, file="file/view.rrd"))
@@ -366,12 +390,12 @@ def test_a_file_that_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("key", ["grpc_port", "web_port"])
-def test_a_taken_port_is_told_in_one_line_and_no_file_is_begun(tmp_path: Path, key: str) -> None:
+def test_a_taken_port_is_a_one_line_error_and_no_file_is_created(tmp_path: Path, key: str) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         ports = {"grpc_port": free_port(), "web_port": 0, key: taken.getsockname()[1]}
-        with pytest.raises(StageError, match=rf"viewer\.{key}: port \d+ .* is taken") as caught:
+        with pytest.raises(StageError, match=rf"viewer\.{key}: port \d+ .* is taken.*viewer\.serve = false") as caught:
             build(context(tmp_path, serve=True, **ports))
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
@@ -494,9 +518,9 @@ def test_messages_of_a_tray_that_is_not_configured_are_counted_and_ignored() -> 
     assert not sink.traces and not sink.lines
 
 
-def test_scores_of_another_number_of_fans_are_told_only_until_the_right_ones_come() -> None:
+def test_a_wrong_number_of_fans_is_reported_until_correct_scores_arrive() -> None:
     core = core_of(FakeSink(), fans=3)
     core.step(made_up_tray(fans=2, seconds=1, faulty_fan=None)[0][0])
-    assert core.problem() == "scores of 2 fans, [[tray]] tray1 says fans = 3: correct `fans`"
+    assert core.problem() == "scores have 2 fans, [[tray]] tray1 has fans = 3: correct `fans`"
     core.step(made_up_tray(fans=3, seconds=1)[0][0])
     assert core.problem() == ""

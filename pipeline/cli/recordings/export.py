@@ -1,4 +1,4 @@
-"""`fantwin export`: a recording becomes tables for pandas, spreadsheets and databases."""
+"""`fantwin export`: a recording as tables for pandas, spreadsheets and databases."""
 
 from __future__ import annotations
 
@@ -20,38 +20,44 @@ from pipeline.cli.options import JsonOption
 from pipeline.cli.twins.training_data import make_folder
 from pipeline.errors import UserError
 from pipeline.optional_dependencies import how_to_install
-from pipeline.recordings.arrays import Block, in_order, read_topics
+from pipeline.recordings.arrays import Block, read_topics
+from pipeline.recordings.order import in_order
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.tables import Form, TableFile, open_table
 from pipeline.recordings.writing import ACTIVE_SUFFIX
+from schemas.topics import current_name
 
 _PART = ".part"
 
 
 def export(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts.")],
-    to: Annotated[Form, typer.Option("--to", help="Form of the tables; parquet needs the extra of that name.")],
+    to: Annotated[Form, typer.Option("--to", help="Format of the tables; parquet needs the extra `parquet`.")],
     topic: Annotated[
         list[str] | None,
-        typer.Option(metavar="TOPIC", help="raw, grid, prediction, score, alarm ... Repeatable. Scores, else raw."),
+        typer.Option(
+            metavar="TOPIC",
+            help="raw, grid, prediction, score, alarm ... Repeatable. Default: score, else raw.",
+        ),
     ] = None,
-    tray: Annotated[str | None, typer.Option(help="Only this tray. All if not given.")] = None,
+    tray: Annotated[str | None, typer.Option(help="Only this tray. Default: all.")] = None,
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for the tables, or the file if it is one.")
+        Path,
+        typer.Option("-o", "--output", metavar="OUT", help="Folder, or the file of a single table."),
     ] = Path(),
-    force: Annotated[bool, typer.Option("--force", help="Replace tables that exist.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing tables.")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Export a recording as tables: one for each topic and tray, with a row for each sample and fan.
+    """Export a recording as tables: one per topic and tray, with a row per sample and fan.
 
-    Exits with 3 where the recording could not be read in full; what could is in the tables.
+    Exits with 3 if the recording could not be read in full; the tables then hold what could be read.
 
     Example: fantwin export runs/demo/recording.mcap --to csv --topic score --topic alarm -o tables
     """
     if to == "parquet" and find_spec("pyarrow") is None:
         raise UserError(f"--to parquet needs the extra `parquet`: use --to csv; or {how_to_install('parquet')}")
     parts = in_order(recordings)
-    topics = list(dict.fromkeys(topic or _default_topics(parts)))
+    topics = list(dict.fromkeys(map(current_name, topic or _default_topics(parts))))
     arrays = read_topics(parts, topics, tray)
     with (
         Console(stderr=True).status(f"exporting {parts[0]}") as status,
@@ -61,16 +67,16 @@ def export(
             tables.add(block)
             status.update(f"exporting {parts[0]}: {tables.rows} rows")
         if not tables.begun:
-            raise UserError(_nothing(parts[0], topics, tray, arrays.damage))
+            raise UserError(_no_messages(parts[0], topics, tray, arrays.damage))
         tables.finish("; ".join(arrays.damage))
-    told = [table.account() for table in tables.begun.values()]
-    absent = [name for name in topics if name not in {table["topic"] for table in told}]
+    written = [table.summary() for table in tables.begun.values()]
+    absent = [name for name in topics if name not in {table["topic"] for table in written}]
     if json_output:
         typer.echo(
-            json.dumps({"tables": told, "absent": absent, "duplicated": arrays.duplicated, "damage": arrays.damage})
+            json.dumps({"tables": written, "absent": absent, "duplicated": arrays.duplicated, "damage": arrays.damage})
         )
     else:
-        for table in told:
+        for table in written:
             typer.echo(f"{table['file']}: {table['rows']} rows")
     for name in absent:
         typer.echo(f"no {name} in this recording", err=True)
@@ -82,7 +88,7 @@ def export(
 
 @dataclass(frozen=True)
 class _Table:
-    """A table on its way: under a temporary name until all are whole."""
+    """A table that is being written, under a temporary name until all tables are complete."""
 
     site: str
     tray: str
@@ -90,22 +96,22 @@ class _Table:
     path: Path
     file: TableFile
 
-    def holds(self, block: Block) -> bool:
+    def belongs_to(self, block: Block) -> bool:
         return (self.site, self.tray, self.topic) == (block.site, block.tray, block.topic)
 
-    def account(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         return {"file": str(self.path), "topic": self.topic, "tray": self.tray, "rows": self.file.rows}
 
 
 class _Tables:
-    """The tables of an export, each begun when its first rows come; without `finish` nothing stays of them."""
+    """The tables of an export. Each is created with its first rows; without `finish` all are removed again."""
 
     def __init__(self, parts: Sequence[Path], form: Form, output: Path, *, replace: bool) -> None:
-        """Output is a folder, or the one file if it ends like one. Raises UserError where it cannot be."""
+        """`output` is a folder, or one file if its suffix says so. Raises UserError if it cannot be used."""
         if output.suffix in (".csv", ".parquet") and output.suffix != f".{form}":
             raise UserError(f"{output}: name a file that ends in .{form} with -o, or a folder")
         self.begun: dict[Path, _Table] = {}
-        self._head = read_metadata(parts[0])
+        self._metadata = read_metadata(parts[0])
         self._stem = parts[0].name.removesuffix(ACTIVE_SUFFIX).removesuffix(".mcap")
         self._form: Form = form
         self._output = output
@@ -118,40 +124,40 @@ class _Tables:
         return sum(table.file.rows for table in self.begun.values())
 
     def add(self, block: Block) -> None:
-        """Append a block to the table it belongs to.
+        """Append a block to its table.
 
         Raises:
-            UserError: the table cannot be written, exists already, or is one too many for one file.
+            UserError: the table cannot be written, exists already, or would be the second one in a single file.
         """
         path = self._path(block)
         try:
             if path not in self.begun:
                 self._begin(path, block)
             table = self.begun[path]
-            if not table.holds(block):
+            if not table.belongs_to(block):
                 raise UserError(
                     f"{path}: would hold both {table.topic} of {table.tray or table.site} and {block.topic} of "
                     f"{block.tray or block.site}: name a folder with -o, or choose with --topic and --tray"
                 )
             table.file.add(block)
         except OSError as error:
-            raise _refused(path, error) from error
+            raise _cannot_write(path, error) from error
 
     def finish(self, damage: str) -> None:
-        """End all tables and give them their names. Raises UserError where the disk refuses."""
+        """Complete all tables and give them their names. Raises UserError if one cannot be written."""
         for path, table in self.begun.items():
             try:
                 table.file.close(damage)
                 _unfinished(path).replace(path)
             except OSError as error:
-                raise _refused(path, error) from error
+                raise _cannot_write(path, error) from error
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         for table in self.begun.values():
-            with suppress(OSError):  # a disk that is full refuses what the file still held, too
+            with suppress(OSError):  # a full disk refuses the buffered rest as well
                 table.file.close()
             _unfinished(table.path).unlink(missing_ok=True)
 
@@ -165,19 +171,19 @@ class _Tables:
         if path.exists() and not self._replace:
             raise UserError(f"{path}: exists; name another folder or file with -o, or replace it with --force")
         about = {
-            **self._head.metadata,
+            **self._metadata.metadata,
             "topic": block.topic,
             "tray": block.tray,
-            "speed_unit": self._head.speed_unit(block.tray),
+            "speed_unit": self._metadata.speed_unit(block.tray),
             "exported_by": f"fantwin {version('fantwin')}",
         }
         file = open_table(self._form, _unfinished(path), block.topic, about)
         self.begun[path] = _Table(block.site, block.tray, block.topic, path, file)
 
 
-def _refused(path: Path, error: OSError) -> UserError:
-    why = os.strerror(error.errno) if error.errno else str(error)  # Arrow's own text is long
-    return UserError(f"{path}: cannot be written: {why}; name another folder with -o")
+def _cannot_write(path: Path, error: OSError) -> UserError:
+    reason = os.strerror(error.errno) if error.errno else str(error)  # the text of Arrow is long
+    return UserError(f"{path}: cannot be written: {reason}; name another folder with -o")
 
 
 def _unfinished(path: Path) -> Path:
@@ -189,7 +195,7 @@ def _default_topics(parts: Sequence[Path]) -> tuple[str]:
     return ("score",) if has_scores else ("raw",)
 
 
-def _nothing(path: Path, topics: Sequence[str], tray: str | None, damage: Sequence[str]) -> str:
+def _no_messages(path: Path, topics: Sequence[str], tray: str | None, damage: Sequence[str]) -> str:
     of_tray = f" of a tray {tray!r}" if tray else ""
     lost = f" ({'; '.join(damage)})" if damage else ""
     return f"{path}: no {' or '.join(topics)}{of_tray} in this recording{lost}; see --topic and --tray"

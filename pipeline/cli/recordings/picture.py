@@ -1,4 +1,4 @@
-"""`fantwin picture`: a view as a PNG, drawn by Rerun's own viewer without a display."""
+"""`fantwin picture`: a view as a PNG, drawn by a headless Rerun viewer."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from pipeline.optional_dependencies import how_to_install
 
 
 def picture(
-    view_file: Annotated[Path, typer.Argument(metavar="VIEW.rrd", help="What the viewer stage wrote.")],
+    view_file: Annotated[Path, typer.Argument(metavar="VIEW.rrd", help="View file of the viewer stage.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="The PNG to write.")] = Path("view.png"),
-    tray: Annotated[str | None, typer.Option(help="Which tray, where there are several.")] = None,
-    fans: Annotated[str | None, typer.Option(help="Which fans, e.g. 2,5. The first eight if not given.")] = None,
+    tray: Annotated[str | None, typer.Option(help="Which tray, if there are several.")] = None,
+    fans: Annotated[str | None, typer.Option(help="Which fans, e.g. 2,5. Default: the first eight.")] = None,
     at: Annotated[
-        float | None, typer.Option(help="End of the picture, s after the first sample. The last one.")
+        float | None, typer.Option(help="End of the picture, s after the first sample. Default: the last sample.")
     ] = None,
-    window: Annotated[float, typer.Option(min=0.1, help="How much is shown before that, s.")] = 30.0,
-    view: Annotated[str | None, typer.Option(help="Only this view: part of its name, e.g. 'fan 2'.")] = None,
+    window: Annotated[float, typer.Option(min=0.1, help="Length of time shown, s.")] = 30.0,
+    view: Annotated[str | None, typer.Option(help="Only this view, by part of its name, e.g. 'fan 2'.")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Draw a view file as a picture, by a headless Rerun viewer (needs a Vulkan driver).
+    """Draw a view file as a picture with a headless Rerun viewer (needs a Vulkan driver).
 
     Example: fantwin picture runs/demo/view.rrd --fans 2,5 --at 25 -o view.png
     """

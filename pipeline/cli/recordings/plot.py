@@ -1,4 +1,4 @@
-"""`fantwin plot`: the fans of a recording beside their twins, as a picture."""
+"""`fantwin plot`: a picture of the fans of a recording beside their twins."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ def plot(
     output: Annotated[Path, typer.Option("-o", "--output", help="The picture: .png, .svg or .pdf.")] = Path(
         "bands.png"
     ),
-    tray: Annotated[str | None, typer.Option(help="Which tray, where there are several.")] = None,
-    fans: Annotated[str | None, typer.Option(help="Which fans, e.g. 2,5. Those with alarms and one without.")] = None,
-    unit: Annotated[str | None, typer.Option(help="Unit of speed, rpm or rad/s. The recording's own.")] = None,
-    truth: Annotated[Path | None, typer.Option(help="A simulated tray's account of its faults (JSON).")] = None,
+    tray: Annotated[str | None, typer.Option(help="Which tray, if there are several.")] = None,
+    fans: Annotated[
+        str | None, typer.Option(help="Which fans, e.g. 2,5. Default: with alarms, and one without.")
+    ] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of speed, rpm or rad/s. Default: the recording's.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="Truth file of a simulated tray, with its faults (JSON).")] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Plot measured speed, prediction, band, alarms and states of a recording.

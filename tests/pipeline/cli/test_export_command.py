@@ -20,7 +20,7 @@ from pipeline.recordings.tables import PIECE_ROWS, open_table, table_columns
 from pipeline.recordings.writing import RecordingWriter
 from schemas.codec import proto_type
 from schemas.messages import MESSAGE_TYPES, FanState, Health, ModelCard, Raw, Statistic
-from tests.pipeline.recordings.test_arrays import alarm, raw, write
+from tests.pipeline.recordings.test_arrays import GOLDEN, alarm, raw, write
 from tests.support.fantwin_command import fantwin, said_instead
 from tests.support.score_data import START_NS, made_up_tray
 
@@ -77,7 +77,7 @@ def test_pandas_finds_every_sample_of_every_fan_with_its_exact_numbers(tmp_path,
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_codes_are_words_and_what_is_not_there_is_empty(tmp_path, form):
+def test_enums_are_names_and_missing_values_are_empty(tmp_path, form):
     fantwin("export", recording(tmp_path), "--to", form, "-o", tmp_path / f"scores.{form}")
     frame = table(tmp_path / f"scores.{form}")
     if form == "csv":
@@ -91,7 +91,7 @@ def test_codes_are_words_and_what_is_not_there_is_empty(tmp_path, form):
     assert set(frame["invalid_reason"]) == {"NONE", "GAP"}
 
 
-def test_parquet_has_true_times_and_says_what_it_is_of(tmp_path):
+def test_parquet_has_timestamps_and_describes_its_source(tmp_path):
     fantwin("export", recording(tmp_path), "--to", "parquet", "-o", tmp_path)
     path = tmp_path / "r.tray1.score.parquet"
     frame = table(path)
@@ -108,7 +108,7 @@ def test_parquet_has_true_times_and_says_what_it_is_of(tmp_path):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_what_the_messages_do_not_have_is_empty(tmp_path, form):
+def test_columns_that_the_messages_lack_are_empty(tmp_path, form):
     path = write(
         tmp_path / "r.mcap",
         [
@@ -125,7 +125,7 @@ def test_what_the_messages_do_not_have_is_empty(tmp_path, form):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_events_are_tables_of_their_own(tmp_path, form):
+def test_alarms_are_a_table_of_their_own(tmp_path, form):
     result = fantwin("export", recording(tmp_path), "--to", form, "--topic", "alarm", "-o", tmp_path)
     assert result.exit_code == 0
     (row,) = table(tmp_path / f"r.tray1.alarm.{form}").to_dict("records")
@@ -167,7 +167,7 @@ def test_there_is_a_table_for_each_topic_and_tray(tmp_path):
     assert names(tmp_path / "left") == ["r.left.score.csv"]
 
 
-def test_scores_are_what_is_wanted_or_else_raw_samples(tmp_path):
+def test_the_default_topic_is_scores_or_else_raw_samples(tmp_path):
     path = write(tmp_path / "r.mcap", [raw(0), raw(1)])
     result = fantwin("export", path, "--to", "csv", "-o", tmp_path / "out")
     assert result.stdout == f"{tmp_path}/out/r.tray1.raw.csv: 40 rows\n"
@@ -177,37 +177,42 @@ def test_parts_become_one_table_under_the_name_of_the_first(tmp_path):
     late = write(tmp_path / "a.mcap", (raw(n) for n in range(2, 6)), start=100)
     early = write(tmp_path / "b.mcap", (raw(n) for n in range(4)))
     result = fantwin("export", late, early, "--to", "csv", "-o", tmp_path, "--json")
-    told = json.loads(result.stdout)
-    assert told["tables"] == [{"file": f"{tmp_path}/b.tray1.raw.csv", "topic": "raw", "tray": "tray1", "rows": 120}]
-    assert told["duplicated"] == 2
+    report = json.loads(result.stdout)
+    assert report["tables"] == [{"file": f"{tmp_path}/b.tray1.raw.csv", "topic": "raw", "tray": "tray1", "rows": 120}]
+    assert report["duplicated"] == 2
     assert table(tmp_path / "b.tray1.raw.csv")["host_receive_t_ns"].is_monotonic_increasing
 
 
-def test_a_topic_that_was_not_recorded_is_told(tmp_path):
+def test_a_topic_that_was_not_recorded_is_reported(tmp_path):
     path = recording(tmp_path, alarms=False)
     result = fantwin("export", path, "--to", "csv", "--topic", "score", "--topic", "alarm", "-o", tmp_path, "--json")
     assert (result.exit_code, result.stderr) == (0, "no alarm in this recording\n")
     assert json.loads(result.stdout)["absent"] == ["alarm"]
 
 
+def test_a_topic_of_an_older_recording_is_exported_under_its_name_today(tmp_path):
+    result = fantwin("export", GOLDEN, "--to", "csv", "--topic", "memory", "--topic", "snapshot", "-o", tmp_path)
+    assert (result.stdout, result.stderr) == (f"{tmp_path}/golden.tray1.snapshot.csv: 9 rows\n", "")
+
+
 @pytest.mark.parametrize("form", FORMS)
-def test_what_could_be_read_of_a_torn_recording_is_exported_with_exit_code_3(tmp_path, form):
+def test_the_readable_part_of_a_truncated_recording_is_exported_with_exit_code_3(tmp_path, form):
     whole = write(tmp_path / "whole.mcap", (raw(n) for n in range(900)))
-    path = tmp_path / "torn.mcap.active"
+    path = tmp_path / "truncated.mcap.active"
     path.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     result = fantwin("export", path, "--to", form, "-o", tmp_path, "--json")
     assert result.exit_code == 3
     assert result.stderr == f"{path}: it is truncated, as after a crash; read up to that point\n"
-    told = json.loads(result.stdout)
-    assert told["damage"] == [result.stderr.strip()]
-    frame = table(tmp_path / f"torn.tray1.raw.{form}")
-    assert 0 < len(frame) == told["tables"][0]["rows"] < 900 * 20
+    report = json.loads(result.stdout)
+    assert report["damage"] == [result.stderr.strip()]
+    frame = table(tmp_path / f"truncated.tray1.raw.{form}")
+    assert 0 < len(frame) == report["tables"][0]["rows"] < 900 * 20
     if form == "parquet":
-        metadata = pq.read_metadata(tmp_path / "torn.tray1.raw.parquet").metadata
-        assert metadata[b"fantwin.damage"].decode() == told["damage"][0]
+        metadata = pq.read_metadata(tmp_path / "truncated.tray1.raw.parquet").metadata
+        assert metadata[b"fantwin.damage"].decode() == report["damage"][0]
 
 
-def test_a_table_that_exists_is_replaced_only_if_asked_and_only_by_a_whole_one(tmp_path):
+def test_an_existing_table_is_replaced_only_with_force_and_only_by_a_complete_one(tmp_path):
     path = recording(tmp_path)
     out = tmp_path / "out"
     out.mkdir()
@@ -224,7 +229,7 @@ def test_a_table_that_exists_is_replaced_only_if_asked_and_only_by_a_whole_one(t
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_full_disk_is_told_in_one_line_and_leaves_nothing(tmp_path, form):
+def test_a_full_disk_is_a_one_line_error_and_leaves_no_file(tmp_path, form):
     path = recording(tmp_path)
     with disk_of(2000):
         said = said_instead("export", path, "--to", form, "-o", tmp_path / "out")
@@ -263,7 +268,7 @@ def test_the_same_tray_of_two_sites_does_not_become_one_table(tmp_path):
         (("--to", "csv", "-o", "x.parquet"), "x.parquet: name a file that ends in .csv with -o, or a folder"),
     ],
 )
-def test_what_cannot_be_done_is_told_in_one_line(tmp_path, monkeypatch, arguments, words):
+def test_what_cannot_be_exported_is_a_one_line_error(tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     assert words in said_instead("export", recording(tmp_path), *arguments)
     assert names(tmp_path) == ["r.mcap"]

@@ -37,6 +37,8 @@ from schemas.messages import (
 from schemas.topics import health_key, tray_key
 from tests.support.score_data import made_up_tray
 
+GOLDEN = Path(__file__).parents[2] / "support" / "data" / "golden.mcap"
+
 
 def key_of(message: Message, site: str = "plant") -> str:
     if isinstance(message, Health):
@@ -126,7 +128,7 @@ def test_blocks_have_the_rows_asked_for_or_a_little_more(tmp_path, rows, lengths
     )
 
 
-def test_trays_come_apart_and_one_can_be_chosen(tmp_path):
+def test_each_tray_has_its_own_blocks_and_one_can_be_chosen(tmp_path):
     both = [raw(n, tray=tray, fans=fans) for n in range(5) for tray, fans in (("left", 2), ("right", 3))]
     path = write(tmp_path / "r.mcap", both)
     blocks = list(read_arrays(path, "raw", rows=20))
@@ -178,7 +180,7 @@ def test_an_event_is_a_row(tmp_path):
     assert (twins.fans, twins["kind"].tolist(), twins["sigma_rad_s"].tolist()) == (2, ["hybrid"], [[1, 1]])
 
 
-def test_health_is_of_no_tray_and_comes_in_the_order_it_was_received(tmp_path):
+def test_health_belongs_to_no_tray_and_keeps_its_order(tmp_path):
     healths = [
         Health(
             header=Header(stage, number, ""),
@@ -197,19 +199,25 @@ def test_health_is_of_no_tray_and_comes_in_the_order_it_was_received(tmp_path):
     assert "counters" not in block.columns
 
 
-def test_every_topic_can_be_told_apart_by_its_time():
+def test_the_first_column_of_every_topic_is_its_time():
     for kind in MESSAGE_TYPES:
         time, *others = block_columns(kind)
         assert time == ("host_receive_t_ns" if kind is Raw else "t_ns")
         assert others[-1] == "producer"
 
 
-def test_several_topics_are_read_in_one_go(tmp_path):
+def test_several_topics_are_read_in_one_pass(tmp_path):
     path = write(tmp_path / "r.mcap", [raw(0), alarm(0), raw(1)])
     assert [(block.topic, len(block)) for block in read_topics([path], ("raw", "alarm"))] == [("raw", 20), ("alarm", 1)]
 
 
-def test_parts_are_one_recording_whatever_their_order_and_what_is_in_two_counts_once(tmp_path):
+def test_a_topic_of_an_older_recording_is_read_by_both_names():
+    for topic in ("snapshot", "memory"):
+        (block,) = read_arrays(GOLDEN, topic)
+        assert (block.topic, len(block)) == ("snapshot", 9)
+
+
+def test_parts_in_any_order_are_one_recording_and_duplicates_count_once(tmp_path):
     first = write(tmp_path / "z.mcap", (raw(n) for n in range(6)))
     second = write(tmp_path / "a.mcap", (raw(n) for n in range(4, 9)), start=100)
     third = write(tmp_path / "b.mcap", (raw(n, producer="b") for n in range(9, 11)), start=200)
@@ -219,7 +227,7 @@ def test_parts_are_one_recording_whatever_their_order_and_what_is_in_two_counts_
     assert times(read_arrays([first, first], "raw")) == list(range(60))
 
 
-def test_producers_and_keys_count_their_messages_apart(tmp_path):
+def test_sequence_numbers_are_counted_per_producer_and_key(tmp_path):
     messages = [raw(0, producer="a"), raw(0, producer="b"), raw(0, tray="other")]
     arrays = read_arrays(write(tmp_path / "r.mcap", messages), "raw")
     assert (sum(len(block) for block in arrays), arrays.duplicated) == (30, 0)
@@ -234,29 +242,29 @@ def test_a_sequence_number_is_new_once_in_any_order(sequences):
     assert len(seen._first) == sum(1 for sequence in known if sequence - 1 not in known)
 
 
-def test_what_is_a_recording_in_itself_is_no_part_of_another(tmp_path):
+def test_an_imported_recording_is_not_a_part_of_another(tmp_path):
     made = [write(tmp_path / f"{n}.mcap", [raw(0)], {"source": "table.csv"}) for n in (1, 2)]
     with pytest.raises(RecordingError, match=r"1\.mcap: made by .* so no part of another"):
         read_arrays(made, "raw")
     assert times(read_arrays(made[0], "raw")) == list(range(10))
 
 
-def test_it_can_be_gone_through_again(tmp_path):
+def test_arrays_can_be_iterated_again(tmp_path):
     arrays = read_arrays(write(tmp_path / "r.mcap", [raw(0), raw(0), raw(1)]), "raw")
     assert times(arrays) == times(arrays)
     assert arrays.duplicated == 1
 
 
-def test_a_torn_part_is_read_up_to_where_it_tears_and_said_to_be(tmp_path):
+def test_a_truncated_part_is_read_up_to_its_end_and_reported(tmp_path):
     whole = write(tmp_path / "whole.mcap", (raw(n) for n in range(900)))
-    torn = tmp_path / "torn.mcap"
-    torn.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    truncated = tmp_path / "truncated.mcap"
+    truncated.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     after = write(tmp_path / "after.mcap", (raw(n) for n in range(900, 910)), start=5000)
-    arrays = read_arrays([torn, after], "raw")
+    arrays = read_arrays([truncated, after], "raw")
     found = times(arrays)
     assert 0 < len(found) < 9000
     assert found[-100:] == list(range(9000, 9100))
-    assert [line.split(":")[0] for line in arrays.damage] == [str(torn)]
+    assert [line.split(":")[0] for line in arrays.damage] == [str(truncated)]
     assert "is truncated" in arrays.damage[0]
 
 
@@ -278,7 +286,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
     assert long < in_the_long_one / 4
 
 
-def test_what_cannot_be_read_is_told_in_one_line(tmp_path):
+def test_what_cannot_be_read_is_a_one_line_error(tmp_path):
     path = write(tmp_path / "r.mcap", [raw(0)])
     with pytest.raises(RecordingError, match=r"no topic is called 'scor'; known: raw, grid, prediction, score"):
         read_arrays(path, "scor")

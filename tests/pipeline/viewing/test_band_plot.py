@@ -35,7 +35,7 @@ def test_without_alarms_one_fan_is_drawn(tmp_path: Path) -> None:
     assert plot_bands(trace_of("tray1", scores, "rpm"), tmp_path / "bands.png") == [0]
 
 
-def test_the_green_band_is_drawn_and_red_only_while_an_alarm_was_active(tmp_path: Path) -> None:
+def test_the_band_is_green_and_red_zones_appear_only_during_an_alarm(tmp_path: Path) -> None:
     scores, _ = made_up_tray(fans=3)
     trace = trace_of("tray1", scores, "rad/s")
     share = {}
@@ -59,7 +59,7 @@ def test_title_axis_and_legend_name_everything_with_its_unit(tmp_path: Path) -> 
     assert figure.axes[-1].get_xlabel() == "time since 2023-11-14 22:13:20 UTC (s)"
     texts = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert texts[:5] == ["measured", "twin", "twin ± 2σ", "outside the band (1 in 20 when healthy)", "alarm active"]
-    assert set(texts[5:]) == {"true fault", "state: normal", "suspect", "alarm", "returning", "unknown: not judged"}
+    assert set(texts[5:]) == {"true fault", "state: normal", "suspect", "alarm", "returning", "unknown: not scored"}
     assert (tmp_path / "bands.svg").stat().st_size > 0
 
 
@@ -84,7 +84,7 @@ def test_no_line_is_drawn_across_missing_samples() -> None:
         assert np.flatnonzero(np.isnan(y)).tolist() == [1000]
 
 
-def test_a_recording_in_two_parts_is_one_trace_in_order_of_time(tmp_path: Path) -> None:
+def test_a_recording_in_two_parts_is_one_trace_in_time_order(tmp_path: Path) -> None:
     scores, alarms = made_up_tray(seconds=4)
     second = record(tmp_path / "b.mcap", scores[20:], alarms)
     first = record(tmp_path / "a.mcap", scores[:20], [])
@@ -95,7 +95,7 @@ def test_a_recording_in_two_parts_is_one_trace_in_order_of_time(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("metadata", [{"speed_unit": "rpm"}, {"speed_unit.tray1": "rpm"}])
-def test_speeds_are_in_the_unit_that_the_recording_names(tmp_path: Path, metadata: dict[str, str]) -> None:
+def test_speeds_are_in_the_display_unit_of_the_recording(tmp_path: Path, metadata: dict[str, str]) -> None:
     scores, _ = made_up_tray(seconds=1)
     path = record(tmp_path / "rec.mcap", scores, [], metadata)
     assert read_trace([path], None, None).speed_unit == "rpm"
@@ -117,7 +117,7 @@ def test_the_command_plots_a_recording_with_its_true_faults(tmp_path: Path) -> N
     assert coverage(output, band_plot.FAULT) > 0.001
 
 
-def test_what_cannot_be_plotted_is_told_in_one_line(tmp_path: Path) -> None:
+def test_what_cannot_be_plotted_is_a_one_line_error(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=1)
     others, _ = made_up_tray(seconds=1, tray="tray2")
     both = record(tmp_path / "both.mcap", [*scores, *others], [])
@@ -125,10 +125,10 @@ def test_what_cannot_be_plotted_is_told_in_one_line(tmp_path: Path) -> None:
     output = tmp_path / "bands.png"
     for said, call in {
         "holds no scores": lambda: plot_recording([empty], output),
-        "say which with --tray: tray1, tray2": lambda: plot_recording([both], output),
+        "choose one with --tray: tray1, tray2": lambda: plot_recording([both], output),
         "no tray called 'x'; there are tray1, tray2": lambda: plot_recording([both], output, tray="x"),
         "has no fan 9": lambda: plot_recording([both], output, tray="tray1", fans=[9]),
-        "no account of faults": lambda: plot_recording([both], output, tray="tray1", truth=tmp_path / "none.json"),
+        "not a truth file": lambda: plot_recording([both], output, tray="tray1", truth=tmp_path / "none.json"),
         "cannot write the plot": lambda: plot_recording([both], tmp_path / "bands.wrong", tray="tray1"),
     }.items():
         with pytest.raises(UserError, match=said) as caught:

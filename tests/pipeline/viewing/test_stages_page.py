@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from pipeline.viewing.stages_page import CHANGES_SHOWN, SILENT_AFTER_NS, StagesPage, about
+from pipeline.viewing.stages_page import CHANGES_SHOWN, SILENT_AFTER_NS, StagesPage, rounded
 from schemas.messages import Header, Health, ModelCard, StageStatus
 
 NOW_NS = 1_760_000_000_000_000_000  # 2025-10-09 08:53:20
@@ -20,7 +20,7 @@ def health(
 def page_of(*healths: Health) -> StagesPage:
     page = StagesPage()
     for one in healths:
-        page.note_health(one)
+        page.add_health(one)
     return page
 
 
@@ -30,7 +30,7 @@ def section(text: str, title: str) -> list[str]:
     return next((part.splitlines()[2:] for part in parts if part.startswith(title)), [])
 
 
-def test_every_stage_has_one_row_with_what_it_said_last() -> None:
+def test_every_stage_has_one_row_with_its_latest_health() -> None:
     page = page_of(
         health("scorer", status=StageStatus.STARTING),
         health("acquisition", "tray1", lost=3),
@@ -42,20 +42,20 @@ def test_every_stage_has_one_row_with_what_it_said_last() -> None:
     ]
 
 
-def test_what_is_wrong_is_told_until_it_is_well_again() -> None:
+def test_a_problem_is_shown_until_it_is_over() -> None:
     page = page_of(health(status=StageStatus.DEGRADED, problem="no port"))
     assert section(page.text(NOW_NS), "What is wrong")[0] == "- **scorer**: no port"
-    page.note_health(health())
+    page.add_health(health())
     assert section(page.text(NOW_NS), "What is wrong") == []
 
 
-def test_a_stage_that_says_nothing_more_is_silent_unless_it_stopped_in_order() -> None:
+def test_a_stage_without_new_health_is_silent_unless_it_stopped_in_order() -> None:
     page = page_of(health("scorer"), health("resampler", status=StageStatus.STOPPED))
     assert "silent" not in page.text(NOW_NS)
     assert "silent" not in page.text(NOW_NS + SILENT_AFTER_NS)
     later = page.text(NOW_NS + SILENT_AFTER_NS + 1)
     assert "| scorer | **silent** | 0 |" in later and "| resampler | **stopped** | 0 |" in later
-    page.note_health(health("scorer"))
+    page.add_health(health("scorer"))
     assert "| scorer | ok | 0 |" in page.text(NOW_NS + SILENT_AFTER_NS + 1)
 
 
@@ -63,7 +63,7 @@ def test_a_stage_on_a_host_whose_clock_is_wrong_is_not_silent() -> None:
     assert "silent" not in page_of(health()).text(NOW_NS + 3600 * 10**9)
 
 
-def test_changes_are_told_newest_first_with_the_time_of_day_and_no_change_is_told_twice() -> None:
+def test_changes_are_listed_once_newest_first_with_their_time() -> None:
     ill = health(status=StageStatus.DEGRADED, problem="no port")
     page = page_of(health(), health(), ill, ill, health(lost=12))
     assert [line for line in section(page.text(NOW_NS), "Last changes") if line] == [
@@ -73,39 +73,39 @@ def test_changes_are_told_newest_first_with_the_time_of_day_and_no_change_is_tol
     ]
 
 
-def test_the_page_stays_short_however_much_is_said() -> None:
+def test_the_page_stays_short_however_many_changes_there_are() -> None:
     page = StagesPage()
     for number in range(1000):
         ill = health(status=StageStatus.DEGRADED, problem=f"problem {number} " + "x" * 10_000)
-        page.note_health(ill)
+        page.add_health(ill)
     text = page.text(NOW_NS)
     assert len([line for line in section(text, "Last changes") if line]) == CHANGES_SHOWN == 20
     assert "problem 999" in text and "problem 979" not in text and len(text) < 6000
 
 
-def test_a_loss_that_grows_and_grows_changes_the_page_ever_more_rarely() -> None:
+def test_a_growing_loss_changes_the_page_less_and_less_often() -> None:
     page = StagesPage()
     texts: list[str] = []
     for lost in range(1, 100_001):
-        if not texts or about(lost) != about(lost - 1):
-            page.note_health(health(lost=lost))
+        if not texts or rounded(lost) != rounded(lost - 1):
+            page.add_health(health(lost=lost))
             texts.append(page.text(NOW_NS))
     assert len(texts) < 400
     assert "| scorer | ok | **100,000** |" in texts[-1]
-    assert [about(count) for count in (0, 7, 99, 123, 128, 1_849)] == ["0", "7", "99", "120", "130", "1,800"]
+    assert [rounded(count) for count in (0, 7, 99, 123, 128, 1_849)] == ["0", "7", "99", "120", "130", "1,800"]
 
 
-def test_what_stages_say_is_shown_as_it_is_and_never_as_markup() -> None:
+def test_text_of_stages_is_never_interpreted_as_markup() -> None:
     page = page_of(health("twin_integrator", status=StageStatus.DEGRADED, problem="a | b\n# *c* [[tray]] `fans` <d>"))
     text = page.text(NOW_NS)
     assert r"a \| b \# \*c\* \[\[tray\]\] \`fans\` \<d\>" in text and r"| twin\_integrator |" in text
 
 
-def test_the_twin_in_force_is_told_for_every_tray() -> None:
+def test_the_twin_in_force_is_shown_for_every_tray() -> None:
     page = page_of(health())
     assert section(page.text(NOW_NS), "Twins in force") == []
     for twin in ("old", "new"):
-        page.note_twin(
+        page.add_twin(
             "tray1", ModelCard(header=Header("x", 0, "tray1"), t_ns=NOW_NS, twin=twin, kind="hybrid", sha256="")
         )
     assert section(page.text(NOW_NS), "Twins in force")[0] == "- tray1: new (hybrid), since 2025-10-09 08:53:20"

@@ -39,7 +39,7 @@ def view_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @needs_a_driver
-def test_the_viewer_draws_every_view_without_a_complaint(view_file: Path) -> None:
+def test_the_viewer_draws_every_view_without_warnings(view_file: Path) -> None:
     drawn = rerun_picture.draw_picture(view_file)
     assert drawn.reports == {
         "tray1 / fan 0 speed (rpm)": [],
@@ -78,7 +78,7 @@ def test_nothing_after_the_end_of_the_picture_is_drawn(view_file: Path) -> None:
 
 @pytest.mark.slow
 @needs_a_driver
-def test_the_command_writes_the_picture_and_says_what_it_shows(
+def test_the_command_writes_the_picture_and_lists_its_views(
     view_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "view.png"
@@ -90,7 +90,7 @@ def test_the_command_writes_the_picture_and_says_what_it_shows(
 
 @pytest.mark.slow
 @needs_a_driver
-def test_a_live_viewer_follows_a_recording_of_long_ago_though_the_stages_speak_today(tmp_path: Path) -> None:
+def test_a_live_viewer_follows_an_old_recording_while_health_is_of_today(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=5)
     port = free_port()
     core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core
@@ -107,7 +107,7 @@ def test_a_live_viewer_follows_a_recording_of_long_ago_though_the_stages_speak_t
     core.close()
 
 
-def test_without_a_driver_one_line_says_what_to_install(view_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_driver_is_a_one_line_error(view_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rerun_picture.sys, "platform", "linux")
     monkeypatch.setenv("VK_DRIVER_FILES", "/nowhere/icd.json")
     with pytest.raises(UserError, match="mesa-vulkan-drivers") as caught:
@@ -123,13 +123,15 @@ def test_without_a_driver_one_line_says_what_to_install(view_file: Path, monkeyp
     ],
 )
 @needs_a_driver
-def test_what_is_not_in_the_file_is_told_in_one_line(view_file: Path, options: dict[str, object], said: str) -> None:
+def test_an_unknown_tray_fan_or_view_is_a_one_line_error(
+    view_file: Path, options: dict[str, object], said: str
+) -> None:
     with pytest.raises(UserError, match=said):
         rerun_picture.draw_picture(view_file, **options)
 
 
 @needs_a_driver
-def test_a_file_that_is_no_view_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_view_is_a_one_line_error(tmp_path: Path) -> None:
     for path, said in ((tmp_path / "none.rrd", "no such file"), (tmp_path / "wrong.rrd", "not a file of Rerun's")):
         if said != "no such file":
             path.write_bytes(b"not a view, and long enough to be read as a header")
