@@ -1,4 +1,4 @@
-"""`fantwin up`: starts all stages as processes, restarts what dies, stops all in the order of the data."""
+"""`fantwin up`: starts all stages as processes, restarts those that die, stops all in the order of the data flow."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, pr
 from pipeline.launch.watcher import Watcher
 from schemas.topics import alive_key
 
-_LOOK_S = 0.05
-_MEETING_S = 10.0  # within which those who were there before are met, however busy the machine
-_OTHERS_S = 2.0  # within which all of them are, once one is
-_ORDERLY = (0, 3)  # how a stage ends in order: all well, or something was lost
+_POLL_S = 0.05
+_DISCOVERY_S = 10.0  # by then a process that was there before has been discovered, however busy the machine
+_OTHERS_S = 2.0  # after the first, by then all of them have been
+_ORDERLY = (0, 3)  # exit status of a stage that stopped in order: all well, or something was lost
 _READY_TIMEOUT_S = 30.0
 _STABLE_S = 10.0  # a stage that ran this long starts again at the shortest delay
 
 
 @dataclass
 class _Slot:
-    """One row of the process list and what has become of it."""
+    """One row of the process list and the state of its process."""
 
     row: StageProcess
     child: Child | None = None
@@ -49,50 +49,53 @@ class Outcome:
 
     @property
     def exit_code(self) -> int:
-        """0: all in order; 3: something was lost; 1: a stage failed at the end, or had to be killed."""
+        """0: stopped in order; 3: something was lost; 1: a stage failed at the end, or had to be killed."""
         if self.killed or self.failed:
             return 1
         return 3 if any(self.lost.values()) else 0
 
 
 class Launcher:
-    """Runs the stages of one configuration until told to stop."""
+    """Runs the stages of one configuration until it is stopped."""
 
     def __init__(self, config: Config, overrides: Sequence[str], say: Callable[[str], None]) -> None:
-        """`say` is given one line at a time on what happens."""
+        """`say` is called with one line for each event."""
         self._config = config
         self._path: Path = config.path
         self._overrides = tuple(overrides)
         self._say = say
-        self._told: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
         self._slots = [_Slot(row, delay_s=config.launcher.restart_delay_s) for row in process_list(config)]
         self.outcome = Outcome(run_folder=str(config.run_folder))
 
     def run(self, stop: threading.Event) -> Outcome:
-        """Start all, look after them until `stop` is set, stop all.
+        """Start all stages, supervise them until `stop` is set, stop all.
 
         Raises:
             UserError: a stage cannot run as configured; the others have been stopped.
         """
         with Bus(self._config.bus, stop) as bus:
-            self._refuse_a_second(bus, stop)
+            self._refuse_second_launcher(bus, stop)
             self._watcher = Watcher(bus, self._config.site)
             try:
                 self._start_all(stop)
-                while not stop.wait(_LOOK_S):
-                    self._look()
-                    self._tell()
-                self._bring_back()
+                while not stop.wait(_POLL_S):
+                    self._check_processes()
+                    self._report_changes()
+                self._restart_those_down()
             finally:
                 self._stop_all()
                 self.outcome.lost = self._watcher.losses()
         return self.outcome
 
-    def _refuse_a_second(self, bus: Bus, stop: threading.Event) -> None:
-        """Somebody at the endpoint is of this site, or of another that shares it, or no stage at all. A busy machine
-        takes seconds until the first is met; a router is met already."""
+    def _refuse_second_launcher(self, bus: Bus, stop: threading.Event) -> None:
+        """Refuse to start when stages of this site already run.
+
+        A process at the endpoint may belong to this site, to another site, or be no stage at all. On a busy machine it
+        takes seconds to discover the first; a router has been discovered as soon as the session is open.
+        """
         ours = {alive_key(self._config.site, slot.row.stage, slot.row.instance): slot.row.label for slot in self._slots}
-        began_s, met_s = time.monotonic(), math.inf if self._config.bus.mode == "peer" else time.monotonic()
+        began_s, discovered_s = time.monotonic(), math.inf if self._config.bus.mode == "peer" else time.monotonic()
         while True:
             alive = bus.alive(alive_key("*", "*", "*"))
             if running := [label for key, label in ours.items() if key in alive]:
@@ -101,14 +104,14 @@ class Launcher:
                     "stop that, or give this one another site or bus.endpoint"
                 )
             now_s = time.monotonic()
-            met_s = min(met_s, now_s if alive else math.inf)
-            if not bus.came_second or now_s >= min(began_s + _MEETING_S, met_s + _OTHERS_S):
+            discovered_s = min(discovered_s, now_s if alive else math.inf)
+            if not bus.came_second or now_s >= min(began_s + _DISCOVERY_S, discovered_s + _OTHERS_S):
                 return
-            if stop.wait(_LOOK_S):
+            if stop.wait(_POLL_S):
                 return
 
     def _start_all(self, stop: threading.Event) -> None:
-        """Whoever listens first: sources start when all others are ready, so that no first sample is missed."""
+        """Consumers first: sources start when all others are ready, so that no first sample is missed."""
         sources = [slot for slot in self._slots if not _listens_only(slot.row)]
         listeners = [slot for slot in self._slots if _listens_only(slot.row)]
         for group in (listeners, sources):
@@ -121,19 +124,19 @@ class Launcher:
     def _wait_until_ready(self, slots: list[_Slot], stop: threading.Event) -> None:
         deadline = time.monotonic() + _READY_TIMEOUT_S
         while not stop.is_set() and any(not slot.was_ready for slot in slots):
-            stop.wait(_LOOK_S)
-            self._look()
+            stop.wait(_POLL_S)
+            self._check_processes()
             if time.monotonic() > deadline:
                 late = ", ".join(slot.row.label for slot in slots if not slot.was_ready)
-                self._say(f"{late}: not ready after {_READY_TIMEOUT_S:.0f} s, going on; see `fantwin doctor`")
+                self._say(f"{late}: not ready after {_READY_TIMEOUT_S:.0f} s, continuing; see `fantwin doctor`")
                 return
 
     def _start(self, slot: _Slot) -> None:
         slot.child = Child(slot.row, self._path, self._overrides, lambda row, line: self._say(f"{row.label} | {line}"))
         self._say(f"{slot.row.label}: started, process {slot.child.process_id}")
 
-    def _look(self) -> None:
-        """See what has died and what is due to start again."""
+    def _check_processes(self) -> None:
+        """Notice stages that have died, and restart those that are due."""
         now = time.monotonic()
         for slot in self._slots:
             if slot.child is None:
@@ -149,19 +152,19 @@ class Launcher:
                 raise UserError(slot.child.last_line or f"{slot.row.label} cannot start as configured")
             self._plan_restart(slot, status, now)
 
-    def _tell(self) -> None:
-        """Say what has changed: troubles of stages, and alarms."""
+    def _report_changes(self) -> None:
+        """Report what has changed: problems of stages, and alarms."""
         for view in self._watcher.stages():
             name, problem = label(view.health), view.health.problem
-            if view.alive and problem != self._told.get(name, ""):
-                self._told[name] = problem
-                self._say(f"{name}: {problem or 'all well again'}")
-        for standing in self._watcher.standing():
-            alarm = standing.newest
+            if view.alive and problem != self._reported.get(name, ""):
+                self._reported[name] = problem
+                self._say(f"{name}: {problem or 'no problem any more'}")
+        for current in self._watcher.current_alarms():
+            alarm = current.newest
             fan = f"{alarm.header.tray} fan {alarm.fan}"
-            now = standing.line()
-            if now != self._told.get(fan):
-                self._told[fan] = now
+            now = current.line()
+            if now != self._reported.get(fan):
+                self._reported[fan] = now
                 self._say(now)
 
     def _plan_restart(self, slot: _Slot, status: int, now: float) -> None:
@@ -170,27 +173,27 @@ class Launcher:
         if now - slot.child.started_s > _STABLE_S:
             slot.delay_s = limits.restart_delay_s
         how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
-        self._say(f"{slot.row.label}: {how}, starting it again in {slot.delay_s:.1f} s")
+        self._say(f"{slot.row.label}: {how}, restarting in {slot.delay_s:.1f} s")
         self.outcome.restarts[slot.row.label] = self.outcome.restarts.get(slot.row.label, 0) + 1
         slot.child, slot.start_at_s = None, now + slot.delay_s
         slot.delay_s = min(2 * slot.delay_s, limits.restart_delay_max_s)
 
-    def _bring_back(self) -> None:
-        """A stage that is down at the end starts once more: it asks for what it missed, and so nothing is lost."""
+    def _restart_those_down(self) -> None:
+        """Start a stage that is down at the end once more: it requests what it missed, so nothing is lost."""
         started = [slot for slot in self._slots if slot.child or slot.start_at_s]
         down = [slot for slot in started if slot.child is None or slot.child.exit_status() is not None]
         for slot in down:
             self._start(slot)
         until_s = time.monotonic() + self._config.launcher.stop_timeout_s
         while time.monotonic() < until_s and not all(map(self._is_back, down)):
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
 
     def _is_back(self, slot: _Slot) -> bool:
         assert slot.child is not None
         return slot.child.exit_status() is not None or self._watcher.is_ready(slot.child.process_id)
 
     def _stop_all(self) -> None:
-        """In the order of the data: each stage ends when all that was sent to it has been handled."""
+        """Stop in the order of the data flow: each stage ends when it has processed all that was sent to it."""
         for slot in self._slots:
             if slot.child is None:
                 continue

@@ -14,7 +14,7 @@ from pathlib import Path
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 
-EXIT_CANNOT_START = 78  # the stage said in one line why it cannot run as configured (EX_CONFIG of sysexits.h)
+EXIT_CANNOT_START = 78  # the stage cannot run as configured; one line on stderr says why (EX_CONFIG of sysexits.h)
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def process_list(config: Config) -> list[StageProcess]:
 
 
 class Child:
-    """One running child. What it writes to standard error is handed on line by line."""
+    """One running child process. Each line of its standard error is passed to `on_line`."""
 
     def __init__(
         self,
@@ -60,8 +60,8 @@ class Child:
         self.row = row
         self.started_s = time.monotonic()
         self.last_line = ""
-        # its own process group, so that Ctrl-C in the terminal reaches the launcher alone, which stops in order;
-        # standard input is held open by the launcher: when it ends, however it ends, the child stops too
+        # a process group of its own, so that Ctrl-C in the terminal reaches only the launcher, which stops all;
+        # the launcher holds standard input open: when the launcher ends, however it ends, the child stops too
         self._process = subprocess.Popen(
             [*command, "--until-stdin-closes"],
             stdin=subprocess.PIPE,
@@ -84,7 +84,7 @@ class Child:
         return self._process.poll()
 
     def stop(self, timeout_s: float) -> int | None:
-        """Ask it to stop and wait; None when it had to be killed."""
+        """Terminate it and wait; returns its exit status, None when it had to be killed."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
         try:

@@ -1,4 +1,4 @@
-"""Watches a running site from outside: the last health of every session, and the alarms."""
+"""Watches a running site from outside: the last health of each session, and the alarms."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pipeline.launch.loss_accounting import losses
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Health
 from schemas.topics import alive_key, health_key, tray_key
+from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence
 
 
@@ -36,13 +37,11 @@ class StageView:
     def _rate(self, now: int, count: Callable[[Health], int]) -> float:
         if self.previous is None or self.health.t_ns <= self.previous.t_ns:
             return 0.0
-        return (now - count(self.previous)) / ((self.health.t_ns - self.previous.t_ns) / 1e9)
+        return (now - count(self.previous)) / ((self.health.t_ns - self.previous.t_ns) / NS_PER_S)
 
 
 class Watcher:
-    """Keeps the last health of every session, and what was said of the last alarm of every fan. Safe to read from any
-    thread.
-    """
+    """Keeps the last health of each session, and the messages about the last alarm of each fan. Thread-safe."""
 
     def __init__(self, bus: Bus, site: str) -> None:
         self._bus = bus
@@ -51,16 +50,16 @@ class Watcher:
         self._healths: dict[str, tuple[Health, Health | None]] = {}
         self._alive: set[str] = set()
         self._alarms: dict[tuple[str, int], dict[tuple[str, int], Alarm]] = {}
-        """of each fan the messages about its last occurrence, by who sent them"""
-        bus.watch_alive(alive_key(site, "*", "*"), self._note_alive)
-        bus.subscribe(health_key(site, "*", "*"), self._note_health)
-        bus.subscribe(tray_key(site, "*", "alarm"), self._note_alarm)
+        """by fan: the messages about its last occurrence, by producer and sequence number"""
+        bus.watch_alive(alive_key(site, "*", "*"), self._on_liveness)
+        bus.subscribe(health_key(site, "*", "*"), self._on_health)
+        bus.subscribe(tray_key(site, "*", "alarm"), self._on_alarm)
 
     def ask_for_past_alarms(self) -> None:
-        """Fetch the alarms that were raised before this watcher came."""
+        """Fetch the alarms that were raised before this watcher started."""
         key = tray_key(self._site, "*", "alarm")
         for _, payload in self._bus.recover(key, "*", 0, 2**63, lambda: time.sleep(0.005)):
-            self._note_alarm("", payload)
+            self._on_alarm("", payload)
 
     def stages(self) -> list[StageView]:
         """The latest session of every stage instance, by name."""
@@ -72,47 +71,47 @@ class Watcher:
             return [latest[name] for name in sorted(latest)]
 
     def is_ready(self, process_id: int) -> bool:
-        """Whether the session of this process is there and has begun its work."""
+        """Whether the session of this process is alive and at work."""
         return any(view.alive and view.health.process_id == process_id for view in self.stages())
 
     def alarms(self) -> list[Alarm]:
         """The last alarm message of every fan that had one, oldest first."""
-        return sorted((standing.newest for standing in self.standing()), key=lambda alarm: alarm.t_ns)
+        return sorted((current.newest for current in self.current_alarms()), key=lambda alarm: alarm.t_ns)
 
-    def standing(self) -> list[CurrentAlarm]:
-        """How the alarm of every fan that had one stands, by tray and fan."""
+    def current_alarms(self) -> list[CurrentAlarm]:
+        """The current alarm of each fan that had one, by tray and fan."""
         with self._lock:
-            return current_alarms(alarm for told in self._alarms.values() for alarm in told.values())
+            return current_alarms(alarm for messages in self._alarms.values() for alarm in messages.values())
 
     def losses(self) -> dict[str, int]:
         """What every stage has lost, over all its sessions; see `pipeline.launch.loss_accounting`."""
         with self._lock:
             return losses(health for health, _ in self._healths.values())
 
-    def _note_alive(self, key: str, alive: bool) -> None:
+    def _on_liveness(self, key: str, alive: bool) -> None:
         with self._lock:
             (self._alive.add if alive else self._alive.discard)(key)
 
-    def _note_health(self, _key: str, payload: bytes) -> None:
+    def _on_health(self, _key: str, payload: bytes) -> None:
         health = _decoded(Health, payload)
         if isinstance(health, Health):
             with self._lock:
                 before = self._healths.get(health.header.producer)
                 self._healths[health.header.producer] = (health, before[0] if before else None)
 
-    def _note_alarm(self, _key: str, payload: bytes) -> None:
+    def _on_alarm(self, _key: str, payload: bytes) -> None:
         alarm = _decoded(Alarm, payload)
         if isinstance(alarm, Alarm):
             with self._lock:
-                told = self._alarms.setdefault((alarm.header.tray, alarm.fan), {})
-                told[alarm.header.producer, alarm.header.sequence] = alarm
-                newest = in_sequence(told.values())[-1]
-                for name in [name for name, each in told.items() if each.onset_t_ns != newest.onset_t_ns]:
-                    del told[name]
+                messages = self._alarms.setdefault((alarm.header.tray, alarm.fan), {})
+                messages[alarm.header.producer, alarm.header.sequence] = alarm
+                newest = in_sequence(messages.values())[-1]
+                for name in [name for name, each in messages.items() if each.onset_t_ns != newest.onset_t_ns]:
+                    del messages[name]
 
 
 def _decoded(kind: type[Health] | type[Alarm], payload: bytes) -> object | None:
-    """A watcher judges nobody: what it cannot read, the stages count."""
+    """None for undecodable bytes: the stages count those."""
     try:
         return decode(kind, payload)
     except CodecError:

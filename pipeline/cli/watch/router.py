@@ -1,4 +1,4 @@
-"""`fantwin router`: the meeting point of stages on several hosts or in containers."""
+"""`fantwin router`: connects stages on several hosts or in containers."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def router(
 ) -> None:
     """Run a Zenoh router until Ctrl-C, for stages with bus.mode = "client".
 
-    On one host none is needed. It listens on loopback unless told otherwise: on other addresses whoever reaches
-    the port reads and writes everything.
+    On one host no router is needed. By default it listens on loopback only: on other addresses, anyone who reaches
+    the port can read and write everything.
 
     Example: fantwin router --listen tcp/0.0.0.0:7447
     """

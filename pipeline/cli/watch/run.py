@@ -30,7 +30,7 @@ def run(
 ) -> None:
     """Run one stage alone, until Ctrl-C.
 
-    It meets the other stages on the bus, whoever starts first. `fantwin up` starts all of them.
+    It discovers the other stages on the bus; the order of starting does not matter. `fantwin up` starts all of them.
 
     Example: fantwin run scorer -c fantwin.toml
     """
@@ -44,7 +44,7 @@ def run(
     except UserError as error:
         if not until_stdin_closes:
             raise
-        typer.echo(error, err=True)  # for the launcher, which then gives up instead of starting it again
+        typer.echo(error, err=True)  # for the launcher, which then gives up instead of restarting it
         raise typer.Exit(EXIT_CANNOT_START) from error
     if until_stdin_closes:
         threading.Thread(target=_set_when_stdin_closes, args=(runner.launcher_gone,), daemon=True).start()

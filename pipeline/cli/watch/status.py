@@ -94,7 +94,7 @@ def stage_table(watcher: Watcher, config: Config) -> Group:
         table.add_row(name, _state(view), f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}", *latency, lost)
         if health.problem and view.alive:
             problems.append(Text(f"{name}: {health.problem}", style="red"))
-    alarms = [_alarm_line(each) for each in watcher.standing() if is_listed(each.newest)]
+    alarms = [_alarm_line(each) for each in watcher.current_alarms() if is_listed(each.newest)]
     if not any(view.alive and view.health.stage == "scorer" for view in views):
         alarms.append(Text("alarms unknown: no scorer is alive", style="red"))
     return Group(*([table] if views else []), *problems, *(alarms or [Text("no alarms", style="green")]))
@@ -143,5 +143,5 @@ def as_json(watcher: Watcher) -> dict[str, object]:
             }
             for view in watcher.stages()
         ],
-        "alarms": [current.as_json() for current in watcher.standing()],
+        "alarms": [current.as_json() for current in watcher.current_alarms()],
     }

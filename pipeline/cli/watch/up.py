@@ -15,7 +15,7 @@ from pipeline.runtime.signals import stop_on_signals
 
 
 def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_output: JsonOption = False) -> None:
-    """Start all stages, restart what dies, stop all in order on Ctrl-C.
+    """Start all stages, restart those that die, stop all in order on Ctrl-C.
 
     Exit codes: 0 stopped in order, nothing lost; 1 could not start, or a stage failed or was killed at the end;
     3 something was lost.

@@ -67,12 +67,12 @@ def test_told_to_stop_before_all_is_ready_it_starts_no_source(chain):
 
 
 class LateBus:
-    """Who comes second meets the sessions of `site` so much later, by a clock that goes on while it waits."""
+    """A bus that discovers the sessions of `site` `after_s` seconds late. Its clock advances while it is waited for."""
 
     def __init__(self, site: str, after_s: float, *, came_second: bool = True) -> None:
         self.came_second = came_second
         self.now_s = 100.0
-        self._met_s = 100.0 + after_s
+        self._discovered_s = 100.0 + after_s
         self._site = site
 
     def monotonic(self) -> float:
@@ -84,30 +84,30 @@ class LateBus:
         return False
 
     def alive(self, _key: str) -> set[str]:
-        return {alive_key(self._site, "scorer", "all")} if self.now_s >= self._met_s else set()
+        return {alive_key(self._site, "scorer", "all")} if self.now_s >= self._discovered_s else set()
 
 
-def refuse_a_second(bus: Any, monkeypatch: pytest.MonkeyPatch, mode: str = "peer") -> float:
-    """How long it took to find nobody."""
+def search_time_s(bus: Any, monkeypatch: pytest.MonkeyPatch, mode: str = "peer") -> float:
+    """How long the launcher searched for another one in vain."""
     monkeypatch.setattr("pipeline.launch.launcher.time", bus)
     config = load_config(DEMO / "demo.toml", [f"bus.mode='{mode}'"])
-    Launcher(config, (), lambda _line: None)._refuse_a_second(bus, bus)
+    Launcher(config, (), lambda _line: None)._refuse_second_launcher(bus, bus)
     return bus.now_s - 100.0
 
 
-def test_a_second_up_looks_out_for_ours_for_ten_seconds(monkeypatch):
+def test_a_second_launcher_searches_for_stages_of_its_site_for_ten_seconds(monkeypatch):
     with pytest.raises(UserError, match=r"site 'demo' already runs at \S+ \(scorer\): stop that"):
-        refuse_a_second(LateBus(SITE, after_s=9.0), monkeypatch)
-    assert refuse_a_second(LateBus(SITE, after_s=99.0), monkeypatch) == pytest.approx(10.0, abs=0.1)
+        search_time_s(LateBus(SITE, after_s=9.0), monkeypatch)
+    assert search_time_s(LateBus(SITE, after_s=99.0), monkeypatch) == pytest.approx(10.0, abs=0.1)
 
 
-def test_once_another_site_is_met_ours_would_be_met_as_well(monkeypatch):
-    assert refuse_a_second(LateBus("other", after_s=1.0), monkeypatch) == pytest.approx(3.0, abs=0.1)
-    assert refuse_a_second(LateBus("", after_s=99.0), monkeypatch, mode="client") == pytest.approx(2.0, abs=0.1)
+def test_two_seconds_after_another_site_is_discovered_the_search_ends(monkeypatch):
+    assert search_time_s(LateBus("other", after_s=1.0), monkeypatch) == pytest.approx(3.0, abs=0.1)
+    assert search_time_s(LateBus("", after_s=99.0), monkeypatch, mode="client") == pytest.approx(2.0, abs=0.1)
 
 
-def test_who_comes_first_waits_for_nobody(monkeypatch):
-    assert refuse_a_second(LateBus(SITE, after_s=1.0, came_second=False), monkeypatch) == 0.0
+def test_the_first_launcher_does_not_search(monkeypatch):
+    assert search_time_s(LateBus(SITE, after_s=1.0, came_second=False), monkeypatch) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -123,10 +123,10 @@ def test_the_exit_code_says_whether_anything_was_lost(outcome, code):
     assert outcome.exit_code == code
 
 
-def test_who_is_stopped_while_it_looks_looks_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_search_ends_when_the_launcher_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     bus: Any = LateBus("elsewhere", 5.0)
     monkeypatch.setattr("pipeline.launch.launcher.time", bus)
     stop = threading.Event()
     stop.set()
-    Launcher(load_config(DEMO / "demo.toml"), (), lambda _line: None)._refuse_a_second(bus, stop)
+    Launcher(load_config(DEMO / "demo.toml"), (), lambda _line: None)._refuse_second_launcher(bus, stop)
     assert bus.now_s == 100.0
