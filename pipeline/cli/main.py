@@ -1,4 +1,4 @@
-"""The command `fantwin`: one table of commands, and one place where a user's error becomes one line."""
+"""The command `fantwin`: a table of commands, and the one place where a `UserError` becomes one line."""
 
 from __future__ import annotations
 
@@ -7,47 +7,52 @@ from collections.abc import Iterable, Sequence
 from importlib import import_module
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from pipeline.errors import UserError
 
-COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("watch.demo", "Watch"),
-    "up": ("watch.up", "Watch"),
-    "run": ("watch.run", "Watch"),
-    "status": ("watch.status", "Watch"),
-    "alarms": ("watch.alarms", "Watch"),
-    "wear": ("watch.wear", "Watch"),
-    "command": ("watch.command", "Watch"),
-    "doctor": ("watch.doctor", "Watch"),
-    "router": ("watch.router", "Watch"),
-    "replay": ("recordings.replay", "Recordings"),
-    "info": ("recordings.info", "Recordings"),
-    "recover": ("recordings.recover", "Recordings"),
-    "import": ("recordings.import_table", "Recordings"),
-    "export": ("recordings.export", "Recordings"),
-    "plot": ("recordings.plot", "Recordings"),
-    "picture": ("recordings.picture", "Recordings"),
-    "identify": ("twins.identify", "Twins"),
-    "train": ("twins.train", "Twins"),
-    "calibrate": ("twins.calibrate", "Twins"),
-    "evaluate": ("twins.evaluate", "Twins"),
-    "compare": ("twins.compare", "Twins"),
-    "report": ("twins.report", "Twins"),
-    "simulate": ("simulation.simulate", "Simulated tray"),
+PANELS = {
+    "watch": "Watch",
+    "recordings": "Recordings",
+    "twins": "Twins",
+    "simulation": "Simulated tray",
 }
-
+"""folder -> heading of its commands in `fantwin --help`"""
+COMMANDS = {
+    "demo": "watch.demo",
+    "up": "watch.up",
+    "run": "watch.run",
+    "status": "watch.status",
+    "alarms": "watch.alarms",
+    "wear": "watch.wear",
+    "command": "watch.command",
+    "doctor": "watch.doctor",
+    "router": "watch.router",
+    "replay": "recordings.replay",
+    "info": "recordings.info",
+    "recover": "recordings.recover",
+    "import": "recordings.import_table",
+    "export": "recordings.export",
+    "plot": "recordings.plot",
+    "picture": "recordings.picture",
+    "identify": "twins.identify",
+    "train": "twins.train",
+    "calibrate": "twins.calibrate",
+    "evaluate": "twins.evaluate",
+    "compare": "twins.compare",
+    "report": "twins.report",
+    "simulate": "simulation.simulate",
+}
+"""command -> its module in this folder; the module's function of the same name is the command"""
 VARIADIC: dict[str, tuple[str, ...]] = {
     "train": ("--validate",),
     "compare": ("--validate", "--test"),
     "calibrate": ("--verify",),
 }
-"""Options that take all words up to the next option, by command."""
+"""command -> options that take all words up to the next option"""
 
 app = typer.Typer(
     name="fantwin",
-    epilog="Exit codes: 0 all well; 1 could not be done, one line says why; 2 wrong usage; 3 something was lost.",
+    epilog="Exit codes: 0 success; 1 failed, one line says why; 2 wrong usage; 3 something was lost.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -57,40 +62,45 @@ app = typer.Typer(
 
 @app.callback()
 def _group() -> None:
-    """Digital twins of fans: run a healthy twin beside each fan, raise an alarm when the two part."""
+    """Digital twins of fans: run a healthy twin beside each fan, raise an alarm when the two diverge."""
 
 
 def _register(names: Iterable[str]) -> None:
     for name in names:
-        module, panel = COMMANDS[name]
-        function = getattr(import_module(f"pipeline.cli.{module}"), module.rpartition(".")[2])
-        app.command(name, rich_help_panel=panel)(function)
+        folder, module = COMMANDS[name].split(".")
+        function = getattr(import_module(f"pipeline.cli.{folder}.{module}"), module)
+        app.command(name, rich_help_panel=PANELS[folder])(function)
 
 
-def spell_out(words: Sequence[str]) -> list[str]:
-    """The words of a command line with each word of a variadic option given its own: `--validate C D` becomes
-    `--validate C --validate D`, which is all the parser understands."""
+def expand_variadic(words: Sequence[str]) -> list[str]:
+    """The command line with the option repeated before each of its values, as the parser requires.
+
+    `--validate C D` becomes `--validate C --validate D`.
+    """
     variadic = VARIADIC.get(words[0], ()) if words else ()
-    spelt: list[str] = []
-    option, given = "", False
+    expanded: list[str] = []
+    option, has_value = "", False
     for word in words:
         if word.startswith("-"):
-            option, given = (word, False) if word in variadic else ("", False)
-        elif option and given:
-            spelt.append(option)
+            option, has_value = (word, False) if word in variadic else ("", False)
+        elif option and has_value:
+            expanded.append(option)
         else:
-            given = True
-        spelt.append(word)
-    return spelt
+            has_value = True
+        expanded.append(word)
+    return expanded
 
 
 def main() -> None:
-    """Entry point: runs a command, turns a user's error into one line and exit code 1."""
-    words = spell_out(sys.argv[1:])
-    wanted = [word for word in words[:1] if word in COMMANDS]
-    _register(wanted or COMMANDS)  # a stage starts sooner when it does not import every command
+    """Entry point: runs a command, turns a `UserError` into one line and exit code 1."""
+    words = expand_variadic(sys.argv[1:])
+    named = [word for word in words[:1] if word in COMMANDS]
+    _register(named or COMMANDS)  # a stage's process imports its own command only
     try:
         app(words)
     except UserError as error:
+        from rich.console import Console  # noqa: PLC0415  a stage's process needs no rich
+        from rich.markup import escape  # noqa: PLC0415
+
         Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]fantwin:[/red] {escape(str(error))}")
         sys.exit(1)

@@ -11,7 +11,7 @@ from pipeline.errors import UserError
 
 def fantwin(name: str, *arguments: object) -> Result:
     """Run a command; the result has its exit code, standard output and exception."""
-    module, _ = COMMANDS[name]
+    module = COMMANDS[name]
     app = typer.Typer(pretty_exceptions_enable=False)
     app.command(name)(getattr(import_module(f"pipeline.cli.{module}"), module.rpartition(".")[2]))
     return CliRunner().invoke(app, [str(argument) for argument in arguments])

@@ -1,4 +1,4 @@
-"""`fantwin alarms`: which alarms stand, and what an operator has to say to them."""
+"""`fantwin alarms`: list the current alarms, and acknowledge, shelve or suppress them."""
 
 from __future__ import annotations
 
@@ -28,19 +28,20 @@ from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
 from schemas.messages import Action, Alarm, Diagnosis, Request, Severity, Transition, newest_t_ns
 from schemas.topics import alive_key, tray_key
+from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.alarm_text import CANNOT_TELL, CAUSES
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, until
 
-_MEET_S = 5.0  # several healths of every stage
-_LOOK_S = 0.02
-_WORTH_NAMING = 0.05  # probability of a cause
+_DISCOVERY_S = 5.0  # every stage sends several health messages in this time
+_POLL_S = 0.02
+_MIN_PROBABILITY = 0.05  # less probable causes are not listed
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 _STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 
 
-class Asked(StrEnum):
-    """What may be asked for, as it is typed."""
+class OperatorAction(StrEnum):
+    """The actions, as they are typed."""
 
     ACK = "ack"
     CONFIRM = "confirm"
@@ -55,29 +56,31 @@ class Asked(StrEnum):
 
     @property
     def action(self) -> Action:
-        """The same on the bus."""
-        return Action.ACKNOWLEDGE if self is Asked.ACK else Action[self.name]
+        """The action of the request message."""
+        return Action.ACKNOWLEDGE if self is OperatorAction.ACK else Action[self.name]
 
 
 def alarms(
-    asked: Annotated[Asked | None, typer.Argument(metavar="ACTION", help=f"{', '.join(Asked)}.")] = None,
-    tray: Annotated[str | None, typer.Argument(help="Of which tray.")] = None,
-    fan: Annotated[int | None, typer.Argument(help="Of which fan, counted from 0; without it: of all.")] = None,
+    asked: Annotated[
+        OperatorAction | None, typer.Argument(metavar="ACTION", help=f"{', '.join(OperatorAction)}.")
+    ] = None,
+    tray: Annotated[str | None, typer.Argument(help="The tray.")] = None,
+    fan: Annotated[int | None, typer.Argument(help="The fan, counted from 0; all fans if omitted.")] = None,
     config: ConfigOption = DEFAULT_CONFIG,
     duration: Annotated[
-        str | None, typer.Option("--for", metavar="TIME", help="How long to shelve, as 90s, 30m, 8h or 2d.")
+        str | None, typer.Option("--for", metavar="TIME", help="How long to shelve: 90s, 30m, 8h or 2d.")
     ] = None,
-    comment: Annotated[str, typer.Option(help="What the record should say.")] = "",
-    operator: Annotated[str | None, typer.Option(help="Who asks; the login name where it is not given.")] = None,
-    show_all: Annotated[bool, typer.Option("--all", help="List those that are over, too.")] = False,
-    watch: Annotated[bool, typer.Option("--watch", help="Go on, and print what happens to alarms.")] = False,
-    timeout_s: Annotated[float, typer.Option("--timeout", metavar="S", help="Wait so long for answers.")] = 5.0,
+    comment: Annotated[str, typer.Option(help="Comment for the record.")] = "",
+    operator: Annotated[str | None, typer.Option(help="Who requests it; default: the login name.")] = None,
+    show_all: Annotated[bool, typer.Option("--all", help="Also list alarms that are over.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Keep running and print every transition.")] = False,
+    timeout_s: Annotated[float, typer.Option("--timeout", metavar="S", help="How long to wait for answers.")] = 5.0,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """List the alarms that stand, or acknowledge, shelve ... the alarm of a fan (docs/reference/alarms.md).
+    """List the current alarms, or acknowledge, shelve ... the alarm of a fan (docs/reference/alarms.md).
 
-    Exit code 0: listed, or granted; 1: refused, or nobody answered.
+    Exit code 0: listed, or granted; 1: refused, or no answer.
 
     Example: fantwin alarms
 
@@ -87,13 +90,13 @@ def alarms(
     stop = threading.Event()
     if asked is None:
         if duration or comment or operator:
-            raise UserError("--for, --comment and --operator go with an action: fantwin alarms ack TRAY FAN")
+            raise UserError("--for, --comment and --operator need an action: fantwin alarms ack TRAY FAN")
         stop_on_signals(stop)
         with Bus(settings.bus, stop, listens=False) as bus:
             _list(bus, settings, stop, show_all=show_all, watch=watch, json_output=json_output)
         return
     if show_all or watch:
-        raise UserError(f"--all and --watch are for the list: leave them out with {asked}")
+        raise UserError(f"--all and --watch belong to the list: leave them out with {asked}")
     number, name = _named(settings, asked, tray, fan)
     request = Request(
         t_ns=time.time_ns(),
@@ -105,7 +108,7 @@ def alarms(
     )
     stop_on_signals(stop)
     with Bus(settings.bus, stop, listens=False) as bus:
-        meet(bus, Watcher(bus, settings.site), settings, stop)
+        wait_for_stages(bus, Watcher(bus, settings.site), settings, stop)
         fans = set(range(settings.tray(name).fans)) if number < 0 else {number}
         answers = ask(bus, settings.site, name, request, fans, timeout_s, stop)
     _report(asked, name, answers, json_output)
@@ -115,9 +118,9 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
     key = tray_key(config.site, "*", "alarm")
     news: queue.Queue[Alarm] = queue.Queue()
     bus.subscribe(key, lambda _key, payload: _decoded(payload, news.put))
-    meet(bus, Watcher(bus, config.site), config, stop)
+    wait_for_stages(bus, Watcher(bus, config.site), config, stop)
     known: list[Alarm] = []
-    for _, payload in bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_LOOK_S)):
+    for _, payload in bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_POLL_S)):
         _decoded(payload, known.append)
     found = [each for each in current_alarms(sorted(known, key=newest_t_ns)) if show_all or is_listed(each.newest)]
     console = Console(soft_wrap=True, highlight=False)
@@ -125,7 +128,7 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
         typer.echo(json.dumps({"alarms": [each.as_json() for each in found]}))
     else:
         for each in found:
-            console.print(standing_lines(each))
+            console.print(alarm_lines(each))
         if not found:
             console.print(Text("no alarms", style="green"))
     names = {(alarm.header.producer, alarm.header.sequence, alarm.header.tray) for alarm in known}
@@ -139,45 +142,45 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
         if json_output:
             typer.echo(json.dumps({"transition": _word(alarm), **_alone(alarm).as_json()}))
         else:
-            console.print(_happened_line(alarm))
+            console.print(_transition_line(alarm))
 
 
-def meet(bus: Bus, watcher: Watcher, config: Config, stop: threading.Event, what: str = "alarms") -> None:
-    """Wait until all stages that are there have been heard of: what is asked, or said, then reaches each of them.
+def wait_for_stages(bus: Bus, watcher: Watcher, config: Config, stop: threading.Event, what: str = "alarms") -> None:
+    """Wait until every stage that is alive has sent its health: requests and answers then reach all of them.
 
     Raises:
-        UserError: no scorer is among them.
+        UserError: no scorer is alive.
     """
-    until_s = time.monotonic() + _MEET_S
+    until_s = time.monotonic() + _DISCOVERY_S
     scorer = alive_key(config.site, "scorer", "all")
     while True:
         heard = {alive_key(config.site, view.health.stage, view.health.instance) for view in watcher.stages()}
         alive = bus.alive(alive_key(config.site, "*", "*"))
         if scorer in alive & heard and alive <= heard:
             return
-        if time.monotonic() > until_s or stop.wait(_LOOK_S):
+        if time.monotonic() > until_s or stop.wait(_POLL_S):
             break
     if scorer not in alive:
         where = f"no scorer of site {config.site!r} answers at {config.bus.endpoint}"
         raise UserError(f"{what} unknown: {where}; is `fantwin up -c {config.path}` running?")
 
 
-def _named(config: Config, asked: Asked, tray: str | None, fan: int | None) -> tuple[int, str]:
+def _named(config: Config, asked: OperatorAction, tray: str | None, fan: int | None) -> tuple[int, str]:
     """The number of the fan, -1 for all, and the tray."""
     names = ", ".join(each.name for each in config.trays)
     if tray is None:
-        raise UserError(f"say of which tray: fantwin alarms {asked} TRAY [FAN] (of {names})")
+        raise UserError(f"name a tray: fantwin alarms {asked} TRAY [FAN] (trays: {names})")
     fans = config.tray(tray).fans
     if fan is not None and not 0 <= fan < fans:
         raise UserError(f"fan {fan}: tray {tray} has fans 0 to {fans - 1}")
     return -1 if fan is None else fan, tray
 
 
-def _seconds(asked: Asked, duration: str | None) -> float:
+def _seconds(asked: OperatorAction, duration: str | None) -> float:
     if duration is None:
         return 0.0
-    if asked is not Asked.SHELVE:
-        raise UserError(f"--for goes with shelve, and not with {asked}")
+    if asked is not OperatorAction.SHELVE:
+        raise UserError(f"--for belongs to shelve, not to {asked}")
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", duration)
     if not match or float(match[1]) == 0:
         raise UserError(f"--for {duration}: give a time such as 90s, 30m, 8h or 2d")
@@ -187,18 +190,18 @@ def _seconds(asked: Asked, duration: str | None) -> float:
 def _login_name() -> str:
     try:
         return getpass.getuser()
-    except (KeyError, OSError):  # a container's user need not have a name
+    except (KeyError, OSError):  # the user of a container may have no name
         return f"user {os.getuid()}"
 
 
-def _report(asked: Asked, tray: str, answers: list[Alarm], json_output: bool) -> None:
+def _report(asked: OperatorAction, tray: str, answers: list[Alarm], json_output: bool) -> None:
     refused = [alarm for alarm in answers if alarm.transition == Transition.REFUSED]
     if json_output:
-        said = [
+        rows = [
             {"fan": alarm.fan, "transition": _word(alarm), "message": alarm.message, **_alone(alarm).as_json()}
             for alarm in answers
         ]
-        typer.echo(json.dumps({"tray": tray, "action": str(asked), "answers": said}))
+        typer.echo(json.dumps({"tray": tray, "action": str(asked), "answers": rows}))
     else:
         for alarm in answers if len(answers) > 1 else set(answers) - set(refused):
             typer.echo(f"{tray}: {_granted(alarm)}")
@@ -211,7 +214,7 @@ def _granted(alarm: Alarm) -> str:
 
 
 def _decoded(payload: bytes, then: Callable[[Alarm], None]) -> None:
-    """An onlooker judges nobody: what it cannot read, the stages count."""
+    """Unreadable messages are skipped here; the stages count them."""
     try:
         alarm = decode(Alarm, payload)
     except CodecError:
@@ -221,7 +224,7 @@ def _decoded(payload: bytes, then: Callable[[Alarm], None]) -> None:
 
 
 def _alone(alarm: Alarm) -> CurrentAlarm:
-    """What this message alone says."""
+    """The alarm as this message alone describes it."""
     return CurrentAlarm(alarm, alarm.message, alarm.causes, alarm.operator_name if alarm.acknowledged else "")
 
 
@@ -229,26 +232,26 @@ def _word(alarm: Alarm) -> str:
     return alarm.transition.name.lower()
 
 
-def standing_lines(standing: CurrentAlarm) -> Text:
-    """How an alarm stands, for people: two lines or three."""
-    alarm = standing.newest
-    by = f" by {standing.acknowledged_by}" if standing.acknowledged_by else ""
-    words = [f"{word}{by}" if word == "acknowledged" else word for word in standing.states()]
+def alarm_lines(current: CurrentAlarm) -> Text:
+    """The alarm for people, in up to three lines: state, causes, message."""
+    alarm = current.newest
+    by = f" by {current.acknowledged_by}" if current.acknowledged_by else ""
+    words = [f"{word}{by}" if word == "acknowledged" else word for word in current.states()]
     style = _STYLES.get(alarm.severity, "bold red") if is_presented(alarm) else "dim"
     text = Text.assemble((f"{_name(alarm)}  {alarm.severity.name:7}", style), f"  {', '.join(words)}")
     if alarm.severity != Severity.NONE:
         text.append(f"  since {clock(alarm.onset_t_ns)} ({_age(time.time_ns() - alarm.onset_t_ns)})")
-    if standing.causes:
-        evidence = standing.causes[0].evidence
-        told = not evidence or evidence in standing.message
-        why = "" if told else f": {evidence.removeprefix(f'{CAUSES[CANNOT_TELL]}: ')}"
-        text.append(f"\n    {_probable(standing.causes)}{why}")
-    if standing.message:
-        text.append(f"\n    {standing.message}")
+    if current.causes:
+        evidence = current.causes[0].evidence
+        is_shown = not evidence or evidence in current.message
+        why = "" if is_shown else f": {evidence.removeprefix(f'{CAUSES[CANNOT_TELL]}: ')}"
+        text.append(f"\n    {_probable(current.causes)}{why}")
+    if current.message:
+        text.append(f"\n    {current.message}")
     return text
 
 
-def _happened_line(alarm: Alarm) -> Text:
+def _transition_line(alarm: Alarm) -> Text:
     by = f" by {alarm.operator_name}" if alarm.operator_name else ""
     why = f"  {_probable(alarm.causes)}" if alarm.causes else ""
     word = Text(
@@ -265,14 +268,14 @@ def _name(alarm: Alarm) -> str:
 
 
 def _probable(causes: Iterable[Diagnosis]) -> str:
-    """The causes that are not all but excluded, the most probable first."""
+    """The causes with a probability worth listing, the most probable first."""
     return ", ".join(
-        f"{each.cause} {100 * each.probability:.0f} %" for each in causes if each.probability >= _WORTH_NAMING
+        f"{each.cause} {100 * each.probability:.0f} %" for each in causes if each.probability >= _MIN_PROBABILITY
     )
 
 
 def _age(age_ns: int) -> str:
-    seconds = max(0, age_ns // 1_000_000_000)
+    seconds = max(0, age_ns // NS_PER_S)
     for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):
         if seconds >= 2 * size:
             return f"{seconds // size} {unit}"

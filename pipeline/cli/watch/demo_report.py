@@ -1,4 +1,4 @@
-"""What happened in a run of the demo: the truth of the simulated tray against what was recorded."""
+"""The report on a run of the demo: the faults of the simulated tray against the recorded alarms."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ import numpy as np
 from pipeline.errors import UserError
 from pipeline.recordings.reading import read_recording
 from schemas.messages import Alarm, Array, Grid, Raw, Score, Transition
+from schemas.units import NS_PER_S
 
-SETTLING_NS = 5_000_000_000  # after a fault has gone the fan runs back: an alarm until then is that fault's
+SETTLING_NS = 5 * NS_PER_S  # an alarm is attributed to a fault until the fan has settled after its end
 
 
 @dataclass(frozen=True)
 class FaultSeen:
-    """One fault, and the alarm it led to. Times are ns since the epoch; None where there was none."""
+    """One fault and its alarm. Times are ns since the epoch; None where there was no alarm."""
 
     fan: int
     kind: str
@@ -28,18 +29,18 @@ class FaultSeen:
     alarm_ns: int | None
     cleared_ns: int | None
     cause: str = ""
-    """the most probable one, as it was known last"""
+    """most probable cause in the last diagnosis"""
     probability: float = 0.0
 
     @property
     def delay_s(self) -> float | None:
         """From the start of the fault to its alarm."""
-        return None if self.alarm_ns is None else (self.alarm_ns - self.start_ns) / 1e9
+        return None if self.alarm_ns is None else (self.alarm_ns - self.start_ns) / NS_PER_S
 
 
 @dataclass(frozen=True)
 class Summary:
-    """The account of a run; `problems` is empty when all went as it must."""
+    """The result of a run; `problems` is empty if the run met all expectations."""
 
     faults: list[FaultSeen]
     false_alarms: int
@@ -53,13 +54,13 @@ class Summary:
     problems: list[str] = field(default_factory=list)
 
     def to_json(self) -> str:
-        """As `summary.json` holds it."""
+        """The content of `summary.json`."""
         return json.dumps(asdict(self), indent=2, allow_nan=False)
 
 
 @dataclass
 class _Recorded:
-    """Each sample once, by tray and what names it there: what was sent twice makes up for nothing that was lost."""
+    """Each sample counted once, by tray and its identifier there, so that a repeated sample hides no lost one."""
 
     samples: set[tuple[str, int]] = field(default_factory=set)
     grid: set[tuple[str, int]] = field(default_factory=set)
@@ -69,16 +70,16 @@ class _Recorded:
 
 
 def summarise(truth_path: Path, recordings: Iterable[Path], lost_by_stage: dict[str, int]) -> Summary:
-    """Hold the recordings of one run against the tray's own account.
+    """Compare the recordings of one run with the simulated tray's own report.
 
     Raises:
-        UserError: a file is missing or is not what it should be.
+        UserError: a file is missing or unreadable.
     """
     truth = _read_truth(truth_path)
     recorded = _read(recordings)
     faults = [_match(fault, recorded.alarms) for fault in truth["faults"]]
     raised = [alarm for alarm in recorded.alarms if alarm.transition == Transition.RAISED]
-    false_alarms = sum(not _explained(alarm, truth["faults"]) for alarm in raised)
+    false_alarms = sum(not _is_explained(alarm, truth["faults"]) for alarm in raised)
     unrecorded = max(0, truth["samples_sent"] - len(recorded.samples))
     lost = unrecorded + len(recorded.grid - recorded.scored) + sum(lost_by_stage.values())
     latency_ms: dict[str, float | None] = {"p50": None, "p99": None}
@@ -104,7 +105,7 @@ def _read_truth(path: Path) -> dict[str, Any]:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: no account of the simulated tray: {error}; did `fantwin simulate` run?") from error
+        raise UserError(f"{path}: no report of the simulated tray: {error}; did `fantwin simulate` run?") from error
 
 
 def _read(recordings: Iterable[Path]) -> _Recorded:
@@ -137,8 +138,8 @@ def _match(fault: dict[str, Any], alarms: list[Alarm]) -> FaultSeen:
         return seen
     raised_ns = started[0].t_ns
     cleared_ns = next((a.t_ns for a in mine if a.transition == Transition.CLEARED and a.t_ns > raised_ns), None)
-    told = [a.causes[0] for a in mine if a.causes and raised_ns <= a.t_ns <= (cleared_ns or a.t_ns)]
-    first = told[-1] if told else None
+    diagnoses = [a.causes[0] for a in mine if a.causes and raised_ns <= a.t_ns <= (cleared_ns or a.t_ns)]
+    first = diagnoses[-1] if diagnoses else None
     return replace(
         seen,
         alarm_ns=raised_ns,
@@ -148,7 +149,7 @@ def _match(fault: dict[str, Any], alarms: list[Alarm]) -> FaultSeen:
     )
 
 
-def _explained(alarm: Alarm, faults: Iterable[dict[str, Any]]) -> bool:
+def _is_explained(alarm: Alarm, faults: Iterable[dict[str, Any]]) -> bool:
     return any(
         fault["fan"] == alarm.fan and fault["start_ns"] <= alarm.t_ns <= fault["stop_ns"] + SETTLING_NS
         for fault in faults

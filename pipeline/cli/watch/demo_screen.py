@@ -1,4 +1,4 @@
-"""What the demo shows while it runs: stages and alarms, and every fan beside its twin."""
+"""What the demo shows while it runs: stages, alarms, and every fan beside its twin."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ _STYLES = {FanState.NORMAL: "green", FanState.UNKNOWN: "dim", FanState.SUSPECT: 
 
 
 class DemoScreen:
-    """What is shown while the demo runs."""
+    """Follows a running demo and renders its state."""
 
     def __init__(self, config: Config, bus: Bus) -> None:
         self._config = config
         self._tray = config.trays[0]
         self._watcher = Watcher(bus, config.site)
         self._score: Score | None = None
-        bus.subscribe(tray_key(config.site, self._tray.name, "score"), self._note_score)
+        bus.subscribe(tray_key(config.site, self._tray.name, "score"), self._on_score)
 
-    def _note_score(self, _key: str, payload: bytes) -> None:
+    def _on_score(self, _key: str, payload: bytes) -> None:
         score = decode(Score, payload)
         assert isinstance(score, Score)
         self._score = score
 
     @property
     def has_score(self) -> bool:
-        """Whether any sample has been judged yet."""
+        """Whether a score has arrived."""
         return self._score is not None
 
     def render(self) -> Group:
-        """Stages and alarms, and below them the fans."""
-        starting = Text("the stages start", style="dim")
+        """Stages, alarms and fans, for a terminal."""
+        starting = Text("starting the stages", style="dim")
         stages = stage_table(self._watcher, self._config) if self._watcher.stages() else starting
         return Group(stages, self._fan_table())
 
     def line(self) -> str:
-        """The same in a line, where there is no terminal."""
+        """The state of the fans in one line, where there is no terminal."""
         if self._score is None:
             return "waiting for the first score"
         states = [FanState(state) for state in self._score.state[-1]]

@@ -14,22 +14,24 @@ from schemas.codec import CodecError, decode, encode, type_name
 from schemas.messages import Alarm, Header, Request
 from schemas.topics import BY_NAME, tray_key
 
-_LOOK_S = 0.05
+_POLL_S = 0.05
 
 
 def ask(
     bus: Bus, site: str, tray: str, request: Request, fans: set[int], timeout_s: float, stop: threading.Event
 ) -> list[Alarm]:
-    """Publish a request, once the stages have been met, and give the answer for each of `fans`, in their order.
+    """Publish a request and return the answers for `fans`, in the order of their numbers.
+
+    The stages must have been discovered before, or the request may reach none of them.
 
     Raises:
-        UserError: not all have been answered in time.
+        UserError: an answer is missing after `timeout_s`.
     """
     producer = f"alarms-{tray}-{secrets.token_hex(4)}"
     publisher = bus.publisher(tray_key(site, tray, "request"), BY_NAME["request"], type_name(Request), producer)
     name = f"{producer}/{publisher.published}"
-    heard: queue.Queue[bytes] = queue.Queue()
-    bus.subscribe(tray_key(site, tray, "alarm"), lambda _key, payload: heard.put(payload))
+    received: queue.Queue[bytes] = queue.Queue()
+    bus.subscribe(tray_key(site, tray, "alarm"), lambda _key, payload: received.put(payload))
     publisher.put(encode(replace(request, header=Header(producer, publisher.published, tray))))
     answers: dict[int, Alarm] = {}
     until_s = time.monotonic() + timeout_s
@@ -37,10 +39,10 @@ def ask(
         if time.monotonic() > until_s or stop.is_set():
             missing = ", ".join(map(str, sorted(fans - set(answers))))
             raise UserError(
-                f"tray {tray}: no answer for fan {missing} in {timeout_s:g} s: does a scorer judge this tray?"
+                f"tray {tray}: no answer for fan {missing} within {timeout_s:g} s: does a scorer run for this tray?"
             )
         try:
-            alarm = decode(Alarm, heard.get(timeout=_LOOK_S))
+            alarm = decode(Alarm, received.get(timeout=_POLL_S))
         except (queue.Empty, CodecError):
             continue
         if isinstance(alarm, Alarm) and alarm.request == name:

@@ -19,7 +19,7 @@ from rich.table import Table
 from pipeline.bus.session import Bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.progress import working
-from pipeline.cli.watch.alarms import meet
+from pipeline.cli.watch.alarms import wait_for_stages
 from pipeline.config.loading import load_config
 from pipeline.errors import UserError
 from pipeline.launch.watcher import Watcher
@@ -63,7 +63,7 @@ def wear(
         stop = threading.Event()
         stop_on_signals(stop)
         with Bus(settings.bus, stop, listens=False) as bus:
-            meet(bus, Watcher(bus, settings.site), settings, stop, what="wear")
+            wait_for_stages(bus, Watcher(bus, settings.site), settings, stop, what="wear")
             key = tray_key(settings.site, "*", "snapshot")
             replies = bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_POLL_S))
             snapshots = [snapshot for _, payload in replies for snapshot in _decoded(payload)]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.cli.watch.alarms import Asked, standing_lines
+from pipeline.cli.watch.alarms import OperatorAction, alarm_lines
 from pipeline.config.loading import load_config
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import Core, Parts, Stage
@@ -180,7 +180,7 @@ def told_of_one_fan() -> list[Alarm]:
 def test_a_cause_that_cannot_be_told_yet_is_said_once():
     (raised,) = [alarm for alarm in told_of_one_fan() if alarm.transition == Transition.RAISED]
     unknown = (Diagnosis(cause="cannot_tell", probability=0.6, evidence="cannot tell yet: the command is not moving"),)
-    _, cause, message = standing_lines(CurrentAlarm(raised, "too slow", unknown, "")).plain.splitlines()
+    _, cause, message = alarm_lines(CurrentAlarm(raised, "too slow", unknown, "")).plain.splitlines()
     assert (cause.strip(), message.strip()) == ("cannot_tell 60 %: the command is not moving", "too slow")
 
 
@@ -240,12 +240,12 @@ def test_watching_prints_what_happens_as_it_happens(site):
 def test_a_scorer_that_does_not_answer_is_told_after_the_timeout(site):
     site.core.deaf = True
     said = site.refused("ack", TRAY, 3, "--timeout", 0.5)
-    assert said == f"tray {TRAY}: no answer for fan 3 in 0.5 s: does a scorer judge this tray?"
+    assert said == f"tray {TRAY}: no answer for fan 3 within 0.5 s: does a scorer run for this tray?"
 
 
 @pytest.mark.parametrize("words", [(), ("ack", TRAY, 3)], ids=["list", "ack"])
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, monkeypatch):
-    monkeypatch.setattr("pipeline.cli.watch.alarms._MEET_S", 0.3)
+    monkeypatch.setattr("pipeline.cli.watch.alarms._DISCOVERY_S", 0.3)
     said = said_instead("alarms", *words, "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
     assert f"alarms unknown: no scorer of site '{SITE}' answers at {endpoint}" in said
 
@@ -253,14 +253,14 @@ def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, m
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("ack", "say of which tray: fantwin alarms ack TRAY [FAN] (of tray1)"),
+        ("ack", "name a tray: fantwin alarms ack TRAY [FAN] (trays: tray1)"),
         ("ack nobody", "no tray called 'nobody'"),
         ("ack tray1 8", "fan 8: tray tray1 has fans 0 to 7"),
         ("shelve tray1 3 --for 3", "--for 3: give a time such as 90s, 30m, 8h or 2d"),
         ("shelve tray1 3 --for 0m", "--for 0m: give a time such as 90s, 30m, 8h or 2d"),
-        ("ack tray1 3 --for 3m", "--for goes with shelve, and not with ack"),
-        ("ack tray1 3 --watch", "--all and --watch are for the list: leave them out with ack"),
-        ("--operator Ann", "--for, --comment and --operator go with an action"),
+        ("ack tray1 3 --for 3m", "--for belongs to shelve, not to ack"),
+        ("ack tray1 3 --watch", "--all and --watch belong to the list: leave them out with ack"),
+        ("--operator Ann", "--for, --comment and --operator need an action"),
     ],
 )
 def test_what_cannot_be_meant_is_one_line(words, said):
@@ -268,4 +268,4 @@ def test_what_cannot_be_meant_is_one_line(words, said):
 
 
 def test_every_action_can_be_typed():
-    assert [asked.action for asked in Asked] == [action for action in Action if action != Action.NONE]
+    assert [asked.action for asked in OperatorAction] == [action for action in Action if action != Action.NONE]

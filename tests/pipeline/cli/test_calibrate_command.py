@@ -10,7 +10,7 @@ from typing import Any
 import onnx
 import pytest
 
-from pipeline.cli.main import spell_out
+from pipeline.cli.main import expand_variadic
 from pipeline.cli.twins.calibration_check import Check
 from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.limits import Limits, Timing
@@ -184,7 +184,7 @@ def test_a_twin_that_is_not_there_is_told_by_the_name_that_was_given(folder: Pat
 def test_all_that_follows_verify_is_verified(folder: Path, calibrated: Path) -> None:
     more, other = folder / "more.mcap", folder / "other.mcap"
     simulated(more, 4, 30)
-    words = spell_out(list(map(str, ("calibrate", calibrated, "--verify", other, more, "--json"))))
+    words = expand_variadic(list(map(str, ("calibrate", calibrated, "--verify", other, more, "--json"))))
     result = fantwin(*words)
     assert json.loads(result.stdout)["verify"]["fan_hours"] == pytest.approx(FANS * 90 / 3600, rel=0.1)
 
@@ -192,10 +192,10 @@ def test_all_that_follows_verify_is_verified(folder: Path, calibrated: Path) -> 
 def test_what_verify_swallowed_is_told(folder: Path, calibrated: Path) -> None:
     other, healthy, twin = folder / "other.mcap", folder / "healthy.mcap", folder / "twin.onnx"
     for option in (("--false-alarms-per-day", PER_DAY), ("--extrapolate",), ("-o", folder / "never.onnx")):
-        words = spell_out(list(map(str, ("calibrate", twin, *option, "--verify", other, healthy))))
+        words = expand_variadic(list(map(str, ("calibrate", twin, *option, "--verify", other, healthy))))
         said = said_instead(*words)
         assert "those after --verify only test; name HEALTHY.mcap... before it" in said
-    words = spell_out(list(map(str, ("calibrate", calibrated, "--verify", other, twin))))
+    words = expand_variadic(list(map(str, ("calibrate", calibrated, "--verify", other, twin))))
     assert f"{twin}: --verify takes recordings" in said_instead(*words)
 
 

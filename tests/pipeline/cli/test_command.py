@@ -39,7 +39,7 @@ def test_a_command_that_the_line_did_not_take_is_one_line_that_says_why(chain, a
 def test_without_an_acquisition_nobody_takes_the_command(chain):
     done = fantwin(*chain.words("command"), "--fan", 3, 0.5)
     assert done.returncode == 1
-    said = "fantwin: no acquisition of tray tray1 took the command: is `fantwin up` running?\n"
+    said = "fantwin: no acquisition of tray tray1 received the command: is `fantwin up` running?\n"
     assert done.stderr == said
 
 

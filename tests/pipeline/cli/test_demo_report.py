@@ -166,5 +166,5 @@ def test_the_parts_of_a_run_are_counted_together(tmp_path):
 
 
 def test_without_the_trays_own_account_there_is_none(tmp_path):
-    with pytest.raises(UserError, match="no account of the simulated tray"):
+    with pytest.raises(UserError, match="no report of the simulated tray"):
         summarise(tmp_path / "truth.json", [], {})

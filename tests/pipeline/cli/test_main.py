@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import main as command_line
-from pipeline.cli.main import COMMANDS, spell_out
+from pipeline.cli.main import COMMANDS, PANELS, expand_variadic
 from tests.support.running_chain import DEMO, fantwin
 
 CONFIG = DEMO / "demo.toml"
@@ -41,7 +42,26 @@ def test_every_command_has_an_example_and_prints_json_if_asked(command):
 def test_help_lists_every_command_and_the_exit_codes():
     text = help_of()
     assert all(f" {command} " in text for command in COMMANDS)
-    assert "Exit codes: 0 all well" in text
+    assert "Exit codes: 0 success" in text
+
+
+def test_help_has_a_panel_for_each_folder_of_commands_in_order():
+    folders = {path.name for path in Path(command_line.__file__).parent.iterdir() if (path / "__init__.py").exists()}
+    assert set(PANELS) == folders == {module.split(".")[0] for module in COMMANDS.values()}
+    lines = help_of().splitlines()
+    panels = [next(n for n, line in enumerate(lines) if f" {panel} ─" in line) for panel in PANELS.values()]
+    assert panels == sorted(panels)
+
+
+def test_the_process_of_a_stage_imports_no_rich_and_no_other_command():
+    look = (
+        "import sys; from pipeline.cli import main; main._register(['run']);"
+        "print([m for m in sys.modules if m == 'rich' or m.startswith(('rich.', 'pipeline.cli.'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
+    assert set(ast.literal_eval(done.stdout)) == {
+        *("pipeline.cli.main", "pipeline.cli.options", "pipeline.cli.watch", "pipeline.cli.watch.run")
+    }
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +137,7 @@ def test_wrong_usage_has_its_own_exit_code():
 
 
 @pytest.mark.parametrize(
-    ("words", "spelt"),
+    ("words", "expanded"),
     [
         ("train A B --validate C D -o T", "train A B --validate C --validate D -o T"),
         ("train A --validate C D", "train A --validate C --validate D"),
@@ -129,8 +149,8 @@ def test_wrong_usage_has_its_own_exit_code():
         ("", ""),
     ],
 )
-def test_a_variadic_option_takes_all_words_up_to_the_next_option(words, spelt):
-    assert spell_out(words.split()) == spelt.split()
+def test_a_variadic_option_takes_all_words_up_to_the_next_option(words, expanded):
+    assert expand_variadic(words.split()) == expanded.split()
 
 
 def test_train_takes_every_recording_after_validate_as_one_to_judge_by(recording, tmp_path):
