@@ -13,7 +13,7 @@ COPY twin twin
 RUN pip install --no-cache-dir --no-deps . && useradd --create-home --uid 1000 fantwin \
     && mkdir /runs && chown fantwin /runs
 COPY pipeline/demo /demo
-# ONNX Runtime would report its use to its maker; caches go where a read-only container may write
+# without this, ONNX Runtime sends usage reports to its maker; caches go where a read-only container may write
 ENV ORT_DISABLE_TELEMETRY=1 MPLCONFIGDIR=/tmp/matplotlib
 USER fantwin
 WORKDIR /runs

@@ -36,7 +36,13 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "twin_integrator": (*COMMON, "scipy.signal", "onnxruntime"),
     "scorer": (*COMMON, "scipy.signal", "scipy.special", "scipy.stats", "scipy.ndimage"),
     "recorder": (*COMMON, "mcap.writer", "zstandard"),
-    "viewer": (*COMMON, "rerun", "rerun.blueprint", "pyarrow"),
+    "viewer": (
+        *COMMON,
+        "rerun",
+        "rerun.blueprint",
+        "pyarrow",
+        "pandas",
+    ),  # pyarrow imports pandas where it is installed
 }
 LIMIT = 1.3
 READY_S = 60.0
@@ -45,9 +51,11 @@ SETTLE_S = 3.0
 BARE = """
 import sys, time
 from importlib import import_module
+from importlib.util import find_spec
 start = time.perf_counter()
 for name in sys.argv[2:]:
-    import_module(name)
+    if name != "pandas" or find_spec(name):
+        import_module(name)
 print(time.perf_counter() - start, flush=True)
 import zenoh
 conf = zenoh.Config()

@@ -21,6 +21,7 @@ from pipeline.runtime.stage import load_stage
 ROOT = Path(__file__).parents[2]
 COMPOSE = (ROOT / "compose.yaml").read_text(encoding="utf-8")
 _BODIES = COMPOSE.partition("\nservices:\n")[2].partition("\nnetworks:\n")[0]
+ENABLED = [name for name, row in STAGES.items() if row.enabled_by == "default"]
 SERVICES: dict[str, str] = dict(re.findall(r"^  (\w+):\n((?:    .*\n|\n)+)", _BODIES, re.M))
 
 
@@ -37,8 +38,8 @@ def needs(service: str) -> set[str]:
     return direct.union(*map(needs, direct))
 
 
-def test_there_is_a_service_for_every_stage_and_the_router():
-    assert set(SERVICES) == {"router", *STAGES}
+def test_there_is_a_service_for_the_router_and_every_stage_enabled_by_default():
+    assert set(SERVICES) == {"router", *ENABLED}
 
 
 @pytest.mark.parametrize("service", SERVICES)
@@ -51,7 +52,7 @@ def test_every_command_is_one_that_fantwin_understands(service):
         group.commands[name].make_context(name, words)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", ENABLED)
 def test_a_service_runs_the_stage_it_is_named_after_with_the_configuration_in_the_image(stage):
     runs = [words for words in fantwin_commands(stage) if words[0] == "run"]
     assert runs
@@ -61,10 +62,10 @@ def test_a_service_runs_the_stage_it_is_named_after_with_the_configuration_in_th
 
 
 def test_a_stage_stops_before_those_that_read_from_it_and_all_before_the_router():
-    for writer, reader in product(STAGES, STAGES):
+    for writer, reader in product(ENABLED, ENABLED):
         if set(load_stage(writer).writes) & set(load_stage(reader).reads):
             assert reader in needs(writer), f"{writer} is read by {reader}"
-    assert all("router" in needs(stage) for stage in STAGES)
+    assert all("router" in needs(stage) for stage in ENABLED)
 
 
 def test_the_configuration_fits_the_services():
@@ -78,5 +79,6 @@ def test_the_configuration_fits_the_services():
     assert (told["--fans"], told["--link"], told["--speed-unit"]) == (str(tray.fans), tray.source.port, tray.speed_unit)
     assert f"runs:{config.run_folder}" in SERVICES["recorder"]
     assert f"runs:{config.run_folder}" in SERVICES["viewer"]
+    assert f"runs:{config.run_folder}" in SERVICES["scorer"], "it keeps its snapshot there"
     assert tray.twin is not None
     assert (config.folder / tray.twin).is_file()
