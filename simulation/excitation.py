@@ -1,4 +1,4 @@
-"""Command profiles over time, for fans that nobody commands.
+"""Command profiles over time, for fans without commands from a host.
 
 A profile is a function of time, `command(t_s) -> (fans,)`, within `low..high`. Each fan has its own; the same seed
 gives the same commands. Profiles are periodic; only those made of steps jump where a period begins again.
@@ -59,7 +59,7 @@ class Prbs:
 
 
 class Multisine:
-    """Sines of equal amplitude and random phase on harmonics of one period, about evenly spread in log frequency."""
+    """Sines of equal amplitude and random phase on harmonics of one period, about equally spaced in log frequency."""
 
     HARMONICS = np.array([1, 2, 3, 5, 8, 13, 21, 34, 55, 89])
 

@@ -59,26 +59,26 @@ class FanParameters:
 VARYING_PARAMETERS = ("J", "alpha", "C_D", "gain", "lag_s", "coulomb_v", "breakaway_v", "stribeck_rad_s")
 
 
-def tray_of_fans(fans: int, seed: int, spread: float = 0.03, base: FanParameters | None = None) -> FanParameters:
+def tray_of_fans(fans: int, seed: int, fan_variation: float = 0.03, base: FanParameters | None = None) -> FanParameters:
     """Parameters of a tray, each field (fans,). Fans differ by a normal variation, cut at three standard deviations.
 
-    spread: relative standard deviation of each of `VARYING_PARAMETERS`. The same seed gives the same fans.
+    fan_variation: relative standard deviation of each of `VARYING_PARAMETERS`. The same seed gives the same fans.
 
     Raises:
-        SimulationError: spread is negative or so large that a parameter could become negative.
+        SimulationError: fan_variation is negative or so large that a parameter could become negative.
     """
-    if not 0.0 <= spread < 0.3:
-        raise SimulationError(f"spread = {spread:g}: give a relative standard deviation from 0 to 0.3")
+    if not 0.0 <= fan_variation < 0.3:
+        raise SimulationError(f"fan_variation = {fan_variation:g}: give a relative standard deviation from 0 to 0.3")
     rng = np.random.default_rng(seed)
     base = base or FanParameters()
-    scattered = {}
+    varied = {}
     for field in fields(FanParameters):
         values = np.full(fans, getattr(base, field.name), dtype=np.float64)
         if field.name in VARYING_PARAMETERS:
-            values *= 1.0 + spread * np.clip(rng.normal(size=fans), -3.0, 3.0)
-        scattered[field.name] = values
-    scattered["breakaway_v"] = np.maximum(scattered["breakaway_v"], scattered["coulomb_v"])
-    return FanParameters(**scattered)
+            values *= 1.0 + fan_variation * np.clip(rng.normal(size=fans), -3.0, 3.0)
+        varied[field.name] = values
+    varied["breakaway_v"] = np.maximum(varied["breakaway_v"], varied["coulomb_v"])
+    return FanParameters(**varied)
 
 
 def drive(duty: Array, parameters: FanParameters) -> Array:

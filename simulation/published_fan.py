@@ -76,13 +76,13 @@ def rough_run(
     duration_s: float = 40.0,
     fans: int = 1,
     *,
-    spread: float = 0.1,
+    fan_variation: float = 0.1,
     lag_s: float = 0.0,
     low: float = ROUGH_RANGE[0],
 ) -> SimulatedRun:
-    """Rough fans under random stairs from `low` up. spread: the parameters of the fans vary from -spread to +spread."""
-    scatter = 1.0 + spread * np.linspace(-1.0, 1.0, fans) if fans > 1 else np.ones(1)
-    parts = [(_rough_torque, INERTIA * s, VISCOUS * s, DRAG * s) for s in scatter.tolist()]
+    """Rough fans under random stairs from `low` up. Parameters vary from -fan_variation to +fan_variation over fans."""
+    factors = 1.0 + fan_variation * np.linspace(-1.0, 1.0, fans) if fans > 1 else np.ones(1)
+    parts = [(_rough_torque, INERTIA * s, VISCOUS * s, DRAG * s) for s in factors.tolist()]
     return _measured(random_stairs(seed, duration_s, fans, low, ROUGH_RANGE[1]), parts, lag_s, seed, f"rough {seed}")
 
 

@@ -41,7 +41,7 @@ class TraySettings:
     """of commands, noise, jitter and losses"""
     fans_seed: int = 1
     """of the variation between fans"""
-    spread: float = 0.03
+    fan_variation: float = 0.03
     """relative standard deviation of the fans' parameters"""
     lost: float = 0.0
     """share of samples that are lost"""
@@ -76,7 +76,7 @@ class SimulatedTray:
         self.settings = settings
         self.fans = settings.fans
         profile, *others = np.random.SeedSequence(settings.seed).generate_state(5).tolist()
-        self.parameters = tray_of_fans(settings.fans, settings.fans_seed, settings.spread)
+        self.parameters = tray_of_fans(settings.fans, settings.fans_seed, settings.fan_variation)
         self._excitation = excitation(settings.profile, settings.fans, profile)
         self._jitter_rng, self._loss_rng, self._tacho_rng, self._dropout_rng = map(np.random.default_rng, others)
         self._state = at_rest(settings.fans)

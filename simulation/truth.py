@@ -35,7 +35,7 @@ def truth(tray: SimulatedTray, start_ns: int | None, *, complete: bool, counts: 
         "profile": settings.profile,
         "seed": settings.seed,
         "fans_seed": settings.fans_seed,
-        "spread": settings.spread,
+        "fan_variation": settings.fan_variation,
         "lost": settings.lost,
         "jitter_us": settings.jitter_us,
         "clock": asdict(settings.clock),

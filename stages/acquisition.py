@@ -6,8 +6,8 @@ Writes: topic `raw`: device clock (us, wraps), device sequence (wraps), host tim
 (rad/s).
 Timing: a message as soon as it has `block_size` samples; an incomplete block waits at most `block_wait_s`.
 
-One process and one core per tray. All sources share what is done here: a reading out of range is refused, what was
-lost or repeated is counted, speeds are converted, samples are put into messages.
+One process and one core per tray. What is done here is the same for all sources: check ranges, count lost and
+repeated samples, convert units, put samples into messages.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, Sta
 from schemas.messages import Array, Command, Raw
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
-QUALITY_WINDOW = 100  # readings by which the quality of the connection is judged
+QUALITY_WINDOW = 100  # readings from which the quality of the connection is computed
 FLOAT32_TOLERANCE = 1e-6
 
 

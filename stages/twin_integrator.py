@@ -10,7 +10,7 @@ command is held for `hold_limit_s`; then the free run ends, and a new one starts
 not valid in the first `warm_up_s` of a free run (WARMING_UP), nor in the first `warm_up_s` after a command that was out
 of the twin's range or too small to turn the rotor (OUT_OF_RANGE).
 
-The *torque balance* is computed beside it: the command given minus the command that a healthy fan needs for the
+The *torque balance* is computed as well: the command given minus the command that a healthy fan needs for the
 measured motion. It needs no free run and is available a third of a second after the first sample
 (scoring.detectors.torque_balance).
 """

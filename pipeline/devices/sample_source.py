@@ -59,7 +59,7 @@ class Rejected:
     kind: str
     detail: str
     harmless: bool = False
-    """True if it says nothing about the quality of the connection"""
+    """True if it is not a sign of a bad connection"""
 
 
 @dataclass(frozen=True, slots=True)

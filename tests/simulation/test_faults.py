@@ -9,7 +9,9 @@ from simulation.faults import Fault, check_schedule, disturbance, parse_fault, t
 from simulation.plant import Tacho
 from simulation.tray import SimulatedTray, TraySettings
 
-QUIET = TraySettings(fans=2, duration_s=12.0, profile="staircase", spread=0.0, jitter_us=0.0, tacho=Tacho(0.0, 0.0))
+QUIET = TraySettings(
+    fans=2, duration_s=12.0, profile="staircase", fan_variation=0.0, jitter_us=0.0, tacho=Tacho(0.0, 0.0)
+)
 
 
 def speeds(*faults: str, duty: float = 0.6) -> np.ndarray:

@@ -21,7 +21,7 @@ from simulation.plant import (
 )
 from simulation.tray import SimulatedTray, TraySettings
 
-ONE = tray_of_fans(1, seed=0, spread=0.0)
+ONE = tray_of_fans(1, seed=0, fan_variation=0.0)
 NO_FRICTION = dataclasses.replace(ONE, coulomb_v=np.zeros(1), breakaway_v=np.zeros(1))
 
 
@@ -123,19 +123,19 @@ def test_the_current_lags_by_its_time_constant() -> None:
     assert state.current_v[0] == pytest.approx(12.0 * (1.0 - np.exp(-1.0)), rel=1e-9)
 
 
-def test_fans_vary_by_the_spread_and_the_seed_determines_how() -> None:
-    tray = tray_of_fans(2000, seed=3, spread=0.03)
+def test_fans_vary_as_asked_and_the_seed_determines_how() -> None:
+    tray = tray_of_fans(2000, seed=3, fan_variation=0.03)
     assert np.std(tray.J) / 0.0148 == pytest.approx(0.03, rel=0.1)
     assert np.mean(tray.C_D) == pytest.approx(5.4772e-6, rel=0.01)
     assert np.abs(np.asarray(tray.alpha) / 0.0074 - 1.0).max() <= 0.09 + 1e-12
-    assert np.array_equal(tray.J, tray_of_fans(2000, seed=3, spread=0.03).J)
-    assert not np.array_equal(tray.J, tray_of_fans(2000, seed=4, spread=0.03).J)
-    assert np.all(tray_of_fans(5, seed=3, spread=0.0).J == 0.0148)
+    assert np.array_equal(tray.J, tray_of_fans(2000, seed=3, fan_variation=0.03).J)
+    assert not np.array_equal(tray.J, tray_of_fans(2000, seed=4, fan_variation=0.03).J)
+    assert np.all(tray_of_fans(5, seed=3, fan_variation=0.0).J == 0.0148)
 
 
-def test_a_spread_that_could_turn_a_parameter_negative_is_refused() -> None:
-    with pytest.raises(SimulationError, match=r"spread = 0\.5"):
-        tray_of_fans(2, seed=0, spread=0.5)
+def test_a_variation_that_could_turn_a_parameter_negative_is_refused() -> None:
+    with pytest.raises(SimulationError, match=r"fan_variation = 0\.5"):
+        tray_of_fans(2, seed=0, fan_variation=0.5)
 
 
 def test_the_tacho_reads_in_steps_with_the_noise_it_was_given() -> None:

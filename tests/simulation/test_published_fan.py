@@ -57,7 +57,7 @@ def test_the_rough_fan_stands_still_in_its_dead_zone():
     assert simulated.true_speed_rad_s[leaves_it].min() < 1.0
 
 
-def test_speeds_scatter_as_the_published_tables_say():
+def test_speeds_vary_as_the_published_tables_say():
     runs = [(published_training(seed), published_test(seed)) for seed in range(8)]
     training, test = np.mean([[part.true_speed_rad_s.std() for part in pair] for pair in runs], axis=0)
     # rmse / sqrt(1 - R2) of the physical model in table 2
@@ -83,10 +83,10 @@ def test_a_seed_gives_the_same_run_and_another_seed_another():
     assert not np.array_equal(longer[0].run.speed_rad_s, longer[1].run.speed_rad_s)
 
 
-def test_fans_of_a_tray_differ_by_the_spread():
-    tray = rough_run(4, 20.0, fans=3, spread=0.2)
+def test_fans_of_a_tray_differ_by_the_variation():
+    tray = rough_run(4, 20.0, fans=3, fan_variation=0.2)
     assert tray.run.fans == 3
-    middle = rough_run(4, 20.0, fans=3, spread=0.0)
+    middle = rough_run(4, 20.0, fans=3, fan_variation=0.0)
     np.testing.assert_array_equal(tray.true_speed_rad_s[:, 1], middle.true_speed_rad_s[:, 1])
     # Less inertia and drag: faster at the top.
     assert tray.true_speed_rad_s[:, 0].max() > middle.true_speed_rad_s[:, 0].max()

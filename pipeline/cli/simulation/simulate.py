@@ -56,7 +56,7 @@ def simulate(
         typer.Option(metavar="KIND:fan=N,start=S,stop=S,size=X", help="Scheduled fault. Repeatable."),
     ] = None,
     truth: Annotated[Path | None, typer.Option(help="JSON file for the ground truth.")] = None,
-    spread: Annotated[
+    fan_variation: Annotated[
         float, typer.Option(help="Variation between fans, relative standard deviation.", rich_help_panel=_IMPERFECTIONS)
     ] = 0.03,
     fans_seed: Annotated[
@@ -154,7 +154,7 @@ def simulate(
             profile=profile,
             seed=seed,
             fans_seed=fans_seed,
-            spread=spread,
+            fan_variation=fan_variation,
             lost=lost,
             jitter_us=jitter_us,
         )
