@@ -12,7 +12,7 @@ import logging
 import os
 import secrets
 import shutil
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +21,7 @@ from typing import Protocol
 from pydantic import Field, field_validator
 
 from pipeline.recordings.disk import DiskError
+from pipeline.recordings.held_messages import HeldMessages
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import RecordingError
@@ -121,8 +122,7 @@ class Recorder(Core):
         self._duplicated: dict[StreamId, int] = {}
         self._recorded: Counter[str] = Counter()
         self._counts: Counter[str] = Counter(lost_unwritten=0)
-        self._held: deque[Envelope] = deque()
-        self._held_bytes = 0
+        self._held = HeldMessages()
         self._lost_in_pause = 0
         self._problem = self._paused_because = ""
         self._now_ns = self._paused_ns = self._began_ns = self._checked_ns = now_ns
@@ -181,8 +181,7 @@ class Recorder(Core):
             self._resume()
         if self._part:
             self._attempt(lambda: self._end_part(has_ended=True))
-        self._counts["lost_unwritten"] += len(self._held)
-        self._held.clear()
+        self._counts["lost_unwritten"] += len(self._held.take_all())
         return ()
 
     def abort(self) -> None:
@@ -205,10 +204,8 @@ class Recorder(Core):
             return
         if self._unflushed_ns is None:
             self._unflushed_ns = min(envelope.received_t_ns, self._now_ns)
-        try:
-            self._part.add(envelope)
-        except RecordingError as error:
-            self._pause(str(error))
+        part = self._part
+        self._attempt(lambda: part.add(envelope))
 
     def _attempt(self, action: Callable[[], None]) -> None:
         """Do something that the disk may refuse, and pause if it does."""
@@ -218,7 +215,8 @@ class Recorder(Core):
             self._pause(str(error))
 
     def _begin(self, about: Mapping[str, str]) -> None:
-        self._began_ns = min(self._held[0].received_t_ns, self._now_ns) if self._held else self._now_ns
+        held_since_ns = self._held.first_received_t_ns
+        self._began_ns = self._now_ns if held_since_ns is None else min(held_since_ns, self._now_ns)
         self._part = self._parts.begin(self._began_ns, self._ledger, about)
         self._counts["parts"] += 1
         self._problem = ""
@@ -258,11 +256,7 @@ class Recorder(Core):
 
     def _hold(self, unwritten: Sequence[Envelope]) -> None:
         """Keep messages in memory until they can be recorded; beyond HELD_BYTES the oldest are lost."""
-        self._held.extend(unwritten)
-        self._held_bytes += sum(len(envelope.payload) for envelope in unwritten)
-        while self._held_bytes > HELD_BYTES:
-            lost = self._held.popleft()
-            self._held_bytes -= len(lost.payload)
+        for lost in self._held.add(unwritten, HELD_BYTES):
             self._ledger.add_lost(lost.key, lost.message.header.producer, lost.message.header.sequence)
             self._counts["lost_unwritten"] += 1
             self._lost_in_pause += 1
@@ -313,7 +307,7 @@ class Recorder(Core):
             "lost_in_pause": str(self._lost_in_pause),
         }
         try:
-            shortage = self._shortage(ROOM_TO_RESUME + self._held_bytes)
+            shortage = self._shortage(ROOM_TO_RESUME + self._held.size_bytes)
             if not shortage:
                 self._begin(about)
         except RecordingError as error:
@@ -326,8 +320,7 @@ class Recorder(Core):
             (self._now_ns - self._paused_ns) / NS_PER_S,
             self._lost_in_pause,
         )
-        held, self._held, self._held_bytes = self._held, deque(), 0
-        for envelope in held:
+        for envelope in self._held.take_all():
             self._record(envelope)
 
     def _count_duplicated(self, health: Health) -> None:
