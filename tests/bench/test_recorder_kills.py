@@ -17,14 +17,14 @@ def outcome(folder, endpoint, history: int) -> Outcome:
         kills.close()
 
 
-def test_with_what_the_bus_still_holds_nothing_is_lost(tmp_path, endpoint):
+def test_nothing_is_lost_that_the_bus_still_holds(tmp_path, endpoint):
     found = outcome(tmp_path, endpoint, history=1024)
     assert found.unreadable == []
     assert found.recorded > 1000
     assert (found.missing, found.counted_missing, found.repeated) == (0, 0, 0)
 
 
-def test_what_the_bus_no_longer_holds_is_missing_and_counted_to_the_message(tmp_path, endpoint):
+def test_messages_that_the_bus_no_longer_holds_are_counted_as_missing(tmp_path, endpoint):
     found = outcome(tmp_path, endpoint, history=4)
     assert found.unreadable == []
     assert found.missing == found.counted_missing > 100

@@ -1,4 +1,4 @@
-"""The recorder stage: everything of the table is kept, and a disk that refuses is told and counted."""
+"""The recorder stage: all topics are recorded, and a disk that refuses is reported and counted."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def health_of(producer: str, duplicated: int, stage: str = "recorder") -> Health
 
 @settings(deadline=None, max_examples=25)
 @given(st.tuples(*(any_message(topic.message) for topic in TOPICS)))
-def test_every_topic_of_the_table_is_recorded_as_it_came(tmp_path_factory, messages):
+def test_every_topic_is_recorded_with_its_bytes(tmp_path_factory, messages):
     run = context(tmp_path_factory.mktemp("recorder"))
     core = STAGE.build(run).core
     packets = [packet(m, topic.name, k + 1) for k, (m, topic) in enumerate(zip(messages, TOPICS, strict=True))]
@@ -181,13 +181,13 @@ def test_every_topic_of_the_table_is_recorded_as_it_came(tmp_path_factory, messa
     assert core.counters() == counted | {"lost_unwritten": 0, "parts": 1}
 
 
-def test_it_keeps_what_was_set_on_the_command_line(tmp_path):
+def test_metadata_hold_the_keys_set_on_the_command_line(tmp_path):
     STAGE.build(replace(context(tmp_path), overrides=("scorer.on_delay_s=1",))).core.close()
     head = read_metadata(tmp_path / "runs" / "recording.mcap")
     assert json.loads(head.metadata["overrides"]) == ["scorer.on_delay_s=1"]
 
 
-def test_it_keeps_the_configuration_and_the_twin(tmp_path):
+def test_configuration_and_twin_are_attached(tmp_path):
     (tmp_path / "twin.onnx").write_bytes(b"the twin")
     tray = TrayConfig(name="tray1", fans=2, speed_unit="rpm", twin=Path("twin.onnx"))
     STAGE.build(context(tmp_path, tray)).core.close()
@@ -202,14 +202,14 @@ def test_it_keeps_the_configuration_and_the_twin(tmp_path):
     assert len(head.metadata["twin_sha256.tray1"]) == 64
 
 
-def test_a_twin_that_cannot_be_read_does_not_keep_it_from_recording(tmp_path, caplog):
+def test_a_twin_that_cannot_be_read_does_not_prevent_recording(tmp_path, caplog):
     tray = TrayConfig(name="tray1", fans=2, twin=Path("nowhere.onnx"))
     with caplog.at_level(logging.WARNING):
         STAGE.build(context(tmp_path, tray)).core.close()
     assert "nowhere.onnx: the twin is not in the recording: No such file" in caplog.text
 
 
-def test_it_says_under_which_name_the_recording_of_a_killed_recorder_is_kept(tmp_path, caplog):
+def test_the_name_of_a_repaired_recording_is_logged(tmp_path, caplog):
     run = context(tmp_path)
     with RecordingWriter(run.run_folder / "recording.mcap", {}) as writer:
         writer.add_message(tray_key("plant", "tray1", "raw"), raw(0), 1)
@@ -220,7 +220,7 @@ def test_it_says_under_which_name_the_recording_of_a_killed_recorder_is_kept(tmp
     assert sorted(p.name for p in run.run_folder.iterdir()) == ["recording-2.mcap", "recording.mcap"]
 
 
-def test_a_place_that_cannot_be_written_is_told_in_one_line_at_the_start(tmp_path):
+def test_a_path_that_cannot_be_written_is_refused_at_the_start(tmp_path):
     (tmp_path / "runs").touch()
     with pytest.raises(StageError, match=r"recording\.mcap: cannot be written: .*; name another .*\(recorder\.file\)"):
         STAGE.build(context(tmp_path))
@@ -254,7 +254,7 @@ def test_behind_a_backlog_it_flushes_more_often_but_not_at_every_tick():
     assert disk.parts[0].flushes == 8
 
 
-def test_a_clock_that_is_set_back_stops_neither_flushing_nor_looking_nor_parts():
+def test_a_clock_that_is_set_back_stops_neither_flushes_nor_disk_checks_nor_parts():
     disk = Disk()
     core = recorder(disk, part_s=60.0)
     core.step(packet(raw(0), "raw", NOW_NS))
@@ -275,7 +275,7 @@ def test_a_clock_that_is_set_back_stops_neither_flushing_nor_looking_nor_parts()
     assert len(disk.parts) == 3
 
 
-def test_what_was_held_while_the_clock_was_set_back_is_flushed_in_time_too():
+def test_messages_held_while_the_clock_is_set_back_are_flushed_in_time_too():
     disk = Disk()
     disk.free = 0
     core = recorder(disk)
@@ -287,7 +287,7 @@ def test_what_was_held_while_the_clock_was_set_back_is_flushed_in_time_too():
     assert sequences(disk.parts[0]) == [0]
 
 
-def test_what_a_failed_flush_may_have_lost_is_recorded_again_in_the_next_part(tmp_path, monkeypatch):
+def test_messages_of_a_failed_flush_are_recorded_again_in_the_next_part(tmp_path, monkeypatch):
     run = context(tmp_path, min_free_bytes=0)
     core, start_ns = STAGE.build(run).core, context(tmp_path).started_t_ns
     sync, failures = os.fdatasync, iter([OSError(errno.EIO, "Input/output error")])
@@ -318,7 +318,7 @@ def test_without_messages_there_is_nothing_to_flush():
     assert disk.parts[0].flushes == 0
 
 
-def test_a_disk_that_refuses_is_told_and_what_comes_meanwhile_is_kept_and_recorded_when_it_no_longer_does():
+def test_messages_that_come_while_the_disk_refuses_are_kept_and_recorded_later():
     disk = Disk()
     core = recorder(disk)
     record(core, range(5))
@@ -341,7 +341,7 @@ def test_a_disk_that_refuses_is_told_and_what_comes_meanwhile_is_kept_and_record
     assert core.counters() == {"recorded_raw": 22, "lost_unwritten": 0, "parts": 2, "pauses": 1}
 
 
-def test_the_part_after_a_pause_tells_the_gap(caplog):
+def test_the_part_after_a_pause_states_the_gap(caplog):
     disk = Disk()
     core = recorder(disk)
     disk.gone = "/mnt: the disk is no longer mounted"
@@ -350,15 +350,15 @@ def test_the_part_after_a_pause_tells_the_gap(caplog):
         disk.gone = ""
         core.tick(NOW_NS + 5 * SECOND_NS)
     assert disk.parts[0].closed == "and goes on", "nobody holds on to a file of a disk that is gone"
-    told = disk.parts[1].about
-    assert int(told["resumed_t_ns"]) - int(told["paused_t_ns"]) == 4 * SECOND_NS
-    assert told["paused_because"].startswith("/mnt: the disk is no longer mounted")
-    assert told["lost_in_pause"] == "0"
+    shown = disk.parts[1].about
+    assert int(shown["resumed_t_ns"]) - int(shown["paused_t_ns"]) == 4 * SECOND_NS
+    assert shown["paused_because"].startswith("/mnt: the disk is no longer mounted")
+    assert shown["lost_in_pause"] == "0"
     assert "NOTHING IS RECORDED: /mnt: the disk is no longer mounted" in caplog.text
     assert "recording resumed after 4.0 s; messages lost in between: 0" in caplog.text
 
 
-def test_what_does_not_fit_into_memory_during_a_pause_is_lost_and_counted_the_oldest_first(monkeypatch):
+def test_a_pause_that_exceeds_memory_loses_the_oldest_messages_and_counts_them(monkeypatch):
     monkeypatch.setattr(stages.recorder, "HELD_BYTES", 10 * len(encode(raw(100))))
     disk = Disk()
     core = recorder(disk)
@@ -386,7 +386,7 @@ def test_a_disk_that_refuses_the_last_chunk_is_counted_too():
     assert core.problem()
 
 
-def test_with_too_little_room_it_pauses_and_the_part_is_ended_in_order():
+def test_without_enough_free_space_it_pauses_and_finishes_the_part():
     disk = Disk()
     core = recorder(disk, min_free_bytes=50_000_000)
     record(core, range(3))
@@ -404,7 +404,7 @@ def test_with_too_little_room_it_pauses_and_the_part_is_ended_in_order():
     assert len(disk.parts) == 2
 
 
-def test_it_starts_and_waits_where_the_disk_is_full_already():
+def test_a_recorder_that_starts_on_a_full_disk_waits():
     disk = Disk()
     disk.free = 0
     core = recorder(disk)
@@ -416,7 +416,7 @@ def test_it_starts_and_waits_where_the_disk_is_full_already():
     assert sequences(disk.parts[0]) == [0, 1, 2]
 
 
-def test_the_oldest_parts_go_one_at_a_time_if_they_may(caplog):
+def test_the_oldest_parts_are_deleted_one_at_a_time_if_allowed(caplog):
     disk = Disk()
     disk.oldest, disk.freed_by_each = ["r.mcap", "r-2.mcap", "r-3.mcap"], 10_000_000
     core = recorder(disk, min_free_bytes=50_000_000, delete_oldest=True)
@@ -438,7 +438,7 @@ def test_when_there_is_nothing_left_to_delete_it_pauses():
     assert core.problem().startswith("NOTHING IS RECORDED")
 
 
-def test_a_part_that_is_large_enough_is_followed_by_the_next():
+def test_a_new_part_begins_at_the_size_limit():
     disk = Disk()
     core = recorder(disk, part_bytes=1_000_000)
     for sequence in range(30):
@@ -451,7 +451,7 @@ def test_a_part_that_is_large_enough_is_followed_by_the_next():
     assert [part.closed for part in disk.parts] == ["and goes on"] * (len(disk.parts) - 1) + ["at the end"]
 
 
-def test_a_part_that_is_long_enough_is_followed_by_the_next():
+def test_a_new_part_begins_at_the_time_limit():
     disk = Disk()
     core = recorder(disk, part_s=60.0)
     for second in range(150):
@@ -474,7 +474,7 @@ def test_each_part_begins_with_the_last_card_of_each_twin():
     assert (tray_key("plant", "tray1", "twin"), "twin_integrator-1") not in disk.parts[1].ledger.counts
 
 
-def test_what_a_killed_recorder_has_recorded_already_is_not_recorded_again():
+def test_messages_that_a_killed_recorder_had_recorded_are_not_recorded_again():
     disk = Disk(before={(RAW_KEY, "acquisition-1"): 7})
     core = recorder(disk)
     record(core, range(5, 10))
@@ -484,7 +484,7 @@ def test_what_a_killed_recorder_has_recorded_already_is_not_recorded_again():
     assert (account.messages, account.missing, account.duplicated) == (3, 0, 2)
 
 
-def test_what_was_lost_between_a_killed_recorder_and_the_next_is_in_the_ledger():
+def test_messages_lost_between_a_killed_recorder_and_the_next_are_in_the_ledger():
     disk = Disk(before={(RAW_KEY, "acquisition-1"): 7})
     core = recorder(disk)
     record(core, range(10, 12))
@@ -492,11 +492,11 @@ def test_what_was_lost_between_a_killed_recorder_and_the_next_is_in_the_ledger()
     assert disk.parts[0].ledger.counts[RAW_KEY, "acquisition-1"].missing == 3
 
 
-def test_what_the_bus_brought_twice_is_in_the_ledger_of_the_part_in_which_it_came():
+def test_messages_that_the_bus_repeated_are_in_the_ledger_of_their_part():
     disk = Disk()
     core = recorder(disk, part_s=60.0)
-    for told in (health_of("recorder-1", 0), health_of("recorder-2", 50), health_of("recorder-1", 4)):
-        core.step(packet(told, "health", NOW_NS))
+    for shown in (health_of("recorder-1", 0), health_of("recorder-2", 50), health_of("recorder-1", 4)):
+        core.step(packet(shown, "health", NOW_NS))
     core.tick(NOW_NS + 60 * SECOND_NS)
     core.step(packet(health_of("scorer-1", 70, stage="scorer"), "health", NOW_NS))
     core.step(packet(health_of("recorder-1", 7), "health", NOW_NS))

@@ -1,4 +1,4 @@
-"""A recorder that is killed again and again under load, and what is found afterwards held against what was sent."""
+"""A recorder that is killed repeatedly under load; its recording is compared with what was sent."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FLUSH_S = 1.0
 
 @dataclass
 class Outcome:
-    """What became of a recording."""
+    """The state of a recording after all kills."""
 
     kills: int
     parts: int = 0
@@ -46,9 +46,9 @@ class Outcome:
     kills_of_recording: int = 0
     """kills of a recorder that had started and caught up with what the bus held"""
     oldest_s: float = 0.0
-    """of those missing that such a kill has cost: the age of the oldest at the kill"""
+    """age, at such a kill, of the oldest message that the kill lost"""
     newest_s: float = 0.0
-    """at such a kill: how long ago the newest message in the file had been received"""
+    """age, at such a kill, of the newest message in the file"""
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ class Stages:
         """Stop in order."""
         for stage in CHAIN:
             self._put_out(stage, self._core(stage).close(), from_timer=True)
-        self.writer.close()
+        self.writer.finish()
 
     def _begin(self, stage: str) -> Session:
         self._lives += 1

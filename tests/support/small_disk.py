@@ -9,7 +9,7 @@ SIZE_BYTES = 8 << 20
 
 
 def mount(place: Path) -> bool:
-    """Mount an empty disk of `SIZE_BYTES`; whether that is possible here."""
+    """Mount an empty disk of `SIZE_BYTES`. Returns False where that is not permitted."""
     words = ["mount", "-t", "tmpfs", "-o", f"size={SIZE_BYTES}", "tmpfs", str(place)]
     try:
         return subprocess.run(words, capture_output=True, check=False).returncode == 0
@@ -18,5 +18,5 @@ def mount(place: Path) -> bool:
 
 
 def unmount(place: Path) -> None:
-    """Take it away, even from under files that are open."""
+    """Unmount it, even while files are open."""
     subprocess.run(["umount", "-l", str(place)], capture_output=True, check=False)

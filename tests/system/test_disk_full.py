@@ -1,4 +1,4 @@
-"""A real disk that fills, or goes: earlier parts stay intact, recording goes on when it can, and the gap is told."""
+"""A real disk that fills or is unmounted: earlier parts stay intact, recording resumes, and the gap is reported."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.pipeline.recordings.test_recordings import raw
 from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, packet
 from tests.support.small_disk import SIZE_BYTES, mount, unmount
 
-LINE = (RAW_KEY, "acquisition-1")
+STREAM = (RAW_KEY, "acquisition-1")
 
 
 class Run:
@@ -55,7 +55,7 @@ class Run:
 
 
 def assert_readable(path: Path) -> None:
-    """By others, with every checksum right."""
+    """By the mcap library, with every checksum right."""
     with path.open("rb") as file:
         for _ in make_reader(file, validate_crcs=True).iter_messages():
             pass
@@ -70,7 +70,7 @@ def until(happens, run: Run) -> None:
     raise AssertionError("it never happened")
 
 
-def test_a_disk_that_fills_costs_nothing_that_memory_can_hold(small_disk, caplog):
+def test_a_full_disk_loses_nothing_that_memory_can_hold(small_disk, caplog):
     run = Run(small_disk, min_free_bytes=0, part_bytes=1_000_000)
     until(lambda: len(run.parts()) == 3, run)
     before = {path: path.read_bytes() for path in run.parts()}
@@ -92,14 +92,14 @@ def test_a_disk_that_fills_costs_nothing_that_memory_can_hold(small_disk, caplog
     assert run.core.counters()["lost_unwritten"] == 0
     assert run.sequences() == list(range(run.sent))
     assert not list(run.folder.glob("*.active"))
-    (told,) = [head for head in (read_metadata(path).metadata for path in run.parts()) if "paused_t_ns" in head]
-    assert int(told["resumed_t_ns"]) - int(told["paused_t_ns"]) >= 5 * SECOND_NS
-    assert "No space left on device" in told["paused_because"]
+    (shown,) = [head for head in (read_metadata(path).metadata for path in run.parts()) if "paused_t_ns" in head]
+    assert int(shown["resumed_t_ns"]) - int(shown["paused_t_ns"]) >= 5 * SECOND_NS
+    assert "No space left on device" in shown["paused_because"]
     for path in run.parts():
         assert_readable(path)
 
 
-def test_what_memory_cannot_hold_is_missing_in_the_ledger_message_by_message(small_disk, monkeypatch):
+def test_messages_that_memory_cannot_hold_are_missing_in_the_ledger(small_disk, monkeypatch):
     monkeypatch.setattr("stages.recorder.HELD_BYTES", 400_000)
     run = Run(small_disk, min_free_bytes=3_000_000)
     until(run.core.problem, run)
@@ -115,12 +115,12 @@ def test_what_memory_cannot_hold_is_missing_in_the_ledger_message_by_message(sma
     holes = sum(later - earlier - 1 for earlier, later in pairwise(found))
     contents = contents_of(part)
     lost = run.core.counters()["lost_unwritten"]
-    assert contents.streams[LINE].missing == holes + (found[0] - contents.before[LINE]) == lost > 0
+    assert contents.streams[STREAM].missing == holes + (found[0] - contents.before[STREAM]) == lost > 0
     assert contents.metadata["lost_in_pause"] == str(lost)
     assert found[-1] == run.sent - 1
 
 
-def test_the_disk_stays_bounded_where_the_oldest_parts_may_go(small_disk):
+def test_disk_use_is_bounded_if_the_oldest_parts_may_be_deleted(small_disk):
     run = Run(small_disk, min_free_bytes=3_000_000, part_bytes=1_000_000, delete_oldest=True)
     for _ in range(300):  # 30 MB, on a disk of 8
         run.second()
@@ -136,7 +136,7 @@ def test_the_disk_stays_bounded_where_the_oldest_parts_may_go(small_disk):
         assert scan(path).is_intact
 
 
-def test_a_disk_that_is_taken_away_is_waited_for_and_its_place_is_not_written_on(small_disk):
+def test_an_unmounted_disk_is_waited_for_and_its_mount_point_not_written(small_disk):
     run = Run(small_disk, min_free_bytes=0)
     for _ in range(3):
         run.second()
@@ -193,5 +193,5 @@ def test_a_recorder_killed_on_a_full_disk_is_followed_by_one_that_waits_and_lose
     assert run.sequences() == [*range(recorded), *range(250, run.sent)]
 
 
-def test_there_must_be_more_room_than_the_least_before_it_goes_on():
+def test_resuming_needs_more_free_space_than_the_minimum():
     assert ROOM_TO_RESUME > 200_000, "or it would pause again at once, part after part"

@@ -1,4 +1,4 @@
-"""`fantwin info`: what is in a recording, by its index, and the same where all of it has to be gone through."""
+"""`fantwin info`: the contents of a recording by its index, and the same by reading all of it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Counter, Header, Health, ModelCard, StageStatus
 from schemas.topics import health_key, tray_key
-from tests.pipeline.recordings.test_parts import part, shelf
+from tests.pipeline.recordings.test_parts import part, parts_in
 from tests.pipeline.recordings.test_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
 from tests.support.fantwin_command import fantwin, said_instead
 
@@ -23,14 +23,14 @@ METADATA = {"site": "plant", "trays": "tray1", "fans.tray1": "2", "speed_unit.tr
 SECOND_NS = 1_000_000_000
 
 
-def told(*files: Path, exit_code: int = 0) -> dict[str, Any]:
+def shown(*files: Path, exit_code: int = 0) -> dict[str, Any]:
     done = fantwin("info", *files, "--json")
     assert done.exit_code == exit_code, done.output
     return json.loads(done.stdout)
 
 
 def recording(path: Path) -> Path:
-    """With a hole, a repetition, a twin, and a stage that complains."""
+    """With a gap, a repeated message, a twin, and a stage that reports a problem."""
     with RecordingWriter(path, METADATA, {"configuration.toml": b"", "tray1.onnx": b"twin"}) as writer:
         for number, sequence in enumerate((0, 1, 4, 5, 5)):
             writer.add_message(RAW_KEY, raw(sequence), number * SECOND_NS)
@@ -52,8 +52,8 @@ def recording(path: Path) -> Path:
     return path
 
 
-def test_topics_are_told_with_what_is_missing(tmp_path):
-    found = told(recording(tmp_path / "r.mcap"), exit_code=3)
+def test_topics_are_listed_with_missing_messages(tmp_path):
+    found = shown(recording(tmp_path / "r.mcap"), exit_code=3)
     assert found["topics"][RAW_KEY] == {
         "messages": 5,
         "missing": 2,
@@ -64,8 +64,8 @@ def test_topics_are_told_with_what_is_missing(tmp_path):
     }
 
 
-def test_it_tells_what_the_recording_is_about(tmp_path):
-    (found,) = told(recording(tmp_path / "r.mcap"), exit_code=3)["files"]
+def test_metadata_twins_and_stages_are_in_the_json(tmp_path):
+    (found,) = shown(recording(tmp_path / "r.mcap"), exit_code=3)["files"]
     assert found["metadata"] == METADATA
     assert (found["messages"], found["duration_s"]) == (8, 6.0)
     assert found["size_bytes"] == (tmp_path / "r.mcap").stat().st_size
@@ -82,7 +82,7 @@ def test_it_tells_what_the_recording_is_about(tmp_path):
     assert found["damage"] == []
 
 
-def test_people_are_told_the_same(tmp_path):
+def test_the_text_shows_the_same(tmp_path):
     said = fantwin("info", recording(tmp_path / "r.mcap")).stdout
     for words in (
         "r.mcap: 0.0",
@@ -98,11 +98,11 @@ def test_people_are_told_the_same(tmp_path):
     assert line.split()[1:4] == ["5", "2", "1"]
 
 
-def test_a_torn_file_is_gone_through_and_the_rest_is_told_as_before(tmp_path):
+def test_a_file_without_an_index_is_read_in_full_with_the_same_result(tmp_path):
     whole = recording(tmp_path / "r.mcap")
-    torn = tmp_path / "torn.mcap"
-    torn.write_bytes(whole.read_bytes()[:-50])
-    (of_whole,), (of_torn,) = (told(path, exit_code=3)["files"] for path in (whole, torn))
+    truncated = tmp_path / "truncated.mcap"
+    truncated.write_bytes(whole.read_bytes()[:-50])
+    (of_whole,), (of_torn,) = (shown(path, exit_code=3)["files"] for path in (whole, truncated))
     assert of_torn["damage"] == ["it has no index"]
     different = {name for name in of_whole if of_whole[name] != of_torn[name]}
     assert different == {"file", "size_bytes", "damage"}
@@ -111,13 +111,13 @@ def test_a_torn_file_is_gone_through_and_the_rest_is_told_as_before(tmp_path):
 def test_a_file_that_lacks_only_its_index_has_lost_nothing(tmp_path):
     path = write(tmp_path / "r.mcap", 30)
     path.write_bytes(path.read_bytes()[:-50])
-    told(path, exit_code=0)
+    shown(path, exit_code=0)
 
 
-def test_a_file_that_breaks_off_is_told(tmp_path):
+def test_a_truncated_file_is_reported(tmp_path):
     path = write(tmp_path / "r.mcap", 300)
     path.write_bytes(path.read_bytes()[:40_000])
-    (found,) = told(path, exit_code=3)["files"]
+    (found,) = shown(path, exit_code=3)["files"]
     assert found["damage"][0] == "it is truncated, as after a crash"
     assert "it is truncated, as after a crash; repair it with `fantwin recover`" in fantwin("info", path).stdout
 
@@ -127,82 +127,82 @@ def test_a_file_that_is_still_being_written_is_shown_as_far_as_it_is_on_the_disk
         writer.add_message(RAW_KEY, raw(0), 1)
         writer.flush()
         writer.add_message(RAW_KEY, raw(1), 2)
-        (found,) = told(tmp_path / "r.mcap.active")["files"]
+        (found,) = shown(tmp_path / "r.mcap.active")["files"]
     assert found["damage"] == ["it is still being written"]
     assert found["topics"][RAW_KEY]["messages"] == 1
 
 
-def test_where_there_are_index_and_ledger_not_all_of_the_file_is_read(tmp_path, monkeypatch):
+def test_with_index_and_ledger_the_file_is_not_read_in_full(tmp_path, monkeypatch):
     path = recording(tmp_path / "r.mcap")
     monkeypatch.setattr(contents, "scan", None)
     assert contents_of(path).messages == 8
 
 
-def test_parts_are_added_up_and_checked_to_go_on_from_one_another(tmp_path):
-    place, ledger = shelf(tmp_path), SequenceLedger()
+def test_parts_are_added_up_and_checked_for_continuity(tmp_path):
+    place, ledger = parts_in(tmp_path), SequenceLedger()
     for first in (0, 10, 23):
         part(place, range(first, first + 10), ledger).finish()
         ledger = ledger.for_next_part()
     names = [tmp_path / name for name in ("r-3.mcap", "r.mcap", "r-2.mcap")]
-    found = told(*names, exit_code=3)
+    found = shown(*names, exit_code=3)
     assert found["topics"][RAW_KEY]["messages"] == 30
     assert found["topics"][RAW_KEY]["missing"] == 3
     assert [Path(each["file"]).name for each in found["files"]] == ["r.mcap", "r-2.mcap", "r-3.mcap"]
     assert found["continuity"] == []
 
 
-def test_what_is_left_of_a_ring_of_parts_is_well(tmp_path):
-    place, ledger = shelf(tmp_path), SequenceLedger()
+def test_parts_whose_oldest_were_deleted_are_continuous(tmp_path):
+    place, ledger = parts_in(tmp_path), SequenceLedger()
     for first in (0, 10, 20):
         part(place, range(first, first + 10), ledger).finish()
         ledger = ledger.for_next_part()
     assert place.delete_oldest() == "r.mcap"
-    assert told(tmp_path / "r-2.mcap", tmp_path / "r-3.mcap")["continuity"] == []
+    assert shown(tmp_path / "r-2.mcap", tmp_path / "r-3.mcap")["continuity"] == []
     assert "continues r.mcap" in fantwin("info", tmp_path / "r-2.mcap", tmp_path / "r-3.mcap").stdout
 
 
 def test_a_file_that_is_named_twice_counts_once(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
         writer.add_message(RAW_KEY, raw(0), 1)
-    assert told(tmp_path / "r.mcap", tmp_path / "r.mcap")["topics"][RAW_KEY]["messages"] == 1
+    assert shown(tmp_path / "r.mcap", tmp_path / "r.mcap")["topics"][RAW_KEY]["messages"] == 1
 
 
-def test_metadata_of_others_under_our_names_are_passed_over(tmp_path):
+def test_foreign_metadata_with_fantwin_keys_are_ignored(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {"paused_t_ns": "yesterday", "resumed_t_ns": "1"}):
         pass
     done = fantwin("info", tmp_path / "r.mcap")
     assert (done.exit_code, "nothing was recorded" in done.stdout) == (0, False)
 
 
-def test_a_part_that_is_not_among_them_is_missed(tmp_path):
-    place, ledger = shelf(tmp_path), SequenceLedger()
+def test_a_part_that_was_not_named_is_reported(tmp_path):
+    place, ledger = parts_in(tmp_path), SequenceLedger()
     for first in (0, 10, 20):
         part(place, range(first, first + 10), ledger).finish()
         ledger = ledger.for_next_part()
-    found = told(tmp_path / "r.mcap", tmp_path / "r-3.mcap", exit_code=3)
+    found = shown(tmp_path / "r.mcap", tmp_path / "r-3.mcap", exit_code=3)
     assert found["continuity"] == ["r-3.mcap continues r-2.mcap, which is not among these files"]
     assert "which is not among these" in fantwin("info", tmp_path / "r.mcap", tmp_path / "r-3.mcap").stdout
 
 
-def test_a_part_that_begins_elsewhere_than_the_one_before_ended_is_told(tmp_path):
-    place = shelf(tmp_path)
+def test_a_part_that_does_not_begin_where_the_one_before_ended_is_reported(tmp_path):
+    place = parts_in(tmp_path)
     part(place, range(10)).finish()
     part(place, range(12, 20), SequenceLedger({(RAW_KEY, "acquisition-1"): 12})).finish()
-    found = told(tmp_path / "r.mcap", tmp_path / "r-2.mcap", exit_code=3)
+    found = shown(tmp_path / "r.mcap", tmp_path / "r-2.mcap", exit_code=3)
     assert found["continuity"] == [
         f"r-2.mcap starts at message 12 of {RAW_KEY} acquisition-1, but r.mcap ends before 10"
     ]
 
 
-def test_a_pause_is_told(tmp_path):
+def test_a_pause_is_shown(tmp_path):
     about = {"paused_t_ns": "1", "resumed_t_ns": "2500000001", "paused_because": "no room", "lost_in_pause": "7"}
-    shelf(tmp_path).begin(0, SequenceLedger(), about).finish()
+    parts_in(tmp_path).begin(0, SequenceLedger(), about).finish()
     said = fantwin("info", tmp_path / "r.mcap").stdout
     assert "before this part nothing was recorded for 2.5 s; messages lost: 7" in said
     assert "reason: no room" in said
 
 
-def test_a_file_of_others_is_told_for_what_it_is(tmp_path):
+def test_a_file_without_fantwin_channels_is_shown_as_such(tmp_path):
     path = tmp_path / "camera.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -210,7 +210,7 @@ def test_a_file_of_others_is_told_for_what_it_is(tmp_path):
         channel = writer.register_channel("/camera", "json", 0)
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()
-    (found,) = told(path)["files"]
+    (found,) = shown(path)["files"]
     assert (found["topics"], found["other_topics"]) == ({}, {"/camera": 1})
     said = fantwin("info", path).stdout
     assert "not a recording of fantwin: it has no channel of fantwin" in said
@@ -219,7 +219,7 @@ def test_a_file_of_others_is_told_for_what_it_is(tmp_path):
 
 def test_a_recording_without_messages_is_shown_too(tmp_path):
     RecordingWriter(tmp_path / "r.mcap", METADATA).finish()
-    (found,) = told(tmp_path / "r.mcap")["files"]
+    (found,) = shown(tmp_path / "r.mcap")["files"]
     assert (found["messages"], found["first_ns"], found["duration_s"]) == (0, None, 0.0)
     assert "0 messages" in fantwin("info", tmp_path / "r.mcap").stdout
 
@@ -227,11 +227,11 @@ def test_a_recording_without_messages_is_shown_too(tmp_path):
 def test_an_alarm_alone_has_no_rate(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
         writer.add_message(ALARM_KEY, alarm(0), 5)
-    assert told(tmp_path / "r.mcap")["topics"][ALARM_KEY]["rate_hz"] is None
+    assert shown(tmp_path / "r.mcap")["topics"][ALARM_KEY]["rate_hz"] is None
 
 
 @pytest.mark.parametrize("content", [b"", b"t,u\n", None])
-def test_what_is_no_recording_is_told_in_one_line(tmp_path, content):
+def test_a_file_that_is_not_a_recording_is_refused_in_one_line(tmp_path, content):
     path = tmp_path / "r.mcap"
     if content is not None:
         path.write_bytes(content)

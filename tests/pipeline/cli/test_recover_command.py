@@ -1,4 +1,4 @@
-"""`fantwin recover`: a torn recording becomes whole, and the exit code says whether anything was lost."""
+"""`fantwin recover`: a damaged recording is repaired, and the exit code says whether anything was lost."""
 
 from __future__ import annotations
 
@@ -25,41 +25,41 @@ def whole(tmp_path) -> Path:
 
 
 @pytest.fixture
-def torn(tmp_path, whole) -> Path:
+def truncated(tmp_path, whole) -> Path:
     path = tmp_path / "r.mcap.active"
     path.write_bytes(whole.read_bytes()[: chunk_ends(whole)[3][0] + 100])
     return path
 
 
-def test_a_torn_file_is_made_whole_in_place_and_the_loss_is_told(tmp_path, torn):
-    done = fantwin("recover", torn)
+def test_a_truncated_file_is_repaired_under_its_name_and_the_loss_reported(tmp_path, truncated):
+    done = fantwin("recover", truncated)
     assert done.exit_code == 3
-    assert f"{torn}: 20 messages recovered in {tmp_path / 'r.mcap'}; the original is kept as" in done.stdout
+    assert f"{truncated}: 20 messages recovered in {tmp_path / 'r.mcap'}; the original is kept as" in done.stdout
     assert f"{RAW_KEY}: 20 messages, the last at 1970" in done.stdout
     assert "it is truncated, as after a crash: messages of the unfinished chunk may be missing" in done.stdout
     assert len(read_by_others(tmp_path / "r.mcap")) == 20
     assert (tmp_path / "r.mcap.original").exists()
 
 
-def test_it_says_so_to_machines_too(tmp_path, torn):
-    done = fantwin("recover", torn, "-o", tmp_path / "out.mcap", "--json")
-    told = json.loads(done.stdout)
+def test_the_json_says_the_same(tmp_path, truncated):
+    done = fantwin("recover", truncated, "-o", tmp_path / "out.mcap", "--json")
+    shown = json.loads(done.stdout)
     assert done.exit_code == 3
-    assert told["output"] == str(tmp_path / "out.mcap")
-    assert told["original"] is None
-    assert told["messages"] == 20
-    assert told["topics"][RAW_KEY] == {
+    assert shown["output"] == str(tmp_path / "out.mcap")
+    assert shown["original"] is None
+    assert shown["messages"] == 20
+    assert shown["topics"][RAW_KEY] == {
         "messages": 20,
         "missing": 0,
         "duplicated": 0,
         "first_ns": 1000,
         "last_ns": 1019,
     }
-    assert told["discarded_bytes"] > 0
-    assert torn.exists(), "with -o the torn file stays what it is"
+    assert shown["discarded_bytes"] > 0
+    assert truncated.exists(), "with -o the truncated file stays what it is"
 
 
-def test_a_whole_file_is_left_alone(whole):
+def test_an_intact_file_is_not_changed(whole):
     before = whole.read_bytes()
     done = fantwin("recover", whole)
     assert done.exit_code == 0
@@ -76,7 +76,7 @@ def test_a_file_that_lacks_only_its_index_has_lost_nothing(whole):
     assert len(read_by_others(whole)) == 41
 
 
-def test_a_damaged_chunk_is_told(whole):
+def test_a_damaged_chunk_is_reported(whole):
     content = bytearray(whole.read_bytes())
     content[chunk_ends(whole)[3][0] - 5] ^= 0xFF
     whole.write_bytes(content)
@@ -98,8 +98,8 @@ def healths_of(producer: str) -> Health:
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
-def test_what_a_recovered_file_has_lost_info_says_ever_after(tmp_path, number):
-    """Whichever chunk it was: the ledger of the damaged file still knows what there had been."""
+def test_info_reports_the_losses_of_a_repaired_file(tmp_path, number):
+    """Whichever chunk is damaged: the ledger of the file still has its messages."""
     path, keys = tmp_path / "r.mcap", health_key("plant", "scorer", "all")
     with RecordingWriter(path, {}) as writer:
         for chunk in range(3):
@@ -114,33 +114,33 @@ def test_what_a_recovered_file_has_lost_info_says_ever_after(tmp_path, number):
     assert fantwin("recover", path, "-o", tmp_path / "out.mcap").exit_code == 3
     done = fantwin("info", tmp_path / "out.mcap", "--json")
     assert done.exit_code == 3
-    told = json.loads(done.stdout)
-    assert told["topics"][RAW_KEY]["missing"] == 5
-    assert told["topics"][keys]["missing"] == 1
-    (file,) = told["files"]
+    shown = json.loads(done.stdout)
+    assert shown["topics"][RAW_KEY]["missing"] == 5
+    assert shown["topics"][keys]["missing"] == 1
+    (file,) = shown["files"]
     assert (file["recovered"][1:], file["damage"]) == (["damaged chunks: 1"], [])
     assert contents_of(tmp_path / "out.mcap").next[RAW_KEY, "acquisition-1"] == 15
     assert "repaired earlier: damaged chunks: 1" in fantwin("info", tmp_path / "out.mcap").stdout
     assert fantwin("recover", tmp_path / "out.mcap").exit_code == 3, "it still is what it is"
 
 
-def test_what_a_torn_file_may_have_lost_info_says_ever_after(tmp_path, torn):
-    assert fantwin("recover", torn, "-o", tmp_path / "out.mcap").exit_code == 3
-    mended = repair_in_place(torn)
-    assert mended is not None
-    for path in (tmp_path / "out.mcap", mended.path):
+def test_info_reports_the_possible_losses_of_a_truncated_file_after_its_repair(tmp_path, truncated):
+    assert fantwin("recover", truncated, "-o", tmp_path / "out.mcap").exit_code == 3
+    repaired = repair_in_place(truncated)
+    assert repaired is not None
+    for path in (tmp_path / "out.mcap", repaired.path):
         done = fantwin("info", path, "--json")
         assert done.exit_code == 3
         (file,) = json.loads(done.stdout)["files"]
         assert file["recovered"] == [f"{TRUNCATED}: messages of the unfinished chunk may be missing"]
 
 
-def test_where_the_output_cannot_be_it_says_to_name_another(tmp_path, whole):
+def test_an_output_that_cannot_be_written_is_refused_with_advice(tmp_path, whole):
     said = said_instead("recover", whole, "-o", tmp_path / "nowhere" / "out.mcap")
     assert "No such file or directory; whole.mcap is left as it was; name another file with -o" in said
 
 
-def test_what_a_health_says_was_published_and_is_not_there_is_told(tmp_path):
+def test_messages_that_health_reports_as_published_and_that_are_not_there_are_reported(tmp_path):
     writer = RecordingWriter(tmp_path / "r.mcap", {"flush_interval_s": "0.5"})
     writer.add_message(RAW_KEY, raw(0), 1)
     health = Health(
@@ -173,7 +173,7 @@ def test_what_a_health_says_was_published_and_is_not_there_is_told(tmp_path):
         (None, "cannot read the recording: No such file or directory"),
     ],
 )
-def test_where_nothing_can_be_recovered_it_says_why_and_makes_nothing(tmp_path, content, said):
+def test_if_nothing_can_be_recovered_the_reason_is_shown_and_no_file_written(tmp_path, content, said):
     path = tmp_path / "r.mcap"
     if content is not None:
         path.write_bytes(content)

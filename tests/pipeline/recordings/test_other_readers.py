@@ -38,7 +38,7 @@ needs_mcap = pytest.mark.skipif(
 
 @dataclass(frozen=True)
 class Files:
-    """A whole recording, what a killed recorder left of it, and how many messages of each key are in each."""
+    """An intact recording, the file a killed recorder left of it, and the messages of each key in both."""
 
     whole: Path
     truncated: Path
@@ -97,7 +97,7 @@ def test_mcap_finds_index_statistics_attachments_and_metadata(files):
         assert {schema.encoding for schema in summary.schemas.values()} == {"protobuf"}
 
 
-def test_mcap_finds_one_topic_and_a_stretch_of_time_by_the_index(files):
+def test_mcap_finds_one_topic_and_a_time_range_by_the_index(files):
     first, last = START_NS + RAWS - 5, START_NS + RAWS + 5
     with files.whole.open("rb") as file:
         found = list(make_reader(file).iter_messages(topics=[SCORE], starting_at=first, ending_before=last))
@@ -105,7 +105,7 @@ def test_mcap_finds_one_topic_and_a_stretch_of_time_by_the_index(files):
     assert {channel.topic for _, channel, _ in found} == {SCORE}
 
 
-def test_mcap_reads_all_of_a_torn_file_that_reached_the_disk_before_it_says_that_it_is_torn(files):
+def test_mcap_reads_all_that_reached_the_disk_of_a_truncated_file_and_then_raises(files):
     found: Counter[str] = Counter()
     with files.truncated.open("rb") as file, pytest.raises((McapError, struct.error)):
         for _, channel, _ in NonSeekingReader(file).iter_messages(log_time_order=False):
@@ -113,7 +113,7 @@ def test_mcap_reads_all_of_a_torn_file_that_reached_the_disk_before_it_says_that
     assert found == files.in_truncated
 
 
-def test_mcap_finds_no_index_in_a_torn_file(files):
+def test_mcap_finds_no_index_in_a_truncated_file(files):
     with files.truncated.open("rb") as file, pytest.raises(McapError):
         make_reader(file).get_summary()
 
@@ -203,7 +203,7 @@ def test_rerun_reads_every_message_with_its_fields(files, tmp_path):
 
 
 @needs_rerun
-def test_rerun_recovers_from_a_torn_file_what_reached_the_disk(files, tmp_path):
+def test_rerun_recovers_from_a_truncated_file_what_reached_the_disk(files, tmp_path):
     assert "PROBLEM" not in run(RERUN, "mcap", "check", "--recover", files.truncated)
     run(RERUN, "mcap", "convert", "--recover", files.truncated, "--application-id", "fantwin", "-o", tmp_path / "r.rrd")
     found = rerun_rows(tmp_path / "r.rrd")

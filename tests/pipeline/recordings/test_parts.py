@@ -1,4 +1,4 @@
-"""The parts of a recording: their names, what they say of one another, and what a killed recorder has left."""
+"""The parts of a recording: names, metadata that link them, and the file that a killed recorder leaves."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from pipeline.recordings.writing import RecordingWriter
 from tests.pipeline.recordings.test_recordings import RAW_KEY, disk_of, kill_a_recorder, raw, sequences, write
 from tests.support.small_disk import unmount
 
-LINE = (RAW_KEY, "acquisition-1")
+STREAM = (RAW_KEY, "acquisition-1")
 
 
-def shelf(folder: Path, session: str = "s1") -> RecordingParts:
+def parts_in(folder: Path, session: str = "s1") -> RecordingParts:
     return RecordingParts(folder / "r.mcap", {"site": "plant"}, {"configuration.toml": b"site = 'plant'"}, session)
 
 
-def part(shelf: RecordingParts, numbers=(), ledger: SequenceLedger | None = None) -> RecordingWriter:
-    writer = shelf.begin(5_000_000_000, ledger or SequenceLedger(shelf.before), {})
+def part(parts_in: RecordingParts, numbers=(), ledger: SequenceLedger | None = None) -> RecordingWriter:
+    writer = parts_in.begin(5_000_000_000, ledger or SequenceLedger(parts_in.before), {})
     for sequence in numbers:
         writer.add_message(RAW_KEY, raw(sequence), sequence)
     return writer
 
 
 def killed(writer: RecordingWriter) -> None:
-    """As if its process had been killed: what is in the unfinished chunk is lost."""
+    """Close the file as kill -9 does: the unfinished chunk is lost."""
     writer._file.close()
 
 
@@ -40,8 +40,8 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_parts_are_numbered_and_say_which_went_before(tmp_path):
-    place = shelf(tmp_path)
+def test_parts_are_numbered_and_name_the_part_before(tmp_path):
+    place = parts_in(tmp_path)
     ledger = SequenceLedger()
     for first in (0, 10, 20):
         part(place, range(first, first + 10), ledger).finish()
@@ -54,11 +54,11 @@ def test_parts_are_numbered_and_say_which_went_before(tmp_path):
         ("3", "s1", "r-2.mcap"),
     ]
     assert said[2]["started_t_ns"] == "5000000000"
-    assert contents_of(tmp_path / "r-3.mcap").before == {LINE: 20}
+    assert contents_of(tmp_path / "r-3.mcap").before == {STREAM: 20}
 
 
-def test_each_part_is_complete_in_itself(tmp_path):
-    place = shelf(tmp_path)
+def test_each_part_has_metadata_and_attachments(tmp_path):
+    place = parts_in(tmp_path)
     for _ in range(2):
         part(place, [0]).finish()
     for name in ("r.mcap", "r-2.mcap"):
@@ -68,15 +68,15 @@ def test_each_part_is_complete_in_itself(tmp_path):
 
 
 def test_an_open_part_is_called_active(tmp_path):
-    place = shelf(tmp_path)
+    place = parts_in(tmp_path)
     part(place).finish()
     writer = part(place)
     assert names(tmp_path) == ["r-2.mcap.active", "r.mcap"]
     writer.finish()
 
 
-def test_the_oldest_part_is_deleted_first_and_its_name_is_not_given_again(tmp_path):
-    place = shelf(tmp_path)
+def test_the_oldest_part_is_deleted_first_and_its_name_is_not_used_again(tmp_path):
+    place = parts_in(tmp_path)
     for _ in range(11):
         part(place, [0]).finish()
     assert [place.delete_oldest() for _ in range(10)] == ["r.mcap", *(f"r-{n}.mcap" for n in range(2, 11))]
@@ -90,27 +90,27 @@ def test_only_parts_of_this_recording_are_deleted(tmp_path):
     write(tmp_path / "r.mcap", 3)  # an import, say
     (tmp_path / "r-2.mcap").write_bytes(b"not ours")
     RecordingParts(tmp_path / "r-3.mcap", {}, {}, "other").begin(0, SequenceLedger(), {}).finish()
-    assert shelf(tmp_path).delete_oldest() is None
+    assert parts_in(tmp_path).delete_oldest() is None
     assert len(names(tmp_path)) == 3
 
 
 def test_the_part_that_is_open_is_not_deleted(tmp_path):
-    place = shelf(tmp_path)
+    place = parts_in(tmp_path)
     writer = part(place)
     assert place.delete_oldest() is None
     writer.finish()
 
 
-def test_a_new_recorder_takes_a_number_above_all_there_are(tmp_path):
+def test_a_new_recorder_takes_a_number_above_all_existing_ones(tmp_path):
     for name in ("r.mcap", "r-7.mcap", "r-9.mcap.torn"):
         (tmp_path / name).touch()
-    part(shelf(tmp_path)).finish()
+    part(parts_in(tmp_path)).finish()
     assert "r-10.mcap" in names(tmp_path)
 
 
-def test_what_a_killed_recorder_left_is_mended_and_gone_on_from(tmp_path):
+def test_the_file_of_a_killed_recorder_is_repaired_and_continued(tmp_path):
     kill_a_recorder(tmp_path / "r.mcap", flushed=40)
-    place = shelf(tmp_path, "s2")
+    place = parts_in(tmp_path, "s2")
     assert [(recovery.path.name, recovery.found.messages) for recovery in place.repaired] == [("r.mcap", 40)]
     assert sequences(tmp_path / "r.mcap") == list(range(40))
     assert read_recording(tmp_path / "r.mcap").damage == ""
@@ -119,36 +119,36 @@ def test_what_a_killed_recorder_left_is_mended_and_gone_on_from(tmp_path):
 
 
 def test_the_first_part_after_a_killed_recorder_continues_its_last(tmp_path):
-    killed_writer = part(shelf(tmp_path), range(40))
+    killed_writer = part(parts_in(tmp_path), range(40))
     killed_writer.flush()
     killed(killed_writer)
-    place = shelf(tmp_path, "s2")
-    assert place.before == {LINE: 40}
+    place = parts_in(tmp_path, "s2")
+    assert place.before == {STREAM: 40}
     part(place, [45]).finish()
     head = read_metadata(tmp_path / "r-2.mcap").metadata
     assert (head["session"], head["part"], head["continues"]) == ("s2", "1", "r.mcap")
-    assert contents_of(tmp_path / "r-2.mcap").streams[LINE].missing == 5
+    assert contents_of(tmp_path / "r-2.mcap").streams[STREAM].missing == 5
 
 
-def test_a_recorder_killed_while_it_had_no_part_open_is_gone_on_from_too(tmp_path):
-    part(shelf(tmp_path), range(40)).finish()  # it paused, and was killed
-    assert shelf(tmp_path, "s2").before == {LINE: 40}
+def test_a_recorder_killed_while_it_had_no_open_part_is_continued_too(tmp_path):
+    part(parts_in(tmp_path), range(40)).finish()  # it paused, and was killed
+    assert parts_in(tmp_path, "s2").before == {STREAM: 40}
 
 
-def test_a_recorder_that_ended_in_order_is_gone_on_from_as_well(tmp_path):
-    part(shelf(tmp_path), range(40)).finish(has_ended=True)
-    place = shelf(tmp_path, "s2")
-    assert place.before == {LINE: 40}
+def test_a_recorder_that_was_stopped_in_order_is_continued_too(tmp_path):
+    part(parts_in(tmp_path), range(40)).finish(has_ended=True)
+    place = parts_in(tmp_path, "s2")
+    assert place.before == {STREAM: 40}
     part(place, [45]).finish()
     assert read_metadata(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
-    assert contents_of(tmp_path / "r-2.mcap").streams[LINE].missing == 5
+    assert contents_of(tmp_path / "r-2.mcap").streams[STREAM].missing == 5
 
 
-def test_a_file_of_others_with_a_higher_number_does_not_hide_the_last_part(tmp_path):
-    part(shelf(tmp_path), range(40)).finish()
+def test_another_recording_with_a_higher_number_does_not_hide_the_last_part(tmp_path):
+    part(parts_in(tmp_path), range(40)).finish()
     write(tmp_path / "r-9.mcap", 3)
-    place = shelf(tmp_path, "s2")
-    assert place.before == {LINE: 40}
+    place = parts_in(tmp_path, "s2")
+    assert place.before == {STREAM: 40}
     part(place).finish()
     assert read_metadata(tmp_path / "r-10.mcap").metadata["continues"] == "r.mcap"
 
@@ -160,71 +160,71 @@ def damage_a_chunk(path: Path, number: int) -> None:
     path.write_bytes(content)
 
 
-def test_a_left_over_whose_only_chunk_is_damaged_is_put_aside_and_not_deleted(tmp_path):
+def test_an_active_file_whose_only_chunk_is_damaged_is_renamed_and_not_deleted(tmp_path):
     kill_a_recorder(tmp_path / "r.mcap", flushed=5)
     damage_a_chunk(tmp_path / "r.mcap.active", 0)
     content = (tmp_path / "r.mcap.active").read_bytes()
-    assert shelf(tmp_path).unreadable == [tmp_path / "r.mcap.original"]
+    assert parts_in(tmp_path).unreadable == [tmp_path / "r.mcap.original"]
     assert (tmp_path / "r.mcap.original").read_bytes() == content
 
 
-def test_a_damaged_left_over_that_a_full_disk_keeps_from_being_mended_is_gone_on_from(tmp_path):
-    writer = part(shelf(tmp_path), range(3000))
+def test_a_damaged_active_file_that_a_full_disk_keeps_from_being_repaired_is_continued(tmp_path):
+    writer = part(parts_in(tmp_path), range(3000))
     writer.flush()
     killed(writer)
     damage_a_chunk(tmp_path / "r.mcap.active", 1)
     with disk_of(100):
-        place = shelf(tmp_path, "s2")
+        place = parts_in(tmp_path, "s2")
     assert (place.unrepaired, place.unreadable, place.repaired) == ([tmp_path / "r.mcap.active"], [], [])
-    assert place.before == {LINE: 3000}
+    assert place.before == {STREAM: 3000}
     part(place, [3000]).finish()
     assert read_metadata(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
-    assert shelf(tmp_path, "s3").repaired[0].path == tmp_path / "r.mcap"
+    assert parts_in(tmp_path, "s3").repaired[0].path == tmp_path / "r.mcap"
 
 
-def test_a_left_over_without_any_message_is_not_kept(tmp_path):
+def test_an_active_file_without_messages_is_removed(tmp_path):
     kill_a_recorder(tmp_path / "r.mcap", flushed=0)
-    assert shelf(tmp_path).repaired == []
+    assert parts_in(tmp_path).repaired == []
     assert names(tmp_path) == []
 
 
-def test_a_recorder_killed_again_and_again_before_it_recorded_anything_still_goes_on_from_the_last_message(tmp_path):
+def test_recorders_killed_before_they_recorded_anything_do_not_hide_the_last_message(tmp_path):
     kill_a_recorder(tmp_path / "r.mcap", flushed=0)
-    first = part(shelf(tmp_path), range(40))
+    first = part(parts_in(tmp_path), range(40))
     first.flush()
     killed(first)
     for _ in range(3):
-        killed(part(shelf(tmp_path)))
-    assert shelf(tmp_path).before == {LINE: 40}
+        killed(part(parts_in(tmp_path)))
+    assert parts_in(tmp_path).before == {STREAM: 40}
 
 
 def test_a_recording_that_is_being_written_is_not_touched(tmp_path):
-    writer = part(shelf(tmp_path), [0])
+    writer = part(parts_in(tmp_path), [0])
     with pytest.raises(RecordingError, match="r.mcap.active: another recorder is writing it; stop it"):
-        shelf(tmp_path)
+        parts_in(tmp_path)
     writer.finish()
     assert sequences(tmp_path / "r.mcap") == [0]
 
 
 @pytest.mark.parametrize("content", [b"something else", bytes(5000)])
-def test_a_left_over_that_is_no_recording_is_put_aside(tmp_path, content):
+def test_an_active_file_that_is_not_a_recording_is_renamed(tmp_path, content):
     (tmp_path / "r.mcap.active").write_bytes(content)
-    place = shelf(tmp_path)
+    place = parts_in(tmp_path)
     assert place.unreadable == [tmp_path / "r.mcap.original"]
     assert place.unreadable[0].read_bytes() == content
     part(place).finish()
     assert names(tmp_path) == ["r-2.mcap", "r.mcap.original"]
 
 
-def test_the_room_of_a_disk_is_what_is_left_on_it(small_disk):
+def test_free_bytes_is_the_free_space_of_the_disk(small_disk):
     disk = Disk(small_disk)
     before = disk.free_bytes()
     (small_disk / "file").write_bytes(bytes(1 << 20))
     assert before - disk.free_bytes() == 1 << 20
 
 
-def test_the_place_of_a_disk_that_was_unmounted_is_not_taken_for_it(small_disk):
-    place = shelf(small_disk)
+def test_the_mount_point_of_an_unmounted_disk_is_not_mistaken_for_the_disk(small_disk):
+    place = parts_in(small_disk)
     part(place, [0]).finish()
     unmount(small_disk)
     for use in (place.free_bytes, lambda: part(place)):
@@ -233,7 +233,7 @@ def test_the_place_of_a_disk_that_was_unmounted_is_not_taken_for_it(small_disk):
     assert names(small_disk) == []
 
 
-def test_a_folder_that_is_taken_away_is_told(tmp_path):
+def test_a_folder_that_disappears_is_reported(tmp_path):
     (tmp_path / "runs").mkdir()
     disk = Disk(tmp_path / "runs")
     (tmp_path / "runs").rmdir()

@@ -1,4 +1,4 @@
-"""Recordings: what is written is read back, by us and by others, also after crashes, full disks and damage."""
+"""Recordings: written messages are read back, by fantwin and by others, after crashes, full disks and damage too."""
 
 import errno
 import os
@@ -95,7 +95,7 @@ def test_topics_can_be_chosen(tmp_path):
     assert [e.topic for e in read_recording(path, topics=("alarm",))] == ["alarm"]
 
 
-def test_a_reading_can_be_gone_through_again(tmp_path):
+def test_a_reading_can_be_iterated_again(tmp_path):
     reading = read_recording(write(tmp_path / "r.mcap", 3))
     assert len(list(reading)) == len(list(reading)) == 4
     assert reading.damage == ""
@@ -118,7 +118,7 @@ def test_the_unit_of_speed_is_that_of_the_tray_or_of_the_recording_or_radians(tm
         assert read_metadata(path).speed_unit("tray1") == unit
 
 
-def test_other_readers_need_nothing_of_ours(tmp_path):
+def test_other_readers_need_no_code_of_fantwin(tmp_path):
     path = write(tmp_path / "r.mcap", 5)
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
@@ -218,7 +218,7 @@ def test_an_exception_while_writing_leaves_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_counted_as_written_is_in_the_file(tmp_path):
+def test_messages_counted_as_written_are_in_the_file(tmp_path):
     writer = RecordingWriter(tmp_path / "r.mcap", {})
     active = tmp_path / f"r.mcap{ACTIVE_SUFFIX}"
     for sequence in range(600):
@@ -231,7 +231,7 @@ def test_what_is_counted_as_written_is_in_the_file(tmp_path):
     writer.finish()
 
 
-def test_what_is_flushed_is_through_to_the_disk_and_so_is_the_name(tmp_path, monkeypatch):
+def test_a_flush_syncs_the_file_once_and_its_name_is_synced_too(tmp_path, monkeypatch):
     synced = []
     monkeypatch.setattr(os, "fdatasync", lambda descriptor: synced.append(os.fstat(descriptor).st_size))
     monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(Path(f"/proc/self/fd/{descriptor}").readlink()))
@@ -246,7 +246,7 @@ def test_what_is_flushed_is_through_to_the_disk_and_so_is_the_name(tmp_path, mon
 
 
 @pytest.mark.parametrize("for_ever", [False, True])
-def test_a_disk_that_fails_to_sync_is_told_and_the_file_ends_readable(tmp_path, monkeypatch, for_ever):
+def test_a_failed_sync_is_reported_and_the_file_ends_readable(tmp_path, monkeypatch, for_ever):
     writer = RecordingWriter(tmp_path / "r.mcap", {})
     for sequence in range(500):
         writer.add_message(RAW_KEY, raw(sequence), sequence)
@@ -273,7 +273,7 @@ def test_a_disk_that_fails_to_sync_is_told_and_the_file_ends_readable(tmp_path, 
     assert (tmp_path / "r.mcap").read_bytes().count(MCAP0_MAGIC) == 2, "one beginning, one end"
 
 
-def test_a_writer_that_nobody_flushes_holds_no_more_than_a_little_in_memory(tmp_path, monkeypatch):
+def test_a_writer_that_is_never_flushed_uses_bounded_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "UNSYNCED_BYTES", 2 * CHUNK_BYTES)
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
         for sequence in range(2000):
@@ -304,7 +304,7 @@ def disk_of(size: int):
 
 
 @pytest.mark.parametrize("size", [3 * CHUNK_BYTES, 3 * CHUNK_BYTES + 1234, 200_000])
-def test_a_full_disk_ends_the_file_where_it_was_whole(tmp_path, size):
+def test_a_full_disk_ends_the_file_after_the_last_intact_chunk(tmp_path, size):
     path = tmp_path / "r.mcap"
     writer = RecordingWriter(path, {})
     written = 0
@@ -322,7 +322,7 @@ def test_a_full_disk_ends_the_file_where_it_was_whole(tmp_path, size):
     assert len(messages) == writer.written["raw"]
 
 
-def test_a_full_disk_leaves_room_for_no_index_and_the_file_is_readable_all_the_same(tmp_path):
+def test_without_room_for_an_index_the_file_is_still_readable(tmp_path):
     path = tmp_path / "r.mcap"
     writer = RecordingWriter(path, {})
     with pytest.raises(RecordingError, match="it ends here and is readable"):
@@ -338,7 +338,7 @@ def test_a_full_disk_leaves_room_for_no_index_and_the_file_is_readable_all_the_s
         assert make_reader(file).get_summary() is None
 
 
-def test_the_ledger_stands_in_the_file(tmp_path):
+def test_the_ledger_is_in_the_file(tmp_path):
     path = tmp_path / "r.mcap"
     with RecordingWriter(path, {}) as writer:
         for sequence in (3, 4, 7):
@@ -352,7 +352,7 @@ def test_the_ledger_stands_in_the_file(tmp_path):
     }
 
 
-def test_an_ending_that_is_refused_at_first_is_in_the_index_once(tmp_path, monkeypatch):
+def test_a_ledger_that_is_refused_at_first_is_in_the_index_once(tmp_path, monkeypatch):
     writer = RecordingWriter(tmp_path / "r.mcap", {})
     writer.add_message(RAW_KEY, raw(0), 0)
     writer.flush()
@@ -371,13 +371,13 @@ def test_an_ending_that_is_refused_at_first_is_in_the_index_once(tmp_path, monke
     assert names == ["fantwin", "fantwin.ledger"]
 
 
-def test_a_disk_that_is_full_from_the_start_is_told_in_one_line(tmp_path):
+def test_a_disk_that_is_full_from_the_start_is_reported_in_one_line(tmp_path):
     with disk_of(20), pytest.raises(RecordingError, match=r"r\.mcap: cannot be written: File too large; name another"):
         RecordingWriter(tmp_path / "r.mcap", {})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_disk_that_refuses_even_to_remove_the_unfinished_file_is_told_as_one_that_refuses(tmp_path, monkeypatch):
+def test_a_disk_that_refuses_even_to_remove_the_unfinished_file_raises_the_first_error(tmp_path, monkeypatch):
     def read_only(*_: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
 
@@ -387,19 +387,19 @@ def test_a_disk_that_refuses_even_to_remove_the_unfinished_file_is_told_as_one_t
         RecordingWriter(tmp_path / "r.mcap", {})
 
 
-def test_a_folder_that_cannot_be_made_is_told_in_one_line(tmp_path):
+def test_a_folder_that_cannot_be_made_is_reported_in_one_line(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(RecordingError, match=r"cannot be written: (Not a directory|File exists)"):
         RecordingWriter(tmp_path / "file" / "r.mcap", {})
 
 
-def test_a_torn_file_is_read_up_to_where_it_tears(tmp_path):
+def test_a_truncated_file_is_read_up_to_its_end(tmp_path):
     whole = write(tmp_path / "whole.mcap", 500).read_bytes()
-    torn = tmp_path / "torn.mcap"
+    truncated = tmp_path / "truncated.mcap"
     found = []
     for size in range(8, len(whole), len(whole) // 40):
-        torn.write_bytes(whole[:size])
-        reading = read_recording(torn)
+        truncated.write_bytes(whole[:size])
+        reading = read_recording(truncated)
         found.append(len([e.message.header.sequence for e in reading]))
         assert reading.truncated
     assert found == sorted(found)
@@ -435,7 +435,7 @@ def test_changed_bytes_anywhere_never_make_a_reader_crash(tmp_path, data):
     read_metadata(broken)
 
 
-def test_channels_of_others_are_passed_over(tmp_path):
+def test_channels_of_other_programs_are_skipped(tmp_path):
     from mcap.writer import Writer  # noqa: PLC0415
 
     path = tmp_path / "foreign.mcap"
@@ -448,7 +448,7 @@ def test_channels_of_others_are_passed_over(tmp_path):
     assert list(read_recording(path)) == []
 
 
-def test_a_payload_that_is_not_its_message_is_left_out_and_counted(tmp_path):
+def test_a_payload_that_cannot_be_decoded_is_skipped_and_counted(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
         writer.add(Envelope(RAW_KEY, "raw", b"\xff\xff\xff", 0, raw(0)))
         writer.add_message(RAW_KEY, raw(1), 1)
@@ -458,7 +458,7 @@ def test_a_payload_that_is_not_its_message_is_left_out_and_counted(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"t,u,y\n0,1,2\n", bytes(100)])
-def test_a_file_that_is_no_recording_is_told_in_one_line(tmp_path, content):
+def test_a_file_that_is_no_recording_is_reported_in_one_line(tmp_path, content):
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     for read in (read_recording, read_metadata):
@@ -466,7 +466,7 @@ def test_a_file_that_is_no_recording_is_told_in_one_line(tmp_path, content):
             read(path)
 
 
-def test_a_missing_file_is_told_in_one_line(tmp_path):
+def test_a_missing_file_is_reported_in_one_line(tmp_path):
     with pytest.raises(RecordingError, match=r"r\.mcap: cannot read the recording: No such file"):
         read_recording(tmp_path / "r.mcap")
 

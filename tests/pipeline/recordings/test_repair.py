@@ -1,4 +1,4 @@
-"""Recovery: whatever was torn off or damaged, all whole chunks are there again, for every reader."""
+"""Repair: after truncation and damage every reader finds all intact chunks again."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from pipeline.recordings.sequence_ledger import StreamCounts
 from pipeline.recordings.writing import RecordingWriter
 from tests.pipeline.recordings.test_recordings import ALARM_KEY, RAW_KEY, alarm, disk_of, raw, write
 
-LINE = (RAW_KEY, "acquisition-1")
+STREAM = (RAW_KEY, "acquisition-1")
 NO_CHECK = [HealthCheck.function_scoped_fixture]
 
 
@@ -80,76 +80,76 @@ SIZE = 15_000
 
 @settings(max_examples=150, suppress_health_check=NO_CHECK)
 @given(size=st.integers(0, SIZE))
-def test_a_file_torn_at_any_byte_is_whole_again_up_to_its_last_whole_chunk(tmp_path, whole, size):
+def test_a_file_truncated_at_any_byte_is_recovered_up_to_its_last_intact_chunk(tmp_path, whole, size):
     content = whole.read_bytes()
-    torn, output = tmp_path / "torn.mcap", tmp_path / "out.mcap"
-    torn.write_bytes(content[:size])
+    truncated, output = tmp_path / "truncated.mcap", tmp_path / "out.mcap"
+    truncated.write_bytes(content[:size])
     output.unlink(missing_ok=True)
     expected = max((messages for end, messages in chunk_ends(whole) if end <= size), default=0)
     if not expected:
         with pytest.raises(RecordingError, match="nothing can be recovered|not a recording"):
-            recover(torn, output)
+            recover(truncated, output)
         assert not output.exists()
         return
-    recover(torn, output)
+    recover(truncated, output)
     assert read_by_others(output) == read_by_others(whole)[:expected]
     assert read_metadata(output) == read_metadata(whole)
     assert scan(output).is_intact
-    assert torn.read_bytes() == content[:size]
+    assert truncated.read_bytes() == content[:size]
 
 
 @settings(max_examples=100, suppress_health_check=NO_CHECK)
 @given(size=st.integers(0, SIZE))
-def test_what_a_killed_recorder_has_left_is_mended_in_place_with_the_same_result(tmp_path, whole, size):
+def test_repair_in_place_gives_the_same_messages_and_ledger_as_a_copy(tmp_path, whole, size):
     content = whole.read_bytes()
     active, output = tmp_path / "a.mcap.active", tmp_path / "out.mcap"
     for path in tmp_path.iterdir():
         path.unlink()
     active.write_bytes(content[:size])
-    mended = repair_in_place(active)
+    repaired = repair_in_place(active)
     assert not active.exists()
-    (tmp_path / "torn.mcap").write_bytes(content[:size])
-    if mended is None:
+    (tmp_path / "truncated.mcap").write_bytes(content[:size])
+    if repaired is None:
         assert not any(end <= size for end, _ in chunk_ends(whole))
         return
-    recover(tmp_path / "torn.mcap", output)
-    assert read_by_others(mended.path) == read_by_others(output)
-    in_place, copy = contents_of(mended.path), contents_of(output)
+    recover(tmp_path / "truncated.mcap", output)
+    assert read_by_others(repaired.path) == read_by_others(output)
+    in_place, copy = contents_of(repaired.path), contents_of(output)
     assert (in_place.streams, in_place.recovered) == (copy.streams, copy.recovered)
-    assert read_metadata(mended.path) == read_metadata(output)
-    assert mended.path.name == "a.mcap"
+    assert read_metadata(repaired.path) == read_metadata(output)
+    assert repaired.path.name == "a.mcap"
 
 
-def test_a_kill_at_any_byte_of_mending_costs_nothing_either(tmp_path, whole):
-    """What a second kill leaves of a mended file is again torn, and is mended again."""
-    torn = whole.read_bytes()[: chunk_ends(whole)[5][0] + 7]
+def test_a_kill_at_any_byte_of_a_repair_loses_nothing(tmp_path, whole):
+    """A second kill leaves a truncated file again, which is repaired again."""
+    truncated = whole.read_bytes()[: chunk_ends(whole)[5][0] + 7]
     active = tmp_path / "r.mcap.active"
-    active.write_bytes(torn)
+    active.write_bytes(truncated)
     first = repair_in_place(active)
     assert first is not None
-    mended = first.path.read_bytes()
-    for size in range(chunk_ends(whole)[5][0], len(mended), 37):
-        active.write_bytes(mended[:size])
+    repaired = first.path.read_bytes()
+    for size in range(chunk_ends(whole)[5][0], len(repaired), 37):
+        active.write_bytes(repaired[:size])
         again = repair_in_place(active)
         assert again is not None
-        assert again.path.read_bytes() == mended
+        assert again.path.read_bytes() == repaired
         again.path.unlink()
 
 
-def test_in_place_the_torn_file_is_kept_beside_the_whole_one(tmp_path, whole):
-    torn = tmp_path / "r.mcap"
-    torn.write_bytes(whole.read_bytes()[:-300])
-    before = torn.read_bytes()
-    recovery = recover(torn)
-    assert (recovery.path, recovery.original) == (torn, tmp_path / "r.mcap.original")
+def test_without_an_output_the_original_is_kept_beside_the_repaired_file(tmp_path, whole):
+    truncated = tmp_path / "r.mcap"
+    truncated.write_bytes(whole.read_bytes()[:-300])
+    before = truncated.read_bytes()
+    recovery = recover(truncated)
+    assert (recovery.path, recovery.original) == (truncated, tmp_path / "r.mcap.original")
     assert recovery.original is not None and recovery.original.read_bytes() == before
-    assert len(read_by_others(torn)) == 41
-    torn.write_bytes(before)
-    assert recover(torn).original == tmp_path / "r.mcap.original-2"
+    assert len(read_by_others(truncated)) == 41
+    truncated.write_bytes(before)
+    assert recover(truncated).original == tmp_path / "r.mcap.original-2"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["r.mcap", "r.mcap.original", "r.mcap.original-2"]
 
 
-def test_what_is_still_called_active_gets_the_name_of_a_recording(tmp_path, whole):
+def test_an_active_file_gets_the_name_of_a_recording(tmp_path, whole):
     (tmp_path / "r.mcap").write_bytes(whole.read_bytes())
     (tmp_path / "r.mcap.active").write_bytes(whole.read_bytes()[:-300])
     recovery = recover(tmp_path / "r.mcap.active")
@@ -159,9 +159,7 @@ def test_what_is_still_called_active_gets_the_name_of_a_recording(tmp_path, whol
 
 @pytest.mark.parametrize("less", [0, 300])
 @pytest.mark.parametrize("moment", range(6))
-def test_a_kill_at_any_moment_leaves_the_recording_under_a_name_that_is_looked_for(
-    tmp_path, whole, monkeypatch, less, moment
-):
+def test_a_kill_at_any_moment_leaves_the_recording_under_one_of_its_names(tmp_path, whole, monkeypatch, less, moment):
     active = tmp_path / "r.mcap.active"
     active.write_bytes(whole.read_bytes()[: whole.stat().st_size - less])
     done = 0
@@ -186,7 +184,7 @@ def test_a_kill_at_any_moment_leaves_the_recording_under_a_name_that_is_looked_f
     assert all(len(list(read_recording(path))) == 41 for path in found)
 
 
-def test_a_file_that_is_whole_is_left_alone_or_copied(tmp_path, whole):
+def test_an_intact_file_is_left_as_it_is_or_copied(tmp_path, whole):
     path = tmp_path / "r.mcap"
     path.write_bytes(whole.read_bytes())
     inode = path.stat().st_ino
@@ -196,31 +194,31 @@ def test_a_file_that_is_whole_is_left_alone_or_copied(tmp_path, whole):
     assert (tmp_path / "copy.mcap").read_bytes() == whole.read_bytes()
 
 
-def test_the_ledger_of_a_file_that_was_finished_but_for_its_index_is_kept(tmp_path):
+def test_the_ledger_of_a_file_that_lacks_only_its_index_is_kept(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
         writer.add_message(RAW_KEY, raw(0), 1)
-        writer.ledger.add_duplicated(*LINE, 7)
+        writer.ledger.add_duplicated(*STREAM, 7)
     path = writer.path
     path.write_bytes(path.read_bytes()[:-40])
     found = recover(path).found
     assert found.is_ended
-    assert contents_of(path).streams[LINE].duplicated == 7
+    assert contents_of(path).streams[STREAM].duplicated == 7
 
 
-def test_holes_are_told_and_stand_in_the_new_ledger(tmp_path):
+def test_gaps_are_counted_in_the_new_ledger(tmp_path):
     writer = RecordingWriter(tmp_path / "r.mcap", {})
     for sequence in (0, 1, 5):
         writer.add_message(RAW_KEY, raw(sequence), 1000 + sequence)
     writer.flush()
     writer._file.close()
     recovery = recover(tmp_path / "r.mcap.active")
-    assert contents_of(recovery.path).streams[LINE] == StreamCounts(3, 3, 0, 0, 5, 1000, 1005)
+    assert contents_of(recovery.path).streams[STREAM] == StreamCounts(3, 3, 0, 0, 5, 1000, 1005)
 
 
 @settings(max_examples=100, suppress_health_check=NO_CHECK)
 @example(at=0.0, value=0)
 @given(at=st.floats(0, 1), value=st.integers(0, 255))
-def test_a_changed_byte_anywhere_costs_its_record_only(tmp_path, whole, at, value):
+def test_a_changed_byte_costs_at_most_its_record(tmp_path, whole, at, value):
     content = bytearray(whole.read_bytes())
     ends = chunk_ends(whole)
     place = round(8 + at * (ends[-1][0] - 9))
@@ -251,7 +249,7 @@ def test_a_damaged_length_costs_one_chunk_though_it_fits_into_the_file(tmp_path,
     lost = before - found.messages
     assert found.reader.damaged_ranges
     assert (0 < lost < 2 * before / chunks) if opcode == Opcode.CHUNK else lost == 0
-    assert contents_of(path).streams[LINE].missing == lost
+    assert contents_of(path).streams[STREAM].missing == lost
 
 
 def test_after_a_damaged_length_the_next_whole_chunk_is_found(tmp_path, whole):
@@ -267,7 +265,7 @@ def test_after_a_damaged_length_the_next_whole_chunk_is_found(tmp_path, whole):
     assert len(read_by_others(path)) == 36
     (stretch,) = found.reader.damaged_ranges
     assert stretch == (third, summary.chunk_indexes[3].chunk_start_offset)
-    assert contents_of(path).streams[LINE].missing == 5
+    assert contents_of(path).streams[STREAM].missing == 5
 
 
 def test_a_sector_of_zeros_costs_the_chunks_it_touches(tmp_path):
@@ -283,7 +281,7 @@ def test_a_sector_of_zeros_costs_the_chunks_it_touches(tmp_path):
     sequences = [entry.message.header.sequence for entry in read_recording(path, topics=("raw",))]
     holes = sum(later - earlier - 1 for earlier, later in pairwise(sequences))
     assert (sequences[0], sequences[-1]) == (0, 999)
-    assert 0 < holes == 1000 - len(sequences) == found.counts.ledger.counts[LINE].missing
+    assert 0 < holes == 1000 - len(sequences) == found.counts.ledger.counts[STREAM].missing
     assert scan(path).is_intact
 
 
@@ -306,7 +304,7 @@ def test_a_channel_that_was_described_in_a_damaged_chunk_is_found_in_the_summary
     assert [key for key, _ in read_by_others(output)].count("lost/1") == 35
 
 
-def test_a_damaged_attachment_is_left_out_and_told(tmp_path, whole):
+def test_a_damaged_attachment_is_left_out_and_reported(tmp_path, whole):
     content = bytearray(whole.read_bytes())
     content[content.index(b"tray1.onnx") + 60] ^= 0xFF
     path = tmp_path / "r.mcap"
@@ -320,22 +318,22 @@ def test_a_damaged_attachment_is_left_out_and_told(tmp_path, whole):
 @pytest.mark.parametrize("room", [0, 100, 10_000])
 def test_a_disk_that_fills_during_recovery_leaves_everything_as_it_was(tmp_path, whole, room):
     path = tmp_path / "r.mcap"
-    torn = whole.read_bytes()[:-300]
-    path.write_bytes(torn)
+    truncated = whole.read_bytes()[:-300]
+    path.write_bytes(truncated)
     with disk_of(room), pytest.raises(RecordingError, match="r.mcap is left as it was; make room"):
         recover(path)
-    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("r.mcap", torn)]
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("r.mcap", truncated)]
 
 
-def test_a_disk_that_is_full_costs_a_killed_recorder_s_file_only_its_index(tmp_path, whole):
+def test_a_full_disk_costs_the_file_of_a_killed_recorder_only_its_index(tmp_path, whole):
     active = tmp_path / "r.mcap.active"
     active.write_bytes(whole.read_bytes()[: chunk_ends(whole)[4][0] + 100])
     with disk_of(active.stat().st_size):
-        mended = repair_in_place(active)
-    assert mended is not None
-    assert len(list(read_recording(mended.path))) == 26
-    recover(mended.path)
-    assert len(read_by_others(mended.path)) == 26
+        repaired = repair_in_place(active)
+    assert repaired is not None
+    assert len(list(read_recording(repaired.path))) == 26
+    recover(repaired.path)
+    assert len(read_by_others(repaired.path)) == 26
 
 
 def test_a_file_that_is_being_written_is_not_touched(tmp_path):
@@ -356,7 +354,7 @@ def test_an_output_that_exists_is_not_overwritten(tmp_path, whole):
     ("chunked", "compression"),
     [(True, CompressionType.ZSTD), (True, CompressionType.LZ4), (True, CompressionType.NONE), (False, None)],
 )
-def test_a_torn_file_of_others_is_mended_too(tmp_path, chunked, compression):
+def test_a_truncated_file_from_another_writer_is_repaired_too(tmp_path, chunked, compression):
     path = tmp_path / "r.mcap"
     with path.open("wb") as file:
         writer = Writer(file, 200, compression or CompressionType.NONE, use_chunking=chunked)

@@ -1,4 +1,4 @@
-"""The ledger: every message of every producer is here, or missing, or came twice."""
+"""The sequence ledger: every message of every producer is recorded, missing, or duplicated."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ def health(producer: str, published: int, key: str = KEY) -> Health:
     )
 
 
-def test_holes_are_missing():
+def test_messages_in_gaps_are_missing():
     assert counted([3, 4, 8, 9]).counts[KEY, "a"] == StreamCounts(4, 3, 0, 3, 9, 1003, 1009)
 
 
-def test_what_a_producer_sent_before_it_was_known_is_no_loss():
+def test_messages_before_the_first_one_seen_are_not_missing():
     assert counted([500]).counts[KEY, "a"].missing == 0
 
 
-def test_a_hole_between_two_parts_is_missing_in_the_second():
+def test_messages_between_two_parts_are_missing_in_the_second():
     first = counted(range(10))
     second = first.for_next_part()
     second.add(KEY, "a", 14, 1014)
     assert (first.counts[KEY, "a"].missing, second.counts[KEY, "a"].missing) == (0, 4)
 
 
-def test_repeated_messages_are_counted_and_make_no_hole():
+def test_repeated_messages_are_counted_and_make_no_gap():
     account = counted([0, 1, 2, 1, 3]).counts[KEY, "a"]
     assert (account.messages, account.missing, account.duplicated, account.last_sequence) == (5, 0, 1, 3)
 
@@ -64,7 +64,7 @@ def test_a_card_that_is_written_again_at_the_start_of_a_part_counts_once():
     assert counted([1, 2], before={(TWIN_KEY, "a"): 2}, key=TWIN_KEY).counts[TWIN_KEY, "a"].messages == 1
 
 
-def test_every_producer_has_an_account_of_its_own_and_a_key_the_sum():
+def test_every_producer_has_its_own_counts_and_every_key_the_sum():
     ledger = counted([0, 1, 4])
     ledger.add(KEY, "b", 7, 5000)
     ledger.add_duplicated(KEY, "b", 3)
@@ -90,13 +90,13 @@ def test_messages_that_will_not_be_recorded_are_missing_at_the_end_if_no_later_o
     assert {line: account.missing for line, account in last.counts.items()} == {(KEY, "a"): 2, (KEY, "b"): 1}
 
 
-def test_where_a_part_should_have_begun_is_where_the_one_before_ended_whatever_was_lost():
+def test_a_part_is_due_to_begin_where_the_one_before_ended_whatever_was_lost():
     ledger = counted([0, 1]).for_next_part()
     ledger.add_lost(KEY, "a", 5)
     assert before_from_metadata(ledger.before_as_metadata()) == {(KEY, "a"): 2}
 
 
-def test_what_a_stage_says_it_has_published_and_never_came_is_unrecorded():
+def test_messages_that_health_reports_as_published_and_that_never_came_are_unrecorded():
     ledger = counted([0, 1, 2])
     ledger.add_health(health("a", 3))
     assert ledger.unrecorded() == {}
@@ -107,14 +107,14 @@ def test_what_a_stage_says_it_has_published_and_never_came_is_unrecorded():
     assert ledger.unrecorded() == {}
 
 
-def test_of_a_producer_of_which_nothing_was_recorded_nothing_is_missing():
+def test_nothing_is_missing_of_a_producer_without_recorded_messages():
     ledger = SequenceLedger()
     ledger.add_health(health("a", 500))
     ledger.finish()
     assert ledger.counts == {}
 
 
-def test_of_a_producer_that_was_there_before_its_first_message_all_are_accounted_for():
+def test_all_messages_count_of_a_producer_that_was_known_before_its_first_one():
     ledger = SequenceLedger()
     ledger.add_health(health("a", 0))
     ledger.add(KEY, "a", 3, 1)
@@ -126,7 +126,7 @@ def test_of_a_producer_that_was_there_before_its_first_message_all_are_accounted
     assert ledger.counts[KEY, "a"] == StreamCounts(missing=5)
 
 
-def test_what_is_never_recorded_is_never_missing():
+def test_topics_that_are_not_recorded_are_never_missing():
     ledger = SequenceLedger()
     for published in (0, 5):
         ledger.add_health(health("a", published, "fantwin/plant/tray1/clock"))
@@ -135,7 +135,7 @@ def test_what_is_never_recorded_is_never_missing():
     assert ledger.counts == {}
 
 
-def test_times_are_the_first_and_the_last_also_where_the_clock_was_set_back():
+def test_first_and_last_times_allow_for_a_clock_that_was_set_back():
     ledger = SequenceLedger()
     for sequence, t_ns in enumerate((50, 90, 10, 20)):
         ledger.add(KEY, "a", sequence, t_ns)
@@ -143,7 +143,7 @@ def test_times_are_the_first_and_the_last_also_where_the_clock_was_set_back():
     assert (account.first_ns, account.last_ns) == (10, 90)
 
 
-def test_of_a_file_that_was_damaged_later_what_was_recorded_and_is_not_found_is_missing():
+def test_messages_recorded_in_a_damaged_file_and_not_found_are_missing():
     recorded = counted([0, 1, 5, 6]).counts | counted([7, 8], producer="b").counts
     found = counted([5]).counts
     assert correct_for_damage(recorded, found) == {
@@ -153,7 +153,7 @@ def test_of_a_file_that_was_damaged_later_what_was_recorded_and_is_not_found_is_
 
 
 @given(st.lists(st.integers(0, 30), min_size=1), st.integers(0, 30))
-def test_each_number_up_to_the_last_is_there_or_missing_and_each_message_is_new_or_twice(sequences, due):
+def test_each_number_is_recorded_or_missing_and_each_message_is_new_or_duplicated(sequences, due):
     account = counted(sequences, before={(KEY, "a"): due}).counts[KEY, "a"]
     new = account.messages - account.duplicated
     last = max(sequences)
@@ -162,7 +162,7 @@ def test_each_number_up_to_the_last_is_there_or_missing_and_each_message_is_new_
 
 
 @given(st.sets(st.integers(0, 40)), st.sets(st.integers(0, 40)))
-def test_parts_together_have_the_account_of_the_whole(first, second):
+def test_the_counts_of_parts_add_up_to_those_of_the_whole(first, second):
     whole = counted(sorted(first) + sorted(n + 41 for n in second))
     one = counted(sorted(first))
     other = one.for_next_part()
@@ -174,14 +174,14 @@ def test_parts_together_have_the_account_of_the_whole(first, second):
     assert sum(part.missing for part in parts) == total.missing
 
 
-def test_it_is_read_back_as_it_was_written():
+def test_a_ledger_is_read_back_as_it_was_written():
     ledger = counted([0, 5])
     ledger.add(KEY, "b", 7, 1)
     assert counts_from_metadata(ledger_metadata(ledger.counts)) == ledger.counts
     assert before_from_metadata(ledger.before_as_metadata()) == ledger.next == {(KEY, "a"): 6, (KEY, "b"): 8}
 
 
-def test_the_next_part_goes_on_after_the_last_message_that_was_recorded():
+def test_the_next_part_is_due_after_the_last_recorded_message():
     ledger = counted([0, 5], before={(KEY, "c"): 9})
     ledger.add_lost(KEY, "a", 6)
     ledger.finish()
