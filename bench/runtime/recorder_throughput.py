@@ -1,7 +1,7 @@
 """The recorder (core, ledger and file, through to the disk every second) against the bare `mcap` writer.
 
 Both write the same messages, those of a tray of eight fans at 100 Hz or in larger blocks, to the same folder, with the
-same chunk size and compression; the bare writer is given bytes and times ready made, as the recorder gets them from
+same chunk size and compression; the bare writer is given ready bytes and times, as the recorder gets them from
 the bus. Best of several runs in turns.
 """
 
@@ -107,11 +107,11 @@ def _packets(first: int, block: int) -> list[Envelope]:
             state=zeros + 1,
         ),
     }
-    made = {topic: make(Header(f"{topic}-tray1-0a1b2c3d", sequence, "tray1")) for topic, make in messages.items()}
+    prepared = {topic: make(Header(f"{topic}-tray1-0a1b2c3d", sequence, "tray1")) for topic, make in messages.items()}
     received_ns = int(t_ns[-1]) + 1_000_000
     return [
         Envelope(tray_key("bench", "tray1", topic), topic, encode(message), received_ns, message)
-        for topic, message in made.items()
+        for topic, message in prepared.items()
     ]
 
 

@@ -1,7 +1,7 @@
 """Replay on the bus at full speed, ten times: what real stages took, what they lost, and how fast that went.
 
 Eight fans at 100 Hz for a minute, one sample a message: resampler, twin_integrator, scorer and recorder run as
-processes of their own and judge all of it anew. Printed are times real time: for the publishing
+processes of their own and score all of it again. Printed are multiples of real time: for the publishing
 alone, and until the recorder had the last score; and how many messages of the whole chain are not in the recording.
 """
 
@@ -58,7 +58,7 @@ def measured(source: Path, folder: Path) -> dict[str, Any]:
         status, account = up.end(), up.output()
     finally:
         chain.close()
-    told = json.loads(done.stdout)
+    summary = json.loads(done.stdout)
     wanted = {"raw": set(range(SAMPLES))} | {topic: set(range(SAMPLES)) for topic in DECIDED}
     first_ns = last_ns = 0
     for entry in read_recording(folder / "recording.mcap", topics=tuple(wanted)):
@@ -69,10 +69,10 @@ def measured(source: Path, folder: Path) -> dict[str, Any]:
         first_ns = first_ns or entry.received_t_ns
         last_ns = entry.received_t_ns if new and entry.topic == "score" else last_ns
     return {
-        "messages": told["messages"]["raw"],
-        "published, x real time": told["rate"],
+        "messages": summary["messages"]["raw"],
+        "published, x real time": summary["rate"],
         "scored and recorded, x real time": SAMPLES * STEP_NS / (last_ns - first_ns),
-        "lost": sum(told["lost"].values()) + sum(account["lost"].values()),
+        "lost": sum(summary["lost"].values()) + sum(account["lost"].values()),
         "not recorded": sum(map(len, wanted.values())),
         "exit codes": f"{done.returncode} {status}",
     }

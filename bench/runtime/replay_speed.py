@@ -87,21 +87,21 @@ def judged(path: Path, output: Path | None, *, verify: bool) -> None:
 
 def recording(folder: Path, seconds: float) -> Path:
     """What a site leaves that watches the demo's tray for so long, with a fault now and then."""
-    made = folder / "raw.mcap"
+    recording = folder / "raw.mcap"
     faults = [
         w
         for start in range(60, int(seconds), 120)
         for w in ("--fault", f"inlet:fan=2,start={start},stop={start + 10},size=1.8")
     ]
-    told = fantwin(
+    done = fantwin(
         *("simulate", "--fans", 8, "--speed-unit", "rpm", "--duration", seconds, "--epoch-ns", 10**18, *faults),
-        *("--recording", made),
+        *("--recording", recording),
         timeout_s=600,
     )
-    assert told.returncode == 0, told.stderr
+    assert done.returncode == 0, done.stderr
     path = folder / "recording.mcap"
     stages = Stages(load_config(DEMO / "demo.toml"), path, 10**18)
-    for entry in read_recording(made):
+    for entry in read_recording(recording):
         assert isinstance(entry.message, Raw)
         for k, t_ns in enumerate(entry.message.host_receive_t_ns.tolist()):
             stages.now_ns = t_ns

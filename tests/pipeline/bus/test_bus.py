@@ -1,4 +1,4 @@
-"""The bus between real processes: nothing lost, whoever starts first, whoever dies."""
+"""The bus between real processes: nothing is lost, in any order of starting and after any death."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def line_of(process: subprocess.Popen[str]) -> str:
 
 
 def collected(collector: subprocess.Popen[str], publisher: subprocess.Popen[str]) -> str:
-    """What the collector prints in the end; until then the publisher is told to publish one more."""
+    """What the collector prints at the end; until then the publisher publishes one more message at a time."""
     result: queue.Queue[str] = queue.Queue()
     threading.Thread(target=lambda: result.put(line_of(collector)), daemon=True).start()
     assert publisher.stdin
@@ -80,23 +80,23 @@ def test_every_message_arrives_in_order_when_the_consumer_starts_last(peers):
     assert collected(collector, publisher).startswith(ALL)
 
 
-def test_peers_meet_after_the_process_that_held_the_endpoint_was_killed(peers):
+def test_peers_discover_each_other_after_the_process_at_the_endpoint_was_killed(peers):
     holder, collector = peers("collect"), peers("collect")
     holder.kill()
     holder.wait()
     assert collected(collector, peers("publish")).startswith(ALL)
 
 
-def test_a_token_tells_when_a_process_comes_and_when_it_is_gone(endpoint):
+def test_a_token_shows_when_a_process_appears_and_when_it_has_gone(endpoint):
     seen: list[bool] = []
     changed = threading.Event()
 
-    def note(_key: str, alive: bool) -> None:
+    def on_change(_key: str, alive: bool) -> None:
         seen.append(alive)
         changed.set()
 
     with Bus(BusConfig(endpoint=endpoint)) as watcher:
-        watcher.watch_alive(alive_key("site", "*", "*"), note)
+        watcher.watch_alive(alive_key("site", "*", "*"), on_change)
         with Bus(BusConfig(endpoint=endpoint)) as other:
             other.declare_alive(alive_key("site", "scorer", "all"))
             assert changed.wait(20)
@@ -105,7 +105,7 @@ def test_a_token_tells_when_a_process_comes_and_when_it_is_gone(endpoint):
     assert seen == [True, False]
 
 
-def test_who_only_looks_in_leaves_the_endpoint_to_those_who_stay(endpoint):
+def test_a_session_that_does_not_listen_leaves_the_endpoint_to_others(endpoint):
     config = BusConfig(endpoint=endpoint)
     with Bus(config, listens=False) as first, Bus(config) as staying:
         assert not staying.came_second
@@ -131,7 +131,7 @@ def test_a_publisher_keeps_the_newest_messages_that_fit_its_memory(endpoint):
         publisher = bus.publisher(KEY, TOPIC, "", "big")
         for number in range(count):
             publisher.put(bytes([number]) * size)
-        # the asker has to have heard who answers for them
+        # the asker must have discovered the publisher
         eventually(lambda: list(asker.recover(KEY, "big", count - 1, count - 1, wait)), "somebody answers")
         kept = [payload[0] for _, payload in asker.recover(KEY, "big", 0, count, wait)]
         assert kept == [2, 3, 4, 5]
@@ -140,7 +140,7 @@ def test_a_publisher_keeps_the_newest_messages_that_fit_its_memory(endpoint):
         assert len(list(asker.recover(KEY, "big", 0, 2**63, wait))) == TOPIC.history
 
 
-def test_asking_where_nobody_answers_ends_empty(endpoint):
+def test_a_recovery_request_that_nobody_answers_ends_empty(endpoint):
     with Bus(BusConfig(endpoint=endpoint)) as bus:
         assert list(bus.recover(KEY, "nobody", 0, 5, lambda: None)) == []
 

@@ -1,4 +1,4 @@
-"""`fantwin router`: sessions on several hosts meet there."""
+"""`fantwin router`: sessions on several hosts communicate through it."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_two_clients_hear_each_other_through_the_router(endpoint, started):
     assert router.output() == {"listening": endpoint}
 
 
-def test_clients_that_start_before_the_router_get_through_once_it_is_there(endpoint, started):
+def test_clients_that_start_before_the_router_connect_once_it_runs(endpoint, started):
     config, never = BusConfig(mode="client", endpoint=endpoint), threading.Event()
     with ThreadPoolExecutor() as pool:
         try:
@@ -72,7 +72,7 @@ def test_clients_that_start_before_the_router_get_through_once_it_is_there(endpo
         assert exchange(one, other) == b"hello"
 
 
-def test_waiting_for_a_router_ends_when_told_to_stop(endpoint, started):
+def test_waiting_for_a_router_ends_on_stop(endpoint, started):
     """In another process, by a signal: it must not be deaf to it."""
     words = ["run", "scorer", "-c", DEMO / "demo.toml", "--set", "bus.mode=client", "--set"]
     stage = Running([*words, f"bus.endpoint={endpoint}"])

@@ -108,7 +108,7 @@ def test_overrides_set_nested_keys_and_keep_their_types():
         ("run_folder='/tmp/it's here'", "not a TOML string"),
     ],
 )
-def test_an_override_that_fits_nowhere_is_refused(override, words):
+def test_an_override_without_a_matching_key_is_refused(override, words):
     with pytest.raises(ConfigError, match=words):
         parse(GOOD, override)
 

@@ -1,4 +1,4 @@
-"""`fantwin up`: all stages from one file, stopped in the order of the data, or not started at all."""
+"""`fantwin up`: all stages from one file, stopped in the order of the data flow, or not started at all."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_wrong_configuration_is_one_line_before_anything_starts(tmp_path, endp
     assert "did you mean 'on_delay_s'" in done.stderr
 
 
-def test_the_process_list_has_one_acquisition_for_each_tray_in_the_order_of_the_data(tmp_path):
+def test_the_process_list_has_one_acquisition_for_each_tray_in_the_order_of_the_data_flow(tmp_path):
     file = tmp_path / "two.toml"
     trays = "".join(f'[[tray]]\nname = "{name}"\nfans = 2\n' for name in ("a", "b"))
     file.write_text('[launcher]\nstages = ["scorer", "acquisition", "resampler"]\n' + trays)
@@ -46,8 +46,8 @@ def test_the_process_list_has_one_acquisition_for_each_tray_in_the_order_of_the_
 
 
 @pytest.mark.slow
-def test_told_to_stop_before_all_is_ready_it_starts_no_source(chain):
-    """The sources come last: what they would bring could go nowhere."""
+def test_no_source_is_started_when_stopped_before_all_are_ready(chain):
+    """Sources start last: nobody could take their samples earlier."""
     stop = threading.Event()
     said: list[str] = []
 

@@ -1,4 +1,4 @@
-"""The runner while a recording is replayed: whose time it goes by, and what a device must not take."""
+"""The runner while a recording is replayed: which time applies, and what a device must not receive."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["config"]  # a fixture
 
 
 class Ticker(Passer):
-    """Remembers the times of its ticks."""
+    """Records the times of its ticks."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -41,7 +41,7 @@ class Replay:
             health_key("s", "replay", "all"), BY_NAME["health"], type_name(Health), "replay-1"
         )
 
-    def tell(self, t_ns: int, rate: float = 1.0) -> None:
+    def publish_time(self, t_ns: int, rate: float = 1.0) -> None:
         header = Header("replay-1", self.clock.published, TRAY_A)
         self.clock.put(encode(Clock(header=header, t_ns=t_ns, rate=rate)))
 
@@ -53,7 +53,7 @@ class Replay:
 
 @pytest.fixture
 def tickers(config):
-    """A bench whose cores remember their ticks, and the two cores."""
+    """A bench whose cores record their ticks, and the two cores."""
     cores: dict[str, Ticker] = {}
 
     def build(context: Context) -> Parts:
@@ -66,30 +66,34 @@ def tickers(config):
 
 
 @pytest.mark.parametrize("leave", [lambda replay: replay.stop(), lambda replay: replay.bus.close()])
-def test_ticks_bear_the_time_of_a_replay_until_it_leaves_however_it_does(config, tickers, leave):
+def test_ticks_carry_the_time_of_a_replay_until_it_leaves_in_any_way(config, tickers, leave):
     _, core, other = tickers
     replay = Replay(config)
     try:
         for t_ns in (1000, 2000):
-            eventually(lambda t_ns=t_ns: replay.tell(t_ns) or core.ticks[-1] == t_ns, "it ticks in recorded time")
+            eventually(
+                lambda t_ns=t_ns: replay.publish_time(t_ns) or core.ticks[-1] == t_ns, "it ticks in recorded time"
+            )
         assert other.ticks[-1] > 1e18, "the other tray is not replayed"
         count = len(core.ticks)
-        eventually(lambda: len(core.ticks) > count + 3, "it goes on ticking")
-        assert set(core.ticks[count:]) == {2000}, "the time stands still while nothing new is told"
+        eventually(lambda: len(core.ticks) > count + 3, "it keeps ticking")
+        assert set(core.ticks[count:]) == {2000}, "the time stands still until the replay publishes another"
         leave(replay)
-        eventually(lambda: core.ticks[-1] > 1e18, "the host's time is in force again")
+        eventually(lambda: core.ticks[-1] > 1e18, "the host's time applies again")
     finally:
         replay.bus.close()
 
 
-def test_latency_is_told_in_the_time_of_the_replay_and_not_at_all_where_that_stands_still(config, tickers):
+def test_latency_is_measured_in_the_time_of_the_replay_and_not_while_it_is_paused(config, tickers):
     bench, core, _ = tickers
     replay = Replay(config)
     try:
-        eventually(lambda: replay.tell(10**9, rate=0.0) or core.ticks[-1] == 10**9, "the replay stands still")
+        eventually(lambda: replay.publish_time(10**9, rate=0.0) or core.ticks[-1] == 10**9, "the replay is paused")
         bench.feed(TRAY_A, 1)
         bench.next(Grid)
-        eventually(lambda: replay.tell(2 * 10**9, rate=0.001) or core.ticks[-1] == 2 * 10**9, "it goes on, slowly")
+        eventually(
+            lambda: replay.publish_time(2 * 10**9, rate=0.001) or core.ticks[-1] == 2 * 10**9, "it continues slowly"
+        )
         bench.feed(TRAY_A, 2 * 10**9 - 5_000_000)
         bench.next(Grid)
         health = bench.health_with(lambda h: h.latency_p99_ms > 0.0)
@@ -98,7 +102,7 @@ def test_latency_is_told_in_the_time_of_the_replay_and_not_at_all_where_that_sta
     assert 5.0 <= health.latency_p50_ms < 100.0, "a thousandth of what passed here, and 5 ms in the recording"
 
 
-def test_a_stage_with_a_device_takes_nothing_of_a_replay_and_keeps_the_hosts_time(config):
+def test_a_stage_with_a_device_refuses_replayed_commands_and_keeps_the_hosts_time(config):
     core = Ticker()
     declared = {"name": "acquisition", "reads": ("command",)}
     bench = Bench(toy(lambda _context: Parts(core, Burst([])), **declared), config, TRAY_A)
@@ -107,7 +111,7 @@ def test_a_stage_with_a_device_takes_nothing_of_a_replay_and_keeps_the_hosts_tim
         for who in ("replay-all-1", "command-1")
     }
     replay = Replay(config)
-    replay.tell(1000)
+    replay.publish_time(1000)
     for who, publisher in publishers.items():
         publisher.put(encode(Command(header=Header(who, 0, TRAY_A), fans=3 if who == "replay-all-1" else 1, t_ns=0)))
     health = bench.health_with(lambda h: len(h.inputs) == 2)

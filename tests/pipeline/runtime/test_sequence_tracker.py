@@ -1,4 +1,4 @@
-"""Sequence accounting: every message once and in order, gaps asked for again, the rest counted."""
+"""The sequence tracker: each message once and in order, gaps recovered, the rest counted."""
 
 from collections.abc import Iterable
 
@@ -30,7 +30,7 @@ def packet(sequence: int, producer: str = "p") -> Envelope:
 
 
 class Producer:
-    """Remembers what was asked of it and answers from what it still keeps."""
+    """Records the requests it gets, and answers them from the messages it still keeps."""
 
     def __init__(self, keeps: Iterable[int]) -> None:
         self.keeps = set(keeps)
@@ -82,14 +82,14 @@ def test_a_message_that_comes_again_is_dropped_and_counted():
     assert tracker.inputs()[0].duplicated == 1
 
 
-def test_a_late_joiner_gets_what_is_still_kept_and_counts_no_loss_for_what_is_history():
+def test_a_late_consumer_gets_the_messages_still_kept_and_counts_earlier_ones_as_history():
     producer = Producer([98, 99])
     tracker = SequenceTracker(producer.recover)
     assert sequences(tracker.accept(packet(100))) == [98, 99, 100]
     assert tracker.inputs()[0].missing == 0
 
 
-def test_a_late_joiner_asks_for_no_more_than_a_producer_keeps():
+def test_a_late_consumer_requests_no_more_than_a_producer_keeps():
     producer = Producer([])
     list(SequenceTracker(producer.recover).accept(packet(10**6)))
     history = BY_NAME["alarm"].history
@@ -103,20 +103,22 @@ def test_a_new_session_of_a_producer_starts_its_own_sequence():
     assert all(line.duplicated == 0 for line in tracker.inputs())
 
 
-def test_of_many_producers_the_latest_are_known_by_name_and_the_others_counted_together():
+def test_the_latest_of_many_producers_are_listed_by_name_and_the_others_summed_up():
     tracker = SequenceTracker(Producer([]).recover)
     list(tracker.accept(packet(0, "controller")))
     for number in range(100):
         list(tracker.accept(packet(0, f"operator-{number}")))
         list(tracker.accept(packet(3, f"operator-{number}")))
-        assert sequences(tracker.accept(packet(number + 1, "controller"))) == [number + 1], "who speaks stays known"
+        assert sequences(tracker.accept(packet(number + 1, "controller"))) == [number + 1], (
+            "the latest producers keep their state"
+        )
     *named, others = tracker.inputs()
     assert {line.producer for line in named} == {"controller", *(f"operator-{number}" for number in range(37, 100))}
     assert (others.producer, others.received, others.missing) == ("", 2 * 37, 2 * 37)
     assert sum(line.received for line in tracker.inputs()) == 301
 
 
-def test_health_shows_a_last_message_that_never_came():
+def test_health_reveals_a_last_message_that_never_arrived():
     producer = Producer(range(3))
     tracker = SequenceTracker(producer.recover)
     list(tracker.accept(packet(0)))
@@ -124,12 +126,12 @@ def test_health_shows_a_last_message_that_never_came():
     assert sequences(tracker.reconcile(health(3), [KEY])) == []
 
 
-def test_health_shows_a_first_message_that_never_came():
+def test_health_reveals_a_first_message_that_never_arrived():
     tracker = SequenceTracker(Producer([0]).recover)
     assert sequences(tracker.reconcile(health(1), [KEY])) == [0]
 
 
-def test_of_a_producer_that_was_there_before_its_first_message_all_are_accounted_for():
+def test_all_messages_are_counted_of_a_producer_known_before_its_first_message():
     tracker = SequenceTracker(Producer([]).recover)
     assert sequences(tracker.reconcile(health(0), [KEY])) == []
     assert sequences(tracker.accept(packet(3))) == [3]
@@ -143,7 +145,7 @@ def test_health_about_keys_that_are_not_read_is_ignored():
     assert producer.asked == []
 
 
-def test_a_stage_that_may_drop_counts_and_asks_nobody():
+def test_without_recovery_gaps_are_only_counted():
     tracker = SequenceTracker(None)
     list(tracker.accept(packet(0)))
     assert sequences(tracker.accept(packet(5))) == [5]
@@ -154,7 +156,7 @@ def test_a_stage_that_may_drop_counts_and_asks_nobody():
     arriving=st.lists(st.integers(0, 60), max_size=80),
     kept=st.sets(st.integers(0, 60)),
 )
-def test_whatever_arrives_each_message_comes_once_in_order_and_the_account_adds_up(arriving, kept):
+def test_each_message_comes_once_and_in_order_and_the_counts_add_up(arriving, kept):
     tracker = SequenceTracker(Producer(kept).recover)
     out = [s for sequence in arriving for s in sequences(tracker.accept(packet(sequence)))]
     assert out == sorted(set(out))
