@@ -1,276 +1,314 @@
-"""The judge of a tray: both residuals and the tachos, and which statistic is the furthest towards its limit.
+"""Scores the fans of a tray: both residuals and the tachos through every detector of the table.
 
-What it finds is the score: that statistic in its own limit. Above one the fan is not what it was. When an alarm comes
-of it is for scoring.alarms.tray_alarms to say.
+The score of a fan is the statistic that is closest to its limit, in multiples of that limit. Above one the fan is not
+what it was. Whether that raises an alarm is decided by scoring.alarms.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from schemas.messages import Array, InvalidReason, Prediction, Statistic
+from schemas.messages import Array, Statistic
 from schemas.units import NS_PER_S
+from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Source
 from scoring.detectors.motion import Motion
-from scoring.detectors.residual import Residual
-from scoring.detectors.tacho import Sensor
+from scoring.detectors.smoothed import SmoothedSettings
+from scoring.detectors.state import restore_column
+from scoring.detectors.table import rows
+from scoring.former_snapshot import upgraded
 from scoring.limits import Limits
+from scoring.residual import Residual
+from scoring.samples import Samples
 
-QUIET = 0.5  # once a fan is commissioned, nothing is learnt from it with a score above
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Samples:
-    """A block to be judged; residuals in sigma of each fan. All (n, fans) but t_ns, (n,)."""
-
-    t_ns: Array
-    period_ns: int
-    speed_rad_s: Array
-    speed_residual: Array
-    speed_valid: Array
-    balance: Array
-    balance_valid: Array
-    missing: Array
-    """the tacho gave no reading"""
-    alive: Array
-    """the line gave something"""
-
-
-def samples_of(prediction: Prediction) -> Samples:
-    """The samples of a block of predictions. The torque balance is judged where the free run is too
-    young, and where a controller asks for more than any healthy fan needed: it holds there.
-    """
-    invalid_reason, residual = (
-        prediction.invalid_reason,
-        prediction.measured_speed_rad_s - prediction.predicted_speed_rad_s,
-    )
-    balance = prediction.torque_balance_command
-    with np.errstate(all="ignore"):
-        speed_residual = residual / prediction.sigma_rad_s
-        balance = balance / prediction.torque_balance_sigma_command
-    speaks = np.isin(invalid_reason, (InvalidReason.NONE, InvalidReason.WARMING_UP, InvalidReason.OUT_OF_RANGE))
-    return Samples(
-        t_ns=prediction.t_ns,
-        period_ns=prediction.period_ns,
-        speed_rad_s=prediction.measured_speed_rad_s,
-        speed_residual=speed_residual,
-        speed_valid=prediction.valid & np.isfinite(speed_residual),
-        balance=balance,
-        balance_valid=speaks & np.isfinite(balance),
-        missing=invalid_reason == InvalidReason.NO_SPEED,
-        alive=~np.isin(invalid_reason, (InvalidReason.GAP, InvalidReason.STALE)),
-    )
+HALF_LIMIT = 0.5  # once a fan is commissioned, baselines learn only below this score
+RESIDUALS: tuple[Source, ...] = ("speed", "balance")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScoredBlock:
-    """What the judge found, (n, fans) each; smoothed residuals and baselines in sigma."""
+    """The scores of a block, (n, fans) each; smoothed residuals and baselines in sigma."""
 
     score: Array
-    """NaN where nothing could be judged"""
+    """NaN where nothing could be scored"""
     statistic: Array
+    """schemas.messages.Statistic of the detector that the score is of"""
     commissioning: Array
     """valid, and no baseline yet"""
     speed_smoothed: Array
     speed_baseline: Array
     balance_smoothed: Array
     balance_baseline: Array
-    balance_usual: Array
-    """what calibration found it to be at this speed, beside the baseline"""
+    balance_expected: Array
+    """the expected residual at this speed, which the baseline comes on top of"""
     balance_baseline_s: Array
-    """seconds of healthy running that this baseline varies as the mean of; 0: there is none yet"""
+    """the baseline varies as a mean over so many seconds of healthy running; 0: there is none yet"""
     balance_commissioned: Array
-    """what the baseline was at the end of commissioning; NaN before"""
-    balance_held: Array
-    """the baseline may go no further from that"""
+    """the baseline at the end of commissioning; NaN before"""
+    balance_at_limit: Array
+    """whether the baseline is held at the adaptation limit"""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Observation:
+    """What calibration needs of a stretch of samples, beside the scores."""
+
+    ratios: Array
+    """(rows of the table, n, fans) every statistic in multiples of its limit"""
+    persistent: dict[Source, Array]
+    """(n, fans) of each residual, see DetectorInput"""
+    expected: dict[Source, Array]
+    """(n, fans) the expected residual at these speeds, sigma"""
+    motion_rad_s: Array
+    """(n, fans) see scoring.detectors.motion"""
+
+
+@dataclass(frozen=True, eq=False)
+class _ScoredResidual:
+    """One residual in a stretch of samples, (n, fans) each. scored: valid, and with a baseline."""
+
+    valid: Array
+    scored: Array
+    smoothed: Array
+    baseline: Array
+    expected: Array
+    commissioned: Array
+    standardised: Array
+    persistent: Array
 
 
 class FanScorer:
-    """Of one tray's fans. What it gives does not depend on how samples are cut into blocks."""
+    """Scores one tray's fans. The result does not depend on how samples are cut into blocks."""
 
-    def __init__(self, fans: int, limits: Limits) -> None:
+    def __init__(self, fans: int, limits: Limits, *, observing: bool = False) -> None:
+        """observing: keep what calibration needs, for `observed`; statistics then grow beyond their limits."""
         self.limits = limits
-        self.speed = Residual(fans, limits.speed, limits.timing)
-        self.balance = Residual(fans, limits.balance, limits.timing)
-        self.sensor = Sensor(fans, limits.stuck_s, limits.missing_share)
-        self.motion = Motion(fans)
-        self.quiet = np.ones(fans, np.bool_)
-        """(fans,) whether all was far from its limit in the present interval so far"""
-        self.normal = np.ones(fans, np.bool_)
-        """(fans,) whether nothing was beyond its limit"""
+        self.residuals = {source: Residual(fans, source, limits) for source in RESIDUALS}
+        contexts = {source: residual.context(fans, capped=not observing) for source, residual in self.residuals.items()}
+        of_tacho = DetectorContext(fans=fans, smoothing_s=limits.timing.smoothing_s, capped=not observing)
+        self._rows = rows()
+        self.detectors: dict[str, Detector] = {
+            row.name: row.detector(limits.detectors[row.name], contexts.get(row.source, of_tacho))
+            for row in self._rows
+            if row.name in limits.detectors
+        }
+        """the detectors that have a limit, by name"""
+        self._is_scored = {
+            source: any(row.source == source and row.name in self.detectors for row in self._rows)
+            for source in RESIDUALS
+        }
+        self._statistics = np.array([row.statistic for row in self._rows])
+        self._motion = Motion(fans)
+        self._below_half_limit = np.ones(fans, np.bool_)
+        """(fans,) whether every statistic stayed below half of its limit in the present interval so far"""
+        self._within_limit = np.ones(fans, np.bool_)
+        """(fans,) whether none exceeded its limit"""
         self.origin_t_ns: int | None = None
-        self.interval = 0
+        self._interval = 0
         self._interval_ns = max(1, round(limits.timing.baseline_s * NS_PER_S))
-        self._watched: list[tuple[Array, ...]] | None = None
+        self._observations: list[Observation] | None = [] if observing else None
+
+    @property
+    def held_baselines(self) -> Array:
+        """(fans,) whether a baseline of a scored residual is held at its adaptation limit."""
+        at_limit = [self.residuals[source].baseline.is_at_limit for source in RESIDUALS if self._is_scored[source]]
+        return np.any(at_limit, axis=0)
 
     def update(self, block: Samples) -> ScoredBlock:
-        """Judge a block of at least one sample."""
+        """Score a block of at least one sample."""
         if self.origin_t_ns is None:
             self.origin_t_ns = int(block.t_ns[0])
         intervals = (block.t_ns - self.origin_t_ns) // self._interval_ns
         cuts = np.flatnonzero(np.diff(intervals)) + 1
         edges = [0, *cuts.tolist(), len(intervals)]
-        verdicts = []
+        scored = []
         for first, last in pairwise(edges):
             number = int(intervals[first])
-            if number != self.interval:
+            if number != self._interval:
                 self._end_interval(block.period_ns)
-                self.interval = number
-            verdicts.append(self._stretch(block, slice(first, last)))
-        if len(verdicts) == 1:
-            return verdicts[0]
-        return ScoredBlock(**{name: np.concatenate([getattr(v, name) for v in verdicts]) for name in vars(verdicts[0])})
+                self._interval = number
+            scored.append(self._score(block, slice(first, last)))
+        if len(scored) == 1:
+            return scored[0]
+        return ScoredBlock(**{name: np.concatenate([getattr(s, name) for s in scored]) for name in vars(scored[0])})
 
-    def watch(self) -> None:
-        """Keep the ratios of all statistics, and what they are of, from now on, for `watched`; and end no sum at a cap:
-        how far beyond its limit a healthy one goes is to be known.
-        """
-        self._watched = []
-        for residual in (self.speed, self.balance):
-            residual.cusum.uncap()
+    def observed(self) -> list[Observation]:
+        """Observations since the last call, in the order of their samples; only if `observing`."""
+        assert self._observations is not None
+        observations, self._observations = self._observations, []
+        return observations
 
-    def watched(self) -> tuple[Array, Array, Array, Array]:
-        """Since the last call: (7, n, fans) the ratios, in the order of Statistic from 1 on; of both residuals, (2, n,
-        fans) standardised, and what is usual at these speeds; (n, fans) the motion, see scoring.detectors.motion.
-        """
-        assert self._watched is not None
-        (ratios, standard, usual, motion_rad_s), self._watched = zip(*self._watched, strict=True), []
-        every, both, known = (np.concatenate(one, axis=1) for one in (ratios, standard, usual))
-        return every, both, known, np.concatenate(motion_rad_s)
-
-    def forget(self, fans: Array) -> None:
-        """Take new baselines of some fans, (fans,) of bool."""
-        for residual in (self.speed, self.balance):
+    def recommission(self, fans: Array) -> None:
+        """Learn new baselines for some fans, (fans,) of bool."""
+        for residual in self.residuals.values():
             residual.baseline.restart(fans)
-            residual.forget(fans)
-        self.sensor.reset(fans)
-        self.quiet[fans] = self.normal[fans] = True
+            residual.reset(fans)
+        for detector in self.detectors.values():
+            detector.reset(fans)
+        self._below_half_limit[fans] = self._within_limit[fans] = True
+
+    def limit_sigmas(self, source: Source, step_s: float) -> float:
+        """How far the smoothed residual may be from its baseline, sigma; infinite without that limit."""
+        limits = [
+            self.detectors[row.name].limit_sigmas(step_s)
+            for row in self._rows
+            if row.source == source and row.detector.settings is SmoothedSettings and row.name in self.detectors
+        ]
+        return min(limits, default=np.inf)
+
+    def persistent_limit_sigmas(self, source: Source, step_s: float) -> float:
+        """How far a shift that stays may be from the commissioned baseline, sigma; infinite without any limit.
+
+        The baseline follows to its adaptation limit; the most sensitive detector reports what is left.
+        """
+        limits = [
+            self.detectors[row.name].limit_sigmas(step_s)
+            for row in self._rows
+            if row.source == source and row.name in self.detectors
+        ]
+        adaptation = self.limits.residual(source).baseline.adaptation_limit_sigmas
+        return adaptation + min(limits, default=np.inf)
 
     def _end_interval(self, period_ns: int) -> None:
         expected = self._interval_ns // period_ns
-        for residual in (self.speed, self.balance):
-            residual.forget(residual.baseline.end_interval(expected, self.normal, self.quiet))
-        self.quiet[:] = self.normal[:] = True
+        for source, residual in self.residuals.items():
+            first = residual.baseline.end_interval(expected, self._within_limit, self._below_half_limit)
+            residual.reset(first)
+            for row in self._rows:
+                if row.source == source and row.name in self.detectors:
+                    self.detectors[row.name].reset(first)
+        self._below_half_limit[:] = self._within_limit[:] = True
 
-    def _stretch(self, block: Samples, rows: slice) -> ScoredBlock:
-        speed_rad_s, step_s = block.speed_rad_s[rows], block.period_ns / NS_PER_S
-        parts: list[Array] = []
-        standardised: list[Array] = []
-        smoothed: list[Array] = []
-        baselines: list[Array] = []
-        usuals: list[Array] = []
-        commissioned: list[Array] = []
-        judged = np.zeros(speed_rad_s.shape, np.bool_)
-        known = np.zeros(speed_rad_s.shape, np.bool_)
-        motion_rad_s = self.motion.update(speed_rad_s, step_s)
-        for residual, values, valid in (
-            (self.speed, block.speed_residual[rows], block.speed_valid[rows]),
-            (self.balance, block.balance[rows], block.balance_valid[rows]),
-        ):
-            usual = residual.usual(speed_rad_s)
-            standard = values - usual
-            shape = residual.shape(speed_rad_s, valid)
-            own = residual.baseline.value * shape
-            residual.learn(standard, shape, speed_rad_s, valid, step_s)
-            may = valid & residual.baseline.is_set
-            found = residual.judge(standard - own, shape, speed_rad_s, motion_rad_s, may, step_s)
-            parts.append(np.where(may, found.ratios, 0.0))
-            standardised.append(found.standard)
-            smoothed.append(np.where(may, found.smoothed, np.nan))
-            baselines.append(own)
-            usuals.append(usual)
-            commissioned.append(residual.baseline.commissioned * shape)
-            if residual.is_judged:
-                judged |= may
-                known |= valid
-        alive = block.alive[rows]
-        sensor = self.sensor.update(speed_rad_s, block.missing[rows], alive, block.period_ns)
-        ratios = np.concatenate((*parts, np.where(alive, sensor, 0.0)[np.newaxis]))
-        if self._watched is not None:
-            self._watched.append((ratios, np.stack(standardised), np.stack(usuals), motion_rad_s))
+    def _score(self, block: Samples, stretch: slice) -> ScoredBlock:
+        """Score samples of one interval."""
+        speed_rad_s, alive = block.speed_rad_s[stretch], block.alive[stretch]
+        step_s = block.period_ns / NS_PER_S
+        motion_rad_s = self._motion.update(speed_rad_s, step_s)
+
+        def residual(source: Source, values: Array, valid: Array) -> _ScoredResidual:
+            return self._score_residual(source, values[stretch], valid[stretch], speed_rad_s, motion_rad_s, step_s)
+
+        speed = residual("speed", block.speed_residual, block.speed_valid)
+        balance = residual("balance", block.balance, block.balance_valid)
+        inputs = {
+            source: DetectorInput(
+                period_ns=block.period_ns,
+                step_s=step_s,
+                valid=valid,
+                standardised=standardised,
+                persistent=persistent,
+                speed_rad_s=speed_rad_s,
+                missing=block.missing[stretch],
+            )
+            for source, valid, standardised, persistent in (
+                ("speed", speed.scored, speed.standardised, speed.persistent),
+                ("balance", balance.scored, balance.standardised, balance.persistent),
+                ("tacho", alive, _NOTHING, _NOTHING),
+            )
+        }
+        ratios = np.zeros((len(self._rows), *speed_rad_s.shape))
+        for number, row in enumerate(self._rows):
+            if row.name in self.detectors:
+                valid = inputs[row.source].valid
+                ratios[number] = np.where(valid, self.detectors[row.name].update(inputs[row.source]), 0.0)
+        if self._observations is not None:
+            persistent: dict[Source, Array] = {"speed": speed.persistent, "balance": balance.persistent}
+            expected: dict[Source, Array] = {"speed": speed.expected, "balance": balance.expected}
+            self._observations.append(
+                Observation(ratios=ratios, persistent=persistent, expected=expected, motion_rad_s=motion_rad_s)
+            )
         largest = ratios.argmax(axis=0)
         score = np.take_along_axis(ratios, largest[np.newaxis], axis=0)[0]
         highest = score.max(axis=0)
-        balance = self.balance.baseline
-        self.quiet &= highest <= QUIET
-        self.normal &= highest <= 1.0
-        seen = judged | (alive & (score > 1.0))
+        self._below_half_limit &= highest <= HALF_LIMIT
+        self._within_limit &= highest <= 1.0
+        judged, known = np.zeros(alive.shape, np.bool_), np.zeros(alive.shape, np.bool_)
+        for source, of in (("speed", speed), ("balance", balance)):
+            if self._is_scored[source]:
+                judged |= of.scored
+                known |= of.valid
+        has_score = judged | (alive & (score > 1.0))
+        baseline = self.residuals["balance"].baseline
+        baseline_s = baseline.independent_intervals * self.limits.timing.baseline_s
         return ScoredBlock(
-            score=np.where(seen, score, np.nan),
-            statistic=np.where(seen, largest + 1, Statistic.NONE).astype(np.uint8),
+            score=np.where(has_score, score, np.nan),
+            statistic=np.where(has_score, self._statistics[largest], Statistic.NONE).astype(np.uint8),
             commissioning=known & ~judged,
-            speed_smoothed=smoothed[0],
-            speed_baseline=baselines[0],
-            balance_smoothed=smoothed[1],
-            balance_baseline=baselines[1],
-            balance_usual=usuals[1],
-            balance_baseline_s=np.broadcast_to(balance.weight * self.limits.timing.baseline_s, known.shape),
-            balance_commissioned=np.where(balance.is_commissioning, np.nan, commissioned[-1]),
-            balance_held=np.broadcast_to(balance.is_at_limit, known.shape),
+            speed_smoothed=np.where(speed.scored, speed.smoothed, np.nan),
+            speed_baseline=speed.baseline,
+            balance_smoothed=np.where(balance.scored, balance.smoothed, np.nan),
+            balance_baseline=balance.baseline,
+            balance_expected=balance.expected,
+            balance_baseline_s=np.broadcast_to(baseline_s, alive.shape),
+            balance_commissioned=np.where(baseline.is_commissioning, np.nan, balance.commissioned),
+            balance_at_limit=np.broadcast_to(baseline.is_at_limit, alive.shape),
+        )
+
+    def _score_residual(
+        self, source: Source, values: Array, valid: Array, speed_rad_s: Array, motion_rad_s: Array, step_s: float
+    ) -> _ScoredResidual:
+        residual = self.residuals[source]
+        expected = residual.expected(speed_rad_s)
+        scaling = residual.scaling(speed_rad_s, valid)
+        baseline = residual.baseline.value * scaling
+        residual.learn(values - expected, scaling, speed_rad_s, valid, step_s)
+        scored = valid & residual.baseline.is_set
+        shift = values - expected - baseline
+        standardised, persistent = residual.standardise(shift, scaling, speed_rad_s, motion_rad_s, scored, step_s)
+        return _ScoredResidual(
+            valid=valid,
+            scored=scored,
+            smoothed=residual.smooth(shift, scored, step_s),
+            baseline=baseline,
+            expected=expected,
+            commissioned=residual.baseline.commissioned * scaling,
+            standardised=standardised,
+            persistent=persistent,
         )
 
     def snapshot(self) -> dict[str, Any]:
-        """All that it knows, as JSON can hold it."""
+        """The state as JSON can hold it."""
         return {
             "origin_t_ns": self.origin_t_ns,
-            "interval": self.interval,
-            **{name: _plain(column) for name, column in self._columns().items()},
+            "interval": self._interval,
+            "below_half_limit": self._below_half_limit.tolist(),
+            "within_limit": self._within_limit.tolist(),
+            "motion": self._motion.snapshot(),
+            "detectors": {name: detector.snapshot() for name, detector in self.detectors.items()},
+            **{source: residual.snapshot() for source, residual in self.residuals.items()},
         }
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a snapshot of a judge of as many fans; without it nothing has changed when this raises.
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a snapshot for as many fans; if this raises, nothing has changed.
+
+        A detector that the snapshot does not know starts new, as after an update that added it.
 
         Raises:
-            ValueError, KeyError, TypeError: it is not one.
+            ValueError, KeyError, TypeError: it is no snapshot of a FanScorer.
         """
-        columns = self._columns()
-        kept = {name: np.array(state[name], column.dtype) for name, column in columns.items()}
-        origin_t_ns, interval = state["origin_t_ns"], int(state["interval"])
-        for name, column in columns.items():
-            if kept[name].shape != column.shape:
-                raise ValueError(f"{name} of a judge of another number of fans")
-        for name, column in columns.items():
-            column[...] = kept[name]
+        before = self.snapshot()
+        try:
+            self._restore(state if "detectors" in state else upgraded(state))
+        except (ValueError, LookupError, TypeError, AttributeError, OverflowError):
+            self._restore(before)
+            raise
+
+    def _restore(self, state: Mapping[str, Any]) -> None:
+        for flags, name in ((self._below_half_limit, "below_half_limit"), (self._within_limit, "within_limit")):
+            restore_column(flags, name, state[name])
+        self._motion.restore(state["motion"])
+        for source, residual in self.residuals.items():
+            residual.restore(state[source])
+        for name, detector in self.detectors.items():
+            if name in state["detectors"]:
+                detector.restore(state["detectors"][name])
+        origin_t_ns = state["origin_t_ns"]
         self.origin_t_ns = None if origin_t_ns is None else int(origin_t_ns)
-        self.interval = interval
-
-    def _columns(self) -> dict[str, Array]:
-        columns: dict[str, Array] = {"quiet": self.quiet, "normal": self.normal}
-        for name, residual in (("speed", self.speed), ("balance", self.balance)):
-            baseline = residual.baseline
-            columns |= {
-                f"{name}_baseline": baseline.value,
-                f"{name}_commissioned": baseline.commissioned,
-                f"{name}_intervals": baseline.intervals,
-                f"{name}_waited": baseline.waited,
-                f"{name}_squares": baseline.squares,
-                f"{name}_means": baseline.means,
-                f"{name}_told": baseline.told,
-                f"{name}_worth": baseline.worth,
-                f"{name}_sums": baseline.sums,
-                f"{name}_shapes": baseline.shapes,
-                f"{name}_counts": baseline.counts,
-                f"{name}_shown": residual.shown.value,
-                f"{name}_smoothed": residual.low_pass.value,
-                f"{name}_cusum": residual.cusum.sums,
-                f"{name}_spread_mean": residual.spread.mean.value,
-                f"{name}_square": residual.spread.square.value,
-            }
-        return columns | {
-            "motion_past": self.motion.past.value,
-            "sensor_last": self.sensor.last,
-            "sensor_since_ns": self.sensor.since_ns,
-            "sensor_missing": self.sensor.missing.value,
-        }
+        self._interval = int(state["interval"])
 
 
-def _plain(column: Array) -> Any:
-    """As JSON can hold it, which has no NaN."""
-    if column.dtype.kind != "f":
-        return column.tolist()
-    values = column.astype(object)
-    values[np.isnan(column)] = None
-    return values.tolist()
+_NOTHING = np.zeros((0, 0))  # the tacho has no residual

@@ -1,16 +1,15 @@
-"""Scorer: judges what was measured against the twin, and keeps each fan's alarm.
+"""Scorer: compares what was measured with the twin, and keeps each fan's alarm.
 
 Reads: topic `prediction` (measured and predicted speed rad/s, torque balance in command units), and `request` (what
-operators want of alarms).
-Writes: topic `score` (residuals, baselines, the statistic furthest towards its limit, state), `alarm` (every transition
-of a fan's alarm), `snapshot` (what a restart must not forget).
-Timing: a score for every prediction, at once, block for block; delays count the valid samples' own time.
+operators want done with alarms).
+Writes: topic `score` (residuals, baselines, the statistic closest to its limit, state), `alarm` (every transition of a
+fan's alarm), `snapshot` (what a restart needs).
+Timing: one score for every prediction, at once, block for block; delays count the time of valid samples.
 
-Four things, kept apart: the *statistics* on the two residuals (scoring.fan_scorer), their *limits* (scoring.limits,
-from the
-twin's card), the *state* of each alarm after OPC UA Part 9 (scoring.alarms.tray_alarms), its *diagnosis*
-(scoring.diagnosis.diagnosis).
-The +-2 sigma band is shown beside them and is no alarm. See docs/explanation/deciding.md.
+Four things are kept apart: the *statistics* on two residuals (scoring.fan_scorer), their *limits* (scoring.limits, from
+the twin's card), the *state* of each alarm after OPC UA Part 9 (scoring.alarms.tray_alarms), and its *diagnosis*
+(scoring.diagnosis.diagnosis). The +-2 sigma band is shown beside them and is no alarm. See
+docs/explanation/deciding.md.
 """
 
 from __future__ import annotations
@@ -46,42 +45,46 @@ from scoring.alarms.alarm_text import AlarmText
 from scoring.alarms.unscored_monitor import UnscoredMonitor
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.diagnosis.regression_window import HealthyBalance
-from scoring.fan_scorer import QUIET, FanScorer, ScoredBlock, samples_of
+from scoring.fan_scorer import HALF_LIMIT, FanScorer, ScoredBlock
 from scoring.limits import Limits, Timing, uncalibrated
+from scoring.samples import samples_of
+from scoring.score_message import score_of
 from scoring.wear.wear_monitor import WearMonitor
 
-BAND_SIGMAS = 2.0
-SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # how often it is noted when nothing happens
-SET_ASIDE_NS = 60 * NS_PER_S  # so long it is told that something was
-ALL_BUT_QUIET = "baselines, alarms and wear begin anew; what operators keep quiet stays so"
-ANOTHER_TWIN = f"the twin is another one: {ALL_BUT_QUIET}"
-IN_PART = f"what was remembered is understood in part: {ALL_BUT_QUIET}"
-NOT_UNDERSTOOD = "what was remembered is not understood: baselines, alarms and wear begin anew, nothing is kept quiet"
+SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
+SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
+NEW_START = "baselines, alarms and wear start new"
+OPERATORS_KEPT = "what operators shelved, suppressed or took out of service stays so"
+ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
+READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_KEPT}"
+NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
 RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
-BACK_IN_TIME_NS = 120 * NS_PER_S  # who is restarted catches up with less; samples still older are another story
+BACK_IN_TIME_NS = 120 * NS_PER_S  # a restarted producer catches up with less; older samples are of another recording
+FORMER_NAMES = {"judge": "scorer", "desk": "alarms", "fed_by": "input_producer"}
+"""entries of a snapshot as earlier versions wrote them, which are still read -> their names today"""
 
 
 class ScorerConfig(StageConfig):
     """Section `[scorer]`. Times that are not given are those that the twin was calibrated with."""
 
     alarm_sigmas: float = Field(
-        default=2.0,
-        gt=0,
-        description="limit on the smoothed speed residual of a twin that was not calibrated, in sigma",
+        default=2.0, gt=0, description="limit on the smoothed speed residual of a twin without calibration, in sigma"
     )
     limit_factor: float = Field(default=1.0, gt=0, description="on all limits; above 1: fewer alarms than declared")
-    smoothing_s: float | None = Field(default=None, ge=0, description="time constant of the residuals' low-pass")
-    baseline_s: float | None = Field(default=None, gt=0, description="how long commissioning takes at least")
+    smoothing_s: float | None = Field(default=None, ge=0, description="time constant of the low-pass of residuals")
+    baseline_s: float | None = Field(default=None, gt=0, description="length of an interval of commissioning")
     adaptation_s: float | None = Field(default=None, gt=0, description="time constant of the baseline in the long run")
     on_delay_s: float | None = Field(default=None, ge=0, description="how long a limit must be exceeded to raise")
     off_delay_s: float = Field(default=1.0, ge=0, description="how long a return must last to clear")
     deadband: float = Field(default=0.25, ge=0, lt=1, description="share of its limit below which a return begins")
-    alarm_ratio: float = Field(default=1.5, ge=1, description="from so many limits on a warning is an alarm")
+    alarm_ratio: float = Field(default=1.5, ge=1, description="score from which a warning is an alarm")
     latching: bool = Field(default=False, description="whether a cleared alarm stays until it is reset")
     confirming: bool = Field(default=False, description="whether an acknowledged alarm must be confirmed, too")
-    wear_every_s: float = Field(default=600.0, gt=0, description="how often a fan's wear is looked at")
+    wear_every_s: float = Field(default=600.0, gt=0, description="how often the wear of a fan is measured")
     not_judged_s: float = Field(
-        default=10.0, gt=0, description="a fan that is not judged for so long is told; above twin_integrator.warm_up_s"
+        default=10.0,
+        gt=0,
+        description="health reports a fan without a score for so long; set it above twin_integrator.warm_up_s",
     )
 
     def timing(self, calibrated: Timing) -> Timing:
@@ -91,8 +94,8 @@ class ScorerConfig(StageConfig):
 
 
 @dataclass(frozen=True, eq=False)
-class Healthy:
-    """What the scorer knows of the twin. sha256: which one it is."""
+class HealthyTwin:
+    """What the scorer knows of the twin. sha256: identifies its file."""
 
     sha256: str
     limits: Limits
@@ -101,23 +104,23 @@ class Healthy:
 
 
 class ScorerCore(Core):
-    """One tray's fans, each judged for itself."""
+    """The scorer of one tray. Fans do not affect one another."""
 
     def __init__(
         self,
         fans: int,
         speed_unit: SpeedUnit,
         config: ScorerConfig,
-        healthy: Healthy,
+        twin: HealthyTwin,
         snapshot_store: SnapshotStore | None = None,
     ) -> None:
-        """snapshot_store: where to keep what must not be forgotten; None: nowhere, as in a replay."""
+        """snapshot_store: where snapshots are kept; None: nowhere, as in a replay."""
         self._fans = fans
-        self._healthy = healthy
+        self._twin = twin
         self._config = config
-        self._wording = AlarmText(speed_unit, healthy.command_unit)
+        self._text = AlarmText(speed_unit, twin.command_unit)
         self._settings = ConditionSettings(
-            on_delay_ns=round(healthy.limits.timing.on_delay_s * NS_PER_S),
+            on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),
             off_delay_ns=round(config.off_delay_s * NS_PER_S),
             return_ratio=1.0 - config.deadband,
             alarm_ratio=config.alarm_ratio,
@@ -128,68 +131,70 @@ class ScorerCore(Core):
         self._snapshot_store = snapshot_store
         self._wrong_fans = 0
         self._counts: Counter[str] = Counter()
-        self._set_aside = ""
-        """what was not gone on from"""
-        self._begin()
-        self._first: list[Alarm | ScorerSnapshot] = []
+        self._not_restored = ""
+        """why the snapshot was not used as a whole, for people"""
+        self._start_new()
         snapshot = snapshot_store.load() if snapshot_store else None
-        if snapshot is not None:
-            self._first = [*self.restore(snapshot)]
+        self._at_start = self.restore(snapshot) if snapshot else []
+        """messages to be emitted first"""
 
-    def _begin(self) -> None:
-        self._judge = FanScorer(self._fans, self._healthy.limits)
-        self._diagnoser = Diagnoser(self._healthy.balances)
+    def _start_new(self) -> None:
+        self._scorer = FanScorer(self._fans, self._twin.limits)
+        self._diagnoser = Diagnoser(self._twin.balances)
         self._wear = WearMonitor(
-            self._healthy.balances, self._diagnoser, self._config.wear_every_s, self._healthy.command_unit
+            self._twin.balances, self._diagnoser, self._config.wear_every_s, self._twin.command_unit
         )
-        self._alarms = AlarmManager(self._fans, self._settings, self._diagnoser, self._wording)
-        self._last_t_ns = np.iinfo(np.int64).min
-        self._noted_t_ns = np.iinfo(np.int64).min
-        self._fed_by = ""  # who made the last prediction
-        self._may_be_of_other_times = False
+        self._alarms = AlarmManager(self._fans, self._settings, self._diagnoser, self._text)
+        self._last_t_ns = self._snapshot_t_ns = np.iinfo(np.int64).min
+        self._input_producer = ""
+        """who made the last prediction"""
+        self._is_restored = False
+        """from a snapshot that was not yet compared with the first prediction"""
 
     def restore(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
-        """Go on from what another session has kept. Gives what is to be told of it.
+        """Continue from a snapshot. Returns the messages that report it.
 
-        Of another twin, or where the rest is not understood, as after an update, only what belongs to operators is
-        taken: what they want quiet, and that they were answered.
+        If it is of another twin, or its baselines or wear cannot be read, as after an update, only what belongs to
+        operators is restored: shelved, suppressed, out of service, and the requests already answered.
         """
         try:
-            state = json.loads(snapshot.state_json)
-            self._alarms.restore(state["desk"])
-            fed_by = str(state["fed_by"])
+            state = {FORMER_NAMES.get(name, name): value for name, value in json.loads(snapshot.state_json).items()}
+            self._alarms.restore(state["alarms"])
+            input_producer = str(state["input_producer"])
         except RESTORE_ERRORS:
-            self._begin()
+            self._start_new()
             self._counts["snapshots_not_understood"] += 1
-            self._set_aside = NOT_UNDERSTOOD
+            self._not_restored = NOT_READ
             return []
-        if snapshot.twin_sha256 != self._healthy.sha256:
+        if snapshot.twin_sha256 != self._twin.sha256:
             self._counts["snapshots_of_another_twin"] += 1
-            self._set_aside = ANOTHER_TWIN
+            self._not_restored = ANOTHER_TWIN
         else:
             try:
                 if "wear" in state:
                     self._wear.restore(state["wear"])
-                self._judge.restore(state["judge"])
+                self._scorer.restore(state["scorer"])
             except RESTORE_ERRORS:
-                self._begin()
-                self._alarms.restore(state["desk"])
+                self._start_new()
+                self._alarms.restore(state["alarms"])
                 self._counts["snapshots_not_understood"] += 1
-                self._set_aside = IN_PART
-        self._last_t_ns = self._noted_t_ns = snapshot.t_ns
-        self._fed_by, self._may_be_of_other_times = fed_by, True
-        told = (
-            self._alarms.discard_all(snapshot.t_ns, keep_silenced=True) if self._set_aside else self._alarms.republish()
-        )
-        return [replace(snapshot, restored=True), *told]
+                self._not_restored = READ_IN_PART
+        self._last_t_ns = self._snapshot_t_ns = snapshot.t_ns
+        self._input_producer, self._is_restored = input_producer, True
+        if self._not_restored:
+            return [
+                replace(snapshot, restored=True),
+                *self._alarms.discard_all(snapshot.t_ns, keep_silenced=True),
+            ]
+        return [replace(snapshot, restored=True), *self._alarms.republish()]
 
     def tick(self, now_ns: int) -> list[Alarm | ScorerSnapshot]:
-        """Say once what was remembered."""
-        first, self._first = self._first, []
-        return first
+        """Emit once what was restored."""
+        at_start, self._at_start = self._at_start, []
+        return at_start
 
     def step(self, item: Prediction | Request) -> list[Score | Alarm | ScorerSnapshot]:
-        """Judge a block: its score, and then what happened to alarms; or answer a request."""
+        """Score a block: its score, and then what happened to alarms; or answer a request."""
         if isinstance(item, Request):
             return [*self.tick(0), *self._answer(item)]
         if item.fans != self._fans:
@@ -197,157 +202,135 @@ class ScorerCore(Core):
             self._counts["lost_wrong_fan_count"] += len(item.t_ns)
             return []
         self._wrong_fans = 0
-        disowned = self._look_back(item)
+        discarded = self._discard_if_of_other_times(item)
         before = np.maximum.accumulate(np.concatenate(([self._last_t_ns], item.t_ns)))[:-1]
         new = item.t_ns > before
         self._counts["repeated"] += int((~new).sum())
         if not new.any():
-            return [*self.tick(0), *disowned]
-        self._last_t_ns, self._fed_by = int(item.t_ns[new][-1]), item.header.producer
-        score, alarms = self._judge_block(item if new.all() else select(item, new))
-        return [*self.tick(0), *disowned, score, *alarms, *self._note(bool(alarms))]
+            return [*self.tick(0), *discarded]
+        self._last_t_ns, self._input_producer = int(item.t_ns[new][-1]), item.header.producer
+        score, alarms = self._score(item if new.all() else select(item, new))
+        return [*self.tick(0), *discarded, score, *alarms, *self._take_snapshot(at_once=bool(alarms))]
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/deciding.md says what each counts."""
-        desk = self._alarms
         of_alarms = {
-            "alarms_raised": desk.raised,
-            "alarms_cleared": desk.cleared,
-            "excursions_too_short": desk.too_short,
+            "alarms_raised": self._alarms.raised,
+            "alarms_cleared": self._alarms.cleared,
+            "excursions_too_short": self._alarms.too_short,
         }
         return {**self._counts, **of_alarms}
 
     def problem(self) -> str:
-        """Predictions of another number of fans, fans that have not been judged for long, or that drift."""
+        """What people should look at: input, snapshot, fans without a score, baselines at their limit, wear."""
         if self._wrong_fans:
             return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
-        began_t_ns = self._judge.origin_t_ns
-        is_new = began_t_ns is None or self._last_t_ns < began_t_ns + SET_ASIDE_NS
-        problems = [self._set_aside if is_new else "", self._unscored.problem()]
+        origin_t_ns = self._scorer.origin_t_ns
+        is_new = origin_t_ns is None or self._last_t_ns < origin_t_ns + SHOWN_NS
+        problems = [self._not_restored if is_new else "", self._unscored.problem()]
         problems += [self._snapshot_store.problem] if self._snapshot_store else []
-        judged = [residual for residual in (self._judge.speed, self._judge.balance) if residual.is_judged]
-        adrift = np.flatnonzero(np.any([residual.baseline.is_at_limit for residual in judged], axis=0))
-        if len(adrift):
-            names = ", ".join(map(str, adrift.tolist()))
-            problems.append(f"the baseline of fan {names} may drift no further: look at the fan, or commission it anew")
+        held = np.flatnonzero(self._scorer.held_baselines)
+        if len(held):
+            names = ", ".join(map(str, held.tolist()))
+            problems.append(
+                f"the baseline of fan {names} is at its adaptation limit: inspect the fan, or commission it again"
+            )
         problems.append(self._wear.problem(self._last_t_ns))
         return "; ".join(filter(None, problems))
 
     def close(self) -> list[ScorerSnapshot]:
-        """Note what is known for the next session."""
-        return self._note(True) if self._last_t_ns > np.iinfo(np.int64).min else []
+        """The snapshot that the next session continues from."""
+        return self._take_snapshot(at_once=True) if self._last_t_ns > np.iinfo(np.int64).min else []
 
-    def _look_back(self, item: Prediction) -> list[Alarm]:
-        """What is remembered of later times is of another recording, or of the same one played again: begin anew, and
-        say so of the alarms that stood."""
-        if not self._may_be_of_other_times or not len(item.t_ns):
+    def _discard_if_of_other_times(self, item: Prediction) -> list[Alarm]:
+        """Start new if a snapshot is of later times than the first prediction: another recording is played, or the same
+        one again. Returns the messages on alarms that are discarded.
+        """
+        if not self._is_restored or not len(item.t_ns):
             return []
-        self._may_be_of_other_times = False
-        if item.header.producer == self._fed_by:
-            return []  # who made the last one still keeps it, and some before it
-        first_t_ns, began_t_ns = int(item.t_ns[0]), self._judge.origin_t_ns
-        again = began_t_ns is not None and first_t_ns <= began_t_ns
+        self._is_restored = False
+        if item.header.producer == self._input_producer:
+            return []  # the producer of the last prediction still runs, and repeats what it has kept
+        first_t_ns, origin_t_ns = int(item.t_ns[0]), self._scorer.origin_t_ns
+        again = origin_t_ns is not None and first_t_ns <= origin_t_ns
         if not again and first_t_ns >= self._last_t_ns - BACK_IN_TIME_NS:
             return []
-        disowned, self._set_aside = self._alarms.discard_all(first_t_ns, keep_silenced=False), ""
-        self._begin()
-        self._first = []
+        discarded, self._not_restored = self._alarms.discard_all(first_t_ns, keep_silenced=False), ""
+        self._start_new()
+        self._at_start = []
         self._counts["snapshots_of_other_times"] += 1
-        return disowned
+        return discarded
 
-    def _judge_block(self, item: Prediction) -> tuple[Score, list[Alarm]]:
-        t_ns, invalid_reason, command = item.t_ns, item.invalid_reason, item.command
-        measured, predicted = item.measured_speed_rad_s, item.predicted_speed_rad_s
-        sigma, sigma_command = item.sigma_rad_s, item.torque_balance_sigma_command
-        residual = measured - predicted
-        verdict = self._judge.update(samples_of(item))
-        valid = np.isfinite(verdict.score)
-        balance_baseline = verdict.balance_baseline * sigma_command
-        told = np.where(np.isin(invalid_reason, (InvalidReason.GAP, InvalidReason.STALE)), np.nan, command)
-        usual = np.where(np.isfinite(measured), verdict.balance_usual * sigma_command, np.nan)
-        self._diagnoser.take(t_ns, item.period_ns, told, measured, balance_baseline, verdict.balance_baseline_s, usual)
-        state, changes = self._alarms.update(t_ns, item.period_ns, verdict.score, valid)
-        invalid_reason = np.where(
-            valid,
-            InvalidReason.NONE,
-            np.where(invalid_reason == InvalidReason.NONE, InvalidReason.WARMING_UP, invalid_reason),
+    def _score(self, item: Prediction) -> tuple[Score, list[Alarm]]:
+        scored = self._scorer.update(samples_of(item))
+        valid = np.isfinite(scored.score)
+        self._show_diagnoser(item, scored)
+        state, events = self._alarms.update(item.t_ns, item.period_ns, scored.score, valid)
+        score = score_of(item, scored, state)
+        self._unscored.update(item.period_ns, valid, score.invalid_reason)
+        self._show_wear(item, scored, state)
+        step_s = item.period_ns / NS_PER_S
+        sigma_command = item.torque_balance_sigma_command
+        context = AlarmContext(
+            balance_command=scored.balance_smoothed * sigma_command,
+            limit_rad_s=self._scorer.limit_sigmas("speed", step_s) * item.sigma_rad_s,
+            balance_limit_command=self._scorer.limit_sigmas("balance", step_s) * sigma_command,
         )
-        self._unscored.update(item.period_ns, valid, invalid_reason.astype(np.uint8))
-        self._watch_wear(item, verdict, state)
-        band = BAND_SIGMAS * sigma
-        score = Score(
-            fans=self._fans,
-            period_ns=item.period_ns,
-            t_ns=t_ns,
-            command=command,
-            measured_speed_rad_s=measured,
-            predicted_speed_rad_s=predicted,
-            lower_bound_rad_s=predicted - band,
-            upper_bound_rad_s=predicted + band,
-            band_variance=np.broadcast_to(band**2, residual.shape),
-            residual_rad_s=residual,
-            smoothed_residual_rad_s=verdict.speed_smoothed * sigma,
-            outside=np.abs(residual) > band,
-            state=np.where(verdict.commissioning & ~valid, int(FanState.COMMISSIONING), state).astype(np.uint8),
-            valid=valid,
-            invalid_reason=invalid_reason.astype(np.uint8),
-            torque_balance_command=item.torque_balance_command,
-            speed_baseline_rad_s=verdict.speed_baseline * sigma,
-            balance_baseline_command=balance_baseline,
-            score=verdict.score,
-            statistic=verdict.statistic,
-        )
-        return score, self._alarms.emit(
-            changes, score, self._distance(verdict, item.period_ns / NS_PER_S, sigma, sigma_command)
+        return score, self._alarms.emit(events, score, context)
+
+    def _show_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
+        unknown = np.isin(item.invalid_reason, (InvalidReason.GAP, InvalidReason.STALE))
+        expected = np.where(np.isfinite(item.measured_speed_rad_s), scored.balance_expected, np.nan)
+        self._diagnoser.take(
+            item.t_ns,
+            item.period_ns,
+            np.where(unknown, np.nan, item.command),
+            item.measured_speed_rad_s,
+            scored.balance_baseline * item.torque_balance_sigma_command,
+            scored.balance_baseline_s,
+            expected * item.torque_balance_sigma_command,
         )
 
-    def _watch_wear(self, item: Prediction, verdict: ScoredBlock, state: Array) -> None:
-        assert self._judge.origin_t_ns is not None
+    def _show_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:
+        assert self._scorer.origin_t_ns is not None
         sigma_command, known = item.torque_balance_sigma_command, np.isfinite(item.torque_balance_command)
-        normal = state == FanState.NORMAL
+        normal, step_s = state == FanState.NORMAL, item.period_ns / NS_PER_S
         self._wear.update(
             item.t_ns,
-            self._judge.origin_t_ns,
-            eligible=(verdict.score < QUIET) & normal & known,
-            disturbed=(verdict.score >= QUIET) | ~(normal | (state == FanState.UNKNOWN)),
-            commissioned_command=verdict.balance_commissioned * sigma_command,
-            held=verdict.balance_held,
-            limit_command=self._judge.balance.lasting_limit_sigmas(item.period_ns / NS_PER_S) * sigma_command,
-        )
-
-    def _distance(self, verdict: ScoredBlock, step_s: float, sigma: Array, sigma_command: Array) -> AlarmContext:
-        return AlarmContext(
-            balance_command=verdict.balance_smoothed * sigma_command,
-            limit_rad_s=self._judge.speed.limit_sigmas(step_s) * sigma,
-            balance_limit_command=self._judge.balance.limit_sigmas(step_s) * sigma_command,
+            self._scorer.origin_t_ns,
+            eligible=(scored.score < HALF_LIMIT) & normal & known,
+            disturbed=(scored.score >= HALF_LIMIT) | ~(normal | (state == FanState.UNKNOWN)),
+            commissioned_command=scored.balance_commissioned * sigma_command,
+            held=scored.balance_at_limit,
+            limit_command=self._scorer.persistent_limit_sigmas("balance", step_s) * sigma_command,
         )
 
     def _answer(self, request: Request) -> list[Alarm | ScorerSnapshot]:
-        told = self._alarms.answer(request, max(self._last_t_ns, 0))
-        if not told:
+        alarms = self._alarms.answer(request, max(self._last_t_ns, 0))
+        if not alarms:
             self._counts["requests_repeated"] += 1
             return []
-        again = np.zeros(self._fans, np.bool_)
-        again[[alarm.fan for alarm in told if alarm.transition == Transition.COMMISSIONING]] = True
-        self._judge.forget(again)
-        self._wear.forget(again, self._last_t_ns)
+        commissioned = np.zeros(self._fans, np.bool_)
+        commissioned[[alarm.fan for alarm in alarms if alarm.transition == Transition.COMMISSIONING]] = True
+        self._scorer.recommission(commissioned)
+        self._wear.forget(commissioned, self._last_t_ns)
         self._counts["requests"] += 1
-        return [*told, *self._note(True)]
+        return [*alarms, *self._take_snapshot(at_once=True)]
 
-    def _note(self, at_once: bool) -> list[ScorerSnapshot]:
-        """What must not be forgotten: when something happened, and now and then."""
-        if not at_once and self._last_t_ns - self._noted_t_ns < SNAPSHOT_PERIOD_NS:
+    def _take_snapshot(self, *, at_once: bool) -> list[ScorerSnapshot]:
+        """The state for a restart, at once or when the last snapshot is old enough."""
+        if not at_once and self._last_t_ns - self._snapshot_t_ns < SNAPSHOT_PERIOD_NS:
             return []
-        self._noted_t_ns = self._last_t_ns
+        self._snapshot_t_ns = self._last_t_ns
         state = {
-            "judge": self._judge.snapshot(),
-            "desk": self._alarms.snapshot(),
+            "scorer": self._scorer.snapshot(),
+            "alarms": self._alarms.snapshot(),
             "wear": self._wear.snapshot(),
-            "fed_by": self._fed_by,
+            "input_producer": self._input_producer,
         }
         snapshot = ScorerSnapshot(
             t_ns=max(self._last_t_ns, 0),
-            twin_sha256=self._healthy.sha256,
+            twin_sha256=self._twin.sha256,
             state_json=json.dumps(state, allow_nan=False),
         )
         if self._snapshot_store:
@@ -359,56 +342,53 @@ def build(context: Context) -> Parts:
     """The core of one tray.
 
     Raises:
-        StageError: the tray names no twin, or one that cannot be used; what an earlier session kept cannot be read.
+        StageError: the tray names no twin, or one that cannot be used; the snapshot file cannot be read.
     """
     tray = context.tray
-    snapshot_store = (
-        SnapshotStore(context.snapshot_folder / f"scorer-{tray.name}.snapshot") if context.snapshot_folder else None
-    )
-    healthy = _healthy(context, load_tray_twin(twin_path(context), tray.fans))
-    return Parts(ScorerCore(tray.fans, tray.speed_unit, context.config, healthy, snapshot_store))
+    path = context.snapshot_folder / f"scorer-{tray.name}.snapshot" if context.snapshot_folder else None
+    twin = _healthy_twin(context, load_tray_twin(twin_path(context), tray.fans))
+    return Parts(ScorerCore(tray.fans, tray.speed_unit, context.config, twin, SnapshotStore(path) if path else None))
 
 
 def limits_in_force(config: ScorerConfig, calibration: Mapping[str, Any] | None) -> Limits:
-    """The limits of a twin's card, or those of a twin that was not calibrated, as the settings change them.
+    """The limits of a twin's card, or those of a twin without calibration, with the scorer's settings applied.
 
     Raises:
-        ValidationError: the calibration is none.
+        ValidationError: the calibration is not valid.
     """
     if calibration is None:
         return uncalibrated(config.alarm_sigmas, config.timing(Timing())).times(config.limit_factor)
     limits = Limits.model_validate(calibration)
     timing = config.timing(limits.timing)
-    promise = limits.promise if timing == limits.timing else None  # it was for the other times
-    return limits.model_copy(update={"timing": timing, "promise": promise}).times(config.limit_factor)
+    declared_rate = limits.declared_rate if timing == limits.timing else None  # it holds for the calibrated times
+    return limits.model_copy(update={"timing": timing, "declared_rate": declared_rate}).times(config.limit_factor)
 
 
-def _healthy(context: Context, twin: TrayTwin) -> Healthy:
+def _healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
+    again = "calibrate it again: fantwin calibrate"
     try:
         limits = limits_in_force(context.config, twin.card.calibration)
     except ValidationError as error:
-        where = ".".join(map(str, error.errors()[0]["loc"]))
-        raise StageError(
-            f"{context.tray.twin}: its calibration cannot be used: {where}: {error.errors()[0]['msg']}; "
-            "calibrate it anew: fantwin calibrate"
-        ) from error
-    for part in (limits.speed, limits.balance):
-        if part.fans is not None and len(part.fans.offset_sigmas) != context.tray.fans:
+        first = error.errors()[0]
+        why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise StageError(f"{context.tray.twin}: its calibration cannot be used: {why}; {again}") from error
+    for residual in (limits.speed, limits.balance):
+        fans = len(residual.fan_offsets.offset_sigmas) if residual.fan_offsets else context.tray.fans
+        if fans != context.tray.fans:
             raise StageError(
-                f"{context.tray.twin}: its calibration is of {len(part.fans.offset_sigmas)} fans, the tray has "
-                f"{context.tray.fans}; calibrate it anew: fantwin calibrate"
+                f"{context.tray.twin}: its calibration is of {fans} fans, the tray has {context.tray.fans}; {again}"
             )
-    return Healthy(twin.sha256, limits, twin.healthy_balances(), twin.card.command_unit)
+    return HealthyTwin(twin.sha256, limits, twin.healthy_balances(), twin.card.command_unit)
 
 
 def check(context: Context) -> list[str]:
-    """What keeps the scorer from judging; of a twin that cannot be loaded the twin integrator tells."""
+    """Why the scorer cannot run; the twin integrator reports a twin that cannot be loaded."""
     try:
         twin = load_tray_twin(twin_path(context), context.tray.fans)
     except StageError:
         return []
     try:
-        _healthy(context, twin)
+        _healthy_twin(context, twin)
     except StageError as error:
         return [str(error)]
     return []

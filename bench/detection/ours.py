@@ -19,9 +19,9 @@ from pipeline.runtime.stage import Core
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.messages import Alarm, Array, Prediction, Score
 from scoring.calibration.calibration import calibrate
-from scoring.calibration.healthy_statistics import Running
-from scoring.fan_scorer import Samples, samples_of
+from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.limits import Limits, Timing
+from scoring.samples import Samples, samples_of
 from twin.export.calibrated import with_calibration
 
 NAME = "fantwin"
@@ -67,10 +67,10 @@ class HealthySamples:
             with self._file(run, name).open("ab") as file:
                 column.astype(np.float32 if name in COLUMNS else np.bool_).tofile(file)
 
-    def __call__(self) -> Iterator[Running]:
+    def __call__(self) -> Iterator[HealthyRun]:
         """All runs from the beginning, as scoring.calibration.calibration wants them."""
         for run, fans in self._fans.items():
-            yield Running(fans, self._blocks(run, fans), fans_of(tray_number(run)))
+            yield HealthyRun(run, fans, self._blocks(run, fans), fans_of(tray_number(run)))
 
     def clear(self) -> None:
         """Remove the files."""
@@ -115,7 +115,7 @@ def calibrated_twins(
         Timing(),
         alarms_per_day,
         extrapolate=extrapolate,
-        bend_rad_s=float(np.median(bends)) if len(bends) == len(known) else None,
+        crossover_speed_rad_s=float(np.median(bends)) if len(bends) == len(known) else None,
     )
     made = []
     for number, path in enumerate(given):

@@ -89,13 +89,13 @@ def _simulated(
     tables["simulated faults, fantwin, by kind and strength"] = kind_rows(faulty)
     tables["causes told first by fantwin, command moving"] = cause_rows(faulty, is_moved=True)
     tables["causes told first by fantwin, command held"] = cause_rows(faulty, is_moved=False)
-    promise = bench.limits.promise
-    assert promise
-    low, high = (sizes.declared_days * figure for figure in promise.interval_95)
+    rate = bench.limits.declared_rate
+    assert rate
+    low, high = (sizes.declared_days * figure for figure in rate.interval_95)
     notes += [
         f"declared: one false alarm of a fan in {sizes.declared_days:g} days; by the calibration's own interval "
-        f"{low:.2g} to {high:.2g}, from {promise.fan_hours / 24:.3g} fan-days"
-        + (", extrapolated" if promise.extrapolated else ""),
+        f"{low:.2g} to {high:.2g}, from {rate.fan_hours / 24:.3g} fan-days"
+        + (", extrapolated" if rate.extrapolated else ""),
     ]
     if not bench.calibration:
         return

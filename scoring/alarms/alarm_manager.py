@@ -24,6 +24,7 @@ from scoring.alarms.alarm_flags import is_listed
 from scoring.alarms.alarm_state import AlarmState, ConditionSettings
 from scoring.alarms.alarm_text import AlarmText
 from scoring.alarms.tray_alarms import AlarmEvent, Conditions
+from scoring.detectors.table import row_of
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.former_snapshot_keys import FORMER_ALARM_KEYS, current_keys
 
@@ -94,8 +95,9 @@ class AlarmManager:
     def _persists(self, row: int, fan: int, score: Score, context: AlarmContext) -> bool:
         """Whether the fault of the last message persists. A diagnosis would take its end for part of the fault."""
         now, before = abs(context.balance_command[row, fan]), abs(self._next_message(fan).torque_balance_command)
-        of_sensor = score.statistic[row, fan] == Statistic.SENSOR
-        return bool(of_sensor or not np.isfinite(now) or now >= PERSISTING_SHARE * before)
+        detector = row_of(int(score.statistic[row, fan]))
+        of_tacho = detector is not None and detector.source == "tacho"
+        return bool(of_tacho or not np.isfinite(now) or now >= PERSISTING_SHARE * before)
 
     def answer(self, request: Request, last_t_ns: int) -> list[Alarm]:
         """One answer for each fan that a request concerns; none if it was answered before.

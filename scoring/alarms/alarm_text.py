@@ -6,9 +6,11 @@ earlier versions differ.
 
 from __future__ import annotations
 
-from schemas.messages import Alarm, Statistic, Transition
-from schemas.units import RAD_S_PER_UNIT, SpeedUnit
+from schemas.messages import Alarm, Transition
+from schemas.units import SpeedUnit
 from scoring.alarms.alarm_flags import is_listed
+from scoring.detectors.alarm_units import AlarmUnits
+from scoring.detectors.table import row_of
 
 CANNOT_TELL = "cannot_tell"
 CAUSES = {
@@ -43,8 +45,7 @@ class AlarmText:
 
     def __init__(self, speed_unit: SpeedUnit, command_unit: str) -> None:
         """command_unit: empty where the twin does not name it."""
-        self._speed_unit: SpeedUnit = speed_unit
-        self._command_unit = command_unit or "of command"
+        self._units = AlarmUnits(speed_unit, command_unit)
 
     def of(self, alarm: Alarm, refusal: str = "") -> str:
         """The line. refusal: the reason why a request was refused."""
@@ -60,17 +61,10 @@ class AlarmText:
         return f"{fan}: {TRANSITIONS[alarm.transition]}"
 
     def _deviation(self, alarm: Alarm) -> str:
-        if alarm.statistic == Statistic.SENSOR:
-            return "the tacho repeats one reading, or gives none"
-        if alarm.statistic in (Statistic.SPEED_VARIANCE_GROWTH, Statistic.BALANCE_VARIANCE_GROWTH):
-            return f"unsteady, {alarm.score:.1f} times the limit"
-        if alarm.statistic in (Statistic.SPEED_SMOOTHED, Statistic.SPEED_DRIFT):
-            side = "below" if alarm.residual_rad_s < 0 else "above"
-            size, limit = self._speed(abs(alarm.residual_rad_s)), self._speed(alarm.limit_rad_s)
-            return f"{size} {self._speed_unit} {side} the twin (limit {limit}){_duration(alarm)}"
-        side = "more" if alarm.torque_balance_command > 0 else "less"
-        size, limit = abs(alarm.torque_balance_command), alarm.torque_balance_limit_command
-        return f"takes {size:.2g} {self._command_unit} {side} than a healthy one (limit {limit:.2g}){_duration(alarm)}"
+        row = row_of(alarm.statistic)
+        if row is None:
+            return f"a statistic of a newer version is {alarm.score:.1f} times its limit"
+        return row.detector.text(alarm, row.source, self._units)
 
     def _cause_if_known(self, alarm: Alarm) -> str:
         known = alarm.causes and alarm.causes[0].cause != CANNOT_TELL
@@ -85,11 +79,3 @@ class AlarmText:
             return first.evidence or name  # the evidence begins with the name
         evidence = f": {first.evidence}" if first.evidence else ""
         return f"{name}, {100 * first.probability:.0f} %{evidence}"
-
-    def _speed(self, speed_rad_s: float) -> str:
-        speed = speed_rad_s / RAD_S_PER_UNIT[self._speed_unit]
-        return f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
-
-
-def _duration(alarm: Alarm) -> str:
-    return ", for long" if alarm.statistic in (Statistic.SPEED_DRIFT, Statistic.BALANCE_DRIFT) else ""

@@ -1,191 +1,197 @@
-"""Commissioning: what of a residual is this fan's, or this day's, own.
+"""Commissioning: the offset of a residual that belongs to this fan, or to this day, and is no fault.
 
-The time since a session's first sample is cut into intervals. The mean residual of the first one in which the residual
-stays where it is becomes the baseline: a fan that starts from rest is not itself at first. But it is not waited for
-longer than some intervals. While the fan is commissioned the baseline is the median of the means of its intervals;
-afterwards good ones refine it, as a running mean and with a fixed time constant in the long run. Nothing is learnt from
-an anomaly: while commissioning, from an interval with anything beyond its limit, and afterwards, from one that was not
-far from every limit. While commissioning the baseline may not lie further from none than those of healthy fans do, and
-afterwards not further from the commissioned one than the adaptation limit: what wears slowly gets there, and alarms.
+The time since the first sample of a session is cut into intervals. The mean residual of the first steady interval is
+the first baseline; a fan that starts from rest has no steady residual yet, and is waited for, but not for ever. While
+the fan is commissioned, the baseline is the median of the means of its intervals. Later intervals refine it, as a
+running mean first and with a fixed time constant in the long run.
 
-A fan's own offset may go with its speed, as `shape` says: one at the speed where the baseline is what it is, and less
-where it is slower. The mean of an interval is then by least squares, and an interval tells as much as the mean square
-of its shape. What a twin is wrong by at a low speed must not be taken for much more of it at a high one: each mean is
-drawn towards none, where healthy fans are, by ridge regression. At a larger shape than that of the intervals that told
-most a baseline is known the less (`unknown`), the larger it is; there it is followed the faster, and the commissioned
-one moves with it, by no more than was unknown.
+Nothing is learned from an anomaly. While commissioning, an interval counts if no statistic exceeded its limit; later,
+if none exceeded half of it. The commissioned baseline is limited to the offsets of healthy fans, and the later one to
+a distance from the commissioned one: slow wear reaches that distance, the residual grows, and an alarm is raised.
+
+The offset may change with the speed (scoring.baseline.speed_scaling). The mean of an interval is then a least-squares
+estimate of the offset at the reference speed, and its information is the mean square of the scaling in it. An error of
+the twin at low speed must not be extrapolated to a large offset at high speed, so estimates are drawn towards zero
+(ridge regression). Above the scaling at which most was learned, the offset is uncertain in proportion
+(`offset_uncertainty`). There the baseline is followed faster, and the commissioned one moves with it by at most that
+uncertainty.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from schemas.messages import Array
+from scoring.baseline.settings import BaselineSettings
+from scoring.detectors.state import ColumnState
 
-COMMISSIONING_INTERVALS = 10  # the baseline after so many is the commissioned one
-GOOD_SHARE = 0.5  # of an interval's samples must be valid
-ONE = 1 << 20  # of fixed point: one sigma
-ONE_SQUARED = 1 << 20  # of fixed point: one sigma squared
-WILD = 1e3  # sigma; a larger residual counts as this
-STEADY = 2.0  # standard deviations of a healthy residual: more within an interval, and the fan is on its way somewhere
-PATIENCE = 10  # intervals that may go by before an unsteady one will do
+COMMISSIONING_INTERVALS = 10
+MIN_VALID_SHARE = 0.5  # of an interval's samples
+FIXED_POINT_ONE = 1 << 20  # one sigma, or one sigma squared; integer sums do not depend on how samples are cut
+LARGEST_SIGMAS = 1e3  # a larger residual counts as this
+MAX_STEADY_STD = 2.0  # of a healthy residual: an interval with more is not steady
+MAX_UNSTEADY_INTERVALS = 10  # then an unsteady interval is accepted
 ROUNDING = 1e-9
-UNUSUAL = 3.0  # times the root mean square: so far an offset may be
-MORE = 1.5  # times as much told as by the one of those kept that told least: such an interval is followed the faster
-LEAST_TOLD = 1e-12
+OFFSET_RANGE_RMS = 3.0  # an offset may be so many times the root mean square of healthy ones
+FASTER_INFORMATION = 1.5  # times the least information kept: such an interval is followed faster
+MIN_INFORMATION = 1e-12
 
 
-@dataclass(frozen=True)
-class BaselineSettings:
-    """limits and spread in sigma; adaptation in intervals: the time constant in the long run."""
+class Baseline(ColumnState):
+    """The baselines of one residual of a tray's fans at the reference speed, in sigma of each fan."""
 
-    farthest: float
-    adaptation_limit: float
-    adaptation_intervals: float
-    spread: float = 1.0
-    """standard deviation of the healthy residual"""
-    ridge: float = 0.0
-    """variance of what a baseline cannot follow, in that of healthy baselines"""
-    usual: float = 0.0
-    """root mean square of healthy baselines"""
-
-
-class Baseline:
-    """The baselines of one residual of a tray's fans where the shape is one, in sigma of each fan."""
-
-    def __init__(self, fans: int, settings: BaselineSettings) -> None:
+    def __init__(
+        self, fans: int, settings: BaselineSettings, adaptation_intervals: float, residual_std: float = 1.0
+    ) -> None:
+        """adaptation_intervals: time constant in the long run. residual_std: of the healthy residual, sigma."""
         self._settings = settings
+        self._adaptation_intervals = adaptation_intervals
+        self._residual_std = residual_std
         self.value = np.zeros(fans)
         """(fans,) sigma; zero before the first good interval"""
         self.commissioned = np.zeros(fans)
-        """(fans,) sigma: the value of commissioning, at its end or so far"""
+        """(fans,) sigma: the value at the end of commissioning, or so far"""
         self.intervals = np.zeros(fans, np.int64)
         """(fans,) good intervals so far"""
-        self.waited = np.zeros(fans, np.int64)
+        self.unsteady_intervals = np.zeros(fans, np.int64)
         """(fans,) unsteady intervals before the first good one"""
-        self.means = np.full((COMMISSIONING_INTERVALS, fans), np.nan)
-        """sigma, of the good intervals that told most; while commissioning the baseline is their median"""
-        self.told = np.zeros((COMMISSIONING_INTERVALS, fans))
-        """how much each of them told"""
-        self.worth = np.zeros(fans)
-        """(fans,) how much all good intervals told together"""
-        self.sums = np.zeros(fans, np.int64)
-        self.shapes = np.zeros(fans, np.int64)
-        self.squares = np.zeros(fans, np.int64)
-        self.counts = np.zeros(fans, np.int64)
+        self.interval_means = np.full((COMMISSIONING_INTERVALS, fans), np.nan)
+        """sigma, of the good intervals with the most information"""
+        self.interval_information = np.zeros((COMMISSIONING_INTERVALS, fans))
+        """mean square of the scaling in each of these intervals"""
+        self.total_information = np.zeros(fans)
+        """(fans,) of all good intervals, each counted as one at most"""
+        self._sums = np.zeros(fans, np.int64)
+        self._scaling_squares = np.zeros(fans, np.int64)
+        self._squares = np.zeros(fans, np.int64)
+        self._counts = np.zeros(fans, np.int64)
 
     @property
     def is_set(self) -> Array:
-        """(fans,) whether a fan can be judged."""
+        """(fans,) whether a fan has a baseline, so that its residual can be scored."""
         return self.intervals > 0
 
     @property
     def is_commissioning(self) -> Array:
-        """(fans,) whether the baseline has yet to settle."""
+        """(fans,) whether commissioning goes on."""
         return self.intervals < COMMISSIONING_INTERVALS
 
     @property
     def is_at_limit(self) -> Array:
-        """(fans,) whether the baseline would have gone further if it might."""
-        limit = self._settings.adaptation_limit
-        went = np.abs(self.value - self.commissioned)
-        return self.is_set & (went >= limit * (1.0 - ROUNDING)) & (limit > 0)
+        """(fans,) whether the baseline is held at the adaptation limit."""
+        limit = self._settings.adaptation_limit_sigmas
+        moved = np.abs(self.value - self.commissioned)
+        return self.is_set & (moved >= limit * (1.0 - ROUNDING)) & (limit > 0)
 
     @property
-    def weight(self) -> Array:
-        """(fans,) of how many independent intervals the baseline varies as the mean."""
-        in_the_long_run = 2.0 * self._settings.adaptation_intervals - 1.0
-        return np.minimum(self.worth, in_the_long_run)
-
-    def unknown(self, shape: Array) -> Array:
-        """(n, fans) how far the fan's own offset may be from the baseline's at a shape, beyond what it is by, sigma."""
-        return UNUSUAL * self._settings.usual * np.maximum(shape - self.reached, 0.0)
+    def independent_intervals(self) -> Array:
+        """(fans,) the baseline varies as the mean of so many independent intervals."""
+        in_the_long_run = 2.0 * self._adaptation_intervals - 1.0
+        return np.minimum(self.total_information, in_the_long_run)
 
     @property
-    def reached(self) -> Array:
-        """(fans,) the shape where most was told."""
-        weights = np.square(self.told)
-        return np.sqrt((weights * self.told).sum(axis=0) / np.maximum(weights.sum(axis=0), LEAST_TOLD))
+    def learned_scale(self) -> Array:
+        """(fans,) the scaling at which most was learned."""
+        weights = np.square(self.interval_information)
+        total = np.maximum(weights.sum(axis=0), MIN_INFORMATION)
+        return np.sqrt((weights * self.interval_information).sum(axis=0) / total)
+
+    def offset_uncertainty(self, scaling: Array) -> Array:
+        """(n, fans) how far the fan's offset at a scaling (n, fans) may be from the scaled baseline, sigma."""
+        return OFFSET_RANGE_RMS * self._settings.rms_sigmas * np.maximum(scaling - self.learned_scale, 0.0)
 
     def restart(self, fans: Array) -> None:
-        """Commission some fans anew, (fans,) of bool."""
-        for column in (
-            self.value,
-            self.commissioned,
-            self.intervals,
-            self.waited,
-            self.worth,
-            self.sums,
-            self.shapes,
-            self.squares,
-            self.counts,
-        ):
-            column[fans] = 0
-        self.means[:, fans] = np.nan
-        self.told[:, fans] = 0.0
+        """Commission some fans again, (fans,) of bool."""
+        for column in self.columns().values():
+            column[..., fans] = 0
+        self.interval_means[:, fans] = np.nan
 
-    def add(self, residual: Array, valid: Array, shape: Array | float = 1.0) -> None:
-        """Note samples of the present interval, (n, fans) each; residual in sigma, shape finite."""
-        known = np.clip(np.where(valid, residual, 0.0), -WILD, WILD)
-        self.sums += np.rint(known * shape * ONE).astype(np.int64).sum(axis=0)
-        self.shapes += np.rint(np.where(valid, shape * shape, 0.0) * ONE_SQUARED).astype(np.int64).sum(axis=0)
-        self.squares += np.rint(known * known * ONE_SQUARED).astype(np.int64).sum(axis=0)
-        self.counts += valid.sum(axis=0)
+    def add(self, residual: Array, valid: Array, scaling: Array | float = 1.0) -> None:
+        """Take samples of the present interval, (n, fans) each; residual in sigma, scaling finite."""
+        known = np.clip(np.where(valid, residual, 0.0), -LARGEST_SIGMAS, LARGEST_SIGMAS)
+        self._sums += np.rint(known * scaling * FIXED_POINT_ONE).astype(np.int64).sum(axis=0)
+        squares = np.rint(np.where(valid, scaling * scaling, 0.0) * FIXED_POINT_ONE)
+        self._scaling_squares += squares.astype(np.int64).sum(axis=0)
+        self._squares += np.rint(known * known * FIXED_POINT_ONE).astype(np.int64).sum(axis=0)
+        self._counts += valid.sum(axis=0)
 
-    def end_interval(self, samples: int, normal: Array, quiet: Array) -> Array:
-        """End the present interval of so many samples. Returns which fans have just got a baseline.
+    def end_interval(self, samples: int, within_limit: Array, below_half_limit: Array) -> Array:
+        """End the present interval of so many samples. Returns which fans have just got their first baseline.
 
-        normal, quiet: (fans,) whether nothing was beyond its limit, and all far from it.
+        within_limit, below_half_limit: (fans,) whether every statistic stayed there during the interval.
         """
-        counts = np.maximum(self.counts, 1)
-        told = self.shapes / counts / ONE_SQUARED
-        product = self.sums / counts / ONE
-        mean = product / np.maximum(told + self._settings.ridge, LEAST_TOLD)
-        explained = product * product / np.maximum(told, LEAST_TOLD)
-        deviation = np.sqrt(np.maximum(self.squares / counts / ONE_SQUARED - explained, 0.0))
-        seen = (self.counts >= GOOD_SHARE * samples) & (self.counts > 0)
-        unsteady = seen & ~self.is_set & (deviation > STEADY * self._settings.spread) & (self.waited < PATIENCE)
-        self.waited += unsteady
-        good = seen & ~unsteady & np.where(self.is_commissioning, normal, quiet)
+        counts = np.maximum(self._counts, 1)
+        information = self._scaling_squares / counts / FIXED_POINT_ONE
+        product = self._sums / counts / FIXED_POINT_ONE
+        mean = product / np.maximum(information + self._settings.ridge, MIN_INFORMATION)
+        explained = product * product / np.maximum(information, MIN_INFORMATION)
+        deviation = np.sqrt(np.maximum(self._squares / counts / FIXED_POINT_ONE - explained, 0.0))
+        seen = (self._counts >= MIN_VALID_SHARE * samples) & (self._counts > 0)
+        unsteady = seen & ~self.is_set & (deviation > MAX_STEADY_STD * self._residual_std)
+        unsteady &= self.unsteady_intervals < MAX_UNSTEADY_INTERVALS
+        self.unsteady_intervals += unsteady
+        good = seen & ~unsteady & np.where(self.is_commissioning, within_limit, below_half_limit)
         first = good & (self.intervals == 0)
-        young = good & self.is_commissioning
-        eager = good & ~young & (told > MORE * self.told.min(axis=0))
-        worth = np.minimum(told, 1.0)
-        self.worth += np.where(good, worth, 0.0)
-        gain = worth / np.maximum(np.minimum(self.worth, self._settings.adaptation_intervals), LEAST_TOLD)
-        reached = self.reached
-        self._keep(mean, told, young | eager)
-        share = np.square(told) / np.maximum(np.square(self.told).sum(axis=0), LEAST_TOLD)
-        gain = np.where(eager, np.maximum(gain, share), gain)
-        value = np.where(good, self.value + gain * (mean - self.value), self.value)
-        if young.any():
-            median = _median(self.means[:, young], np.square(self.told[:, young]))
-            value[young] = np.clip(median, -self._settings.farthest, self._settings.farthest)
-        moved = np.where(eager, UNUSUAL * self._settings.usual * np.maximum(self.reached - reached, 0.0), 0.0)
-        commissioned = np.clip(value, self.commissioned - moved, self.commissioned + moved)
-        limit = self._settings.adaptation_limit
-        held = np.clip(value, commissioned - limit, commissioned + limit)
-        self.value = np.where(young, value, held)
-        self.commissioned = np.where(young, self.value, commissioned)
+        self._learn(mean, information, good)
         self.intervals += good
-        for column in (self.sums, self.shapes, self.squares, self.counts):
+        for column in (self._sums, self._scaling_squares, self._squares, self._counts):
             column[:] = 0
         return first
 
-    def _keep(self, mean: Array, told: Array, fans: Array) -> None:
-        """Keep the means of some fans, each in the place of the one that told least."""
-        least, each = self.told.argmin(axis=0), np.flatnonzero(fans)
-        self.means[least[each], each] = mean[each]
-        self.told[least[each], each] = told[each]
+    def _learn(self, mean: Array, information: Array, good: Array) -> None:
+        """Move the baselines of fans with a good interval. All (fans,)."""
+        settings = self._settings
+        commissioning = good & self.is_commissioning
+        faster = good & ~commissioning & (information > FASTER_INFORMATION * self.interval_information.min(axis=0))
+        counted = np.minimum(information, 1.0)
+        self.total_information += np.where(good, counted, 0.0)
+        gain = counted / np.maximum(np.minimum(self.total_information, self._adaptation_intervals), MIN_INFORMATION)
+        scale_before = self.learned_scale
+        self._keep(mean, information, commissioning | faster)
+        kept = np.maximum(np.square(self.interval_information).sum(axis=0), MIN_INFORMATION)
+        gain = np.where(faster, np.maximum(gain, np.square(information) / kept), gain)
+        value = np.where(good, self.value + gain * (mean - self.value), self.value)
+        if commissioning.any():
+            weights = np.square(self.interval_information[:, commissioning])
+            median = _weighted_median(self.interval_means[:, commissioning], weights)
+            limit = settings.commissioning_limit_sigmas
+            value[commissioning] = np.clip(median, -limit, limit)
+        learned = np.maximum(self.learned_scale - scale_before, 0.0)
+        moved = np.where(faster, OFFSET_RANGE_RMS * settings.rms_sigmas * learned, 0.0)
+        commissioned = np.clip(value, self.commissioned - moved, self.commissioned + moved)
+        limit = settings.adaptation_limit_sigmas
+        held = np.clip(value, commissioned - limit, commissioned + limit)
+        self.value = np.where(commissioning, value, held)
+        self.commissioned = np.where(commissioning, self.value, commissioned)
+
+    def _keep(self, mean: Array, information: Array, fans: Array) -> None:
+        """Keep the means of some fans, each in place of the one with the least information."""
+        least, each = self.interval_information.argmin(axis=0), np.flatnonzero(fans)
+        self.interval_means[least[each], each] = mean[each]
+        self.interval_information[least[each], each] = information[each]
+
+    def columns(self) -> dict[str, Array]:
+        """See ColumnState."""
+        return {
+            "value": self.value,
+            "commissioned": self.commissioned,
+            "intervals": self.intervals,
+            "unsteady_intervals": self.unsteady_intervals,
+            "interval_means": self.interval_means,
+            "interval_information": self.interval_information,
+            "total_information": self.total_information,
+            "sums": self._sums,
+            "scaling_squares": self._scaling_squares,
+            "squares": self._squares,
+            "counts": self._counts,
+        }
 
 
-def _median(means: Array, weights: Array) -> Array:
-    """(fans,) weighted median of (intervals, fans); that of the plain kind where all weights are alike."""
+def _weighted_median(means: Array, weights: Array) -> Array:
+    """(fans,) weighted median of (intervals, fans); the plain median where all weights are equal."""
     order = np.argsort(means, axis=0)  # NaN, of weight zero, come last
     ordered = np.nan_to_num(np.take_along_axis(means, order, axis=0))
-    weights = np.take_along_axis(np.maximum(weights, LEAST_TOLD) * np.isfinite(means), order, axis=0)
+    weights = np.take_along_axis(np.maximum(weights, MIN_INFORMATION) * np.isfinite(means), order, axis=0)
     centres = np.cumsum(weights, axis=0) - weights / 2.0
     half = weights.sum(axis=0) / 2.0
     return np.array(

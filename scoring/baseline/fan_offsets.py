@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.messages import Array
-from scoring.limits import FanOffsets
+from scoring.healthy_residual import FanOffsets
 
 FEWEST_FANS = 3
 FEWEST_RUNS = 12

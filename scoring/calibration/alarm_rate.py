@@ -1,9 +1,9 @@
-"""The interval of a rate of alarms that were counted in blocks of running: runs, fans, or stretches of time.
+"""Confidence interval of a rate of alarms that were counted in blocks of running: runs, fans, or stretches of time.
 
-Alarms of one block go together: a day, or a fan, has many or none. So the count is worth as many independent ones as
-its variance over bootstrapped blocks says (quasi-Poisson: Wedderburn, Biometrika 61 (1974) 439; the bootstrap of
-blocks: Kuensch, Annals of Statistics 17 (1989) 1217), and the interval is Garwood's (Biometrika 28 (1936) 437) of that
-count.
+Alarms of one block come together: a day, or a fan, has many or none. The variance of the count over bootstrapped blocks
+shows how many independent alarms it is equivalent to (quasi-Poisson: Wedderburn, Biometrika 61 (1974) 439; block
+bootstrap: Kuensch, Annals of Statistics 17 (1989) 1217). The interval is that of Garwood (Biometrika 28 (1936) 437) for
+this number.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ COVERAGE = 0.95
 
 
 def rate_interval(counts: Array, exposures: Array, seed: int) -> tuple[float, float]:
-    """95 % of the rate per unit of exposure. counts, exposures: (blocks,)."""
+    """95 % interval of the rate per unit of exposure. counts, exposures: (blocks,)."""
     total = float(exposures.sum())
-    worth = 1.0 / dispersion(counts, exposures, seed)
-    low, high = poisson_interval(float(counts.sum()) * worth)
-    return low / worth / total, high / worth / total
+    independent = 1.0 / dispersion(counts, exposures, seed)
+    low, high = poisson_interval(float(counts.sum()) * independent)
+    return low / independent / total, high / independent / total
 
 
 def poisson_interval(count: float) -> tuple[float, float]:
-    """95 % of what was expected where so many were counted."""
+    """95 % interval of the expected count, given the count."""
     outside = (1.0 - COVERAGE) / 2
     low = float(chi2.ppf(outside, 2 * count)) / 2 if count > 0 else 0.0
     return low, float(chi2.ppf(1.0 - outside, 2 * count + 2)) / 2
 
 
 def dispersion(counts: Array, exposures: Array, seed: int) -> float:
-    """Variance of the count over bootstrapped blocks, in that of independent alarms; not below one."""
+    """Variance of the count over bootstrapped blocks, relative to that of independent alarms; at least one."""
     if not counts.sum():
         return 1.0
     random = np.random.default_rng(seed)

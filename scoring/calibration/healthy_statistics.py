@@ -1,181 +1,203 @@
-"""One pass over healthy runs, judged as live fans are: what calibration needs to know of them."""
+"""One pass over healthy runs, scored as live fans are: the statistics that calibration sets limits by."""
 
 from __future__ import annotations
 
-import math
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from schemas.messages import Array, Statistic
+from schemas.messages import Array
+from schemas.units import NS_PER_S
 from scoring.baseline.fan_offsets import Cells
-from scoring.calibration.windows import Windows, peaks
-from scoring.fan_scorer import FanScorer, Samples
+from scoring.calibration.residual_moments import MOTION_BINS, SPEED_BINS, ResidualMoments, octaves
+from scoring.calibration.windows import WindowMaxima, Windows, peaks
+from scoring.detectors.detector import DetectorRow, Source
+from scoring.detectors.smoothed import Smoothed
+from scoring.detectors.table import rows
+from scoring.fan_scorer import RESIDUALS, FanScorer, Observation, ScoredBlock
 from scoring.limits import Limits
+from scoring.samples import Samples
 
-SPEED_BINS = 24
-MOTION_BINS = 12  # each twice the one before; the last begins at the top speed
-LARGEST_SQUARE, PARTS_OF_OCTAVE, OCTAVE_PARTS = 1e4, 8, 320
-MEDIAN_OF_SQUARE = 0.4549  # of a normal variable of variance one
-WILD = 100.0  # sigma; a larger residual counts as this
-RESIDUALS = ("speed", "balance")
-FIRST = (Statistic.SPEED_SMOOTHED - 1, Statistic.BALANCE_SMOOTHED - 1)
-"""the first of the three statistics of each residual"""
+LARGEST_SIGMAS = 100.0  # a larger residual counts as this
 
 
-class Running(NamedTuple):
-    """A healthy run. known_as: which fans of the twin these are; None where it does not know one from another."""
+class HealthyRun(NamedTuple):
+    """A healthy run of one tray."""
 
+    name: str
+    """of the recording, for people"""
     fans: int
     blocks: Iterable[Samples]
     known_as: range | None = None
+    """the numbers of these fans in the twin; None where it does not know its fans one by one"""
 
 
-Runs = Callable[[], Iterable[Running]]
-"""At each call the healthy runs from the beginning."""
+Runs = Callable[[], Iterable[HealthyRun]]
+"""Gives the healthy runs from the beginning at each call."""
 
 
-@dataclass
-class Moments:
-    """Of one residual over bins of speed: counts, sums, sums of squares; and of means over a second."""
+class MixedRatesError(Exception):
+    """Healthy runs have grids of different rates, and limits hold for one."""
 
-    count: Array = field(default_factory=lambda: np.zeros(SPEED_BINS))
-    total: Array = field(default_factory=lambda: np.zeros(SPEED_BINS))
-    cells: list[Cells] = field(default_factory=list)
-    """of each run of fans that the twin knows"""
-    square: Array = field(default_factory=lambda: np.zeros(SPEED_BINS))
-    means: int = 0
-    mean_square: float = 0.0
-    baselines: list[Array] = field(default_factory=list)
-    growth: float = 0.0
-    """sum of the spread, in its limit"""
-    moved: Array = field(default_factory=lambda: np.zeros((3, MOTION_BINS)))
-    """over bins of motion: counts, sums of the squares of motion, and of the low-passed residual"""
-    lasting: Array = field(default_factory=lambda: np.zeros((2, SPEED_BINS)))
-    """over bins of speed: counts, and sums of the square of the step, in its limit"""
-
-    raw: Array = field(default_factory=lambda: np.zeros(OCTAVE_PARTS))
-    """of squares of means over a second, by how many parts of an octave they are below the largest"""
-    standard: Array = field(default_factory=lambda: np.zeros(OCTAVE_PARTS))
-    """the same of the standardised residual"""
-
-    def left(self) -> float:
-        """Mean square of what the baseline leaves, over seconds."""
-        return self.mean_square / self.means if self.means else math.inf
-
-    def usually_left(self) -> float:
-        """The same by the median, as of normal ones: what is only there on the way from one speed to another is not."""
-        return _quantile(self.raw, 0.5) / MEDIAN_OF_SQUARE
-
-    def lasts(self, share: float) -> float:
-        """What the mean of the standardised residual over a second is not above in such a share of them."""
-        return math.sqrt(_quantile(self.standard, share))
-
-
-def _quantile(below: Array, share: float) -> float:
-    if not below.sum():
-        return math.inf
-    parts = np.interp(1.0 - share, np.cumsum(below) / below.sum(), np.arange(OCTAVE_PARTS) + 1.0)
-    return float(LARGEST_SQUARE * 0.5 ** (parts / PARTS_OF_OCTAVE))
+    def __init__(self, first: tuple[str, int], other: tuple[str, int]) -> None:
+        super().__init__(first, other)
+        self.first = first
+        """name of a run and its period in ns"""
+        self.other = other
 
 
 @dataclass
-class Healthy:
-    """What one pass over the healthy runs has found. maxima: by run, (windows, 8, fans), see
-    scoring.calibration.windows."""
+class HealthyStatistics:
+    """What one pass over the healthy runs has found."""
 
     top_speed_rad_s: float
-    step_s: float = 0.0
-    maxima: list[Array] = field(default_factory=list)
-    moments: dict[str, Moments] = field(default_factory=lambda: {name: Moments() for name in RESIDUALS})
+    period_ns: int = 0
+    maxima: list[WindowMaxima] = field(default_factory=list)
+    """of each run"""
+    moments: dict[Source, ResidualMoments] = field(
+        default_factory=lambda: {source: ResidualMoments() for source in RESIDUALS}
+    )
+    ratio_sums: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    """of each detector of a residual, the sum of its statistic in its limit"""
     fan_s: float = 0.0
-    speeds: float = 0.0
-    """sum over the samples that were judged, rad/s"""
-    stuck_s: float = 0.0
-    missing: float = 0.0
+    """time that was scored, summed over fans"""
+    speed_sum_rad_s: float = 0.0
+    """over the samples that were scored"""
+    observed: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
+    """of each detector, see Detector.observed"""
 
-    def peaks(self, row: int) -> Array:
-        """(windows of fans,) of one statistic, or the score as the last."""
-        every = np.concatenate([peaks(run[:, row]).ravel() for run in self.maxima])
-        return every[np.isfinite(every)]
+    @property
+    def step_s(self) -> float:
+        """Sampling period of the runs."""
+        return self.period_ns / NS_PER_S
 
     @property
     def centres_rad_s(self) -> Array:
-        """(SPEED_BINS,)"""
+        """(SPEED_BINS,) centres of the bins of speed."""
         return (np.arange(SPEED_BINS) + 0.5) / SPEED_BINS * self.top_speed_rad_s
 
     @property
     def mean_speed_rad_s(self) -> float:
-        """Of the samples that were judged."""
-        return self.speeds * self.step_s / max(self.fan_s, 1e-9)
+        """Mean speed of the samples that were scored."""
+        return self.speed_sum_rad_s * self.step_s / max(self.fan_s, 1e-9)
 
     @property
     def windows(self) -> int:
-        """So many in which a fan was judged."""
-        return sum(int(np.isfinite(run[:, -1]).sum()) for run in self.maxima)
+        """Number of windows of fans in which the fan was scored."""
+        return sum(int(np.isfinite(run.score).sum()) for run in self.maxima)
+
+    def peaks(self, row: int) -> Array:
+        """(windows of fans,) of the statistic in a row of the table, see windows.peaks."""
+        every = np.concatenate([peaks(run.statistics[:, row]).ravel() for run in self.maxima])
+        return every[np.isfinite(every)]
+
+    def mean_ratio(self, row: DetectorRow) -> float:
+        """Mean of the statistic of a detector of a residual, in multiples of its limit."""
+        if row.source == "tacho":
+            return 0.0
+        return float(self.ratio_sums[row.name] / max(self.moments[row.source].count.sum(), 1.0))
 
 
-def survey(runs: Runs, limits: Limits, top_speed_rad_s: float) -> Healthy:
-    """Judge healthy runs by some limits and keep what calibration needs."""
-    healthy = Healthy(top_speed_rad_s)
-    for fans, blocks, known_as in runs():
-        judge = FanScorer(fans, limits.of(known_as))
-        judge.watch()
-        windows = Windows(fans, limits.timing.on_delay_s)
-        seconds = {row + more: _Seconds() for row in FIRST for more in (0, 1)}
-        cells = {name: np.zeros((2, fans, SPEED_BINS)) for name in RESIDUALS}
-        for block in blocks:
-            _take(healthy, judge, windows, seconds, cells, block)
-        healthy.maxima.append(windows.end())
-        for name in RESIDUALS:
-            baseline = getattr(judge, name).baseline
-            settled = baseline.is_set & ~baseline.is_commissioning
-            count, total = cells[name]
-            healthy.moments[name].count += count.sum(axis=0)
-            healthy.moments[name].total += total.sum(axis=0)
-            if known_as is not None:
-                healthy.moments[name].cells.append(Cells(known_as, count, total))
-            healthy.moments[name].baselines.append(baseline.commissioned[settled if settled.any() else baseline.is_set])
-    return healthy
+def healthy_statistics(runs: Runs, limits: Limits, top_speed_rad_s: float) -> HealthyStatistics:
+    """Score healthy runs with some limits.
+
+    Raises:
+        MixedRatesError: the runs are not all of one sampling period.
+    """
+    found = HealthyStatistics(top_speed_rad_s)
+    first = ""
+    for run in runs():
+        one = _RunStatistics(found, run, limits.of(run.known_as))
+        for block in run.blocks:
+            if not found.period_ns:
+                found.period_ns, first = block.period_ns, run.name
+            elif block.period_ns != found.period_ns:
+                raise MixedRatesError((first, found.period_ns), (run.name, block.period_ns))
+            one.add(block)
+        one.end()
+    return found
 
 
-def _take(
-    healthy: Healthy,
-    judge: FanScorer,
-    windows: Windows,
-    seconds: dict[int, _Seconds],
-    cells: dict[str, Array],
-    block: Samples,
-) -> None:
-    verdict = judge.update(block)
-    judged = np.isfinite(verdict.score)
-    ratios, standard, usual, motion_rad_s = judge.watched()
-    windows.add(block.t_ns, block.period_ns, ratios, judged)
-    healthy.step_s = block.period_ns / 1e9
-    healthy.fan_s += float(judged.sum()) * healthy.step_s
-    healthy.speeds += float(np.nansum(np.abs(block.speed_rad_s), where=judged))
-    healthy.stuck_s = max(healthy.stuck_s, judge.sensor.longest_s)
-    healthy.missing = max(healthy.missing, judge.sensor.most_missing)
-    bins = np.clip(np.abs(block.speed_rad_s) / healthy.top_speed_rad_s * SPEED_BINS, 0, SPEED_BINS - 1)
-    octaves = np.log2(np.maximum(motion_rad_s / healthy.top_speed_rad_s, 1e-9))
-    moving = np.clip(np.ceil(octaves) + MOTION_BINS - 1, 0, MOTION_BINS - 1).astype(int)
-    for name, first, residual, valid, smoothed, baseline in (
-        ("speed", FIRST[0], block.speed_residual, block.speed_valid, verdict.speed_smoothed, verdict.speed_baseline),
-        ("balance", FIRST[1], block.balance, block.balance_valid, verdict.balance_smoothed, verdict.balance_baseline),
-    ):
+class _RunStatistics:
+    """Adds the statistics of one run to those of all."""
+
+    def __init__(self, found: HealthyStatistics, run: HealthyRun, limits: Limits) -> None:
+        self._found = found
+        self._run = run
+        self._scorer = FanScorer(run.fans, limits, observing=True)
+        self._windows = Windows(run.fans, len(rows()), limits.timing.on_delay_s)
+        self._seconds = {source: _SecondMeans() for source in RESIDUALS}
+        self._standardised_seconds = {source: _SecondMeans() for source in RESIDUALS}
+        self._cells = {source: np.zeros((2, run.fans, SPEED_BINS)) for source in RESIDUALS}
+
+    def add(self, block: Samples) -> None:
+        """Score a block."""
+        found, scored = self._found, self._scorer.update(block)
+        seen = self._scorer.observed()
+        ratios = np.concatenate([one.ratios for one in seen], axis=1)
+        has_score = np.isfinite(scored.score)
+        self._windows.add(block.t_ns, block.period_ns, ratios, has_score)
+        found.fan_s += float(has_score.sum()) * found.step_s
+        found.speed_sum_rad_s += float(np.nansum(np.abs(block.speed_rad_s), where=has_score))
+        self._add_residual("speed", block, scored, seen, ratios)
+        self._add_residual("balance", block, scored, seen, ratios)
+
+    def _add_residual(
+        self, source: Source, block: Samples, scored: ScoredBlock, seen: list[Observation], ratios: Array
+    ) -> None:
+        is_speed = source == "speed"
+        residual, valid = (
+            (block.speed_residual, block.speed_valid) if is_speed else (block.balance, block.balance_valid)
+        )
+        smoothed, baseline = (
+            (scored.speed_smoothed, scored.speed_baseline)
+            if is_speed
+            else (scored.balance_smoothed, scored.balance_baseline)
+        )
         use = valid & np.isfinite(smoothed)
-        if use.any():
-            moments = healthy.moments[name]
-            moments.growth += float(ratios[first + 2][use].sum())
-            moments.lasting += _sums(bins[use].astype(int), SPEED_BINS, np.square(ratios[first][use]))
-            shift = np.clip(np.where(use, residual - usual[first // 3] - baseline, np.nan), -WILD, WILD)
-            _note(moments, cells[name], shift, bins, seconds[first].of(shift, healthy.step_s))
-            lasts = seconds[first + 1].of(np.where(use, standard[first // 3], np.nan), healthy.step_s)
-            moments.standard += _below(np.square(lasts))
-            motions = np.square(motion_rad_s[use])
-            moments.moved += _sums(moving[use], MOTION_BINS, motions, np.square(smoothed[use]))
+        if not use.any():
+            return
+        found, moments = self._found, self._found.moments[source]
+        speed = np.abs(block.speed_rad_s) / found.top_speed_rad_s * SPEED_BINS
+        bins = np.clip(speed, 0, SPEED_BINS - 1)
+        motion_rad_s = np.concatenate([one.motion_rad_s for one in seen])
+        octave = np.log2(np.maximum(motion_rad_s / found.top_speed_rad_s, 1e-9))
+        moving = np.clip(np.ceil(octave) + MOTION_BINS - 1, 0, MOTION_BINS - 1).astype(int)
+        for number, row in enumerate(rows()):
+            if row.source == source:
+                found.ratio_sums[row.name] += float(ratios[number][use].sum())
+                if row.detector is Smoothed:
+                    squares = np.square(ratios[number][use])
+                    moments.smoothed_by_speed += _sums(bins[use].astype(int), SPEED_BINS, squares)
+        expected = np.concatenate([one.expected[source] for one in seen])
+        shift = np.clip(np.where(use, residual - expected - baseline, np.nan), -LARGEST_SIGMAS, LARGEST_SIGMAS)
+        _add_shift(moments, self._cells[source], shift, bins, self._seconds[source].of(shift, found.step_s))
+        persistent = np.concatenate([one.persistent[source] for one in seen])
+        means = self._standardised_seconds[source].of(np.where(use, persistent, np.nan), found.step_s)
+        moments.standardised_octaves += octaves(np.square(means))
+        motions = np.square(motion_rad_s[use])
+        moments.by_motion += _sums(moving[use], MOTION_BINS, motions, np.square(smoothed[use]))
+
+    def end(self) -> None:
+        """Add what is known at the end of the run."""
+        found = self._found
+        found.maxima.append(self._windows.end())
+        for name, detector in self._scorer.detectors.items():
+            largest = found.observed[name]
+            for key, value in detector.observed().items():
+                largest[key] = max(largest.get(key, 0.0), value)
+        for source, moments in found.moments.items():
+            baseline = self._scorer.residuals[source].baseline
+            settled = baseline.is_set & ~baseline.is_commissioning
+            count, total = self._cells[source]
+            moments.count += count.sum(axis=0)
+            moments.total += total.sum(axis=0)
+            if self._run.known_as is not None:
+                moments.cells.append(Cells(self._run.known_as, count, total))
+            moments.baselines.append(baseline.commissioned[settled if settled.any() else baseline.is_set])
 
 
 def _sums(places: Array, bins: int, *columns: Array) -> Array:
@@ -183,7 +205,7 @@ def _sums(places: Array, bins: int, *columns: Array) -> Array:
     return np.stack([np.bincount(places, column, minlength=bins) for column in (np.ones(len(places)), *columns)])
 
 
-def _note(moments: Moments, cells: Array, shift: Array, bins: Array, means: Array) -> None:
+def _add_shift(moments: ResidualMoments, cells: Array, shift: Array, bins: Array, means: Array) -> None:
     use = np.isfinite(shift)
     where = bins[use].astype(int)
     of_fans = where + SPEED_BINS * np.nonzero(use)[1]
@@ -191,48 +213,42 @@ def _note(moments: Moments, cells: Array, shift: Array, bins: Array, means: Arra
         cells[column] += np.bincount(of_fans, values, minlength=cells[column].size).reshape(-1, SPEED_BINS)
     moments.square += np.bincount(where, shift[use] ** 2, minlength=SPEED_BINS)
     squares = np.square(means)
-    moments.means += squares.size
-    moments.mean_square += float(squares.sum())
-    moments.raw += _below(squares)
+    moments.seconds += squares.size
+    moments.second_mean_square += float(squares.sum())
+    moments.second_octaves += octaves(squares)
 
 
-class _Seconds:
+class _SecondMeans:
     """Means over whole seconds of one residual of one run, however its samples are cut into blocks."""
 
     def __init__(self) -> None:
         self._rest: Array | None = None
 
     def of(self, shift: Array, step_s: float) -> Array:
-        """(m,) finite means that are now whole; shift: (n, fans)."""
+        """(m,) finite means that are complete now; shift: (n, fans)."""
         second = max(1, round(1.0 / step_s))
-        rows = shift if self._rest is None else np.concatenate((self._rest, shift))
-        whole = len(rows) // second * second
-        self._rest = rows[whole:].copy()
-        means = rows[:whole].reshape(-1, second, rows.shape[1]).mean(axis=1)
+        samples = shift if self._rest is None else np.concatenate((self._rest, shift))
+        whole = len(samples) // second * second
+        self._rest = samples[whole:].copy()
+        means = samples[:whole].reshape(-1, second, samples.shape[1]).mean(axis=1)
         return means[np.isfinite(means)]
 
 
-def _below(squares: Array) -> Array:
-    """(OCTAVE_PARTS,) how many are how far below the largest."""
-    parts = PARTS_OF_OCTAVE * np.log2(LARGEST_SQUARE / np.clip(squares, 1e-12, LARGEST_SQUARE))
-    return np.bincount(np.minimum(parts, OCTAVE_PARTS - 1).astype(int), minlength=OCTAVE_PARTS)
-
-
 def truncate_runs(runs: Runs, count: int, fan_s: float) -> Runs:
-    """The truncate_runs of so many runs, together not more than so much running of fans."""
+    """The first part of each of `count` runs, together not longer than fan_s, summed over fans."""
 
-    def each() -> Iterator[Running]:
-        for fans, blocks, known_as in runs():
-            yield Running(fans, _until(blocks, fan_s / count / fans), known_as)
+    def each() -> Iterator[HealthyRun]:
+        for run in runs():
+            yield run._replace(blocks=_until(run.blocks, fan_s / count / run.fans))
 
     return each
 
 
 def _until(blocks: Iterable[Samples], seconds: float) -> Iterator[Samples]:
-    """The first block at least."""
+    """Blocks up to a time; the first one at least."""
     end_t_ns = None
     for block in blocks:
         if end_t_ns is not None and block.t_ns[-1] > end_t_ns:
             return
-        end_t_ns = end_t_ns or int(block.t_ns[0]) + round(seconds * 1e9)
+        end_t_ns = end_t_ns or int(block.t_ns[0]) + round(seconds * NS_PER_S)
         yield block

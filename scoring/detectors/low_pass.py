@@ -1,4 +1,4 @@
-"""A first-order low-pass over valid samples: a sample that is not valid leaves it where it was."""
+"""First-order low-pass over valid samples; an invalid sample leaves the output unchanged."""
 
 from __future__ import annotations
 
@@ -7,27 +7,28 @@ import math
 import numpy as np
 
 from schemas.messages import Array
+from scoring.detectors.state import ColumnState
 from scoring.detectors.torque_balance import filter_rows
 
 
-class LowPass:
+class LowPass(ColumnState):
     """y[k] = keep y[k-1] + (1 - keep) x[k] with keep = exp(-step / time constant), exact for a held input."""
 
     def __init__(self, columns: int, time_constant_s: float, start: float = 0.0) -> None:
         self._time_constant_s = time_constant_s
         self.value = np.full(columns, start)
-        """(columns,) the last y"""
+        """(columns,) the last output"""
 
     def keep(self, step_s: float) -> float:
-        """What is left of the past after one step."""
+        """Weight of the previous output after one step."""
         return math.exp(-step_s / self._time_constant_s) if self._time_constant_s > 0 else 0.0
 
     def reset(self, columns: Array, to: float = 0.0) -> None:
-        """Begin anew for some columns, (columns,) of bool."""
+        """Start again for some columns, (columns,) of bool."""
         self.value[columns] = to
 
     def update(self, x: Array, valid: Array, step_s: float) -> Array:
-        """Take a block, (n, columns) each, and return y after each sample."""
+        """Take a block, (n, columns) each, and return the output after each sample."""
         keep = self.keep(step_s)
         whole = valid.all(axis=0)
         if len(x) == 1:
@@ -43,6 +44,10 @@ class LowPass:
                 y[:, column] = self._held(x[:, column], valid[:, column], keep, self.value[column])
         self.value = y[-1].copy()
         return y
+
+    def columns(self) -> dict[str, Array]:
+        """See ColumnState."""
+        return {"value": self.value}
 
     @staticmethod
     def _held(x: Array, valid: Array, keep: float, before: float) -> Array:

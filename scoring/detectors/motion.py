@@ -1,7 +1,7 @@
-"""How much a fan is being moved: how far its speed is from what it was over the last second.
+"""How fast a fan is changing its speed: distance of the speed from its low-pass over one second.
 
-A twin that is right where the speed holds is a little wrong on the way from one speed to another. A healthy residual
-varies the more, the further it went (an adaptive threshold by the size of the input: Emami-Naeini, Akhter and Rock,
+A twin that is accurate at constant speed is less accurate while the speed changes, so healthy residuals vary more
+there. Limits widen with this measure (an adaptive threshold by the size of the input: Emami-Naeini, Akhter and Rock,
 IEEE Transactions on Automatic Control 33 (1988) 1106).
 """
 
@@ -11,19 +11,20 @@ import numpy as np
 
 from schemas.messages import Array
 from scoring.detectors.low_pass import LowPass
+from scoring.detectors.state import ColumnState
 
-MEMORY_S = 1.0
+TIME_CONSTANT_S = 1.0
 
 
-class Motion:
-    """Of a tray's fans."""
+class Motion(ColumnState):
+    """The measure of a tray's fans."""
 
     def __init__(self, fans: int) -> None:
-        self.past = LowPass(fans, MEMORY_S, np.nan)
+        self.past = LowPass(fans, TIME_CONSTANT_S, np.nan)
         """rad/s; NaN before the first reading"""
 
     def update(self, speed_rad_s: Array, step_s: float) -> Array:
-        """(n, fans) rad/s, for as many speeds; none where there is no reading."""
+        """Take speeds, (n, fans) rad/s. Returns the measure, (n, fans) rad/s, 0 where there is no reading."""
         valid = np.isfinite(speed_rad_s)
         new = np.isnan(self.past.value) & valid.any(axis=0)
         if new.any():
@@ -31,3 +32,7 @@ class Motion:
             self.past.value[new] = speed_rad_s[first, np.flatnonzero(new)]
         speed = np.where(valid, speed_rad_s, 0.0)
         return np.where(valid, np.abs(speed - self.past.update(speed, valid, step_s)), 0.0)
+
+    def columns(self) -> dict[str, Array]:
+        """See ColumnState."""
+        return {"past": self.past.value}

@@ -1,62 +1,114 @@
-"""The tacho itself: readings that repeat themselves, and readings that are missing.
+"""The tacho itself: readings that repeat, and readings that are missing.
 
-A stuck tacho goes on to give the last value. A healthy one may do so as well, for a while, where it counts coarsely
-and the fan runs evenly; calibration says for how long. What is missing is judged by its share.
+A stuck tacho repeats its last value. A healthy one may do so for a while, where it counts coarsely and the fan runs
+evenly; calibration measures for how long. Missing readings are judged by their share.
 """
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from collections.abc import Mapping
+from typing import ClassVar
 
-from schemas.messages import Array
+import numpy as np
+from pydantic import Field
+
+from schemas.messages import Alarm, Array
+from schemas.units import NS_PER_S
+from scoring.detectors.alarm_units import AlarmUnits
+from scoring.detectors.detector import (
+    UNREACHED,
+    Detector,
+    DetectorContext,
+    DetectorInput,
+    DetectorSettings,
+    LimitRule,
+    Source,
+)
 from scoring.detectors.low_pass import LowPass
 
 MISSING_TIME_CONSTANT_S = 2.0
+STUCK_MARGIN, MIN_STUCK_S = 3.0, 2.0  # times the longest repetition of healthy runs
+MISSING_MARGIN, MIN_MISSING_SHARE, MAX_MISSING_SHARE = 3.0, 0.25, 0.9  # times the largest share of healthy runs
 
 
-class Sensor:
-    """The tachos of a tray's fans."""
+class SensorSettings(DetectorSettings):
+    """Of Sensor."""
 
-    def __init__(self, fans: int, stuck_limit_s: float, missing_limit: float) -> None:
-        """stuck_limit_s: for how long a reading may repeat itself. missing_limit: the share that may be missing."""
-        self._stuck_limit_s = stuck_limit_s
-        self._missing_limit = missing_limit
-        self.last = np.full(fans, np.nan)
-        """(fans,) rad/s, the last reading"""
-        self.since_ns = np.zeros(fans, np.int64)
-        """(fans,) for how long it has repeated itself"""
-        self.missing = LowPass(fans, MISSING_TIME_CONSTANT_S)
-        self.longest_s = 0.0
-        """for how long any reading has repeated itself so far"""
-        self.most_missing = 0.0
-        """the largest share so far"""
+    rule: ClassVar[LimitRule] = LimitRule.FIXED
+    stuck_s: float = Field(default=5.0, gt=0, description="for how long a reading may repeat itself")
+    missing_share: float = Field(default=0.25, gt=0, le=1, description="share of readings that may be missing")
 
-    def reset(self, fans: Array) -> None:
-        """Begin anew for some fans, (fans,) of bool."""
-        self.since_ns[fans] = 0
-        self.missing.reset(fans)
+    @classmethod
+    def unreached(cls) -> SensorSettings:
+        """See DetectorSettings."""
+        return cls(stuck_s=UNREACHED, missing_share=1.0)
 
-    def stuck_s(self, speed_rad_s: Array, period_ns: int) -> Array:
-        """For how long each reading has repeated itself, s. speed_rad_s: (n, fans), NaN where there is none.
+    @classmethod
+    def fixed(cls, observed: Mapping[str, float]) -> SensorSettings:
+        """Limits by the longest repetition and the largest missing share of healthy runs."""
+        share = max(MIN_MISSING_SHARE, MISSING_MARGIN * observed.get("missing_share", 0.0))
+        return cls(
+            stuck_s=max(MIN_STUCK_S, STUCK_MARGIN * observed.get("stuck_s", 0.0)),
+            missing_share=min(MAX_MISSING_SHARE, share),
+        )
 
-        A fan at rest reads zero and is not stuck.
-        """
-        before = np.vstack((self.last, speed_rad_s))[:-1]
+    def scaled(self, factor: float) -> SensorSettings:
+        """The limit of repetition scales; a share of missing readings cannot go far beyond its limit."""
+        return self.model_copy(update={"stuck_s": self.stuck_s * factor})
+
+
+class Sensor(Detector):
+    """How long each reading has repeated, or the share of missing ones, whichever is closer to its limit."""
+
+    settings = SensorSettings
+
+    def __init__(self, settings: SensorSettings, context: DetectorContext) -> None:
+        self._settings = settings
+        self._last = np.full(context.fans, np.nan)
+        """(fans,) the last reading, rad/s"""
+        self._repeated_ns = np.zeros(context.fans, np.int64)
+        """(fans,) for how long it has repeated"""
+        self._missing = LowPass(context.fans, MISSING_TIME_CONSTANT_S)
+        self._longest_s = self._largest_share = 0.0
+
+    def update(self, block: DetectorInput) -> Array:
+        """See Detector. An invalid sample is one at which the line was silent."""
+        known = block.valid & np.isfinite(block.speed_rad_s)
+        stuck_s = self._stuck_s(np.where(known, block.speed_rad_s, np.nan), block.period_ns)
+        share = self._missing.update(block.missing.astype(np.float64), block.valid, block.step_s)
+        self._longest_s = max(self._longest_s, float(stuck_s.max()))
+        self._largest_share = max(self._largest_share, float(share.max()))
+        return np.maximum(stuck_s / self._settings.stuck_s, share / self._settings.missing_share)
+
+    def _stuck_s(self, speed_rad_s: Array, period_ns: int) -> Array:
+        """(n, fans) for how long each reading has repeated, s. A fan at rest reads zero and is not stuck."""
+        before = np.vstack((self._last, speed_rad_s))[:-1]
         same = (speed_rad_s == before) & (speed_rad_s != 0.0)
         rows = np.arange(1, len(speed_rad_s) + 1)[:, np.newaxis]
-        broken = np.maximum.accumulate(np.where(same, 0, rows), axis=0)
-        lasted_ns = (rows - broken) * period_ns + np.where(broken == 0, self.since_ns, 0)
-        self.last, self.since_ns = speed_rad_s[-1].copy(), lasted_ns[-1].copy()
-        return lasted_ns / 1e9
+        changed = np.maximum.accumulate(np.where(same, 0, rows), axis=0)
+        repeated_ns = (rows - changed) * period_ns + np.where(changed == 0, self._repeated_ns, 0)
+        self._last, self._repeated_ns = speed_rad_s[-1].copy(), repeated_ns[-1].copy()
+        return repeated_ns / NS_PER_S
 
-    def update(self, speed_rad_s: Array, missing: Array, alive: Array, period_ns: int) -> Array:
-        """Take a block, (n, fans) each: readings, where one is missing, and where the line gave any at all.
+    def reset(self, fans: Array) -> None:
+        """See Detector."""
+        self._repeated_ns[fans] = 0
+        self._missing.reset(fans)
 
-        Returns the larger of the two in its own limit.
-        """
-        known = alive & np.isfinite(speed_rad_s)
-        stuck_s = self.stuck_s(np.where(known, speed_rad_s, np.nan), period_ns)
-        share = self.missing.update(missing.astype(np.float64), alive, period_ns / 1e9)
-        self.longest_s = max(self.longest_s, float(stuck_s.max()))
-        self.most_missing = max(self.most_missing, float(share.max()))
-        return np.maximum(stuck_s / self._stuck_limit_s, share / self._missing_limit)
+    def limit_sigmas(self, step_s: float) -> float:
+        """It does not watch a residual."""
+        return math.inf
+
+    def observed(self) -> dict[str, float]:
+        """See Detector."""
+        return {"stuck_s": self._longest_s, "missing_share": self._largest_share}
+
+    def columns(self) -> dict[str, Array]:
+        """See ColumnState."""
+        return {"last": self._last, "repeated_ns": self._repeated_ns, "missing": self._missing.value}
+
+    @classmethod
+    def text(cls, alarm: Alarm, source: Source, units: AlarmUnits) -> str:
+        """See Detector."""
+        return "the tacho repeats one reading, or gives none"

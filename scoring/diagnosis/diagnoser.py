@@ -13,9 +13,9 @@ import numpy as np
 from schemas.messages import Array
 from schemas.messages import Diagnosis as CauseMessage
 from schemas.units import NS_PER_S
+from scoring.detectors.deviation import summed_deviation
 from scoring.diagnosis.diagnosis import RankedCause, diagnose
 from scoring.diagnosis.regression_window import HealthyBalance, Window
-from scoring.limits import summed_deviation
 
 WINDOW_S = 95.0
 AGAIN_AFTER_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # after the raise; the last window still contains some health

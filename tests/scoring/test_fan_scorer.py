@@ -1,4 +1,4 @@
-"""scoring.fan_scorer: the same verdict however samples are cut, over restarts too; what raises a score and what not."""
+"""scoring.fan_scorer: cuts and restarts do not change scores; what raises a score and what does not."""
 
 from __future__ import annotations
 
@@ -13,28 +13,45 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.messages import Statistic
-from scoring.detectors.residual import Residual
-from scoring.fan_scorer import FanScorer, Samples, ScoredBlock
-from scoring.limits import Limits, ResidualLimits, Timing
+from scoring.baseline.settings import BaselineSettings
+from scoring.baseline.speed_scaling import speed_scaling
+from scoring.detectors.detector import DetectorSettings
+from scoring.detectors.drift import DriftSettings
+from scoring.detectors.smoothed import SmoothedSettings
+from scoring.detectors.table import rows
+from scoring.detectors.tacho import SensorSettings
+from scoring.detectors.variance_growth import VarianceGrowthSettings
+from scoring.fan_scorer import FanScorer, ScoredBlock
+from scoring.healthy_residual import HealthyResidual
+from scoring.limits import Limits, Timing
+from scoring.samples import Samples
 from tests.support.healthy_residuals import autoregressive, rows_of, samples_of
 
 FANS = 3
-RESIDUAL = ResidualLimits(
-    step=6.0,
-    drift=10.0,
-    growth=1.4,
-    usual_growth=0.97,
-    reference_sigmas=0.25,
-    baseline_sigmas=1.0,
-    adaptation_sigmas=0.7,
-)
-LIMITS = Limits(speed=RESIDUAL, balance=RESIDUAL, stuck_s=2.0)
+RESIDUAL = HealthyResidual(baseline=BaselineSettings(commissioning_limit_sigmas=1.0, adaptation_limit_sigmas=0.7))
+
+
+def detectors(stuck_s: float) -> dict[str, DetectorSettings]:
+    kinds: dict[str, DetectorSettings] = {
+        "smoothed": SmoothedSettings(limit=6.0),
+        "drift": DriftSettings(limit=10.0, reference_sigmas=0.25, period_s=0.01),
+        "variance_growth": VarianceGrowthSettings(limit=1.4, healthy=0.97),
+    }
+    of_residuals = {f"{source}_{kind}": kinds[kind] for source in ("speed", "balance") for kind in kinds}
+    return of_residuals | {"sensor": SensorSettings(stuck_s=stuck_s)}
+
+
+LIMITS = Limits(speed=RESIDUAL, balance=RESIDUAL, detectors=detectors(2.0))
 CURVED = Limits(
     speed=RESIDUAL.model_copy(
-        update={"speeds_rad_s": (90.0, 110.0), "offset_sigmas": (0.0, 0.3), "spread": (0.9, 1.2)}
+        update={
+            "speeds_rad_s": (90.0, 110.0),
+            "expected_residual_sigmas": (0.0, 0.3),
+            "residual_std": (0.9, 1.2),
+        }
     ),
     balance=RESIDUAL,
-    stuck_s=0.3,
+    detectors=detectors(0.3),
     timing=Timing(baseline_s=0.5, adaptation_s=5.0),
 )
 
@@ -43,9 +60,9 @@ def white(samples: int, fans: int = FANS, seed: int = 1) -> Samples:
     return samples_of(autoregressive(samples, fans, 0.0, seed), autoregressive(samples, fans, 0.0, seed + 1))
 
 
-def judged(judge: FanScorer, samples: Samples, cuts: Sequence[int] = ()) -> ScoredBlock:
+def scored_of(scorer: FanScorer, samples: Samples, cuts: Sequence[int] = ()) -> ScoredBlock:
     edges = [0, *sorted({cut for cut in cuts if 0 < cut < len(samples.t_ns)}), len(samples.t_ns)]
-    parts = [judge.update(rows_of(samples, slice(first, last))) for first, last in pairwise(edges)]
+    parts = [scorer.update(rows_of(samples, slice(first, last))) for first, last in pairwise(edges)]
     return ScoredBlock(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
 
 
@@ -88,65 +105,65 @@ def troubled(samples: int, seed: int) -> Samples:
     cuts=st.lists(st.integers(1, 399), max_size=10),
     limits=st.sampled_from([LIMITS, CURVED]),
 )
-def test_cuts_change_no_bit_of_verdicts_and_snapshots(seed: int, cuts: list[int], limits: Limits) -> None:
+def test_cuts_change_no_bit_of_scores_and_snapshots(seed: int, cuts: list[int], limits: Limits) -> None:
     samples = troubled(400, seed)
     whole = FanScorer(FANS, limits)
-    verdict = judged(whole, samples)
+    scored = scored_of(whole, samples)
     for each in (cuts, range(400)):
-        judge = FanScorer(FANS, limits)
-        assert_same(judged(judge, samples, each), verdict)
-        assert json.dumps(judge.snapshot()) == json.dumps(whole.snapshot())
+        scorer = FanScorer(FANS, limits)
+        assert_same(scored_of(scorer, samples, each), scored)
+        assert json.dumps(scorer.snapshot()) == json.dumps(whole.snapshot())
 
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 100_000), cut=st.integers(1, 399))
-def test_a_judge_that_is_restored_goes_on_with_the_same_bits(seed: int, cut: int) -> None:
+def test_a_restored_scorer_continues_with_the_same_bits(seed: int, cut: int) -> None:
     samples = troubled(400, seed)
     whole, first, second = FanScorer(FANS, CURVED), FanScorer(FANS, CURVED), FanScorer(FANS, CURVED)
-    verdict = judged(whole, samples)
-    judged(first, rows_of(samples, slice(0, cut)))
+    scored = scored_of(whole, samples)
+    scored_of(first, rows_of(samples, slice(0, cut)))
     second.restore(json.loads(json.dumps(first.snapshot(), allow_nan=False)))
-    after = judged(second, rows_of(samples, slice(cut, 400)))
-    assert_same(after, ScoredBlock(**{name: getattr(verdict, name)[cut:] for name in vars(verdict)}))
+    after = scored_of(second, rows_of(samples, slice(cut, 400)))
+    assert_same(after, ScoredBlock(**{name: getattr(scored, name)[cut:] for name in vars(scored)}))
     assert second.snapshot() == whole.snapshot()
 
 
-def test_what_is_no_snapshot_of_as_many_fans_is_refused_and_changes_nothing() -> None:
-    judge = FanScorer(FANS, LIMITS)
-    judged(judge, white(300))
-    before = json.dumps(judge.snapshot())
+def test_a_snapshot_that_does_not_fit_is_refused_and_changes_nothing() -> None:
+    scorer = FanScorer(FANS, LIMITS)
+    scored_of(scorer, white(300))
+    before = json.dumps(scorer.snapshot())
     one = FanScorer(1, LIMITS).snapshot()
-    broken = [one, {}, {**judge.snapshot(), "quiet": None}, {**judge.snapshot(), "interval": "x"}]
+    broken = [one, {}, {**scorer.snapshot(), "within_limit": None}, {**scorer.snapshot(), "interval": "x"}]
     for state in broken:
         with pytest.raises((ValueError, KeyError, TypeError)):
-            judge.restore(state)
-        assert json.dumps(judge.snapshot()) == before
+            scorer.restore(state)
+        assert json.dumps(scorer.snapshot()) == before
 
 
-def test_a_fan_is_judged_from_its_first_good_interval_on() -> None:
-    verdict = judged(FanScorer(FANS, LIMITS), white(300))
-    assert verdict.commissioning[:100].all()
-    assert not verdict.commissioning[100:].any()
-    assert np.isnan(verdict.score[:100]).all()
-    assert np.isfinite(verdict.score[100:]).all()
-    assert (verdict.statistic[:100] == Statistic.NONE).all()
+def test_a_fan_has_a_score_from_its_first_good_interval_on() -> None:
+    scored = scored_of(FanScorer(FANS, LIMITS), white(300))
+    assert scored.commissioning[:100].all()
+    assert not scored.commissioning[100:].any()
+    assert np.isnan(scored.score[:100]).all()
+    assert np.isfinite(scored.score[100:]).all()
+    assert (scored.statistic[:100] == Statistic.NONE).all()
 
 
 def test_a_fans_own_offset_is_its_baseline_and_raises_no_score() -> None:
     samples = white(3000)
     samples.speed_residual[:, 1] += 0.8
-    verdict = judged(FanScorer(FANS, LIMITS), samples)
-    assert np.nanmax(verdict.score) < 1.0
-    np.testing.assert_allclose(verdict.speed_baseline[-1], [0.0, 0.8, 0.0], atol=0.1)
+    scored = scored_of(FanScorer(FANS, LIMITS), samples)
+    assert np.nanmax(scored.score) < 1.0
+    np.testing.assert_allclose(scored.speed_baseline[-1], [0.0, 0.8, 0.0], atol=0.1)
 
 
 def test_an_offset_beyond_those_of_healthy_fans_raises_the_score_at_once() -> None:
     samples = white(300)
-    samples.balance[:, 2] += RESIDUAL.baseline_sigmas + 2.0
-    verdict = judged(FanScorer(FANS, LIMITS), samples)
-    assert verdict.score[200, 2] > 1.0
-    assert verdict.statistic[200, 2] in (Statistic.BALANCE_SMOOTHED, Statistic.BALANCE_DRIFT)
-    assert np.nanmax(verdict.score[:, :2]) < 1.0
+    samples.balance[:, 2] += RESIDUAL.baseline.commissioning_limit_sigmas + 2.0
+    scored = scored_of(FanScorer(FANS, LIMITS), samples)
+    assert scored.score[200, 2] > 1.0
+    assert scored.statistic[200, 2] in (Statistic.BALANCE_SMOOTHED, Statistic.BALANCE_DRIFT)
+    assert np.nanmax(scored.score[:, :2]) < 1.0
 
 
 def speed_up(samples: Samples) -> None:
@@ -184,126 +201,129 @@ def test_each_change_is_found_by_the_statistic_made_for_it(
 ) -> None:
     samples = white(2000)
     change(rows_of(samples, slice(1000, 2000)))
-    verdict = judged(FanScorer(FANS, LIMITS), samples)
-    assert np.nanmax(verdict.score[:1000]) < 1.0
+    scored = scored_of(FanScorer(FANS, LIMITS), samples)
+    assert np.nanmax(scored.score[:1000]) < 1.0
     for fan in range(FANS):
-        above = verdict.score[1000:, fan] > 1.0
-        assert statistic in verdict.statistic[1000:, fan][above]
+        above = scored.score[1000:, fan] > 1.0
+        assert statistic in scored.statistic[1000:, fan][above]
 
 
 @pytest.mark.parametrize("size", [1e2, 1e6, 1e300])
-def test_one_wild_reading_raises_no_alarm_however_wild(size: float) -> None:
+def test_one_outlier_raises_no_alarm_however_large(size: float) -> None:
     samples = white(2000)
     samples.speed_residual[1000] = samples.balance[1500] = size
-    judge = FanScorer(FANS, LIMITS)
-    verdict = judged(judge, samples)
-    above = verdict.score[1000:] > 1.0
+    scorer = FanScorer(FANS, LIMITS)
+    scored = scored_of(scorer, samples)
+    above = scored.score[1000:] > 1.0
     assert above.sum(axis=0).max() * 0.01 <= LIMITS.timing.on_delay_s
-    json.dumps(judge.snapshot(), allow_nan=False)
-    assert np.abs(judge.speed.baseline.value).max() < 0.2
-    assert np.abs(judge.balance.baseline.value).max() < 0.2
+    json.dumps(scorer.snapshot(), allow_nan=False)
+    assert np.abs(scorer.residuals["speed"].baseline.value).max() < 0.2
+    assert np.abs(scorer.residuals["balance"].baseline.value).max() < 0.2
 
 
-def test_a_healthy_fan_goes_on_to_refine_its_baseline() -> None:
-    """The spread of a healthy residual is near its limit all the time, and must not keep it from that."""
-    judge = FanScorer(20, LIMITS)
-    judged(judge, white(6000, 20))
-    assert judge.speed.baseline.intervals.min() > 30
-    assert np.abs(judge.speed.baseline.value).max() < 0.06
+def test_a_healthy_fan_continues_to_refine_its_baseline() -> None:
+    """The deviation of a healthy residual is near its limit all the time, and must not prevent that."""
+    scorer = FanScorer(20, LIMITS)
+    scored_of(scorer, white(6000, 20))
+    assert scorer.residuals["speed"].baseline.intervals.min() > 30
+    assert np.abs(scorer.residuals["speed"].baseline.value).max() < 0.06
 
 
-def test_a_spread_that_is_healthy_again_leaves_its_limit_far_behind() -> None:
+def test_a_variance_that_is_healthy_again_falls_well_below_its_limit() -> None:
     samples = white(3000)
     samples.balance[1000:1500] *= 3.0
-    verdict = judged(FanScorer(FANS, LIMITS), samples)
-    assert (verdict.score[1500] > 1.0).all()
-    assert np.nanmax(verdict.score[2200:]) < 0.75
+    scored = scored_of(FanScorer(FANS, LIMITS), samples)
+    assert (scored.score[1500] > 1.0).all()
+    assert np.nanmax(scored.score[2200:]) < 0.75
 
 
 def far_apart() -> Limits:
-    """Limits by which healthy baselines may lie far from none."""
-    return LIMITS.model_copy(update={"balance": LIMITS.balance.model_copy(update={"baseline_sigmas": 20.0})})
+    """Limits with baselines that may be far from zero."""
+    wide = RESIDUAL.model_copy(update={"baseline": BaselineSettings(commissioning_limit_sigmas=20.0)})
+    return LIMITS.model_copy(update={"balance": wide})
 
 
-def test_a_fan_that_is_still_on_its_way_is_not_commissioned_yet() -> None:
+def test_a_fan_that_still_changes_its_speed_is_not_commissioned_yet() -> None:
     samples = white(2000)
     samples.balance[:180] += np.linspace(15.0, 0.0, 180)[:, np.newaxis]
-    verdict = judged(FanScorer(FANS, far_apart()), samples)
-    assert (verdict.balance_baseline[:290] == 0.0).all()
-    assert np.nanmax(verdict.score) < 1.0
+    scored = scored_of(FanScorer(FANS, far_apart()), samples)
+    assert (scored.balance_baseline[:290] == 0.0).all()
+    assert np.nanmax(scored.score) < 1.0
 
 
-def test_a_first_second_that_holds_still_is_believed_and_what_leaves_it_alarms() -> None:
+def test_a_steady_first_second_is_the_baseline_and_leaving_it_alarms() -> None:
     samples = white(2000)
     samples.balance[:100] += 3.0
-    verdict = judged(FanScorer(FANS, far_apart()), samples)
-    assert (np.abs(verdict.balance_baseline[150] - 3.0) < 0.5).all()
-    assert (verdict.score[200:] > 1.0).all()
+    scored = scored_of(FanScorer(FANS, far_apart()), samples)
+    assert (np.abs(scored.balance_baseline[150] - 3.0) < 0.5).all()
+    assert (scored.score[200:] > 1.0).all()
 
 
-def test_nothing_is_learnt_while_the_score_is_high() -> None:
+def test_nothing_is_learned_while_the_score_is_high() -> None:
     samples = white(4000)
     samples.speed_residual[1500:, 0] += 2.0
-    judge = FanScorer(FANS, LIMITS)
-    verdict = judged(judge, samples)
-    np.testing.assert_array_equal(verdict.speed_baseline[1700:, 0], verdict.speed_baseline[1700, 0])
-    assert abs(verdict.speed_baseline[-1, 0]) < 0.1
+    scorer = FanScorer(FANS, LIMITS)
+    scored = scored_of(scorer, samples)
+    np.testing.assert_array_equal(scored.speed_baseline[1700:, 0], scored.speed_baseline[1700, 0])
+    assert abs(scored.speed_baseline[-1, 0]) < 0.1
 
 
-def test_a_fan_is_commissioned_anew_and_the_others_are_left_alone() -> None:
-    judge, other = FanScorer(FANS, LIMITS), FanScorer(FANS, LIMITS)
+def test_a_fan_is_commissioned_again_and_the_others_are_left_alone() -> None:
+    scorer, other = FanScorer(FANS, LIMITS), FanScorer(FANS, LIMITS)
     samples = white(1500)
     samples.speed_residual[500:, 0] += 0.9
     first, rest = rows_of(samples, slice(0, 500)), rows_of(samples, slice(500, 1500))
-    judged(judge, first)
-    judged(other, first)
-    judge.forget(np.array([True, False, False]))
-    anew, as_before = judged(judge, rest), judged(other, rest)
+    scored_of(scorer, first)
+    scored_of(other, first)
+    scorer.recommission(np.array([True, False, False]))
+    again, as_before = scored_of(scorer, rest), scored_of(other, rest)
     assert np.nanmax(as_before.score[:, 0]) > 1.0
-    assert np.nanmax(anew.score[:, 0]) < 1.0
-    assert anew.commissioning[0, 0]
-    np.testing.assert_array_equal(anew.score[:, 1:], as_before.score[:, 1:])
+    assert np.nanmax(again.score[:, 0]) < 1.0
+    assert again.commissioning[0, 0]
+    np.testing.assert_array_equal(again.score[:, 1:], as_before.score[:, 1:])
 
 
-def test_a_line_that_says_nothing_is_no_verdict_and_a_tacho_that_is_gone_is_one() -> None:
+def test_a_silent_line_gives_no_score_and_a_missing_tacho_gives_one() -> None:
     samples = white(2000)
     samples.alive[500:1000, 0] = False
     samples.missing[500:1000, 1] = True
     samples.speed_rad_s[500:1000, :2] = np.nan
     samples.speed_valid[500:1000, :2] = samples.balance_valid[500:1000, :2] = False
-    verdict = judged(FanScorer(FANS, LIMITS), samples)
-    assert np.isnan(verdict.score[500:1000, 0]).all()
-    assert verdict.score[999, 1] > 1.0
-    assert verdict.statistic[999, 1] == Statistic.SENSOR
-    assert np.isfinite(verdict.score[1000:]).all()
+    scored = scored_of(FanScorer(FANS, LIMITS), samples)
+    assert np.isnan(scored.score[500:1000, 0]).all()
+    assert scored.score[999, 1] > 1.0
+    assert scored.statistic[999, 1] == Statistic.SENSOR
+    assert np.isfinite(scored.score[1000:]).all()
 
 
-def test_residuals_are_told_in_sigma_whatever_a_healthy_one_varies_by() -> None:
-    wide = LIMITS.model_copy(update={"speed": RESIDUAL.model_copy(update={"spread": (4.0,)})})
+def test_smoothed_residuals_are_in_sigma_of_the_card() -> None:
+    wide = LIMITS.model_copy(update={"speed": RESIDUAL.model_copy(update={"residual_std": (4.0,)})})
     samples = white(3000)
     samples.speed_residual[1000:] += 3.0
-    verdict = judged(FanScorer(FANS, wide), samples)
-    np.testing.assert_allclose(verdict.speed_smoothed[1200:1500].mean(axis=0), 3.0, atol=0.1)
-    judge = FanScorer(FANS, wide)
-    assert judge.speed.limit_sigmas(0.01) == pytest.approx(4.0 * judge.balance.limit_sigmas(0.01))
+    scored = scored_of(FanScorer(FANS, wide), samples)
+    np.testing.assert_allclose(scored.speed_smoothed[1200:1500].mean(axis=0), 3.0, atol=0.1)
+    scorer = FanScorer(FANS, wide)
+    assert scorer.limit_sigmas("speed", 0.01) == pytest.approx(4.0 * scorer.limit_sigmas("balance", 0.01))
 
 
-def test_who_watches_sees_how_far_a_drift_goes_beyond_its_limit() -> None:
+def test_while_observing_a_drift_grows_beyond_its_limit() -> None:
     samples = white(3000)
     samples.speed_residual[1000:] += 0.6
-    judge, watched = FanScorer(FANS, LIMITS), FanScorer(FANS, LIMITS)
-    watched.watch()
-    verdict = judged(judge, samples)
-    assert verdict.score[verdict.statistic == Statistic.SPEED_DRIFT].max() < 1.1
-    judged(watched, samples)
-    assert watched.watched()[0][Statistic.SPEED_DRIFT - 1].max() > 3.0
+    scorer, observing = FanScorer(FANS, LIMITS), FanScorer(FANS, LIMITS, observing=True)
+    scored = scored_of(scorer, samples)
+    assert scored.score[scored.statistic == Statistic.SPEED_DRIFT].max() < 1.1
+    scored_of(observing, samples)
+    number = next(number for number, row in enumerate(rows()) if row.statistic == Statistic.SPEED_DRIFT)
+    assert max(one.ratios[number].max() for one in observing.observed()) > 3.0
 
 
-def test_an_offset_goes_with_the_speed_as_what_a_little_more_speed_needs_says() -> None:
+def test_an_offset_scales_with_the_speed_as_the_physics_say() -> None:
     # A balance off by a part of the drag, over viscous + 2 drag w, in that at the baseline's speed.
     viscous, drag = 6e-4, 4e-7
     speed = np.array([[50.0, 200.0, 500.0, 900.0]])
     off = drag * speed**2 / (viscous + 2.0 * drag * speed)
-    limits = ResidualLimits(baseline_power=2, baseline_speed_rad_s=500.0, baseline_bend_rad_s=viscous / (2.0 * drag))
-    found = Residual(4, limits, Timing()).shape(speed, np.ones_like(speed, np.bool_))
+    settings = BaselineSettings(
+        speed_exponent=2, reference_speed_rad_s=500.0, crossover_speed_rad_s=viscous / (2.0 * drag)
+    )
+    found = speed_scaling(settings, speed, np.ones_like(speed, np.bool_))
     np.testing.assert_allclose(found, off / off[0, 2])

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from scoring.baseline.settings import BaselineSettings
+from scoring.detectors.deviation import smoothed_deviation, summed_deviation
+from scoring.detectors.drift import DriftSettings
 from scoring.detectors.low_pass import LowPass
-from scoring.limits import (
-    DeclaredRate,
-    Limits,
-    ResidualLimits,
-    Timing,
-    smoothed_deviation,
-    summed_deviation,
-    uncalibrated,
-)
+from scoring.detectors.smoothed import SmoothedSettings
+from scoring.detectors.tacho import SensorSettings
+from scoring.detectors.variance_growth import VarianceGrowthSettings
+from scoring.healthy_residual import FanOffsets, HealthyResidual
+from scoring.limits import FORMAT_VERSION, DeclaredRate, Limits, Timing, uncalibrated
 from tests.support.healthy_residuals import autoregressive
 
 STEP_S = 0.01
@@ -41,53 +40,100 @@ def test_the_deviation_of_a_long_sum_is_what_it_is_on_simulated_ones(memory_s: f
 def test_without_a_calibration_the_limit_is_in_sigma_of_the_speed_whatever_the_rate(step_s: float) -> None:
     limits = uncalibrated(2.0, Timing())
     memory_s = limits.speed.autocorrelation_time_s
-    assert limits.speed.step == 2.0
     assert smoothed_deviation(limits.timing.smoothing_s, memory_s, step_s) == pytest.approx(1.0, rel=1e-6)
-    assert limits.speed.drift is limits.speed.growth is limits.balance.step is None
+    assert limits.detectors.keys() == {"speed_smoothed", "sensor"}
+    assert limits.detectors["speed_smoothed"] == SmoothedSettings(limit=2.0)
 
 
 def calibrated() -> Limits:
-    speed = ResidualLimits(
+    speed = HealthyResidual(
         speeds_rad_s=(50.0, 100.0),
-        offset_sigmas=(0.1, 0.2),
-        spread=(0.9, 1.1),
-        step=4.0,
-        drift=10.0,
-        growth=1.4,
-        usual_growth=1.0,
+        expected_residual_sigmas=(0.1, 0.2),
+        residual_std=(0.9, 1.1),
+        transient_scale_rad_s=3.0,
     )
-    promise = DeclaredRate(
-        false_alarms_per_day=1.0, interval_95=(0.5, 2.0), extrapolated=False, fan_hours=100.0, runs=3
-    )
-    return Limits(speed=speed, balance=ResidualLimits(), promise=promise)
+    rate = DeclaredRate(false_alarms_per_day=1.0, interval_95=(0.5, 2.0), extrapolated=False, fan_hours=100.0, runs=3)
+    detectors = {
+        "speed_smoothed": SmoothedSettings(limit=4.0),
+        "speed_drift": DriftSettings(limit=10.0, period_s=0.02),
+        "speed_variance_growth": VarianceGrowthSettings(limit=1.4, healthy=1.0),
+        "sensor": SensorSettings(stuck_s=3.0),
+    }
+    return Limits(speed=speed, balance=HealthyResidual(), detectors=detectors, declared_rate=rate)
 
 
-def test_limits_go_through_a_card_and_come_back() -> None:
+def test_limits_survive_the_way_through_a_card() -> None:
     limits = calibrated()
     assert Limits.model_validate(json.loads(limits.model_dump_json())) == limits
 
 
-def test_a_factor_moves_every_limit_and_what_was_promised_is_no_longer() -> None:
+def test_a_factor_scales_every_limit_and_voids_the_declared_rate() -> None:
     limits = calibrated().times(2.0)
-    assert (limits.speed.step, limits.speed.drift) == (8.0, 20.0)
-    assert limits.speed.growth == pytest.approx(1.8)  # twice as far from what it usually is
-    assert limits.balance.step is None
-    assert limits.promise is None
+    assert limits.settings_of("speed", SmoothedSettings) == SmoothedSettings(limit=8.0)
+    assert limits.settings_of("speed", DriftSettings) == DriftSettings(limit=20.0, period_s=0.02)
+    growth = limits.settings_of("speed", VarianceGrowthSettings)
+    assert growth
+    assert growth.limit == pytest.approx(1.8)  # twice as far from its healthy value
+    assert limits.settings_of("tacho", SensorSettings) == SensorSettings(stuck_s=6.0)
+    assert limits.settings_of("balance", SmoothedSettings) is None
+    assert limits.speed.baseline.adaptation_limit_sigmas == 2.0
+    assert limits.declared_rate is None
     assert calibrated().times(1.0) == calibrated()
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "where"),
     [
-        {"speeds_rad_s": (100.0, 50.0), "offset_sigmas": (0.0, 0.0), "spread": (1.0, 1.0)},
-        {"speeds_rad_s": (50.0, 100.0)},
-        {"spread": (0.0,)},
-        {"step": 0.0},
-        {"drift": math.inf},
-        {"growth": 1.0, "usual_growth": 1.0},
-        {"steps": 3.0},
+        ({"speed": {"speeds_rad_s": (100.0, 50.0), "expected_residual_sigmas": (0.0, 0.0)}}, "speed"),
+        ({"speed": {"speeds_rad_s": (50.0, 100.0)}}, "one length"),
+        ({"speed": {"residual_std": (0.0,)}}, "above zero"),
+        ({"detectors": {"speed_smoothed": {"limit": 0.0}}}, "speed_smoothed.limit"),
+        ({"detectors": {"speed_drift": {"limit": math.inf, "period_s": 0.01}}}, "speed_drift.limit"),
+        ({"detectors": {"speed_variance_growth": {"limit": 1.0, "healthy": 1.0}}}, "above healthy"),
+        ({"detectors": {"speed_smoothed": {"limits": 3.0}}}, "speed_smoothed.limit"),
+        ({"detectors": {"speed_jitter": {"limit": 3.0}}}, "speed_jitter: there is no such detector"),
     ],
 )
-def test_limits_that_make_no_sense_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValidationError):
-        ResidualLimits.model_validate(wrong)
+def test_wrong_limits_are_refused_by_name(wrong: dict[str, object], where: str) -> None:
+    card = {"format_version": FORMAT_VERSION, "speed": {}, "balance": {}, "detectors": {}} | wrong
+    with pytest.raises(ValidationError, match=where):
+        Limits.model_validate(card)
+
+
+def test_a_card_of_format_1_is_read_with_its_former_names() -> None:
+    former = {
+        "format_version": 1,
+        "speed": {
+            "fans": {"speeds_rad_s": [1.0], "offset_sigmas": [[0.5]]}, "speeds_rad_s": [50.0, 100.0],
+            "offset_sigmas": [0.1, 0.2], "spread": [0.9, 1.1], "lasting": [1.0, 1.2], "motion_rad_s": 3.0,
+            "autocorrelation_time_s": 0.3, "step": 4.0, "drift": 10.0, "reference_sigmas": 0.7, "growth": 1.4,
+            "usual_growth": 1.0, "baseline_sigmas": 2.0, "adaptation_sigmas": 0.8, "baseline_power": 2,
+            "baseline_speed_rad_s": 70.0, "baseline_bend_rad_s": 20.0, "baseline_ridge": 0.2,
+            "baseline_usual_sigmas": 0.6,
+        },
+        "balance": {"step": 5.0, "drift": None},
+        "stuck_s": 3.0, "missing_share": 0.5,
+        "timing": {"smoothing_s": 0.3, "baseline_s": 1.0, "adaptation_s": 60.0, "on_delay_s": 0.1},
+        "promise": {"false_alarms_per_day": 1.0, "interval_95": [0.5, 2.0], "extrapolated": False, "fan_hours": 100.0,
+                    "runs": 3},
+    }  # fmt: skip
+    baseline = BaselineSettings(
+        commissioning_limit_sigmas=2.0, adaptation_limit_sigmas=0.8, speed_exponent=2, reference_speed_rad_s=70.0,
+        crossover_speed_rad_s=20.0, ridge=0.2, rms_sigmas=0.6,
+    )  # fmt: skip
+    limits = Limits.model_validate(former)
+    assert limits.speed == HealthyResidual(
+        fan_offsets=FanOffsets(speeds_rad_s=(1.0,), offset_sigmas=((0.5,),)), speeds_rad_s=(50.0, 100.0),
+        expected_residual_sigmas=(0.1, 0.2), residual_std=(0.9, 1.1), persistent_std=(1.0, 1.2),
+        transient_scale_rad_s=3.0, autocorrelation_time_s=0.3, baseline=baseline,
+    )  # fmt: skip
+    assert limits.detectors == {
+        "speed_smoothed": SmoothedSettings(limit=4.0),
+        "speed_drift": DriftSettings(limit=10.0, reference_sigmas=0.7, period_s=0.01),
+        "speed_variance_growth": VarianceGrowthSettings(limit=1.4, healthy=1.0),
+        "balance_smoothed": SmoothedSettings(limit=5.0),
+        "sensor": SensorSettings(stuck_s=3.0, missing_share=0.5),
+    }
+    assert limits.timing == Timing(smoothing_s=0.3)
+    assert limits.declared_rate and limits.declared_rate.runs == 3
+    assert limits.format_version == FORMAT_VERSION

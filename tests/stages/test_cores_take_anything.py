@@ -80,11 +80,22 @@ def test_the_twin_integrator_takes_anything(twin: TwinFile, session: list[Messag
 
 
 LOW_LIMITS = CALIBRATION | {
-    "speed": {"step": 0.1, "drift": 0.1, "growth": 0.1, "spread": [1.0, 2.0], "speeds_rad_s": [0.0, 100.0],
-              "offset_sigmas": [0.0, 1.0], "baseline_sigmas": 0.0},
-    "balance": {"step": 0.1, "baseline_sigmas": 0.0},
+    "speed": {
+        "residual_std": [1.0, 2.0],
+        "speeds_rad_s": [0.0, 100.0],
+        "expected_residual_sigmas": [0.0, 1.0],
+        "baseline": {"commissioning_limit_sigmas": 0.0},
+    },
+    "balance": {"baseline": {"commissioning_limit_sigmas": 0.0}},
+    "detectors": {
+        "speed_smoothed": {"limit": 0.1},
+        "speed_drift": {"limit": 0.1, "period_s": 0.01},
+        "speed_variance_growth": {"limit": 0.1},
+        "balance_smoothed": {"limit": 0.1},
+        "sensor": {"stuck_s": 2.0, "missing_share": 0.5},
+    },
     "timing": {"baseline_s": 0.01, "on_delay_s": 0.0},
-}  # fmt: skip
+}
 
 
 def judged_prediction(message: Message) -> Message:

@@ -1,4 +1,4 @@
-"""stages.scorer: what is judged by which limits, what is said of it, and that blocks make no difference."""
+"""stages.scorer: which limits apply, what is emitted, and that cuts into blocks make no difference."""
 
 from __future__ import annotations
 
@@ -30,6 +30,9 @@ from schemas.messages import (
     Statistic,
     Transition,
 )
+from scoring.detectors.smoothed import SmoothedSettings
+from scoring.detectors.tacho import SensorSettings
+from scoring.detectors.variance_growth import VarianceGrowthSettings
 from scoring.limits import Timing
 from stages.scorer import STAGE, ScorerConfig, ScorerCore, limits_in_force
 from tests.support.scored_blocks import (
@@ -42,9 +45,9 @@ from tests.support.scored_blocks import (
     commissioned,
     core_of,
     feed,
-    note_of,
     prediction_of,
     request_of,
+    snapshot_of,
 )
 from tests.support.twin_files import write_twin
 
@@ -69,7 +72,7 @@ def samples(t_ns: int) -> int:
 # a twin that was not calibrated
 
 
-def test_an_alarm_is_raised_exactly_when_the_on_delay_has_run_out() -> None:
+def test_an_alarm_is_raised_exactly_at_the_end_of_the_on_delay() -> None:
     residual = [0, 0] + [9] * 7
     assert states(unsmoothed(), residual) == [NORMAL] * 2 + [SUSPECT] * 5 + [ALARM] * 2
     _, (alarm,) = feed(unsmoothed(), [prediction_of(np.array(residual))])
@@ -95,7 +98,7 @@ def test_an_excursion_one_sample_too_short_raises_nothing_and_is_counted() -> No
     assert core.counters()["excursions_too_short"] == 2
 
 
-def test_an_alarm_is_cleared_below_the_deadband_when_the_off_delay_has_run_out() -> None:
+def test_an_alarm_clears_below_the_deadband_at_the_end_of_the_off_delay() -> None:
     residual = np.array([9.0] * 6 + [7.0] * 10 + [5.0] * 12)
     assert states(unsmoothed(), residual.tolist())[5:] == [ALARM] * 11 + [RETURNING] * 10 + [NORMAL] * 2
     _, (raised, cleared) = feed(unsmoothed(), [prediction_of(residual)])
@@ -103,7 +106,7 @@ def test_an_alarm_is_cleared_below_the_deadband_when_the_off_delay_has_run_out()
     assert cleared.onset_t_ns == raised.onset_t_ns == EPOCH_NS
 
 
-def test_samples_that_are_not_valid_freeze_the_delays_and_clear_nothing() -> None:
+def test_invalid_samples_pause_the_delays_and_clear_nothing() -> None:
     valid = [True] * 3 + [False] * 40 + [True] * 3
     core = unsmoothed()
     assert states(core, [9.0] * 46, valid) == [SUSPECT] * 3 + [FanState.UNKNOWN] * 40 + [SUSPECT] * 2 + [ALARM]
@@ -113,7 +116,7 @@ def test_samples_that_are_not_valid_freeze_the_delays_and_clear_nothing() -> Non
     assert np.isnan(score.score).all()
 
 
-def test_fans_are_judged_each_for_itself() -> None:
+def test_fans_do_not_affect_one_another() -> None:
     residual = np.zeros((20, 3))
     residual[5:, 2] = -9
     core = commissioned(core_of(fans=3, smoothing_s=0, on_delay_s=0.05), fans=3)
@@ -192,7 +195,7 @@ def test_without_a_calibration_a_torque_balance_alone_judges_nothing() -> None:
 # commissioning
 
 
-def test_while_the_baseline_is_taken_nothing_is_judged() -> None:
+def test_there_is_no_score_before_the_first_baseline() -> None:
     (score,), alarms = feed(core_of(), [prediction_of(np.full(150, 100.0))])
     taken = score.state[:, 0] == FanState.COMMISSIONING
     assert taken[:100].all() and not taken[100:].any()
@@ -201,22 +204,22 @@ def test_while_the_baseline_is_taken_nothing_is_judged() -> None:
     assert len(alarms) == 1, "what was wrong from the beginning is no baseline"
 
 
-def test_an_offset_of_a_healthy_size_is_taken_for_the_fans_own() -> None:
+def test_an_offset_of_a_healthy_size_becomes_the_baseline() -> None:
     (score,), _ = feed(core_of(smoothing_s=0.0), [prediction_of(np.full(150, 3.0))])
     np.testing.assert_allclose(score.speed_baseline_rad_s[100:], 3.0, rtol=1e-5)
     np.testing.assert_allclose(score.smoothed_residual_rad_s[100:], 0.0, atol=1e-5)
     assert (score.residual_rad_s == 3.0).all(), "the residual itself is what it is"
 
 
-def test_a_larger_offset_is_taken_away_up_to_its_limit_only() -> None:
+def test_a_larger_offset_becomes_the_baseline_up_to_its_limit() -> None:
     (score,), _ = feed(core_of(), [prediction_of(np.full(150, 30.0))])
     np.testing.assert_allclose(score.speed_baseline_rad_s[100:], SIGMA)
 
 
-def test_a_baseline_that_may_drift_no_further_is_told() -> None:
+def test_a_baseline_at_its_adaptation_limit_is_reported() -> None:
     core = core_of(baseline_s=0.1, adaptation_s=0.5, alarm_sigmas=20.0)
     feed(core, [prediction_of(0.002 * np.arange(5000.0))])
-    assert "the baseline of fan 0 may drift no further" in core.problem()
+    assert "the baseline of fan 0 is at its adaptation limit" in core.problem()
 
 
 # a calibrated twin
@@ -251,7 +254,7 @@ def test_a_tacho_that_repeats_one_reading_is_found() -> None:
     assert alarms[0].message.startswith("fan 0: the tacho repeats one reading, or gives none")
 
 
-def test_a_tacho_that_gives_nothing_is_found_though_nothing_can_be_judged_by_it() -> None:
+def test_a_tacho_that_gives_nothing_is_found_without_any_residual() -> None:
     dead = prediction_of(np.zeros(400), np.zeros(400, np.bool_))
     dead.invalid_reason[:] = InvalidReason.NO_SPEED
     _, alarms = feed(calibrated(), [dead])
@@ -263,7 +266,7 @@ def test_a_silent_line_is_no_tacho_that_gives_nothing() -> None:
     assert alarms == []
 
 
-def test_the_torque_balance_is_judged_while_the_free_run_is_young() -> None:
+def test_the_torque_balance_counts_while_the_free_run_warms_up() -> None:
     young = prediction_of(noise(300), balance=10.0)
     young.valid[:] = False
     young.invalid_reason[:] = InvalidReason.WARMING_UP
@@ -273,26 +276,28 @@ def test_the_torque_balance_is_judged_while_the_free_run_is_young() -> None:
 
 def test_a_factor_on_all_limits_makes_alarms_rarer() -> None:
     weak = prediction_of(noise(300), balance=np.where(np.arange(300) < 100, 0.0, 0.8))
-    limits = CALIBRATION | {"balance": {"step": 4.0}}
+    limits = CALIBRATION | {"detectors": {"balance_smoothed": {"limit": 4.0}}}
     _, alarms = feed(commissioned(core_of(calibration=limits)), [weak])
     _, fewer = feed(commissioned(core_of(calibration=limits, limit_factor=3.0)), [weak])
     assert alarms and not fewer
 
 
-def test_limits_in_force_are_those_of_the_card_with_the_times_that_are_set() -> None:
-    promise = {
+def test_settings_change_the_times_of_the_limits_in_the_card() -> None:
+    rate = {
         "false_alarms_per_day": 0.1, "interval_95": (0.05, 0.2), "extrapolated": False, "fan_hours": 9.0, "runs": 3
     }  # fmt: skip
-    card = CALIBRATION | {"promise": promise}
+    card = CALIBRATION | {"declared_rate": rate}
     of_card = limits_in_force(ScorerConfig(), card)
     assert of_card.timing == Timing(smoothing_s=0.1, baseline_s=0.5, adaptation_s=30.0, on_delay_s=0.05)
-    assert of_card.promise and of_card.promise.runs == 3
+    assert of_card.declared_rate and of_card.declared_rate.runs == 3
     changed = limits_in_force(ScorerConfig(on_delay_s=0.7), card)
     assert changed.timing == Timing(smoothing_s=0.1, baseline_s=0.5, adaptation_s=30.0, on_delay_s=0.7)
-    assert changed.promise is None, "it was for other times"
+    assert changed.declared_rate is None, "it was for other times"
     factor = limits_in_force(ScorerConfig(limit_factor=2.0), card)
-    assert (factor.balance.step, factor.speed.growth, factor.stuck_s) == (8.0, 6.0, 4.0)
-    assert factor.promise is None
+    assert factor.settings_of("balance", SmoothedSettings) == SmoothedSettings(limit=8.0)
+    assert factor.settings_of("speed", VarianceGrowthSettings) == VarianceGrowthSettings(limit=6.0)
+    assert factor.settings_of("tacho", SensorSettings) == SensorSettings(stuck_s=4.0, missing_share=0.5)
+    assert factor.declared_rate is None
 
 
 def context_of(folder: Path, **card: Any) -> Context:
@@ -301,7 +306,7 @@ def context_of(folder: Path, **card: Any) -> Context:
     return Context("plant", (tray,), ScorerConfig(), folder, folder, 0)
 
 
-def test_the_core_of_a_tray_takes_limits_and_balance_from_the_twins_card(tmp_path: Path) -> None:
+def test_limits_and_balance_come_from_the_twins_card(tmp_path: Path) -> None:
     core = STAGE.build(context_of(tmp_path, calibration=CALIBRATION)).core
     assert isinstance(core, ScorerCore)
     core = commissioned(core, fans=2)
@@ -311,22 +316,22 @@ def test_the_core_of_a_tray_takes_limits_and_balance_from_the_twins_card(tmp_pat
     assert STAGE.check(context_of(tmp_path)) == []
 
 
-def test_a_calibration_that_cannot_be_used_is_told_in_one_line(tmp_path: Path) -> None:
-    context = context_of(tmp_path, calibration={"speed": {"step": -1.0}, "balance": {}})
+def test_a_calibration_that_cannot_be_used_is_reported_in_one_line(tmp_path: Path) -> None:
+    context = context_of(tmp_path, calibration=CALIBRATION | {"detectors": {"speed_smoothed": {"limit": -1.0}}})
     with pytest.raises(StageError) as refused:
         STAGE.build(context)
-    assert "calibration cannot be used: speed.step" in str(refused.value)
+    assert "calibration cannot be used: detectors: speed_smoothed.limit" in str(refused.value)
     assert "fantwin calibrate" in str(refused.value) and "\n" not in str(refused.value)
     assert STAGE.check(context) == [str(refused.value)]
 
 
 @pytest.mark.parametrize("fans", [1, 3])
-def test_a_calibration_of_another_number_of_fans_is_told_in_one_line(tmp_path: Path, fans: int) -> None:
+def test_a_calibration_of_another_number_of_fans_is_reported_in_one_line(tmp_path: Path, fans: int) -> None:
     own = {"speeds_rad_s": [100.0], "offset_sigmas": [[0.5]] * fans}
-    context = context_of(tmp_path, calibration={"speed": {"fans": own}, "balance": {}})
+    context = context_of(tmp_path, calibration=CALIBRATION | {"speed": {"fan_offsets": own}})
     (problem,) = STAGE.check(context)
-    assert f"its calibration is of {fans} fans, the tray has 2; calibrate it anew" in problem
-    with pytest.raises(StageError, match="calibrate it anew"):
+    assert f"its calibration is of {fans} fans, the tray has 2; calibrate it again" in problem
+    with pytest.raises(StageError, match="calibrate it again"):
         STAGE.build(context)
 
 
@@ -405,7 +410,7 @@ def judged(core: ScorerCore, items: Iterable[Prediction | Request]) -> tuple[Any
     with np.errstate(all="ignore"):
         scores, alarms = feed(core, items)
     bits = {name: np.concatenate([getattr(s, name) for s in scores]).tobytes() for name in columns(Score) if scores}
-    return bits, [repr(alarm) for alarm in alarms], core.counters(), core.problem(), note_of(core).state_json
+    return bits, [repr(alarm) for alarm in alarms], core.counters(), core.problem(), snapshot_of(core).state_json
 
 
 def parts(whole: Prediction, marks: Iterable[int]) -> list[Prediction]:
@@ -447,7 +452,7 @@ def test_blocks_of_any_size_are_judged_the_same_to_the_bit(
     assert single == blocks
 
 
-def test_the_made_up_predictions_raise_and_clear_alarms_and_are_diagnosed() -> None:
+def test_the_synthetic_predictions_raise_and_clear_alarms_and_are_diagnosed() -> None:
     core = core_of(3, calibration=LIVELY, baseline_s=0.1, on_delay_s=0.03, off_delay_s=0.05)
     with np.errstate(all="ignore"):
         _, alarms = feed(core, [eventful_prediction(seed=1, samples=2000, change_s=0.0)])
@@ -468,7 +473,7 @@ def test_a_score_carries_all_that_a_viewer_draws() -> None:
     assert score.outside[:, 0].tolist() == [False, False, True, True]
 
 
-def test_samples_that_were_judged_are_dropped_and_counted() -> None:
+def test_repeated_samples_are_dropped_and_counted() -> None:
     residual = np.array([0.0] * 5 + [9.0] * 20)
     whole = prediction_of(residual)
     core = unsmoothed()
@@ -477,7 +482,7 @@ def test_samples_that_were_judged_are_dropped_and_counted() -> None:
     assert core.counters()["repeated"] == 24
 
 
-def test_a_prediction_that_is_no_number_is_not_judged() -> None:
+def test_a_prediction_that_is_no_number_has_no_score() -> None:
     prediction = prediction_of(np.zeros(3))
     prediction.predicted_speed_rad_s[1] = np.nan
     (score,), _ = feed(commissioned(core_of()), [prediction])
@@ -493,7 +498,7 @@ def test_an_alarm_reads_in_the_unit_people_are_shown() -> None:
     assert above.message.startswith("fan 0: 955 rpm above the twin (limit 76)")
 
 
-def test_another_number_of_fans_is_lost_and_said_only_until_the_right_one_comes() -> None:
+def test_another_number_of_fans_is_lost_and_reported_until_the_right_one_comes() -> None:
     core = core_of(fans=2)
     assert core.step(prediction_of(np.zeros((5, 3)))) == []
     assert core.counters()["lost_wrong_fan_count"] == 5
@@ -511,7 +516,7 @@ def unjudged(seconds: float, why: Sequence[InvalidReason], first_s: float = 0.0)
     return prediction
 
 
-def test_fans_that_are_not_judged_for_long_are_told_with_the_reason_until_they_are_again() -> None:
+def test_fans_long_without_a_score_are_reported_with_the_reason() -> None:
     core = commissioned(core_of(fans=4), fans=4)
     why = [InvalidReason.NONE, InvalidReason.NO_SPEED, InvalidReason.OUT_OF_RANGE, InvalidReason.NO_SPEED]
     feed(core, [unjudged(9.99, why)])
@@ -527,7 +532,7 @@ def test_fans_that_are_not_judged_for_long_are_told_with_the_reason_until_they_a
     assert core.problem() == ""
 
 
-def test_a_first_warm_up_is_not_told_but_one_without_an_end_is() -> None:
+def test_a_first_warm_up_is_reported_only_after_a_minute() -> None:
     core = core_of()
     feed(core, [unjudged(59.99, [InvalidReason.WARMING_UP])])
     assert core.problem() == ""
@@ -535,7 +540,7 @@ def test_a_first_warm_up_is_not_told_but_one_without_an_end_is() -> None:
     assert "fan 0 is not scored: the twin is warming up" in core.problem()
 
 
-def test_a_silent_line_does_not_count_as_not_judged() -> None:
+def test_a_silent_line_does_not_count_as_time_without_a_score() -> None:
     core = commissioned(core_of())
     feed(core, [unjudged(1, [InvalidReason.NONE]), unjudged(1, [InvalidReason.WARMING_UP], first_s=1000)])
     assert core.problem() == ""

@@ -1,4 +1,4 @@
-"""stages.scorer, killed and begun anew: it forgets nothing, and mistakes what it remembers for nothing else."""
+"""stages.scorer, killed and started again: it continues from its snapshot, and never from a wrong one."""
 
 from __future__ import annotations
 
@@ -20,7 +20,16 @@ from scoring.alarms.current_alarms import CurrentAlarm, current_alarms
 from scoring.fan_scorer import FanScorer
 from stages.scorer import ScorerCore
 from tests.stages.test_scorer import eventful_prediction
-from tests.support.scored_blocks import LIVELY, commissioned, core_of, feed, note_of, prediction_of, request_of
+from tests.support.scored_blocks import (
+    CALIBRATION,
+    LIVELY,
+    commissioned,
+    core_of,
+    feed,
+    prediction_of,
+    request_of,
+    snapshot_of,
+)
 
 HOUR = 360_000  # samples
 
@@ -54,16 +63,21 @@ def eventful() -> Prediction:
     return prediction_of(residual, valid, balance=extra)
 
 
-STEPS_ALONE = LIVELY | {name: {"step": 4.0, "baseline_sigmas": 0.0} for name in ("speed", "balance")}
+SMOOTHED_ONLY = LIVELY | {
+    "speed": {"baseline": {"commissioning_limit_sigmas": 0.0}},
+    "balance": {"baseline": {"commissioning_limit_sigmas": 0.0}},
+    "detectors": {f"{source}_smoothed": {"limit": 4.0} for source in ("speed", "balance")}
+    | {"sensor": CALIBRATION["detectors"]["sensor"]},
+}
 
 
 @pytest.mark.parametrize("middle", [160, 255, 300, 360, 500])
-def test_a_scorer_that_goes_on_from_its_memory_is_one_that_never_stopped(middle: int) -> None:
+def test_a_restored_scorer_continues_as_one_that_never_stopped(middle: int) -> None:
     whole = eventful()
     first, second = cut(whole, 0, middle), cut(whole, middle, 900)
 
     def core() -> ScorerCore:
-        return core_of(3, calibration=STEPS_ALONE, baseline_s=0.1, on_delay_s=0.03, off_delay_s=0.05)
+        return core_of(3, calibration=SMOOTHED_ONLY, baseline_s=0.1, on_delay_s=0.03, off_delay_s=0.05)
 
     ack = request_of(Action.ACKNOWLEDGE, -1)
     with np.errstate(all="ignore"):
@@ -73,7 +87,7 @@ def test_a_scorer_that_goes_on_from_its_memory_is_one_that_never_stopped(middle:
         killed = core()
         feed(killed, [first, ack])
         successor = core()
-        successor.restore(note_of(killed))
+        successor.restore(snapshot_of(killed))
         scores, alarms = feed(successor, [second])
     assert {Transition.RAISED, Transition.CLEARED} <= {alarm.transition for alarm in expected_alarms}
     assert bits(scores) == bits(expected)
@@ -81,7 +95,7 @@ def test_a_scorer_that_goes_on_from_its_memory_is_one_that_never_stopped(middle:
     assert successor.problem() == unbroken.problem() or "not scored" in unbroken.problem()
 
 
-def test_after_a_kill_what_producers_still_keep_is_made_up_for(tmp_path: Path) -> None:
+def test_after_a_kill_the_samples_that_producers_still_keep_are_scored(tmp_path: Path) -> None:
     blocks = [cut(eventful_prediction(3, 900, 0.0), k, k + 10) for k in range(0, 900, 10)]
     with np.errstate(all="ignore"):
         unbroken, _ = feed(core(), blocks)
@@ -110,7 +124,7 @@ def test_a_block_on_which_the_scorer_crashed_is_judged_after_the_restart(
 
     with np.errstate(all="ignore"):
         feed(crashed, blocks[:-1])
-        store.save(note_of(crashed))
+        store.save(snapshot_of(crashed))
         with monkeypatch.context() as patch:
             patch.setattr(FanScorer, "update", crash)
             with pytest.raises(ZeroDivisionError):
@@ -121,14 +135,14 @@ def test_a_block_on_which_the_scorer_crashed_is_judged_after_the_restart(
     assert [score.t_ns.tolist() for score in scores] == [blocks[-1].t_ns.tolist()]
 
 
-def test_every_alarm_and_answer_is_noted_before_it_is_told(tmp_path: Path) -> None:
+def test_every_alarm_and_answer_is_in_the_snapshot_before_it_is_emitted(tmp_path: Path) -> None:
     snapshot_store = SnapshotStore(tmp_path / "m")
     scorer = commissioned(core_of(snapshot_store=snapshot_store))
 
     def noted() -> dict[str, Any]:
         memory = SnapshotStore(tmp_path / "m").load()
         assert memory
-        return json.loads(memory.state_json)["desk"]["last_emitted"]["0"]
+        return json.loads(memory.state_json)["alarms"]["last_emitted"]["0"]
 
     _, alarms = feed(scorer, [prediction_of(np.full(100, 20.0))])
     assert alarms and noted()["active"]
@@ -136,7 +150,7 @@ def test_every_alarm_and_answer_is_noted_before_it_is_told(tmp_path: Path) -> No
     assert noted()["shelved_until_t_ns"] > 0
 
 
-def test_without_news_it_is_noted_each_minute() -> None:
+def test_without_events_there_is_a_snapshot_every_minute() -> None:
     scorer = core_of()
     notes = [
         message
@@ -160,7 +174,7 @@ def raised() -> ScorerCore:
 
 def test_a_restarted_scorer_tells_again_what_stands_and_who_acknowledged_it() -> None:
     successor = core_of(3)
-    memory, *told = successor.restore(note_of(raised()))
+    memory, *told = successor.restore(snapshot_of(raised()))
     assert isinstance(memory, ScorerSnapshot) and memory.restored
     assert [(alarm.fan, alarm.transition) for alarm in told if isinstance(alarm, Alarm)] == [
         (0, Transition.REPUBLISHED),
@@ -176,7 +190,7 @@ def test_a_restarted_scorer_tells_again_what_stands_and_who_acknowledged_it() ->
 
 def test_a_successor_tells_of_it_at_once_and_once(tmp_path: Path) -> None:
     snapshot_store = SnapshotStore(tmp_path / "m")
-    snapshot_store.save(note_of(raised()))
+    snapshot_store.save(snapshot_of(raised()))
     successor = core_of(3, snapshot_store=snapshot_store)
     assert [type(message) for message in successor.tick(0)] == [ScorerSnapshot, Alarm, Alarm]
     assert [*successor.tick(0), *successor.step(prediction_of(np.zeros((1, 3)), first=100))][0].__class__ is Score
@@ -186,7 +200,7 @@ def test_a_baseline_is_that_of_the_session_before() -> None:
     scorer = core_of(smoothing_s=0.0)
     feed(scorer, [prediction_of(np.full(1200, 3.0))])
     successor = core_of(smoothing_s=0.0)
-    successor.restore(note_of(scorer))
+    successor.restore(snapshot_of(scorer))
     (score,), _ = feed(successor, [prediction_of(np.full(50, 3.0), first=HOUR)])
     assert score.valid.all(), "no commissioning"
     np.testing.assert_allclose(score.speed_baseline_rad_s, 3.0, rtol=1e-5)
@@ -194,7 +208,7 @@ def test_a_baseline_is_that_of_the_session_before() -> None:
 
 def standing_of(told: Sequence[Any]) -> list[CurrentAlarm]:
     """How the alarms stand for who has followed them from `raised` on."""
-    former = raised().restore(note_of(raised()))
+    former = raised().restore(snapshot_of(raised()))
     messages = [*(("former", each) for each in former), *(("successor", each) for each in told)]
     return current_alarms(
         replace(message, header=Header(producer, number, "tray1"))
@@ -203,12 +217,12 @@ def standing_of(told: Sequence[Any]) -> list[CurrentAlarm]:
     )
 
 
-def test_of_another_twin_only_what_operators_keep_quiet_is_gone_on_from() -> None:
+def test_from_a_snapshot_of_another_twin_only_operator_settings_are_restored() -> None:
     successor = core_of(3, sha256="another")
-    memory, *told = successor.restore(note_of(raised()))
+    memory, *told = successor.restore(snapshot_of(raised()))
     assert isinstance(memory, ScorerSnapshot) and memory.restored
     assert successor.counters()["snapshots_of_another_twin"] == 1
-    assert "the twin is another one" in successor.problem()
+    assert "the snapshot is of another twin" in successor.problem()
     acknowledged, shelved = standing_of(told)
     assert (is_retained(acknowledged.newest), acknowledged.newest.message) == (False, "fan 0: stands no longer")
     assert (is_silenced(shelved.newest), shelved.newest.message) == (True, "fan 1: still stands")
@@ -219,9 +233,9 @@ def test_of_another_twin_only_what_operators_keep_quiet_is_gone_on_from() -> Non
     assert unshelved.transition == Transition.UNSHELVED
 
 
-@pytest.mark.parametrize("of", ["judge", "wear"])
-def test_of_a_memory_in_an_older_form_what_operators_keep_quiet_is_gone_on_from(of: str) -> None:
-    memory = note_of(raised())
+@pytest.mark.parametrize("of", ["scorer", "wear"])
+def test_from_a_snapshot_read_in_part_operator_settings_are_restored(of: str) -> None:
+    memory = snapshot_of(raised())
     state = json.loads(memory.state_json)
     state["wear"]["last_attempt"] = 5
     state[of].popitem()
@@ -229,20 +243,20 @@ def test_of_a_memory_in_an_older_form_what_operators_keep_quiet_is_gone_on_from(
     first, *told = successor.restore(replace(memory, state_json=json.dumps(state)))
     assert isinstance(first, ScorerSnapshot) and first.restored
     assert successor.counters()["snapshots_not_understood"] == 1
-    assert "is understood in part" in successor.problem()
+    assert "can be read in part only" in successor.problem()
     acknowledged, shelved = standing_of(told)
     assert (is_retained(acknowledged.newest), is_silenced(shelved.newest)) == (False, True)
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
     assert (score.state == FanState.COMMISSIONING).all()
-    assert json.loads(note_of(successor).state_json)["wear"]["last_attempt"] == 0, "wear begins anew"
+    assert json.loads(snapshot_of(successor).state_json)["wear"]["last_attempt"] == 0, "wear begins anew"
 
 
-def test_what_was_set_aside_is_told_for_a_minute() -> None:
+def test_a_snapshot_that_was_not_used_is_reported_for_a_minute() -> None:
     successor = core_of(3, sha256="another")
-    successor.restore(note_of(raised()))
+    successor.restore(snapshot_of(raised()))
     feed(successor, [prediction_of(np.zeros((5999, 3)), first=100)])
-    assert "the twin is another one" in successor.problem()
+    assert "the snapshot is of another twin" in successor.problem()
     feed(successor, [prediction_of(np.zeros((2, 3)), first=6099)])
     assert successor.problem() == ""
 
@@ -253,34 +267,35 @@ def test_what_was_set_aside_is_told_for_a_minute() -> None:
         "",
         "[]",
         "{}",
-        '{"judge": 1}',
-        '{"judge": {}, "desk": {}}',
+        '{"scorer": 1}',
+        '{"scorer": {}, "alarms": {}}',
+        '{"scorer": null, "alarms": 3, "input_producer": ""}',
         '{"judge": null, "desk": 3, "fed_by": ""}',
         "[" * 100_000,
     ],
 )
-def test_a_memory_that_is_not_understood_is_set_aside_and_counted(state: str) -> None:
+def test_a_snapshot_that_cannot_be_read_is_counted(state: str) -> None:
     successor = core_of(3)
-    assert successor.restore(replace(note_of(raised()), state_json=state)) == []
+    assert successor.restore(replace(snapshot_of(raised()), state_json=state)) == []
     assert successor.counters()["snapshots_not_understood"] == 1
-    assert "what was remembered is not understood" in successor.problem()
+    assert "the snapshot cannot be read" in successor.problem()
     feed(successor, [prediction_of(np.zeros((200, 3)))])
 
 
-@pytest.mark.parametrize("where", ["last_emitted", "due", "onset_t_ns"])
-def test_a_memory_of_a_fan_that_is_not_there_is_not_understood(where: str) -> None:
-    memory = note_of(raised())
+@pytest.mark.parametrize("where", ["told", "due", "onset_t_ns"])
+def test_a_snapshot_of_a_fan_that_does_not_exist_is_refused(where: str) -> None:
+    memory = snapshot_of(raised())
     state = json.loads(memory.state_json)
-    fans = state["desk"]["last_emitted"] if where == "last_emitted" else state["desk"]["diagnoser"][where]
-    fans["99"] = next(iter(fans.values())) if where == "last_emitted" else {"due": [0], "onset_t_ns": 0}[where]
+    fans = state["alarms"]["last_emitted"] if where == "told" else state["alarms"]["diagnoser"][where]
+    fans["99"] = next(iter(fans.values())) if where == "told" else {"due": [0], "onset_t_ns": 0}[where]
     successor = core_of(3)
     assert successor.restore(replace(memory, state_json=json.dumps(state))) == []
     assert successor.counters()["snapshots_not_understood"] == 1
 
 
-def test_a_memory_of_another_number_of_fans_is_not_understood() -> None:
+def test_a_snapshot_of_another_number_of_fans_is_refused() -> None:
     successor = core_of(1)
-    assert successor.restore(note_of(raised())) == []
+    assert successor.restore(snapshot_of(raised())) == []
     assert successor.counters()["snapshots_not_understood"] == 1
     (score,), _ = feed(successor, [prediction_of(np.zeros(50))])
     assert (score.state == FanState.COMMISSIONING).all()
@@ -289,7 +304,7 @@ def test_a_memory_of_another_number_of_fans_is_not_understood() -> None:
 def restored(first: int, producer: str) -> tuple[ScorerCore, list[Any]]:
     """A successor of `raised`, which began at sample -1101 and ended at 100, and what it makes of its first block."""
     successor = core_of(3)
-    successor.restore(note_of(raised()))
+    successor.restore(snapshot_of(raised()))
     return successor, list(successor.step(prediction_of(np.zeros((20, 3)), first=first, producer=producer)))
 
 
@@ -304,7 +319,7 @@ def restored(first: int, producer: str) -> tuple[ScorerCore, list[Any]]:
         (-1101, "integrator-2", True),  # the same is played again
     ],
 )
-def test_samples_of_another_story_are_judged_anew_and_those_kept_by_producers_are_not(first, producer, is_anew) -> None:
+def test_a_snapshot_of_later_times_is_discarded_unless_producers_repeat_samples(first, producer, is_anew) -> None:
     successor, messages = restored(first, producer)
     assert successor.counters().get("snapshots_of_other_times", 0) == is_anew
     scores = [message for message in messages if isinstance(message, Score)]
@@ -314,9 +329,9 @@ def test_samples_of_another_story_are_judged_anew_and_those_kept_by_producers_ar
         assert not scores or scores[0].t_ns[0] > prediction_of(np.zeros(1), first=99).t_ns[0]
 
 
-def test_an_alarm_of_another_story_stands_no_longer_whoever_told_it() -> None:
+def test_alarms_of_a_discarded_snapshot_are_no_longer_current() -> None:
     successor = core_of(3)
-    restated = successor.restore(note_of(raised()))
+    restated = successor.restore(snapshot_of(raised()))
     assert [is_listed(each.newest) for each in standing_of(restated)] == [True, True]
     later = successor.step(prediction_of(np.zeros((20, 3)), first=-HOUR, producer="integrator-2"))
     told = [message for message in later if isinstance(message, Alarm)]
@@ -325,7 +340,7 @@ def test_an_alarm_of_another_story_stands_no_longer_whoever_told_it() -> None:
     assert [is_listed(each.newest) for each in standing_of(later)] == [False, False], "nothing was restated"
 
 
-def test_only_what_comes_first_can_be_of_another_story() -> None:
+def test_only_the_first_prediction_can_discard_a_snapshot() -> None:
     successor, _ = restored(50, "integrator-1")
     feed(successor, [prediction_of(np.zeros((20, 3)), first=-HOUR, producer="integrator-2")])
     assert "snapshots_of_other_times" not in successor.counters()
@@ -338,7 +353,7 @@ def test_only_what_comes_first_can_be_of_another_story() -> None:
 def test_a_request_that_was_answered_is_not_answered_again_after_a_restart() -> None:
     scorer = raised()
     successor = core_of(3)
-    successor.restore(note_of(scorer))
+    successor.restore(snapshot_of(scorer))
     for sequence, action in enumerate((Action.ACKNOWLEDGE, Action.SHELVE)):
         assert successor.step(request_of(action, sequence, sequence=sequence, duration_s=60.0)) == []
     assert successor.counters()["requests_repeated"] == 2
@@ -352,18 +367,18 @@ def test_requests_are_remembered_of_the_latest_producers_only() -> None:
     scorer = commissioned(core_of())
     for number in range(100):
         feed(scorer, [request_of(Action.SUPPRESS, producer=f"operator-{number}")])
-    known = json.loads(note_of(scorer).state_json)["desk"]["answered"]
+    known = json.loads(snapshot_of(scorer).state_json)["alarms"]["answered"]
     assert list(known) == [f"operator-{number}" for number in range(36, 100)]
 
 
-def test_all_that_is_remembered_stays_small() -> None:
+def test_a_snapshot_stays_small() -> None:
     scorer = commissioned(core_of(8), 8)
     with np.errstate(all="ignore"):
         feed(scorer, [prediction_of(np.full((300, 8), 50.0))])
-    assert len(note_of(scorer).state_json) < 40_000
+    assert len(snapshot_of(scorer).state_json) < 40_000
 
 
-def test_a_full_disk_is_told_and_stops_nothing(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_stops_nothing(tmp_path: Path) -> None:
     scorer = core_of(snapshot_store=SnapshotStore(tmp_path / "gone" / "m"))
     (tmp_path / "gone").write_text("a file where there was a folder")
     commissioned(scorer)

@@ -1,4 +1,4 @@
-"""Streams of residuals of many fans, for tests of what judges them: first-order autoregressive, of a known memory."""
+"""Streams of residuals of many fans for tests of scoring: first-order autoregressive, of a known correlation time."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import numpy as np
 from scipy.signal import lfilter
 
 from schemas.messages import Array, Statistic, Transition
+from schemas.units import NS_PER_S
 from scoring.alarms.alarm_state import ConditionSettings
 from scoring.alarms.tray_alarms import Conditions
-from scoring.fan_scorer import FanScorer, Samples
+from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits
+from scoring.samples import Samples
 
 STEP_NS = 10_000_000
 BLOCK = 512
@@ -47,19 +49,19 @@ def samples_of(speed: Array, balance: Array, first: int = 0, period_ns: int = ST
 
 
 def rows_of(samples: Samples, rows: slice) -> Samples:
-    """Some rows."""
+    """Some rows of the samples."""
     return replace(samples, **{name: value[rows] for name, value in vars(samples).items() if name != "period_ns"})
 
 
 def in_blocks(samples: Samples, block: int = BLOCK) -> Iterator[Samples]:
-    """The same, cut."""
+    """The samples, cut into blocks."""
     for first in range(0, len(samples.t_ns), block):
         yield rows_of(samples, slice(first, first + block))
 
 
 @dataclass(frozen=True)
 class Raised:
-    """An alarm: whose, by what, and when."""
+    """An alarm: fan, time and statistic."""
 
     fan: int
     t_s: float
@@ -68,18 +70,20 @@ class Raised:
 
 def alarms_of(limits: Limits, blocks: Iterable[Samples], fans: int) -> list[Raised]:
     """Alarms that a scorer would raise."""
-    judge = FanScorer(fans, limits)
-    settings = ConditionSettings(round(limits.timing.on_delay_s * 1e9), 1_000_000_000)
+    scorer = FanScorer(fans, limits)
+    settings = ConditionSettings(round(limits.timing.on_delay_s * NS_PER_S), NS_PER_S)
     conditions = Conditions(fans, settings)
     raised: list[Raised] = []
     for block in blocks:
-        verdict = judge.update(block)
-        course = conditions.update(block.t_ns, block.period_ns, verdict.score, np.isfinite(verdict.score))
+        scored = scorer.update(block)
+        result = conditions.update(block.t_ns, block.period_ns, scored.score, np.isfinite(scored.score))
         raised += [
             Raised(
-                change.fan, int(block.t_ns[change.row]) / 1e9, Statistic(int(verdict.statistic[change.row, change.fan]))
+                change.fan,
+                int(block.t_ns[change.row]) / NS_PER_S,
+                Statistic(int(scored.statistic[change.row, change.fan])),
             )
-            for change in course.events
+            for change in result.events
             if change.transition == Transition.RAISED
         ]
     return raised

@@ -1,4 +1,4 @@
-"""Scores of a made-up tray: sines of speed, a seeded noise, one fan with a fault, one with a gap."""
+"""Scores of a synthetic tray: sines of speed, seeded noise, one fan with a fault, one with a gap."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Made-up predictions, scorer cores, and what comes of the ones in the others."""
+"""Synthetic predictions, scorer cores, and what the cores emit for them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pipeline.runtime.snapshot_store import SnapshotStore
 from schemas.messages import Action, Alarm, Header, InvalidReason, Prediction, Request, Score, ScorerSnapshot
 from schemas.units import SpeedUnit
 from scoring.diagnosis.regression_window import HealthyBalance
-from stages.scorer import Healthy, ScorerConfig, ScorerCore, limits_in_force
+from stages.scorer import HealthyTwin, ScorerConfig, ScorerCore, limits_in_force
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -20,24 +20,34 @@ SIGMA = 4.0
 SIGMA_COMMAND = 0.5
 TWIN_SPEED = 300.0
 NEEDED = 50.0
-"""command at which the made-up fan runs at TWIN_SPEED"""
+"""command at which the synthetic fan runs at TWIN_SPEED"""
 CALIBRATION: dict[str, Any] = {
-    "speed": {"step": 4.0, "drift": 6.0, "growth": 3.0},
-    "balance": {"step": 4.0, "drift": 6.0, "growth": 3.0},
-    "stuck_s": 2.0,
-    "missing_share": 0.5,
+    "format_version": 2,
+    "speed": {},
+    "balance": {},
+    "detectors": {
+        "speed_smoothed": {"limit": 4.0},
+        "speed_drift": {"limit": 6.0, "period_s": 0.01},
+        "speed_variance_growth": {"limit": 3.0},
+        "balance_smoothed": {"limit": 4.0},
+        "balance_drift": {"limit": 6.0, "period_s": 0.01},
+        "balance_variance_growth": {"limit": 3.0},
+        "sensor": {"stuck_s": 2.0, "missing_share": 0.5},
+    },
     "timing": {"smoothing_s": 0.1, "baseline_s": 0.5, "adaptation_s": 30.0, "on_delay_s": 0.05},
 }
-LIVELY = CALIBRATION | {
-    name: CALIBRATION[name] | {"baseline_sigmas": 0.0, "adaptation_sigmas": 0.0} for name in ("speed", "balance")
+NO_BASELINES = {
+    name: {"baseline": {"commissioning_limit_sigmas": 0.0, "adaptation_limit_sigmas": 0.0}}
+    for name in ("speed", "balance")
 }
-"""limits that take nothing of what is made up for a fan's own"""
+LIVELY = CALIBRATION | NO_BASELINES
+"""limits with which no part of a test's residual becomes a baseline"""
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 
 def balance_of_a_fan() -> HealthyBalance:
-    """It needs NEEDED for TWIN_SPEED."""
+    """A fan that needs NEEDED for TWIN_SPEED."""
     return HealthyBalance(
         inertia=0.1,
         viscous=0.05,
@@ -63,8 +73,8 @@ def core_of(
 ) -> ScorerCore:
     """Without a calibration: limits on the speed residual alone, 2 SIGMA."""
     settings = ScorerConfig.model_validate(config)
-    healthy = Healthy(sha256, limits_in_force(settings, calibration), [balance_of_a_fan()] * fans, "%")
-    return ScorerCore(fans, unit, settings, healthy, snapshot_store)
+    twin = HealthyTwin(sha256, limits_in_force(settings, calibration), [balance_of_a_fan()] * fans, "%")
+    return ScorerCore(fans, unit, settings, twin, snapshot_store)
 
 
 def prediction_of(
@@ -76,7 +86,7 @@ def prediction_of(
     period_ns: int = STEP_NS,
     producer: str = "integrator-1",
 ) -> Prediction:
-    """Of a twin that says TWIN_SPEED. residual, valid, balance: (n, fans) or (n,)."""
+    """Predictions of a twin that predicts TWIN_SPEED. residual, valid, balance: (n, fans) or (n,)."""
     residual = np.asarray(residual, float).reshape(len(residual), -1)
     valid = np.ones(residual.shape, np.bool_) if valid is None else valid.reshape(residual.shape)
     extra = np.broadcast_to(
@@ -100,7 +110,7 @@ def prediction_of(
 
 
 def commissioned(core: ScorerCore, fans: int = 1, seconds: float = 11.0) -> ScorerCore:
-    """A core whose fans have been healthy up to EPOCH_NS, for longer than commissioning takes."""
+    """A core whose fans were healthy up to EPOCH_NS, for longer than commissioning takes."""
     samples = round(seconds * 100) + 1
     wobble = 1e-9 * (np.arange(samples) % 7 - 3.0)[:, np.newaxis]  # a tacho that repeats itself is stuck
     core.step(prediction_of(np.tile(wobble, (1, fans)).astype(np.float64), first=-samples))
@@ -116,12 +126,12 @@ def request_of(
 
 
 def feed(core: ScorerCore, items: Iterable[Prediction | Request]) -> tuple[list[Score], list[Alarm]]:
-    """Scores and alarms that come of predictions and requests."""
+    """The scores and alarms that a core emits for predictions and requests."""
     messages = [message for item in items for message in core.step(item)]
     return [m for m in messages if isinstance(m, Score)], [m for m in messages if isinstance(m, Alarm)]
 
 
-def note_of(core: ScorerCore) -> ScorerSnapshot:
-    """What it leaves behind in the end."""
-    (memory,) = core.close()
-    return memory
+def snapshot_of(core: ScorerCore) -> ScorerSnapshot:
+    """The snapshot that it leaves at the end."""
+    (snapshot,) = core.close()
+    return snapshot

@@ -14,15 +14,18 @@ from rich.table import Table
 
 from pipeline.cli.options import JsonOption, SetOption
 from pipeline.cli.progress import working
-from pipeline.cli.twins.calibration_check import check_promise
-from pipeline.cli.twins.outlier_run_check import doubt
+from pipeline.cli.twins.calibration_check import check_declared_rate
+from pipeline.cli.twins.outlier_run_check import outlier_warning
 from pipeline.cli.twins.training_data import sha256_of, twin_errors
 from pipeline.errors import UserError
 from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.runtime.tray_twin import load_tray_twin
+from schemas.units import NS_PER_S
 from scoring.calibration.calibration import TooLittleError
 from scoring.calibration.calibration import calibrate as find_limits
-from scoring.limits import Limits, ResidualLimits, Timing
+from scoring.calibration.healthy_statistics import MixedRatesError
+from scoring.detectors.table import rows
+from scoring.limits import Limits, Timing
 
 EXIT_BROKEN = 3
 
@@ -31,51 +34,57 @@ def calibrate(
     twin: Annotated[Path, typer.Argument(metavar="TWIN.onnx", help="Twin whose alarms are calibrated.")],
     healthy: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="HEALTHY.mcap...", help="Healthy recordings, best such as the twin was not trained on."),
+        typer.Argument(
+            metavar="HEALTHY.mcap...", help="Healthy recordings, preferably not those that the twin was trained on."
+        ),
     ] = None,
     false_alarms_per_day: Annotated[
-        float | None, typer.Option(help="What is declared: false alarms per fan and day.", min=1e-6, max=8640)
+        float | None, typer.Option(help="The rate to declare: false alarms per fan and day.", min=1e-6, max=8640)
     ] = None,
     verify: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="OTHER.mcap...",
-            help="Other healthy recordings, to test what was declared: all words that follow, up to the next option. "
-            "So TWIN.onnx and HEALTHY.mcap... stand before it.",
+            help="Other healthy recordings, to test the declared rate: all arguments up to the next option, so name "
+            "TWIN.onnx and HEALTHY.mcap... before it.",
         ),
     ] = None,
     extrapolate: Annotated[
-        bool, typer.Option("--extrapolate", help="Set limits beyond what so little data can show; promises nothing.")
+        bool,
+        typer.Option(
+            "--extrapolate",
+            help="Set limits beyond what so little data can show; the declared rate is then a target only.",
+        ),
     ] = False,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="OUT.onnx", help="Write there, not into TWIN.onnx.")
+        Path | None, typer.Option("-o", "--output", metavar="OUT.onnx", help="Write to this file, not into TWIN.onnx.")
     ] = None,
     overrides: SetOption = None,
-    seed: Annotated[int, typer.Option(help="Of the bootstrap.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the bootstrap.")] = 0,
     json_output: JsonOption = False,
 ) -> None:
     """Set the alarm limits of a twin by healthy recordings, and write them into its card.
 
-    Every recording is judged as a live fan is, from its own start. Limits are set where false alarms come as often as
-    declared; what the data cannot support is refused, with how much would be needed. Alarms of a twin that was never
-    calibrated rest on its speed band alone.
+    Every recording is scored as a live fan is, from its own start. Limits are set where false alarms are as frequent as
+    declared. A rate that the data cannot support is refused, with the amount that it needs. Alarms of a twin without
+    calibration depend on its speed band alone.
 
-    Exit codes: 0 well; 1 could not be done; 3 --verify found more false alarms than declared.
+    Exit codes: 0 success; 1 error; 3 --verify found more false alarms than declared.
 
     Example: fantwin calibrate TWIN.onnx healthy-1.mcap healthy-2.mcap --false-alarms-per-day 1
 
     Example: fantwin calibrate TWIN.onnx --verify healthy-3.mcap healthy-4.mcap
     """
-    _refuse_what_makes_no_sense(twin, healthy or [], verify or [], overrides or [])
+    _refuse_wrong_arguments(twin, healthy or [], verify or [], overrides or [])
     if not healthy:
         finding = {"--false-alarms-per-day": false_alarms_per_day, "--extrapolate": extrapolate, "--output": output}
         _refuse_without_healthy([name for name, value in finding.items() if value])
-    if output and (output.is_dir() or not output.parent.is_dir()):  # told now, and not after an hour of judging
-        raise UserError(f"{output}: cannot write the twin: name a file in a folder that is there")
+    if output and (output.is_dir() or not output.parent.is_dir()):  # before an hour of scoring
+        raise UserError(f"{output}: cannot write the twin: name a file in an existing folder")
     result: dict[str, Any] = {}
     if healthy:
         if false_alarms_per_day is None:
-            raise UserError("say what is declared: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
+            raise UserError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
         limits, warning = _calibrated(twin, healthy, false_alarms_per_day, extrapolate, overrides or [], seed)
         output = output or twin
         _write(twin, output, limits)
@@ -84,14 +93,14 @@ def calibrate(
         if warning:
             typer.echo(warning, err=True)
         if not json_output:
-            _tell(output, limits)
-    check = check_promise(output or twin, verify, overrides or []) if verify else None
+            _print(output, limits)
+    check = check_declared_rate(output or twin, verify, overrides or []) if verify else None
     if check:
         result["verify"] = check.as_json()
     if json_output:
         typer.echo(json.dumps(result))
     elif check:
-        typer.echo(check.said)
+        typer.echo(check.text)
     if check and check.is_broken:
         raise typer.Exit(EXIT_BROKEN)
 
@@ -99,56 +108,59 @@ def calibrate(
 def _calibrated(
     twin: Path, healthy: list[Path], per_day: float, extrapolate: bool, overrides: list[str], seed: int
 ) -> tuple[Limits, str]:
-    """The limits, and what is to be told of the recordings, empty if nothing."""
+    """The limits, and a warning about the recordings, empty if there is none."""
     known = load_tray_twin(twin)
     top_speed_rad_s = known.card.top_speed_rad_s
     if top_speed_rad_s <= 0.0:
         raise UserError(f"{twin}: its training data have no speed above zero (speed_range_rad_s): train it again")
-    with working("judging healthy recordings") as tell:
-        runs = HealthyRuns(healthy, twin, overrides, tell)
+    with working("scoring healthy recordings") as show:
+        runs = HealthyRuns(healthy, twin, overrides, show)
         try:
             limits = find_limits(runs, top_speed_rad_s, runs.timing(), per_day, seed, extrapolate, known.bend_rad_s)
         except TooLittleError as error:
             raise UserError(_too_little(error, per_day)) from error
-        tell("comparing the recordings")
-        warning = doubt(runs, limits, top_speed_rad_s)
-    assert limits.promise
-    promise = limits.promise.model_copy(
+        except MixedRatesError as error:
+            raise UserError(_mixed_rates(error)) from error
+        show("comparing the recordings")
+        warning = outlier_warning(runs, limits, top_speed_rad_s)
+    assert limits.declared_rate
+    declared_rate = limits.declared_rate.model_copy(
         update={
             "data": tuple({"name": path.name, "sha256": sha256_of(path)} for path in healthy),
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         }
     )
-    return limits.model_copy(update={"promise": promise}), warning
+    return limits.model_copy(update={"declared_rate": declared_rate}), warning
 
 
-def _refuse_what_makes_no_sense(twin: Path, healthy: list[Path], verify: list[Path], overrides: list[str]) -> None:
+def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path], overrides: list[str]) -> None:
     if not twin.is_file():
         raise UserError(f"{twin}: there is no such twin: name the file that `fantwin train` wrote")
     if not healthy and not verify:
-        raise UserError("nothing to calibrate on: name healthy recordings, or --verify OTHER.mcap to test what is set")
+        raise UserError(
+            "nothing to calibrate on: name healthy recordings, or --verify OTHER.mcap to test the declared rate"
+        )
     for path in (path for path in verify if path.suffix == ".onnx"):
-        raise UserError(f"{path}: --verify takes recordings, all that follow it: name TWIN.onnx before it")
+        raise UserError(f"{path}: --verify takes recordings, and all arguments after it: name TWIN.onnx before it")
     _named_once([*healthy, *verify])
     for key in (override.partition("=")[0].strip() for override in overrides if healthy):
         if key.startswith("scorer.") and key.removeprefix("scorer.") not in Timing.model_fields:
             raise UserError(
-                f"--set {key}: does not change which limits are found; of [scorer] these do: "
-                f"{', '.join(Timing.model_fields)}"
+                f"--set {key}: does not affect calibration; of [scorer] these do: {', '.join(Timing.model_fields)}"
             )
 
 
 def _refuse_without_healthy(names: list[str]) -> None:
-    """names: of options that were given and say how to find limits."""
+    """names: options that were given and are for calibrating."""
     if names:
         raise UserError(
-            f"{names[0]} goes with recordings to calibrate on, and there are none: those after --verify only test; "
+            f"{names[0]} needs recordings to calibrate on, and there are none: those after --verify only test; "
             "name HEALTHY.mcap... before it"
         )
 
 
 def _named_once(recordings: list[Path]) -> None:
-    """A recording that counted twice would promise more than is known, and verifies nothing it was calibrated on."""
+    """A recording that counted twice would claim more running than there was, and cannot test its own calibration."""
     seen: set[Path] = set()
     for path in recordings:
         if path.resolve() in seen:
@@ -161,9 +173,20 @@ def _too_little(error: TooLittleError, per_day: float) -> str:
         return (
             f"{error.fan_hours:.2g} fan-hours of healthy running cannot support {_rate(per_day)}: that takes "
             f"{error.needed_fan_hours:.3g}; record more, declare {_round_up(error.least_per_day):g} or more, or set "
-            "limits that promise nothing: --extrapolate"
+            "limits without a declared rate: --extrapolate"
         )
-    return f"{error.fan_hours * 3600:.0f} s of healthy running is too little for any limit: give a minute at least"
+    return f"{error.fan_hours * 3600:.0f} s of healthy running is too little for any limit: give at least one minute"
+
+
+def _mixed_rates(error: MixedRatesError) -> str:
+    (first, first_ns), (other, other_ns) = error.first, error.other
+    rates = f"{NS_PER_S / first_ns:g} Hz and {NS_PER_S / other_ns:g} Hz"
+    if first == other:
+        return f"{first}: its grid changes between {rates}, and limits hold for one rate: calibrate without it"
+    return (
+        f"{first} and {other} have grids of different rates, {rates}, and limits hold for one: calibrate on recordings "
+        "of one rate, or choose one with --set resampler.rate_hz=..."
+    )
 
 
 def _rate(per_day: float) -> str:
@@ -175,7 +198,7 @@ def _runs(count: int) -> str:
 
 
 def _round_up(rate: float) -> float:
-    """To two digits, so that it is enough when it is typed."""
+    """To two digits, upwards: a rate that is enough when it is typed."""
     unit = 10.0 ** (math.floor(math.log10(rate)) - 1)
     return math.ceil(rate / unit) * unit
 
@@ -193,26 +216,21 @@ def _write(twin: Path, output: Path, limits: Limits) -> None:
         raise UserError(f"{output}: cannot write the twin: {error.strerror}") from error
 
 
-def _tell(output: Path, limits: Limits) -> None:
-    promise = limits.promise
-    assert promise
+def _print(output: Path, limits: Limits) -> None:
+    rate = limits.declared_rate
+    assert rate
     console = Console(highlight=False, soft_wrap=True)
-    table = Table("residual", box=None, pad_edge=False)
-    for column in ("step", "drift", "growth", "memory of the healthy residual"):
-        table.add_column(column, justify="right")
-    for name in ("speed", "balance"):
-        of: ResidualLimits = getattr(limits, name)
-        figures = ["-" if limit is None else f"{limit:.3g}" for limit in (of.step, of.drift, of.growth)]
-        table.add_row(name, *figures, f"{of.autocorrelation_time_s:.2g} s")
-    low, high = promise.interval_95
-    console.print(
-        f"{output}: alarms calibrated on {promise.fan_hours:.3g} fan-hours in {_runs(promise.runs)}", markup=False
-    )
-    console.print("limits, in standard deviations of each healthy statistic:")
+    console.print(f"{output}: alarms calibrated on {rate.fan_hours:.3g} fan-hours in {_runs(rate.runs)}", markup=False)
+    table = Table("detector", "settings", box=None, pad_edge=False)
+    for row in rows():
+        settings = limits.detectors.get(row.name)
+        shown = ", ".join(f"{name} {value:.3g}" for name, value in settings) if settings else "not used"
+        table.add_row(row.name, shown)
     console.print(table)
-    declared = _rate(promise.false_alarms_per_day)
-    if promise.extrapolated:
-        console.print(f"[yellow]aimed at {declared}, beyond what so little data can show: nothing is promised[/yellow]")
+    declared = _rate(rate.false_alarms_per_day)
+    if rate.extrapolated:
+        console.print(f"[yellow]target: {declared}; so little data cannot show whether these limits keep it[/yellow]")
     else:
+        low, high = rate.interval_95
         console.print(f"declared: {declared} (95 % by these data: {low:.3g} to {high:.3g})")
     console.print("test it on other healthy recordings: fantwin calibrate TWIN.onnx --verify OTHER.mcap")

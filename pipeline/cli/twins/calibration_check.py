@@ -1,4 +1,4 @@
-"""Whether a declared false-alarm rate is kept: alarms on other healthy recordings, counted."""
+"""Whether a declared false-alarm rate is kept: counts alarms on other healthy recordings."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from pipeline.replay.offline.judging import judge
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
 from scoring.calibration.alarm_rate import poisson_interval
+from scoring.limits import DeclaredRate, Limits
 
 NS_PER_HOUR = 3.6e12
 
 
 @dataclass(frozen=True)
 class Check:
-    """Alarms in so many fan-hours, beside what was declared per fan and day."""
+    """Alarms in so many fan-hours, and the declared rate per fan and day."""
 
     alarms: int
     fan_hours: float
@@ -30,24 +31,24 @@ class Check:
 
     @property
     def expected(self) -> float:
-        """Alarms by the declared rate."""
+        """Number of alarms by the declared rate."""
         return self.declared_per_day * self.fan_hours / 24
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """Of the rate per fan and day."""
+        """95 % confidence interval of the rate per fan and day."""
         days = self.fan_hours / 24
         low, high = poisson_interval(self.alarms)
         return low / days, high / days
 
     @property
     def is_broken(self) -> bool:
-        """More alarms than chance explains: even the low end of the interval is above what was declared."""
+        """Whether there were more alarms than chance explains: the whole interval is above the declared rate."""
         return self.interval_95[0] > self.declared_per_day
 
     @property
-    def said(self) -> str:
-        """In one line."""
+    def text(self) -> str:
+        """The result in one line."""
         low, high = self.interval_95
         found = (
             f"{self.alarms} alarm{'s' * (self.alarms != 1)} in {self.fan_hours:.3g} fan-hours: "
@@ -57,11 +58,11 @@ class Check:
         if self.is_broken:
             return f"{found}: not kept"
         if self.expected < 1.0:
-            return f"{found}: kept, as far as so little running can tell ({self.expected:.2g} alarms were expected)"
+            return f"{found}: kept, as far as so little running can show ({self.expected:.2g} alarms were expected)"
         return f"{found}: kept"
 
     def as_json(self) -> dict[str, Any]:
-        """For machines."""
+        """The same for --json."""
         return {
             "alarms": self.alarms,
             "fan_hours": self.fan_hours,
@@ -72,38 +73,39 @@ class Check:
         }
 
 
-def check_promise(twin: Path, recordings: Sequence[Path], overrides: Sequence[str]) -> Check:
-    """Judge other healthy recordings whole, as `fantwin replay --offline` does.
+def check_declared_rate(twin: Path, recordings: Sequence[Path], overrides: Sequence[str]) -> Check:
+    """Count alarms on other healthy recordings, processed as by `fantwin replay --offline`.
 
     Raises:
-        UserError: the twin declares nothing or was made of a recording, one cannot be used, or none of its samples
-            could be judged.
+        UserError: the twin declares no rate or was made from one of the recordings, a recording cannot be used, or none
+            of its samples could be scored.
     """
     loaded = load_tray_twin(twin)
     calibration = loaded.card.calibration
-    if calibration is None or calibration.get("promise") is None:
+    declared = Limits.model_validate(calibration).declared_rate if calibration else None
+    if declared is None:
         raise UserError(f"{twin}: its alarms were never calibrated: give healthy recordings and --false-alarms-per-day")
-    _refuse_what_it_was_made_of(twin, loaded, recordings)
+    _refuse_its_own_recordings(twin, loaded, declared, recordings)
     alarms, fan_hours = 0, 0.0
-    with working("judging other healthy recordings") as tell:
+    with working("scoring other healthy recordings") as show:
         for path in recordings:
-            tell(f"verifying: {path}")
-            with open_replay_input([path], None, overrides, twin) as material:
-                for tray, judged in zip(material.trays, judge(material, None, False), strict=True):
+            show(f"verifying: {path}")
+            with open_replay_input([path], None, overrides, twin) as replay_input:
+                for tray, judged in zip(replay_input.trays, judge(replay_input, None, False), strict=True):
                     if judged.problem:
                         raise UserError(f"{path}: {judged.problem}")
                     alarms += len(episodes(judged.alarms))
                     fan_samples = judged.samples * tray.fans - judged.not_judged.total()
                     fan_hours += fan_samples * judged.period_ns / NS_PER_HOUR
-    return Check(alarms, fan_hours, float(calibration["promise"]["false_alarms_per_day"]))
+    return Check(alarms, fan_hours, declared.false_alarms_per_day)
 
 
-def _refuse_what_it_was_made_of(path: Path, twin: TrayTwin, recordings: Sequence[Path]) -> None:
-    card = json.loads(twin.card_json)
-    for verb, part in (("calibrated", card["calibration"]["promise"]), ("trained", card.get("training", {}))):
-        known = {data["sha256"] for data in part.get("data", ())}
+def _refuse_its_own_recordings(path: Path, twin: TrayTwin, declared: DeclaredRate, recordings: Sequence[Path]) -> None:
+    training = json.loads(twin.card_json).get("training", {})
+    for verb, data in (("calibrated", declared.data), ("trained", training.get("data", ()))):
+        known = {entry["sha256"] for entry in data}
         for recording in recordings:
             if recording.is_file() and sha256_of(recording) in known:
                 raise UserError(
-                    f"{recording}: {path} was {verb} on it, so that it proves nothing: --verify takes other recordings"
+                    f"{recording}: {path} was {verb} on it, so it proves nothing: --verify takes other recordings"
                 )

@@ -1,57 +1,68 @@
-"""Whether one of the recordings that a twin was calibrated on was healthy: what went far beyond all others in them."""
+"""Whether a recording that a twin was calibrated on was not healthy: its scores went far beyond the others."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.replay.offline.healthy_runs import HealthyRuns
 from schemas.messages import Array
-from scoring.calibration.calibration import DAY_S, SCORE, SHAPE_FAN_S
-from scoring.calibration.healthy_statistics import survey, truncate_runs
+from scoring.calibration.calibration import DAY_S, VARIATION_FAN_S
+from scoring.calibration.healthy_statistics import healthy_statistics, truncate_runs
 from scoring.limits import Limits
 
-FEWEST = 4  # fans of runs: of fewer nobody knows what is usual
-FAR_BEYOND = 3.0  # times as far as usual: healthy fans that ran alike came to 1.7, faulty ones to 3.5 and more
+MIN_FANS = 4  # fans of runs: of fewer nobody can say what is common
+OUTLIER_RATIO = 3.0  # times the median: healthy fans that ran alike came to 1.7, faulty ones to 3.5 and more
 
 
-def doubt(runs: HealthyRuns, limits: Limits, top_speed_rad_s: float) -> str:
-    """One line on the fan of a recording that went much further than the others did, by the limits that were found.
+class Outlier(NamedTuple):
+    """The fan of a run whose score went furthest."""
 
-    Empty where none did. Of more than five fan-days the truncate_runs of all runs are looked at.
+    run: int
+    """number of the run"""
+    fan: int
+    score: float
+    median_score: float
+    """of the highest scores of all fans of runs"""
+
+
+def outlier_warning(runs: HealthyRuns, limits: Limits, top_speed_rad_s: float) -> str:
+    """One line on the fan of a recording whose score went far beyond the others; empty if none did.
+
+    limits: those that were found on these runs. Of more than five fan-days only the first part of each run is scored.
 
     Raises:
         UserError: a recording cannot be used.
     """
-    assert limits.promise
-    is_long = limits.promise.fan_hours > 24 * SHAPE_FAN_S / DAY_S
-    of = truncate_runs(runs, limits.promise.runs, SHAPE_FAN_S) if is_long else runs
-    went = [run[:, SCORE] for run in survey(of, limits, top_speed_rad_s).maxima]
-    found = farthest(went)
+    assert limits.declared_rate
+    is_long = limits.declared_rate.fan_hours > 24 * VARIATION_FAN_S / DAY_S
+    part = truncate_runs(runs, limits.declared_rate.runs, VARIATION_FAN_S) if is_long else runs
+    found = outlier([run.score for run in healthy_statistics(part, limits, top_speed_rad_s).maxima])
     if found is None:
         return ""
-    number, fan, far, usual = found
-    run = runs.runs[number]
+    tray = runs.trays[found.run]
     return (
-        f"{run.path}: {run.tray} fan {fan} goes to {far:.2g} times the limits that were found, the others mostly to "
-        f"{usual:.2g}: if something was wrong there, calibrate without this recording"
+        f"{tray.path}: {tray.tray} fan {found.fan} goes to {found.score:.2g} times the limits that were found, the "
+        f"others mostly to {found.median_score:.2g}: if something was wrong there, calibrate without this recording"
     )
 
 
-def farthest(went: Sequence[Array]) -> tuple[int, int, float, float] | None:
-    """Number of the run, fan, how far that went, and how far is usual; None where all went alike.
+def outlier(scores: Sequence[Array]) -> Outlier | None:
+    """The fan of a run that went furthest, if that is far beyond the others.
 
-    went: of each run (windows, fans), how far its score went, NaN where it was not judged.
+    scores: of each run (windows, fans), NaN where a fan was not scored.
     """
-    far = {
+    highest = {
         (number, fan): float(np.nanmax(run[:, fan]))
-        for number, run in enumerate(went)
+        for number, run in enumerate(scores)
         for fan in range(run.shape[1])
         if np.isfinite(run[:, fan]).any()
     }
-    if len(far) < FEWEST:
+    if len(highest) < MIN_FANS:
         return None
-    usual = float(np.median(list(far.values())))
-    number, fan = max(far, key=lambda key: far[key])
-    return (number, fan, far[number, fan], usual) if far[number, fan] > FAR_BEYOND * usual else None
+    median = float(np.median(list(highest.values())))
+    run, fan = max(highest, key=lambda key: highest[key])
+    score = highest[run, fan]
+    return Outlier(run, fan, score, median) if score > OUTLIER_RATIO * median else None

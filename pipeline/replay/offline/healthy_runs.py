@@ -1,4 +1,4 @@
-"""Healthy recordings as the scorer would be fed them: what alarms are calibrated on."""
+"""Healthy recordings as the scorer would receive them: what `fantwin calibrate` calibrates on."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from pipeline.errors import UserError
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
-from scoring.calibration.healthy_statistics import Running
-from scoring.fan_scorer import Samples, samples_of
+from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.limits import Timing
+from scoring.samples import Samples, samples_of
 
-KEPT_SAMPLES = 10_000_000
-"""of fans, about 80 bytes each: so many are kept between passes, what is beyond is made anew"""
+MAX_KEPT_SAMPLES = 10_000_000
+"""of fans, about 80 bytes each: so many are kept between passes; with more, recordings are read again"""
 
 
 @dataclass(frozen=True)
-class HealthyRun:
+class RecordedTray:
     """One tray of one recording."""
 
     path: Path
@@ -29,7 +29,7 @@ class HealthyRun:
 
 
 class HealthyRuns:
-    """Recordings, each judged from its start as a live tray is; to be gone through several times."""
+    """Recordings, each processed from its start as a live tray is; they can be gone through several times."""
 
     def __init__(
         self, paths: Sequence[Path], twin: Path, overrides: Sequence[str], progress: Callable[[str], None]
@@ -40,10 +40,11 @@ class HealthyRuns:
         self._progress = progress
         self._knows_fans = load_tray_twin(twin).fans > 1
         self._pass = 0
-        self._kept: list[Running] | None = None
-        self.runs: list[HealthyRun] = []
+        self._kept: list[HealthyRun] | None = None
+        self.trays: list[RecordedTray] = []
+        """of each run of the last pass"""
 
-    def __call__(self) -> Iterator[Running]:
+    def __call__(self) -> Iterator[HealthyRun]:
         """All runs from the beginning.
 
         Raises:
@@ -53,74 +54,74 @@ class HealthyRuns:
         if self._kept is not None:
             yield from self._kept
             return
-        self.runs = []
-        kept = _Kept()
+        self.trays = []
+        kept = _KeptRuns()
         for path in self._paths:
             self._progress(f"pass {self._pass}: {path}")
             try:
-                for run, blocks in self._of(path):
-                    self.runs.append(run)
-                    known_as = range(run.fans) if self._knows_fans else None
-                    yield kept.noting(Running(run.fans, blocks, known_as))
+                for tray, blocks in self._of(path):
+                    self.trays.append(tray)
+                    known_as = range(tray.fans) if self._knows_fans else None
+                    yield kept.recording(HealthyRun(str(path), tray.fans, blocks, known_as))
             except CodecError as error:
                 raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
-        self._kept = kept.whole
+        self._kept = kept.complete
 
     def timing(self) -> Timing:
-        """The times of the scorer, as the recordings' configuration has them, and the keys set on top.
+        """The times of the scorer in the configuration of the recordings, with the overrides applied.
 
         Raises:
-            UserError: a recording cannot be used, or they are not the same for all.
+            UserError: a recording cannot be used, or the times are not the same in all.
         """
         found: dict[Timing, Path] = {}
         for path in self._paths:
-            with open_replay_input([path], None, self._overrides, self._twin) as material:
-                scorer: Any = material.config.sections["scorer"]
+            with open_replay_input([path], None, self._overrides, self._twin) as replay_input:
+                scorer: Any = replay_input.config.sections["scorer"]
                 found.setdefault(scorer.timing(Timing()), path)
         first, *others = found
         for other in others:
             names = [name for name in Timing.model_fields if getattr(first, name) != getattr(other, name)]
             raise UserError(
-                f"{found[first]} and {found[other]} differ in scorer.{names[0]}, for which limits are found: "
-                "say which with --set"
+                f"{found[first]} and {found[other]} differ in scorer.{names[0]}, which limits depend on: "
+                "choose one with --set"
             )
         return first
 
-    def _of(self, path: Path) -> Iterator[tuple[HealthyRun, Iterator[Samples]]]:
-        with open_replay_input([path], None, self._overrides, self._twin) as material:
-            for tray in material.trays:
+    def _of(self, path: Path) -> Iterator[tuple[RecordedTray, Iterator[Samples]]]:
+        with open_replay_input([path], None, self._overrides, self._twin) as replay_input:
+            for tray in replay_input.trays:
                 name = tray.name
-                yield HealthyRun(path, name, tray.fans), map(samples_of, material.pipeline(name).predictions())
+                yield RecordedTray(path, name, tray.fans), map(samples_of, replay_input.pipeline(name).predictions())
 
 
-class _Kept:
-    """The blocks of all runs, as long as there is room for them. runs: None once there was none."""
+class _KeptRuns:
+    """The blocks of all runs, kept while they are gone through for the first time, if they are not too many."""
 
     def __init__(self) -> None:
-        self.runs: list[Running] | None = []
-        self._room = KEPT_SAMPLES
-        self._begun = 0
+        self._runs: list[HealthyRun] | None = []
+        self._room = MAX_KEPT_SAMPLES
+        self._unfinished = 0
 
     @property
-    def whole(self) -> list[Running] | None:
-        """The runs, if there was room and every one was gone through to its end."""
-        return None if self._begun else self.runs
+    def complete(self) -> list[HealthyRun] | None:
+        """The runs; None if they were too many, or one was not read to its end."""
+        return None if self._unfinished else self._runs
 
-    def noting(self, run: Running) -> Running:
-        """The next run, whose blocks are noted as they go by."""
-        mine: list[Samples] = []
-        if self.runs is not None:
-            self.runs.append(run._replace(blocks=mine))
-        return run._replace(blocks=self._noted(run.blocks, mine))
+    def recording(self, run: HealthyRun) -> HealthyRun:
+        """The same run, whose blocks are kept as they are read."""
+        kept: list[Samples] = []
+        if self._runs is not None:
+            self._runs.append(run._replace(blocks=kept))
+        return run._replace(blocks=self._recorded(run.blocks, kept))
 
-    def _noted(self, blocks: Iterable[Samples], mine: list[Samples]) -> Iterator[Samples]:
-        self._begun += 1
+    def _recorded(self, blocks: Iterable[Samples], kept: list[Samples]) -> Iterator[Samples]:
+        self._unfinished += 1
         for block in blocks:
             self._room -= block.speed_rad_s.size
             if self._room < 0:
-                self.runs = None
-                mine.clear()
+                self._runs = None
+                kept.clear()
             else:
-                mine.append(block)
+                kept.append(block)
             yield block
-        self._begun -= 1
+        self._unfinished -= 1

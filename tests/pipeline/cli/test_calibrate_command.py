@@ -1,4 +1,4 @@
-"""`fantwin calibrate` on simulated recordings: what it promises and refuses, and that it leaves the twin as it was."""
+"""`fantwin calibrate` on simulated recordings: what it declares and refuses, and that it leaves the twin as it was."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ def test_the_limits_are_in_the_card_and_all_else_of_the_twin_is_as_it_was(folder
     graphs = [onnx.load(twin).graph.SerializeToString(deterministic=True) for twin in (before, after)]
     assert graphs[0] == graphs[1]
     limits = Limits.model_validate(load_tray_twin(after).card.calibration)
-    assert limits.speed.step and limits.balance.step
-    assert limits.promise
-    assert limits.promise.false_alarms_per_day == PER_DAY
-    assert limits.promise.interval_95[0] < PER_DAY < limits.promise.interval_95[1]
-    assert limits.promise.data[0]["name"] == "healthy.mcap"
-    assert len(limits.promise.data[0]["sha256"]) == 64
+    assert {"speed_smoothed", "balance_smoothed", "sensor"} <= limits.detectors.keys()
+    assert limits.declared_rate
+    assert limits.declared_rate.false_alarms_per_day == PER_DAY
+    assert limits.declared_rate.interval_95[0] < PER_DAY < limits.declared_rate.interval_95[1]
+    assert limits.declared_rate.data[0]["name"] == "healthy.mcap"
+    assert len(limits.declared_rate.data[0]["sha256"]) == 64
 
 
 def test_the_limits_decide_what_a_replay_finds(folder: Path, calibrated: Path) -> None:
@@ -86,19 +86,19 @@ def alarmed_s(replayed: str) -> float:
 
 
 def strict(folder: Path, calibrated: Path) -> Path:
-    """The twin with limits that healthy fans pass all the time, and a promise that they never do."""
+    """The twin with limits that healthy fans pass all the time, and a declared rate that says they never do."""
     from twin.export.calibrated import with_calibration  # noqa: PLC0415
 
     was = Limits.model_validate(load_tray_twin(calibrated).card.calibration)
-    assert was.promise
-    promise = was.promise.model_copy(update={"false_alarms_per_day": 0.1})
-    limits = was.times(0.3).model_copy(update={"promise": promise})
+    assert was.declared_rate
+    rate = was.declared_rate.model_copy(update={"false_alarms_per_day": 0.1})
+    limits = was.times(0.3).model_copy(update={"declared_rate": rate})
     path = folder / "strict.onnx"
     path.write_bytes(with_calibration(calibrated.read_bytes(), json.loads(limits.model_dump_json())))
     return path
 
 
-def test_it_says_what_it_found_in_lines_a_person_can_read(folder: Path) -> None:
+def test_the_output_is_readable(folder: Path) -> None:
     told = calibrate(folder, "-o", folder / "said.onnx").stdout
     assert "said.onnx: alarms calibrated on 0.06" in told
     assert f"declared: {PER_DAY} false alarms per fan and day" in told
@@ -130,17 +130,17 @@ def test_too_little_is_refused_with_what_would_be_needed_and_the_twin_is_left_al
     assert (folder / "twin.onnx").read_bytes() == before
 
 
-def test_what_is_extrapolated_promises_nothing(folder: Path) -> None:
+def test_extrapolated_limits_declare_a_target_only(folder: Path) -> None:
     output = folder / "extrapolated.onnx"
     result = fantwin(
         "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1, "--extrapolate",
         "-o", output,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    assert "nothing is promised" in result.stdout
-    promise = Limits.model_validate(load_tray_twin(output).card.calibration).promise
-    assert promise
-    assert promise.extrapolated
+    assert "so little data cannot show whether these limits keep it" in result.stdout
+    rate = Limits.model_validate(load_tray_twin(output).card.calibration).declared_rate
+    assert rate
+    assert rate.extrapolated
 
 
 def test_what_was_declared_is_kept_on_other_healthy_running(folder: Path, calibrated: Path) -> None:
@@ -151,18 +151,18 @@ def test_what_was_declared_is_kept_on_other_healthy_running(folder: Path, calibr
     assert len(result.stdout.strip().splitlines()) == 1
 
 
-def test_a_promise_that_is_broken_is_exit_code_3(folder: Path, calibrated: Path) -> None:
+def test_a_declared_rate_that_is_not_kept_is_exit_code_3(folder: Path, calibrated: Path) -> None:
     result = fantwin("calibrate", strict(folder, calibrated), "--verify", folder / "other.mcap")
     assert result.exit_code == 3, result.output
     assert "declared 0.1: not kept" in result.stdout
 
 
 @pytest.mark.parametrize("alarms", range(20))
-def test_what_decides_is_the_interval_that_is_printed(alarms: int) -> None:
+def test_the_printed_interval_decides(alarms: int) -> None:
     check = Check(alarms, 100.0, 1.0)
     low, _ = check.interval_95
-    assert check.said.endswith(": not kept") == check.is_broken == (low > 1.0)
-    assert f"(95 %: {low:.2g} to " in check.said
+    assert check.text.endswith(": not kept") == check.is_broken == (low > 1.0)
+    assert f"(95 %: {low:.2g} to " in check.text
 
 
 def test_a_twin_that_was_never_calibrated_has_nothing_to_verify(folder: Path) -> None:
@@ -170,13 +170,13 @@ def test_a_twin_that_was_never_calibrated_has_nothing_to_verify(folder: Path) ->
     assert "never calibrated" in said
 
 
-def test_what_is_missing_from_the_command_is_said(folder: Path) -> None:
+def test_missing_arguments_are_named(folder: Path) -> None:
     assert "nothing to calibrate on" in said_instead("calibrate", folder / "twin.onnx")
     said = said_instead("calibrate", folder / "twin.onnx", folder / "healthy.mcap")
     assert "--false-alarms-per-day" in said
 
 
-def test_a_twin_that_is_not_there_is_told_by_the_name_that_was_given(folder: Path) -> None:
+def test_a_missing_twin_is_reported_by_the_given_name(folder: Path) -> None:
     said = said_instead("calibrate", folder / "no.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY)
     assert said == f"{folder / 'no.onnx'}: there is no such twin: name the file that `fantwin train` wrote"
 
@@ -189,7 +189,7 @@ def test_all_that_follows_verify_is_verified(folder: Path, calibrated: Path) -> 
     assert json.loads(result.stdout)["verify"]["fan_hours"] == pytest.approx(FANS * 90 / 3600, rel=0.1)
 
 
-def test_what_verify_swallowed_is_told(folder: Path, calibrated: Path) -> None:
+def test_arguments_consumed_by_verify_are_reported(folder: Path, calibrated: Path) -> None:
     other, healthy, twin = folder / "other.mcap", folder / "healthy.mcap", folder / "twin.onnx"
     for option in (("--false-alarms-per-day", PER_DAY), ("--extrapolate",), ("-o", folder / "never.onnx")):
         words = expand_variadic(list(map(str, ("calibrate", twin, *option, "--verify", other, healthy))))
@@ -249,11 +249,11 @@ def test_a_recording_counts_once(folder: Path) -> None:
     assert "named twice" in said_instead("calibrate", twin, healthy, *rate, *verify)
 
 
-def test_what_the_twin_was_made_of_verifies_nothing_under_any_name(folder: Path, calibrated: Path) -> None:
+def test_the_twins_own_recordings_cannot_verify_it_under_any_name(folder: Path, calibrated: Path) -> None:
     copy = folder / "copy.mcap"
     copy.write_bytes((folder / "healthy.mcap").read_bytes())
     said = said_instead("calibrate", calibrated, "--verify", folder / "other.mcap", "--verify", copy)
-    assert f"{copy}: {calibrated} was calibrated on it, so that it proves nothing" in said
+    assert f"{copy}: {calibrated} was calibrated on it, so it proves nothing" in said
     said = said_instead("calibrate", calibrated, "--verify", folder / "training.mcap")
     assert f"{calibrated} was trained on it" in said
 
@@ -264,7 +264,7 @@ def test_limits_are_found_for_the_times_that_the_scorer_is_set_to(folder: Path, 
     assert result.exit_code == 0, result.output
     slow, usual = (Limits.model_validate(load_tray_twin(twin).card.calibration) for twin in (output, calibrated))
     assert (usual.timing, slow.timing) == (Timing(), Timing(smoothing_s=1.0))
-    assert slow.speed.step != usual.speed.step
+    assert slow.detectors["speed_smoothed"] != usual.detectors["speed_smoothed"]
 
 
 def test_recordings_of_scorers_with_other_times_are_refused(folder: Path) -> None:
@@ -274,15 +274,15 @@ def test_recordings_of_scorers_with_other_times_are_refused(folder: Path) -> Non
     )
     assert result.exit_code == 0, result.output
     said = said_instead("calibrate", twin, folder / "healthy.mcap", slow, "--false-alarms-per-day", PER_DAY)
-    assert f"healthy.mcap and {slow} differ in scorer.on_delay_s, for which limits are found: say which" in said
+    assert f"healthy.mcap and {slow} differ in scorer.on_delay_s, which limits depend on: choose one" in said
 
 
-def test_what_has_no_part_in_finding_limits_is_refused(folder: Path, calibrated: Path) -> None:
+def test_settings_that_do_not_affect_calibration_are_refused(folder: Path, calibrated: Path) -> None:
     said = said_instead(
         "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY,
         "--set", "scorer.limit_factor=2",
     )  # fmt: skip
-    assert "--set scorer.limit_factor: does not change which limits are found" in said
+    assert "--set scorer.limit_factor: does not affect calibration" in said
     result = fantwin("calibrate", calibrated, "--verify", folder / "other.mcap", "--set", "scorer.off_delay_s=2.0")
     assert result.exit_code == 0, result.output
 
@@ -295,3 +295,14 @@ def test_a_rate_is_broken_only_by_more_alarms_than_chance_explains() -> None:
     low, high = Check(3, 72.0, 1.0).interval_95
     assert (low, high) == (pytest.approx(0.206, abs=0.001), pytest.approx(2.922, abs=0.001))
     assert math.isfinite(Check(0, 1.0, 1.0).interval_95[1])
+
+
+def test_recordings_with_grids_of_different_rates_are_refused_by_name(folder: Path) -> None:
+    slow, twin = folder / "half-rate.mcap", folder / "twin.onnx"
+    result = fantwin(
+        "replay", folder / "other.mcap", "--offline", "--twin", twin, "--set", "resampler.rate_hz=50", "-o", slow
+    )
+    assert result.exit_code == 0, result.output
+    said = said_instead("calibrate", twin, folder / "healthy.mcap", slow, "--false-alarms-per-day", PER_DAY)
+    assert f"healthy.mcap and {slow} have grids of different rates, 100 Hz and 50 Hz" in said
+    assert "\n" not in said

@@ -23,7 +23,7 @@ from stages.scorer import ScorerConfig
 from tests.scoring.wear.test_wear_monitor import DAY_NS, GROWTH_PER_DAY, HEALTHY, LIMIT, WORN, core, live_through
 from tests.support.fantwin_command import fantwin, said_instead
 from tests.support.running_chain import DEMO, SITE, TRAY
-from tests.support.scored_blocks import EPOCH_NS, note_of
+from tests.support.scored_blocks import EPOCH_NS, snapshot_of
 
 KEY = tray_key(SITE, TRAY, "snapshot")
 
@@ -34,7 +34,7 @@ def notes() -> list[ScorerSnapshot]:
     worn, noted = core(), []
     for number, (from_day, days) in enumerate(((0, 3), (3, 6))):
         assert list(live_through(worn, days, from_day, swing=0.005)) == []
-        noted.append(replace(note_of(worn), header=Header("scorer-1", number, TRAY)))
+        noted.append(replace(snapshot_of(worn), header=Header("scorer-1", number, TRAY)))
     return noted
 
 

@@ -1,26 +1,33 @@
-"""scoring.baseline.baseline: what is learnt of a fan's own offset, when, and how far."""
+"""scoring.baseline.baseline: when the offset of a fan is learned, and how far."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from scoring.baseline.baseline import COMMISSIONING_INTERVALS, PATIENCE, Baseline, BaselineSettings
+from scoring.baseline.baseline import COMMISSIONING_INTERVALS, MAX_UNSTEADY_INTERVALS, Baseline
+from scoring.baseline.settings import BaselineSettings
 
 SAMPLES = 100
 GOOD = np.array([True, True])
-SETTINGS = BaselineSettings(farthest=3.0, adaptation_limit=0.5, adaptation_intervals=60.0)
+SETTINGS = BaselineSettings(commissioning_limit_sigmas=3.0, adaptation_limit_sigmas=0.5)
+ADAPTATION_INTERVALS = 60.0
+
+
+def baseline_of(settings: BaselineSettings = SETTINGS, **changes: float) -> Baseline:
+    """Of two fans."""
+    return Baseline(2, settings.model_copy(update=changes), ADAPTATION_INTERVALS)
 
 
 def feed(baseline: Baseline, level: float, intervals: int, good: np.ndarray = GOOD) -> None:
-    """good: normal and quiet."""
+    """good: within the limits, and below half of them."""
     for _ in range(intervals):
         baseline.add(np.full((SAMPLES, 2), level), np.ones((SAMPLES, 2), np.bool_))
         baseline.end_interval(SAMPLES, good, good)
 
 
 def test_the_first_good_interval_gives_the_baseline_and_says_so() -> None:
-    baseline = Baseline(2, SETTINGS)
+    baseline = baseline_of()
     assert not baseline.is_set.any()
     baseline.add(np.full((SAMPLES, 2), 1.5), np.ones((SAMPLES, 2), np.bool_) & np.array([True, False]))
     np.testing.assert_array_equal(baseline.end_interval(SAMPLES, GOOD, GOOD), [True, False])
@@ -29,7 +36,7 @@ def test_the_first_good_interval_gives_the_baseline_and_says_so() -> None:
 
 
 def test_while_commissioning_it_is_the_median_of_the_intervals() -> None:
-    baseline = Baseline(2, SETTINGS)
+    baseline = baseline_of()
     levels = np.random.default_rng(1).normal(0.0, 0.1, COMMISSIONING_INTERVALS)
     for level in levels:
         feed(baseline, float(level), 1)
@@ -39,15 +46,15 @@ def test_while_commissioning_it_is_the_median_of_the_intervals() -> None:
 
 
 def test_in_the_long_run_it_follows_with_its_time_constant() -> None:
-    baseline = Baseline(2, BaselineSettings(3.0, 10.0, 60.0))
+    baseline = baseline_of(adaptation_limit_sigmas=10.0)
     feed(baseline, 0.0, 200)
     feed(baseline, 1.0, 60)
     np.testing.assert_allclose(baseline.value, 1.0 - (1.0 - 1.0 / 60) ** 60, atol=1e-6)
 
 
 @pytest.mark.parametrize("valid_share", [0.0, 0.4])
-def test_an_interval_with_too_few_samples_teaches_nothing(valid_share: float) -> None:
-    baseline = Baseline(2, SETTINGS)
+def test_an_interval_with_too_few_samples_is_ignored(valid_share: float) -> None:
+    baseline = baseline_of()
     valid = np.zeros((SAMPLES, 2), np.bool_)
     valid[: round(valid_share * SAMPLES)] = True
     baseline.add(np.full((SAMPLES, 2), 1.0), valid)
@@ -55,8 +62,8 @@ def test_an_interval_with_too_few_samples_teaches_nothing(valid_share: float) ->
     assert not baseline.is_set.any()
 
 
-def test_nothing_is_learnt_from_an_anomaly() -> None:
-    baseline = Baseline(2, SETTINGS)
+def test_nothing_is_learned_from_an_anomaly() -> None:
+    baseline = baseline_of()
     feed(baseline, 0.2, 20)
     before = baseline.value.copy()
     feed(baseline, 0.4, 100, good=np.array([False, True]))
@@ -65,20 +72,22 @@ def test_nothing_is_learnt_from_an_anomaly() -> None:
 
 
 @pytest.mark.parametrize("level", [9.0, -9.0])
-def test_while_commissioning_it_never_goes_further_than_those_of_healthy_fans(level: float) -> None:
-    baseline = Baseline(2, SETTINGS)
+def test_while_commissioning_it_stays_within_the_commissioning_limit(level: float) -> None:
+    baseline = baseline_of()
     feed(baseline, np.sign(level) * 2.9, 1)
     for _ in range(COMMISSIONING_INTERVALS + 1):
         feed(baseline, level, 1)
-        assert np.abs(baseline.commissioned).max() <= SETTINGS.farthest
-    np.testing.assert_allclose(np.abs(baseline.commissioned), SETTINGS.farthest)
+        assert np.abs(baseline.commissioned).max() <= SETTINGS.commissioning_limit_sigmas
+    np.testing.assert_allclose(np.abs(baseline.commissioned), SETTINGS.commissioning_limit_sigmas)
     feed(baseline, level, 1000)
-    np.testing.assert_allclose(np.abs(baseline.value), SETTINGS.farthest + SETTINGS.adaptation_limit)
+    np.testing.assert_allclose(
+        np.abs(baseline.value), SETTINGS.commissioning_limit_sigmas + SETTINGS.adaptation_limit_sigmas
+    )
 
 
 @pytest.mark.parametrize("commissioned", [0.0, 0.1, 1.0 / 3.0, 2.0])
-def test_it_stops_at_the_adaptation_limit_and_says_so(commissioned: float) -> None:
-    baseline = Baseline(2, SETTINGS)
+def test_it_stops_at_the_adaptation_limit_and_reports_it(commissioned: float) -> None:
+    baseline = baseline_of()
     feed(baseline, commissioned, COMMISSIONING_INTERVALS)
     assert not baseline.is_at_limit.any()
     feed(baseline, commissioned + 5.0, 1000)
@@ -88,8 +97,8 @@ def test_it_stops_at_the_adaptation_limit_and_says_so(commissioned: float) -> No
     assert not baseline.is_at_limit.any()
 
 
-def test_some_fans_are_commissioned_anew() -> None:
-    baseline = Baseline(2, SETTINGS)
+def test_some_fans_are_commissioned_again() -> None:
+    baseline = baseline_of()
     feed(baseline, 0.2, 20)
     baseline.restart(np.array([True, False]))
     np.testing.assert_array_equal(baseline.is_set, [False, True])
@@ -100,7 +109,7 @@ def test_some_fans_are_commissioned_anew() -> None:
 def test_a_sum_does_not_depend_on_how_it_was_cut() -> None:
     x = np.random.default_rng(2).normal(size=(SAMPLES, 2))
     valid = np.ones(x.shape, np.bool_)
-    whole, cut = Baseline(2, SETTINGS), Baseline(2, SETTINGS)
+    whole, cut = baseline_of(), baseline_of()
     whole.add(x, valid)
     for row in range(SAMPLES):
         cut.add(x[row : row + 1], valid[row : row + 1])
@@ -112,25 +121,25 @@ def test_a_sum_does_not_depend_on_how_it_was_cut() -> None:
 BAD = np.array([False, False])
 
 
-def test_an_unsteady_interval_is_waited_out_but_not_for_ever() -> None:
+def test_unsteady_intervals_are_skipped_but_not_for_ever() -> None:
     swing = np.linspace(-6.0, 6.0, SAMPLES)[:, np.newaxis] * np.ones(2)
-    baseline = Baseline(2, SETTINGS)
-    for number in range(PATIENCE + 1):
+    baseline = baseline_of()
+    for number in range(MAX_UNSTEADY_INTERVALS + 1):
         assert not baseline.is_set.any(), number
         baseline.add(swing, np.ones((SAMPLES, 2), np.bool_))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
     assert baseline.is_set.all()
 
 
-def test_while_commissioning_nothing_is_learnt_from_what_is_beyond_a_limit() -> None:
-    baseline = Baseline(2, SETTINGS)
+def test_while_commissioning_nothing_is_learned_beyond_a_limit() -> None:
+    baseline = baseline_of()
     feed(baseline, 2.0, 1)
     feed(baseline, 0.0, 5, good=BAD)
     np.testing.assert_allclose(baseline.value, 2.0, atol=1e-6)
 
 
-def test_it_does_not_go_on_for_ever() -> None:
-    baseline = Baseline(2, SETTINGS)
+def test_a_long_anomaly_never_becomes_the_baseline() -> None:
+    baseline = baseline_of()
     feed(baseline, 0.0, 1)
     feed(baseline, 2.0, COMMISSIONING_INTERVALS - 1, good=BAD)
     before = baseline.value.copy()
@@ -138,8 +147,8 @@ def test_it_does_not_go_on_for_ever() -> None:
     np.testing.assert_array_equal(baseline.value, before)
 
 
-def test_once_commissioned_it_learns_only_from_what_is_far_from_every_limit() -> None:
-    baseline = Baseline(2, SETTINGS)
+def test_once_commissioned_it_learns_only_below_half_of_the_limits() -> None:
+    baseline = baseline_of()
     feed(baseline, 0.0, COMMISSIONING_INTERVALS)
     baseline.add(np.full((SAMPLES, 2), 1.0), np.ones((SAMPLES, 2), np.bool_))
     baseline.end_interval(SAMPLES, GOOD, np.array([False, True]))
@@ -147,52 +156,52 @@ def test_once_commissioned_it_learns_only_from_what_is_far_from_every_limit() ->
     assert baseline.value[1] > 0.0
 
 
-# An offset that goes with the speed
+# An offset that changes with the speed
 
-SHAPED = BaselineSettings(farthest=5.0, adaptation_limit=0.5, adaptation_intervals=60.0, ridge=0.25, usual=0.5)
+SCALED = BaselineSettings(commissioning_limit_sigmas=5.0, adaptation_limit_sigmas=0.5, ridge=0.25, rms_sigmas=0.5)
 EVERY = np.ones((SAMPLES, 2), np.bool_)
 
 
-def shaped(levels: np.ndarray, seed: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of an offset of two where the shape is one, and the shapes; (samples, 2) each, from (samples,)."""
-    shape = levels[:, np.newaxis] * np.ones(2)
-    return 2.0 * shape + np.random.default_rng(seed).normal(0.0, noise, shape.shape), shape
+def scaled(levels: np.ndarray, seed: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals with an offset of two at scaling one, and the scalings; (samples, 2) each, from (samples,)."""
+    scaling = levels[:, np.newaxis] * np.ones(2)
+    return 2.0 * scaling + np.random.default_rng(seed).normal(0.0, noise, scaling.shape), scaling
 
 
-def test_an_offset_that_goes_with_the_speed_is_found_while_the_speed_moves() -> None:
-    baseline = Baseline(2, BaselineSettings(5.0, 0.5, 60.0))
+def test_an_offset_that_changes_with_the_speed_is_found_while_the_speed_changes() -> None:
+    baseline = baseline_of(SCALED, ridge=0.0, rms_sigmas=0.0)
     for seed in range(COMMISSIONING_INTERVALS):
-        baseline.add(*_with(EVERY, shaped(np.linspace(0.3, 1.5, SAMPLES), seed, 0.2)))
+        baseline.add(*_with(EVERY, scaled(np.linspace(0.3, 1.5, SAMPLES), seed, 0.2)))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
     np.testing.assert_allclose(baseline.value, 2.0, atol=0.05)
 
 
-def test_a_fan_too_slow_to_tell_its_offset_is_judged_and_not_led_astray() -> None:
-    baseline = Baseline(2, SHAPED)
+def test_a_fan_too_slow_to_show_its_offset_gets_a_baseline_near_zero() -> None:
+    baseline = baseline_of(SCALED)
     for seed in range(5 * COMMISSIONING_INTERVALS):
-        baseline.add(*_with(EVERY, shaped(np.full(SAMPLES, 0.02), seed, 1.0)))
+        baseline.add(*_with(EVERY, scaled(np.full(SAMPLES, 0.02), seed, 1.0)))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
         assert baseline.is_set.all()
         assert np.abs(baseline.value).max() < 0.5
 
 
-def test_how_far_an_offset_may_be_is_known_where_it_was_learnt() -> None:
-    baseline = Baseline(2, SHAPED)
+def test_an_offset_is_certain_at_the_scaling_where_it_was_learned() -> None:
+    baseline = baseline_of(SCALED)
     for level, unknown in ((0.2, 3.0 * 0.5 * 0.8), (1.0, 0.0)):
         for seed in range(COMMISSIONING_INTERVALS):
-            baseline.add(*_with(EVERY, shaped(np.full(SAMPLES, level), seed, 0.2)))
+            baseline.add(*_with(EVERY, scaled(np.full(SAMPLES, level), seed, 0.2)))
             baseline.end_interval(SAMPLES, GOOD, GOOD)
-        np.testing.assert_allclose(baseline.unknown(np.ones((1, 2))), unknown, atol=1e-6)
-        assert (baseline.unknown(np.full((1, 2), 0.1)) == 0.0).all()
+        np.testing.assert_allclose(baseline.offset_uncertainty(np.ones((1, 2))), unknown, atol=1e-6)
+        assert (baseline.offset_uncertainty(np.full((1, 2), 0.1)) == 0.0).all()
 
 
-def test_intervals_that_tell_more_take_the_place_of_those_that_told_little() -> None:
-    baseline = Baseline(2, SHAPED)
+def test_intervals_with_more_information_replace_those_with_little() -> None:
+    baseline = baseline_of(SCALED)
     for seed in range(COMMISSIONING_INTERVALS):
-        baseline.add(*_with(EVERY, shaped(np.full(SAMPLES, 0.02), seed, 1.0)))
+        baseline.add(*_with(EVERY, scaled(np.full(SAMPLES, 0.02), seed, 1.0)))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
     for seed in range(2):
-        baseline.add(*_with(EVERY, shaped(np.full(SAMPLES, 1.0), seed, 0.2)))
+        baseline.add(*_with(EVERY, scaled(np.full(SAMPLES, 1.0), seed, 0.2)))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
     assert not baseline.is_commissioning.any()
     np.testing.assert_allclose(baseline.value, 2.0 * 1.0 / 1.25, rtol=0.05)
@@ -202,9 +211,9 @@ def _with(valid: np.ndarray, made: tuple[np.ndarray, np.ndarray]) -> tuple[np.nd
     return made[0], valid, made[1]
 
 
-def test_a_moment_at_a_higher_speed_does_not_bring_back_what_was_long_ago() -> None:
-    """It is followed there, and the adaptation limit goes with it by no more than was unknown."""
-    baseline = Baseline(2, BaselineSettings(5.0, 4.5, 60.0, ridge=0.01, usual=0.1))
+def test_a_moment_at_a_higher_speed_does_not_undo_the_adaptation() -> None:
+    """The baseline follows there, and the commissioned one moves by at most the uncertainty."""
+    baseline = baseline_of(SCALED, adaptation_limit_sigmas=4.5, ridge=0.01, rms_sigmas=0.1)
     for level in np.linspace(0.0, 4.0, 600):
         baseline.add(np.full((SAMPLES, 2), level), EVERY, np.ones((SAMPLES, 2)))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
@@ -216,11 +225,11 @@ def test_a_moment_at_a_higher_speed_does_not_bring_back_what_was_long_ago() -> N
     assert (np.abs(baseline.commissioned - commissioned) <= 3.0 * 0.1 * 0.5).all()
 
 
-def test_what_has_worn_to_its_limit_is_held_there_at_a_higher_speed_too() -> None:
-    baseline = Baseline(2, BaselineSettings(5.0, 1.0, 60.0, ridge=0.01, usual=0.1))
-    for level, shape in ((0.0, 1.0), (3.0, 1.0), (3.0 * 1.25, 1.25)):
+def test_a_worn_fan_is_held_at_its_limit_at_a_higher_speed_too() -> None:
+    baseline = baseline_of(SCALED, adaptation_limit_sigmas=1.0, ridge=0.01, rms_sigmas=0.1)
+    for level, scaling in ((0.0, 1.0), (3.0, 1.0), (3.0 * 1.25, 1.25)):
         for _ in range(300):
-            baseline.add(np.full((SAMPLES, 2), level), EVERY, np.full((SAMPLES, 2), shape))
+            baseline.add(np.full((SAMPLES, 2), level), EVERY, np.full((SAMPLES, 2), scaling))
             baseline.end_interval(SAMPLES, GOOD, GOOD)
     assert baseline.is_at_limit.all()
     assert (baseline.value <= 1.0 + 3.0 * 0.1 * 0.25 + 1e-6).all()

@@ -1,10 +1,10 @@
-"""scoring.baseline.fan_offsets: what each fan's residual is at each speed, told from days and from noise."""
+"""scoring.baseline.fan_offsets: the mean residual of each fan over speed, apart from days and noise."""
 
 import numpy as np
 import pytest
 
 from scoring.baseline.fan_offsets import Cells, fan_offsets
-from scoring.limits import FanOffsets
+from scoring.healthy_residual import FanOffsets
 
 BINS, STEP_S = 6, 0.01
 CENTRES = np.arange(BINS) * 100.0 + 50.0

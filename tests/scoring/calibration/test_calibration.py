@@ -1,5 +1,4 @@
-"""scoring.calibration.calibration: limits keep what they declare, on fans whose residuals are known; and what they
-then find."""
+"""scoring.calibration.calibration: limits keep the declared rate on fans of known residuals, and detect faults."""
 
 from __future__ import annotations
 
@@ -10,10 +9,20 @@ import numpy as np
 import pytest
 
 from scoring.calibration.alarm_rate import dispersion, poisson_interval, rate_interval
-from scoring.calibration.calibration import TooLittleError, _no_oftener, calibrate
-from scoring.calibration.healthy_statistics import Healthy, Running, Runs, survey
+from scoring.calibration.calibration import TooLittleError, _with_alarms_at_most, calibrate
+from scoring.calibration.healthy_statistics import (
+    HealthyRun,
+    HealthyStatistics,
+    MixedRatesError,
+    Runs,
+    healthy_statistics,
+)
 from scoring.calibration.tail import Tail
-from scoring.calibration.windows import Windows, peaks
+from scoring.calibration.windows import WindowMaxima, Windows, peaks
+from scoring.detectors.detector import SingleLimit
+from scoring.detectors.drift import DriftSettings
+from scoring.detectors.table import rows
+from scoring.detectors.tacho import SensorSettings
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits, Timing
 from tests.support.healthy_residuals import Raised, alarms_of, autoregressive, in_blocks, samples_of
@@ -24,11 +33,11 @@ FAN_DAYS = FANS * RUNS * RUN_SAMPLES / 100 / 86_400
 
 
 def healthy(memory_s: float, seed: int, fans: int = FANS, runs: int = RUNS, samples: int = RUN_SAMPLES) -> Runs:
-    def each() -> Iterator[Running]:
+    def each() -> Iterator[HealthyRun]:
         for run in range(runs):
             speed = autoregressive(samples, fans, memory_s, 1000 * seed + 2 * run)
             balance = autoregressive(samples, fans, memory_s, 1000 * seed + 2 * run + 1)
-            yield Running(fans, in_blocks(samples_of(speed, balance)))
+            yield HealthyRun(f"run {run}", fans, in_blocks(samples_of(speed, balance)))
 
     return each
 
@@ -39,11 +48,23 @@ def white_limits() -> Limits:
     return calibrate(healthy(0.0, 1), TOP_RAD_S, Timing(), 15.0)
 
 
-def judged_white(limits: Limits, seconds: float, shift: np.ndarray | float, fans: int = 4) -> list[Raised]:
+def alarms_on_white(limits: Limits, seconds: float, shift: np.ndarray | float, fans: int = 4) -> list[Raised]:
     """Alarms on white residuals with something added to the speed's, (n, 1) or one for all."""
     samples = round(seconds * 100)
     speed, balance = autoregressive(samples, fans, 0.0, 50), autoregressive(samples, fans, 0.0, 51)
     return alarms_of(limits, in_blocks(samples_of(speed + shift, balance)), fans)
+
+
+def limit_of(limits: Limits, name: str) -> float:
+    settings = limits.detectors[name]
+    assert isinstance(settings, SingleLimit)
+    return settings.limit
+
+
+def sensor_of(limits: Limits) -> SensorSettings:
+    sensor = limits.settings_of("tacho", SensorSettings)
+    assert sensor
+    return sensor
 
 
 # What is declared
@@ -53,21 +74,21 @@ def judged_white(limits: Limits, seconds: float, shift: np.ndarray | float, fans
 def test_fresh_healthy_fans_alarm_as_often_as_declared(memory_s: float) -> None:
     declared = 600.0
     limits = calibrate(healthy(memory_s, 2), TOP_RAD_S, Timing(), declared)
-    assert limits.promise is not None
-    low, high = limits.promise.interval_95
+    assert limits.declared_rate is not None
+    low, high = limits.declared_rate.interval_95
     assert 0.5 * declared < low < declared < high < 2.0 * declared
-    assert not limits.promise.extrapolated
-    alarms = sum(len(alarms_of(limits, blocks, fans)) for fans, blocks, _ in healthy(memory_s, 3)())
+    assert not limits.declared_rate.extrapolated
+    alarms = sum(len(alarms_of(limits, blocks, fans)) for _, fans, blocks, _ in healthy(memory_s, 3)())
     fresh_low, fresh_high = (count / FAN_DAYS for count in poisson_interval(alarms))
     assert fresh_low < 1.25 * high
     assert fresh_high > 0.75 * low
 
 
-def test_the_memory_of_healthy_residuals_and_their_spread_are_found() -> None:
+def test_correlation_time_and_deviation_of_healthy_residuals_are_found() -> None:
     for memory_s in (0.1, 1.0):
         limits = calibrate(healthy(memory_s, 4, runs=1), TOP_RAD_S, Timing(), 600.0)
         assert limits.speed.autocorrelation_time_s == pytest.approx(memory_s, rel=0.1)
-        assert limits.speed.spread[0] == pytest.approx(1.0, rel=0.05)
+        assert limits.speed.residual_std[0] == pytest.approx(1.0, rel=0.05)
         assert limits.balance.autocorrelation_time_s == pytest.approx(memory_s, rel=0.1)
 
 
@@ -81,23 +102,23 @@ def test_too_little_running_is_refused_with_what_would_be_needed() -> None:
     enough = calibrate(
         healthy(0.0, 5, runs=1, samples=3000), TOP_RAD_S, Timing(), min(1.01 * caught.value.least_per_day, 8640)
     )
-    assert enough.promise is not None
-    assert not enough.promise.extrapolated
+    assert enough.declared_rate is not None
+    assert not enough.declared_rate.extrapolated
 
 
 def test_extrapolated_limits_say_so_and_lie_further_out() -> None:
     runs = healthy(0.0, 6, runs=1, samples=10_000)
     near = calibrate(runs, TOP_RAD_S, Timing(), 600.0)
     far = calibrate(runs, TOP_RAD_S, Timing(), 1.0, extrapolate=True)
-    assert far.promise is not None
-    assert far.promise.extrapolated
-    for residual, limits in (("speed", ("step", "growth")), ("balance", ("step", "drift", "growth"))):
-        for limit in limits:
-            assert getattr(getattr(far, residual), limit) > getattr(getattr(near, residual), limit)
-    assert far.speed.drift is None  # what the speed is at another one is not known from so little
+    assert far.declared_rate is not None
+    assert far.declared_rate.extrapolated
+    names = [name for name in near.detectors if name not in ("speed_drift", "sensor")]
+    assert len(names) == 5
+    assert all(limit_of(far, name) > limit_of(near, name) for name in names)
+    assert "speed_drift" not in far.detectors  # the residual at another speed is not known from so little
 
 
-def test_a_minute_of_one_fan_is_refused_even_so() -> None:
+def test_a_minute_of_one_fan_is_refused_even_with_extrapolate() -> None:
     with pytest.raises(TooLittleError):
         calibrate(healthy(0.0, 7, fans=1, runs=1, samples=3000), TOP_RAD_S, Timing(), 600.0, extrapolate=True)
 
@@ -107,27 +128,27 @@ def test_the_same_seed_gives_the_same_limits() -> None:
     assert calibrate(runs, TOP_RAD_S, Timing(), 600.0) == calibrate(runs, TOP_RAD_S, Timing(), 600.0)
 
 
-def test_how_long_a_healthy_tacho_repeats_itself_is_allowed_for_wherever_in_a_block_it_does() -> None:
-    def coarse() -> Iterator[Running]:
-        for fans, blocks, _ in healthy(0.0, 9, runs=1, samples=10_000)():
+def test_the_limit_of_repeated_readings_allows_for_a_coarse_healthy_tacho() -> None:
+    def coarse() -> Iterator[HealthyRun]:
+        for name, fans, blocks, _ in healthy(0.0, 9, runs=1, samples=10_000)():
             made = list(blocks)
             made[5].speed_rad_s[50:250, 3] = 77.0  # 2 s
-            yield Running(fans, made)
+            yield HealthyRun(name, fans, made)
 
     limits = calibrate(coarse, TOP_RAD_S, Timing(), 600.0)
-    assert limits.stuck_s == pytest.approx(3 * 1.99)
+    assert sensor_of(limits).stuck_s == pytest.approx(3 * 1.99)
 
 
-def test_a_tacho_that_misses_half_its_readings_can_still_be_told_from_one_that_is_gone() -> None:
-    def misses() -> Iterator[Running]:
-        for fans, blocks, _ in healthy(0.0, 10, runs=1, samples=10_000)():
+def test_the_limit_of_missing_readings_stays_below_a_dead_tacho() -> None:
+    def misses() -> Iterator[HealthyRun]:
+        for name, fans, blocks, _ in healthy(0.0, 10, runs=1, samples=10_000)():
             made = list(blocks)
             for number, block in enumerate(made):
                 block.missing[number % 2 :: 2, 3] = True
-            yield Running(fans, made)
+            yield HealthyRun(name, fans, made)
 
     limits = calibrate(misses, TOP_RAD_S, Timing(), 600.0)
-    assert 0.5 < limits.missing_share < 1.0
+    assert 0.5 < sensor_of(limits).missing_share < 1.0
 
 
 # What differs from day to day
@@ -148,7 +169,7 @@ def days(
     """
     wrong = wrong_sigmas * np.random.default_rng(5).normal(size=(5, fans))
 
-    def each() -> Iterator[Running]:
+    def each() -> Iterator[HealthyRun]:
         for run in range(runs):
             rng = np.random.default_rng(1000 * seed + run)
             levels = np.repeat(rng.uniform(40.0, 180.0, (samples // 1000, fans)), 1000, axis=0)
@@ -157,7 +178,8 @@ def days(
                 off[:, fan] += np.interp(levels[:, fan], np.linspace(40.0, 180.0, 5), wrong[:, fan])
             speed = autoregressive(samples, fans, 0.0, 2000 * seed + 2 * run) + off
             made = samples_of(speed, autoregressive(samples, fans, 0.0, 2000 * seed + 2 * run + 1))
-            yield Running(fans, in_blocks(replace(made, speed_rad_s=levels + 1e-6 * made.speed_rad_s)), known_as)
+            blocks = in_blocks(replace(made, speed_rad_s=levels + 1e-6 * made.speed_rad_s))
+            yield HealthyRun(f"run {run}", fans, blocks, known_as)
 
     return each
 
@@ -169,23 +191,24 @@ def limits_of_days() -> dict[int, Limits]:
 
 
 @pytest.mark.parametrize("power", [0, 1])
-def test_it_is_seen_whether_what_differs_between_days_goes_with_the_speed(
+def test_it_is_found_whether_the_differences_between_days_change_with_the_speed(
     limits_of_days: dict[int, Limits], power: int
 ) -> None:
-    limits = limits_of_days[power].speed
-    assert limits.baseline_power == power
-    assert limits.step is not None
-    assert limits.step * 0.16 < 1.0  # sigma: what a day does is followed, and not allowed for
-    assert limits_of_days[power].balance.baseline_power == 0
+    limits = limits_of_days[power]
+    assert limits.speed.baseline.speed_exponent == power
+    assert (
+        limit_of(limits, "speed_smoothed") * 0.16 < 1.0
+    )  # sigma: baselines follow the day, limits need not allow for it
+    assert limits.balance.baseline.speed_exponent == 0
 
 
-def test_a_fan_on_another_day_alarms_at_no_other_speed_and_is_found_where_it_is_off_by_more(
+def test_another_day_raises_no_alarm_at_other_speeds_and_a_fault_does(
     limits_of_days: dict[int, Limits],
 ) -> None:
     limits = limits_of_days[1]
     fresh = list(days(21, 1, 3)())
-    assert sum(len(alarms_of(limits, blocks, fans)) for fans, blocks, _ in fresh) <= 5  # two are declared
-    fans, blocks, _ = next(iter(days(22, 1, 1)()))
+    assert sum(len(alarms_of(limits, blocks, fans)) for _, fans, blocks, _ in fresh) <= 5  # two are declared
+    _, fans, blocks, _ = next(iter(days(22, 1, 1)()))
     late = [
         replace(b, speed_residual=b.speed_residual + 1.5 * (b.t_ns >= 60_000_000_000)[:, np.newaxis]) for b in blocks
     ]
@@ -193,52 +216,54 @@ def test_a_fan_on_another_day_alarms_at_no_other_speed_and_is_found_where_it_is_
     assert found == set(range(fans))
 
 
-def test_what_the_twin_is_wrong_by_of_each_fan_is_learned_where_it_knows_them_one_by_one() -> None:
+def test_errors_of_the_twin_are_learned_for_each_fan_that_it_knows() -> None:
     unknown, known = (
         calibrate(days(23, 0, 12, wrong_sigmas=1.0, known_as=fans), TOP_RAD_S, Timing(), 60.0)
         for fans in (None, range(10))
     )
-    assert unknown.speed.fans is None
-    assert known.speed.fans is not None
-    assert len(known.speed.fans.offset_sigmas) == 10
-    assert known.speed.adaptation_sigmas < 0.65 * unknown.speed.adaptation_sigmas, "the limit of a step, in sigma"
-    assert np.abs(known.speed.offset_sigmas).max() < 0.3, "what is the fans' own is not there once more"
-    assert known.speed.mean_spread < unknown.speed.mean_spread - 0.05
+    assert unknown.speed.fan_offsets is None
+    assert known.speed.fan_offsets is not None
+    assert len(known.speed.fan_offsets.offset_sigmas) == 10
+    assert known.speed.baseline.adaptation_limit_sigmas < 0.65 * unknown.speed.baseline.adaptation_limit_sigmas
+    assert np.abs(known.speed.expected_residual_sigmas).max() < 0.3, "the offsets of the fans are not counted twice"
+    assert known.speed.mean_residual_std < unknown.speed.mean_residual_std - 0.05
     fresh = list(days(24, 0, 4, wrong_sigmas=1.0)())
-    assert sum(len(alarms_of(known, blocks, fans)) for fans, blocks, _ in fresh) <= 7  # three are declared
+    assert sum(len(alarms_of(known, blocks, fans)) for _, fans, blocks, _ in fresh) <= 7  # three are declared
     with pytest.raises(ValueError, match="limits of 10 fans for 3"):
         FanScorer(3, known)
-    assert known.of(range(2, 5)).speed.fans == known.speed.fans.of(range(2, 5))
-    assert known.of(None).speed.fans is None
+    assert known.of(range(2, 5)).speed.fan_offsets == known.speed.fan_offsets.of(range(2, 5))
+    assert known.of(None).speed.fan_offsets is None
 
 
 def test_the_recordings_themselves_have_no_more_alarms_than_declared() -> None:
     # One fan goes much further than a tail of all would say, in two of twenty windows.
     runs = days(25, 0, 8)
 
-    def with_one_that_strays() -> Iterator[Running]:
-        for number, (fans, blocks, known_as) in enumerate(runs()):
+    def with_one_that_strays() -> Iterator[HealthyRun]:
+        for number, (name, fans, blocks, known_as) in enumerate(runs()):
             strays = np.where((np.arange(fans) == 3) & (number % 2 == 0), 4.0, 0.0)
             late = [
                 replace(b, speed_residual=b.speed_residual + strays * ((b.t_ns // 10_000_000_000) == 5)[:, np.newaxis])
                 for b in blocks
             ]
-            yield Running(fans, late, known_as)
+            yield HealthyRun(name, fans, late, known_as)
 
     declared = 60.0
     limits = calibrate(with_one_that_strays, TOP_RAD_S, Timing(), declared)
-    alarms = sum(len(alarms_of(limits, blocks, fans)) for fans, blocks, _ in with_one_that_strays())
+    alarms = sum(len(alarms_of(limits, blocks, fans)) for _, fans, blocks, _ in with_one_that_strays())
     assert alarms <= declared * 8 * 90.0 * 10 / 86_400.0
 
 
 def test_the_tacho_has_its_own_limits_and_widens_no_others() -> None:
-    # The seventh row, of the tacho, is beyond its limit for ever: no factor of the others can help that.
-    maxima = np.full((20, 8, 3), 0.5)
-    maxima[::3, 6] = 1.5
-    found = Healthy(TOP_RAD_S, maxima=[maxima])
-    np.testing.assert_array_equal(_no_oftener(found, np.ones(7), 0), np.ones(7))
-    maxima[::4, 2, 1] = 3.0
-    np.testing.assert_allclose(_no_oftener(found, np.ones(7), 0), [1.0, 1.0, 3.0, 1.0, 1.0, 1.0, 1.0])
+    # The row of the tacho is beyond its limit all the time: no factor of the others can help that.
+    names = [row.name for row in rows()]
+    maxima, ones = np.full((20, len(names), 3), 0.5), np.ones(len(names))
+    maxima[::3, names.index("sensor")] = 1.5
+    found = HealthyStatistics(TOP_RAD_S, maxima=[WindowMaxima(maxima, maxima.max(axis=1))])
+    np.testing.assert_array_equal(_with_alarms_at_most(found, ones, 0), ones)
+    maxima[::4, names.index("speed_variance_growth"), 1] = 3.0
+    expected = np.where(np.array(names) == "speed_variance_growth", 3.0, 1.0)
+    np.testing.assert_allclose(_with_alarms_at_most(found, ones, 0), expected)
 
 
 # What they find
@@ -247,28 +272,28 @@ def test_the_tacho_has_its_own_limits_and_widens_no_others() -> None:
 @pytest.mark.parametrize(("size", "within_s"), [(3.0, 0.25), (1.5, 0.5), (0.5, 10.0)])
 def test_a_step_is_found_the_faster_the_larger_it_is(white_limits: Limits, size: float, within_s: float) -> None:
     step = np.where(np.arange(9000) < 6000, 0.0, size)[:, np.newaxis]
-    alarms = judged_white(white_limits, 90.0, step)
+    alarms = alarms_on_white(white_limits, 90.0, step)
     assert {alarm.fan for alarm in alarms} == {0, 1, 2, 3}
     assert all(60.0 <= alarm.t_s <= 60.0 + within_s for alarm in alarms)
 
 
-def test_one_wild_reading_is_no_alarm(white_limits: Limits) -> None:
+def test_one_outlier_raises_no_alarm(white_limits: Limits) -> None:
     wild = np.zeros((9000, 1))
     wild[[3000, 5000, 7000]] = [[1e6], [-50.0], [12.0]]
-    assert judged_white(white_limits, 90.0, wild) == []
+    assert alarms_on_white(white_limits, 90.0, wild) == []
 
 
-def test_a_run_that_begins_with_a_usual_offset_is_none_and_with_an_unusual_one_is(white_limits: Limits) -> None:
-    usual = white_limits.speed.baseline_sigmas
-    assert judged_white(white_limits, 60.0, 0.9 * usual) == []
-    alarms = judged_white(white_limits, 60.0, usual + 2.0)
+def test_a_run_alarms_if_it_starts_with_an_offset_beyond_healthy_ones(white_limits: Limits) -> None:
+    usual = white_limits.speed.baseline.commissioning_limit_sigmas
+    assert alarms_on_white(white_limits, 60.0, 0.9 * usual) == []
+    alarms = alarms_on_white(white_limits, 60.0, usual + 2.0)
     assert {alarm.fan for alarm in alarms} == {0, 1, 2, 3}
     assert max(alarm.t_s for alarm in alarms[:4]) < 2.0
 
 
 def test_slow_wear_is_followed_to_the_adaptation_limit_and_then_alarms(white_limits: Limits) -> None:
     per_s = 3e-4
-    farthest = white_limits.speed.adaptation_sigmas
+    farthest = white_limits.speed.baseline.adaptation_limit_sigmas
     seconds = 2.2 * farthest / per_s
     samples, fans = round(seconds * 100), 2
     wear = per_s * np.arange(samples)[:, np.newaxis] / 100
@@ -278,10 +303,11 @@ def test_slow_wear_is_followed_to_the_adaptation_limit_and_then_alarms(white_lim
     assert {alarm.fan for alarm in alarms} == {0, 1}
     first_s = [min(alarm.t_s for alarm in alarms if alarm.fan == fan) for fan in range(fans)]
     assert min(first_s) > 0.15 * farthest / per_s  # not at once: the baseline follows, and lags
-    judge = FanScorer(fans, white_limits)
+    scorer = FanScorer(fans, white_limits)
     for block in blocks:
-        judge.update(block)
-    assert np.abs(judge.speed.baseline.value - judge.speed.baseline.commissioned).max() <= farthest * (1 + 1e-9)
+        scorer.update(block)
+    baseline = scorer.residuals["speed"].baseline
+    assert np.abs(baseline.value - baseline.commissioned).max() <= farthest * (1 + 1e-9)
 
 
 # The parts
@@ -343,14 +369,14 @@ def test_a_window_counts_by_what_was_held_for_the_on_delay_however_blocks_are_cu
     ratios[2] = score
     t_ns = 10_000_000 * np.arange(2500)
     for block in (1, 7, 2500):
-        windows = Windows(1, 0.1)
+        windows = Windows(1, len(ratios), 0.1)
         for row in range(0, 2500, block):
             rows = slice(row, row + block)
             windows.add(t_ns[rows], 10_000_000, ratios[:, rows], judged[rows])
         maxima = windows.end()
-        np.testing.assert_array_equal(maxima[:, 7, 0], [3.0, 7.0, 0.0])
-        np.testing.assert_array_equal(maxima[:, 2, 0], maxima[:, 7, 0])
-        assert maxima[:, 0].max() == 0.0
+        np.testing.assert_array_equal(maxima.score[:, 0], [3.0, 7.0, 0.0])
+        np.testing.assert_array_equal(maxima.statistics[:, 2, 0], maxima.score[:, 0])
+        assert maxima.statistics[:, 0].max() == 0.0
 
 
 def test_an_excursion_over_several_windows_counts_once() -> None:
@@ -358,7 +384,28 @@ def test_an_excursion_over_several_windows_counts_once() -> None:
     np.testing.assert_array_equal(peaks(maxima), [[0.0, 3.0], [0.0, np.nan], [5.0, 3.0], [0.0, 0.0], [0.0, 4.0]])
 
 
-def test_a_survey_counts_only_what_was_judged(white_limits: Limits) -> None:
-    found = survey(healthy(0.0, 11, fans=2, runs=2, samples=2500), white_limits, TOP_RAD_S)
+def test_only_samples_with_a_score_are_counted(white_limits: Limits) -> None:
+    found = healthy_statistics(healthy(0.0, 11, fans=2, runs=2, samples=2500), white_limits, TOP_RAD_S)
     assert found.fan_s == pytest.approx(2 * 2 * 24.0)
     assert found.windows == 2 * 2 * 3
+
+
+def test_runs_of_different_rates_are_refused_with_their_names() -> None:
+    def mixed() -> Iterator[HealthyRun]:
+        for run, period_ns in (("fast", 10_000_000), ("slow", 20_000_000)):
+            speed, balance = (autoregressive(10_000, 4, 0.0, seed) for seed in (1, 2))
+            yield HealthyRun(run, 4, in_blocks(samples_of(speed, balance, period_ns=period_ns)))
+
+    with pytest.raises(MixedRatesError) as refused:
+        calibrate(mixed, TOP_RAD_S, Timing(), 600.0)
+    assert (refused.value.first, refused.value.other) == (("fast", 10_000_000), ("slow", 20_000_000))
+
+
+def test_the_drift_of_runs_at_another_rate_is_in_deviations_at_that_rate() -> None:
+    def slow() -> Iterator[HealthyRun]:
+        for run in healthy(0.0, 12, runs=1, samples=20_000)():
+            blocks = [replace(block, period_ns=2 * block.period_ns, t_ns=2 * block.t_ns) for block in run.blocks]
+            yield run._replace(blocks=blocks)
+
+    drift = calibrate(slow, TOP_RAD_S, Timing(), 600.0).settings_of("speed", DriftSettings)
+    assert drift and drift.period_s == 0.02

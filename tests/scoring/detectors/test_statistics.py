@@ -1,4 +1,4 @@
-"""The statistics of scoring: what each is by its definition, how often it fires on noise; cuts change nothing."""
+"""scoring.detectors: each statistic against its definition and its false alarms on noise; cuts change nothing."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scoring.detectors.cusum import LARGEST, ONE, Cusum
+from scoring.detectors.cusum import LARGEST_SIGMAS, ONE, Cusum
+from scoring.detectors.detector import Detector, DetectorContext, DetectorInput
+from scoring.detectors.drift import Drift, DriftSettings
 from scoring.detectors.low_pass import LowPass
-from scoring.detectors.tacho import Sensor
-from scoring.detectors.variance_growth import Spread
+from scoring.detectors.smoothed import Smoothed, SmoothedSettings
+from scoring.detectors.tacho import Sensor, SensorSettings
+from scoring.detectors.variance_growth import VarianceGrowth, VarianceGrowthSettings
 from tests.support.healthy_residuals import autoregressive
 
 STEP_S, STEP_NS = 0.01, 10_000_000
@@ -32,22 +35,67 @@ def of_cusum() -> Update:
     return lambda x, valid: cusum.update(x, valid, STEP_S)
 
 
-def of_spread() -> Update:
-    spread = Spread(FANS, 0.2)
-    return lambda x, valid: spread.update(x, valid, STEP_S)
+def context(fans: int = FANS, smoothing_s: float = 0.2) -> DetectorContext:
+    return DetectorContext(fans=fans, smoothing_s=smoothing_s)
+
+
+def block_of(
+    residual: np.ndarray, valid: np.ndarray, speed: np.ndarray | None = None, missing: np.ndarray | None = None
+) -> DetectorInput:
+    """A block with one residual for all uses."""
+    return DetectorInput(
+        period_ns=STEP_NS,
+        step_s=STEP_S,
+        valid=valid,
+        standardised=residual,
+        persistent=residual,
+        speed_rad_s=residual if speed is None else speed,
+        missing=np.zeros(valid.shape, np.bool_) if missing is None else missing,
+    )
+
+
+def readings(
+    sensor: Sensor, speed: np.ndarray, missing: np.ndarray | None = None, alive: np.ndarray | None = None
+) -> np.ndarray:
+    return sensor.update(block_of(speed, np.ones(speed.shape, np.bool_) if alive is None else alive, missing=missing))
+
+
+def sensor_of(fans: int, stuck_s: float, missing_share: float = 0.25) -> Sensor:
+    return Sensor(SensorSettings(stuck_s=stuck_s, missing_share=missing_share), context(fans))
+
+
+def growth_of(fans: int, smoothing_s: float) -> VarianceGrowth:
+    """Its ratio is the standard deviation itself."""
+    return VarianceGrowth(VarianceGrowthSettings(limit=1.0), context(fans, smoothing_s))
+
+
+def of(detector: Detector) -> Update:
+    return lambda x, valid: detector.update(block_of(x, valid))
+
+
+def of_smoothed() -> Update:
+    return of(Smoothed(SmoothedSettings(limit=3.0), context()))
+
+
+def of_drift() -> Update:
+    return of(Drift(DriftSettings(limit=2.0, reference_sigmas=0.25, period_s=STEP_S), context()))
+
+
+def of_variance_growth() -> Update:
+    return of(growth_of(FANS, 0.2))
 
 
 def of_sensor() -> Update:
-    sensor = Sensor(FANS, stuck_limit_s=1.0, missing_limit=0.25)
-    return lambda x, valid: sensor.update(np.round(np.where(valid, x, np.nan)), ~valid, np.isfinite(x), STEP_NS)
+    sensor = sensor_of(FANS, 1.0)
+    return lambda x, valid: readings(sensor, np.round(np.where(valid, x, np.nan)), ~valid, np.isfinite(x))
 
 
-@pytest.mark.parametrize("make", [of_low_pass, of_cusum, of_spread, of_sensor])
+@pytest.mark.parametrize("make", [of_low_pass, of_cusum, of_smoothed, of_drift, of_variance_growth, of_sensor])
 @settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 10_000), cuts=st.lists(st.integers(1, 119), max_size=8), share=st.sampled_from([0.0, 0.1, 0.9])
 )
-def test_cuts_and_samples_that_are_not_valid_change_no_bit(
+def test_neither_cuts_nor_invalid_samples_change_a_bit(
     make: Callable[[], Update], seed: int, cuts: list[int], share: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -62,7 +110,7 @@ def test_cuts_and_samples_that_are_not_valid_change_no_bit(
         np.testing.assert_array_equal(made, whole)
 
 
-def test_the_low_pass_is_its_recursion_and_holds_where_nothing_is_valid() -> None:
+def test_the_low_pass_is_its_recursion_and_holds_over_invalid_samples() -> None:
     x = np.random.default_rng(1).normal(size=(50, 1))
     valid = np.ones((50, 1), np.bool_)
     valid[10:20] = False
@@ -90,9 +138,9 @@ def test_the_cusum_is_its_recursion_up_to_its_cap_and_finds_both_signs() -> None
     assert made.max() == pytest.approx(0.5)
 
 
-def test_a_wild_number_counts_as_the_largest() -> None:
+def test_an_extreme_number_counts_as_the_largest() -> None:
     made = Cusum(1, reference=0.0, cap=math.inf).update(np.array([[1e300]]), np.array([[True]]), STEP_S)
-    assert made[0, 0] == pytest.approx(LARGEST * STEP_S)
+    assert made[0, 0] == pytest.approx(LARGEST_SIGMAS * STEP_S)
 
 
 def average_run_length(z: np.ndarray, reference: float, limit: float) -> float:
@@ -124,30 +172,30 @@ def test_a_shift_below_the_reference_value_is_never_found() -> None:
     assert Cusum(1, 0.5, math.inf).update(z, np.ones(z.shape, np.bool_), STEP_S).max() == 0.0
 
 
-def test_the_spread_of_noise_is_its_deviation_and_doubles_with_it() -> None:
+def test_the_deviation_of_noise_is_found_and_doubles_with_it() -> None:
     noise = np.random.default_rng(6).normal(size=(6000, 50))
     valid = np.ones(noise.shape, np.bool_)
     for scale in (1.0, 2.0):
-        made = Spread(50, 100.0).update(scale * noise, valid, STEP_S)
+        made = growth_of(50, 100.0).update(block_of(scale * noise, valid))
         assert np.sqrt((made[1000:] ** 2).mean()) == pytest.approx(scale, rel=0.02)
 
 
-def test_the_spread_does_not_see_a_shift_that_the_low_pass_has_followed() -> None:
+def test_a_shift_that_the_low_pass_has_followed_is_no_variance() -> None:
     z = np.full((3000, 1), 7.0)
-    spread = Spread(1, 0.2).update(z, np.ones(z.shape, np.bool_), STEP_S)
-    assert spread.max() > 1.0  # it cannot know at once
-    assert spread[-1] < 1e-5
+    deviation = growth_of(1, 0.2).update(block_of(z, np.ones(z.shape, np.bool_)))
+    assert deviation.max() > 1.0  # it cannot know at once
+    assert deviation[-1] < 1e-5
 
 
-def test_a_reading_that_repeats_itself_is_stuck_for_as_long_as_it_does() -> None:
+def test_a_reading_is_stuck_for_as_long_as_it_repeats() -> None:
     speed = np.arange(1.0, 301.0)[:, np.newaxis]
     speed[100:200] = speed[99]
-    sensor = Sensor(1, stuck_limit_s=0.5, missing_limit=0.25)
-    stuck_s = sensor.update(speed, np.zeros(speed.shape, np.bool_), np.ones(speed.shape, np.bool_), STEP_NS) * 0.5
+    sensor = sensor_of(1, 0.5)
+    stuck_s = readings(sensor, speed) * 0.5
     assert stuck_s[:100].max() == 0.0
     np.testing.assert_allclose(stuck_s[100:200, 0], STEP_S * np.arange(1, 101))
     assert stuck_s[200:].max() == 0.0
-    assert sensor.longest_s == pytest.approx(1.0)  # within the block, not at its end only
+    assert sensor.observed()["stuck_s"] == pytest.approx(1.0)  # within the block, not at its end only
 
 
 def test_a_fan_at_rest_and_a_silent_line_are_not_stuck() -> None:
@@ -155,16 +203,16 @@ def test_a_fan_at_rest_and_a_silent_line_are_not_stuck() -> None:
     speed = np.zeros((300, 2))
     speed[:, 1] = 50.0
     alive[50:250, 1] = False
-    made = Sensor(2, stuck_limit_s=0.6, missing_limit=0.25).update(speed, np.zeros_like(alive), alive, STEP_NS)
+    made = readings(sensor_of(2, 0.6), speed, alive=alive)
     assert made.max() < 1.0
 
 
 def test_a_coarse_tacho_of_a_fan_that_moves_is_not_stuck_for_longer_than_its_steps() -> None:
     speed = 100.0 + 20.0 * np.sin(0.5 * STEP_S * np.arange(6000))[:, np.newaxis]
     coarse = np.round(speed / 0.5) * 0.5
-    sensor = Sensor(1, stuck_limit_s=2.0, missing_limit=0.25)
-    sensor.update(coarse, np.zeros(speed.shape, np.bool_), np.ones(speed.shape, np.bool_), STEP_NS)
-    assert 0.2 < sensor.longest_s < 1.0
+    sensor = sensor_of(1, 2.0)
+    readings(sensor, coarse)
+    assert 0.2 < sensor.observed()["stuck_s"] < 1.0
 
 
 @pytest.mark.parametrize(("share", "alarms"), [(0.1, False), (0.6, True), (1.0, True)])
@@ -172,29 +220,31 @@ def test_missing_readings_are_judged_by_their_share(share: float, alarms: bool) 
     rng = np.random.default_rng(7)
     missing = rng.random((2000, 1)) < share
     speed = np.where(missing, np.nan, 100.0 + rng.normal(size=missing.shape))
-    sensor = Sensor(1, stuck_limit_s=5.0, missing_limit=0.25)
-    made = sensor.update(speed, missing, np.ones(missing.shape, np.bool_), STEP_NS)
+    sensor = sensor_of(1, 5.0)
+    made = readings(sensor, speed, missing)
     assert bool(made.max() > 1.0) is alarms
-    assert sensor.most_missing == pytest.approx(0.25 * made.max(), rel=0.05)
+    assert sensor.observed()["missing_share"] == pytest.approx(0.25 * made.max(), rel=0.05)
 
 
 def test_a_speed_that_is_no_number_is_no_reading_that_repeats_itself() -> None:
     speed = np.full((500, 2), np.inf)
     speed[:, 1] = np.nan
-    sensor = Sensor(2, stuck_limit_s=0.1, missing_limit=0.25)
-    assert sensor.update(speed, np.zeros(speed.shape, np.bool_), np.ones(speed.shape, np.bool_), STEP_NS).max() == 0.0
-    assert np.isnan(sensor.last).all()
+    sensor = sensor_of(2, 0.1)
+    assert readings(sensor, speed).max() == 0.0
+    assert np.isnan(sensor.columns()["last"]).all()
 
 
-def test_some_fans_begin_anew_and_the_others_go_on() -> None:
+def test_some_fans_start_again_and_the_others_continue() -> None:
     x = np.random.default_rng(8).normal(0.5, 1.0, (200, 2))
     valid = np.ones(x.shape, np.bool_)
     first = np.array([True, False])
-    low_pass, cusum, spread = LowPass(2, 0.2), Cusum(2, 0.25, math.inf), Spread(2, 0.2)
-    for each in (low_pass, cusum, spread):
+    low_pass, cusum, growth = LowPass(2, 0.2), Cusum(2, 0.25, math.inf), growth_of(2, 0.2)
+    growth.update(block_of(x, valid))
+    growth.reset(first)
+    for each in (low_pass, cusum):
         each.update(x, valid, STEP_S)
         each.reset(first)
-    assert low_pass.value[0] == cusum.sums[:, 0].max() == spread.square.value[0] == 0.0
+    assert low_pass.value[0] == cusum.sums[:, 0].max() == growth.columns()["square"][0] == 0.0
     assert low_pass.value[1] != 0.0
     assert cusum.sums[0, 1] > 0
-    assert spread.square.value[1] > 0.0
+    assert growth.columns()["square"][1] > 0.0

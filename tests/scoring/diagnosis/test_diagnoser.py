@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from schemas.messages import Transition
+from scoring.detectors.deviation import summed_deviation
 from scoring.diagnosis.diagnoser import MAX_SAMPLES, Diagnoser
-from scoring.limits import summed_deviation
 from tests.support.scored_blocks import (
     CALIBRATION,
     NEEDED,

@@ -23,8 +23,8 @@ from tests.support.scored_blocks import (
     balance_of_a_fan,
     core_of,
     feed,
-    note_of,
     request_of,
+    snapshot_of,
 )
 
 HOUR_NS = 3600 * 10**9
@@ -94,7 +94,7 @@ def wear_of(memory: ScorerSnapshot) -> Any:
 
 
 def worn(fan: int, parameter: str, core: ScorerCore) -> Any:
-    return wear_of(note_of(core))["fans"][fan]["parameters"][parameter]
+    return wear_of(snapshot_of(core))["fans"][fan]["parameters"][parameter]
 
 
 @pytest.fixture(scope="module")
@@ -179,14 +179,14 @@ def test_less_than_a_day_foretells_nothing() -> None:
 
 def restored(core: ScorerCore) -> ScorerCore:
     successor = core_of(2, calibration=CALIBRATION)
-    successor.restore(note_of(core))
+    successor.restore(snapshot_of(core))
     return successor
 
 
 def test_a_restart_forgets_nothing_of_it(after_eight_days) -> None:
     core, _ = after_eight_days
     successor = restored(core)
-    assert wear_of(note_of(successor)) == wear_of(note_of(core))
+    assert wear_of(snapshot_of(successor)) == wear_of(snapshot_of(core))
     assert successor.problem() == core.problem()
     assert list(live_through(successor, 8.25, from_day=8)) == []
     assert worn(WORN, "friction", successor)["series"]["t_ns"][-1] > worn(WORN, "friction", core)["series"]["t_ns"][-1]
@@ -195,22 +195,22 @@ def test_a_restart_forgets_nothing_of_it(after_eight_days) -> None:
 def test_a_memory_from_before_wear_was_watched_is_taken() -> None:
     before = core()
     list(live_through(before, 0.2))
-    memory = note_of(before)
+    memory = snapshot_of(before)
     state = json.loads(memory.state_json)
     del state["wear"]
     successor = core()
     successor.restore(replace(memory, state_json=json.dumps(state)))
     assert "snapshots_not_understood" not in successor.counters()
-    assert wear_of(note_of(successor)) == wear_of(note_of(core_after_one_sample()))
+    assert wear_of(snapshot_of(successor)) == wear_of(snapshot_of(core_after_one_sample()))
 
 
 def test_a_memory_from_before_disturbances_were_kept_is_taken(after_eight_days) -> None:
-    memory = note_of(after_eight_days[0])
+    memory = snapshot_of(after_eight_days[0])
     state = json.loads(memory.state_json)
     del state["wear"]["disturbed_t_ns"]
     successor = core()
     successor.restore(replace(memory, state_json=json.dumps(state)))
-    assert wear_of(note_of(successor)) == wear_of(memory)
+    assert wear_of(snapshot_of(successor)) == wear_of(memory)
 
 
 def core_after_one_sample() -> ScorerCore:
@@ -221,7 +221,7 @@ def core_after_one_sample() -> ScorerCore:
 
 @pytest.mark.parametrize("broken", [{"fans": []}, {"tried": "x"}, {"fans": 3}])
 def test_what_is_no_wear_is_set_aside(broken) -> None:
-    memory = note_of(core_after_one_sample())
+    memory = snapshot_of(core_after_one_sample())
     state = json.loads(memory.state_json)
     state["wear"] |= broken
     successor = core()
@@ -236,7 +236,7 @@ def test_blocks_make_no_difference() -> None:
         for hour in (0, 1, 2):
             for first in range(0, 1500, block):
                 one.step(cut(burst(hour), first, min(first + block, 1500)))
-        found.append(wear_of(note_of(one)))
+        found.append(wear_of(snapshot_of(one)))
     assert len(found[0]["fans"][0]["parameters"]["drag"]["series"]["t_ns"]) == 3
     assert found[1] == found[0] and found[2] == found[0]
 
@@ -296,7 +296,7 @@ def test_how_far_back_a_fault_is_does_not_depend_on_blocks(block: int, first_s: 
     whole, cut_up, faulty = core(), core(), with_a_fault(first_s)
     feed(whole, [faulty])
     feed(cut_up, [cut(faulty, first, min(first + block, 3000)) for first in range(0, 3000, block)])
-    assert wear_of(note_of(cut_up)) == wear_of(note_of(whole))
+    assert wear_of(snapshot_of(cut_up)) == wear_of(snapshot_of(whole))
 
 
 def test_after_a_restart_it_is_known_how_far_back_a_fault_is() -> None:

@@ -1,0 +1,52 @@
+"""State that consists of arrays, as JSON and back: what a snapshot of a detector, a baseline or a filter is made of."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from schemas.messages import Array
+
+
+class ColumnState(ABC):
+    """Keeps all its state in arrays, so that a snapshot is the arrays by name."""
+
+    @abstractmethod
+    def columns(self) -> dict[str, Array]:
+        """The arrays that hold the state, by the name they have in a snapshot. `restore` writes into them."""
+
+    def snapshot(self) -> dict[str, Any]:
+        """The state as JSON can hold it, which has no NaN."""
+        return {name: _plain(column) for name, column in self.columns().items()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a snapshot.
+
+        Raises:
+            ValueError, KeyError, TypeError: it is no snapshot of this state, or one of another number of fans.
+        """
+        for name, column in self.columns().items():
+            restore_column(column, name, state[name])
+
+
+def restore_column(column: Array, name: str, values: Any) -> None:
+    """Write the values of a snapshot into an array.
+
+    Raises:
+        ValueError, TypeError: they are of another shape, or no numbers.
+    """
+    restored = np.array(values, column.dtype)
+    if restored.shape != column.shape:
+        raise ValueError(f"{name} has the shape {restored.shape}, not {column.shape}")
+    column[...] = restored
+
+
+def _plain(column: Array) -> Any:
+    if column.dtype.kind != "f":
+        return column.tolist()
+    values = column.astype(object)
+    values[np.isnan(column)] = None
+    return values.tolist()

@@ -1,0 +1,51 @@
+"""A block of samples to be scored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.messages import Array, InvalidReason, Prediction
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Samples:
+    """Residuals in sigma of each fan. All (n, fans) but t_ns, (n,)."""
+
+    t_ns: Array
+    period_ns: int
+    speed_rad_s: Array
+    speed_residual: Array
+    speed_valid: Array
+    balance: Array
+    balance_valid: Array
+    missing: Array
+    """the tacho gave no reading"""
+    alive: Array
+    """the line delivered something"""
+
+
+def samples_of(prediction: Prediction) -> Samples:
+    """The samples of a block of predictions.
+
+    The torque balance also counts while the free run warms up, and while the command is out of the twin's range, where
+    a controller takes it when a fan fails.
+    """
+    invalid_reason, balance = prediction.invalid_reason, prediction.torque_balance_command
+    residual = prediction.measured_speed_rad_s - prediction.predicted_speed_rad_s
+    with np.errstate(all="ignore"):
+        speed_residual = residual / prediction.sigma_rad_s
+        balance = balance / prediction.torque_balance_sigma_command
+    balance_counts = np.isin(invalid_reason, (InvalidReason.NONE, InvalidReason.WARMING_UP, InvalidReason.OUT_OF_RANGE))
+    return Samples(
+        t_ns=prediction.t_ns,
+        period_ns=prediction.period_ns,
+        speed_rad_s=prediction.measured_speed_rad_s,
+        speed_residual=speed_residual,
+        speed_valid=prediction.valid & np.isfinite(speed_residual),
+        balance=balance,
+        balance_valid=balance_counts & np.isfinite(balance),
+        missing=invalid_reason == InvalidReason.NO_SPEED,
+        alive=~np.isin(invalid_reason, (InvalidReason.GAP, InvalidReason.STALE)),
+    )

@@ -1,0 +1,41 @@
+"""The message `Score`: what a viewer draws of a block, in rad/s and command units."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from schemas.messages import Array, FanState, InvalidReason, Prediction, Score
+from scoring.fan_scorer import ScoredBlock
+
+BAND_SIGMAS = 2.0
+
+
+def score_of(item: Prediction, scored: ScoredBlock, state: Array) -> Score:
+    """The message of a block that was scored. state: (n, fans) of FanState."""
+    valid, sigma = np.isfinite(scored.score), item.sigma_rad_s
+    residual = item.measured_speed_rad_s - item.predicted_speed_rad_s
+    band = BAND_SIGMAS * sigma
+    of_prediction = item.invalid_reason
+    why = np.where(of_prediction == InvalidReason.NONE, InvalidReason.WARMING_UP, of_prediction)
+    return Score(
+        fans=item.fans,
+        period_ns=item.period_ns,
+        t_ns=item.t_ns,
+        command=item.command,
+        measured_speed_rad_s=item.measured_speed_rad_s,
+        predicted_speed_rad_s=item.predicted_speed_rad_s,
+        lower_bound_rad_s=item.predicted_speed_rad_s - band,
+        upper_bound_rad_s=item.predicted_speed_rad_s + band,
+        band_variance=np.broadcast_to(band**2, residual.shape),
+        residual_rad_s=residual,
+        smoothed_residual_rad_s=scored.speed_smoothed * sigma,
+        outside=np.abs(residual) > band,
+        state=np.where(scored.commissioning & ~valid, int(FanState.COMMISSIONING), state).astype(np.uint8),
+        valid=valid,
+        invalid_reason=np.where(valid, InvalidReason.NONE, why).astype(np.uint8),
+        torque_balance_command=item.torque_balance_command,
+        speed_baseline_rad_s=scored.speed_baseline * sigma,
+        balance_baseline_command=scored.balance_baseline * item.torque_balance_sigma_command,
+        score=scored.score,
+        statistic=scored.statistic,
+    )
