@@ -1,8 +1,8 @@
-"""The serial wire protocol, both directions: frames to bytes and back. Pure: bytes in, frames out.
+"""The serial wire protocol in both directions: frames to bytes and back, without any input or output.
 
-Up the line a device sends samples; down the line a host sends commands and set-points. Two forms, one
-meaning: `binary` (COBS, CRC-32) and `text` (lines that any sketch can print). Numbers are float32 in both, so
-that encoding and decoding are exact inverses on float32 values. Reference: docs/reference/wire-protocol.md.
+A device sends samples; the host sends commands and set points. There are two equivalent forms: `binary` (COBS, CRC-32)
+and `text` (lines that any sketch can print). Numbers are float32 in both, so that decoding inverts encoding exactly for
+float32 values. Reference: docs/reference/wire-protocol.md.
 """
 
 from __future__ import annotations
@@ -24,16 +24,18 @@ End: TypeAlias = Literal["host", "device"]
 
 VERSION = 1
 MAX_FANS = 64
-MAX_FRAME_BYTES = 4096  # no frame of either protocol is longer; bounds what a decoder holds
+MAX_FRAME_BYTES = 4096  # of both forms; bounds the memory of a decoder
 UINT32 = 1 << 32
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What a device measured. Clock in microseconds and sequence wrap at 2^32; a text device may have neither (None).
+    """One sample of a device.
 
-    `command` is in the tray's command unit, `speed` in the tray's speed unit, one value a fan. A NaN speed means
-    that the tacho gave no reading.
+    Attributes:
+        clock_us, sequence: wrap at 2^32; None if a text device has none.
+        command: one value per fan, in the tray's command unit.
+        speed: one value per fan, in the tray's speed unit; NaN without a tacho reading.
     """
 
     clock_us: int | None
@@ -44,14 +46,14 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class CommandFrame:
-    """Commands wanted, one a fan, in the tray's command unit; NaN leaves a fan as it is."""
+    """Commands, one per fan, in the tray's command unit; NaN leaves a fan unchanged."""
 
     command: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class SetPointFrame:
-    """Speeds wanted, one a fan, in the tray's speed unit, for a device that closes its own loop; NaN leaves as is."""
+    """Speed set points, one per fan, in the tray's speed unit, for a device with its own loop; NaN: unchanged."""
 
     set_point: tuple[float, ...]
 
@@ -59,15 +61,15 @@ class SetPointFrame:
 class FaultKind(Enum):
     """Why a piece of the stream is not a frame."""
 
-    RESYNC = "resync"  # the rest of a frame that began before we listened: harmless
-    GARBAGE = "garbage"  # looks like no frame at all
-    TORN = "torn"  # begins like a frame, but has not the length it should have
+    RESYNC = "resync"  # the rest of a frame that began before listening started: harmless
+    GARBAGE = "garbage"  # does not look like a frame
+    TRUNCATED = "truncated"  # begins like a frame, but has the wrong length
     OVERSIZED = "oversized"  # longer than any frame
     WRONG_CRC = "wrong_crc"
     WRONG_VERSION = "wrong_version"
-    WRONG_TYPE = "wrong_type"  # unknown, or not meant for this end of the line
+    WRONG_TYPE = "wrong_type"  # unknown, or not for this end of the line
     WRONG_FAN_COUNT = "wrong_fan_count"
-    BAD_NUMBER = "bad_number"  # a field of a text line is no number, or does not fit
+    BAD_NUMBER = "bad_number"  # a field of a text line is not a number, or is out of range
     BAD_COMMAND = "bad_command"  # a sample's command is NaN or infinite
 
 
@@ -115,12 +117,12 @@ def _encode_binary(frame: Frame) -> bytes:
 
 
 def _fan_count_at(frame_type: int) -> int:
-    """Where the fan count stands in a payload; the values follow it."""
+    """Offset of the fan count in a payload; the values follow it."""
     return _HEAD.size + (_CLOCK_SEQUENCE.size if frame_type == _TYPES[Sample] else 0)
 
 
 def _fits_its_length(payload: bytes) -> bool:
-    """Whether a payload of a known type is as long as its own fan count asks for."""
+    """Whether the length of a payload of a known type fits its fan count."""
     frame_type = payload[1]
     at = _fan_count_at(frame_type)
     bytes_per_fan = 8 if frame_type == _TYPES[Sample] else 4
@@ -131,24 +133,24 @@ def _decode_binary(piece: bytes) -> Frame:
     try:
         data = cobs.decode(piece)
     except cobs.DecodeError as error:
-        raise _FrameError(FaultKind.TORN, f"{len(piece)} bytes end within a COBS block") from error
+        raise _FrameError(FaultKind.TRUNCATED, f"{len(piece)} bytes end within a COBS block") from error
     if len(data) < _SHORTEST:
-        raise _FrameError(FaultKind.TORN, f"{len(data)} bytes, the shortest frame has {_SHORTEST}")
+        raise _FrameError(FaultKind.TRUNCATED, f"{len(data)} bytes, the shortest frame has {_SHORTEST}")
     payload, (crc,) = data[: -_CRC.size], _CRC.unpack(data[-_CRC.size :])
     version, frame_type = _HEAD.unpack_from(payload)
     known = version == VERSION and frame_type in _TYPES.values()
     if crc != zlib.crc32(payload):
         if not known:
-            raise _FrameError(FaultKind.GARBAGE, f"{len(data)} bytes that are no frame")
+            raise _FrameError(FaultKind.GARBAGE, f"{len(data)} bytes that are not a frame")
         if not _fits_its_length(payload):
-            raise _FrameError(FaultKind.TORN, f"{len(data)} bytes are not the length of the frame they begin")
+            raise _FrameError(FaultKind.TRUNCATED, f"{len(data)} bytes do not fit the fan count of the frame")
         raise _FrameError(FaultKind.WRONG_CRC, f"CRC-32 {crc:08x} does not match the frame")
     if version != VERSION:
-        raise _FrameError(FaultKind.WRONG_VERSION, f"version {version}, this side speaks {VERSION}")
+        raise _FrameError(FaultKind.WRONG_VERSION, f"version {version}, this side has {VERSION}")
     if not known:
-        raise _FrameError(FaultKind.WRONG_TYPE, f"frame type {frame_type} is not known")
+        raise _FrameError(FaultKind.WRONG_TYPE, f"unknown frame type {frame_type}")
     if not _fits_its_length(payload):
-        raise _FrameError(FaultKind.TORN, f"{len(data)} bytes are not the length its fan count asks for")
+        raise _FrameError(FaultKind.TRUNCATED, f"{len(data)} bytes do not fit the fan count of the frame")
     at = _fan_count_at(frame_type)
     values = struct.unpack_from(f"<{(len(payload) - at - 1) // 4}f", payload, at + 1)
     if frame_type == _TYPES[CommandFrame]:
@@ -161,7 +163,7 @@ def _decode_binary(piece: bytes) -> Frame:
 
 # ---- text: `S clock sequence command speed ...`, `C fan value`, `P fan value`, `# comment`
 
-_LETTER = re.compile(rb"[SCP]")  # begins a line and occurs nowhere else in one: a reader can always find the next
+_LETTER = re.compile(rb"[SCP]")  # begins a line and occurs nowhere else, so that a reader can find the next line
 _INTEGER = re.compile(rb"[0-9]{1,10}")
 _NUMBER = re.compile(rb"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|nan|[+-]?inf")
 _NONE = b"-"
@@ -183,12 +185,12 @@ def _encode_text(frame: Frame) -> bytes:
 
 def _integer(field: bytes) -> int:
     if not _INTEGER.fullmatch(field) or int(field) >= UINT32:
-        raise _FrameError(FaultKind.BAD_NUMBER, f"{field!r} is not an integer of 32 bits")
+        raise _FrameError(FaultKind.BAD_NUMBER, f"{field!r} is not a 32-bit integer")
     return int(field)
 
 
 def _number(field: bytes) -> float:
-    """A number as printed; `-` and nan are NaN, Arduino's `ovf` is an infinity."""
+    """A printed number; `-` and nan are NaN, Arduino's `ovf` is infinity."""
     if field == _NONE:
         return math.nan
     field = field.lower().replace(b"ovf", b"inf")
@@ -198,7 +200,7 @@ def _number(field: bytes) -> float:
 
 
 def _numbers(fields: Sequence[bytes]) -> tuple[float, ...]:
-    """Fields as float32; what is too large for one becomes infinite."""
+    """Fields as float32; a value too large becomes infinite."""
     with np.errstate(over="ignore"):
         return tuple(np.array([_number(field) for field in fields], np.float32).tolist())
 
@@ -206,15 +208,15 @@ def _numbers(fields: Sequence[bytes]) -> tuple[float, ...]:
 def _decode_text(line: bytes, fans: int) -> Frame:
     fields = line[1:].split()
     if not line[1:2].isspace():
-        raise _FrameError(FaultKind.GARBAGE, f"{line[:24]!r} is no line of this protocol")
+        raise _FrameError(FaultKind.GARBAGE, f"{line[:24]!r} is not a line of this protocol")
     if line[:1] == b"S":
         if len(fields) < 4 or len(fields) % 2:
-            raise _FrameError(FaultKind.TORN, f"{len(fields)} fields; S needs clock, sequence, and two for each fan")
+            raise _FrameError(FaultKind.TRUNCATED, f"{len(fields)} fields; S needs clock, sequence and two per fan")
         clock_us, sequence = (None if field == _NONE else _integer(field) for field in fields[:2])
         values = _numbers(fields[2:])
         return Sample(clock_us, sequence, values[0::2], values[1::2])
     if len(fields) != 2:
-        raise _FrameError(FaultKind.TORN, f"{len(fields)} fields; {line[:1].decode()} needs fan and value")
+        raise _FrameError(FaultKind.TRUNCATED, f"{len(fields)} fields; {line[:1].decode()} needs fan and value")
     fan, (value,) = _integer(fields[0]), _numbers(fields[1:])
     if fan >= fans:
         raise _FrameError(FaultKind.WRONG_FAN_COUNT, f"fan {fan}, this tray has {fans}, counted from 0")
@@ -226,13 +228,13 @@ def _decode_text(line: bytes, fans: int) -> Frame:
 
 
 def encode(protocol: Protocol, frame: Frame) -> bytes:
-    """Bytes of a frame, delimiters included; what `Decoder` gives back from them is the same frame in float32.
+    """Bytes of a frame with delimiters; `Decoder` turns them into the same frame in float32.
 
-    In text, a command or set-point frame becomes one line for each fan that is not NaN, so possibly none.
+    In text, a command or set-point frame is one line for each fan that is not NaN, so possibly none.
 
     Raises:
-        ValueError: no fans or more than 64, columns of different length, clock or sequence outside 32 bits, or
-            neither of them in a binary sample.
+        ValueError: no fans or more than 64, columns of different length, a clock or sequence outside 32 bits, or
+            a binary sample without one of them.
     """
     fans = len(frame.set_point if isinstance(frame, SetPointFrame) else frame.command)
     if not 1 <= fans <= MAX_FANS:
@@ -240,21 +242,21 @@ def encode(protocol: Protocol, frame: Frame) -> bytes:
     if isinstance(frame, Sample):
         for name, count in (("clock_us", frame.clock_us), ("sequence", frame.sequence)):
             if count is None and protocol == "binary":
-                raise ValueError(f"{name} is missing; only a text sample may leave it out")
+                raise ValueError(f"{name} is missing; only a text sample may omit it")
             if count is not None and not 0 <= count < UINT32:
                 raise ValueError(f"{name} = {count} does not fit 32 bits")
     return _encode_binary(frame) if protocol == "binary" else _encode_text(frame)
 
 
 class Decoder:
-    """Incremental parser of one end of a line: feed it bytes as they come, take frames and faults in their order.
+    """Incremental parser for one end of a line: takes bytes as they arrive, gives frames and faults in order.
 
-    It never raises on any bytes and holds at most `MAX_FRAME_BYTES + 1` of them between calls. How the bytes
-    are cut into calls makes no difference to what comes out.
+    It never raises and holds at most `MAX_FRAME_BYTES + 1` bytes between calls. The result does not depend on how the
+    bytes are split into calls.
     """
 
     def __init__(self, protocol: Protocol, fans: int, end: End = "host") -> None:
-        """`fans` is the number every frame must carry; `host` hears samples, `device` commands and set-points."""
+        """Every frame must have `fans` fans. The end `host` accepts samples, `device` commands and set points."""
         self._text = protocol == "text"
         self._delimiter = b"\n" if self._text else b"\0"
         self._fans = fans
@@ -262,15 +264,15 @@ class Decoder:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what is half received: the line was interrupted, and may be joined again in the middle of a frame."""
+        """Drop a partial frame after an interruption; the line may continue in the middle of another frame."""
         self._pending = b""
         self._joining = True
 
     def feed(self, data: bytes) -> list[Frame | Fault]:
-        """What `data` completes."""
+        """The frames and faults that `data` completes."""
         *pieces, rest = (self._pending + data).split(self._delimiter)
-        # Too long already: keep the first byte (a comment?) and the newest (a frame may begin there). The
-        # length still tells that the piece is too long, and no cutting of the stream can change the outcome.
+        # Of a piece that is too long, keep the first byte (it may begin a comment) and the newest bytes (a frame may
+        # begin there). Its length still shows that it is too long, however the stream is split.
         self._pending = rest if len(rest) <= MAX_FRAME_BYTES else rest[:1] + rest[-MAX_FRAME_BYTES:]
         found: list[Frame | Fault] = []
         for piece in pieces:
@@ -298,7 +300,7 @@ class Decoder:
         if len(line) > MAX_FRAME_BYTES:
             found.append(self._fault(FaultKind.OVERSIZED, f"more than {MAX_FRAME_BYTES} bytes without an end"))
         elif before.strip():
-            found.append(self._fault(FaultKind.GARBAGE, f"{before[:24]!r} is no line of this protocol"))
+            found.append(self._fault(FaultKind.GARBAGE, f"{before[:24]!r} is not a line of this protocol"))
         if starts:
             try:
                 found.append(self._checked(_decode_text(tail[starts[-1] :], self._fans)))
@@ -307,12 +309,12 @@ class Decoder:
         return found
 
     def _checked(self, frame: Frame) -> Frame:
-        """The frame, if it is meant for this end and tray."""
+        """The frame, if it is for this end and tray."""
         if not isinstance(frame, self._accepts):
-            raise _FrameError(FaultKind.WRONG_TYPE, f"a {type(frame).__name__} is not for this end of the line")
+            raise _FrameError(FaultKind.WRONG_TYPE, f"{type(frame).__name__} is not for this end of the line")
         fans = len(frame.set_point if isinstance(frame, SetPointFrame) else frame.command)
         if fans != self._fans:
-            raise _FrameError(FaultKind.WRONG_FAN_COUNT, f"a frame of {fans} fans, this tray has {self._fans}")
+            raise _FrameError(FaultKind.WRONG_FAN_COUNT, f"frame of {fans} fans, this tray has {self._fans}")
         if isinstance(frame, Sample) and not all(map(math.isfinite, frame.command)):
             raise _FrameError(FaultKind.BAD_COMMAND, "a sample's command is NaN or infinite")
         return frame

@@ -156,16 +156,16 @@ def test_after_a_reset_half_a_frame_is_forgotten(protocol: Protocol) -> None:
 SAMPLE_PAYLOAD = cobs.decode(SAMPLE_BINARY.strip(b"\0"))[:-4]
 NAN, INFINITY = struct.pack("<f", math.nan), struct.pack("<f", math.inf)
 BINARY_FAULTS = {
-    "garbage": (b"\0\x05helo\0", FaultKind.TORN),
+    "garbage": (b"\0\x05helo\0", FaultKind.TRUNCATED),
     "noise of a frame's length": (b"\0" + cobs.encode(b"\x77" * 30) + b"\0", FaultKind.GARBAGE),
-    "ends early": (SAMPLE_BINARY[:-3] + b"\0", FaultKind.TORN),
-    "a byte missing": (b"\0" + cobs.encode(cobs.decode(SAMPLE_BINARY.strip(b"\0"))[:-1]) + b"\0", FaultKind.TORN),
+    "ends early": (SAMPLE_BINARY[:-3] + b"\0", FaultKind.TRUNCATED),
+    "a byte missing": (b"\0" + cobs.encode(cobs.decode(SAMPLE_BINARY.strip(b"\0"))[:-1]) + b"\0", FaultKind.TRUNCATED),
     "a bit flipped": (framed(SAMPLE_PAYLOAD)[:-3] + b"\x55" + framed(SAMPLE_PAYLOAD)[-2:], FaultKind.WRONG_CRC),
     "a newer version": (framed(b"\x02" + SAMPLE_PAYLOAD[1:]), FaultKind.WRONG_VERSION),
     "an unknown type": (framed(b"\x01\x09" + SAMPLE_PAYLOAD[2:]), FaultKind.WRONG_TYPE),
     "a frame for the device": (encode("binary", CommandFrame((0.5, 0.5))), FaultKind.WRONG_TYPE),
     "three fans": (encode("binary", Sample(1, 1, (0.5,) * 3, (1.0,) * 3)), FaultKind.WRONG_FAN_COUNT),
-    "fan count and length differ": (framed(SAMPLE_PAYLOAD[:10] + b"\x03" + SAMPLE_PAYLOAD[11:]), FaultKind.TORN),
+    "fan count and length differ": (framed(SAMPLE_PAYLOAD[:10] + b"\x03" + SAMPLE_PAYLOAD[11:]), FaultKind.TRUNCATED),
     "too long": (b"\0" + b"\x01" * (MAX_FRAME_BYTES + 1) + b"\0", FaultKind.OVERSIZED),
     "NaN command": (framed(SAMPLE_PAYLOAD[:11] + NAN + SAMPLE_PAYLOAD[15:]), FaultKind.BAD_COMMAND),
     "infinite command": (framed(SAMPLE_PAYLOAD[:11] + INFINITY + SAMPLE_PAYLOAD[15:]), FaultKind.BAD_COMMAND),
@@ -174,8 +174,8 @@ TEXT_FAULTS = {
     "garbage": (b"hello\n", FaultKind.GARBAGE),
     "not ASCII": (b"\xff\xfe\x01\n", FaultKind.GARBAGE),
     "a word that begins with S": (b"Start\n", FaultKind.GARBAGE),
-    "ends early": (b"S 1000 7 0.5 101.5 0.25\n", FaultKind.TORN),
-    "no fans": (b"S 1000 7\n", FaultKind.TORN),
+    "ends early": (b"S 1000 7 0.5 101.5 0.25\n", FaultKind.TRUNCATED),
+    "no fans": (b"S 1000 7\n", FaultKind.TRUNCATED),
     "a frame for the device": (b"C 0 0.5\n", FaultKind.WRONG_TYPE),
     "one fan": (b"S 1000 7 0.5 101.5\n", FaultKind.WRONG_FAN_COUNT),
     "too long": (b"S" + b" 1" * MAX_FRAME_BYTES + b"\n", FaultKind.OVERSIZED),
@@ -246,7 +246,7 @@ def test_a_person_can_type_commands() -> None:
         repr(CommandFrame((math.nan, 0.5, math.nan))),
         repr(SetPointFrame((math.nan, math.nan, 120.0))),
     ]
-    assert faults(found) == [FaultKind.WRONG_FAN_COUNT, FaultKind.TORN]
+    assert faults(found) == [FaultKind.WRONG_FAN_COUNT, FaultKind.TRUNCATED]
 
 
 @pytest.mark.parametrize(

@@ -207,7 +207,7 @@ def test_samples_measured_while_the_line_was_down_are_counted_as_lost() -> None:
     assert feed_sequences(core, [8]) == [8]
     assert core.counters()["lost_on_line"] == 5
     assert core.counters()["resync"] == 1
-    assert core.counters().get("torn", 0) == 0
+    assert core.counters().get("truncated", 0) == 0
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -219,7 +219,7 @@ def test_faulty_frames_are_counted_by_kind_and_valid_ones_pass(protocol: Protoco
     core.step(ReceivedBytes(bad + wrong + encode(protocol, CommandFrame((0.5, math.nan))), S))
     assert len(feed(core, [sample(1)], protocol)) == 1
     counters = core.counters()
-    assert counters["torn" if protocol == "binary" else "garbage"] == 1
+    assert counters["truncated" if protocol == "binary" else "garbage"] == 1
     assert counters["wrong_fan_count"] == 1
     assert counters["wrong_type"] == 1
     assert counters["samples"] == 2
@@ -305,7 +305,7 @@ def test_a_line_without_a_valid_frame_is_a_problem_that_says_what_to_check() -> 
         core.tick(second * S)
         core.step(ReceivedBytes(encode("binary", Sample(1, 1, (0.5,), (1.0,))), second * S))
     problem = core.problem()
-    assert problem.startswith("/dev/ttyTEST: no valid sample for 2 s (last fault: wrong_fan_count, a frame of 1 fans")
+    assert problem.startswith("/dev/ttyTEST: no valid sample for 2 s (last fault: wrong_fan_count, frame of 1 fans")
     assert problem.endswith("check baud = 115200, protocol = 'binary', fans = 2 of the [[tray]]")
 
 
@@ -314,7 +314,7 @@ def test_mostly_faulty_frames_are_a_problem_although_some_are_valid() -> None:
     for i in range(30):
         feed(core, [sample(i)])
         core.step(ReceivedBytes(b"\0\x09aa\0" * 2, S))
-    assert core.problem().startswith("/dev/ttyTEST: most input is faulty (last fault: torn")
+    assert core.problem().startswith("/dev/ttyTEST: most input is faulty (last fault: truncated")
     feed(core, map(sample, range(30, 100)))
     assert core.problem() == ""
 

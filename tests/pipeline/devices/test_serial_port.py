@@ -262,7 +262,7 @@ def test_samples_continue_after_the_device_was_away_and_health_reports_it_meanwh
     assert sequences == [0, 1, 5, 6]
     counters = core.counters()
     assert (counters["lost_on_line"], counters["line_up"], counters["resync"]) == (3, 2, 1)
-    assert "torn" not in counters
+    assert "truncated" not in counters
     assert line.write(encode("binary", CommandFrame((0.25,))))
     command = encode("binary", CommandFrame((0.25,)))
     assert Decoder("binary", 1, "device").feed(device.receive(len(command))) == [CommandFrame((0.25,))]

@@ -132,7 +132,7 @@ def test_an_unknown_tray_fan_or_view_is_a_one_line_error(
 
 @needs_a_driver
 def test_a_file_that_is_not_a_view_is_a_one_line_error(tmp_path: Path) -> None:
-    for path, said in ((tmp_path / "none.rrd", "no such file"), (tmp_path / "wrong.rrd", "not a file of Rerun's")):
+    for path, said in ((tmp_path / "none.rrd", "no such file"), (tmp_path / "wrong.rrd", "not a Rerun file")):
         if said != "no such file":
             path.write_bytes(b"not a view, and long enough to be read as a header")
         with pytest.raises(UserError, match=said):
