@@ -284,8 +284,8 @@ def test_it_says_when_nobody_listens_and_where_it_looked(tmp_path, endpoint):
     recording = write_raw(tmp_path / "source.mcap", 10)
     done = fantwin("replay", recording, "--rate", "max", "--set", f"bus.endpoint={endpoint}", "--json")
     assert done.returncode == 0
-    assert done.stderr.startswith(f"nobody on site 'demo' at {endpoint} reads ")
-    assert done.stderr.endswith("; publishing all the same\n")
+    assert done.stderr.startswith(f"no stage on site 'demo' at {endpoint} reads ")
+    assert done.stderr.endswith("; publishing anyway\n")
     assert json.loads(done.stdout)["messages"] == {"raw": 10}
 
 
@@ -305,4 +305,4 @@ def test_topics_that_the_recording_does_not_have_are_one_line(tmp_path, endpoint
     recording = write_raw(tmp_path / "source.mcap", 10)
     done = fantwin("replay", recording, "--from", "grid", "--set", f"bus.endpoint={endpoint}")
     assert done.returncode == 1
-    assert done.stderr.splitlines()[-1] == f"fantwin: {recording}: there is no grid in it, or not in that stretch"
+    assert done.stderr.splitlines()[-1] == f"fantwin: {recording}: it holds no grid, or none between --start and --end"

@@ -1,4 +1,4 @@
-"""`fantwin replay`: a recording, on the bus again."""
+"""`fantwin replay`: play a recording on the bus, or judge it again offline."""
 
 from __future__ import annotations
 
@@ -28,47 +28,48 @@ from pipeline.replay.resolve_config import resolve_config
 from pipeline.replay.stage_chain import replay_starts
 from pipeline.runtime.signals import stop_on_signals
 from schemas.topics import TOPICS
+from schemas.units import NS_PER_S
 
 REPLAYED = tuple(topic.name for topic in TOPICS if topic.recorded and topic.name != "health")
-"""What is replayed where nothing else is said; the health of stages that are gone is told to nobody."""
+"""the topics replayed by default; the health of stages that are not running is not one of them"""
 _KEYS_HELP = "space pause, → step, ↑↓ rate, q quit"
 _SHOWN_EVERY_S = 0.1
 LARGEST_RATE = 1e6
 LONGEST_S = 1e10
-"""three centuries, and still a time in ns"""
+"""three centuries, which still fits in ns"""
 _Show: TypeAlias = Callable[[Progress], None]
 _VIEWING = "Viewing"
-_DECIDING = "Deciding again, without a bus"
+_DECIDING = "Judging again, without a bus"
 
 
 def replay(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE", help="Recordings: the parts of one, in any order.")],
+    files: Annotated[list[Path], typer.Argument(metavar="FILE", help="Parts of one recording, in any order.")],
     rate: Annotated[
         str | None,
         typer.Option(
             metavar="X|max",
-            help="Seconds of the recording a second; max: as fast as it goes.",
+            help="Seconds of the recording per second; max: as fast as possible.",
             rich_help_panel=_VIEWING,
         ),
     ] = None,
-    start: Annotated[float, typer.Option(help="Where to begin, s since the recording began.")] = 0.0,
-    end: Annotated[float, typer.Option(help="Where to end, s since the recording began.")] = math.inf,
+    start: Annotated[float, typer.Option(help="Start, in s since the first message.")] = 0.0,
+    end: Annotated[float, typer.Option(help="End, in s since the first message.")] = math.inf,
     pause: Annotated[
-        bool, typer.Option("--pause", help="Begin paused: space goes on.", rich_help_panel=_VIEWING)
+        bool, typer.Option("--pause", help="Start paused; space continues.", rich_help_panel=_VIEWING)
     ] = False,
     loop: Annotated[
-        bool, typer.Option("--loop", help="Again and again, times going on.", rich_help_panel=_VIEWING)
+        bool, typer.Option("--loop", help="Repeat until Ctrl-C; times continue.", rich_help_panel=_VIEWING)
     ] = False,
     topics: Annotated[
         str | None,
-        typer.Option(metavar="A,B", help="Topics to publish; without it, all of the trays.", rich_help_panel=_VIEWING),
+        typer.Option(metavar="A,B", help="Topics to publish. Default: all of the trays.", rich_help_panel=_VIEWING),
     ] = None,
     from_topic: Annotated[
         str | None,
         typer.Option(
             "--from",
             metavar="TOPIC",
-            help="Publish only what the stages that read TOPIC need (raw, grid or prediction); they decide again.",
+            help="Publish only what the stages that read TOPIC need (raw, grid or prediction); they judge again.",
             rich_help_panel=_VIEWING,
         ),
     ] = None,
@@ -77,43 +78,43 @@ def replay(
         typer.Option(
             "-c",
             "--config",
-            help="Configuration file (TOML): its site, trays and bus. Without it, the one in the recording; where "
-            "there is none, as in an imported table, site and trays of the recording, and defaults.",
+            help="Configuration file (TOML) with site, trays and bus. Default: the one in the recording; for an "
+            "imported table, which has none, its site and trays.",
         ),
     ] = None,
     overrides: SetOption = None,
     json_output: JsonOption = False,
     offline: Annotated[
-        bool, typer.Option("--offline", help="Run the stages in this process instead.", rich_help_panel=_DECIDING)
+        bool, typer.Option("--offline", help="Run the stages in this process.", rich_help_panel=_DECIDING)
     ] = False,
     twin: Annotated[
-        Path | None, typer.Option(metavar="TWIN.onnx", help="Another twin.", rich_help_panel=_DECIDING)
+        Path | None, typer.Option(metavar="TWIN.onnx", help="Judge with another twin.", rich_help_panel=_DECIDING)
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="OUT.mcap", help="Write what was decided.", rich_help_panel=_DECIDING),
+        typer.Option("-o", "--output", metavar="OUT.mcap", help="Write a new recording.", rich_help_panel=_DECIDING),
     ] = None,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="Compare with what was recorded, bit for bit.", rich_help_panel=_DECIDING),
+        typer.Option("--verify", help="Compare with the recorded result, bit for bit.", rich_help_panel=_DECIDING),
     ] = False,
 ) -> None:
-    """Publish a recording on the bus in recorded time, for the viewer or for the stages; or decide it again offline.
+    """Publish a recording on the bus in recorded time, for the viewer or the stages; or judge it again offline.
 
-    In a terminal: space pauses, right arrow or s goes to the next sample, up and down double and halve the rate, q
-    quits. Nothing is published that a running stage writes itself. Exit code 3 when a stage lost something, or part of
-    the recording could not be read.
+    In a terminal: space pauses, right arrow or s steps to the next sample, up and down double and halve the rate, q
+    quits. Topics that a running stage writes are not published. Exit code 3 if a stage lost messages or part of the
+    recording could not be read.
 
     Example: fantwin replay recording.mcap --rate 4 --from raw -c fantwin.toml
     """
     viewing = {"--rate": rate, "--pause": pause, "--loop": loop, "--topics": topics, "--from": from_topic}
     deciding = {"--twin": twin, "--output": output, "--verify": verify}
     for name in (name for name, value in (viewing if offline else deciding).items() if value):
-        raise typer.BadParameter(f"{name} {'cannot go' if offline else 'goes only'} with --offline")
+        raise typer.BadParameter(f"{name} {'cannot be used' if offline else 'can only be used'} with --offline")
     if not 0.0 <= start < min(end, LONGEST_S) or (end > LONGEST_S and not math.isinf(end)):
         raise typer.BadParameter("0 <= --start < --end, in seconds", param_hint="--start, --end")
     if offline:
-        from pipeline.cli.recordings.replay_offline import run_offline  # noqa: PLC0415  with all that decides
+        from pipeline.cli.recordings.replay_offline import run_offline  # noqa: PLC0415  loads the stages
 
         run_offline(
             files,
@@ -122,41 +123,41 @@ def replay(
             twin=twin,
             output=output,
             verify=verify,
-            from_s=start,
-            to_s=end,
+            start_s=start,
+            end_s=end,
             json_output=json_output,
         )
         return
     chosen = _chosen_topics(topics, from_topic)
     pace = Pace(_rate(rate or "1"), paused=pause)
     keys = Keys()
-    if pause and not keys.are_there:
-        raise typer.BadParameter("nobody could press a key to go on: this is no terminal", param_hint="--pause")
-    reel = RecordingPlayback(files, chosen, start, end)
-    place = resolve_config(reel.files[0], reel.first, config, overrides or ())
+    if pause and not keys.is_available:
+        raise typer.BadParameter("needs a terminal, to continue with a key", param_hint="--pause")
+    playback = RecordingPlayback(files, chosen, start, end)
+    replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
     stop = threading.Event()
     stop_on_signals(stop)
     console = Console(stderr=True, highlight=False)
-    with keys, _status_line(console, reel.end_s(), reel.seconds_at) as show:
+    with keys, _status_line(console, playback.end_s(), playback.seconds_at) as show:
         outcome = publish(
-            reel,
+            playback,
             chosen,
             pace,
-            place,
+            replay_config,
             stop,
             loop=loop,
             keys=keys.pressed,
             show=show,
-            say=lambda line: console.print(line, markup=False, soft_wrap=True),
+            report=lambda line: console.print(line, markup=False, soft_wrap=True),
         )
     for line in outcome.damage:
         console.print(line, markup=False, soft_wrap=True)
     for name in outcome.behind:
-        console.print(f"{name} has not said that it took all: look at `fantwin status`", markup=False, soft_wrap=True)
+        console.print(f"{name} has not received everything: see `fantwin status`", markup=False, soft_wrap=True)
     if json_output:
-        typer.echo(json.dumps({"files": [str(file) for file in reel.files], **asdict(outcome)}))
+        typer.echo(json.dumps({"files": [str(file) for file in playback.files], **asdict(outcome)}))
     else:
-        typer.echo(_sentence(outcome))
+        typer.echo(_summary(outcome))
     if outcome.exit_code:
         raise typer.Exit(outcome.exit_code)
 
@@ -164,17 +165,17 @@ def replay(
 def _chosen_topics(topics: str | None, from_topic: str | None) -> tuple[str, ...]:
     if from_topic is not None:
         if topics is not None:
-            raise typer.BadParameter("--topics or --from, not both", param_hint="--from")
+            raise typer.BadParameter("give --topics or --from, not both", param_hint="--from")
         starts = replay_starts()
         if from_topic not in starts:
-            raise typer.BadParameter(f"{from_topic!r} is none of {', '.join(starts)}", param_hint="--from")
+            raise typer.BadParameter(f"{from_topic!r} is not one of {', '.join(starts)}", param_hint="--from")
         return starts[from_topic]
     if topics is None:
         return REPLAYED
     chosen = tuple(topics.split(","))
     for name in chosen:
         if name not in REPLAYED:
-            raise typer.BadParameter(f"{name!r} is none of {', '.join(REPLAYED)}", param_hint="--topics")
+            raise typer.BadParameter(f"{name!r} is not one of {', '.join(REPLAYED)}", param_hint="--topics")
     return chosen
 
 
@@ -190,7 +191,7 @@ def _rate(text: str) -> float:
 
 @contextmanager
 def _status_line(console: Console, end_s: float | None, seconds_at: Callable[[int], float]) -> Iterator[_Show]:
-    """Where the replay has come to, in the terminal's last line; nothing where there is none."""
+    """Shows the progress in the last line of the terminal; without a terminal, nothing."""
     if not console.is_terminal:
         yield lambda _progress: None
         return
@@ -210,16 +211,16 @@ def _status_line(console: Console, end_s: float | None, seconds_at: Callable[[in
 
 
 def status_line(progress: Progress, at_s: float, end_s: float | None) -> str:
-    """One line: recorded time, place in the recording, rate, messages sent."""
-    when = datetime.fromtimestamp(progress.t_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
-    place = f"{at_s:.2f} s" + (f" of {end_s:.2f} s" if end_s is not None and not progress.round else "")
+    """One line: recorded time, position in the recording, rate, messages sent."""
+    utc = datetime.fromtimestamp(progress.t_ns / NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
+    position = f"{at_s:.2f} s" + (f" of {end_s:.2f} s" if end_s is not None and not progress.round else "")
     rounds = f"  round {progress.round + 1}" if progress.round else ""
-    rate = "as fast as it goes" if math.isinf(progress.rate) else f"x {progress.rate:g}"
+    rate = "as fast as possible" if math.isinf(progress.rate) else f"x {progress.rate:g}"
     state = "paused, " if progress.paused else ""
-    return f"{when} UTC  {place}{rounds}  {state}{rate}  {progress.messages:,} sent  ({_KEYS_HELP})"
+    return f"{utc} UTC  {position}{rounds}  {state}{rate}  {progress.messages:,} sent  ({_KEYS_HELP})"
 
 
-def _sentence(outcome: Outcome) -> str:
+def _summary(outcome: Outcome) -> str:
     messages = ", ".join(f"{count:,} {name}" for name, count in outcome.messages.items()) or "nothing"
     rate = f", {outcome.rate:.3g} times real time" if outcome.rate is not None else ""
     lost = ", ".join(f"{name} {count}" for name, count in outcome.lost.items()) or "nothing"

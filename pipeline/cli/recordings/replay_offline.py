@@ -1,4 +1,4 @@
-"""`fantwin replay --offline`: judge a recording again, compare, and say what came of it."""
+"""`fantwin replay --offline`: judge a recording again, compare, and print the result."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, 
 from pipeline.replay.offline.judging import JudgedTray, judge
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from pipeline.replay.offline.verify import CannotCompareError, format_utc
+from schemas.units import NS_PER_S
 
 EXIT_DIFFERS, EXIT_CANNOT_COMPARE, EXIT_LOST = 1, 2, 3
 _SHOWN = 40
-"""so many alarms are listed"""
+"""alarms that are listed"""
 _WIDEST = 100
-"""columns of the list"""
+"""characters of a line of the list"""
 
 
 def run_offline(
@@ -37,19 +38,19 @@ def run_offline(
     twin: Path | None,
     output: Path | None,
     verify: bool,
-    from_s: float,
-    to_s: float,
+    start_s: float,
+    end_s: float,
     json_output: bool,
 ) -> None:
-    """Judge, print, and exit: 0 well, 1 could not be done, 3 something was lost; with `verify` 0 equal, 1 differs,
-    2 could not compare.
+    """Judge, print, and exit with 0: success, 1: failed, 3: something was lost. With `verify`: 0 equal, 1 different,
+    2 not comparable.
 
     Raises:
-        UserError: it cannot be done.
+        UserError: it failed.
     """
     began_s = time.monotonic()
     try:
-        with open_replay_input(files, config, overrides, twin, from_s, to_s) as replay_input:
+        with open_replay_input(files, config, overrides, twin, start_s, end_s) as replay_input:
             if verify and not replay_input.is_as_recorded:
                 raise CannotCompareError(
                     f"{files[0]}: --verify compares with the recording: leave out --twin, -c and --set, and give a "
@@ -61,12 +62,12 @@ def run_offline(
     except UserError as error:
         if not verify:
             raise
-        _say_cannot(str(error), json_output)
+        _print_not_comparable(str(error), json_output)
         raise typer.Exit(EXIT_CANNOT_COMPARE) from error
     if json_output:
         typer.echo(json.dumps(result))
     else:
-        _tell(trays, result, output)
+        _print_result(trays, result, output)
     problems = [tray.problem for tray in trays if tray.problem]
     if problems and not verify and not any(tray.judged for tray in trays):
         raise UserError(f"{files[0]}: {'; '.join(problems)}")
@@ -79,11 +80,11 @@ def run_offline(
 def _judged(replay_input: ReplayInput, output: Path | None, verify: bool) -> list[JudgedTray]:
     columns = (SpinnerColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        task = shown.add_task("reading what the stages were fed")
+        task = shown.add_task("reading what each stage consumed")
         first: dict[str, int] = {}
 
         def progress(tray: str, t_ns: int) -> None:
-            since_s = (t_ns - first.setdefault(tray, t_ns)) / 1e9
+            since_s = (t_ns - first.setdefault(tray, t_ns)) / NS_PER_S
             shown.update(task, description=f"judging {tray}: {since_s:.0f} s of it")
 
         return judge(replay_input, output, verify, progress)
@@ -131,11 +132,11 @@ def _what_if(found: AlarmDiff) -> dict[str, Any]:
     return {name: [episode.as_json() for episode in getattr(found, name)] for name in ("gained", "lost", "kept")}
 
 
-def _tell(trays: Sequence[JudgedTray], result: dict[str, Any], output: Path | None) -> None:
+def _print_result(trays: Sequence[JudgedTray], result: dict[str, Any], output: Path | None) -> None:
     console = Console(highlight=False, soft_wrap=True)
     console.width = min(_WIDEST, console.width) if console.is_terminal else _WIDEST
     now, start_ns = result["alarms"], result["start_ns"]
-    _list(console, "alarms", now, start_ns)
+    _print_alarms(console, "alarms", now, start_ns)
     console.print(
         f"{len(now)} alarm{'s' * (len(now) != 1)} in {_duration(result['hours'])}, {result['samples']} samples, "
         f"{result['lost']} lost; "
@@ -145,16 +146,16 @@ def _tell(trays: Sequence[JudgedTray], result: dict[str, Any], output: Path | No
         if tray.problem:
             console.print(f"[bold yellow]not judged:[/bold yellow] {escape(tray.problem)}")
     if result["restarts"]:
-        console.print(f"{result['restarts']} restarts of stages, replayed as they were recorded")
+        console.print(f"{result['restarts']} restarts of stages, replayed as recorded")
     for damage in result["damage"]:
         console.print(f"[bold yellow]damaged:[/bold yellow] {escape(damage)}")
     if "what_if" in result:
         for name in ("gained", "lost"):
             found = result["what_if"][name]
             console.print(f"against the recording: {len(found)} alarms {name}")
-            _list(console, name, found, start_ns)
+            _print_alarms(console, name, found, start_ns)
     if "verified" in result:
-        _tell_verified(result["verified"], console)
+        _print_verified(result["verified"], console)
     if output:
         console.print(f"written to {output}", markup=False)
 
@@ -165,7 +166,7 @@ def _duration(hours: float) -> str:
     )
 
 
-def _tell_verified(found: dict[str, Any], console: Console) -> None:
+def _print_verified(found: dict[str, Any], console: Console) -> None:
     if found["equal"]:
         console.print(
             f"[bold green]equal:[/bold green] {found['samples_equal']} samples and {found['alarms_equal']} alarms, "
@@ -175,15 +176,15 @@ def _tell_verified(found: dict[str, Any], console: Console) -> None:
         console.print(
             f"[bold red]DIFFERS:[/bold red] {found['samples_different']} of "
             f"{found['samples_different'] + found['samples_equal']} samples differ, {found['samples_not_made']} "
-            f"were not made anew, {found['alarms_different']} alarms differ; the first differences:"
+            f"were not replayed, {found['alarms_different']} alarms differ; the first differences:"
         )
         for line in found["differences"]:
             console.print(f"  {line}", markup=False)
     if found["samples_not_recorded"]:
-        console.print(f"{found['samples_not_recorded']} samples made anew are not in the recording")
+        console.print(f"{found['samples_not_recorded']} replayed samples are not in the recording")
 
 
-def _list(console: Console, title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> None:
+def _print_alarms(console: Console, title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> None:
     if not alarms:
         return
     console.print(_table(f"{title}, s since {format_utc(start_ns)}", alarms[:_SHOWN], start_ns))
@@ -199,16 +200,16 @@ def _table(title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> Table
         table.add_column(column, no_wrap=True)
     table.add_column("what")
     for one in alarms:
-        raised = f"{(one['raised_ns'] - start_ns) / 1e9:.2f}"
-        cleared = "standing" if one["cleared_ns"] is None else f"{(one['cleared_ns'] - start_ns) / 1e9:.2f}"
+        raised = f"{(one['raised_ns'] - start_ns) / NS_PER_S:.2f}"
+        cleared = "active" if one["cleared_ns"] is None else f"{(one['cleared_ns'] - start_ns) / NS_PER_S:.2f}"
         first = f"{one['causes'][0]['cause']} {100 * one['causes'][0]['probability']:.0f} %" if one["causes"] else "-"
-        # the message of the raise names fan and cause, too: the one stands beside it, the other is known better now
+        # the message also names fan and first cause; both have columns of their own, with the newest cause
         what = one["message"].removeprefix(f"fan {one['fan']}: ").partition("; ")[0]
         table.add_row(one["tray"], str(one["fan"]), raised, cleared, one["severity"], first, escape(what))
     return table
 
 
-def _say_cannot(reason: str, json_output: bool) -> None:
+def _print_not_comparable(reason: str, json_output: bool) -> None:
     if json_output:
         typer.echo(json.dumps({"verified": None, "cannot_compare": reason}))
     Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]could not compare:[/red] {escape(reason)}")

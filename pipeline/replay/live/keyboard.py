@@ -1,4 +1,4 @@
-"""The keys of a terminal, one at a time and without Return. The terminal is given back as it was, however that ends."""
+"""Single keys from a terminal, without Return. The terminal's mode is restored however the program ends."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any, Self
 
 
 class Key(Enum):
-    """What a key asks for."""
+    """The keys and their actions."""
 
     PAUSE = "space"
     STEP = "right or s"
@@ -27,7 +27,7 @@ _KEYS = {
     b" ": Key.PAUSE,
     b"s": Key.STEP,
     b"q": Key.QUIT,
-    # arrows, in the two manners of terminals
+    # terminals send arrows in one of two forms
     **{start + b"C": Key.STEP for start in (b"\x1b[", b"\x1bO")},
     **{start + b"A": Key.FASTER for start in (b"\x1b[", b"\x1bO")},
     **{start + b"B": Key.SLOWER for start in (b"\x1b[", b"\x1bO")},
@@ -35,13 +35,13 @@ _KEYS = {
 
 
 class KeyParser:
-    """Bytes to keys. What begins an arrow is kept until the rest has come; what means nothing is passed over."""
+    """Bytes to keys. An incomplete arrow is kept until the rest arrives; other bytes are ignored."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Key]:
-        """The keys that are complete with these bytes."""
+        """The keys that these bytes complete."""
         rest, keys = self._rest + data, []
         while rest:
             known = next((known for known in _KEYS if rest.startswith(known)), None)
@@ -55,20 +55,20 @@ class KeyParser:
 
 
 class Keys:
-    """Keys pressed on standard input, if that is a terminal and this process is the one in its foreground."""
+    """Keys pressed on standard input, if it is a terminal with this process in the foreground."""
 
     def __init__(self) -> None:
         self._descriptor: int | None = None
         self._before: list[Any] = []
         self._parser = KeyParser()
-        with suppress(OSError, ValueError):  # there is no standard input, or not of a terminal
+        with suppress(OSError, ValueError):  # standard input is closed or has no descriptor
             descriptor = sys.stdin.fileno()
             if os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp():
                 self._descriptor = descriptor
 
     @property
-    def are_there(self) -> bool:
-        """Whether anybody can press one."""
+    def is_available(self) -> bool:
+        """Whether keys can be pressed."""
         return self._descriptor is not None
 
     def __enter__(self) -> Self:
@@ -81,7 +81,7 @@ class Keys:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._descriptor is not None:
-            with suppress(termios.error):  # the terminal has gone
+            with suppress(termios.error):  # the terminal was closed
                 termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
 
     def pressed(self) -> list[Key]:
@@ -92,7 +92,7 @@ class Keys:
                 data = os.read(self._descriptor, 1024)
             except OSError:
                 data = b""
-            if not data:  # the terminal has gone
+            if not data:  # the terminal was closed
                 self._descriptor = None
             found += self._parser.feed(data)
         return found

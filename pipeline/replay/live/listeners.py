@@ -1,4 +1,4 @@
-"""Who is on the bus with the replayer: who reads what it sends, who must not be there, and what they lost."""
+"""The stages on the bus of a replay: which read it, which conflict with it, and what they lost."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from schemas.messages import Health
 from schemas.streams import StreamId, input_streams, output_streams
 from schemas.topics import alive_key
 
-_LOOK_S = 0.02
-_NOBODY_S = 2.0  # within which somebody is met; stages whose first peer has died try its endpoint every second
-_MEETING_S = 4.0  # within which all have told their health
-_STEADY_S = 1.0  # nobody new for so long: all are met
-_PATIENCE_S = 10.0  # how long nothing may change at the end before those who are behind are given up
+_POLL_S = 0.02
+_ANY_STAGE_S = 2.0  # to find any stage: one whose first peer has died tries its endpoint every second
+_ALL_STAGES_S = 4.0  # to receive the health of all stages that were found
+_UNCHANGED_S = 1.0  # after so long without a new stage, all are found
+_STALLED_S = 10.0  # at the end: after so long without progress, waiting for stages that are behind ends
 
 
 @dataclass(frozen=True)
 class Present:
-    """A stage that is on the bus."""
+    """A stage that is running on the bus."""
 
     stage: Stage
     instance: str
@@ -40,7 +40,7 @@ class Present:
 
 
 def conflict(present: Collection[Present], topics: Collection[str], trays: Collection[str], site: str) -> str:
-    """Why a replay of these topics must not be: one line, empty if it may."""
+    """Why these topics must not be replayed beside the running stages: one line; empty if they may."""
     if "command" in topics:
         driving = [
             each for each in present if STAGES[each.stage.name].scope == "tray" and "command" in each.stage.reads
@@ -55,7 +55,7 @@ def conflict(present: Collection[Present], topics: Collection[str], trays: Colle
             continue
         for topic in each.stage.writes:
             if topic in topics:
-                other = _other_start(present)
+                other = _another_start(present)
                 way_out = f"replay with --from {other}, or stop it" if other else "stop it"
                 return f"{each.label} of site {site!r} is running and writes {topic} itself: {way_out}"
     answering = [each for each in present if "request" in each.stage.reads and "alarm" in each.stage.writes]
@@ -67,8 +67,8 @@ def conflict(present: Collection[Present], topics: Collection[str], trays: Colle
     return ""
 
 
-def _other_start(present: Collection[Present]) -> str:
-    """From where to replay so that stages which are there have something to do, and none of them does it, too."""
+def _another_start(present: Collection[Present]) -> str:
+    """The topic to start from so that running stages have input, and none of them writes what is replayed; or empty."""
     for start, topics in replay_starts().items():
         written = any(topic in each.stage.writes for each in present for topic in topics)
         if not written and any(start in each.stage.reads for each in present if each.stage.writes):
@@ -77,51 +77,52 @@ def _other_start(present: Collection[Present]) -> str:
 
 
 class Listeners:
-    """The stages on the bus of a replay."""
+    """Watches the stages on the bus."""
 
     def __init__(self, bus: Bus, site: str) -> None:
-        """Begin to look; the replayer itself is not there yet."""
+        """Start watching, before the replay itself is on the bus."""
         self._site = site
         self._watcher = Watcher(bus, site)
         self._alive: set[str] = set()
-        bus.watch_alive(alive_key(site, "*", "*"), self._note_alive)
+        bus.watch_alive(alive_key(site, "*", "*"), self._set_alive)
         self._before: dict[str, int] = {}
-        self._there_at_start: set[str] = set()
+        self._present_at_start: set[str] = set()
 
-    def meet(self, stop: threading.Event) -> None:
-        """Wait until those who were there before are connected, and each has said how it is."""
+    def wait_for_discovery(self, stop: threading.Event) -> None:
+        """Wait until the running stages are connected and the health of each has arrived."""
         began_s = steady_s = time.monotonic()
         known: set[str] = set()
-        while not stop.wait(_LOOK_S):
+        while not stop.wait(_POLL_S):
             now_s = time.monotonic()
             views = {view.health.header.producer for view in self._views()}
             if views != known:
                 known, steady_s = views, now_s
-            told = len(views) >= len(self.present()) and now_s - steady_s > _STEADY_S
-            if now_s - began_s > (_MEETING_S if self._alive else _NOBODY_S) or (views and told):
+            complete = len(views) >= len(self.present()) and now_s - steady_s > _UNCHANGED_S
+            if now_s - began_s > (_ALL_STAGES_S if self._alive else _ANY_STAGE_S) or (views and complete):
                 break
         self._before = self._watcher.losses()
-        self._there_at_start = known
+        self._present_at_start = known
 
     def present(self) -> list[Present]:
-        """The stages that are there."""
+        """The running stages."""
         names = [tuple(key.split("/")[3:]) for key in sorted(self._alive)]
         return [Present(load_stage(stage), instance) for stage, instance in names if stage in STAGES]
 
     def is_replaying(self) -> bool:
-        """Whether another replay, or this one, is on the bus."""
+        """Whether a replay, this one or another, is on the bus."""
         return alive_key(self._site, REPLAY, "all") in self._alive
 
     def readers(self, topics: Collection[str]) -> list[str]:
-        """Who reads any of these topics."""
+        """The running stages that read any of these topics."""
         return [each.label for each in self.present() if any(topic in topics for topic in each.stage.reads)]
 
-    def settle(
-        self, producer: str, published: Mapping[str, int], stop: threading.Event, beat: Callable[[], None]
+    def wait_until_drained(
+        self, producer: str, published: Mapping[str, int], stop: threading.Event, heartbeat: Callable[[], None]
     ) -> list[str]:
-        """Wait until all that was sent, and all that the stages made of it, has been taken. Returns who is behind.
+        """Wait until the stages have consumed what was sent and what other stages made of it.
 
-        `beat` is called all the while: the replayer is still there, and answers.
+        `heartbeat` is called while waiting, to keep the replay alive on the bus. Returns the stages that are behind
+        and no longer make progress.
         """
         old = {view.health.header.producer: view.health.header.sequence for view in self._views()}
         seen: object = None
@@ -132,25 +133,28 @@ class Listeners:
                 seen, changed_s = healths, time.monotonic()
             if stop.is_set():
                 return []
-            if time.monotonic() - changed_s > _PATIENCE_S:
+            if time.monotonic() - changed_s > _STALLED_S:
                 return behind
-            beat()
-            stop.wait(_LOOK_S)
+            heartbeat()
+            stop.wait(_POLL_S)
         return []
 
     def lost(self, producer: str, published: Mapping[str, int]) -> dict[str, int]:
-        """What each stage has lost since the replay began, of what was sent before it was known to listen, too."""
+        """Messages that each stage has lost since the replay began.
+
+        For a stage that was running at the start, messages sent before its first received one count as lost too.
+        """
         now = self._watcher.losses()
         lost = Counter({name: count - self._before.get(name, 0) for name, count in now.items()})
         for view in self._views():
-            if view.health.header.producer in self._there_at_start and not load_stage(view.health.stage).may_drop:
+            if view.health.header.producer in self._present_at_start and not load_stage(view.health.stage).may_drop:
                 for (key, of), state in input_streams(view.health).items():
                     if of == producer and key in published:
                         lost[label(view.health)] += state.first_sequence
         return {name: count for name, count in lost.items() if count > 0}
 
     def _behind(self, producer: str, published: Mapping[str, int], old: Mapping[str, int]) -> list[str]:
-        """Who has not yet said, in a health newer than the `old` ones, that it has all that its producers have sent."""
+        """The stages without a health newer than the `old` one that shows that they received all that was sent."""
         healths = [view.health for view in self._views()]
         sent = {(key, producer): count for key, count in published.items()}
         for each in healths:
@@ -164,7 +168,7 @@ class Listeners:
     def _views(self) -> list[StageView]:
         return [view for view in self._watcher.stages() if view.alive and view.health.stage in STAGES]
 
-    def _note_alive(self, key: str, alive: bool) -> None:
+    def _set_alive(self, key: str, alive: bool) -> None:
         (self._alive.add if alive else self._alive.discard)(key)
 
 

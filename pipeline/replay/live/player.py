@@ -1,4 +1,4 @@
-"""Plays a recording: each message when it is due, keys in between, and twenty times a second what time it is."""
+"""Plays a recording: sends each message when it is due, handles keys, and publishes the time 20 times a second."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ HEALTH_PERIOD_S = 1.0
 _RANK = {topic.name: rank for rank, topic in enumerate(TOPICS)}
 
 
-class Stopped(Exception):  # noqa: N818  it is no error
-    """Somebody asked for the end."""
+class Stopped(Exception):  # noqa: N818  not an error
+    """The user asked to stop."""
 
 
 class Time(Protocol):
-    """The clock of this process, and how to wait by it."""
+    """A monotonic clock that can be waited on."""
 
     def now_s(self) -> float:
         """Monotonic seconds."""
         ...
 
     def wait(self, for_s: float) -> bool:
-        """Wait; true, and at once, when the end is asked for."""
+        """Wait for some seconds. Returns True, at once, when the replay has to stop."""
         ...
 
 
@@ -46,22 +46,22 @@ class RealTime:
         return time.monotonic()
 
     def wait(self, for_s: float) -> bool:
-        """Wait; true, and at once, when the end is asked for."""
+        """Wait for some seconds. Returns True, at once, when the replay has to stop."""
         return self._stop.wait(for_s) if for_s > 0.0 else self._stop.is_set()
 
 
 class Output(Protocol):
-    """Where the messages go; see `pipeline.replay.live.sender`."""
+    """Publishes messages, clock and health; see `pipeline.replay.live.sender`."""
 
     def send(self, entry: Envelope) -> None: ...  # noqa: D102
-    def tell_clock(self, t_ns: int, rate: float) -> None: ...  # noqa: D102
-    def tell_health(self, status: StageStatus = ..., problem: str = ...) -> None: ...  # noqa: D102
+    def publish_clock(self, t_ns: int, rate: float) -> None: ...  # noqa: D102
+    def publish_health(self, status: StageStatus = ..., problem: str = ...) -> None: ...  # noqa: D102
     def published(self) -> Mapping[str, int]: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a replay has come to."""
+    """How far a replay is."""
 
     t_ns: int
     rate: float
@@ -82,7 +82,7 @@ class Player:
         keys: Callable[[], Sequence[Key]] = tuple,
         look: Callable[[Progress], None] = lambda _progress: None,
     ) -> None:
-        """`keys` gives those pressed since it was asked last; `look` is called about every 50 ms, and may raise."""
+        """`keys` returns the keys pressed since the last call; `look` is called about every 50 ms, and may raise."""
         self._output = output
         self._pace = pace
         self._clock = clock
@@ -93,17 +93,17 @@ class Player:
         self._leading = len(_RANK)
         self._round = 0
         self._messages = 0
-        self._told_ns = 0
+        self._clock_ns = 0
         self.first_ns = self.last_ns = 0
-        """from when to when it was played, in recorded time"""
+        """recorded time of the first and the newest message sent"""
         self.began_s = self.ended_s = clock.now_s()
-        """the same by this process's clock"""
+        """the same on this process's clock"""
 
     def play(self, rounds: Iterable[tuple[int, Envelope]]) -> None:
-        """Play to the end.
+        """Play to the end. Each message comes with the number of its round.
 
         Raises:
-            Stopped: the end was asked for before.
+            Stopped: the user asked to stop.
         """
         try:
             for self._round, entry in rounds:
@@ -113,14 +113,14 @@ class Player:
                 self._output.send(entry)
                 self._messages += 1
                 self.last_ns = max(self.last_ns, entry.received_t_ns)
-                self._note_step(entry)
+                self._count_step(entry)
         finally:
             self.ended_s = self._clock.now_s()
-            self._pace.change(self.last_ns, self.ended_s)  # a last pause counts, too
-        self._output.tell_health()  # at once: how much has been sent in all
+            self._pace.change(self.last_ns, self.ended_s)  # counts a pause that is not over
+        self._output.publish_health()  # at once, so that stages know how many messages there are
 
-    def linger(self) -> None:
-        """Go on saying what time it is and how it is, after the end."""
+    def heartbeat_after_end(self) -> None:
+        """Keep publishing clock and health after the last message."""
         if self._clock.now_s() >= self._next_beat_s:
             self._beat(self._clock.now_s(), self.last_ns, self.last_ns)
 
@@ -135,7 +135,7 @@ class Player:
             now_s = self._clock.now_s()
             if now_s >= self._next_beat_s:
                 self._press(entry, now_s)
-                self._beat(now_s, self._pace.position_ns(now_s, entry.received_t_ns), _no_later(entry))
+                self._beat(now_s, self._pace.position_ns(now_s, entry.received_t_ns), _latest_clock_ns(entry))
             wait_s = 0.0 if self._steps else self._pace.due_in_s(entry.received_t_ns, now_s)
             if self._clock.wait(min(max(wait_s, 0.0), BEAT_S)):
                 raise Stopped
@@ -144,16 +144,16 @@ class Player:
 
     def _beat(self, now_s: float, position_ns: int, no_later_ns: int) -> None:
         self._next_beat_s = now_s + BEAT_S
-        # samples that are still to come are not late: the clock waits before them
-        self._told_ns = max(self._told_ns, min(position_ns, no_later_ns))
-        self._output.tell_clock(self._told_ns, self._pace.rate_now)
+        # The clock stops before the next samples, so that a stage does not take them for late.
+        self._clock_ns = max(self._clock_ns, min(position_ns, no_later_ns))
+        self._output.publish_clock(self._clock_ns, self._pace.rate_now)
         if now_s >= self._next_health_s:
             self._next_health_s = now_s + HEALTH_PERIOD_S
-            self._output.tell_health()
+            self._output.publish_health()
         self._look(Progress(position_ns, self._pace.rate, self._pace.paused, self._round, self._messages))
 
     def _press(self, entry: Envelope, now_s: float) -> None:
-        """Do what the keys ask for."""
+        """Handle the pressed keys."""
         for key in self._keys():
             at_ns = self._pace.position_ns(now_s, entry.received_t_ns)
             match key:
@@ -169,17 +169,17 @@ class Player:
                 case Key.QUIT:
                     raise Stopped
 
-    def _note_step(self, entry: Envelope) -> None:
-        """A step ends with a message of the first topic there is: with the next sample, and all recorded before it."""
+    def _count_step(self, entry: Envelope) -> None:
+        """Count a step down when it ends: with a message of the earliest topic, which is the next sample."""
         self._leading = min(self._leading, _RANK[entry.topic])
         if self._steps and _RANK[entry.topic] == self._leading:
             self._steps -= 1
             self._pace.change(entry.received_t_ns, self._clock.now_s(), paused=True)
-            self._next_beat_s = self._clock.now_s()  # to be seen at once
+            self._next_beat_s = self._clock.now_s()  # publishes the clock at once
 
 
-def _no_later(entry: Envelope) -> int:
-    """The time of its oldest raw sample, or its own."""
+def _latest_clock_ns(entry: Envelope) -> int:
+    """The time of a message's oldest raw sample, or of its receipt: the clock must not pass it before."""
     message = entry.message
     if isinstance(message, Raw) and len(message.host_receive_t_ns):
         return int(message.host_receive_t_ns[0])

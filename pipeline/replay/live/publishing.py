@@ -1,4 +1,4 @@
-"""A replay on the bus from its beginning to its end: who is there, the playing, and what became of it."""
+"""A replay on the bus: find the running stages, play, wait until they have consumed all, and report losses."""
 
 from __future__ import annotations
 
@@ -18,94 +18,99 @@ from pipeline.replay.live.recording_playback import RecordingPlayback
 from pipeline.replay.live.sender import Sender
 from pipeline.replay.resolve_config import trays_of
 from schemas.messages import StageStatus
+from schemas.units import NS_PER_S
 
 
 @dataclass
 class Outcome:
-    """What became of a replay."""
+    """The result of a replay."""
 
     site: str
     listeners: list[str] = field(default_factory=list)
-    """who was there to read it when it began"""
+    """stages that could read it when it began"""
     messages: dict[str, int] = field(default_factory=dict)
     """by topic"""
     recorded_s: float = 0.0
     elapsed_s: float = 0.0
     rate: float | None = None
-    """seconds of the recording a second, pauses left out; None where it was too short to say"""
+    """seconds of the recording per second, without pauses; None where it was too short"""
     stopped: bool = False
-    """it was ended before its end"""
+    """the user stopped it"""
     lost: dict[str, int] = field(default_factory=dict)
     """by stage"""
     behind: list[str] = field(default_factory=list)
-    """stages that never said they had taken all"""
+    """stages that did not report that they received everything"""
     damage: list[str] = field(default_factory=list)
-    """what could not be read, a line for each file"""
+    """what could not be read, a line a file"""
 
     @property
     def exit_code(self) -> int:
-        """0: all in order; 3: something was lost, or could not be read."""
+        """0: success; 3: something was lost, or could not be read."""
         return 3 if self.lost or self.behind or self.damage else 0
 
 
 def publish(
-    reel: RecordingPlayback,
+    playback: RecordingPlayback,
     topics: Collection[str],
     pace: Pace,
-    place: Config,
+    config: Config,
     stop: threading.Event,
     *,
     loop: bool,
     keys: Callable[[], Sequence[Key]],
     show: Callable[[Progress], None],
-    say: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> Outcome:
-    """Replay on the bus of `place` until the end, or until `stop` is set; `say` is given a line for people.
+    """Replay on the bus of `config` until the end, or until `stop` is set; `report` prints a line for the user.
 
     Raises:
-        UserError: a tray is unknown, or a stage is there, or comes, that writes the same.
+        UserError: a tray is unknown, or a running stage writes the same topics.
     """
-    recorded = trays_of(reel.files)
+    recorded = trays_of(playback.files)
     for tray in sorted(recorded):
-        place.tray(tray)
-    trays = recorded or {tray.name for tray in place.trays}
-    outcome = Outcome(place.site)
-    with Bus(place.bus, stop) as bus:
-        listeners = Listeners(bus, place.site)
+        config.tray(tray)
+    trays = recorded or {tray.name for tray in config.trays}
+    outcome = Outcome(config.site)
+    with Bus(config.bus, stop) as bus:
+        listeners = Listeners(bus, config.site)
 
         def refuse_conflicts() -> None:
-            if invalid_reason := conflict(listeners.present(), topics, trays, place.site):
-                raise UserError(invalid_reason)
+            if problem := conflict(listeners.present(), topics, trays, config.site):
+                raise UserError(problem)
 
         def look(progress: Progress) -> None:
             refuse_conflicts()
             show(progress)
 
-        listeners.meet(stop)
+        listeners.wait_for_discovery(stop)
         if listeners.is_replaying():
-            raise UserError(f"a replay is running on site {place.site!r} at {place.bus.endpoint}: stop that first")
+            raise UserError(f"a replay is running on site {config.site!r} at {config.bus.endpoint}: stop that first")
         refuse_conflicts()
         outcome.listeners = listeners.readers(topics)
         if not outcome.listeners:
-            where = f"site {place.site!r} at {place.bus.endpoint}"
-            say(f"nobody on {where} reads {', '.join(topics)}; publishing all the same")
-        sender = Sender(bus, place.site, trays)
+            where = f"site {config.site!r} at {config.bus.endpoint}"
+            report(f"no stage on {where} reads {', '.join(topics)}; publishing anyway")
+        sender = Sender(bus, config.site, trays)
         player = Player(sender, pace, RealTime(stop), keys=keys, look=look)
         outcome.stopped = True
         try:
             with suppress(Stopped):
-                player.play(reel.rounds() if loop else ((0, entry) for entry in reel))
+                player.play(playback.rounds() if loop else ((0, entry) for entry in playback))
                 if not sender.sent:
-                    raise UserError(f"{reel.files[0]}: there is no {' or '.join(topics)} in it, or not in that stretch")
-                outcome.behind = listeners.settle(sender.producer, sender.published(), stop, player.linger)
+                    raise UserError(
+                        f"{playback.files[0]}: it holds no {' or '.join(topics)}, or none between --start and --end"
+                    )
+                outcome.behind = listeners.wait_until_drained(
+                    sender.producer, sender.published(), stop, player.heartbeat_after_end
+                )
                 outcome.stopped = False
         finally:
-            sender.tell_health(StageStatus.STOPPED, "; ".join(reel.damage))
+            sender.publish_health(StageStatus.STOPPED, "; ".join(playback.damage))
         outcome.lost = listeners.lost(sender.producer, sender.published())
     outcome.messages = dict(sender.sent)
-    outcome.recorded_s = (player.last_ns - player.first_ns) / 1e9
+    outcome.recorded_s = (player.last_ns - player.first_ns) / NS_PER_S
     outcome.elapsed_s = player.ended_s - player.began_s
     running_s = outcome.elapsed_s - pace.paused_s
     outcome.rate = outcome.recorded_s / running_s if running_s > 0.0 else None
-    outcome.damage = list(reel.damage)
+    outcome.damage = list(playback.damage)
     return outcome

@@ -1,4 +1,4 @@
-"""What is played: the parts of a recording one after another, each message once, from one time to another."""
+"""The messages to play: a stretch of a recording, its parts in order, each message once."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from schemas.envelope import Envelope
 from schemas.messages import Array, Grid, Message, Prediction, Raw, Score
 from schemas.units import NS_PER_S
 
-LOOP_GAP_NS = 10_000_000  # between two rounds where no grid says how far samples are apart
+LOOP_GAP_NS = 10_000_000  # between two rounds of a recording without a grid, whose period would say more
 OUT_OF_ORDER_NS = 10 * NS_PER_S
-"""a message that was fetched from the bus later is recorded at a later time than some that follow it"""
-CARRIED = "twin"
-"""the topic whose last message before the start is in force at the start"""
+"""how much later than its followers a message may be recorded, because it was recovered from its producer"""
+LATCHED_TOPIC = "twin"
+"""the topic whose last message before the stretch still holds at its start"""
 
 
 class RecordingPlayback:
@@ -33,10 +33,10 @@ class RecordingPlayback:
     def __init__(
         self, files: Sequence[Path], topics: Collection[str], start_s: float = 0.0, end_s: float = math.inf
     ) -> None:
-        """Look at the first message of each file; `start_s` and `end_s` count from the very first.
+        """Read the first message of each file; `start_s` and `end_s` count from the first message of all.
 
         Raises:
-            RecordingError: a file is no recording, or no file holds a message.
+            RecordingError: a file is not a recording, or no file holds a message.
         """
         firsts = {file: entry for file in in_order(files) for entry in islice(read_recording(file), 1)}
         if not firsts:
@@ -44,19 +44,18 @@ class RecordingPlayback:
         self.files = list(firsts)
         self._topics = topics
         first = self.first = firsts[self.files[0]]
-        self._start_ns = (
-            first.received_t_ns + round(start_s * NS_PER_S) if start_s else 0
-        )  # all of it, whatever its times
+        # with start_s = 0 everything is played, also messages that were recorded out of order
+        self._start_ns = first.received_t_ns + round(start_s * NS_PER_S) if start_s else 0
         self._end_ns = first.received_t_ns + round(end_s * NS_PER_S) if math.isfinite(end_s) else None
         self.damage: tuple[str, ...] = ()
-        """what could not be read, a line for each file, once the messages are through"""
+        """what could not be read of the files that were played, a line a file"""
 
     def seconds_at(self, t_ns: int) -> float:
         """Seconds since the first message of the recording."""
         return (t_ns - self.first.received_t_ns) / NS_PER_S
 
     def end_s(self) -> float | None:
-        """Where it ends, in seconds since its first message; None where no file says so."""
+        """The end of the stretch in seconds since the first message; None where no file has an index."""
         recorded = max(map(_last_received_t_ns, self.files))
         if not recorded:
             return None
@@ -65,7 +64,7 @@ class RecordingPlayback:
     def __iter__(self) -> Iterator[Envelope]:
         """One round."""
         seen: dict[tuple[str, str], Seen] = {}
-        carried: dict[str, Envelope] = {}
+        latched: dict[str, Envelope] = {}
         damage: list[str] = []
         for file in self.files:
             reading = read_recording(file, self._topics)
@@ -73,56 +72,56 @@ class RecordingPlayback:
                 for entry in reading:
                     header = entry.message.header
                     if not seen.setdefault((entry.key, header.producer), Seen()).is_new(header.sequence):
-                        continue  # the part before this one had it, too
+                        continue  # also in the part before
                     if self._end_ns is not None and entry.received_t_ns > self._end_ns:
                         if entry.received_t_ns > self._end_ns + OUT_OF_ORDER_NS:
                             return
                         continue
                     if entry.received_t_ns >= self._start_ns:
-                        yield from carried.values()
-                        carried.clear()
+                        yield from latched.values()
+                        latched.clear()
                         yield entry
-                    elif entry.topic == CARRIED:
-                        carried[entry.key] = entry.received_at(self._start_ns)
-            finally:  # also when the stretch ends or playback stops before the end of the file
+                    elif entry.topic == LATCHED_TOPIC:
+                        latched[entry.key] = entry.received_at(self._start_ns)
+            finally:  # also when the stretch or the playback ends before the file
                 damage += filter(None, [reading.damage])
                 self.damage = tuple(damage)
 
     def rounds(self) -> Iterator[tuple[int, Envelope]]:
-        """Round after round without end, each with its number; times are shifted so that they never run back."""
+        """Endless rounds, each message with its round's number; times are shifted so that they never go back."""
         number, by_ns = 0, 0
         while True:
-            extent = Extent()
+            extent = TimeExtent()
             for entry in self:
-                extent.note(entry)
+                extent.add(entry)
                 yield number, shifted(entry, by_ns)
             number, by_ns = number + 1, by_ns + extent.length_ns()
             if not by_ns:
                 return
 
 
-class Extent:
-    """From when to when messages go: by the times they were received, and by those of their samples."""
+class TimeExtent:
+    """The first and the last time of messages, by receipt and by sample."""
 
     def __init__(self) -> None:
         self._spans: dict[str, tuple[int, int]] = {}
-        self._steps_ns: set[int] = set()
+        self._periods_ns: set[int] = set()
 
-    def note(self, entry: Envelope) -> None:
-        """Take a message in."""
+    def add(self, entry: Envelope) -> None:
+        """Include a message."""
         self._widen("received", entry.received_t_ns)
         times = sample_times(entry.message)
         if len(times):
             self._widen("sampled", int(times[0]))
             self._widen("sampled", int(times[-1]))
         if (period_ns := getattr(entry.message, "period_ns", 0)) > 0:
-            self._steps_ns.add(period_ns)
+            self._periods_ns.add(period_ns)
 
     def length_ns(self) -> int:
-        """By how much a next round has to be later; a whole number of grid steps. 0: there was no message."""
+        """The shift in ns of the next round: a whole number of grid periods. 0: there was no message."""
         if not self._spans:
             return 0
-        period_ns = math.lcm(*self._steps_ns) if self._steps_ns else LOOP_GAP_NS
+        period_ns = math.lcm(*self._periods_ns) if self._periods_ns else LOOP_GAP_NS
         longest_ns = max(last - first for first, last in self._spans.values())
         return (longest_ns // period_ns + 1) * period_ns
 
@@ -132,14 +131,14 @@ class Extent:
 
 
 def sample_times(message: Message) -> Array:
-    """(samples,) ns since the epoch; of a message without samples none."""
+    """(samples,) ns since the epoch; empty for a message without samples."""
     if isinstance(message, Raw):
         return message.host_receive_t_ns
     return message.t_ns if isinstance(message, Grid | Prediction | Score) else np.zeros(0, np.int64)
 
 
 def shifted(entry: Envelope, by_ns: int) -> Envelope:
-    """The same, later."""
+    """The same message with all its times later."""
     if not by_ns:
         return entry
     message = entry.message
@@ -148,13 +147,13 @@ def shifted(entry: Envelope, by_ns: int) -> Envelope:
 
 
 def _later(t_ns: Any, by_ns: int) -> Any:
-    """A time of a message, or an array of them. What is no time of an alarm (never, until it clears) stays so."""
+    """A time, or an array of times, shifted. Values that stand for `never` or `until it clears` are not."""
     is_none = isinstance(t_ns, int) and not 0 < t_ns < 2**63 - 1
     return t_ns if is_none else t_ns + by_ns
 
 
 def _last_received_t_ns(file: Path) -> int:
-    """When the last message was received, as the file's index says; 0 where it has none."""
+    """Receipt of the last message according to the file's index; 0 where it has none."""
     with suppress(McapError, OSError, ValueError), file.open("rb") as opened:
         summary = make_reader(opened).get_summary()
         if summary and summary.statistics:

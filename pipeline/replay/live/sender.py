@@ -1,4 +1,4 @@
-"""The replayer on the bus: a producer like any other, with sequences, health and a liveliness token of its own."""
+"""The replay's producer on the bus, with its own sequence numbers, health and liveliness token."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
 
 class Sender:
-    """Publishes messages under the site's keys, stamped anew; and the clock of every tray, and health."""
+    """Publishes recorded messages under the site's keys with new headers, the clock of each tray, and health."""
 
     def __init__(self, bus: Bus, site: str, trays: Collection[str]) -> None:
-        """Come onto the bus; `trays` are those that the site has."""
+        """Join the bus; `trays` are the trays of the site."""
         self.producer = f"{REPLAY}-all-{secrets.token_hex(4)}"
         self.sent: Counter[str] = Counter()
-        """messages of each topic"""
+        """messages sent, by topic"""
         self._bus = bus
         self._site = site
         self._publishers: dict[str, Publisher] = {}
         self._clocks = {tray: self._publisher(tray_key(site, tray, "clock"), "clock") for tray in trays}
         self._health = self._publisher(health_key(site, REPLAY, "all"), "health")
         self._builder = HealthBuilder(REPLAY, "all", time.time_ns(), may_drop=False)
-        self.tell_health(StageStatus.STARTING)
+        self.publish_health(StageStatus.STARTING)
         bus.declare_alive(alive_key(site, REPLAY, "all"))
 
     def send(self, entry: Envelope) -> None:
-        """Publish a message; waits while those who read it are behind.
+        """Publish a message; blocks while a reader is behind.
 
         Raises:
-            UserError: it is of a tray that the site does not have.
+            UserError: the site has no such tray.
         """
         tray = tray_of(entry.key)
         if tray not in self._clocks:
@@ -51,13 +51,13 @@ class Sender:
         self._put(self._publishers[key], entry.message, tray)
         self.sent[entry.topic] += 1
 
-    def tell_clock(self, t_ns: int, rate: float) -> None:
-        """Say what recorded time is now, and how fast it goes."""
+    def publish_clock(self, t_ns: int, rate: float) -> None:
+        """Publish recorded time and the rate at which it passes."""
         for tray, publisher in self._clocks.items():
             self._put(publisher, Clock(t_ns=t_ns, rate=rate), tray)
 
-    def tell_health(self, status: StageStatus = StageStatus.OK, problem: str = "") -> None:
-        """Say how it is and how much has been sent, so that whoever missed the last messages asks for them."""
+    def publish_health(self, status: StageStatus = StageStatus.OK, problem: str = "") -> None:
+        """Publish health with the number of sent messages, so that a reader that missed the last ones asks for them."""
         health = self._builder.build(
             status=status,
             problems=[problem],
@@ -69,7 +69,7 @@ class Sender:
         self._put(self._health, health, "")
 
     def published(self) -> Mapping[str, int]:
-        """How many messages have been sent on each key."""
+        """Messages sent, by key."""
         return {key: publisher.published for key, publisher in self._publishers.items()}
 
     def _publisher(self, key: str, topic: str) -> Publisher:
@@ -80,5 +80,5 @@ class Sender:
 
 
 def tray_of(key: str) -> str:
-    """The tray in a key of the bus."""
+    """The tray in a key."""
     return key.split("/")[2]

@@ -1,4 +1,4 @@
-"""What was decided, as people and machines read it: alarms from raised to cleared, and two such lists side by side."""
+"""Alarm episodes, each from raised to cleared, and the comparison of two lists of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from schemas.messages import Alarm, Diagnosis
 
 @dataclass(frozen=True)
 class Episode:
-    """An alarm from being raised to being cleared, or to the end: then `cleared_ns` is None."""
+    """One alarm from raised to cleared; `cleared_ns` is None if it was active at the end."""
 
     tray: str
     fan: int
@@ -22,13 +22,13 @@ class Episode:
     """the highest"""
     residual_rad_s: float | None
     torque_balance_command: float | None
-    """as it was raised; None where none was known"""
+    """both when it was raised; None where unknown"""
     message: str
     causes: tuple[Diagnosis, ...]
-    """as they were known last"""
+    """the newest diagnosis"""
 
     def as_json(self) -> dict[str, Any]:
-        """For machines; times in the recording's own clock, ns."""
+        """The JSON form; times on the recording's clock in ns."""
         return {
             "tray": self.tray,
             "fan": self.fan,
@@ -44,34 +44,35 @@ class Episode:
 
 
 def episodes(alarms: Iterable[Alarm]) -> list[Episode]:
-    """The alarms of one or several trays, by the time they were raised.
+    """The episodes of one or several trays, in the order they were raised.
 
-    A session of the scorer that raises what an earlier one had raised and never cleared goes on with that alarm.
+    If a scorer restarts without a snapshot and raises an alarm that its predecessor raised and did not clear, both
+    are one episode.
     """
     found: list[Episode] = []
-    standing: dict[tuple[str, int], list[Alarm]] = {}
+    open_alarms: dict[tuple[str, int], list[Alarm]] = {}
     for alarm in sorted(alarms, key=lambda alarm: alarm.t_ns):
         fan = (alarm.header.tray, alarm.fan)
         if alarm.active:
-            standing.setdefault(fan, []).append(alarm)
-        elif fan in standing:
-            found.append(_episode([*standing.pop(fan), alarm], alarm.t_ns))
-    found += [_episode(told, None) for told in standing.values()]
+            open_alarms.setdefault(fan, []).append(alarm)
+        elif fan in open_alarms:
+            found.append(_episode([*open_alarms.pop(fan), alarm], alarm.t_ns))
+    found += [_episode(alarms_of_fan, None) for alarms_of_fan in open_alarms.values()]
     return sorted(found, key=lambda episode: (episode.raised_ns, episode.tray, episode.fan))
 
 
 @dataclass(frozen=True)
 class AlarmDiff:
-    """How one list of alarms differs from another. An alarm is in both where the same fan's overlap in time."""
+    """How two lists of episodes differ. An episode is in both if one of the same fan overlaps it in time."""
 
     gained: list[Episode]
     lost: list[Episode]
     kept: list[Episode]
-    """as they are now"""
+    """in the new list, as they are there"""
 
 
 def compare_episodes(now: list[Episode], before: list[Episode]) -> AlarmDiff:
-    """What has been gained and lost since `before`."""
+    """The episodes that are gained, lost and kept compared with `before`."""
     kept = [episode for episode in now if any(_overlap(episode, other) for other in before)]
     return AlarmDiff(
         gained=[episode for episode in now if episode not in kept],
@@ -94,23 +95,23 @@ def _to(episode: Episode) -> int:
     return 2**63 if episode.cleared_ns is None else episode.cleared_ns
 
 
-def _episode(told: list[Alarm], cleared_ns: int | None) -> Episode:
-    """told: all that was said of it, in order."""
-    first = told[0]
+def _episode(messages: list[Alarm], cleared_ns: int | None) -> Episode:
+    """messages: all of this episode, in order."""
+    first = messages[0]
     return Episode(
         tray=first.header.tray,
         fan=first.fan,
         raised_ns=first.t_ns,
         cleared_ns=cleared_ns,
         onset_ns=first.onset_t_ns,
-        severity=max(alarm.severity for alarm in told).name.lower(),
+        severity=max(alarm.severity for alarm in messages).name.lower(),
         residual_rad_s=_known(first.residual_rad_s),
         torque_balance_command=_known(first.torque_balance_command),
         message=first.message,
-        causes=next((alarm.causes for alarm in reversed(told) if alarm.causes), ()),
+        causes=next((alarm.causes for alarm in reversed(messages) if alarm.causes), ()),
     )
 
 
 def _known(value: float) -> float | None:
-    """Of an alarm: a message holds 0 for what was not known, and what was is never so to the last bit."""
+    """None for 0.0, which a message holds where the value is unknown."""
     return value or None

@@ -37,7 +37,7 @@ def test_without_a_terminal_there_are_no_keys(monkeypatch, tmp_path):
     with (tmp_path / "input").open("w+") as no_terminal:
         monkeypatch.setattr(sys, "stdin", no_terminal)
         keys = Keys()
-        assert not keys.are_there
+        assert not keys.is_available
         with keys:
             assert keys.pressed() == []
 
@@ -49,7 +49,7 @@ def test_keys_are_read_without_return_and_the_terminal_is_as_before_even_after_a
         monkeypatch.setattr(sys, "stdin", terminal)
         before = termios.tcgetattr(theirs)
         keys = Keys()
-        assert keys.are_there
+        assert keys.is_available
         with pytest.raises(KeyboardInterrupt), keys:
             os.write(ours, b" q")
             assert not termios.tcgetattr(theirs)[3] & termios.ICANON
@@ -67,5 +67,5 @@ def test_in_the_background_of_a_terminal_there_are_no_keys(monkeypatch):
     monkeypatch.setattr(os, "tcgetpgrp", lambda _descriptor: os.getpgrp() + 1)
     with os.fdopen(theirs, "r") as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)
-        assert not Keys().are_there
+        assert not Keys().is_available
     os.close(ours)

@@ -94,7 +94,7 @@ def sites(endpoint):
 
 
 def settled(listeners: Listeners, stop: threading.Event, say) -> list[str]:
-    return listeners.settle("replay-1", {GRID: 100}, stop, say)
+    return listeners.wait_until_drained("replay-1", {GRID: 100}, stop, say)
 
 
 def test_it_waits_until_those_who_are_there_have_said_how_they_are(sites):
@@ -110,7 +110,7 @@ def test_it_waits_until_those_who_are_there_have_said_how_they_are(sites):
 
     speaker = threading.Thread(target=say_on)
     speaker.start()
-    listeners.meet(threading.Event())
+    listeners.wait_for_discovery(threading.Event())
     done.set()
     speaker.join()
     assert listeners.readers(("grid",)) == ["twin_integrator"]
@@ -146,7 +146,7 @@ def test_it_is_settled_when_all_has_been_taken_down_the_whole_chain(sites):
 
 
 def test_whoever_stops_changing_and_is_behind_is_named(sites, monkeypatch):
-    monkeypatch.setattr("pipeline.replay.live.listeners._PATIENCE_S", 0.2)
+    monkeypatch.setattr("pipeline.replay.live.listeners._STALLED_S", 0.2)
     bus, listeners = sites
     twin = FakeStage(bus, "twin_integrator")
     twin.say(line(GRID, "replay-1", 99))
@@ -159,7 +159,7 @@ def test_what_was_sent_before_a_listener_heard_it_counts_as_lost_if_it_was_there
     twin, recorder = FakeStage(bus, "twin_integrator"), FakeStage(bus, "recorder")
     twin.say()
     eventually(listeners._views, "it is known")
-    listeners._there_at_start = {twin.producer}
+    listeners._present_at_start = {twin.producer}
     twin.say(line(GRID, "replay-1", 90, first=7, missing=3), lost=3)
     recorder.say(line(GRID, "replay-1", 50, first=50))
     eventually(lambda: len(listeners._views()) == 2, "both are known")

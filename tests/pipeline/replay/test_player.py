@@ -49,10 +49,10 @@ class Sent:
         self.messages.append((round(self.time.s - 50.0, 6), entry.topic, entry.message.header.sequence))
         self.time.s += self.cost_s
 
-    def tell_clock(self, t_ns: int, rate: float) -> None:
+    def publish_clock(self, t_ns: int, rate: float) -> None:
         self.clocks.append((self.time.s - 50.0, t_ns - START_NS, rate))
 
-    def tell_health(self, status: StageStatus = StageStatus.OK, problem: str = "") -> None:
+    def publish_health(self, status: StageStatus = StageStatus.OK, problem: str = "") -> None:
         self.healths.append(self.time.s - 50.0)
 
     def published(self) -> Mapping[str, int]:
@@ -135,7 +135,7 @@ def test_the_time_is_told_before_the_first_message():
         def send(self, entry: Envelope) -> None:
             order.append("message")
 
-        def tell_clock(self, t_ns: int, rate: float) -> None:
+        def publish_clock(self, t_ns: int, rate: float) -> None:
             order.append("clock")
 
     time = FakeTime()

@@ -14,7 +14,7 @@ from mcap.records import ChunkIndex
 
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.writing import RecordingWriter
-from pipeline.replay.live.recording_playback import Extent, RecordingPlayback, shifted
+from pipeline.replay.live.recording_playback import RecordingPlayback, TimeExtent, shifted
 from schemas.envelope import Envelope
 from schemas.fields import columns
 from schemas.messages import MESSAGE_TYPES, Alarm, Grid, Header, InvalidReason, ModelCard, Severity
@@ -42,17 +42,17 @@ def test_parts_are_played_in_the_order_of_their_times_and_what_two_parts_hold_is
     parts = [part(tmp_path / "z.mcap", range(20)), part(tmp_path / "b.mcap", range(15, 40), 1.0)]
     parts.append(part(tmp_path / "a.mcap", range(40, 50), 2.0))
     random.Random(3).shuffle(parts)
-    reel = RecordingPlayback([*parts, parts[0]], ("raw",))
-    assert [file.name for file in reel.files] == ["z.mcap", "b.mcap", "a.mcap"]
-    assert sequences(reel) == list(range(50))
-    assert sequences(reel) == list(range(50)), "a second time it is the same"
+    playback = RecordingPlayback([*parts, parts[0]], ("raw",))
+    assert [file.name for file in playback.files] == ["z.mcap", "b.mcap", "a.mcap"]
+    assert sequences(playback) == list(range(50))
+    assert sequences(playback) == list(range(50)), "a second time it is the same"
 
 
 def test_parts_of_a_session_keep_their_order_where_the_hosts_clock_was_set_back(tmp_path):
     first = part(tmp_path / "r.mcap", range(50), 100.0, session="s", part="1")
     second = part(tmp_path / "r-2.mcap", range(50, 100), 0.0, session="s", part="2")
-    reel = RecordingPlayback([second, first], ("raw",))
-    assert sequences(reel) == list(range(100))
+    playback = RecordingPlayback([second, first], ("raw",))
+    assert sequences(playback) == list(range(100))
 
 
 def test_a_message_that_was_fetched_later_does_not_end_a_stretch(tmp_path):
@@ -64,9 +64,9 @@ def test_a_message_that_was_fetched_later_does_not_end_a_stretch(tmp_path):
 
 
 def test_a_stretch_begins_and_ends_in_seconds_since_the_first_message(tmp_path):
-    reel = RecordingPlayback([write_raw(tmp_path / "r.mcap", 500)], ("raw",), 1.0, 2.5)
-    assert sequences(reel) == list(range(100, 251))
-    assert reel.end_s() == 2.5
+    playback = RecordingPlayback([write_raw(tmp_path / "r.mcap", 500)], ("raw",), 1.0, 2.5)
+    assert sequences(playback) == list(range(100, 251))
+    assert playback.end_s() == 2.5
     assert RecordingPlayback([tmp_path / "r.mcap"], ("raw",)).end_s() == pytest.approx(4.99)
 
 
@@ -102,13 +102,13 @@ def test_a_recording_without_such_messages_ends_even_in_a_loop(tmp_path):
 
 @pytest.mark.parametrize("span_ns", [10 * 33_333_333, 10 * 33_333_333 + 5])
 def test_a_round_is_a_whole_number_of_grid_steps_and_longer_than_all_that_is_in_it(span_ns):
-    extent = Extent()
+    extent = TimeExtent()
     for t_ns in (START_NS, START_NS + span_ns):
         zeros = np.zeros((1, 1))
         why = np.full((1, 1), InvalidReason.NONE, np.uint8)
         states = {"valid": zeros == 0, "invalid_reason": why, "command": zeros, "speed_rad_s": zeros}
         grid = Grid(fans=1, period_ns=33_333_333, t_ns=np.array([t_ns]), **states)
-        extent.note(Envelope.of("fantwin/demo/tray1/grid", grid, START_NS + 7))
+        extent.add(Envelope.of("fantwin/demo/tray1/grid", grid, START_NS + 7))
     assert extent.length_ns() % 33_333_333 == 0
     assert span_ns < extent.length_ns() <= span_ns + 33_333_333
 
@@ -140,12 +140,12 @@ def test_a_torn_part_is_played_as_far_as_it_goes_and_told(tmp_path):
     whole = write_raw(tmp_path / "whole.mcap", 3000)
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    reel = RecordingPlayback([torn], ("raw",))
-    count = sum(1 for _ in reel)
+    playback = RecordingPlayback([torn], ("raw",))
+    count = sum(1 for _ in playback)
     assert 0 < count < 3000
-    (said,) = reel.damage
+    (said,) = playback.damage
     assert "torn.mcap" in said
-    assert reel.end_s() is None
+    assert playback.end_s() is None
 
 
 @pytest.mark.parametrize("what", ["the content of a chunk", "the length of a record"])

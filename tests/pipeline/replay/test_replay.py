@@ -32,21 +32,21 @@ def recording(tmp_path):
         ("--rate inf", "give a number above 0"),
         ("--rate nan", "give a number above 0"),
         ("--rate quick", "give a number above 0"),
-        ("--topics health", "'health' is none of raw, grid"),
-        ("--topics clock", "'clock' is none of"),
-        ("--from score", "'score' is none of raw, grid, prediction"),
+        ("--topics health", "'health' is not one of raw, grid"),
+        ("--topics clock", "'clock' is not one of"),
+        ("--from score", "'score' is not one of raw, grid, prediction"),
         ("--from raw --topics raw", "not both"),
         ("--start 5 --end 5", "--start < --end"),
         ("--start -1", "--start < --end"),
-        ("--pause", "no terminal"),
-        ("--verify", "goes only with --offline"),
-        ("--twin t.onnx", "goes only with --offline"),
-        ("-o out.mcap", "goes only with --offline"),
-        ("--offline --rate 2", "--rate cannot go with --offline"),
-        ("--offline --loop", "--loop cannot go with --offline"),
-        ("--offline --pause", "--pause cannot go with --offline"),
-        ("--offline --topics raw", "--topics cannot go with --offline"),
-        ("--offline --from raw", "--from cannot go with --offline"),
+        ("--pause", "needs a terminal"),
+        ("--verify", "can only be used with --offline"),
+        ("--twin t.onnx", "can only be used with --offline"),
+        ("-o out.mcap", "can only be used with --offline"),
+        ("--offline --rate 2", "--rate cannot be used with --offline"),
+        ("--offline --loop", "--loop cannot be used with --offline"),
+        ("--offline --pause", "--pause cannot be used with --offline"),
+        ("--offline --topics raw", "--topics cannot be used with --offline"),
+        ("--offline --from raw", "--from cannot be used with --offline"),
     ],
 )
 def test_what_makes_no_sense_is_wrong_usage(recording, words, said):
@@ -69,7 +69,7 @@ def test_deciding_again_is_handed_over_as_it_was_asked_for(recording, tmp_path, 
     words = ["--offline", "--verify", "--twin", "t.onnx", "-o", "out.mcap", "--start", 1, "--set", "site=x", "--json"]
     assert fantwin("replay", recording, *words).exit_code == 0
     assert asked["files"] == [recording]
-    assert (asked["verify"], asked["json_output"], asked["from_s"], asked["to_s"]) == (True, True, 1.0, math.inf)
+    assert (asked["verify"], asked["json_output"], asked["start_s"], asked["end_s"]) == (True, True, 1.0, math.inf)
     assert (str(asked["twin"]), str(asked["output"]), asked["overrides"]) == ("t.onnx", "out.mcap", ["site=x"])
 
 
@@ -80,14 +80,14 @@ def test_the_line_tells_time_place_rate_and_messages():
         assert words in line
     later = Progress(START_NS, math.inf, paused=True, round=2, messages=0)
     assert "round 3" in status_line(later, 12.5, 60.0)
-    assert "paused, as fast as it goes" in status_line(later, 12.5, None)
+    assert "paused, as fast as possible" in status_line(later, 12.5, None)
 
 
 def test_round_after_round_a_resampler_sees_a_device_that_restarts_and_loses_nothing(tmp_path):
     core = ResamplerCore(8, ResamplerConfig())
-    reel = RecordingPlayback([write_raw(tmp_path / "long.mcap", 300)], ("raw",))
+    playback = RecordingPlayback([write_raw(tmp_path / "long.mcap", 300)], ("raw",))
     times: list[int] = []
-    for number, entry in reel.rounds():
+    for number, entry in playback.rounds():
         if number == 3:
             break
         times += [int(t_ns) for grid in core.step(entry.message) for t_ns in grid.t_ns]  # pyright: ignore[reportArgumentType]
