@@ -89,7 +89,7 @@ def train_twin(
     fan_numbers (what the recordings call the runs' fans; default: counted from 0), command_unit, data and
     validation_data (the files that the runs are from) and created (default: now) go into the card. The same seed and
     runs give the same model.
-    Raises TwinError when the runs do not tell the parameters, or the result cannot serve as a twin.
+    Raises TwinError when the runs do not determine the parameters, or the result cannot serve as a twin.
     """
     model_kind = find_kind(kind)
     _require_trainer(model_kind, trainer)

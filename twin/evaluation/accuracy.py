@@ -59,12 +59,12 @@ def evaluate_model(model: TwinModel, parameters: Array, sigma_rad_s: Array, runs
     one_step = one_step_residuals(model, parameters, pieces)
     within = np.abs(residual) <= 2.0 * sigma_rad_s
     measured = np.isfinite(speed)
-    spread = np.where(measured, speed - _column_mean(speed), 0.0) ** 2
+    squared_deviation = np.where(measured, speed - _column_mean(speed), 0.0) ** 2
     per_fan = tuple(
-        _figures(measured[:, fan], residual[:, fan], one_step[:, fan], within[:, fan], spread[:, fan])
+        _figures(measured[:, fan], residual[:, fan], one_step[:, fan], within[:, fan], squared_deviation[:, fan])
         for fan in range(speed.shape[1])
     )
-    return Evaluation(per_fan, _figures(measured, residual, one_step, within, spread))
+    return Evaluation(per_fan, _figures(measured, residual, one_step, within, squared_deviation))
 
 
 def evaluation_pieces(runs: Sequence[Run]) -> list[Run]:
@@ -195,11 +195,11 @@ def _residual(measured: Array, predicted: Array) -> Array:
     return np.where(diverged, np.inf, measured - predicted)
 
 
-def _figures(measured: Flags, residual: Array, one_step: Array, within: Flags, spread: Array) -> Figures:
+def _figures(measured: Flags, residual: Array, one_step: Array, within: Flags, squared_deviation: Array) -> Figures:
     samples = int(np.count_nonzero(measured))
     if samples == 0:
         return Figures(np.nan, np.nan, np.nan, np.nan, np.nan, 0)
-    total, errors = float(spread.sum()), np.where(measured, residual, 0.0)
+    total, errors = float(squared_deviation.sum()), np.where(measured, residual, 0.0)
     with np.errstate(over="ignore"):
         squares = float(np.sum(errors**2))
     steps = one_step[np.isfinite(one_step)]

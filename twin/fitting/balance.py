@@ -29,7 +29,7 @@ COEFFICIENTS = ("inertia", "viscous", "drag", "friction")
 def torque_balance(command: Array, speed_rad_s: Array, period_s: float, coefficients: Array, lag_s: Array) -> Array:
     """(n, fans) balance in units of the command; NaN at first, and wherever the speed was not known.
 
-    command, speed_rad_s: (n, fans) on a grid of period_s; an unknown speed is NaN, and the filter starts anew after it.
+    command, speed_rad_s: (n, fans) on a grid of period_s; an unknown speed is NaN, and the filter restarts after it.
     coefficients: (fans, 4) in the order of COEFFICIENTS. lag_s: (fans,), in which the command has long been the first.
     """
     terms, _ = filtered_terms(command, speed_rad_s, period_s, lag_s)

@@ -1,21 +1,20 @@
-"""The coefficients of the torque balance (twin.fitting.balance), learned from healthy runs, and how it moves when all
-is well.
+"""The coefficients of the torque balance (twin.fitting.balance), and its healthy variation, from healthy runs.
 
 There are two candidates for each fan. *physics*: J, alpha, C_D and lag_s of the identification, and the friction by
 least squares. A noisy tacho does not bias them, but the physics know no dry friction, and a speed loop can spoil them.
 *least-squares*: all four coefficients by least squares on the filtered balance, none of the first three below zero;
 the lag is that of the physics. It knows friction and bears a loop, but noise in the speeds makes its inertia too small.
 
-Both are judged by the *spread*: the standard deviation of the balance about the mean of each run. (Constant
-differences between runs are for commissioning to take away.) Least squares is cross-validated: each group of samples
-is judged by coefficients of the others. The physics are judged as they are, for their friction cannot change a spread.
-A group is a run, or a part of one where runs are few. Held-out runs have no say in this; sigma is their spread.
+The candidates are compared by the *residual standard deviation*: that of the balance about the mean of each run.
+(Commissioning removes constant differences between runs.) Least squares is cross-validated: each group of samples uses
+the coefficients of the other groups. The physics need none, for their friction does not change a standard deviation. A
+group is a run, or a part of one where runs are few. Held-out runs take no part in the choice; they give sigma.
 
-The smaller spread is better, but least squares gains some of it by its very bias: where noise takes the share 1 - r
-from its inertia, it takes at most the share 1 - sqrt(r) from the spread (r is the reliability ratio of Fuller,
-Measurement Error Models, 1987, section 1.1). So least squares is chosen where it gains more than that, its spread
-being below that of the physics times sqrt(r), r = inertia / J but within 1/2 and 1: a J of twice the inertia or more
-is not explained by noise.
+The smaller standard deviation is better, but bias alone lowers that of least squares: where noise reduces its inertia
+by the share 1 - r, it reduces the standard deviation by at most the share 1 - sqrt(r) (r is the reliability ratio of
+Fuller, Measurement Error Models, 1987, section 1.1). So least squares is chosen where its standard deviation is below
+that of the physics times sqrt(r), with r = inertia / J, but between 1/2 and 1: noise does not explain a J of twice the
+inertia or more.
 
 A fan that stands, starts or stops is left out, and so is the first second of each stretch. Errors are those of the
 identification where coefficients come from there, otherwise of the jackknife over the groups, which allows for errors
@@ -41,9 +40,9 @@ from twin.runs import GAP_IN_MEDIAN_PERIODS, Array, Run
 LOWEST_SHARE_OF_TOP = 0.05
 SETTLING_S = 3.0 / FILTER_RATE_PER_S
 ENOUGH_RUNS, GROUPS = 4, 8
-LEAST_RELIABILITY = 0.5
+MIN_RELIABILITY = 0.5
 INERTIA, FRICTION = COEFFICIENTS.index("inertia"), COEFFICIENTS.index("friction")
-LEAST_COEFFICIENTS = (0.0, 0.0, 0.0, -np.inf)
+LOWER_BOUNDS = (0.0, 0.0, 0.0, -np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +51,8 @@ class BalanceFit:
 
     coefficients: (fans, 4) in the order of balance.COEFFICIENTS. covariance: (fans, 4, 4) of their errors, zero where a
     coefficient stays at its bound whatever is left out. The others are (fans,): lag_s, sigma_command (the healthy
-    spread within a run), autocorrelation_time_s (as in residual_analysis; the filter's own where the runs are too short
-    to tell), lowest_speed_rad_s (below it the balance means nothing), sources (which candidate).
+    standard deviation within a run), autocorrelation_time_s (as in residual_analysis; that of the filter where the runs
+    are too short), lowest_speed_rad_s (below it the balance does not hold), sources (which candidate).
     """
 
     coefficients: Array
@@ -85,7 +84,7 @@ class _Stretch:
 
 
 def fit_balance(runs: Sequence[Run], held_out: Sequence[Run], identification: Identification) -> BalanceFit:
-    """Learn and choose by the runs; sigma is that of the held-out ones, or of the same where there are none.
+    """Fit and choose on the runs; sigma comes from the held-out runs, or from the same ones where there are none.
 
     Raises TwinError where a fan never turns long enough, or its balance never moves.
     """
@@ -96,7 +95,9 @@ def fit_balance(runs: Sequence[Run], held_out: Sequence[Run], identification: Id
     fans = range(len(lag_s))
     chosen = [_choose(learned, identification, fan) for fan in fans]
     coefficients = np.array([coefficients for coefficients, _, _ in chosen])
-    sigma = np.array([_spread([balance_of(run, coefficients[fan]) for run in _by_run(judged, fan)]) for fan in fans])
+    sigma = np.array(
+        [_residual_std([balance_of(run, coefficients[fan]) for run in _by_run(judged, fan)]) for fan in fans]
+    )
     if not np.all(sigma > 0.0):
         raise TwinError(f"fan {np.argmin(sigma > 0.0)}: its torque balance never moves; check the speed column")
     return BalanceFit(
@@ -149,16 +150,18 @@ def _choose(
     runs = _by_run(learned, fan)
     parts = 1 if len(runs) >= ENOUGH_RUNS else -(-GROUPS // len(runs))
     groups = [np.array_split(run, parts) for run in runs]
-    # A triangle of five rows says of a group all that least squares ask.
+    # The triangular factor, five rows, holds all that least squares needs of a group.
     triangles = [np.linalg.qr(group).R for of_run in groups for group in of_run]
     free = _least_squares(triangles)
     without = [_least_squares([other for other in triangles if other is not left_out]) for left_out in triangles]
     physics, of_physics = _physics([group for of_run in groups for group in of_run], identification, fan)
     of_others = iter(without)
-    spread = _spread([np.concatenate([balance_of(group, next(of_others)) for group in of_run]) for of_run in groups])
-    spread_of_physics = _spread([balance_of(run, physics) for run in runs])
-    reliability = np.clip(free[INERTIA] / physics[INERTIA], LEAST_RELIABILITY, 1.0)
-    if spread < spread_of_physics * np.sqrt(reliability):
+    least_squares_std = _residual_std(
+        [np.concatenate([balance_of(group, next(of_others)) for group in of_run]) for of_run in groups]
+    )
+    physics_std = _residual_std([balance_of(run, physics) for run in runs])
+    reliability = np.clip(free[INERTIA] / physics[INERTIA], MIN_RELIABILITY, 1.0)
+    if least_squares_std < physics_std * np.sqrt(reliability):
         return free, _jackknife(np.array(without)), "least-squares"
     return physics, of_physics, "physics"
 
@@ -183,7 +186,7 @@ def _least_squares(triangles: Sequence[Array]) -> Array:
     """(4,) coefficients that leave the least balance."""
     stacked = np.concatenate(triangles)
     scale = np.linalg.norm(stacked[:, 1:], axis=0) + np.finfo(float).tiny
-    return lsq_linear(stacked[:, 1:] / scale, stacked[:, 0], (LEAST_COEFFICIENTS, np.inf), method="bvls").x / scale
+    return lsq_linear(stacked[:, 1:] / scale, stacked[:, 0], (LOWER_BOUNDS, np.inf), method="bvls").x / scale
 
 
 def _jackknife(without: Array) -> Array:
@@ -206,7 +209,7 @@ def _by_run(stretches: Sequence[_Stretch], fan: int) -> list[Array]:
     return runs
 
 
-def _spread(balances: Sequence[Array]) -> float:
+def _residual_std(balances: Sequence[Array]) -> float:
     """Standard deviation within runs, over all their samples."""
     return float(np.sqrt(np.mean(np.concatenate([balance - balance.mean() for balance in balances]) ** 2)))
 

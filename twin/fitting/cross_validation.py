@@ -1,11 +1,11 @@
 """How far a network may depart from the physics, chosen by recordings left out.
 
 A free-running model that fits a handful of recordings to the last disturbance predicts the next one worse than its
-physics do. With several recordings and none held out, each third of them is left out in turn and predicted in free run
-with several spreads of the prior (mean absolute error, the published loss). The smallest spread is taken that is not
-worse than the best by more than one standard error of their difference over the recordings (the rule of one standard
-error: Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, section 7.10). For a hybrid a spread of
-zero is among the choices: no network at all.
+physics do. With several recordings and none held out, each third of them is left out in turn and predicted in free
+run, with several prior standard deviations of the network (mean absolute error, the published loss). The smallest one
+is taken that is not worse than the best by more than one standard error of their difference over the recordings (the
+rule of one standard error: Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, section 7.10). For a
+hybrid zero is among the choices: no network at all.
 """
 
 from collections.abc import Sequence
@@ -15,34 +15,37 @@ import numpy as np
 from twin.errors import TwinError
 from twin.evaluation.accuracy import evaluation_pieces, free_run_residuals
 from twin.fitting.identification import identify
-from twin.fitting.training import GRID_SPREAD, Physics, Progress, train_network
+from twin.fitting.training import GRID_PRIOR_STD, Physics, Progress, train_network
 from twin.models.model import NetworkOde
 from twin.runs import Array, Run
 
-SPREADS = (0.1 * GRID_SPREAD, GRID_SPREAD)
+PRIOR_STDS = (0.1 * GRID_PRIOR_STD, GRID_PRIOR_STD)
 FOLDS = 3
 ITERATIONS = 25
 
 
-def chosen_spread(
+def choose_prior_std(
     model: NetworkOde, runs: Sequence[Run], *, seed: int, physics: Physics, progress: Progress | None = None
 ) -> float:
-    """The spread for training.train_network. The usual one where there is a single run, or too little without one."""
+    """The prior standard deviation for training.train_network.
+
+    GRID_PRIOR_STD where there is a single run, or where the runs are too few to leave some out.
+    """
     # A recording in which some fan was never measured judges nothing.
     runs = [run for run in runs if np.all(np.isfinite(run.speed_rad_s).any(axis=0))]
     folds = min(FOLDS, len(runs))
     if folds < 2:
-        return GRID_SPREAD
-    spreads = (0.0, *SPREADS) if model.has_physics else SPREADS
-    losses: list[list[float]] = [[] for _ in spreads]
+        return GRID_PRIOR_STD
+    prior_stds = (0.0, *PRIOR_STDS) if model.has_physics else PRIOR_STDS
+    losses: list[list[float]] = [[] for _ in prior_stds]
     for fold in range(folds):
         left_out, rest = list(runs[fold::folds]), [run for k, run in enumerate(runs) if k % folds != fold]
         try:
             identification = identify(rest)
         except TwinError:
             # What is left does not excite every fan: nothing can be learned from this choice.
-            return GRID_SPREAD
-        for index, spread in enumerate(spreads):
+            return GRID_PRIOR_STD
+        for index, prior_std in enumerate(prior_stds):
             trained, parameters, _ = train_network(
                 model,
                 rest,
@@ -51,11 +54,11 @@ def chosen_spread(
                 max_iterations=ITERATIONS,
                 seed=seed,
                 physics=physics,
-                spread=spread,
+                prior_std=prior_std,
                 progress=progress,
             )
             losses[index] += [_loss(trained, parameters, run) for run in left_out]
-    return spreads[simplest_of_the_best(np.array(losses))]
+    return prior_stds[simplest_of_the_best(np.array(losses))]
 
 
 def simplest_of_the_best(losses: Array) -> int:

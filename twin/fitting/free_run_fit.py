@@ -46,25 +46,26 @@ NONE_FREE = np.zeros(len(PARAMETER_NAMES), dtype=bool)
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """weights: (P,), empty without a network. own: (fans, 4), see twin.models.physical. initial_speed_rad_s:
+    """weights: (P,), empty without a network. physics: (fans, 4), see twin.models.physical. initial_speed_rad_s:
     (batch,)."""
 
     weights: Array
-    own: Array
+    physics: Array
     initial_speed_rad_s: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Quadratic pulls, in units of squared scaled residuals: weights towards zero, own unknowns towards own_mean.
+    """Quadratic pulls, in units of squared scaled residuals: weights towards zero, the physics towards
+    physics_mean.
 
-    own: (4,). own_mean: (fans, 4). network: pulls the network's acceleration towards what it should be where no data
-    say otherwise, or None.
+    physics: (4,). physics_mean: (fans, 4). network: pulls the acceleration of the network towards a
+    given one where there are no data, or None.
     """
 
     weights: float
-    own: Array
-    own_mean: Array
+    physics: Array
+    physics_mean: Array
     network: "NetworkPrior | None" = None
 
 
@@ -117,7 +118,7 @@ IterationDone = Callable[[int, Unknowns, float], bool]
 
 def fit_free_run(
     model: OdeModel,
-    own: Array,
+    physics: Array,
     top_speed_rad_s: Array,
     trajectories: Trajectories,
     *,
@@ -128,15 +129,15 @@ def fit_free_run(
     estimate_initial_speed: bool = True,
     iteration_done: IterationDone | None = None,
 ) -> FreeRunFit:
-    """Fit the weights of the model, where it has any, starting from its own, and the free ones of the own unknowns.
+    """Fit the weights of the model, where it has any, starting from its own, and the free ones of the physics unknowns.
 
-    own: (fans, 4) to start from. top_speed_rad_s: (fans,). free: (4,) or (fans, 4).
+    physics: (fans, 4) to start from. top_speed_rad_s: (fans,). free: (4,) or (fans, 4).
     estimate_initial_speed: otherwise the first measured speeds stand, as they do in service; an unstable equilibrium
     cannot then hide behind an initial speed that happens to balance on it. It stops when a step lowers the cost by
     less than tolerance, relative, or when none lowers it.
     """
     problem = FreeRunProblem(model, trajectories, top_speed_rad_s, free, prior, estimate_initial_speed)
-    start = Unknowns(model.theta, own, trajectories.starting_speed_rad_s())
+    start = Unknowns(model.theta, physics, trajectories.starting_speed_rad_s())
     point = problem.evaluate(start, trajectories.interpolated_speed_rad_s())
     iteration = 0
     for _ in range(SCALE_ROUNDS):
@@ -229,19 +230,22 @@ class FreeRunProblem:
 
     def parameters(self, unknowns: Unknowns) -> Array:
         """(fans, 4) physical parameters."""
-        return physical_parameters(unknowns.own, self.top_speed_rad_s)
+        return physical_parameters(unknowns.physics, self.top_speed_rad_s)
 
     def total(self, point: Point) -> Array:
         """(groups,) cost with the prior."""
-        own = 0.5 * np.sum(self.prior.own * (point.unknowns.own - self.prior.own_mean) ** 2, axis=1)
-        total = np.bincount(self.group_of_fan, point.cost + own, self.groups).astype(np.float64)
+        physics = 0.5 * np.sum(self.prior.physics * (point.unknowns.physics - self.prior.physics_mean) ** 2, axis=1)
+        total = np.bincount(self.group_of_fan, point.cost + physics, self.groups).astype(np.float64)
         weights = point.unknowns.weights
         if self.prior.network is not None:
             total = total + self.prior.network.cost(self._network(weights))
         return total + 0.5 * self.prior.weights * float(weights @ weights)
 
     def normal_equations(self, point: Point) -> tuple[Array, Array]:
-        """Per trajectory the weighted S^T S (batch, M, M) and S^T residual (batch, M): weights, own, initial speed."""
+        """For each trajectory the weighted S^T S (batch, M, M) and S^T residual (batch, M).
+
+        The unknowns are in the order weights, physics, initial speed.
+        """
         data = self.trajectories
         steps, batch = data.command.shape
         size = self.weights + len(PARAMETER_NAMES) + 1
@@ -264,7 +268,7 @@ class FreeRunProblem:
         return np.where(data.measured[:, part], 1.0 / np.hypot(1.0, scaled / HUBER_DELTA), 0.0)
 
     def sensitivities(self, point: Point, part: slice) -> Array:
-        """(n, batch, M) derivatives of the free run by weights, own unknowns and initial speed."""
+        """(n, batch, M) derivatives of the free run by weights, physics unknowns and initial speed."""
         data = self.trajectories
         fan, step_s = data.fan[part], data.step_s[:, part]
         parameters = self.parameters(point.unknowns)[fan]
@@ -275,7 +279,7 @@ class FreeRunProblem:
         by_parameters[..., LAG] = raw[..., -2]
         if equation.parameters is not None:
             by_parameters[..., :LAG] = raw[..., self.weights : -2]
-        chain = parameters_by_unknowns(point.unknowns.own, self.top_speed_rad_s)[fan]
+        chain = parameters_by_unknowns(point.unknowns.physics, self.top_speed_rad_s)[fan]
         by_own = np.einsum("nbp,bpq->nbq", by_parameters, chain)
         return np.concatenate((raw[..., : self.weights], by_own, raw[..., -1:]), axis=-1)
 
@@ -294,16 +298,20 @@ class FreeRunProblem:
         np.add.at(downhill, fan_of, gradient[:, :-1] - coupling * gradient[:, -1:])
         np.add.at(diagonal, fan_of, np.diagonal(squares[:, :-1, :-1], axis1=1, axis2=2))
 
-        weights, own = slice(self.weights), slice(self.weights, None)
-        pivot = self._own_pivot(unknowns, reduced[:, own, own], downhill[:, own], diagonal[:, own], damping_of_fan)
-        downhill[:, own] -= self.prior.own * (unknowns.own - self.prior.own_mean)
-        shared = np.linalg.solve(pivot, np.concatenate((reduced[:, own, weights], downhill[:, own, None]), axis=-1))
+        weights, physics = slice(self.weights), slice(self.weights, None)
+        pivot = self._physics_pivot(
+            unknowns, reduced[:, physics, physics], downhill[:, physics], diagonal[:, physics], damping_of_fan
+        )
+        downhill[:, physics] -= self.prior.physics * (unknowns.physics - self.prior.physics_mean)
+        shared = np.linalg.solve(
+            pivot, np.concatenate((reduced[:, physics, weights], downhill[:, physics, None]), axis=-1)
+        )
         share, alone = shared[..., :-1], shared[..., -1]
         move = np.zeros(self.weights)
         if self.weights:
             of_weights = diagonal[:, weights].sum(axis=0)
-            hessian = np.sum(reduced[:, weights, weights] - reduced[:, weights, own] @ share, axis=0)
-            slope = np.sum(downhill[:, weights] - np.einsum("fwo,fo->fw", reduced[:, weights, own], alone), axis=0)
+            hessian = np.sum(reduced[:, weights, weights] - reduced[:, weights, physics] @ share, axis=0)
+            slope = np.sum(downhill[:, weights] - np.einsum("fwo,fo->fw", reduced[:, weights, physics], alone), axis=0)
             if self.prior.network is not None:
                 squares_of_prior, slope_of_prior = self.prior.network.normal_equations(self._network(unknowns.weights))
                 hessian += squares_of_prior
@@ -311,26 +319,28 @@ class FreeRunProblem:
             floor = 1e-12 * of_weights.max() + np.finfo(float).tiny
             hessian[np.diag_indices(self.weights)] += damping[0] * of_weights + self.prior.weights + floor
             move = np.linalg.solve(hessian, slope - self.prior.weights * unknowns.weights)
-        own_move = np.where(self.free, alone - share @ move, 0.0)
-        whole = np.concatenate((np.broadcast_to(move, (self.fans, self.weights)), own_move), axis=1)
+        physics_move = np.where(self.free, alone - share @ move, 0.0)
+        whole = np.concatenate((np.broadcast_to(move, (self.fans, self.weights)), physics_move), axis=1)
         initial_move = gradient[:, -1] / by_initial - np.sum(coupling * whole[fan_of], axis=1)
-        new_own = unknowns.own + own_move
-        new_own[:, LAG] = np.maximum(new_own[:, LAG], 0.0)
-        return Unknowns(unknowns.weights + move, new_own, unknowns.initial_speed_rad_s + initial_move)
+        new_physics = unknowns.physics + physics_move
+        new_physics[:, LAG] = np.maximum(new_physics[:, LAG], 0.0)
+        return Unknowns(unknowns.weights + move, new_physics, unknowns.initial_speed_rad_s + initial_move)
 
     def _network(self, weights: Array) -> TanhNetwork:
         network = self.model.network
         assert network is not None, "a prior on a network needs a network"
         return network.with_theta(weights)
 
-    def _own_pivot(self, unknowns: Unknowns, reduced: Array, downhill: Array, diagonal: Array, damping: Array) -> Array:
-        """(fans, 4, 4) the damped curvature of the own unknowns; those that are held get one beyond all measure."""
+    def _physics_pivot(
+        self, unknowns: Unknowns, reduced: Array, downhill: Array, diagonal: Array, damping: Array
+    ) -> Array:
+        """(fans, 4, 4) the damped curvature of the physics unknowns; a very large one for those that are held."""
         held = np.broadcast_to(~self.free, diagonal.shape).copy()
         # A lag of zero that would fall further stays where it is.
-        held[:, LAG] |= (unknowns.own[:, LAG] <= 0.0) & (downhill[:, LAG] <= 0.0)
+        held[:, LAG] |= (unknowns.physics[:, LAG] <= 0.0) & (downhill[:, LAG] <= 0.0)
         largest = diagonal.max(axis=1, keepdims=True) + 1.0
         # An unknown without any effect still needs a pivot: the floor keeps the system solvable and the step zero.
-        ridge = damping[:, None] * diagonal + self.prior.own + 1e-12 * largest + np.where(held, HELD * largest, 0.0)
+        ridge = damping[:, None] * diagonal + self.prior.physics + 1e-12 * largest + np.where(held, HELD * largest, 0.0)
         pivot = reduced.copy()
         pivot[:, np.arange(len(PARAMETER_NAMES)), np.arange(len(PARAMETER_NAMES))] += ridge
         return pivot
@@ -343,7 +353,7 @@ class FreeRunProblem:
         column = fan[self.trajectories.fan]
         unknowns = Unknowns(
             weights=new.unknowns.weights,
-            own=np.where(fan[:, np.newaxis], new.unknowns.own, old.unknowns.own),
+            physics=np.where(fan[:, np.newaxis], new.unknowns.physics, old.unknowns.physics),
             initial_speed_rad_s=np.where(column, new.unknowns.initial_speed_rad_s, old.unknowns.initial_speed_rad_s),
         )
         return replace(

@@ -24,8 +24,8 @@ UNCERTAIN_INERTIA = 0.25
 # alpha and C_D of a fan run from standstill to top speed correlate by -0.96 to -0.98, from two thirds of it by -0.99.
 TRADE_OFF_CORRELATION = -0.99
 NARROW_SPEED_RANGE = 0.35
-# So many standard errors from zero, a drag coefficient is told even where the two trade off.
-WELL_TOLD = 10.0
+# At so many standard errors from zero, a coefficient counts as determined even where the two trade off.
+WELL_DISTINCT = 10.0
 # Of the damping at one end of the speeds to that at the other; the fit keeps both positive (twin.models.physical).
 EDGE = 1e-3
 # Noise estimates scatter by some percent.
@@ -54,7 +54,7 @@ MORE_OF = {
 
 
 def identifiability_warnings(runs: Sequence[Run], parameters: Array, covariance: Array) -> tuple[str, ...]:
-    """One line for each thing that the runs cannot tell of each fan; none when all is well.
+    """One warning for each thing that the runs do not determine about a fan; none where they determine everything.
 
     parameters: (fans, 4) in the order of PARAMETER_NAMES. covariance: (fans, 4, 4), zero for a parameter that was held.
     """
@@ -177,21 +177,21 @@ def _inertia(pieces: Sequence[Run], fan: int, parameters: Array, covariance: Arr
 
 
 def _drag(pieces: Sequence[Run], fan: int, parameters: Array, covariance: Array) -> list[str]:
-    """alpha and C_D: they trade off; or one has the wrong sign, or is not told from zero."""
+    """alpha and C_D: they trade off; or one has the wrong sign, or is not distinguishable from zero."""
     low, high = _speed_range(pieces, fan)
     viscous, drag, errors = parameters[ALPHA], parameters[C_D], np.sqrt(np.diag(covariance))
-    told = viscous > REACH * errors[ALPHA] and drag > REACH * errors[C_D]
-    well_told = viscous > WELL_TOLD * errors[ALPHA] and drag > WELL_TOLD * errors[C_D]
+    distinct = viscous > REACH * errors[ALPHA] and drag > REACH * errors[C_D]
+    well_distinct = viscous > WELL_DISTINCT * errors[ALPHA] and drag > WELL_DISTINCT * errors[C_D]
     product = errors[ALPHA] * errors[C_D]
     correlation = covariance[ALPHA, C_D] / product if product > 0.0 else 0.0
     on_edge = _on_edge(pieces, fan, parameters)
     narrow = high - low < NARROW_SPEED_RANGE * high
-    if narrow and (on_edge or (correlation < TRADE_OFF_CORRELATION and not well_told)):
+    if narrow and (on_edge or (correlation < TRADE_OFF_CORRELATION and not well_distinct)):
         return [
-            f"alpha and C_D cannot be told apart: the speed keeps between {low:.3g} and {high:.3g} rad/s; "
+            f"alpha and C_D cannot be distinguished: the speed keeps between {low:.3g} and {high:.3g} rad/s; "
             f"{_determined(low, high, parameters, covariance)}; record speeds from a third of the largest up to it"
         ]
-    if told and not on_edge:
+    if distinct and not on_edge:
         return []
     lines = []
     for which in (ALPHA, C_D):
@@ -203,9 +203,9 @@ def _drag(pieces: Sequence[Run], fan: int, parameters: Array, covariance: Array)
                 "speeds; a hybrid learns the difference"
             )
         elif on_edge and which == ALPHA and drag > 0.0:
-            lines.append(f"{name} is not told from zero (the fit drove it there): {MORE_OF[which]}")
+            lines.append(f"{name} is not distinguishable from zero (the fit drove it there): {MORE_OF[which]}")
         elif value - reach <= 0.0:
-            lines.append(f"{name} is not told from zero ({value:.3g} ± {reach:.2g}): {MORE_OF[which]}")
+            lines.append(f"{name} is not distinguishable from zero ({value:.3g} ± {reach:.2g}): {MORE_OF[which]}")
     return lines
 
 
@@ -236,7 +236,8 @@ def _lag(pieces: Sequence[Run], parameters: Array, covariance: Array) -> list[st
     if reach_s == 0.0 or lag_s > max(reach_s, period_s):
         return []
     return [
-        f"lag_s ({1e3 * lag_s:.3g} ± {1e3 * reach_s:.2g} ms) is not told by samples every {1e3 * period_s:.3g} ms: "
+        f"lag_s ({1e3 * lag_s:.3g} ± {1e3 * reach_s:.2g} ms) is not determined by samples every "
+        f"{1e3 * period_s:.3g} ms: "
         "no lag, a delay, and clocks of command and speed that differ look the same; record with several samples in a "
         "lag, or take it as the twin's and not as the fan's"
     ]

@@ -88,7 +88,7 @@ class Identification:
 
 
 def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
-    """Identify every fan of the runs. Raises TwinError when the data cannot tell the parameters.
+    """Identify every fan of the runs. Raises TwinError when the data do not determine the parameters.
 
     with_lag: false holds the lag at zero, which is the published model.
     """
@@ -105,16 +105,16 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
     free = np.tile(ALL_FREE, (fans, 1))
     free[:, LAG] = with_lag
     fit, covariance, freedom = _refine(start, free, top_speed, trajectories)
-    lag_s = physical_parameters(fit.point.unknowns.own, top_speed)[:, LAG]
+    lag_s = physical_parameters(fit.point.unknowns.physics, top_speed)[:, LAG]
     unseen = free[:, LAG] & (lag_s <= LAG_IN_STANDARD_ERRORS * np.sqrt(covariance[:, LAG, LAG]))
     iterations = fit.iterations
     if np.any(unseen):
         free[:, LAG] &= ~unseen
-        without = physical_parameters(fit.point.unknowns.own, top_speed)
+        without = physical_parameters(fit.point.unknowns.physics, top_speed)
         without[unseen, LAG] = 0.0
         fit, covariance, freedom = _refine(without, free, top_speed, trajectories, start)
         iterations += fit.iterations
-    parameters = physical_parameters(fit.point.unknowns.own, top_speed)
+    parameters = physical_parameters(fit.point.unknowns.physics, top_speed)
     rmse_rad_s = _rmse_rad_s(fit, trajectories, fans)
     return Identification(
         parameters=parameters,
@@ -200,11 +200,17 @@ def _refine(
 ) -> tuple[FreeRunFit, Array, Array]:
     """The fit of the free run from parameters (fans, 4), and what _covariance says of it."""
     fans = len(start)
-    own = fitted_unknowns(start, top_speed_rad_s)
+    start_physics = fitted_unknowns(start, top_speed_rad_s)
     pull = inertia_anchor(np.count_nonzero(trajectories.measured) / fans)
-    prior = Prior(0.0, pull, own if anchor is None else fitted_unknowns(anchor, top_speed_rad_s))
+    prior = Prior(0.0, pull, start_physics if anchor is None else fitted_unknowns(anchor, top_speed_rad_s))
     fit = fit_free_run(
-        PhysicalModel(), own, top_speed_rad_s, trajectories, free=free, prior=prior, max_iterations=MAX_ITERATIONS
+        PhysicalModel(),
+        start_physics,
+        top_speed_rad_s,
+        trajectories,
+        free=free,
+        prior=prior,
+        max_iterations=MAX_ITERATIONS,
     )
     return fit, *_covariance(fit, free, top_speed_rad_s, trajectories, prior)
 
@@ -234,7 +240,7 @@ def _covariance(
     weighted_initial = weight[:, :, np.newaxis] * by_initial
     overlap = np.sum(weighted_initial * sensitivity[:, :, :-1], axis=0) / np.sum(weighted_initial * by_initial, axis=0)
     slopes_of_all = sensitivity[:, :, :-1] - by_initial * overlap
-    chain = parameters_by_unknowns(fit.point.unknowns.own, top_speed_rad_s)
+    chain = parameters_by_unknowns(fit.point.unknowns.physics, top_speed_rad_s)
     covariance = np.zeros((len(chain), len(PARAMETER_NAMES), len(PARAMETER_NAMES)))
     freedom = np.full((len(chain), len(PARAMETER_NAMES)), BLOCKS - 1.0)
     for fan in range(len(chain)):
@@ -242,9 +248,9 @@ def _covariance(
         # Stretches one after the other, so that a block is a piece of time.
         slopes = slopes_of_all[:, columns].transpose(1, 0, 2).reshape(-1, len(PARAMETER_NAMES))[:, known]
         weights, residual = weight[:, columns].T.ravel(), fit.point.residual[:, columns].T.ravel()
-        # Padding and missing samples tell nothing: a block is a share of what was measured.
-        told = weights > 0.0
-        slopes, weights, residual = slopes[told], weights[told], residual[told]
+        # Padding and missing samples hold no information: blocks are shares of the measured samples.
+        counted = weights > 0.0
+        slopes, weights, residual = slopes[counted], weights[counted], residual[counted]
         scores = slopes * (weights * residual)[:, np.newaxis]
         # The second derivative of the pseudo-Huber loss, where a step of the fit makes do with its secant.
         weighted = slopes * weights[:, np.newaxis] ** 3

@@ -7,11 +7,11 @@ from typing import Literal
 import numpy as np
 
 from twin.evaluation.accuracy import evaluation_pieces
-from twin.fitting.cross_validation import chosen_spread
+from twin.fitting.cross_validation import choose_prior_std
 from twin.fitting.identification import Identification
 from twin.fitting.initial_weights import initial_weights
 from twin.fitting.narx_training import train_narx
-from twin.fitting.training import GRID_SPREAD, Physics, Progress, data_scaling, train_network
+from twin.fitting.training import GRID_PRIOR_STD, Physics, Progress, data_scaling, train_network
 from twin.models.model import Model, NetworkOde
 from twin.models.network import TanhNetwork
 from twin.models.physical import PhysicalModel
@@ -102,9 +102,9 @@ def _by_adam(untrained: NetworkOde, request: FitRequest, limit: int) -> tuple[Ne
 
 
 def _by_levenberg_marquardt(untrained: NetworkOde, request: FitRequest, limit: int) -> tuple[NetworkOde, Array, int]:
-    spread = GRID_SPREAD
+    prior_std = GRID_PRIOR_STD
     if not request.validation_runs:
-        spread = chosen_spread(
+        prior_std = choose_prior_std(
             untrained, request.runs, seed=request.seed, physics=request.physics, progress=request.progress
         )
     return train_network(
@@ -115,6 +115,6 @@ def _by_levenberg_marquardt(untrained: NetworkOde, request: FitRequest, limit: i
         max_iterations=limit,
         seed=request.seed,
         physics=request.physics,
-        spread=spread,
+        prior_std=prior_std,
         progress=request.progress,
     )

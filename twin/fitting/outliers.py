@@ -16,7 +16,7 @@ from twin.runs import Array, Run
 
 NEIGHBOURS = 11
 LOCAL_DEVIATIONS, TYPICAL_DEVIATIONS = 5.0, 6.0
-LEAST_OF_RANGE = 0.02
+MIN_SHARE_OF_RANGE = 0.02
 QUANTISATION_STEPS = 2.5
 NORMAL_DEVIATION = 1.4826
 """a standard deviation in median absolute deviations of a normal distribution"""
@@ -46,6 +46,8 @@ def _are_outliers(speed_rad_s: Array) -> NDArray[np.bool_]:
     values = np.unique(speed_rad_s)
     step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
     least = max(
-        TYPICAL_DEVIATIONS * float(np.median(deviation)), LEAST_OF_RANGE * float(high - low), QUANTISATION_STEPS * step
+        TYPICAL_DEVIATIONS * float(np.median(deviation)),
+        MIN_SHARE_OF_RANGE * float(high - low),
+        QUANTISATION_STEPS * step,
     )
     return np.abs(speed_rad_s - median) > LOCAL_DEVIATIONS * deviation + least

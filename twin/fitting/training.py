@@ -10,9 +10,9 @@ few time
 2. The same until nothing is gained.
 3. Over stretches as long as is practical and from their measured speeds: the free run itself.
 
-Every iterate is judged as it would serve: by its free run from the measured start, over the held-out runs, or over the
-training runs where none are given. The best one is kept, the untrained network (all weights zero: for a hybrid, its
-physics) being a candidate, and training stops when held-out runs have ceased to improve.
+Every iterate is evaluated as it would be used: by its free run from the measured start, over the held-out runs, or over
+the training runs where none are given. The best one is kept. The untrained network (all weights zero: for a hybrid, its
+physics) is a candidate. Training stops when held-out runs no longer improve.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,11 +49,11 @@ SHORT_STRETCH_TIME_CONSTANTS = 10.0
 STARTS, START_ITERATIONS, START_SAMPLES = 4, 5, 30_000
 SHORT_SHARE = 0.75
 TOLERANCE = 1e-4
-PATIENCE = 10
-# Weights have a prior standard deviation of ten in scaled units: wide enough to be invisible where data speak.
+MAX_STALLED_ITERATIONS = 10
+# Weights have a prior standard deviation of ten in scaled units: too wide to matter where there are data.
 PRIOR_PRECISION = 0.01
 # Each point of the grid counts as much as one sample that tells the acceleration to a spread of its scale.
-GRID_POINTS, GRID_REACH, GRID_SPREAD = 15, 1.5, 0.1
+GRID_POINTS, GRID_REACH, GRID_PRIOR_STD = 15, 1.5, 0.1
 
 
 def data_scaling(runs: Sequence[Run], identification: Identification) -> Scaling:
@@ -79,31 +79,33 @@ def train_network(
     max_iterations: int,
     seed: int = 0,
     physics: Physics = "refined",
-    spread: float = GRID_SPREAD,
+    prior_std: float = GRID_PRIOR_STD,
     progress: Progress | None = None,
 ) -> tuple[NetworkOde, Array, int]:
     """Train the model's network. Returns the trained model, the parameters (fans, 4) and the iterations taken.
 
     max_iterations: of the start that goes on; those of all starts come before. physics: "refined" fits J, alpha, C_D
     and the lag of each fan along with the network; "fixed" leaves them as they were identified, as published.
-    spread: how far the network's acceleration may be from the physics where no data speak, in units of its scale
+    prior_std: how far the network's acceleration may be from the physics where there are no data, in units of its scale
     (twin.fitting.cross_validation chooses it). Zero: the weights stay zero.
     """
-    if spread == 0.0:
+    if prior_std == 0.0:
         return model.with_theta(np.zeros_like(model.network.theta)), identification.parameters, 0
     pieces = evaluation_pieces(runs)
     period_s = min(piece.median_period_s for piece in pieces)
     short = stretch_samples(float(identification.time_constant_s.max()), period_s, SHORT_STRETCH_TIME_CONSTANTS)
     top_speed = identification.top_speed_rad_s
-    own = fitted_unknowns(identification.parameters, top_speed)
-    free = np.full(own.shape, physics == "refined")
+    start_physics = fitted_unknowns(identification.parameters, top_speed)
+    free = np.full(start_physics.shape, physics == "refined")
     # A lag that identification has not found stays out of the model.
     free[:, LAG] &= identification.parameters[:, LAG] > 0.0
     pull = inertia_anchor(sum(piece.samples for piece in pieces))
-    prior = Prior(PRIOR_PRECISION, pull, own, _network_prior(model, identification, spread))
+    prior = Prior(PRIOR_PRECISION, pull, start_physics, _network_prior(model, identification, prior_std))
     in_all = STARTS * START_ITERATIONS + max_iterations
-    untrained = Unknowns(np.zeros_like(model.network.theta), own, np.zeros(0))
-    judge = _Judge(model, untrained, validation_runs or runs, bool(validation_runs), top_speed, in_all, progress)
+    untrained = Unknowns(np.zeros_like(model.network.theta), start_physics, np.zeros(0))
+    best_run = _BestFreeRun(
+        model, untrained, validation_runs or runs, bool(validation_runs), top_speed, in_all, progress
+    )
 
     stretches = cut_into_trajectories(pieces, short)
     few = stretches.thinned(START_SAMPLES)
@@ -111,42 +113,42 @@ def train_network(
     for theta in initial_weights(model, pieces, identification, np.random.default_rng(seed), STARTS):
         fit = fit_free_run(
             model.with_theta(theta),
-            own,
+            start_physics,
             top_speed,
             few,
             free=np.zeros_like(free),
             prior=prior,
             max_iterations=START_ITERATIONS,
-            iteration_done=judge.start_iteration_done,
+            iteration_done=best_run.start_iteration_done,
         )
-        judge.stage_done(fit.iterations)
+        best_run.stage_done(fit.iterations)
         starts.append(fit)
     best = min(starts, key=lambda fit: fit.rmse_rad_s if np.isfinite(fit.rmse_rad_s) else np.inf).point.unknowns
-    judge.consider(best)
-    tried = judge.iterations
+    best_run.consider(best)
+    tried = best_run.iterations
     for data, share, estimate in (
         (stretches, SHORT_SHARE, True),
         (cut_into_trajectories(pieces, practical_samples(pieces, MAX_SAMPLES)), 1.0, False),
     ):
         fit = fit_free_run(
             model.with_theta(best.weights),
-            best.own,
+            best.physics,
             top_speed,
             data,
             free=free,
             prior=prior,
-            max_iterations=max(round(share * max_iterations) + tried - judge.iterations, 1),
+            max_iterations=max(round(share * max_iterations) + tried - best_run.iterations, 1),
             tolerance=TOLERANCE,
             estimate_initial_speed=estimate,
-            iteration_done=judge.iteration_done,
+            iteration_done=best_run.iteration_done,
         )
-        judge.stage_done(fit.iterations)
-        best = judge.best
-    return model.with_theta(best.weights), physical_parameters(best.own, top_speed), judge.iterations
+        best_run.stage_done(fit.iterations)
+        best = best_run.best
+    return model.with_theta(best.weights), physical_parameters(best.physics, top_speed), best_run.iterations
 
 
-def _network_prior(model: NetworkOde, identification: Identification, spread: float) -> NetworkPrior:
-    """Where no data speak, the model is the mean fan's physics: on a grid over and around the recorded ranges."""
+def _network_prior(model: NetworkOde, identification: Identification, prior_std: float) -> NetworkPrior:
+    """Where there are no data, the model is the mean fan's physics: on a grid over and around the recorded ranges."""
     scale = model.network.scaling
     side = np.linspace(-GRID_REACH, GRID_REACH, GRID_POINTS)
     speed, command = (values.ravel() for values in np.meshgrid(side, side))
@@ -156,12 +158,12 @@ def _network_prior(model: NetworkOde, identification: Identification, spread: fl
     untrained = model.with_theta(np.zeros_like(model.network.theta)).equation(mean_fan)
     physics = PhysicalModel().equation(mean_fan).acceleration(speed_rad_s[:, None], commands[:, None])
     known = untrained.acceleration(speed_rad_s[:, None], commands[:, None])
-    weight = (spread * scale.acceleration_scale_rad_s2) ** -2
+    weight = (prior_std * scale.acceleration_scale_rad_s2) ** -2
     return NetworkPrior(speed_rad_s, commands, (physics - known)[:, 0], weight)
 
 
-class _Judge:
-    """Keeps the unknowns with the best free run, and says when held-out runs have ceased to improve."""
+class _BestFreeRun:
+    """Keeps the unknowns with the best free run, and stops the fit when held-out runs no longer improve."""
 
     def __init__(
         self,
@@ -186,18 +188,18 @@ class _Judge:
         self.early = self.data.measured & (np.cumsum(self.data.measured, axis=0) <= STARTING_SAMPLES)
         self.problem.scale_rad_s = robust_scale(self._free_run(untrained).residual, self.data)
         self.best, self.best_loss = untrained, float(self._free_run(untrained).cost.sum())
-        self.worse_in_a_row = 0
+        self.stalled_iterations = 0
 
     def consider(self, unknowns: Unknowns) -> None:
-        """Judge weights and physics by the robust loss of their free run from the measured start."""
+        """Keep these unknowns if the robust loss of their free run from the measured start is the smallest so far."""
         loss = float(self._free_run(unknowns).cost.sum())
         if loss < self.best_loss:
-            self.best, self.best_loss, self.worse_in_a_row = unknowns, loss, 0
+            self.best, self.best_loss, self.stalled_iterations = unknowns, loss, 0
         else:
-            self.worse_in_a_row += 1
+            self.stalled_iterations += 1
 
     def start_iteration_done(self, iteration: int, unknowns: Unknowns, rmse_rad_s: float) -> bool:
-        """One of several starts has taken a step: that is only told."""
+        """Report a step of one of the starts; never stops it."""
         if self.progress is not None:
             self.progress(self.iterations + iteration, self.max_iterations, rmse_rad_s)
         return False
@@ -206,16 +208,16 @@ class _Judge:
         """See free_run_fit.IterationDone."""
         self.start_iteration_done(iteration, unknowns, rmse_rad_s)
         self.consider(unknowns)
-        return self.held_out and self.worse_in_a_row >= PATIENCE
+        return self.held_out and self.stalled_iterations >= MAX_STALLED_ITERATIONS
 
     def stage_done(self, iterations: int) -> None:
-        """Count a stage's iterations; the next one has its own patience."""
+        """Count the iterations of a stage; the next one starts with none stalled."""
         self.iterations += iterations
-        self.worse_in_a_row = 0
+        self.stalled_iterations = 0
 
     def _free_run(self, unknowns: Unknowns) -> Point:
         """From the speeds whose free runs are nearest to the first measured ones, as in twin.evaluation.accuracy."""
-        started = Unknowns(unknowns.weights, unknowns.own, self.data.starting_speed_rad_s())
+        started = Unknowns(unknowns.weights, unknowns.physics, self.data.starting_speed_rad_s())
         point = self.problem.evaluate(started, self.guess_rad_s)
         missed = np.sum(point.residual, axis=0, where=self.early) / self.early.sum(axis=0)
         nearer = started.initial_speed_rad_s + np.where(np.isfinite(missed), missed, 0.0)

@@ -26,7 +26,7 @@ class Nodes:
         self._scope = outer
 
     def constant(self, name: str, value: ArrayLike, dtype: type[np.generic] = np.float64) -> str:
-        """A constant tensor, float64 unless told."""
+        """A constant tensor, float64 by default."""
         self.constants.append(numpy_helper.from_array(np.asarray(value, dtype=dtype), self._scope + name))
         return self._scope + name
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tests.support import fan_data
-from twin.fitting.cross_validation import chosen_spread, simplest_of_the_best
+from twin.fitting.cross_validation import choose_prior_std, simplest_of_the_best
 from twin.fitting.identification import identify
-from twin.fitting.training import GRID_SPREAD, data_scaling
+from twin.fitting.training import GRID_PRIOR_STD, data_scaling
 from twin.models.hybrid import Hybrid
 from twin.models.network import TanhNetwork
 from twin.runs import Run
@@ -18,21 +18,21 @@ def untrained(runs: list[Run]) -> Hybrid:
 
 @pytest.mark.slow
 def test_a_fan_that_the_physics_describe_gets_no_network_and_a_rough_one_does() -> None:
-    plain = [fan_data.published_run(seed, 20.0) for seed in (1, 2, 3, 4)]
+    plain = [fan_data.published_run(seed, 12.0) for seed in (1, 2, 3, 4)]
     rough = [fan_data.rough_run(seed, 20.0) for seed in (1, 2, 3, 4)]
-    assert chosen_spread(untrained(plain), plain, seed=0, physics="refined") == 0.0
-    assert chosen_spread(untrained(rough), rough, seed=0, physics="refined") > 0.0
+    assert choose_prior_std(untrained(plain), plain, seed=0, physics="refined") == 0.0
+    assert choose_prior_std(untrained(rough), rough, seed=0, physics="refined") > 0.0
 
 
 def test_a_recording_without_speeds_does_not_count() -> None:
     run = fan_data.rough_run(1, 10.0)
     blind = Run("blind", run.t_s, run.command, np.full_like(run.speed_rad_s, np.nan))
-    assert chosen_spread(untrained([run]), [run, blind], seed=0, physics="refined") == GRID_SPREAD
+    assert choose_prior_std(untrained([run]), [run, blind], seed=0, physics="refined") == GRID_PRIOR_STD
 
 
 def test_a_single_recording_gives_no_choice() -> None:
     runs = [fan_data.rough_run(1, 10.0)]
-    assert chosen_spread(untrained(runs), runs, seed=0, physics="refined") == GRID_SPREAD
+    assert choose_prior_std(untrained(runs), runs, seed=0, physics="refined") == GRID_PRIOR_STD
 
 
 @pytest.mark.parametrize(
