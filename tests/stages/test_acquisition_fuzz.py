@@ -114,7 +114,7 @@ def make_stream(
             stream += frame  # after half a comment, a line of text is part of the comment
             if not hidden:
                 untouched.append(sample)
-                stream += frame if what == 0 else b""  # comes twice
+                stream += frame if what == 0 else b""  # repeated
         elif what < 9:
             stream += spoil(frame, chance)
     return stream, untouched
@@ -169,7 +169,7 @@ def check_one_stream(protocol: Protocol, pool: list[tuple[Sample, bytes]], chanc
     outcomes = outcomes_by_kind(protocol, stream)
     assert outcomes.pop("samples", 0) == counts["samples"] + counts["repeated"] + counts["absurd_command"]
     assert outcomes == +Counter({kind.value: counts[kind.value] for kind in FaultKind}), "a fault has no count"
-    if protocol == "binary":  # a checksum: what comes out is true, so that the sequence must add up
+    if protocol == "binary":  # with a checksum all output is correct, so that the sequence must add up
         pieces = stream.split(b"\0")[:-1]
         good = counts["samples"] + counts["repeated"] + counts["absurd_command"]
         assert outcomes.total() + good == sum(1 for piece in pieces if piece)

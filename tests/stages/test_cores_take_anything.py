@@ -47,7 +47,7 @@ def sessions(*kinds: type[Message]) -> st.SearchStrategy[list[Message]]:
 
 
 def survives(core: Core, session: list[Message], tray: str = "tray1") -> None:
-    """Hand over a session as the runner does; what comes out can be encoded."""
+    """Feed a session as the runner does; all outputs can be encoded."""
     out: list[Any] = []
     with np.errstate(all="ignore"):
         for number, message in enumerate(session):
@@ -124,9 +124,9 @@ def test_the_scorer_takes_anything(session: list[Message], calibration: Any, all
 def test_a_fan_of_any_speed_and_command_is_diagnosed(period_ns: int, values: list, repeats: int) -> None:
     core = core_of(1, calibration=LOW_LIMITS, off_delay_s=0.0)
     samples = np.repeat(np.array(values), repeats, axis=0)
-    made = prediction_of(np.zeros(len(samples)), period_ns=period_ns)
+    prediction = prediction_of(np.zeros(len(samples)), period_ns=period_ns)
     wild = replace(
-        made, measured_speed_rad_s=samples[:, :1], command=samples[:, 1:], torque_balance_command=samples[:, 1:]
+        prediction, measured_speed_rad_s=samples[:, :1], command=samples[:, 1:], torque_balance_command=samples[:, 1:]
     )
     survives(core, [prediction_of(np.zeros(3), first=-9, period_ns=period_ns), wild])
 

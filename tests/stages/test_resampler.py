@@ -1,4 +1,4 @@
-"""stages.resampler: a uniform grid from irregular samples, and no more than the samples tell."""
+"""stages.resampler: a uniform grid from irregular samples, and nothing invented."""
 
 from __future__ import annotations
 
@@ -191,10 +191,10 @@ def test_nothing_is_published_before_the_watermark_or_beyond_the_end() -> None:
     assert core.problem() == ""
     grid = joined(_ticks(core, 0.5, 60.0))
     assert seconds_of(grid.t_ns[[0, -1]]).tolist() == [0.01, 5.0]
-    told = core.problem()
-    assert "acquisition" in told
+    problem = core.problem()
+    assert "acquisition" in problem
     _ticks(core, 60.0, 63.0)
-    assert core.problem() == told  # a state and no stopwatch: whoever tells changes must not tell it every second
+    assert core.problem() == problem  # without a duration, which would be a change to report every second
 
 
 def test_a_stalled_host_is_not_a_silent_source() -> None:

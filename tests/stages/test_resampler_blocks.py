@@ -1,4 +1,4 @@
-"""stages.resampler: whatever happens to the line, the grid does not depend on how its samples are cut into messages."""
+"""stages.resampler: the grid never depends on how raw samples are divided into messages."""
 
 from __future__ import annotations
 

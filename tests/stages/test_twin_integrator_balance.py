@@ -44,24 +44,24 @@ def balance(grids: list[Grid], friction: float = 0.0) -> Floats:
     return feed(core_of(twin), grids).torque_balance_command[:, 0]
 
 
-def test_a_healthy_fan_needs_what_it_is_given() -> None:
+def test_the_balance_of_a_healthy_fan_is_zero() -> None:
     found = balance([healthy()])
     assert np.isnan(found[: SETTLES - 1]).all() and np.isfinite(found[SETTLES:]).all()
     assert np.abs(found[SETTLES:]).max() < 0.3
 
 
-def test_what_is_given_on_top_is_the_balance() -> None:
+def test_additional_command_shows_in_the_balance() -> None:
     found = balance([healthy(extra=5.0)])
     assert found[-1] == pytest.approx(5.0, abs=0.3)
 
 
-def test_it_carries_the_healthy_deviation_of_each_fan() -> None:
+def test_predictions_carry_the_healthy_deviation_of_each_fan() -> None:
     prediction = feed(core_of(physical_twin(2)), [grid_of(stairs(5, 2))])
     assert prediction.torque_balance_sigma_command.tolist() == [SIGMA_COMMAND] * 2
 
 
 @pytest.mark.parametrize("size", [1, 7, 50])
-def test_it_is_the_same_to_the_bit_however_the_grid_is_cut(size: int) -> None:
+def test_the_balance_is_the_same_to_the_bit_for_every_block_size(size: int) -> None:
     grid = healthy(extra=5.0)
     assert balance(split(grid, size)).tobytes() == balance([grid]).tobytes()
 
@@ -72,7 +72,7 @@ def where_known(found: Floats) -> list[int]:
     return [int(edge) for edge in edges]
 
 
-def test_after_missing_samples_it_begins_anew() -> None:
+def test_after_missing_samples_the_balance_starts_again() -> None:
     grid = healthy()
     first, second = cut(grid, 0, 225), cut(grid, 225, 400)  # in the middle of a stair: the lag has settled
     jumped = replace(second, t_ns=second.t_ns + 10 * STEP_NS)
@@ -85,13 +85,13 @@ def test_after_missing_samples_it_begins_anew() -> None:
         assert np.abs(found[again:]).max() < 0.3
 
 
-def test_one_sample_of_another_length_is_no_gap() -> None:
+def test_one_interval_of_another_length_is_not_a_gap() -> None:
     grid = healthy()
     grid.t_ns[200:] += STEP_NS // 3
     assert where_known(balance([grid])) == [SETTLES, 400]
 
 
-def test_without_a_reading_or_a_command_there_is_none_and_it_begins_anew() -> None:
+def test_without_a_reading_or_a_command_there_is_no_balance_and_it_starts_again() -> None:
     for column in ("speed_rad_s", "command"):
         grid = healthy()
         getattr(grid, column)[200] = NAN
@@ -99,12 +99,12 @@ def test_without_a_reading_or_a_command_there_is_none_and_it_begins_anew() -> No
         assert where_known(found) == [SETTLES, 200, 201 + SETTLES, 400]
 
 
-def test_a_silent_line_has_none() -> None:
+def test_there_is_no_balance_while_no_samples_arrive() -> None:
     found = balance([healthy(200), silent(50, 200, 40.0), silent(50, 250, 40.0, InvalidReason.STALE)])
     assert where_known(found) == [SETTLES, 200]
 
 
-def test_a_drive_that_is_off_is_another_machine() -> None:
+def test_there_is_no_balance_while_the_drive_is_off() -> None:
     grid = healthy()
     grid.command[200:220] = 1.0
     found = balance([grid], friction=5.0)
@@ -113,7 +113,7 @@ def test_a_drive_that_is_off_is_another_machine() -> None:
     assert again >= 220 + SETTLES
 
 
-def test_at_another_rate_of_the_grid_it_begins_anew() -> None:
+def test_the_balance_starts_again_at_another_grid_rate() -> None:
     first = healthy(200)
     second = grid_of(np.full(200, 40.0), np.full(200, 100.0), first=1000, period_ns=2 * STEP_NS)
     core = core_of()
@@ -121,7 +121,7 @@ def test_at_another_rate_of_the_grid_it_begins_anew() -> None:
     assert where_known(feed(core, [second]).torque_balance_command[:, 0]) == [(SETTLES + 1) // 2, 200]
 
 
-def test_it_needs_no_free_run() -> None:
+def test_the_balance_needs_no_free_run() -> None:
     twin = physical_twin(fixed_rate=True, rate_hz=50.0)
     prediction = feed(core_of(twin), [healthy()])
     assert not prediction.valid.any()
@@ -129,7 +129,7 @@ def test_it_needs_no_free_run() -> None:
     assert np.isfinite(prediction.torque_balance_command[SETTLES:]).all()
 
 
-def test_far_above_the_speeds_it_was_made_from_nobody_knows_what_a_fan_needs() -> None:
+def test_there_is_no_balance_far_above_the_training_speeds() -> None:
     twin = physical_twin(speed_range_rad_s=(0.0, 200.0))
     fast = grid_of(np.full(100, 60.0), np.full(100, 301.0))
     slower = grid_of(np.full(100, 60.0), np.full(100, 299.0))
@@ -137,7 +137,7 @@ def test_far_above_the_speeds_it_was_made_from_nobody_knows_what_a_fan_needs() -
     assert np.isfinite(feed(core_of(twin), [slower]).torque_balance_command[SETTLES:]).all()
 
 
-def test_the_fan_of_these_tests_is_the_one_of_the_card() -> None:
+def test_the_fan_of_these_tests_is_that_of_the_card() -> None:
     balance = physical_twin().balance
     assert [float(balance.inertia[0]), float(balance.viscous[0]), float(balance.drag[0])] == pytest.approx(
         PARAMETERS[:3]

@@ -1,4 +1,4 @@
-"""stages.twin_integrator: whatever happens, predictions do not depend on how the grid is cut into messages."""
+"""stages.twin_integrator: predictions never depend on how the grid is divided into messages."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_blocks_of_any_size_are_predicted_the_same_to_the_bit(
     assert single == blocks
 
 
-def test_a_fan_that_diverges_within_a_block_is_started_anew_from_the_next_reading() -> None:
+def test_a_fan_that_diverges_within_a_block_restarts_from_the_next_reading() -> None:
     command = np.full((40, FANS), 40.0)
     command[10, 0] = command[25, 0] = 90.0
     core = core_of(unstable_twin())

@@ -1,4 +1,4 @@
-"""Measured machines through the whole chain: imported, a twin of their first part, the rest played down the line.
+"""Measured machines through the whole chain: a twin trained on the first part, the rest played on a serial line.
 
 Two rigs are two trays of one site and run at the same time.
 """
@@ -98,7 +98,7 @@ def check(rig: Rig, folder: Path, messages: list[Message]) -> None:
     card = next(json.loads(message.card_json) for message in messages if isinstance(message, ModelCard))
     low, high = card["command_range"]
     beyond = (command < low - 0.05 * (high - low)) | (command > high + 0.05 * (high - low))
-    assert not valid[beyond].any(), "a twin is not believed beyond the commands it was made from"
+    assert not valid[beyond].any(), "a twin is not valid beyond its training commands"
     assert valid.mean() > 0.25
     assert np.isfinite(residual[valid]).all()
     assert np.sqrt(np.mean(residual[valid] ** 2)) < 0.1 * np.nanmax(measured)

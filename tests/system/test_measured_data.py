@@ -26,14 +26,14 @@ def imported(table: Path, recording: Path, *columns: str) -> dict:
 
 def test_esc_test_is_imported_with_its_dates_and_repeated_times(measured_data, tmp_path):
     table, recording = measured_data / "esc_test" / "f40_steps_5-2.csv", tmp_path / "esc.mcap"
-    told = imported(table, recording, *ESC_TEST)
+    result = imported(table, recording, *ESC_TEST)
     ours = pd.read_csv(table)
     time = pd.to_datetime(ours["Timestamp"], format="%Y-%m-%d %H:%M:%S:%f")
     merged = ours.groupby(time).agg({"RPM": "mean", "Duty": "last"})
-    assert (told["rows"], told["samples"]) == (len(ours), len(merged))
-    assert told["repeated"] == int(time.duplicated().sum()) > 0.06 * len(ours)
-    assert told["out_of_order"] == told["without_time"] == told["speeds_missing"] == 0
-    assert told["duration_s"] == (time.iloc[-1] - time.iloc[0]).total_seconds()
+    assert (result["rows"], result["samples"]) == (len(ours), len(merged))
+    assert result["repeated"] == int(time.duplicated().sum()) > 0.06 * len(ours)
+    assert result["out_of_order"] == result["without_time"] == result["speeds_missing"] == 0
+    assert result["duration_s"] == (time.iloc[-1] - time.iloc[0]).total_seconds()
     (run,) = read_runs(recording).runs
     np.testing.assert_allclose(run.speed_rad_s[:, 0] * RPM, merged["RPM"], rtol=1e-12)
     np.testing.assert_array_equal(run.command[:, 0], merged["Duty"])
@@ -42,11 +42,11 @@ def test_esc_test_is_imported_with_its_dates_and_repeated_times(measured_data, t
 
 def test_rosa_is_imported_in_spite_of_its_blanks_and_byte_order_mark(measured_data, tmp_path):
     table, recording = measured_data / "rosa" / "healthy_103.csv", tmp_path / "rosa.mcap"
-    told = imported(table, recording, *ROSA)
+    result = imported(table, recording, *ROSA)
     ours = pd.read_csv(table, encoding="utf-8-sig")
     ours.columns = ours.columns.str.strip()
-    assert (told["samples"], told["repeated"]) == (len(ours), int(ours["Time"].duplicated().sum()))
-    assert told["duration_s"] == pytest.approx((ours["Time"].iloc[-1] - ours["Time"].iloc[0]) / 1000)
+    assert (result["samples"], result["repeated"]) == (len(ours), int(ours["Time"].duplicated().sum()))
+    assert result["duration_s"] == pytest.approx((ours["Time"].iloc[-1] - ours["Time"].iloc[0]) / 1000)
     (run,) = read_runs(recording).runs
     np.testing.assert_allclose(run.speed_rad_s[:, 0] * RPM, ours["Actual Speed"], rtol=1e-12)
     np.testing.assert_array_equal(run.command[:, 0], ours["Shaft Control Effort"])
@@ -55,10 +55,10 @@ def test_rosa_is_imported_in_spite_of_its_blanks_and_byte_order_mark(measured_da
 def test_imrclab_is_imported_as_four_fans_of_one_command_without_times(measured_data, tmp_path):
     table = measured_data / "imrclab" / "cf21_stock2.csv"
     speeds = [option for k in (1, 2, 3, 4) for option in ("--speed", f"rpm{k}:rpm")]
-    told = imported(table, tmp_path / "imrc.mcap", "--period", "10ms", "--command", "pwm", *speeds)
+    result = imported(table, tmp_path / "imrc.mcap", "--period", "10ms", "--command", "pwm", *speeds)
     ours = pd.read_csv(table)
-    assert (told["samples"], told["fans"]) == (len(ours), 4)
-    assert told["duration_s"] == pytest.approx((len(ours) - 1) * 0.01)
+    assert (result["samples"], result["fans"]) == (len(ours), 4)
+    assert result["duration_s"] == pytest.approx((len(ours) - 1) * 0.01)
 
 
 @pytest.mark.slow
@@ -68,11 +68,11 @@ def test_a_twin_of_the_first_part_of_esc_test_follows_the_rest(measured_data, tm
     imported(measured_data / "esc_test" / "f40_steps_5-2.csv", recording, *ESC_TEST)
     trained = fantwin("train", recording, "--to", 90, "--model", model, "--iterations", 15, "-o", twin)
     assert trained.exit_code == 0, trained.output
-    told = json.loads(fantwin("evaluate", twin, recording, "--from", 90, "--json").stdout)
-    assert told["speed_unit"] == "rpm"
-    assert told["r2"] > 0.98
-    assert told["rmse"] < 900
-    assert told["one_step_rmse"] < told["rmse"]
+    result = json.loads(fantwin("evaluate", twin, recording, "--from", 90, "--json").stdout)
+    assert result["speed_unit"] == "rpm"
+    assert result["r2"] > 0.98
+    assert result["rmse"] < 900
+    assert result["one_step_rmse"] < result["rmse"]
 
 
 @pytest.mark.slow
@@ -85,6 +85,6 @@ def test_a_twin_of_some_rosa_runs_follows_others(measured_data, tmp_path):
     twin = tmp_path / "rosa.onnx"
     trained = fantwin("train", *recordings(44, 98, 105, 110), "--model", "physical", "-o", twin)
     assert trained.exit_code == 0, trained.output
-    told = json.loads(fantwin("evaluate", twin, *recordings(103, 113, 120), "--json").stdout)
-    assert told["r2"] > 0.88
-    assert told["coverage_2_sigma"] > 0.9
+    result = json.loads(fantwin("evaluate", twin, *recordings(103, 113, 120), "--json").stdout)
+    assert result["r2"] > 0.88
+    assert result["coverage_2_sigma"] > 0.9

@@ -1,7 +1,6 @@
-"""pipeline.devices.device_clock: a drifting, wrapping device clock seen through a jittery line gives the time of the
-sample.
+"""pipeline.devices.device_clock: the host time of samples from a drifting, wrapping clock and delayed receipts.
 
-Units: ns unless the name says us. A made-up device has a clock of its own; the truth is the host's time of the sample.
+Units: ns unless the name ends in us. A simulated device has its own clock; the true time is host time of the sample.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ LEAST_DELAY_NS = 300 * US
 
 @dataclass(frozen=True)
 class Line:
-    """What a device sent: its clock and the host's times of receipt, and what only the test knows: the true times."""
+    """The clock readings of a device, their host times of receipt, and the true times, which only the test knows."""
 
     true_t_ns: NDArray[np.int64]
     clock_us: NDArray[np.int64]
@@ -37,7 +36,7 @@ class Line:
         return np.array([clock.to_host_ns(us, t_ns) for us, t_ns in pairs])
 
     def error_ns(self, clock: DeviceClock | None = None) -> NDArray[np.int64]:
-        """Against the truth plus the smallest delay, which nobody on this side can know."""
+        """Error against the true time plus the smallest delay, which the host cannot know."""
         return self.mapped(clock) - self.true_t_ns - LEAST_DELAY_NS
 
 
