@@ -230,7 +230,7 @@ def _decode_text(line: bytes, fans: int) -> Frame:
 def encode(protocol: Protocol, frame: Frame) -> bytes:
     """Bytes of a frame with delimiters; `Decoder` turns them into the same frame in float32.
 
-    In text, a command or set-point frame is one line for each fan that is not NaN, so possibly none.
+    In text, a command or set point frame is one line for each fan that is not NaN, so possibly none.
 
     Raises:
         ValueError: no fans or more than 64, columns of different length, a clock or sequence outside 32 bits, or
