@@ -20,7 +20,7 @@ from scoring.detectors.motion import Motion
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.state import restore_column
 from scoring.detectors.table import rows
-from scoring.former_snapshot import upgraded
+from scoring.former_snapshot_keys import current_fan_scorer
 from scoring.limits import Limits
 from scoring.residual import Residual
 from scoring.samples import Samples
@@ -292,7 +292,7 @@ class FanScorer:
         """
         before = self.snapshot()
         try:
-            self._restore(state if "detectors" in state else upgraded(state))
+            self._restore(state if "detectors" in state else current_fan_scorer(state))
         except (ValueError, LookupError, TypeError, AttributeError, OverflowError):
             self._restore(before)
             raise

@@ -8,8 +8,7 @@ Timing: one score for every prediction, at once, block for block; delays count t
 
 Four things are kept apart: the *statistics* on two residuals (scoring.fan_scorer), their *limits* (scoring.limits, from
 the twin's card), the *state* of each alarm after OPC UA Part 9 (scoring.alarms.tray_alarms), and its *diagnosis*
-(scoring.diagnosis.diagnosis). The +-2 sigma band is shown beside them and is no alarm. See
-docs/explanation/deciding.md.
+(scoring.diagnosis.diagnosis). See docs/explanation/deciding.md.
 """
 
 from __future__ import annotations
@@ -46,6 +45,7 @@ from scoring.alarms.unscored_monitor import UnscoredMonitor
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.fan_scorer import HALF_LIMIT, FanScorer, ScoredBlock
+from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
 from scoring.limits import Limits, Timing, uncalibrated
 from scoring.samples import samples_of
 from scoring.score_message import score_of
@@ -60,8 +60,6 @@ READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
 RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 BACK_IN_TIME_NS = 120 * NS_PER_S  # a restarted producer catches up with less; older samples are of another recording
-FORMER_NAMES = {"judge": "scorer", "desk": "alarms", "fed_by": "input_producer"}
-"""entries of a snapshot as earlier versions wrote them, which are still read -> their names today"""
 
 
 class ScorerConfig(StageConfig):
@@ -158,7 +156,7 @@ class ScorerCore(Core):
         operators is restored: shelved, suppressed, out of service, and the requests already answered.
         """
         try:
-            state = {FORMER_NAMES.get(name, name): value for name, value in json.loads(snapshot.state_json).items()}
+            state = current_keys(json.loads(snapshot.state_json), FORMER_SCORER_KEYS)
             self._alarms.restore(state["alarms"])
             input_producer = str(state["input_producer"])
         except RESTORE_ERRORS:
@@ -182,10 +180,7 @@ class ScorerCore(Core):
         self._last_t_ns = self._snapshot_t_ns = snapshot.t_ns
         self._input_producer, self._is_restored = input_producer, True
         if self._not_restored:
-            return [
-                replace(snapshot, restored=True),
-                *self._alarms.discard_all(snapshot.t_ns, keep_silenced=True),
-            ]
+            return [replace(snapshot, restored=True), *self._alarms.discard_all(snapshot.t_ns, keep_silenced=True)]
         return [replace(snapshot, restored=True), *self._alarms.republish()]
 
     def tick(self, now_ns: int) -> list[Alarm | ScorerSnapshot]:
