@@ -34,10 +34,10 @@ class FillingChunk:
         log_time_ns = max(0, log_time_ns)
         publish_time_ns = max(0, publish_time_ns)
         length = MESSAGE.size + len(payload)
-        head = _MESSAGE_RECORD.pack(
+        header = _MESSAGE_RECORD.pack(
             Opcode.MESSAGE, length, channel, sequence & 0xFFFFFFFF, log_time_ns, publish_time_ns
         )
-        self._parts += (head, payload)
+        self._parts += (header, payload)
         entries = self.entries.get(channel)
         if entries is None:
             entries = self.entries[channel] = []

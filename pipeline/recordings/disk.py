@@ -108,7 +108,7 @@ class Disk:
     def __init__(self, folder: Path) -> None:
         """The folder must exist. OSError otherwise."""
         self._folder = folder.resolve(strict=True)
-        self._mounted_at = next(place for place in (self._folder, *self._folder.parents) if place.is_mount())
+        self._mounted_at = next(path for path in (self._folder, *self._folder.parents) if path.is_mount())
 
     def free_bytes(self) -> int:
         """Free space for this user.

@@ -34,15 +34,15 @@ def _sessions_in_order(paths: Iterable[Path]) -> list[Path]:
     for path in paths:
         metadata = read_metadata(path).metadata
         part = metadata.get("part", "")
-        entry = (int(part) if part.isdecimal() else 0, _start_ns(path), path)
-        sessions.setdefault(metadata.get("session") or str(path), []).append(entry)
+        numbered = (int(part) if part.isdecimal() else 0, _start_ns(path), path)
+        sessions.setdefault(metadata.get("session") or str(path), []).append(numbered)
     ordered = [sorted(parts) for parts in sessions.values()]
     return [path for parts in sorted(ordered, key=lambda parts: parts[0][1]) for _, _, path in parts]
 
 
 def _start_ns(path: Path) -> int:
     """When its first message was received; 0 without any, since its place does not matter then."""
-    return next((entry.received_t_ns for entry in read_recording(path)), 0)
+    return next((envelope.received_t_ns for envelope in read_recording(path)), 0)
 
 
 class Seen:

@@ -1,4 +1,4 @@
-"""Reading recordings: their messages, as bytes or decoded, and what stands before the first message.
+"""Reading recordings: their messages, as bytes or decoded, and their metadata and attachments.
 
 A channel is a key of the bus; its messages are the protobuf bytes that were sent. A truncated or damaged file is read
 as far as possible. See docs/reference/recordings.md.
@@ -132,7 +132,7 @@ def read_recording(path: Path, topics: Collection[str] | None = None, tray: str 
 
 @dataclass(frozen=True)
 class RecordingMetadata:
-    """What stands before the first message of a recording."""
+    """The metadata and attachments of a recording."""
 
     metadata: Mapping[str, str]
     attachments: Mapping[str, bytes]

@@ -124,10 +124,10 @@ class RecordReader:
 
     def _record(self, file: BinaryIO) -> Record | None:
         """The record at `self.end`; None if the bytes there are no record."""
-        head = file.read(RECORD.size)
-        if not self._is_plausible(head, self.end):
+        header = file.read(RECORD.size)
+        if not self._is_plausible(header, self.end):
             return None
-        opcode, length = RECORD.unpack(head)
+        opcode, length = RECORD.unpack(header)
         content = file.read(length)
         if len(content) < length:
             return None
@@ -145,8 +145,10 @@ class RecordReader:
         leads_on = self._is_plausible(following, self.end + RECORD.size + length) and following[0] in _KNOWN
         return Record(self.end, opcode, content, parsed) if leads_on else None
 
-    def _is_plausible(self, head: bytes, offset: int) -> bool:
-        return len(head) == RECORD.size and head[0] != 0 and RECORD.unpack(head)[1] <= self.size - offset - RECORD.size
+    def _is_plausible(self, header: bytes, offset: int) -> bool:
+        """Whether these bytes can be the opcode and length of a record at `offset`."""
+        is_whole = len(header) == RECORD.size and header[0] != 0
+        return is_whole and RECORD.unpack(header)[1] <= self.size - offset - RECORD.size
 
     def _next_chunk(self, file: BinaryIO, start: int) -> int | None:
         """Offset of the next intact zstd chunk at or after `start`; None if there is none."""

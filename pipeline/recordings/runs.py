@@ -61,10 +61,10 @@ def read_runs(
     """
     reading = read_recording(path, topics=("raw",))
     by_tray: dict[str, list[Raw]] = {}
-    for entry in reading:
-        assert isinstance(entry.message, Raw)
-        if tray is None or entry.message.header.tray == tray:
-            by_tray.setdefault(entry.message.header.tray, []).append(entry.message)
+    for envelope in reading:
+        assert isinstance(envelope.message, Raw)
+        if tray is None or envelope.message.header.tray == tray:
+            by_tray.setdefault(envelope.message.header.tray, []).append(envelope.message)
     if not by_tray:
         raise RecordingError(f"{path}: no raw samples{f' of tray {tray!r}' if tray else ''} in this recording")
     if len(by_tray) > 1:

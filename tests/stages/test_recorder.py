@@ -49,7 +49,7 @@ def context(folder: Path, tray: TrayConfig | None = None, **config) -> Context:
     )
 
 
-def packet(message: Message, topic: str, received_t_ns: int = 5) -> Envelope:
+def envelope(message: Message, topic: str, received_t_ns: int = 5) -> Envelope:
     key = health_key("plant", "scorer", "all") if topic == "health" else tray_key("plant", "tray1", topic)
     return Envelope(key, topic, encode(message), received_t_ns, message)
 
@@ -149,7 +149,7 @@ def sequences(part: Part) -> list[int]:
 
 def record(core: Recorder, numbers: Iterable[int]) -> None:
     for sequence in numbers:
-        core.step(packet(raw(sequence), "raw", NOW_NS))
+        core.step(envelope(raw(sequence), "raw", NOW_NS))
 
 
 def card(sequence: int) -> ModelCard:
@@ -169,14 +169,16 @@ def health_of(producer: str, duplicated: int, stage: str = "recorder") -> Health
 def test_every_topic_is_recorded_with_its_bytes(tmp_path_factory, messages):
     run = context(tmp_path_factory.mktemp("recorder"))
     core = STAGE.build(run).core
-    packets = [packet(m, topic.name, k + 1) for k, (m, topic) in enumerate(zip(messages, TOPICS, strict=True))]
-    for item in packets:
+    envelopes = [envelope(m, topic.name, k + 1) for k, (m, topic) in enumerate(zip(messages, TOPICS, strict=True))]
+    for item in envelopes:
         assert list(core.step(item)) == []
     core.close()
     entries = list(read_recording(run.run_folder / "recording.mcap"))
-    assert [(e.key, e.topic, e.received_t_ns) for e in entries] == [(p.key, p.topic, p.received_t_ns) for p in packets]
-    for entry, item in zip(entries, packets, strict=True):
-        assert same(encode(entry.message), item.payload)
+    assert [(e.key, e.topic, e.received_t_ns) for e in entries] == [
+        (p.key, p.topic, p.received_t_ns) for p in envelopes
+    ]
+    for found, item in zip(entries, envelopes, strict=True):
+        assert same(encode(found.message), item.payload)
     counted = {f"recorded_{topic.name}": 1 for topic in TOPICS}
     assert core.counters() == counted | {"lost_unwritten": 0, "parts": 1}
 
@@ -239,7 +241,7 @@ def test_every_message_is_on_the_disk_a_second_after_it_was_received_and_not_at_
     core = recorder(disk)
     for tick in range(200):
         now_ns = NOW_NS + tick * TICK_NS
-        core.step(packet(raw(tick), "raw", now_ns - 1))
+        core.step(envelope(raw(tick), "raw", now_ns - 1))
         core.tick(now_ns)
         assert all(now_ns + TICK_NS - pending.received_t_ns <= SECOND_NS for pending in disk.parts[0].pending)
     assert disk.parts[0].flushes == 10
@@ -249,7 +251,7 @@ def test_behind_a_backlog_it_flushes_more_often_but_not_at_every_tick():
     disk = Disk()
     core = recorder(disk)
     for tick in range(40):
-        core.step(packet(raw(tick), "raw", NOW_NS - 5 * SECOND_NS))
+        core.step(envelope(raw(tick), "raw", NOW_NS - 5 * SECOND_NS))
         core.tick(NOW_NS + tick * TICK_NS)
     assert disk.parts[0].flushes == 8
 
@@ -257,12 +259,12 @@ def test_behind_a_backlog_it_flushes_more_often_but_not_at_every_tick():
 def test_a_clock_that_is_set_back_stops_neither_flushes_nor_disk_checks_nor_parts():
     disk = Disk()
     core = recorder(disk, part_s=60.0)
-    core.step(packet(raw(0), "raw", NOW_NS))
+    core.step(envelope(raw(0), "raw", NOW_NS))
     core.tick(NOW_NS)
     back_ns = NOW_NS - 3600 * SECOND_NS
     core.tick(back_ns)
     assert sequences(disk.parts[0]) == [0]
-    core.step(packet(raw(1), "raw", back_ns))
+    core.step(envelope(raw(1), "raw", back_ns))
     core.tick(back_ns + SECOND_NS)
     assert sequences(disk.parts[0]) == [0, 1]
     disk.free = 0
@@ -299,11 +301,11 @@ def test_messages_of_a_failed_flush_are_recorded_again_in_the_next_part(tmp_path
 
     monkeypatch.setattr(os, "fdatasync", fail_once)
     for second in range(4):
-        core.step(packet(raw(second), "raw", start_ns + second * SECOND_NS))
+        core.step(envelope(raw(second), "raw", start_ns + second * SECOND_NS))
         core.tick(start_ns + second * SECOND_NS)
     core.close()
     found = [
-        [entry.message.header.sequence for entry in read_recording(run.run_folder / name)]
+        [envelope.message.header.sequence for envelope in read_recording(run.run_folder / name)]
         for name in ("recording.mcap", "recording-2.mcap")
     ]
     assert found == [[], [0, 1, 2, 3]]
@@ -442,7 +444,7 @@ def test_a_new_part_begins_at_the_size_limit():
     disk = Disk()
     core = recorder(disk, part_bytes=1_000_000)
     for sequence in range(30):
-        core.step(packet(raw(sequence, samples=5_000), "raw", NOW_NS))
+        core.step(envelope(raw(sequence, samples=5_000), "raw", NOW_NS))
         core.tick(NOW_NS + sequence * SECOND_NS)
     core.close()
     assert len(disk.parts) > 3
@@ -463,7 +465,7 @@ def test_each_part_begins_with_the_last_card_of_each_twin():
     disk = Disk()
     core = recorder(disk, part_s=60.0)
     for item in (card(0), card(1), raw(0)):
-        core.step(packet(item, "raw" if isinstance(item, Raw) else "twin", NOW_NS))
+        core.step(envelope(item, "raw" if isinstance(item, Raw) else "twin", NOW_NS))
     core.tick(NOW_NS + 60 * SECOND_NS)
     record(core, [1])
     core.close()
@@ -496,10 +498,10 @@ def test_messages_that_the_bus_repeated_are_in_the_ledger_of_their_part():
     disk = Disk()
     core = recorder(disk, part_s=60.0)
     for shown in (health_of("recorder-1", 0), health_of("recorder-2", 50), health_of("recorder-1", 4)):
-        core.step(packet(shown, "health", NOW_NS))
+        core.step(envelope(shown, "health", NOW_NS))
     core.tick(NOW_NS + 60 * SECOND_NS)
-    core.step(packet(health_of("scorer-1", 70, stage="scorer"), "health", NOW_NS))
-    core.step(packet(health_of("recorder-1", 7), "health", NOW_NS))
+    core.step(envelope(health_of("scorer-1", 70, stage="scorer"), "health", NOW_NS))
+    core.step(envelope(health_of("recorder-1", 7), "health", NOW_NS))
     core.close()
     assert [part.ledger.counts[RAW_KEY, "a"].duplicated for part in disk.parts] == [4, 3]
 

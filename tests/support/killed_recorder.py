@@ -168,8 +168,8 @@ class Kills:
             if not _is_readable(path):
                 outcome.unreadable.append(path.name)
             contents.append(contents_of(path))
-            for entry in read_recording(path, topics=("raw", "grid", "prediction", "score")):
-                found[entry.key].append(entry.message.header.sequence)
+            for envelope in read_recording(path, topics=("raw", "grid", "prediction", "score")):
+                found[envelope.key].append(envelope.message.header.sequence)
         for key, times in sent_ns.items():
             recorded = set(found[key])
             outcome.sent += len(times)

@@ -14,7 +14,7 @@ from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.scan import scan
 from stages.recorder import ROOM_TO_RESUME, STAGE, Recorder
 from tests.pipeline.recordings.test_recordings import raw
-from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, packet
+from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, envelope
 from tests.support.small_disk import SIZE_BYTES, mount, unmount
 
 STREAM = (RAW_KEY, "acquisition-1")
@@ -37,7 +37,7 @@ class Run:
     def second(self) -> None:
         now_ns = 1_800_000_000_250_000_000 + next(self.seconds) * SECOND_NS
         for _ in range(50):
-            self.core.step(packet(raw(next(self.numbers), samples=100), "raw", now_ns))
+            self.core.step(envelope(raw(next(self.numbers), samples=100), "raw", now_ns))
         self.core.tick(now_ns)
 
     @property
@@ -51,7 +51,7 @@ class Run:
         return sorted(self.folder.glob("*.mcap"), key=number)
 
     def sequences(self) -> list[int]:
-        return [entry.message.header.sequence for path in self.parts() for entry in read_recording(path)]
+        return [envelope.message.header.sequence for path in self.parts() for envelope in read_recording(path)]
 
 
 def assert_readable(path: Path) -> None:
@@ -111,7 +111,7 @@ def test_messages_that_memory_cannot_hold_are_missing_in_the_ledger(small_disk, 
     until(lambda: not run.core.problem(), run)
     run.core.close()
     (part,) = run.parts()
-    found = [entry.message.header.sequence for entry in read_recording(part)]
+    found = [envelope.message.header.sequence for envelope in read_recording(part)]
     holes = sum(later - earlier - 1 for earlier, later in pairwise(found))
     contents = contents_of(part)
     lost = run.core.counters()["lost_unwritten"]

@@ -71,7 +71,7 @@ def write(path: Path, messages: int, **options) -> Path:
 
 
 def sequences(path: Path) -> list[int]:
-    return [entry.message.header.sequence for entry in read_recording(path, topics=("raw",))]
+    return [envelope.message.header.sequence for envelope in read_recording(path, topics=("raw",))]
 
 
 def test_messages_are_read_back_as_written_in_their_order(tmp_path):
@@ -264,7 +264,7 @@ def test_a_failed_sync_is_reported_and_the_file_ends_readable(tmp_path, monkeypa
     with pytest.raises(DiskError, match="r.mcap: cannot be written any more: Input/output error; it ends here"):
         writer.flush()
     reading = read_recording(tmp_path / "r.mcap")
-    assert [entry.message.header.sequence for entry in reading] == list(range(500)), "what was on the disk before"
+    assert [envelope.message.header.sequence for envelope in reading] == list(range(500)), "what was on the disk before"
     assert [pending.message.header.sequence for pending in writer.pending] == list(range(500, 1001))
     assert (writer.written["raw"], contents_of(writer.path).streams[RAW_KEY, "acquisition-1"].messages) == (500, 500)
     assert reading.damage == ""

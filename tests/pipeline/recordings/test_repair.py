@@ -278,7 +278,7 @@ def test_a_sector_of_zeros_costs_the_chunks_it_touches(tmp_path):
     content[starts[2] - 2000 : starts[2] + 2096] = bytes(4096)
     path.write_bytes(content)
     found = recover(path).found
-    sequences = [entry.message.header.sequence for entry in read_recording(path, topics=("raw",))]
+    sequences = [envelope.message.header.sequence for envelope in read_recording(path, topics=("raw",))]
     holes = sum(later - earlier - 1 for earlier, later in pairwise(sequences))
     assert (sequences[0], sequences[-1]) == (0, 999)
     assert 0 < holes == 1000 - len(sequences) == found.counts.ledger.counts[STREAM].missing
