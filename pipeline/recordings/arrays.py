@@ -81,33 +81,33 @@ class Arrays:
     def __iter__(self) -> Iterator[Block]:
         self.damage, self.duplicated = [], 0
         gathered: dict[tuple[str, str, str], _Gathered] = {}
-        for entry in self._entries():
-            if not _rows(entry.message):
+        for envelope in self._envelopes():
+            if not _rows(envelope.message):
                 continue
-            source = (*_site_and_tray(entry.key), entry.topic)
+            source = (*_site_and_tray(envelope.key), envelope.topic)
             pending = gathered.get(source)
-            if pending is not None and not pending.accepts(entry.message):
+            if pending is not None and not pending.accepts(envelope.message):
                 yield pending.block()
                 pending = None
             if pending is None:
-                pending = gathered[source] = _Gathered(*source, _form(entry.message))
-            pending.add(entry.message)
+                pending = gathered[source] = _Gathered(*source, _form(envelope.message))
+            pending.add(envelope.message)
             if pending.rows >= self.rows:
                 yield gathered.pop(source).block()
         for rest in gathered.values():
             yield rest.block()
 
-    def _entries(self) -> Iterator[Envelope]:
+    def _envelopes(self) -> Iterator[Envelope]:
         """The messages of all parts, each once."""
         seen: dict[tuple[str, str], Seen] = {}
         for path in self.paths:
             reading = read_recording(path, self.topics)
-            for entry in reading:
-                if self.tray is not None and _site_and_tray(entry.key)[1] not in ("", self.tray):
+            for envelope in reading:
+                if self.tray is not None and _site_and_tray(envelope.key)[1] not in ("", self.tray):
                     continue
-                header = entry.message.header
-                if seen.setdefault((entry.key, header.producer), Seen()).is_new(header.sequence):
-                    yield entry
+                header = envelope.message.header
+                if seen.setdefault((envelope.key, header.producer), Seen()).is_new(header.sequence):
+                    yield envelope
                 else:
                     self.duplicated += 1
             if reading.damage:

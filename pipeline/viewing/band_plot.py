@@ -87,10 +87,10 @@ def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUn
     """
     scores: dict[str, list[Score]] = {}
     for path in recordings:
-        for entry in read_recording(path, topics=("score",)):
-            assert isinstance(entry.message, Score)
-            if len(entry.message.t_ns):
-                scores.setdefault(entry.message.header.tray, []).append(entry.message)
+        for envelope in read_recording(path, topics=("score",)):
+            assert isinstance(envelope.message, Score)
+            if len(envelope.message.t_ns):
+                scores.setdefault(envelope.message.header.tray, []).append(envelope.message)
     where = ", ".join(str(path) for path in recordings)
     if not scores:
         raise UserError(f"{where}: holds no scores to plot; did twin_integrator and scorer run?")

@@ -16,7 +16,7 @@ IN_ALARM = (FanState.ALARM, FanState.RETURNING)
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """A stretch of one tray. Columns are (n, fans) unless said; speeds are in `speed_unit`.
+    """A stretch of one tray. Columns are (n, fans) unless noted; speeds are in `speed_unit`.
 
     Attributes:
         t_ns: (n,) time of the samples, ns since the epoch.
