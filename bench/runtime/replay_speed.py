@@ -1,7 +1,7 @@
-"""How fast a recording is judged again offline: times real time, and messages a second beside the bare `mcap` library.
+"""How fast a recording is scored again offline: multiples of real time, and messages a second beside bare `mcap`.
 
-Ten minutes of eight fans at 100 Hz, one sample a message, as the stages on a bus leave them: made here by the stages'
-own cores, message by message. The library reads the same file and decodes nothing.
+Ten minutes of eight fans at 100 Hz, one sample a message, as the stages on a bus leave them: written here by the cores
+of the stages, message by message. The library reads the same file and decodes nothing.
 """
 
 from __future__ import annotations

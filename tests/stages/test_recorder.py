@@ -388,6 +388,14 @@ def test_a_disk_that_refuses_the_last_chunk_is_counted_too():
     assert core.problem()
 
 
+def test_after_a_crash_the_file_is_finished_and_does_not_say_that_the_recorder_ended_in_order():
+    disk = Disk()
+    core = recorder(disk)
+    record(core, range(3))
+    core.abort()
+    assert (sequences(disk.parts[0]), disk.parts[0].closed) == ([0, 1, 2], "and goes on")
+
+
 def test_without_enough_free_space_it_pauses_and_finishes_the_part():
     disk = Disk()
     core = recorder(disk, min_free_bytes=50_000_000)
