@@ -13,8 +13,8 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate pyproject.toml
 TORCH := torch==2.13.0
-BENCHES := $(addprefix training/,published_table interval_coverage rough_table measured_table onnx_speed training_race) \
-	$(addprefix runtime/,restart recorder_throughput recorder_kills replay_bus replay_speed)
+BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_table measured_table onnx_speed training_race) \
+	$(addprefix bench.runtime.,restart recorder_throughput recorder_kills replay_bus replay_speed)
 SOURCES := schemas scoring pipeline simulation stages twin tests bench
 
 .PHONY: demo test check bench schema twin lock clean
@@ -34,7 +34,7 @@ check: $(VENV)/.development
 	$(BIN)/lint-imports
 
 bench: $(VENV)/.benches
-	for bench in $(BENCHES); do $(BIN)/python bench/$$bench.py || exit 1; done
+	for bench in $(BENCHES); do $(BIN)/python -m $$bench || exit 1; done
 
 schema: $(VENV)/.development
 	$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. schemas/fan.proto

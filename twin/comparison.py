@@ -87,7 +87,7 @@ def contend(
     validation_data: Sequence[DataCard] = (),
     progress: Progress | None = None,
 ) -> Contender:
-    """Train one candidate and judge it. Arguments as of build.train_twin; test_runs take no part in training.
+    """Train one candidate and evaluate it. Arguments as of build.train_twin; test_runs take no part in training.
 
     A candidate that cannot be trained on runs that others can be trained on is a result, and not an error.
     """

@@ -29,7 +29,7 @@ FOLDER = Path(os.environ.get("FANTWIN_DATA", Path(__file__).parents[3] / "shared
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Runs of one set, parted. unit: in which the set's speeds are told."""
+    """Runs of one set, parted. unit: of the speeds of the set."""
 
     name: str
     how: str

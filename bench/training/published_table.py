@@ -3,7 +3,7 @@
 Several independent pairs of training and test runs, 40 s each (simulation.published_fan); every figure is a median
 over them
 and its worst. The floor is the noise: the error of a perfect model, sqrt(10) on average and a little more or less in
-each run, so errors are told as multiples of both.
+each run, so errors are given as multiples of both.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import jax.numpy as jnp  # pyright: ignore[reportMissingImports]
 import numpy as np
 import optax  # pyright: ignore[reportMissingImports]
 
-from bench.training.race_problem import Judge, Phase, Problem
+from bench.training.race_problem import Phase, Problem, TimedEvaluation
 from twin.models.hybrid import Hybrid
 from twin.runs import Array
 
@@ -56,7 +56,7 @@ def speeds(
     return solved.ys
 
 
-def train(problem: Problem, judge: Judge, phases: Sequence[Phase], *, single: bool) -> float:
+def train(problem: Problem, timed: TimedEvaluation, phases: Sequence[Phase], *, single: bool) -> float:
     """Mean square error of stretches with learned initial speeds. single: float32. Returns the time to compile, s."""
     dtype = jnp.float32 if single else jnp.float64
     theta, compiled_in_s = jnp.asarray(problem.model.network.theta, dtype), 0.0
@@ -65,12 +65,12 @@ def train(problem: Problem, judge: Judge, phases: Sequence[Phase], *, single: bo
         began_s = time.perf_counter()
         jax.block_until_ready(improve(unknowns, state))
         compiled_in_s += time.perf_counter() - began_s
-        judge.start()
-        while judge.spent_s < phase.until_share * judge.limit_s or phase is phases[-1]:
+        timed.start()
+        while timed.spent_s < phase.until_share * timed.limit_s or phase is phases[-1]:
             unknowns, state = improve(unknowns, state)
-            if judge.due() and judge.finished(np.asarray(unknowns["theta"])):
+            if timed.due() and timed.finished(np.asarray(unknowns["theta"])):
                 return compiled_in_s
-        judge.pause()
+        timed.pause()
         theta = unknowns["theta"]
     return compiled_in_s
 

@@ -1,4 +1,4 @@
-"""What the training race is about: one run, one hybrid, and a judge with a stopwatch that is fair to all.
+"""What the training race is about: one run, one hybrid, and an evaluation whose own time does not count.
 
 All racers train the same 41 weights, in the layout of twin.models.network. Whoever fits by gradient gets the run cut
 into
@@ -22,7 +22,7 @@ from twin.models.network import TanhNetwork
 from twin.models.physics import LAG
 from twin.runs import Array, Run
 
-JUDGED_EVERY_S = 1.0
+EVALUATION_PERIOD_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class Phase:
 
 
 @dataclass
-class Judge:
+class TimedEvaluation:
     """Runs weights freely over the whole run, as they would serve, and keeps the best. Its own time does not count.
 
     floor_rad_s: the error of a perfect model. A racer calls `start` when its preparations (compiling, say) are over,
@@ -91,7 +91,7 @@ class Judge:
     iterations: int = 0
     _shown_s: float = 0.0
     _started_s: float = field(default_factory=time.perf_counter)
-    _judged_s: float = -np.inf
+    _evaluated_s: float = -np.inf
 
     def start(self) -> None:
         """The stopwatch runs on from what it showed last."""
@@ -109,10 +109,10 @@ class Judge:
     def due(self) -> bool:
         """Whether it is time to show weights again. Counts an iteration."""
         self.iterations += 1
-        return self.spent_s - self._judged_s > JUDGED_EVERY_S
+        return self.spent_s - self._evaluated_s > EVALUATION_PERIOD_S
 
     def finished(self, theta: Array) -> bool:
-        """Judge weights (41,); true when the target is reached or the time is up."""
+        """Evaluate weights (41,); true when the target is reached or the time is up."""
         now_s = self.spent_s
         model = self.problem.model.with_theta(np.asarray(theta, dtype=np.float64))
         pieces = evaluation_pieces([self.problem.run])
@@ -123,5 +123,5 @@ class Judge:
         if self.reached_after_s is None and error <= self.target:
             self.reached_after_s = now_s
         self._started_s += self.spent_s - now_s
-        self._judged_s = now_s
+        self._evaluated_s = now_s
         return self.reached_after_s is not None or now_s > self.limit_s

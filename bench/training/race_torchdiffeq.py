@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torchdiffeq import odeint  # pyright: ignore[reportMissingImports]
 
-from bench.training.race_problem import Judge, Phase, Problem
+from bench.training.race_problem import Phase, Problem, TimedEvaluation
 from twin.models.hybrid import Hybrid
 
 
@@ -41,21 +41,21 @@ def speeds(
     return solved
 
 
-def train(problem: Problem, judge: Judge, phases: Sequence[Phase]) -> None:
+def train(problem: Problem, timed: TimedEvaluation, phases: Sequence[Phase]) -> None:
     """Mean square error of stretches with learned initial speeds."""
     scale = problem.model.network.scaling.speed_scale_rad_s
     parameters = torch.from_numpy(problem.identification.parameters)
     theta = torch.from_numpy(problem.model.network.theta.copy()).requires_grad_()
-    judge.start()
+    timed.start()
     for phase in phases:
         command, measured = (torch.from_numpy(values) for values in problem.stretches(phase.stretch))
         initial = (measured[:5].mean(dim=0) / scale).requires_grad_()
         optimiser = torch.optim.Adam([theta, initial], lr=phase.learning_rate)
-        while judge.spent_s < phase.until_share * judge.limit_s or phase is phases[-1]:
+        while timed.spent_s < phase.until_share * timed.limit_s or phase is phases[-1]:
             optimiser.zero_grad()
             run = speeds(problem.model, theta, parameters, scale * initial, command, problem.step_s)
             loss = ((run - measured) / scale).square().mean()
             loss.backward()
             optimiser.step()
-            if judge.due() and judge.finished(theta.detach().numpy()):
+            if timed.due() and timed.finished(theta.detach().numpy()):
                 return

@@ -11,7 +11,7 @@ target:
 The last two minimise the mean square over stretches with learned initial speeds, at the rates and lengths that did
 best of those tried. Each has its natural start: random hidden units without output yet, and for ours the
 placement of twin.fitting.initial_weights. diffrax runs from our placement too, to tell the start's share from the rest.
-All are judged alike: one free run over the whole 80 s from the measured start, in multiples of the noise as it fell.
+All are evaluated alike: one free run over the whole 80 s from the measured start, in multiples of the noise as it fell.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import typer
 
 from bench.printing import JsonOption, progress, show
 from bench.training import race_diffrax, race_published, race_torchdiffeq
-from bench.training.race_problem import Judge, Phase, problem
+from bench.training.race_problem import Phase, TimedEvaluation, problem
 from simulation.published_fan import SimulatedRun, rough_run
 from twin.build import TrainedTwin, train_twin
 from twin.fitting.identification import Identification, identify
@@ -103,9 +103,9 @@ def _ours(simulated: SimulatedRun, seed: int, physics: Physics, iterations: int 
 
 def _published(simulated: SimulatedRun, identification: Identification, seed: int, limit_s: float) -> dict[str, Any]:
     progress("published recipe in torch, random start")
-    judge = _judge(simulated, identification, seed, limit_s, placed=False)
-    race_published.train(judge.problem, judge)
-    return _judged("published recipe in torch", "random", judge, 0.0)
+    timed = _timed(simulated, identification, seed, limit_s, placed=False)
+    race_published.train(timed.problem, timed)
+    return _result_row("published recipe in torch", "random", timed, 0.0)
 
 
 def _diffrax(
@@ -113,28 +113,28 @@ def _diffrax(
 ) -> dict[str, Any]:
     start = "placed" if placed else "random"
     progress(f"diffrax, {start} start")
-    judge = _judge(simulated, identification, seed, limit_s, placed=placed)
+    timed = _timed(simulated, identification, seed, limit_s, placed=placed)
     phases = DIFFRAX_PLACED_PHASES if placed else DIFFRAX_PHASES
-    compiled_s = race_diffrax.train(judge.problem, judge, phases, single=True)
-    return _judged("Adam through diffrax", start, judge, compiled_s)
+    compiled_s = race_diffrax.train(timed.problem, timed, phases, single=True)
+    return _result_row("Adam through diffrax", start, timed, compiled_s)
 
 
 def _torchdiffeq(simulated: SimulatedRun, identification: Identification, seed: int, limit_s: float) -> dict[str, Any]:
     progress("torchdiffeq, random start")
-    judge = _judge(simulated, identification, seed, limit_s, placed=False)
-    race_torchdiffeq.train(judge.problem, judge, TORCHDIFFEQ_PHASES)
-    return _judged("Adam through torchdiffeq", "random", judge, 0.0)
+    timed = _timed(simulated, identification, seed, limit_s, placed=False)
+    race_torchdiffeq.train(timed.problem, timed, TORCHDIFFEQ_PHASES)
+    return _result_row("Adam through torchdiffeq", "random", timed, 0.0)
 
 
-def _judge(
+def _timed(
     simulated: SimulatedRun, identification: Identification, seed: int, limit_s: float, *, placed: bool
-) -> Judge:
+) -> TimedEvaluation:
     task = problem(simulated.run, identification, placed=placed, seed=seed)
-    return Judge(task, simulated.noise_rms_rad_s, TARGET, limit_s)
+    return TimedEvaluation(task, simulated.noise_rms_rad_s, TARGET, limit_s)
 
 
-def _judged(who: str, start: str, judge: Judge, compiled_s: float) -> dict[str, Any]:
-    return _row(who, start, judge.best, judge.best_after_s, judge.reached_after_s, judge.iterations, compiled_s)
+def _result_row(who: str, start: str, timed: TimedEvaluation, compiled_s: float) -> dict[str, Any]:
+    return _row(who, start, timed.best, timed.best_after_s, timed.reached_after_s, timed.iterations, compiled_s)
 
 
 def _error(twin: TrainedTwin, simulated: SimulatedRun) -> float:

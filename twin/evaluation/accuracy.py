@@ -24,7 +24,7 @@ Flags = NDArray[np.bool_]
 START_ITERATIONS = 3
 START_NUDGE = 1e-4
 FORGOTTEN = 0.01
-"""squared sensitivity below which the first measured speeds come too late to tell the speed at the start"""
+"""squared sensitivity below which the first measured speeds do not determine the speed at the start"""
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class ResidualAnalysis:
     """One fan's free-run residual. NaN where nothing can be said: too few samples, a diverged run, a still command.
 
     samples: the measured ones. period_s: of the grid. mean_rad_s: what the fan is above the model on average.
-    independent_samples: as many independent ones would tell the mean as well; at most samples.
+    independent_samples: the number of independent samples whose mean is equally certain; at most samples.
     autocorrelation_time_s: half the time from one independent sample to the next; T where it decays as exp(-t / T).
     lags_s, autocorrelation: (lags,) from one step on, about the mean. bound_95: white noise stays within it at 95 % of
     the lags. ljung_box_p: how probable so much autocorrelation over the first ljung_box_lags is in white noise.

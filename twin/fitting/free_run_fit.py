@@ -6,8 +6,8 @@ Minimises the sum of a pseudo-Huber loss of (measured - free run) / scale over e
     each fan's own physics (twin.models.physical: ln J, two ln dampings, lag), and
     the initial speed of each trajectory.
 
-The scale is a robust spread of each fan's residual, so that outliers count linearly and fans of different noise count
-alike. Initial speeds meet the other unknowns only in their own trajectory, and physics only in their own fan: both
+The scale is a robust standard deviation of each fan's residual, so that outliers count
+linearly and fans of different noise count alike. Initial speeds meet the other unknowns only in their own trajectory, and physics only in their own fan: both
 are eliminated from the normal equations (Schur complements), so that a thousand trajectories and a hundred fans cost
 no more than their own integration. More, Numerical Analysis, LNM 630 (1978), for the damping by the diagonal.
 
@@ -384,6 +384,6 @@ def robust_scale(residual: Array, trajectories: Trajectories) -> Array:
         magnitude = np.abs(residual[:, columns][measured])
         span = float(np.ptp(trajectories.speed_rad_s[:, columns][measured]))
         # A magnitude beyond the range says nothing more, and may be infinite.
-        spread = float(np.quantile(np.fmin(magnitude, span), 0.9)) / NORMAL_90_PERCENT
-        scale[fan] = max(spread, 1e-6 * span, np.finfo(float).tiny)
+        robust_std = float(np.quantile(np.fmin(magnitude, span), 0.9)) / NORMAL_90_PERCENT
+        scale[fan] = max(robust_std, 1e-6 * span, np.finfo(float).tiny)
     return scale

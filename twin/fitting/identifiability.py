@@ -1,7 +1,7 @@
-"""What a recording cannot tell about a fan, why, and what to record instead.
+"""What a recording does not determine about a fan, why, and what to record instead.
 
-Whether a parameter is told comes from the covariance of the estimates; why not comes from the data. Two things the
-covariance cannot see are looked for in the data alone: a recording that hardly excites the fan, and a controller that
+Whether a parameter is determined follows from the covariance of the estimates; the reason follows from the data. Two
+things the covariance cannot see are looked for in the data alone: a recording that hardly excites the fan, and a controller that
 feeds the noise of the speed back into the command. Under such feedback the direct approach, which fits command to
 speed as if there were no loop, is biased unless its noise model is right, and ours, white noise on the speed, is not
 once the load fluctuates too (Ljung, System Identification, second edition, section 13.4).
@@ -40,7 +40,7 @@ SMALL_SPEED_RANGE_IN_NOISE = 5.0
 LAGS = 5
 """samples of the past that a command may follow from"""
 FEWEST_MOVES = 50
-"""of the command, to judge by; a controller makes them within seconds"""
+"""moves of the command needed for a decision; a controller makes them within seconds"""
 FALSE_ALARM_PROBABILITY = 1e-3
 FEEDBACK_SHARE = 0.05
 """of the command's movement; excitation from outside that is twenty times stronger makes feedback harmless"""
@@ -89,7 +89,7 @@ def feedback_share(pieces: Sequence[Run], fan: int) -> float:
     The test of Granger for feedback (Caines and Chan, IEEE Transactions on Automatic Control 20, 1975): what of the
     speed its own past and that of the command do not predict is noise; a command given from outside does not follow
     from past noise, beyond what it follows from its own past. Only samples at which the command moves are looked at,
-    and the share must be significant by an F test and worth a warning by its size: the physics that the linear
+    and the share must be significant by an F test and large enough for a warning: the physics that the linear
     prediction lacks leave traces of the command in the noise, but small ones.
 
     The noise of the sample at which the command was given counts only where the command moves against it. The other

@@ -18,7 +18,7 @@ otherwise it is zero, and the model is the published one of three parameters.
 Covariances come from the jackknife over blocks of time, linearised: leaving out block b moves the estimate by
 -(H - H_b)^-1 g_b, with g_b the summed score and H_b the curvature of that block. Unlike the plain inverse Hessian it
 stays honest when the residual is correlated in time, which it is whenever the physics are not the whole truth, and
-unlike the sandwich of raw scores when a few transients tell most of what is known. Efron and Stein, Annals of
+unlike the sandwich of raw scores when a few transients hold most of the information. Efron and Stein, Annals of
 Statistics 9 (1981).
 """
 
@@ -228,7 +228,8 @@ def _covariance(
     """Covariance (fans, 4, 4) of J, alpha, C_D, lag_s by the block jackknife, zero where one is held, and its degrees
     of freedom (fans, 4).
 
-    Few where few blocks tell most: the variance of a sum of squares d_b^2 of normal moves is 2/3 of sum d_b^4, and a
+    Few where few blocks hold most of the information:
+    the variance of a sum of squares d_b^2 of normal moves is 2/3 of sum d_b^4, and a
     chi-square with that variance has 3 (sum d_b^2)^2 / sum d_b^4 of them (Satterthwaite, Biometrics Bulletin 2, 1946).
     """
     problem = FreeRunProblem(PhysicalModel(), trajectories, top_speed_rad_s, free, prior)

@@ -95,8 +95,8 @@ class OutputErrorFit:
 
     def _robust_scale(self, speeds: Sequence[Array]) -> float:
         """Standard deviation of a normal residual with the same 90th percentile: a tenth may be outliers."""
-        spread = float(np.quantile(np.abs(self._residual(speeds)), 0.9)) / NORMAL_90_PERCENT
-        return max(spread, 1e-6 * self.scaling.speed_scale_rad_s)
+        robust_std = float(np.quantile(np.abs(self._residual(speeds)), 0.9)) / NORMAL_90_PERCENT
+        return max(robust_std, 1e-6 * self.scaling.speed_scale_rad_s)
 
     def _cost(self, theta: Array, speeds: Sequence[Array], scale_rad_s: float, precision: Array) -> float:
         relative = self._residual(speeds) / (HUBER_DELTA * scale_rad_s)

@@ -19,7 +19,7 @@ TIME_CONSTANTS_SAMPLES = np.geomspace(0.5, 2000.0, 40)
 LAG_DECAY = 0.7
 # Standard deviation of a unit's input when all its regressors have standard deviation one.
 UNIT_SLOPE = 0.2
-# Regressors of a linear filter lie in a plane. Scatter round it tells the layer to be linear off the plane as well.
+# Regressors of a linear filter lie in a plane. Scatter around it makes the layer linear off the plane as well.
 SCATTER = 0.1
 MAX_ROWS = 4000
 

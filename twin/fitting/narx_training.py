@@ -96,7 +96,7 @@ def draw_stretches(pieces: Sequence[Run], rng: np.random.Generator) -> list[Run]
 
 
 def leave_out(runs: Sequence[Run]) -> list[tuple[list[Run], list[Run]]]:
-    """Pieces to fit and pieces to judge by: three folds of whole runs, as many as there are runs, or blocks of one."""
+    """Pieces to fit and to evaluate on: up to three folds of whole runs, or blocks of a single one."""
     folds = min(len(runs), FOLDS)
     if folds == 1:
         return [leave_out_blocks(evaluation_pieces(runs))]

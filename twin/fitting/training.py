@@ -52,7 +52,7 @@ TOLERANCE = 1e-4
 MAX_STALLED_ITERATIONS = 10
 # Weights have a prior standard deviation of ten in scaled units: too wide to matter where there are data.
 PRIOR_PRECISION = 0.01
-# Each point of the grid counts as much as one sample that tells the acceleration to a spread of its scale.
+# Each point of the grid counts as one observation of the acceleration with this standard deviation, in its scale.
 GRID_POINTS, GRID_REACH, GRID_PRIOR_STD = 15, 1.5, 0.1
 
 

@@ -153,22 +153,22 @@ def static_curve(content: Content, fan: FanContent, curve: StaticCurve) -> str:
 
 
 def error_over_speed(content: Content, fan: FanContent) -> str:
-    """Mean and spread of the error over the twin's speed: where in its range the twin is off."""
+    """Mean and standard deviation of the error over the twin's speed: where in its range the twin is off."""
     each = content.unit.rad_s
     half = 2.0 * fan.sigma_rad_s / each
     with _small_figure() as (figure, axes):
         axes.axhspan(-half, half, color=BAND, lw=0, alpha=0.6, label="± 2σ of the card")
         axes.axhline(0.0, color="#888888", lw=0.6)
-        middle, mean, spread = (
+        middle, mean, deviation = (
             [getattr(part, name) / each for part in fan.by_speed]
             for name in ("middle_rad_s", "mean_rad_s", "std_rad_s")
         )
-        reach = [2.0 * value for value in spread]
+        reach = [2.0 * value for value in deviation]
         axes.errorbar(middle, mean, reach, fmt="o", ms=3, lw=0.8, capsize=2, color=MEASURED, label="mean ± 2 std")
         axes.set_xlabel(f"speed of the free run ({content.unit.name})")
         axes.set_ylabel(f"error ({content.unit.name})")
         _legend_above(axes, 2)
-        return _svg(figure, f"fan{fan.number}-speed", "Mean and spread of the error over the speed")
+        return _svg(figure, f"fan{fan.number}-speed", "Mean and standard deviation of the error over the speed")
 
 
 def _draw_over_time(content: Content, fan: FanContent, panels: tuple[Axes, Axes, Axes], columns: int) -> None:

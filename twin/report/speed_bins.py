@@ -21,7 +21,7 @@ class SpeedBin:
 
 
 def speed_bins(predicted_rad_s: Array, error_rad_s: Array) -> tuple[SpeedBin, ...]:
-    """Bins of equal width over the speeds of the free run; those of too few samples to judge by are left out.
+    """Bins of equal width over the speeds of the free run; those with too few samples are left out.
 
     predicted_rad_s, error_rad_s: (n,), anything not finite counts nowhere.
     """

@@ -48,7 +48,7 @@ def test_the_best_has_the_smallest_error_over_the_untouched_recordings(compared)
     assert compared["best"] == min(errors, key=errors.__getitem__)
 
 
-def test_a_kept_twin_gives_on_each_recording_the_figures_that_were_told(folder, compared):
+def test_a_saved_twin_gives_on_each_recording_the_figures_that_were_printed(folder, compared):
     assert json.loads((folder / "twins" / "comparison.json").read_text()) == compared
     for its in compared["models"]:
         for part, recording in (("held-out", "held-out"), ("test", "untouched")):

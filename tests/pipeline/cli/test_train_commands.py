@@ -67,7 +67,7 @@ def test_identify_shows_a_row_for_each_fan(folder):
 
 
 @pytest.mark.parametrize("model", ["physical", "narx", "neural-ode", "hybrid"])
-def test_each_model_is_trained_and_its_file_evaluates_as_it_said(folder, tmp_path, model):
+def test_each_model_is_trained_and_its_file_evaluates_to_the_printed_figures(folder, tmp_path, model):
     file = tmp_path / "twin.onnx"
     arguments = ("--model", model, "--validate", folder / "held-out.mcap", "--iterations", "2", "--json")
     result = json.loads(fantwin("train", folder / "healthy.mcap", *arguments, "-o", file).stdout)
@@ -210,7 +210,7 @@ def test_a_command_that_never_changes_is_told_in_one_line(tmp_path):
 
 
 @pytest.mark.parametrize("command", ["identify", "train", "evaluate"])
-def test_a_missing_extra_is_told_with_what_to_install(folder, twin, monkeypatch, command):
+def test_a_missing_extra_is_reported_with_what_to_install(folder, twin, monkeypatch, command):
     real_import = builtins.__import__
 
     def without_the_extra(name: str, *arguments, **options):

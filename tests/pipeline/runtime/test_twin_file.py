@@ -77,7 +77,7 @@ def test_the_balance_of_each_fan_is_read_and_that_of_one_fan_holds_for_all(tmp_p
     np.testing.assert_allclose(five.sigma_command, SIGMA_COMMAND)
 
 
-def test_of_an_older_card_errors_are_known_one_by_one(tmp_path: Path) -> None:
+def test_errors_in_an_older_card_have_no_correlations(tmp_path: Path) -> None:
     older = asdict(made_up_balance((PARAMETERS,))) | {"std_errors": [[0.001, 0.001, 1e-5, 0.1]], "covariance": None}
     balance = TwinFile.load(write_twin(tmp_path / "twin.onnx", balance=older), 1).balance
     np.testing.assert_allclose(balance.covariance[0], np.diag(np.square(older["std_errors"][0])))
@@ -85,7 +85,7 @@ def test_of_an_older_card_errors_are_known_one_by_one(tmp_path: Path) -> None:
     assert "std_errors must have four numbers" in _refusal(write_twin(tmp_path / "twin.onnx", balance=older))
 
 
-def test_a_calibration_is_carried_as_it_stands(tmp_path: Path) -> None:
+def test_a_calibration_is_kept_as_it_is(tmp_path: Path) -> None:
     assert TwinFile.load(write_twin(tmp_path / "never.onnx"), 1).card.calibration is None
     told = {"limits": [1.5, {"kind": "fast"}]}
     assert TwinFile.load(write_twin(tmp_path / "twin.onnx", calibration=told), 1).card.calibration == told

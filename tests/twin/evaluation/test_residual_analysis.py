@@ -198,8 +198,8 @@ def test_independent_samples_say_how_far_the_mean_scatters(
 ) -> None:
     rng = np.random.default_rng(10)
     drawn = [np.where(rng.random(SAMPLES) < missing, np.nan, residual(rng)) for _ in range(200)]
-    told = [np.nanstd(one) / np.sqrt(analysed(one, np.zeros(SAMPLES)).independent_samples) for one in drawn]
-    assert np.mean(told) == pytest.approx(np.std([np.nanmean(one) for one in drawn]), rel=0.2)
+    claimed = [np.nanstd(one) / np.sqrt(analysed(one, np.zeros(SAMPLES)).independent_samples) for one in drawn]
+    assert np.mean(claimed) == pytest.approx(np.std([np.nanmean(one) for one in drawn]), rel=0.2)
 
 
 def test_the_autocorrelation_time_is_that_of_an_exponential_with_and_without_lost_samples() -> None:

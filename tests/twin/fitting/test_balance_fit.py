@@ -185,8 +185,8 @@ def test_on_rosa_healthy_runs_lie_still_and_faults_stand_out(measured_data, tmp_
         return recording
 
     learned = [imported(f"healthy_{k}") for k in (44, 98, 103, 110, 120)]
-    told = fantwin("train", *learned, "--model", "physical", "--command-unit", "%", "-o", tmp_path / "t.onnx")
-    assert "torque balance: healthy sigma 0.2" in told.stdout
+    result = fantwin("train", *learned, "--model", "physical", "--command-unit", "%", "-o", tmp_path / "t.onnx")
+    assert "torque balance: healthy sigma 0.2" in result.stdout
     of_card = OnnxTwin(tmp_path / "t.onnx").card.balance
     assert of_card.source == ("least-squares",)
     assert 0.1 < of_card.sigma_command[0] < 0.3

@@ -1,4 +1,4 @@
-"""Warnings: none on recordings that tell everything, the right one on each that does not."""
+"""Warnings: none on recordings that determine everything, the right one on each that does not."""
 
 import re
 from pathlib import Path
@@ -120,7 +120,7 @@ def test_the_published_and_the_rough_fan_are_never_warned_about_but_for_a_lag() 
     assert len(lines) <= 1
 
 
-def test_settled_speeds_tell_the_drag_but_not_the_inertia() -> None:
+def test_settled_speeds_determine_the_drag_but_not_the_inertia() -> None:
     levels = [commanded(np.full((1500, 1), level), seed=1, warm_up_s=5.0) for level in (10.0, 40.0, 70.0, 100.0)]
     lines = warnings_of(*levels)
     assert said(lines, "little excitation: the command changes 0 time(s) only")
@@ -199,7 +199,7 @@ def test_a_loop_at_one_set_point_is_told_with_what_is_biased_and_what_is_not_tol
         assert said(lines, f"fan {fan}: alpha and C_D cannot be distinguished", "the speed keeps between 11")
 
 
-def test_a_narrow_range_of_speed_tells_only_the_sum_of_alpha_and_drag() -> None:
+def test_a_narrow_range_of_speed_determines_only_the_sum_of_alpha_and_drag() -> None:
     stairs = fan_data.stairs(np.random.default_rng(9), 4500, 4, 50.0, 70.0)
     apart = [
         line for line in warnings_of(commanded(stairs, seed=1, warm_up_s=5.0)) if "cannot be distinguished" in line
@@ -225,9 +225,9 @@ def test_a_single_step_is_too_few() -> None:
 
 def judged(run: Run, **values_and_errors: tuple[float, float]) -> tuple[str, ...]:
     """Warnings of estimates as given, the published ones and well known where nothing is given."""
-    told = {"J": (0.15, 0.001), "alpha": (0.012, 0.001), "C_D": (0.0025, 1e-5), "lag_s": (0.0, 0.0)}
-    told |= values_and_errors
-    parameters, errors = np.array([told[name] for name in PARAMETER_NAMES]).T
+    estimates = {"J": (0.15, 0.001), "alpha": (0.012, 0.001), "C_D": (0.0025, 1e-5), "lag_s": (0.0, 0.0)}
+    estimates |= values_and_errors
+    parameters, errors = np.array([estimates[name] for name in PARAMETER_NAMES]).T
     return identifiability_warnings([run], parameters[None], np.diag(errors**2)[None])
 
 

@@ -34,7 +34,7 @@ def test_95_percent_intervals_hold_the_truth_in_95_percent_of_recordings() -> No
     found = [identify([run]) for run in runs]
     low, high = (np.concatenate([one.interval_95[:, :3, side] for one in found]) for side in (0, 1))
     inside = (low <= fan_data.PUBLISHED_PARAMETERS) & (high >= fan_data.PUBLISHED_PARAMETERS)
-    # 300 recordings tell a share of 95 % to 1.3 %
+    # 300 recordings determine a share of 95 % to 1.3 %
     assert np.all(np.abs(inside.mean(axis=0) - 0.95) < 0.035), inside.mean(axis=0)
 
 
@@ -45,7 +45,7 @@ def test_short_pieces_beside_a_long_run_do_not_widen_the_intervals() -> None:
     assert np.all(with_pieces.standard_errors[0, :3] < 1.3 * alone.standard_errors[0, :3])
 
 
-def test_a_fan_that_physics_alone_do_not_describe_is_told(published) -> None:
+def test_a_fan_that_physics_alone_do_not_describe_is_reported(published) -> None:
     assert published[1].misfits == ()
     found = identify([fan_data.rough_run(1, 40.0)])
     assert "the physical model misses the speed" in found.misfits[0]

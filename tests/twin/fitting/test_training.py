@@ -75,7 +75,7 @@ def test_fans_that_differ_share_one_network_and_keep_their_own_physics() -> None
     assert times_noise(together, test) < 1.1
 
 
-def test_several_recordings_teach_more_than_one(rough) -> None:
+def test_several_recordings_give_a_better_twin_than_one(rough) -> None:
     parts = [rough[0].between(0.0, 12.0), rough[0].between(30.0, 42.0), rough[0].between(60.0, 72.0)]
     one, all_three = (
         train_twin(runs, [rough[1]], "hybrid", name="x", max_iterations=20) for runs in (parts[:1], parts)

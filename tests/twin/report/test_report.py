@@ -151,7 +151,7 @@ def test_the_page_needs_nothing_but_itself(page):
     assert not re.search(r"url\((?!#)|@import", page)
 
 
-def test_ids_are_told_once_and_every_reference_has_its_target(folder):
+def test_ids_are_unique_and_every_reference_has_its_target(folder):
     fantwin("report", folder / "two.onnx", folder / "two.mcap", "-o", folder / "two.html")
     text = (folder / "two.html").read_text(encoding="utf-8")
     parsed = Page(text)
@@ -162,17 +162,17 @@ def test_ids_are_told_once_and_every_reference_has_its_target(folder):
     assert set(parsed.numbers) > {"pooled", "row-0", "row-1"}
 
 
-def test_machines_are_told_the_same(folder, page):
+def test_json_holds_the_same_figures(folder, page):
     arguments = (folder / "healthy.onnx", folder / "held-out.mcap", "-o", folder / "again.html", "--json")
-    told = json.loads(fantwin("report", *arguments).stdout)
+    reported = json.loads(fantwin("report", *arguments).stdout)
     evaluated = json.loads(fantwin("evaluate", *arguments[:2], "--json").stdout)
     figures = ("rmse", "max_error", "r2", "coverage_2_sigma", "one_step_rmse", "samples")
-    assert told["speed_unit"] == evaluated["speed_unit"]
+    assert reported["speed_unit"] == evaluated["speed_unit"]
     for figure in figures:
-        assert told[figure] == evaluated[figure]
-        assert told["fans"][0][figure] == evaluated["fans"][0][figure]
-    assert (told["assessment"], told["fans"][0]["fan"]) == ("as declared", 0)
-    assert told["bytes"] == (folder / "again.html").stat().st_size
+        assert reported[figure] == evaluated[figure]
+        assert reported["fans"][0][figure] == evaluated["fans"][0][figure]
+    assert (reported["assessment"], reported["fans"][0]["fan"]) == ("as declared", 0)
+    assert reported["bytes"] == (folder / "again.html").stat().st_size
     assert (folder / "again.html").read_text() == page
 
 
@@ -211,7 +211,7 @@ def test_what_lessens_the_figures_is_told(twin):
     assert any("speeds are missing" in line for line in assess(content_of(twin, with_speed(run, speed))).warnings)
 
 
-def test_a_free_run_that_diverges_is_told_and_still_drawn(twin):
+def test_a_free_run_that_diverges_is_reported_and_still_drawn(twin):
     content = content_of(twin, published_run(8, 5.0))
     (fan,) = content.fans
     nowhere = np.full_like(fan.error_rad_s, np.nan)
@@ -295,7 +295,7 @@ def test_the_static_curve_is_where_torque_and_load_meet():
     assert len(static_curve(model, parameters, [shaken], 0, 100.0, 180.0).measured) == 0
 
 
-def test_a_staircase_of_two_and_a_half_seconds_a_step_tells_the_static_curve_of_the_simulated_tray():
+def test_a_staircase_of_two_and_a_half_seconds_a_step_gives_the_static_curve_of_the_simulated_tray():
     profile, rng = Staircase(1, 1, 0.1, 0.95, hold_s=2.5), np.random.default_rng(1)
     plant, tacho, state = FanParameters(), Tacho(), at_rest(1)
     command = np.stack([profile.command(k / 100.0) for k in range(6000)])
@@ -323,7 +323,7 @@ def test_the_page_says_why_no_measured_point_is_on_the_static_curve(twin):
     assert "The command was never constant" in Page(report_page(content_of(twin, moving))).text
 
 
-def test_a_band_that_is_too_wide_and_figures_of_few_errors_are_told(twin):
+def test_a_band_that_is_too_wide_and_figures_of_few_errors_are_reported(twin):
     run = published_run(5, 30.0)
     assert assess(content_of(twin, run)).warnings == ()
     content = content_of(twin, run)
@@ -389,7 +389,7 @@ def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
 
 
 @pytest.mark.parametrize(("command", "missing"), [("report", "jinja2"), ("report", "matplotlib"), ("compare", "onnx")])
-def test_a_missing_extra_is_told_with_what_to_install(folder, tmp_path, command, missing):
+def test_a_missing_extra_is_reported_with_what_to_install(folder, tmp_path, command, missing):
     code = f"import sys; sys.modules[{missing!r}] = None; from pipeline.cli.main import main; main()"
     given = [folder / "healthy.onnx"] * (command == "report") + [folder / "held-out.mcap"]
     done = subprocess.run(
