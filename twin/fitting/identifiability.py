@@ -2,8 +2,9 @@
 
 Whether a parameter is determined follows from the covariance of the estimates; the reason follows from the data. Two
 things the covariance cannot see are looked for in the data alone: a recording that hardly excites the fan, and a
-controller that feeds the noise of the speed back into the command. Under such feedback the direct approach, which fits command to
-speed as if there were no loop, is biased unless its noise model is right, and ours, white noise on the speed, is not
+controller that feeds the noise of the speed back into the command. Under such feedback the direct approach, which fits
+command to speed as if there were no loop, is biased unless its noise model is
+right, and ours, white noise on the speed, is not
 once the load fluctuates too (Ljung, System Identification, second edition, section 13.4).
 """
 
