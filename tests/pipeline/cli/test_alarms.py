@@ -18,7 +18,7 @@ from pipeline.cli.watch.alarms import OperatorAction, alarm_lines
 from pipeline.config.loading import load_config
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import Core, Parts, Stage
-from schemas.messages import Action, Alarm, Diagnosis, Header, Message, Request, StageStatus, Transition
+from schemas.messages import Action, Alarm, Diagnosis, Header, Message, Request, Severity, StageStatus, Transition
 from scoring.alarms.alarm_state import AlarmState, ConditionSettings
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.tray_alarms import Conditions
@@ -169,6 +169,11 @@ def test_the_list_has_what_stands_and_with_all_what_is_over(site):
     first, cause, message = site.ask().splitlines()
     assert first.startswith(f"{TRAY} fan 3  ALARM    active, unacknowledged  since ")
     assert (cause.strip(), message.strip()) == ("drag_up 83 %, friction_up 10 %: drag +50 %", "too slow")
+
+
+def test_an_alarm_of_a_newer_scorer_is_listed_with_its_number():
+    newest = replace(told_of_one_fan()[0], severity=Severity(7), transition=Transition(88), active=True)
+    assert "UNKNOWN (7)" in alarm_lines(CurrentAlarm(newest, newest.message, (), "")).plain
 
 
 def told_of_one_fan() -> list[Alarm]:
