@@ -1,2 +1,1 @@
-"""Deciding: residuals to statistics, thresholds, states and causes. Pure; docs/explanation/deciding.md tells the
-whole."""
+"""From residuals to statistics, limits, alarm states and causes. Pure; docs/explanation/deciding.md explains it."""

@@ -226,18 +226,18 @@ class FanScorer:
         highest = score.max(axis=0)
         self._below_half_limit &= highest <= HALF_LIMIT
         self._within_limit &= highest <= 1.0
-        judged, known = np.zeros(alive.shape, np.bool_), np.zeros(alive.shape, np.bool_)
+        scored_now, known = np.zeros(alive.shape, np.bool_), np.zeros(alive.shape, np.bool_)
         for source, of in (("speed", speed), ("balance", balance)):
             if self._is_scored[source]:
-                judged |= of.scored
+                scored_now |= of.scored
                 known |= of.valid
-        has_score = judged | (alive & (score > 1.0))
+        has_score = scored_now | (alive & (score > 1.0))
         baseline = self.residuals["balance"].baseline
         baseline_s = baseline.independent_intervals * self.limits.timing.baseline_s
         return ScoredBlock(
             score=np.where(has_score, score, np.nan),
             statistic=np.where(has_score, self._statistics[largest], Statistic.NONE).astype(np.uint8),
-            commissioning=known & ~judged,
+            commissioning=known & ~scored_now,
             speed_smoothed=np.where(speed.scored, speed.smoothed, np.nan),
             speed_baseline=speed.baseline,
             balance_smoothed=np.where(balance.scored, balance.smoothed, np.nan),

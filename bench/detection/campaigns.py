@@ -14,7 +14,7 @@ from bench.detection.plant import RATE_HZ, Plant
 from bench.detection.simulated import Chain, Fleet, run_name
 from schemas.messages import Array, Prediction
 
-Tell = Callable[[str], None]
+Progress = Callable[[str], None]
 KEPT_ROWS = 8
 """of so many samples the largest score is kept"""
 
@@ -25,7 +25,7 @@ class Healthy:
 
     alarms: list[RaisedAlarm]
     fan_hours: float
-    """judged"""
+    """samples with a score"""
     in_alarm_hours: float
 
 
@@ -36,20 +36,20 @@ def everyday(fleet: Fleet, runs: int, seed: int) -> Plant:
     return Plant(fleet.fans, runs, Knobs(knobs, seed), seed + 1)
 
 
-def predictions(fleet: Fleet, plant: Plant, seconds: float, tell: Tell) -> Iterator[tuple[str, Prediction]]:
+def predictions(fleet: Fleet, plant: Plant, seconds: float, progress: Progress) -> Iterator[tuple[str, Prediction]]:
     """Of every tray of every run, by its name, block by block."""
     trays = len(fleet.twins)
     chains: dict[int, Chain] = {}
-    told = 0
+    reported = 0
     for number, blocks in enumerate(plant.blocks(seconds)):
         for unit, raw in enumerate(blocks):
             chain = chains.setdefault(unit, Chain(fleet.twins[unit % trays]))
             for prediction in chain.take(raw):
                 yield run_name(unit, trays), prediction
         minutes = int(number * len(blocks[0].command) / RATE_HZ / 60)
-        if minutes >= told + 10:
-            told = minutes
-            tell(f"  {minutes} of {seconds / 60:.0f} min of {len(blocks)} trays")
+        if minutes >= reported + 10:
+            reported = minutes
+            progress(f"  {minutes} of {seconds / 60:.0f} min of {len(blocks)} trays")
 
 
 def calibrate(
@@ -72,7 +72,7 @@ def calibrate(
 
 
 class Watch:
-    """One method over all runs: what it raised, for how long it judged, and its scores, if they are kept."""
+    """One method over all runs: what it raised, for how long it scored, and its scores, if they are kept."""
 
     def __init__(self, detector: Callable[[str, int], Detector], *, keep_scores: bool) -> None:
         self._new = detector
@@ -80,7 +80,7 @@ class Watch:
         self._log = Log()
         self._keep = keep_scores
         self._kept: dict[str, list[Array]] = {}
-        self._judged = 0
+        self._scored = 0
         self._step_ns = 0
         self._start_ns: dict[str, int] = {}
         self._end_ns: dict[str, int] = {}
@@ -90,18 +90,18 @@ class Watch:
         if run not in self._detectors:
             self._detectors[run] = self._new(run, block.fans)
             self._start_ns[run] = int(block.t_ns[0])
-        verdict = self._detectors[run].take(block)
-        self._log.take(run, verdict.changes)
-        self._judged += int(np.isfinite(verdict.score).sum())
+        output = self._detectors[run].take(block)
+        self._log.take(run, output.changes)
+        self._scored += int(np.isfinite(output.score).sum())
         self._step_ns, self._end_ns[run] = block.period_ns, int(block.t_ns[-1])
         if self._keep:
-            self._kept.setdefault(run, []).append(thinned(verdict.score).astype(np.float32))
+            self._kept.setdefault(run, []).append(thinned(output.score).astype(np.float32))
 
     def healthy(self) -> Healthy:
         """What it did, if all was healthy."""
         alarms = self._log.alarms
         in_alarm_ns = sum((one.cleared_ns or self._end_ns[one.run]) - one.raised_ns for one in alarms)
-        return Healthy(alarms, self._judged * self._step_ns / 3.6e12, in_alarm_ns / 3.6e12)
+        return Healthy(alarms, self._scored * self._step_ns / 3.6e12, in_alarm_ns / 3.6e12)
 
     @property
     def alarms(self) -> list[RaisedAlarm]:
@@ -119,7 +119,7 @@ class Watch:
 
 
 def thinned(score: Array) -> Array:
-    """(m, fans) the largest of each KEPT_ROWS samples; NaN where none was judged."""
+    """(m, fans) the largest of each KEPT_ROWS samples; NaN where none was scored."""
     rows = -len(score) % KEPT_ROWS
     padded = np.concatenate((score, np.full((rows, score.shape[1]), np.nan)))
     largest = np.where(np.isfinite(padded), padded, -np.inf).reshape(-1, KEPT_ROWS, score.shape[1]).max(axis=1)
@@ -127,7 +127,7 @@ def thinned(score: Array) -> Array:
 
 
 def watched(watches: dict[str, Watch], stream: Iterator[tuple[str, Prediction]]) -> dict[str, Watch]:
-    """Let all methods judge all blocks."""
+    """Feed all blocks to all methods."""
     for run, block in stream:
         for watch in watches.values():
             watch.take(run, block)

@@ -1,4 +1,4 @@
-"""What the columns of a campaign are told: every one turns a knob of its own, holds it for a while, and turns again.
+"""The commands of a campaign: every column turns a knob of its own, holds it for a while, and turns again.
 
 A held level, a hand at the knob, random stairs and a random binary sequence are one thing: they differ in how long is
 held and turned, and in how many levels there are. Drawn as time goes on, so that no run is too long.

@@ -51,7 +51,7 @@ class Scored:
 
 
 def library_methods(rate_hz: float, healthy: Sequence[Sequence[Prediction]], *, few_fans: bool) -> list[Method]:
-    """One of each library. healthy: runs to fit to. few_fans: only some are judged, for these are slow.
+    """One of each library. healthy: runs to fit to. few_fans: only some are scored, for these are slow.
 
     Ends the program with one line where a library is missing.
     """
@@ -81,10 +81,10 @@ def _pyod_method(name: str, model: Any, rate_hz: float, healthy: Sequence[Sequen
     def score(features: Array) -> Array:
         scores = np.full(features.shape[:2], np.nan)
         flat = features[:, ::every].reshape(-1, 4)
-        judged = np.isfinite(flat).all(axis=1)
+        scored = np.isfinite(flat).all(axis=1)
         found = np.full(len(flat), np.nan)
-        if judged.any():
-            found[judged] = model.decision_function(flat[judged])
+        if scored.any():
+            found[scored] = model.decision_function(flat[scored])
         scores[:, ::every] = found.reshape(len(features), -1)
         return scores
 

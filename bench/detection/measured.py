@@ -1,8 +1,8 @@
-"""Measured data with labelled faults, the rosa rig (docs/how-to/datasets.md), as a newcomer would judge them.
+"""Measured data with labelled faults, the rosa rig (docs/how-to/datasets.md), as a newcomer would evaluate them.
 
 `fantwin import`, `train`, `calibrate` and `replay --offline --json`, nothing else, and healthy runs alone decide on
 twins and limits. Healthy runs are held out in turn: of the others every second one by speed trains, the rest sets the
-limits. Faulty runs are judged by each of these twins. An event is a stretch of rows that `Binary Macro Health Mode`
+limits. Faulty runs are scored by each of these twins. An event is a stretch of rows that `Binary Macro Health Mode`
 calls anomalous; stretches less than a second apart are one.
 """
 
@@ -45,7 +45,7 @@ MOST_FOLDS = 8
 JOINED_NS = 1_000_000_000
 LONGEST_BUFFER_S, BUFFERS = 2.0, 11
 REFERENCE = "filtered balance"
-Tell = Callable[[str], None]
+Progress = Callable[[str], None]
 Rows = list[dict[str, Any]]
 
 
@@ -66,8 +66,8 @@ class Measured:
 
 
 @dataclass
-class Judged:
-    """What a method made of the runs: alarms and scores of each, and how long it judged."""
+class Scored:
+    """What a method made of the runs: alarms and scores of each, and how long it scored."""
 
     alarms: dict[str, list[RaisedAlarm]] = field(default_factory=dict)
     scores: dict[str, tuple[Array, Array]] = field(default_factory=dict)
@@ -86,7 +86,7 @@ class Tally:
     volumes: list[float] = field(default_factory=list)
 
 
-def measured_tables(tell: Tell, *, libraries: bool) -> tuple[dict[str, Rows], list[str]]:
+def measured_tables(progress: Progress, *, libraries: bool) -> tuple[dict[str, Rows], list[str]]:
     """The tables of the rig, and what has to be said about them. Ends the program where the data are not there."""
     if not FOLDER.is_dir():
         raise SystemExit(
@@ -97,11 +97,13 @@ def measured_tables(tell: Tell, *, libraries: bool) -> tuple[dict[str, Rows], li
         runs = imported(FOLDER, Path(folder))
         for number, (training, calibrating, held_out) in enumerate(folds(runs)):
             names = ", ".join(run.name for run in held_out)
-            tell(f"rosa {number + 1}: held out {names}; trained on {len(training)}, limits by {len(calibrating)} runs")
+            progress(
+                f"rosa {number + 1}: held out {names}; trained on {len(training)}, limits by {len(calibrating)} runs"
+            )
             place = Path(folder) / f"fold{number}"
             place.mkdir()
-            judged = judged_fold(place, training, calibrating, held_out, runs, libraries=libraries)
-            for name, one in judged.items():
+            scored = scored_fold(place, training, calibrating, held_out, runs, libraries=libraries)
+            for name, one in scored.items():
                 _add(tallies.setdefault(name, Tally()), one, held_out, runs)
     minutes = next(iter(tallies.values())).healthy_hours * 60
     return {
@@ -110,7 +112,7 @@ def measured_tables(tell: Tell, *, libraries: bool) -> tuple[dict[str, Rows], li
         ],
         "rosa: each event, by twins of how many folds it is found": _event_rows(tallies),
     }, [
-        f"rosa: every healthy run was held out once, {minutes:.1f} min judged",
+        f"rosa: every healthy run was held out once, {minutes:.1f} min scored",
         "rosa: limits for one false alarm in half an hour, of which the healthy runs are the sixth part: extrapolated",
         *(f"rosa: fantwin, false alarm: {one.run} at {one.raised_ns / 1e9:.2f} s" for one in tallies[NAME].false),
         "rosa: 'beside' are alarms of faulty runs outside of their events and the 5 s after them",
@@ -152,7 +154,7 @@ def folds(runs: Sequence[Measured]) -> list[tuple[list[Measured], list[Measured]
     return made
 
 
-def judged_fold(
+def scored_fold(
     place: Path,
     training: Sequence[Measured],
     calibrating: Sequence[Measured],
@@ -160,19 +162,19 @@ def judged_fold(
     runs: Sequence[Measured],
     *,
     libraries: bool,
-) -> dict[str, Judged]:
-    """Train and calibrate on healthy runs, and judge those held out and the faulty ones by every method."""
+) -> dict[str, Scored]:
+    """Train and calibrate on healthy runs, and score those held out and the faulty ones by every method."""
     twin = place / "rosa.onnx"
     healthy = [run.recording for run in calibrating]
     _fantwin("train", *(run.recording for run in training), "--model", "physical", "--command-unit", "%", "-o", twin)
     _fantwin("calibrate", twin, *healthy, "--false-alarms-per-day", 24 * ALARMS_PER_HOUR, "--extrapolate")
     judged_runs = [*held_out, *(run for run in runs if not run.is_healthy)]
-    ours = Judged()
+    ours = Scored()
     blocks: dict[str, list[Prediction]] = {}
     for run in judged_runs:
-        blocks[run.name] = _judge(run, twin, place, ours)
+        blocks[run.name] = _score(run, twin, place, ours)
     for run in (*training, *calibrating):
-        blocks[run.name] = _judge(run, twin, place, Judged())
+        blocks[run.name] = _score(run, twin, place, Scored())
     rate_hz = 1e9 / blocks[training[0].name][0].period_ns
     learned = [blocks[run.name] for run in training]
     coefficients = fitted_balance(learned)
@@ -185,23 +187,23 @@ def judged_fold(
     for method in methods:
         if not method.is_fixed:
             method.limit = _limit(method, [blocks[run.name] for run in calibrating])
-        found[method.name] = Judged()
+        found[method.name] = Scored()
         for run in judged_runs:
             _watch(method, run.name, blocks[run.name], found[method.name])
     return found
 
 
-def _judge(run: Measured, twin: Path, place: Path, judged: Judged) -> list[Prediction]:
+def _score(run: Measured, twin: Path, place: Path, scored: Scored) -> list[Prediction]:
     """What fantwin says of a run; its predictions, for the others."""
     written = place / f"{run.name}.mcap"
     result = json.loads(_fantwin("replay", run.recording, "--offline", "--twin", twin, "--json", "-o", written))
-    judged.alarms[run.name] = [
+    scored.alarms[run.name] = [
         RaisedAlarm(
             run.name, one["fan"], one["raised_ns"], one["cleared_ns"], tuple(cause["cause"] for cause in one["causes"])
         )
         for one in result["alarms"]
     ]
-    judged.hours[run.name] = result["hours"]
+    scored.hours[run.name] = result["hours"]
     predictions: list[Prediction] = []
     scores: list[Score] = []
     for entry in read_recording(written, ("prediction", "score")):
@@ -209,7 +211,7 @@ def _judge(run: Measured, twin: Path, place: Path, judged: Judged) -> list[Predi
             predictions.append(entry.message)
         elif isinstance(entry.message, Score):
             scores.append(entry.message)
-    judged.scores[run.name] = (
+    scored.scores[run.name] = (
         np.concatenate([one.t_ns for one in scores]),
         np.concatenate([one.score[:, 0] for one in scores]),
     )
@@ -226,30 +228,30 @@ def _limit(method: Method, healthy: Sequence[Sequence[Prediction]]) -> float:
     return calibration.limit()
 
 
-def _watch(method: Method, run: str, blocks: Sequence[Prediction], judged: Judged) -> None:
+def _watch(method: Method, run: str, blocks: Sequence[Prediction], scored: Scored) -> None:
     detector, log = method.detector(1), Log()
     scores = []
     for block in blocks:
-        verdict = detector.take(block)
-        log.take(run, verdict.changes)
-        scores.append(verdict.score[:, 0])
+        output = detector.take(block)
+        log.take(run, output.changes)
+        scores.append(output.score[:, 0])
     score = np.concatenate(scores)
-    judged.alarms[run] = log.alarms
-    judged.scores[run] = (np.concatenate([block.t_ns for block in blocks]), score)
-    judged.hours[run] = float(np.isfinite(score).sum()) * blocks[0].period_ns / 3.6e12
+    scored.alarms[run] = log.alarms
+    scored.scores[run] = (np.concatenate([block.t_ns for block in blocks]), score)
+    scored.hours[run] = float(np.isfinite(score).sum()) * blocks[0].period_ns / 3.6e12
 
 
-def _add(tally: Tally, judged: Judged, held_out: Sequence[Measured], runs: Sequence[Measured]) -> None:
+def _add(tally: Tally, scored: Scored, held_out: Sequence[Measured], runs: Sequence[Measured]) -> None:
     for run in held_out:
-        tally.false += judged.alarms[run.name]
-        tally.healthy_hours += judged.hours[run.name]
+        tally.false += scored.alarms[run.name]
+        tally.healthy_hours += scored.hours[run.name]
     for run in runs:
         if run.is_healthy:
             continue
-        alarms = judged.alarms[run.name]
+        alarms = scored.alarms[run.name]
         tally.found += outcomes(run.events, alarms)
         tally.beside_events += len(false_alarms(alarms, run.events))
-        t_ns, score = judged.scores[run.name]
+        t_ns, score = scored.scores[run.name]
         anomalous = np.zeros(len(t_ns), np.bool_)
         for event in run.events:
             anomalous |= (t_ns >= event.start_ns) & (t_ns <= event.end_ns)
@@ -280,7 +282,7 @@ def _event_rows(tallies: dict[str, Tally]) -> Rows:
             row[name] = _found(of)
             if name == NAME:
                 causes = Counter(one.cause for one in of if one.cause)
-                row["told first"] = ", ".join(f"{cause} {count}" for cause, count in causes.most_common(3))
+                row["reported first"] = ", ".join(f"{cause} {count}" for cause, count in causes.most_common(3))
     return list(rows.values())
 
 
@@ -292,7 +294,7 @@ def _found(found: Sequence[Outcome]) -> str:
 
 def _fantwin(*words: object) -> str:
     """Run a command; what it printed. Ends the program where it could not be done."""
-    told = fantwin(*words, timeout_s=600)
-    if told.returncode not in (0, 3):
-        raise SystemExit(f"fantwin {words[0]} ended with {told.returncode}: {told.stderr.strip()}")
-    return told.stdout
+    reported = fantwin(*words, timeout_s=600)
+    if reported.returncode not in (0, 3):
+        raise SystemExit(f"fantwin {words[0]} ended with {reported.returncode}: {reported.stderr.strip()}")
+    return reported.stdout

@@ -1,7 +1,7 @@
 """What is compared: a method is a name, a detector for each run, and whether its limit is ours to set.
 
 The seam. A *detector* is handed the predictions of one tray's run block by block, as the scorer is, and gives for each
-block a score (n, fans), NaN where it does not judge, and the alarms it raised and cleared. Whatever only has a score
+block a score (n, fans), NaN where it has none, and the alarms it raised and cleared. Whatever only has a score
 gets its alarms from `Limited`; the limit is set for all of them by one rule on the same healthy runs (`Calibration`).
 The scorer itself (`ours`) brings its own limits, in the twin's card, and its own alarms.
 """
@@ -25,7 +25,7 @@ WINDOW_S = 60.0
 
 @dataclass(frozen=True)
 class Change:
-    """An alarm of a fan was raised or cleared, or its causes were told; the most probable cause is the first."""
+    """An alarm of a fan was raised or cleared, or its causes were reported; the most probable cause is the first."""
 
     fan: int
     t_ns: int
@@ -34,7 +34,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class MethodOutput:
     """What a detector says of a block. score: (n, fans)."""
 
     score: Array
@@ -42,17 +42,17 @@ class Verdict:
 
 
 class Scores(Protocol):
-    """A score with a memory; the larger, the less healthy."""
+    """A score that depends on past samples; the larger, the less healthy."""
 
     def take(self, block: Prediction) -> Array:
-        """(n, fans), NaN where a sample is not judged."""
+        """(n, fans), NaN where a sample has no score."""
         ...
 
 
 class Detector(Protocol):
     """Scores and alarms of one run."""
 
-    def take(self, block: Prediction) -> Verdict:
+    def take(self, block: Prediction) -> MethodOutput:
         """Judge a block; blocks come in the order of time."""
         ...
 
@@ -67,7 +67,7 @@ class Method:
     limit: float | None = None
     is_fixed: bool = False
     every: int = 1
-    """judges only one fan in so many: for what is too slow for all"""
+    """scores only one fan in so many: for methods that are too slow for all"""
 
     def detector(self, fans: int) -> Detector:
         """A new one, for a run."""
@@ -85,21 +85,23 @@ class Limited:
         self._last = np.full(fans, np.iinfo(np.int64).min // 2)
         self._was_active = np.zeros(fans, np.bool_)
 
-    def take(self, block: Prediction) -> Verdict:
+    def take(self, block: Prediction) -> MethodOutput:
         """See Detector."""
         score: Array = self._scores.take(block)
         rows = np.arange(self._row, self._row + len(score))[:, np.newaxis]
         self._row += len(score)
         exceeds = score > self._limit  # NaN does not
         if not exceeds.any() and not self._was_active.any():
-            return Verdict(score, [])
+            return MethodOutput(score, [])
         last = np.maximum.accumulate(np.where(exceeds, rows, self._last), axis=0)
         self._last = last[-1]
         active = rows - last <= round(OFF_DELAY_S * 1e9 / block.period_ns)
         before = np.concatenate((self._was_active[np.newaxis], active[:-1]))
         self._was_active = active[-1]
         changed = zip(*np.nonzero(active != before), strict=True)
-        return Verdict(score, [Change(int(fan), int(block.t_ns[row]), bool(active[row, fan])) for row, fan in changed])
+        return MethodOutput(
+            score, [Change(int(fan), int(block.t_ns[row]), bool(active[row, fan])) for row, fan in changed]
+        )
 
 
 class Calibration:
@@ -112,21 +114,21 @@ class Calibration:
         """alarms_per_hour: of a fan."""
         self._alarms_per_hour = alarms_per_hour
         self._windows: dict[tuple[str, int], Array] = {}
-        self._judged_ns = 0
+        self._scored_ns = 0
 
     def take(self, run: str, block: Prediction, score: Array) -> None:
         """Note the scores of a block of a run, (n, fans)."""
-        judged = np.isfinite(score)
-        self._judged_ns += int(judged.sum()) * block.period_ns
+        scored = np.isfinite(score)
+        self._scored_ns += int(scored.sum()) * block.period_ns
         window = (run, int(block.t_ns[0] // round(WINDOW_S * 1e9)))
-        largest: Array = np.max(np.where(judged, score, -np.inf), axis=0)
+        largest: Array = np.max(np.where(scored, score, -np.inf), axis=0)
         before = self._windows.get(window)
         self._windows[window] = largest if before is None else np.maximum(before, largest)
 
     @property
     def fan_hours(self) -> float:
-        """How long fans were judged."""
-        return self._judged_ns / 3.6e12
+        """How long fans had a score."""
+        return self._scored_ns / 3.6e12
 
     @property
     def allowed(self) -> int:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest, chi2
 
 THRESHOLDS = 250
-NONE = "none told"
+NONE = "none reported"
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class RaisedAlarm:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of an event. delay_s: NaN where it was missed. cause: the first one told, empty where none was."""
+    """What came of an event. delay_s: NaN where it was missed. cause: the first one reported, empty where none was."""
 
     event: Event
     delay_s: float
@@ -112,7 +112,7 @@ def false_alarms(
 
 
 def confusion(found: Iterable[Outcome]) -> dict[str, Counter[str]]:
-    """True cause to how often each cause was told first, of the events that were found."""
+    """True cause to how often each cause was reported first, of the events that were found."""
     table: dict[str, Counter[str]] = {}
     for one in found:
         if one.is_found:
@@ -154,8 +154,8 @@ def _range_pr(
     spans: Sequence[tuple[int, int]],
     buffer: int,
 ) -> float:
-    worth = _with_buffers(anomalous, spans, buffer)
-    true_positive = np.cumsum(worth[order])[predicted - 1]
+    weight = _with_buffers(anomalous, spans, buffer)
+    true_positive = np.cumsum(weight[order])[predicted - 1]
     in_buffers = true_positive - np.cumsum(anomalous[order])[predicted - 1]
     positive = np.sum(anomalous) + in_buffers / 2.0
     wide = _widened(spans, buffer // 2, len(anomalous))
@@ -172,13 +172,13 @@ def _spans(anomalous: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _with_buffers(anomalous: NDArray[np.bool_], spans: Sequence[tuple[int, int]], buffer: int) -> NDArray[np.float64]:
-    worth = anomalous.astype(np.float64)
+    weight = anomalous.astype(np.float64)
     for first, last in spans:
-        after = np.arange(last + 1, min(last + buffer // 2 + 1, len(worth)))
-        worth[after] += np.sqrt(1.0 - (after - last) / max(buffer, 1))
+        after = np.arange(last + 1, min(last + buffer // 2 + 1, len(weight)))
+        weight[after] += np.sqrt(1.0 - (after - last) / max(buffer, 1))
         before = np.arange(max(first - buffer // 2, 0), first)
-        worth[before] += np.sqrt(1.0 - (first - before) / max(buffer, 1))
-    return np.minimum(worth, 1.0)
+        weight[before] += np.sqrt(1.0 - (first - before) / max(buffer, 1))
+    return np.minimum(weight, 1.0)
 
 
 def _widened(spans: Sequence[tuple[int, int]], by: int, length: int) -> list[tuple[int, int]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.detection.methods import Change, Verdict
+from bench.detection.methods import Change, MethodOutput
 from bench.detection.plant import BLOCK, STEP_NS, TRAY_FANS
 from bench.detection.simulated import tray_number
 from pipeline.runtime.stage import Core
@@ -35,7 +35,7 @@ class Scorer:
     def __init__(self, core: Core) -> None:
         self._core = core
 
-    def take(self, block: Prediction) -> Verdict:
+    def take(self, block: Prediction) -> MethodOutput:
         """See methods.Detector."""
         scores: list[Array] = []
         changes: list[Change] = []
@@ -44,9 +44,9 @@ class Scorer:
                 scores.append(message.score)
             elif isinstance(message, Alarm):
                 causes = sorted(message.causes, key=lambda one: -one.probability)
-                told = tuple(one.cause for one in causes)
-                changes.append(Change(message.fan, message.t_ns, message.active, told))
-        return Verdict(np.concatenate(scores), changes)
+                reported = tuple(one.cause for one in causes)
+                changes.append(Change(message.fan, message.t_ns, message.active, reported))
+        return MethodOutput(np.concatenate(scores), changes)
 
 
 class HealthySamples:

@@ -38,22 +38,22 @@ def main(
     seed: Annotated[int, typer.Option(help="Of commands and noise.")] = 7,
     json_output: JsonOption = False,
 ) -> None:
-    """Simulate, judge and draw the three runs."""
+    """Simulate, score and draw the three runs."""
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as work:
         for name, faults in RUNS.items():
-            recording, judged = Path(work) / f"{name}.mcap", Path(work) / f"{name}-judged.mcap"
+            recording, scored = Path(work) / f"{name}.mcap", Path(work) / f"{name}-judged.mcap"
             truth = Path(work) / f"{name}.json"
             options = [word for fault in faults for word in ("--fault", fault)]
             settings = ("--fans", 8, "--profile", "manual", "--seed", seed, "--duration", 45, "--speed-unit", "rpm")
             _fantwin("simulate", *settings, *options, "--recording", recording, "--truth", truth)
-            told = json.loads(
-                _fantwin("replay", recording, "--offline", "--twin", TWIN, "-o", judged, "--json", accept=(0, 3))
+            reported = json.loads(
+                _fantwin("replay", recording, "--offline", "--twin", TWIN, "-o", scored, "--json", accept=(0, 3))
             )
             picture = folder / f"experiment-{name}.png"
-            _fantwin("plot", judged, "--fans", FAN, "--unit", "rpm", "--truth", truth, "-o", picture)
+            _fantwin("plot", scored, "--fans", FAN, "--unit", "rpm", "--truth", truth, "-o", picture)
             start_ns = json.loads(truth.read_text(encoding="utf-8"))["start_ns"]
-            rows += _rows(name, told["alarms"], start_ns) or [NO_ALARM | {"run": name}]
+            rows += _rows(name, reported["alarms"], start_ns) or [NO_ALARM | {"run": name}]
     show({"alarms of the three runs, s since the first sample": rows}, [], as_json=json_output)
 
 

@@ -23,10 +23,10 @@ from bench.detection.simulated_tables import (
     Sizes,
     cause_rows,
     healthy_rows,
-    judged_faults,
     kind_rows,
     method_rows,
     prepared,
+    scored_faults,
 )
 from bench.printing import JsonOption, progress, show
 from scoring.calibration.calibration import TooLittleError
@@ -60,9 +60,9 @@ def main(
         with tempfile.TemporaryDirectory() as folder:
             _simulated(Path(folder), sizes, extrapolate, others, others and libraries, tables, notes)
     if only != "simulated":
-        measured, told = measured_tables(progress, libraries=libraries)
+        measured, reported = measured_tables(progress, libraries=libraries)
         tables |= measured
-        notes += told
+        notes += reported
     notes.append(f"all of it took {(time.monotonic() - began_s) / 60:.1f} min")
     show(tables, notes, as_json=json_output)
 
@@ -77,18 +77,18 @@ def _simulated(
     notes: list[str],
 ) -> None:
     try:
-        bench = prepared(folder, sizes, extrapolate=extrapolate, others=others, libraries=libraries, tell=progress)
+        bench = prepared(folder, sizes, extrapolate=extrapolate, others=others, libraries=libraries, progress=progress)
     except TooLittleError as error:
         raise SystemExit(
             f"{sizes.calibration_days:g} healthy fan-days cannot support one alarm of a fan in "
             f"{sizes.declared_days:g} days: give --calibration-days {error.needed_fan_hours / 24:.3g}, or --extrapolate"
         ) from error
     tables["simulated, healthy running of other days"] = healthy_rows(bench, sizes, progress)
-    faulty = judged_faults(bench, sizes, progress)
+    faulty = scored_faults(bench, sizes, progress)
     tables["simulated faults, by method"] = method_rows(faulty, bench)
     tables["simulated faults, fantwin, by kind and strength"] = kind_rows(faulty)
-    tables["causes told first by fantwin, command moving"] = cause_rows(faulty, is_moved=True)
-    tables["causes told first by fantwin, command held"] = cause_rows(faulty, is_moved=False)
+    tables["causes reported first by fantwin, command moving"] = cause_rows(faulty, is_moved=True)
+    tables["causes reported first by fantwin, command held"] = cause_rows(faulty, is_moved=False)
     rate = bench.limits.declared_rate
     assert rate
     low, high = (sizes.declared_days * figure for figure in rate.interval_95)
@@ -102,7 +102,7 @@ def _simulated(
     notes += [
         f"all other limits: no more than {bench.calibration.allowed} excursions on the same fan-days; '+-2 sigma, as "
         "published' and 'CUSUM, textbook limit' have their own",
-        "PyOD judges one fan in 3, river one in 13; delays: median and quartiles of what was found",
+        "PyOD scores one fan in 3, river one in 13; delays: median and quartiles of what was found",
     ]
 
 

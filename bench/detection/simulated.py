@@ -48,13 +48,13 @@ class Fleet:
         )
 
 
-def trained_fleet(folder: Path, fans: int, seed: int, tell: Callable[[str], None]) -> Fleet:
+def trained_fleet(folder: Path, fans: int, seed: int, progress: Callable[[str], None]) -> Fleet:
     """Fans, and twins of them written to a folder. fans: a multiple of TRAY_FANS."""
     parameters = tray_of_fans(fans, FANS_SEED)
     recorded = [healthy_runs(parameters, seed + number, TRAINING_S) for number in (0, 1)]
     twins = []
     for number, (training, held_out) in enumerate(zip(*recorded, strict=True)):
-        tell(f"training the twins of tray {number + 1} of {fans // TRAY_FANS}")
+        progress(f"training the twins of tray {number + 1} of {fans // TRAY_FANS}")
         name = f"tray{number + 1}"
         twin = train_twin([training], [held_out], "hybrid", name=name, max_iterations=ITERATIONS)
         twins.append(twin.save(folder / f"{name}.onnx"))

@@ -1,4 +1,4 @@
-"""The simulated part of the bench: healthy running for long, then faults, judged by all methods; as rows of tables."""
+"""The simulated part of the bench: healthy running for long, then faults, scored by all methods; as rows of tables."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FITTING_S = 300.0
 LONGEST_BUFFER_S = 2.0
 BUFFERS = 11
 VUS_EVENTS = 600
-Tell = Callable[[str], None]
+Progress = Callable[[str], None]
 Rows = list[dict[str, Any]]
 
 
@@ -78,39 +78,41 @@ class Bench:
         return {NAME: ours, **others}
 
     def every(self, name: str) -> int:
-        """The method judges one fan in so many."""
+        """The method scores one fan in so many."""
         return next((method.every for method in self.methods if method.name == name), 1)
 
     def _scorer(self, run: str, _fans: int) -> Scorer:
         return Scorer(stage("scorer", self.calibrated[tray_number(run)]))
 
 
-def prepared(folder: Path, sizes: Sizes, *, extrapolate: bool, others: bool, libraries: bool, tell: Tell) -> Bench:
+def prepared(
+    folder: Path, sizes: Sizes, *, extrapolate: bool, others: bool, libraries: bool, progress: Progress
+) -> Bench:
     """Train the twins, fit and calibrate all methods on the same healthy runs.
 
     Raises:
         TooLittleError: so rare an alarm cannot be declared by so little healthy running.
     """
-    fleet = trained_fleet(folder, sizes.fans, sizes.seed, tell)
+    fleet = trained_fleet(folder, sizes.fans, sizes.seed, progress)
     per_hour = 1.0 / (24.0 * sizes.declared_days)
     methods = plain_methods(RATE_HZ, per_hour) if others else []
     if libraries:
-        tell("fitting the libraries")
-        methods += library_methods(RATE_HZ, _fitting(fleet, sizes.seed + 1000, tell), few_fans=True)
+        progress("fitting the libraries")
+        methods += library_methods(RATE_HZ, _fitting(fleet, sizes.seed + 1000, progress), few_fans=True)
     kept = HealthySamples(folder)
     seconds = sizes.seconds(sizes.calibration_days)
-    tell(f"calibration: {sizes.calibration_days:g} fan-days in {sizes.runs} runs of {seconds / 60:.0f} min")
-    stream = predictions(fleet, everyday(fleet, sizes.runs, sizes.seed + 2000), seconds, tell)
+    progress(f"calibration: {sizes.calibration_days:g} fan-days in {sizes.runs} runs of {seconds / 60:.0f} min")
+    stream = predictions(fleet, everyday(fleet, sizes.runs, sizes.seed + 2000), seconds, progress)
     calibration = calibrate(methods, _keeping(kept, stream), per_hour)
-    tell("limits of the scorer")
+    progress("limits of the scorer")
     calibrated, limits = calibrated_twins(fleet.twins, kept, 1.0 / sizes.declared_days, extrapolate=extrapolate)
     kept.clear()
     return Bench(fleet, methods, calibrated, limits, calibration)
 
 
-def _fitting(fleet: Fleet, seed: int, tell: Tell) -> list[list[Prediction]]:
+def _fitting(fleet: Fleet, seed: int, progress: Progress) -> list[list[Prediction]]:
     runs: dict[str, list[Prediction]] = {}
-    for run, block in predictions(fleet, everyday(fleet, 1, seed), FITTING_S, tell):
+    for run, block in predictions(fleet, everyday(fleet, 1, seed), FITTING_S, progress):
         runs.setdefault(run, []).append(block)
     return list(runs.values())
 
@@ -121,12 +123,12 @@ def _keeping(kept: HealthySamples, stream: Any) -> Any:
         yield run, block
 
 
-def healthy_rows(bench: Bench, sizes: Sizes, tell: Tell) -> Rows:
+def healthy_rows(bench: Bench, sizes: Sizes, progress: Progress) -> Rows:
     """False alarms in healthy running of other days."""
     seconds = sizes.seconds(sizes.healthy_days)
-    tell(f"healthy running: {sizes.healthy_days:g} fan-days in {sizes.runs} runs of {seconds / 60:.0f} min")
+    progress(f"healthy running: {sizes.healthy_days:g} fan-days in {sizes.runs} runs of {seconds / 60:.0f} min")
     plant = everyday(bench.fleet, sizes.runs, sizes.seed + 3000)
-    watches = watched(bench.watches(keep_scores=False), predictions(bench.fleet, plant, seconds, tell))
+    watches = watched(bench.watches(keep_scores=False), predictions(bench.fleet, plant, seconds, progress))
     return [_healthy_row(name, watch.healthy(), sizes.declared_days) for name, watch in watches.items()]
 
 
@@ -144,7 +146,7 @@ def _healthy_row(name: str, healthy: Healthy, declared_days: float) -> dict[str,
 
 @dataclass(frozen=True)
 class Faulty:
-    """A campaign of faults, judged."""
+    """A campaign of faults, scored."""
 
     shown: Campaign
     watches: dict[str, Watch]
@@ -176,11 +178,11 @@ class Faulty:
         return float(np.mean(volumes))
 
 
-def judged_faults(bench: Bench, sizes: Sizes, tell: Tell) -> Faulty:
-    """Let all methods judge faulty runs."""
+def scored_faults(bench: Bench, sizes: Sizes, progress: Progress) -> Faulty:
+    """Score faulty runs by all methods."""
     shown = campaign(bench.fleet, sizes.fault_runs, sizes.commissioned_s, sizes.seed + 4000)
-    tell(f"faults: {len(shown.events)} in {sizes.fault_runs} runs of {shown.seconds:.0f} s")
-    stream = predictions(bench.fleet, shown.plant, shown.seconds, tell)
+    progress(f"faults: {len(shown.events)} in {sizes.fault_runs} runs of {shown.seconds:.0f} s")
+    stream = predictions(bench.fleet, shown.plant, shown.seconds, progress)
     return Faulty(shown, watched(bench.watches(keep_scores=True), stream))
 
 
@@ -248,11 +250,11 @@ def cause_rows(faulty: Faulty, *, is_moved: bool) -> Rows:
     pairs = faulty.outcomes(NAME)
     chosen = [one for cell, one in pairs if cell.is_moved == is_moved and (cell.kind.sizes or cell.strength > 1.0)]
     table = confusion(chosen)
-    told = sorted({cause for row in table.values() for cause in row})
+    reported = sorted({cause for row in table.values() for cause in row})
     return [
         {
             "true cause": cause,
-            **{name.replace("_", " "): row[name] for name in told},
+            **{name.replace("_", " "): row[name] for name in reported},
             "right (95 %)": str(share(row[cause], row.total())),
         }
         for cause, row in sorted(table.items())

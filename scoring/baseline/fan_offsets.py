@@ -1,9 +1,9 @@
-"""What each fan's healthy residual is at each speed, beyond what a baseline of one run takes away.
+"""Mean healthy residual of each fan at each speed, beyond the baseline of a run.
 
-A twin is wrong by another little at each speed, and of each fan: most where it was hardly trained. That stays from day
-to day, so several runs show it, and then it need not be allowed for in limits. The mean residual of fan f in run r and
-bin of speed b is taken as e_fb + c_fr, where c is that day's baseline; both by least squares. How far e is drawn
-towards the mean of all fans follows from how much it varies between fans, and the rest between runs (empirical Bayes:
+A twin has a small error for each fan at each speed, largest where it had little training data. The error is the same
+on all days, so several runs show it, and limits need not allow for it. The mean residual of fan f in run r and speed
+bin b is modelled as e_fb + c_fr, where c is the baseline of that day; both by least squares. e is then shrunk towards
+the mean of all fans, as far as its variance between fans and the remaining variance between runs say (empirical Bayes:
 Efron and Morris, JASA 70 (1975) 311).
 """
 
@@ -17,18 +17,18 @@ import numpy as np
 from schemas.messages import Array
 from scoring.healthy_residual import FanOffsets
 
-FEWEST_FANS = 3
-FEWEST_RUNS = 12
-"""of a fan: what is learned from a run is off by that day, and limits are set by the same runs, which do not see it"""
-LEAST_S, WHOLE_S = 3.0, 30.0  # of one run in a bin of speed, to count at all, and to count as a whole one
+MIN_FANS = 3
+MIN_RUNS = 12
+"""of a fan: with fewer, the offsets contain too much of single days, which limits set on the same runs cannot show"""
+MIN_S, FULL_S = 3.0, 30.0  # of one run in a speed bin: to count at all, and to count fully
 ROUNDS = 20
 DIGITS = 4
-LEAST = 1e-12
+MIN_WEIGHT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Of one run: sums of a residual less its baseline. known_as: numbers of its fans. count, total: (fans, bins)."""
+    """Sums of one run's residual less its baseline. known_as: the numbers of its fans. count, total: (fans, bins)."""
 
     known_as: range
     count: Array
@@ -36,38 +36,40 @@ class Cells:
 
 
 def fan_offsets(runs: Sequence[Cells], centres_rad_s: Array, step_s: float) -> FanOffsets | None:
-    """Of all fans known; None where fans or runs are too few. centres_rad_s: (bins,)."""
+    """The offsets of all fans; None if there are too few fans or runs. centres_rad_s: (bins,)."""
     numbers = np.array([number for run in runs for number in run.known_as], int)
-    if len(set(numbers.tolist())) < FEWEST_FANS or np.bincount(numbers).max() < FEWEST_RUNS:
+    if len(set(numbers.tolist())) < MIN_FANS or np.bincount(numbers).max() < MIN_RUNS:
         return None
     count = np.concatenate([run.count for run in runs])
     mean = np.concatenate([run.total for run in runs]) / np.maximum(count, 1.0)
     seconds = count * step_s
-    weight = np.where(seconds >= LEAST_S, np.minimum(seconds / WHOLE_S, 1.0), 0.0)
-    runs_of = _by_fan(weight, numbers)
-    seen = runs_of.sum(axis=0) > 0.0
+    weight = np.where(seconds >= MIN_S, np.minimum(seconds / FULL_S, 1.0), 0.0)
+    weights = _by_fan(weight, numbers)
+    seen = weights.sum(axis=0) > 0.0
     if not seen.any():
         return None
-    own = of_all = np.zeros_like(runs_of)
+    offset = mean_offset = np.zeros_like(weights)
     for _ in range(ROUNDS):
-        of_day = _mean(weight, mean - own[numbers])
-        own = _by_fan(weight * (mean - of_day), numbers) / np.maximum(runs_of, LEAST)
-        of_all = (runs_of * own).sum(axis=0) / np.maximum(runs_of.sum(axis=0), LEAST)
-        own = own - _mean(runs_of, own - of_all)  # what a fan is off by at all speeds alike is its baseline's
-    of_day = _mean(weight, mean - own[numbers])
-    left_over = (weight * np.square(mean - of_day - own[numbers])).sum()
+        day = _mean(weight, mean - offset[numbers])
+        offset = _by_fan(weight * (mean - day), numbers) / np.maximum(weights, MIN_WEIGHT)
+        mean_offset = (weights * offset).sum(axis=0) / np.maximum(weights.sum(axis=0), MIN_WEIGHT)
+        offset = offset - _mean(weights, offset - mean_offset)  # an offset at all speeds alike belongs to the baseline
+    day = _mean(weight, mean - offset[numbers])
+    rest = (weight * np.square(mean - day - offset[numbers])).sum()
     parameters = (
-        np.count_nonzero(runs_of) + np.count_nonzero(weight.any(axis=1)) - np.count_nonzero(runs_of.any(axis=1))
+        np.count_nonzero(weights) + np.count_nonzero(weight.any(axis=1)) - np.count_nonzero(weights.any(axis=1))
     )
-    between_runs = left_over / max(np.count_nonzero(weight) - parameters, 1)
-    by_chance = (runs_of > 0).sum(axis=0) * between_runs
-    varies = ((runs_of * np.square(own - of_all)).sum(axis=0) - by_chance) / np.maximum(runs_of.sum(axis=0), LEAST)
-    varies = np.maximum(varies, 0.0)
-    trusted = varies / np.maximum(varies + between_runs / np.maximum(runs_of, LEAST), LEAST)
-    drawn = of_all + trusted * (own - of_all)
+    between_runs = rest / max(np.count_nonzero(weight) - parameters, 1)
+    expected_by_chance = (weights > 0).sum(axis=0) * between_runs
+    variance = ((weights * np.square(offset - mean_offset)).sum(axis=0) - expected_by_chance) / np.maximum(
+        weights.sum(axis=0), MIN_WEIGHT
+    )
+    variance = np.maximum(variance, 0.0)
+    shrinkage = variance / np.maximum(variance + between_runs / np.maximum(weights, MIN_WEIGHT), MIN_WEIGHT)
+    shrunk = mean_offset + shrinkage * (offset - mean_offset)
     return FanOffsets(
         speeds_rad_s=tuple(centres_rad_s[seen].tolist()),
-        offset_sigmas=tuple(tuple(row) for row in np.round(drawn[:, seen], DIGITS).tolist()),
+        offset_sigmas=tuple(tuple(row) for row in np.round(shrunk[:, seen], DIGITS).tolist()),
     )
 
 
@@ -80,4 +82,4 @@ def _by_fan(values: Array, numbers: Array) -> Array:
 
 def _mean(weight: Array, values: Array) -> Array:
     """(rows, 1) over bins."""
-    return ((weight * values).sum(axis=1) / np.maximum(weight.sum(axis=1), LEAST))[:, np.newaxis]
+    return ((weight * values).sum(axis=1) / np.maximum(weight.sum(axis=1), MIN_WEIGHT))[:, np.newaxis]

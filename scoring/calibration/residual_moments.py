@@ -1,4 +1,4 @@
-"""Sums over the residual of healthy runs, from which its mean, standard deviation and memory are computed."""
+"""Sums over the residual of healthy runs, from which its mean, standard deviation and correlation time are computed."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The tacho itself: readings that repeat, and readings that are missing.
 
 A stuck tacho repeats its last value. A healthy one may do so for a while, where it counts coarsely and the fan runs
-evenly; calibration measures for how long. Missing readings are judged by their share.
+evenly; calibration measures for how long. Missing readings are limited by their share.
 """
 
 from __future__ import annotations

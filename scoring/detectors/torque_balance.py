@@ -1,9 +1,9 @@
-"""Torque balance: the command that was given, less the command that a healthy fan needs for the motion measured.
+"""Torque balance: the command given, less the command that a healthy fan needs for the measured motion.
 
-A healthy fan needs J w' + alpha w + C_D w|w| + friction. The difference goes through 1 / (1 + s / lambda), and so no
-speed is differentiated: over a step the filter gives J w' the weight of J lambda (w - filtered w), as the filtering
-operator of Peng and Chen does (their equations 13 to 18). A speed loop cannot hide a fault from it: what it adds to
-the command to hold the speed is just what appears here.
+A healthy fan needs J w' + alpha w + C_D w|w| + friction. The difference is filtered by 1 / (1 + s / lambda), so that no
+speed is differentiated: the filter turns J w' into J lambda (w - filtered w), as the filtering operator of Peng and
+Chen does (their equations 13 to 18). A speed controller cannot hide a fault from it: what it adds to the
+command to hold the speed appears here.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ class BalanceModel:
     lag_s: Array
     filter_rate_per_s: float
     lowest_speed_rad_s: Array
-    """below it friction is whatever holds the rotor, and nothing is said"""
+    """below it friction is undefined, and there is no balance"""
     highest_speed_rad_s: float
-    """above it nobody knows what a healthy fan needs"""
+    """above it the command of a healthy fan is not known"""
     off_below: Array | None = None
     """(fans,) with a smaller command the drive is off; None: where friction is not overcome"""
 
 
 class TorqueBalance:
-    """The balance of a tray's fans, block by block; what it gives does not depend on how blocks are cut.
+    """The balance of a tray's fans, block by block. The result does not depend on how samples are cut into blocks.
 
-    It begins with a fan's first known pair of samples, and anew after what is not known, when the drive was off, and
-    when the fan was too slow.
+    It starts with the first two known samples of a fan, and again after unknown samples, after the drive was off, and
+    after the fan was too slow.
     """
 
     def __init__(self, model: BalanceModel) -> None:
@@ -57,13 +57,13 @@ class TorqueBalance:
         self._weight = np.zeros(fans)
 
     def reset(self) -> None:
-        """Forget what was measured: samples are missing."""
+        """Start again: samples are missing."""
         self._speed[:] = self._command[:] = self._lagged[:] = np.nan
 
     def update(self, step_s: float, command: Array, speed_rad_s: Array, known: Array) -> Array:
         """The balance at each sample, NaN where it is not settled. All (n, fans); command: held to the next sample."""
         model = self._model
-        drives = command >= self._off_below  # one that is off may brake or coast: that is another machine
+        drives = command >= self._off_below  # a drive that is off may brake or coast, which the model does not cover
         turns = np.abs(speed_rad_s) >= model.lowest_speed_rad_s
         speed = np.where(known & drives & turns, speed_rad_s, np.nan)
         before, given = np.vstack((self._speed, speed))[:-1], np.vstack((self._command, command))[:-1]
@@ -136,7 +136,7 @@ class TorqueBalance:
         return np.where(self._model.lag_s > 0.0, given + (start - given) * share, given)
 
     def _lagging(self, step_s: float) -> tuple[Array, Array]:
-        """What is left of a distance after a step, and its mean over the step, (fans,) each."""
+        """The rest of a deviation after a step, and its mean over the step, (fans,) each, as shares of it."""
         if step_s != self._lag_step_s:
             steps = step_s / np.where(self._model.lag_s > 0.0, self._model.lag_s, 1.0)
             self._lag_step_s, self._lag_shares = step_s, (np.exp(-steps), -np.expm1(-steps) / steps)
@@ -144,11 +144,11 @@ class TorqueBalance:
 
 
 SETTLED = 0.6
-"""share of the filter's memory that must be filled: one time constant"""
+"""weight of the samples in the filter from which on the balance is valid: one time constant"""
 
 
 def filter_rows(keep: float, rows: Array, state: Array) -> tuple[Array, Array]:
-    """y[k] = (1 - keep) x[k] + keep y[k-1] along the first axis, sample by sample, so cuts change nothing.
+    """y[k] = (1 - keep) x[k] + keep y[k-1] along the first axis, sample by sample, so that cuts change nothing.
 
     rows: (n, m). state: (1, m), keep times the y before the first. Returns y (n, m) and the state after.
     """
