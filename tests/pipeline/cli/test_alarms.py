@@ -1,4 +1,4 @@
-"""`fantwin alarms`: the command, over a real bus, with a scorer that raises when it is told to."""
+"""`fantwin alarms`: the command, over a real bus, with a scorer that raises an alarm on request."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class ToldScorer(Core):
     def tick(self, now_ns: int) -> Sequence[Message]:
         self._now_ns = now_ns
         ratio = np.array([[self.ratio.get(fan, 0.0) for fan in range(FANS)]])
-        course = self.conditions.update(np.array([now_ns]), 1, ratio, ratio >= 0)
-        return [self._alarm(c.fan, c.transition, c.alarm_state, "too slow") for c in course.events]
+        result = self.conditions.update(np.array([now_ns]), 1, ratio, ratio >= 0)
+        return [self._alarm(c.fan, c.transition, c.alarm_state, "too slow") for c in result.events]
 
     def step(self, item: Any) -> Sequence[Message]:
         if self.deaf or not isinstance(item, Request):
@@ -182,7 +182,7 @@ def told_of_one_fan() -> list[Alarm]:
     return [alarm for t_ns in range(3) for alarm in scorer.tick(t_ns) if isinstance(alarm, Alarm)]
 
 
-def test_a_cause_that_cannot_be_told_yet_is_said_once():
+def test_a_missing_diagnosis_is_explained_once():
     (raised,) = [alarm for alarm in told_of_one_fan() if alarm.transition == Transition.RAISED]
     unknown = (Diagnosis(cause="cannot_tell", probability=0.6, evidence="cannot tell yet: the command is not moving"),)
     _, cause, message = alarm_lines(CurrentAlarm(raised, "too slow", unknown, "")).plain.splitlines()
@@ -242,7 +242,7 @@ def test_watching_prints_what_happens_as_it_happens(site):
     assert (acknowledged["transition"], acknowledged["acknowledged_by"]) == ("acknowledged", "Ann")
 
 
-def test_a_scorer_that_does_not_answer_is_told_after_the_timeout(site):
+def test_a_scorer_that_does_not_answer_is_reported_after_the_timeout(site):
     site.core.deaf = True
     said = site.refused("ack", TRAY, 3, "--timeout", 0.5)
     assert said == f"tray {TRAY}: no answer for fan 3 within 0.5 s: does a scorer run for this tray?"

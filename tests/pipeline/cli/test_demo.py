@@ -53,9 +53,9 @@ def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
         assert picture.width > 1000
     assert (out / "view.rrd").stat().st_size > 100_000
 
-    told = fantwin("replay", "--offline", "--verify", out / "recording.mcap", "--json")
-    assert told.returncode == 0, told.stdout + told.stderr
-    verified = json.loads(told.stdout)["verified"]
+    reported = fantwin("replay", "--offline", "--verify", out / "recording.mcap", "--json")
+    assert reported.returncode == 0, reported.stdout + reported.stderr
+    verified = json.loads(reported.stdout)["verified"]
     assert verified["samples_equal"] > 3100 and verified["alarms_equal"] >= 4
 
 

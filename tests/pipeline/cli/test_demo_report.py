@@ -114,10 +114,10 @@ def test_a_run_as_it_must_be_has_no_problems(tmp_path):
 
 
 def test_its_json_has_the_fields_that_others_rely_on(tmp_path):
-    told = json.loads(Run(tmp_path).summary().to_json())
-    assert {"faults", "false_alarms", "samples_sent", "samples_recorded", "lost", "latency_ms"} <= set(told)
-    assert {"fan", "kind", "start_ns", "alarm_ns", "cleared_ns"} <= set(told["faults"][0])
-    assert set(told["latency_ms"]) == {"p50", "p99"}
+    reported = json.loads(Run(tmp_path).summary().to_json())
+    assert {"faults", "false_alarms", "samples_sent", "samples_recorded", "lost", "latency_ms"} <= set(reported)
+    assert {"fan", "kind", "start_ns", "alarm_ns", "cleared_ns"} <= set(reported["faults"][0])
+    assert set(reported["latency_ms"]) == {"p50", "p99"}
 
 
 @pytest.mark.parametrize(
@@ -145,8 +145,8 @@ def test_without_a_score_there_is_no_latency_and_the_json_is_still_json(tmp_path
     def refuse(word: str) -> None:
         pytest.fail(f"{word} is no JSON")
 
-    told = json.loads(Run(tmp_path, scored=0).summary().to_json(), parse_constant=refuse)
-    assert told["latency_ms"] == {"p50": None, "p99": None}
+    reported = json.loads(Run(tmp_path, scored=0).summary().to_json(), parse_constant=refuse)
+    assert reported["latency_ms"] == {"p50": None, "p99": None}
 
 
 def test_an_alarm_while_the_fan_runs_back_is_that_faults_and_not_false(tmp_path):

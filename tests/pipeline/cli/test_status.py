@@ -147,13 +147,13 @@ def test_alarms_raised_before_the_watcher_came_are_fetched_and_the_last_of_a_fan
     assert [(alarm.fan, alarm.active) for alarm in watcher.alarms()] == [(2, False)]
 
 
-def test_machines_are_told_stages_rates_losses_and_alarms(site):
+def test_json_has_stages_rates_losses_and_alarms(site):
     watcher = Watcher(site.outside, SITE)
     site.alarm.put(encode(ALARM))
     view(site, watcher, HEALTH)
     watcher.ask_for_past_alarms()
-    told = json.loads(json.dumps(as_json(watcher)))
-    (stage,), (alarm,) = told["stages"], told["alarms"]
+    reported = json.loads(json.dumps(as_json(watcher)))
+    (stage,), (alarm,) = reported["stages"], reported["alarms"]
     assert (stage["stage"], stage["alive"], stage["status"], stage["process_id"]) == ("scorer", True, "ok", 4711)
     assert stage["lost"] == 7
     assert stage["counters"] == {"lost_on_purpose": 4}
@@ -161,7 +161,7 @@ def test_machines_are_told_stages_rates_losses_and_alarms(site):
     assert (alarm["tray"], alarm["fan"], alarm["active"]) == (TRAY, 2, True)
 
 
-def test_people_are_told_how_alarms_stand_and_what_is_probably_wrong(site):
+def test_alarms_are_shown_with_their_states_and_probable_causes(site):
     def tell(number: int, transition: Transition, **more: Any) -> None:
         header, t_ns = Header("scorer-all-1", number, TRAY), ALARM.t_ns + number
         site.alarm.put(
@@ -183,9 +183,9 @@ def test_people_are_told_how_alarms_stand_and_what_is_probably_wrong(site):
     assert "fan 2: active, acknowledged, drag_up 87 %; more drag" in " ".join(text.split())
     assert "fan 3" not in text, "it is over, and everybody knows"
     assert "fan 4: never raised, shelved until it clears" in text
-    told = {alarm["fan"]: alarm for alarm in as_json(watcher)["alarms"]}  # type: ignore[attr-defined]
-    assert (told[2]["acknowledged"], told[2]["causes"][0]["cause"]) == (True, "drag_up")
-    assert (told[3]["retained"], told[4]["presented"]) == (False, False)
+    reported = {alarm["fan"]: alarm for alarm in as_json(watcher)["alarms"]}  # type: ignore[attr-defined]
+    assert (reported[2]["acknowledged"], reported[2]["causes"][0]["cause"]) == (True, "drag_up")
+    assert (reported[3]["retained"], reported[4]["presented"]) == (False, False)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_people_are_told_how_alarms_stand_and_what_is_probably_wrong(site):
         (HEALTH, "silent"),  # its last word is years old
     ],
 )
-def test_people_are_told_what_is_wrong(site, health, word):
+def test_problems_of_stages_are_shown(site, health, word):
     watcher = Watcher(site.outside, SITE)
     view(site, watcher, health)
     text = shown(watcher)

@@ -19,6 +19,7 @@ from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import Core, Parts, Stage
 from schemas.messages import Header, Message, ScorerSnapshot
 from schemas.topics import tray_key
+from scoring.former_snapshot_keys import FORMER_PARAMETER_KEYS
 from stages.scorer import ScorerConfig
 from tests.scoring.wear.test_wear_monitor import DAY_NS, GROWTH_PER_DAY, HEALTHY, LIMIT, WORN, core, live_through
 from tests.support.fantwin_command import fantwin, said_instead
@@ -51,7 +52,7 @@ def rows(*words: object) -> dict[tuple[int, str], dict[str, Any]]:
     return {(row["fan"], row["parameter"]): row for row in json.loads(done.stdout)["wear"]}
 
 
-def test_a_recording_tells_what_wears_and_when_its_limit_is_reached(tmp_path, notes):
+def test_a_recording_reports_what_wears_and_when_its_limit_is_reached(tmp_path, notes):
     found = rows(recording(tmp_path / "r.mcap", notes))
     assert sorted(found) == [(fan, name) for fan in (0, 1) for name in ("balance", "drag", "friction", "gain")]
     balance = found[WORN, "balance"]
@@ -65,7 +66,7 @@ def test_a_recording_tells_what_wears_and_when_its_limit_is_reached(tmp_path, no
     assert found[HEALTHY, "balance"]["unknown_reason"]
 
 
-def test_parts_in_any_order_tell_what_was_known_last(tmp_path, notes):
+def test_parts_in_any_order_give_the_last_snapshot(tmp_path, notes):
     first, second = (recording(tmp_path / f"{k}.mcap", [note]) for k, note in enumerate(notes))
     assert rows(second, first) == rows(second)
     assert rows(first) != rows(second)
@@ -86,10 +87,10 @@ def without_points(note: ScorerSnapshot, *fans: int) -> ScorerSnapshot:
     state = json.loads(note.state_json)
     for fan in fans:
         state["wear"]["fans"][fan]["t_ns"] = 0
-        for told in state["wear"]["fans"][fan]["parameters"].values():
-            series = told["series"]
-            told.clear()
-            told |= {"unit": "relative", "series": series}
+        for reported in state["wear"]["fans"][fan]["parameters"].values():
+            series = reported["series"]
+            reported.clear()
+            reported |= {"unit": "relative", "series": series}
     return replace(note, state_json=json.dumps(state))
 
 
@@ -110,7 +111,7 @@ def test_a_tray_without_points_is_one_line(tmp_path, notes):
         )
 
 
-@pytest.mark.parametrize("former", ["why_not", "invalid_reason"])
+@pytest.mark.parametrize("former", sorted(FORMER_PARAMETER_KEYS))
 def test_recordings_of_earlier_versions_are_shown_alike(tmp_path, notes, former):
     state = json.loads(notes[-1].state_json)
     for fan in state["wear"]["fans"]:
@@ -181,7 +182,7 @@ def site(endpoint: str, request: pytest.FixtureRequest, notes: list[ScorerSnapsh
 
 
 @pytest.mark.parametrize("site", [True], indirect=True)
-def test_a_running_site_tells_the_same(site, tmp_path, notes):
+def test_a_running_site_reports_the_same(site, tmp_path, notes):
     assert rows(*site) == rows(recording(tmp_path / "r.mcap", notes))
 
 

@@ -17,19 +17,19 @@ from scoring.diagnosis.hypotheses import CAUSES as HYPOTHESES
 def line(
     transition: Transition = Transition.RAISED, *, unit: SpeedUnit = "rad/s", refusal: str = "", **more: Any
 ) -> str:
-    told: dict[str, Any] = {
+    reported: dict[str, Any] = {
         **{"fan": 2, "active": True, "severity": Severity.WARNING, "t_ns": 0, "onset_t_ns": 0, "message": ""},
         **{"residual_rad_s": -71.2, "limit_rad_s": 8.0, "statistic": Statistic.SPEED_SMOOTHED, "score": 8.9},
         **{"torque_balance_command": 12.34, "torque_balance_limit_command": 3.0},
     }
-    return AlarmText(unit, "%").of(Alarm(transition=transition, **told | more), refusal)
+    return AlarmText(unit, "%").of(Alarm(transition=transition, **reported | more), refusal)
 
 
 BLOCKED = Diagnosis(cause="drag_up", probability=0.87, evidence="drag +62 % (95 %: 55 to 70)")
 NOT_YET = Diagnosis(cause="cannot_tell", probability=0.9, evidence="cannot tell yet: the command is not moving")
 
 
-def test_a_departure_of_the_speed_is_told_in_the_trays_unit() -> None:
+def test_a_deviation_of_the_speed_is_in_the_trays_unit() -> None:
     assert line() == "fan 2: 71 rad/s below the twin (limit 8)"
     assert line(unit="rpm", residual_rad_s=100.0) == "fan 2: 955 rpm above the twin (limit 76)"
 
@@ -69,11 +69,11 @@ def test_every_cause_that_can_be_found_has_words() -> None:
 
 @pytest.mark.parametrize("transition", [t for t in Transition if t != Transition.NONE])
 def test_every_transition_is_one_line_that_names_the_fan(transition: Transition) -> None:
-    told = line(transition, refusal="it is active", causes=(BLOCKED,))
-    assert told.startswith("fan 2: ") and len(told) > len("fan 2: ") and "\n" not in told
+    reported = line(transition, refusal="it is active", causes=(BLOCKED,))
+    assert reported.startswith("fan 2: ") and len(reported) > len("fan 2: ") and "\n" not in reported
 
 
-def test_after_a_restart_it_is_told_what_still_stands_and_what_does_not() -> None:
+def test_a_republished_alarm_says_whether_it_is_still_listed() -> None:
     over: dict[str, Any] = {"active": False, "acknowledged": True, "confirmed": True}
     quiet: dict[str, Any] = {"suppressed": True}
     assert line(Transition.REPUBLISHED) == "fan 2: still stands"

@@ -20,9 +20,9 @@ _numbers = itertools.count()
 def alarm(
     transition: Transition = Transition.RAISED, t_ns: int = 1, *, tray: str = "a", producer: str = "p", **more: Any
 ) -> Alarm:
-    told: dict[str, Any] = {"fan": 0, "active": True, "severity": Severity.WARNING, "onset_t_ns": 1, "confirmed": True}
-    told |= {"residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": f"{transition.name} at {t_ns}"}
-    return Alarm(header=Header(producer, next(_numbers), tray), t_ns=t_ns, transition=transition, **told | more)
+    fields: dict[str, Any] = {"fan": 0, "active": True, "severity": Severity.WARNING, "onset_t_ns": 1}
+    fields |= {"confirmed": True, "residual_rad_s": 0.0, "limit_rad_s": 0.0, "message": f"{transition.name} at {t_ns}"}
+    return Alarm(header=Header(producer, next(_numbers), tray), t_ns=t_ns, transition=transition, **fields | more)
 
 
 def one(*messages: Alarm) -> CurrentAlarm:
@@ -31,8 +31,8 @@ def one(*messages: Alarm) -> CurrentAlarm:
 
 
 def test_the_newest_message_of_each_fan_says_how_it_stands_whatever_the_order():
-    told = [alarm(fan=1), alarm(), alarm(Transition.CLEARED, 5, active=False), alarm(tray="b", t_ns=9)]
-    for messages in itertools.permutations(told):
+    reported = [alarm(fan=1), alarm(), alarm(Transition.CLEARED, 5, active=False), alarm(tray="b", t_ns=9)]
+    for messages in itertools.permutations(reported):
         found = [(each.newest.header.tray, each.newest.fan, each.newest.active) for each in current_alarms(messages)]
         assert found == [("a", 0, False), ("a", 1, True), ("b", 0, True)]
 
@@ -92,7 +92,7 @@ def test_a_new_occurrence_has_nothing_of_the_one_before():
     assert (standing.message, standing.causes, standing.acknowledged_by) == ("RAISED at 9", (), "")
 
 
-def test_who_acknowledged_is_known_from_what_a_restarted_scorer_tells_again():
+def test_who_acknowledged_is_known_from_what_a_restarted_scorer_reports_again():
     standing = one(alarm(Transition.REPUBLISHED, acknowledged=True, operator_name="Ann"))
     assert standing.acknowledged_by == "Ann"
 

@@ -41,8 +41,8 @@ def take(
     return conditions.update(t_ns, STEP_NS, np.where(mask, ratio, np.nan), mask)
 
 
-def happened(course: BlockResult) -> list[tuple[int, Transition]]:
-    return [(change.row, change.transition) for change in course.events]
+def happened(result: BlockResult) -> list[tuple[int, Transition]]:
+    return [(change.row, change.transition) for change in result.events]
 
 
 def states(conditions: Conditions, ratios: Sequence[float], valid: Sequence[bool] | None = None) -> list[int]:
@@ -55,15 +55,15 @@ def asked(conditions: Conditions, action: Action, now_t_ns: int = 0, duration_ns
 
 
 def test_an_alarm_is_raised_exactly_when_the_on_delay_has_run_out():
-    course = take(conditions_of(), [LOW, LOW] + [UP] * 7)
-    assert course.state[:, 0].tolist() == [NORMAL] * 2 + [SUSPECT] * 5 + [ALARM] * 2
-    (change,) = course.events
+    result = take(conditions_of(), [LOW, LOW] + [UP] * 7)
+    assert result.state[:, 0].tolist() == [NORMAL] * 2 + [SUSPECT] * 5 + [ALARM] * 2
+    (change,) = result.events
     assert (change.row, change.fan, change.transition, change.alarm_state.onset_t_ns) == (7, 0, RAISED, 2 * STEP_NS)
 
 
 def test_an_excursion_one_sample_too_short_raises_nothing_and_is_counted():
-    course = take(conditions_of(), [LOW] + [UP] * 5 + [LOW] + [UP] * 5 + [LOW])
-    assert (course.events, course.too_short) == ([], 2)
+    result = take(conditions_of(), [LOW] + [UP] * 5 + [LOW] + [UP] * 5 + [LOW])
+    assert (result.events, result.too_short) == ([], 2)
 
 
 def test_the_limit_itself_is_not_exceeded_and_the_limit_of_return_itself_is_no_return():
@@ -72,10 +72,10 @@ def test_the_limit_itself_is_not_exceeded_and_the_limit_of_return_itself_is_no_r
 
 
 def test_an_alarm_is_cleared_exactly_when_the_off_delay_has_run_out():
-    course = take(conditions_of(), [UP] * 6 + [MID] * 20 + [LOW] * 12)
-    assert course.state[5:, 0].tolist() == [ALARM] * 21 + [RETURNING] * 10 + [NORMAL] * 2
-    assert happened(course) == [(5, RAISED), (36, CLEARED)]
-    assert [change.alarm_state.onset_t_ns for change in course.events] == [0, 0]
+    result = take(conditions_of(), [UP] * 6 + [MID] * 20 + [LOW] * 12)
+    assert result.state[5:, 0].tolist() == [ALARM] * 21 + [RETURNING] * 10 + [NORMAL] * 2
+    assert happened(result) == [(5, RAISED), (36, CLEARED)]
+    assert [change.alarm_state.onset_t_ns for change in result.events] == [0, 0]
 
 
 def test_a_return_that_is_interrupted_begins_again():
@@ -85,8 +85,8 @@ def test_a_return_that_is_interrupted_begins_again():
 
 def test_samples_that_are_not_valid_stop_the_timers_and_end_nothing():
     valid = [True] * 3 + [False] * 50 + [True] * 3
-    course = take(conditions_of(), [UP] * 56, valid)
-    assert course.state[:, 0].tolist() == [SUSPECT] * 3 + [FanState.UNKNOWN] * 50 + [SUSPECT] * 2 + [ALARM]
+    result = take(conditions_of(), [UP] * 56, valid)
+    assert result.state[:, 0].tolist() == [SUSPECT] * 3 + [FanState.UNKNOWN] * 50 + [SUSPECT] * 2 + [ALARM]
     conditions = at_once()
     take(conditions, [UP])
     assert states(conditions, [LOW] * 9, [False] * 9) == [FanState.UNKNOWN] * 9
@@ -94,9 +94,9 @@ def test_samples_that_are_not_valid_stop_the_timers_and_end_nothing():
 
 
 def test_severity_rises_at_its_ratio_and_does_not_fall_before_the_next_alarm():
-    course = take(at_once(), [UP, 1.5, UP, LOW, UP])
-    told = [(change.row, change.transition, change.alarm_state.severity) for change in course.events]
-    assert told == [
+    result = take(at_once(), [UP, 1.5, UP, LOW, UP])
+    reported = [(change.row, change.transition, change.alarm_state.severity) for change in result.events]
+    assert reported == [
         (0, RAISED, Severity.WARNING),
         (1, Transition.SEVERITY, Severity.ALARM),
         (3, CLEARED, Severity.ALARM),
@@ -105,8 +105,8 @@ def test_severity_rises_at_its_ratio_and_does_not_fall_before_the_next_alarm():
 
 
 def test_every_change_says_how_the_alarm_stood_at_its_own_row():
-    course = take(at_once(), [UP, LOW, UP])
-    assert [change.alarm_state.active for change in course.events] == [True, False, True]
+    result = take(at_once(), [UP, LOW, UP])
+    assert [change.alarm_state.active for change in result.events] == [True, False, True]
 
 
 B1 = [  # table B.1 of Part 9: what happens, then Active, Acked, Confirmed, Retain
@@ -222,25 +222,25 @@ def test_every_fan_asked_about_gets_exactly_one_answer():
 def test_a_timed_shelving_ends_with_the_first_sample_at_its_time_even_if_that_is_not_valid():
     conditions = at_once()
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=3 * STEP_NS)
-    course = take(conditions, [LOW] * 6, [True, True, True, False, False, True])
-    assert happened(course) == [(3, UNSHELVED)]
+    result = take(conditions, [LOW] * 6, [True, True, True, False, False, True])
+    assert happened(result) == [(3, UNSHELVED)]
     assert conditions.alarm_state(0).shelved_until_t_ns == 0
 
 
-def test_a_shelved_alarm_is_evaluated_and_told_as_ever_and_not_presented():
+def test_a_shelved_alarm_is_evaluated_and_emitted_but_not_presented():
     conditions = at_once()
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=4 * STEP_NS)
-    course = take(conditions, [LOW, LOW, UP, UP, UP])
-    assert happened(course) == [(2, RAISED), (4, UNSHELVED)]
-    assert [is_silenced(change.alarm_state) for change in course.events] == [True, False]
+    result = take(conditions, [LOW, LOW, UP, UP, UP])
+    assert happened(result) == [(2, RAISED), (4, UNSHELVED)]
+    assert [is_silenced(change.alarm_state) for change in result.events] == [True, False]
 
 
 def test_an_alarm_raised_at_the_very_sample_at_which_a_shelving_ends_is_presented():
     conditions = at_once()
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=2 * STEP_NS)
-    course = take(conditions, [LOW, LOW, UP])
-    assert happened(course) == [(2, UNSHELVED), (2, RAISED)]
-    assert not is_silenced(course.events[1].alarm_state)
+    result = take(conditions, [LOW, LOW, UP])
+    assert happened(result) == [(2, UNSHELVED), (2, RAISED)]
+    assert not is_silenced(result.events[1].alarm_state)
 
 
 def test_shelving_again_sets_a_new_time():
@@ -312,10 +312,10 @@ def played(conditions: Conditions, history: dict[str, Any], cuts: set[int], rest
             action, fan, duration_ns = history["requests"][first]
             answers += conditions.request(action, [fan], STEP_NS * (first - 1), duration_ns, "Ann")
         rows = slice(first, last)
-        course = conditions.update(STEP_NS * np.arange(first, last), STEP_NS, ratio[rows], valid[rows])
-        states.append(course.state)
-        changes += [(first + c.row, c.fan, c.transition, c.alarm_state) for c in course.events]
-        too_short += course.too_short
+        result = conditions.update(STEP_NS * np.arange(first, last), STEP_NS, ratio[rows], valid[rows])
+        states.append(result.state)
+        changes += [(first + c.row, c.fan, c.transition, c.alarm_state) for c in result.events]
+        too_short += result.too_short
         if restart:
             kept = json.loads(json.dumps(conditions.snapshot()))
             conditions = Conditions(2, restart)

@@ -113,7 +113,7 @@ def test_times_that_fall_into_a_gap_are_one() -> None:
     assert diagnoser.due(times(10, 5000)) == [(0, 0)]
 
 
-def test_without_samples_there_is_nothing_to_tell() -> None:
+def test_without_samples_there_is_no_diagnosis() -> None:
     assert fed(1, 1).diagnose(0, EPOCH_NS) == ()
     assert fed(100, 100).diagnose(0, EPOCH_NS + 3600 * S) == ()
 

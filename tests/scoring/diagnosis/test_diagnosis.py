@@ -1,4 +1,4 @@
-"""Causes told where the motion tells them, shared where it does not, and never more certain than the data."""
+"""Causes are named where the motion separates them, share the probability elsewhere, and are never overconfident."""
 
 from collections import Counter
 from dataclasses import replace
@@ -80,7 +80,7 @@ def test_probabilities_add_up_to_one_over_all_causes_and_fall() -> None:
     assert probabilities == sorted(probabilities, reverse=True)
 
 
-def test_the_evidence_is_told_in_words() -> None:
+def test_the_evidence_is_reported_in_words() -> None:
     command = data.moving_command(0)
     found = diagnose(data.window(command, faulty_speed("drag_up", command, 0)[0]), data.HEALTHY)
     evidence = evidence_of(found.first)
@@ -90,7 +90,7 @@ def test_the_evidence_is_told_in_words() -> None:
     assert evidence.unit == "relative"
 
 
-def test_the_words_beside_cannot_tell_fit_its_probability() -> None:
+def test_the_evidence_of_cannot_tell_fits_its_probability() -> None:
     command = data.moving_command(0)
     for readings in (faulty_speed("drag_up", command, 0)[0], data.measured(data.speeds(command), 0)):
         found = diagnose(data.window(command, readings), data.HEALTHY)
@@ -155,7 +155,7 @@ def test_a_torque_that_comes_and_goes_is_external() -> None:
 
 
 @pytest.mark.parametrize("moving", [True, False])
-def test_of_a_healthy_fan_nothing_is_told(moving) -> None:
+def test_a_healthy_fan_gets_no_cause(moving) -> None:
     for seed in range(15):
         command = data.moving_command(seed) if moving else data.still_command(seed)
         found = diagnose(data.window(command, data.measured(data.speeds(command), seed)), data.HEALTHY)
@@ -168,7 +168,7 @@ def test_correlated_noise_is_not_taken_for_many_independent_samples() -> None:
     keep = np.exp(-data.STEP_S / correlation_s)
     knowing = replace(data.HEALTHY, sigma_command=sigma, autocorrelation_time_s=correlation_s)
     ignorant = replace(knowing, autocorrelation_time_s=0.0)
-    told: Counter[str] = Counter()
+    reported: Counter[str] = Counter()
     for seed in range(25):
         rng = np.random.default_rng(seed)
         command = data.moving_command(seed)
@@ -176,10 +176,10 @@ def test_correlated_noise_is_not_taken_for_many_independent_samples() -> None:
         for k in range(1, len(load)):
             load[k] = keep * load[k - 1] + sigma * np.sqrt(1.0 - keep**2) * rng.normal()
         window = data.window(command, data.measured(data.speeds(command, torque=load), seed))
-        told["knowing"] += diagnose(window, knowing).first.cause != "cannot_tell"
-        told["ignorant"] += diagnose(window, ignorant).first.cause != "cannot_tell"
-    assert told["knowing"] <= 2
-    assert told["ignorant"] >= 3 * max(told["knowing"], 1)
+        reported["knowing"] += diagnose(window, knowing).first.cause != "cannot_tell"
+        reported["ignorant"] += diagnose(window, ignorant).first.cause != "cannot_tell"
+    assert reported["knowing"] <= 2
+    assert reported["ignorant"] >= 3 * max(reported["knowing"], 1)
 
 
 def test_noise_that_grows_is_no_change_of_the_balance() -> None:
@@ -270,7 +270,7 @@ def test_what_the_fan_showed_at_commissioning_is_no_fault() -> None:
     assert diagnose(replace(whole, fan_offset=0.03), data.HEALTHY).first.cause == "cannot_tell"
 
 
-def test_a_stuck_sensor_is_told_whatever_the_loop_does() -> None:
+def test_a_stuck_sensor_is_reported_whatever_the_loop_does() -> None:
     for seed in range(5):
         command = data.moving_command(seed)
         readings = data.measured(data.speeds(command), seed)
@@ -313,7 +313,7 @@ def test_missing_readings_are_a_dropout(share) -> None:
     assert evidence_of(found.first).change == pytest.approx(share, abs=0.06)
 
 
-def test_a_fault_is_told_in_spite_of_some_missing_readings() -> None:
+def test_a_fault_is_found_in_spite_of_some_missing_readings() -> None:
     command = data.moving_command(12)
     readings, _ = faulty_speed("drag_up", command, 12)
     missing = np.random.default_rng(0).random(len(command)) < 0.05
@@ -339,7 +339,7 @@ def test_units_of_the_command_do_not_matter() -> None:
 
 
 @pytest.mark.parametrize("samples", [2, 5, 40, 300])
-def test_windows_without_anything_to_judge_by_are_taken(samples) -> None:
+def test_windows_without_usable_samples_are_accepted(samples) -> None:
     command = np.full(samples, 0.5)
     for readings in (np.full(samples, np.nan), np.zeros(samples), np.full(samples, 300.0)):
         for onset in (0, samples // 2, samples):
@@ -369,7 +369,7 @@ def test_drifts_of_parameters_are_found_within_their_errors() -> None:
     assert abs(np.mean(found)) < 1.0
 
 
-def test_a_window_that_is_too_short_tells_no_drift() -> None:
+def test_a_window_that_is_too_short_reports_no_drift() -> None:
     command = data.moving_command(0)[:30]
     assert parameter_drifts(Window(data.STEP_S, command, data.speeds(command), 0), data.HEALTHY) == ()
 
@@ -416,22 +416,22 @@ def healthy_balance(command: np.ndarray, speed_rad_s: np.ndarray, lag_s: float) 
 @pytest.mark.slow
 @pytest.mark.parametrize("loop", ["open", "closed"])
 def test_nine_of_ten_simulated_faults_are_named_rightly_under_excitation(loop) -> None:
-    told = [(cause, kind, size) for cause, (kind, sizes) in SEVERITIES.items() for size in sizes]
-    faults = tuple(Fault(kind, fan, FAULT_S, END_S, size) for fan, (_, kind, size) in enumerate(told))
+    reported = [(cause, kind, size) for cause, (kind, sizes) in SEVERITIES.items() for size in sizes]
+    faults = tuple(Fault(kind, fan, FAULT_S, END_S, size) for fan, (_, kind, size) in enumerate(reported))
     tray = SimulatedTray(
-        TraySettings(fans=len(told), duration_s=END_S, profile="manual", seed=5, fans_seed=6, faults=faults)
+        TraySettings(fans=len(reported), duration_s=END_S, profile="manual", seed=5, fans_seed=6, faults=faults)
     )
     rng = np.random.default_rng(7)
     command, speed = [], []
     while tray.due_s() is not None:
         if loop == "closed" and len(command) % 150 == 0:
-            tray.set_point(rng.uniform(250.0, 750.0, len(told)))
+            tray.set_point(rng.uniform(250.0, 750.0, len(reported)))
         sample = tray.take()
         command.append(sample.command)
         speed.append(sample.speed_rad_s)
     command, speed = np.array(command), np.array(speed)
     right, table = 0, Counter()
-    for fan, (cause, kind, _) in enumerate(told):
+    for fan, (cause, kind, _) in enumerate(reported):
         begun = round(FAULT_S / data.STEP_S)
         # A growing fault is seen late; the detector's onset of a step is a little off.
         onset = begun + (400 if kind == "wear" else 7)
@@ -441,4 +441,4 @@ def test_nine_of_ten_simulated_faults_are_named_rightly_under_excitation(loop) -
         found = diagnose(Window(data.STEP_S, command[rows, fan], speed[rows, fan], onset - begun + 400), healthy)
         table[cause, found.first.cause] += 1
         right += found.first.cause == cause
-    assert right >= 0.9 * len(told), table
+    assert right >= 0.9 * len(reported), table

@@ -1,4 +1,4 @@
-"""Trends per day with intervals that hold, in compressed time, and limits foretold only where they can be."""
+"""Trends per day with intervals that hold, in compressed time, and limits forecast only where they can be."""
 
 import numpy as np
 import pytest
@@ -27,17 +27,17 @@ def trend_of(points: WearSeries) -> Trend:
     return trend
 
 
-def times_of(foretold: LimitForecast) -> tuple[int, int, int]:
-    assert foretold.earliest_ns is not None and foretold.likely_ns is not None and foretold.latest_ns is not None
-    return foretold.earliest_ns, foretold.likely_ns, foretold.latest_ns
+def times_of(forecast: LimitForecast) -> tuple[int, int, int]:
+    assert forecast.earliest_ns is not None and forecast.likely_ns is not None and forecast.latest_ns is not None
+    return forecast.earliest_ns, forecast.likely_ns, forecast.latest_ns
 
 
 @pytest.mark.parametrize(("correlation", "wrong"), [(0.0, 0.08), (0.5, 0.1), (0.8, 0.12)])
 def test_where_there_is_no_trend_one_is_found_about_as_rarely_as_declared(correlation, wrong) -> None:
     trends = [series(10, 20, 0.0, seed, correlation).trend() for seed in range(200)]
-    told = [trend for trend in trends if trend is not None]  # what hangs together for long need not tell anything
-    assert len(told) > 190
-    assert np.mean([trend.significant for trend in told]) <= wrong
+    reported = [trend for trend in trends if trend is not None]  # residuals correlated for too long give no trend
+    assert len(reported) > 190
+    assert np.mean([trend.significant for trend in reported]) <= wrong
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
@@ -46,28 +46,28 @@ def test_the_interval_holds_the_true_slope(correlation) -> None:
     assert 0.88 <= np.mean([trend.low <= 0.004 <= trend.high for trend in trends]) <= 1.0
 
 
-def test_wear_over_thirty_days_is_found_and_its_limit_foretold() -> None:
+def test_wear_over_thirty_days_is_found_and_its_limit_forecast() -> None:
     points = series(30, 48, 0.002, 1, 0.5)
     trend = trend_of(points)
     assert trend.significant and trend.slope_per_day == pytest.approx(0.002, rel=0.1)
     now_ns = START_NS + 30 * NS_PER_DAY
-    foretold = forecast_limit(trend, 0.1, now_ns)
-    days = [(t_ns - START_NS) / NS_PER_DAY for t_ns in times_of(foretold)]
+    forecast = forecast_limit(trend, 0.1, now_ns)
+    days = [(t_ns - START_NS) / NS_PER_DAY for t_ns in times_of(forecast)]
     assert days == sorted(days)
     assert days[0] < 50.0 < days[2]
     assert days[1] == pytest.approx(50.0, abs=4.0)
 
 
-def test_the_foretold_interval_holds_the_day_on_which_the_limit_is_reached() -> None:
+def test_the_forecast_interval_contains_the_day_on_which_the_limit_is_reached() -> None:
     held = []
     for seed in range(100):
-        foretold = forecast_limit(trend_of(series(20, 24, 0.003, seed, 0.5)), 0.12, START_NS + 20 * NS_PER_DAY)
-        earliest_ns, _, latest_ns = times_of(foretold)
+        forecast = forecast_limit(trend_of(series(20, 24, 0.003, seed, 0.5)), 0.12, START_NS + 20 * NS_PER_DAY)
+        earliest_ns, _, latest_ns = times_of(forecast)
         held.append(earliest_ns <= START_NS + 40 * NS_PER_DAY <= latest_ns)
     assert np.mean(held) >= 0.88
 
 
-def test_a_limit_is_not_foretold_where_it_cannot_be() -> None:
+def test_there_is_no_forecast_without_a_basis_for_one() -> None:
     now_ns = START_NS + 20 * NS_PER_DAY
     rising = trend_of(series(20, 24, 0.003, 3))
     assert "no significant trend" in forecast_limit(trend_of(series(20, 24, 0.0, 3)), 0.1, now_ns).unknown_reason
@@ -96,7 +96,7 @@ def test_memory_is_bounded_and_merging_keeps_the_trend() -> None:
     assert points.snapshot()["std_error"][0] < 0.2 * 0.01
 
 
-def test_few_points_tell_nothing() -> None:
+def test_few_points_give_no_trend() -> None:
     assert WearSeries().trend() is None
     assert series(1, 5, 0.1, 6).trend() is None
 

@@ -122,7 +122,7 @@ def test_the_growth_of_friction_is_found_with_an_interval_that_holds_it(after_ei
         assert found["change"] == pytest.approx(8 * slope, rel=0.1), parameter
 
 
-def test_the_limit_is_foretold_where_its_alarm_then_comes(after_eight_days) -> None:
+def test_the_alarm_comes_within_the_forecast(after_eight_days) -> None:
     core, _ = after_eight_days
     found = worn(WORN, "balance", core)
     assert found["limit"] == pytest.approx(LIMIT)
@@ -154,7 +154,7 @@ def test_a_healthy_fan_shows_no_wear(after_eight_days) -> None:
     assert "no significant trend" in worn(HEALTHY, "balance", core)["unknown_reason"]
 
 
-def test_what_is_near_is_told_in_health_and_alarms_nobody(after_eight_days) -> None:
+def test_a_limit_within_days_is_reported_in_health_and_raises_no_alarm(after_eight_days) -> None:
     core, _ = after_eight_days
     assert (
         core.problem()
@@ -170,7 +170,7 @@ def test_what_is_far_away_is_not_told() -> None:
     assert slow.problem() == ""
 
 
-def test_less_than_a_day_foretells_nothing() -> None:
+def test_less_than_a_day_gives_no_forecast() -> None:
     young = core()
     assert list(live_through(young, 0.9, every_hours=0.25, growth_per_day=0.1, swing=0.0)) == []
     assert worn(WORN, "balance", young)["unknown_reason"] == "less than a day was observed"
@@ -241,7 +241,7 @@ def test_blocks_make_no_difference() -> None:
     assert found[1] == found[0] and found[2] == found[0]
 
 
-def test_a_fan_that_is_commissioned_anew_begins_anew(after_eight_days) -> None:
+def test_wear_starts_again_for_a_fan_that_is_commissioned_again(after_eight_days) -> None:
     successor = restored(after_eight_days[0])
     successor.step(request_of(Action.COMMISSION, WORN))
     assert worn(WORN, "friction", successor)["series"]["t_ns"] == []
@@ -249,7 +249,7 @@ def test_a_fan_that_is_commissioned_anew_begins_anew(after_eight_days) -> None:
     assert successor.problem() == ""
 
 
-def test_of_a_fan_that_is_not_quiet_nothing_is_learnt() -> None:
+def test_a_fan_above_half_its_limit_gets_no_point() -> None:
     one = core()
     list(live_through(one, 0.3))
     before = len(worn(WORN, "friction", one)["series"]["t_ns"])
@@ -264,7 +264,7 @@ def first_point_s(fan: int, core: ScorerCore) -> float | None:
     return (times[0] - EPOCH_NS) / 1e9 if times else None
 
 
-def test_a_fan_that_was_not_quiet_is_looked_at_once_that_is_out_of_sight() -> None:
+def test_a_fan_gets_a_point_once_its_disturbance_is_out_of_the_window() -> None:
     one, block = core(), burst(0, seconds=60.0)
     measured = block.measured_speed_rad_s.copy()
     measured[435:520, WORN] = measured[434, WORN]  # more than half as long as a reading may repeat itself
@@ -307,13 +307,13 @@ def test_after_a_restart_it_is_known_how_far_back_a_fault_is() -> None:
     assert first_point_s(WORN, successor) == 50.0
 
 
-def test_no_point_looks_back_on_what_was_before_a_fan_was_commissioned_anew() -> None:
+def test_no_point_looks_back_on_what_was_before_a_fan_was_commissioned_again() -> None:
     one, block = core(), burst(0, seconds=60.0)
     feed(one, [cut(block, 0, 500), request_of(Action.COMMISSION, WORN), cut(block, 500, 3000)])
     assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)
 
 
-def test_a_fan_that_stands_tells_nothing() -> None:
+def test_a_fan_that_stands_reports_nothing() -> None:
     one = core()
     for hour in range(6):
         one.step(burst(hour, speed=10.0))
