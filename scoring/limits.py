@@ -12,12 +12,12 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
+from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.detectors.detector import DetectorSettings, Source
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import rows
 from scoring.detectors.tacho import SensorSettings
 from scoring.former_limits import upgraded
-from scoring.healthy_residual import HealthyResidual
 
 FORMAT_VERSION = 2
 NEVER_S = 1e9

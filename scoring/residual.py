@@ -9,13 +9,13 @@ import numpy as np
 
 from schemas.messages import Array
 from scoring.baseline.baseline import Baseline
+from scoring.baseline.healthy_residual import FanOffsets
 from scoring.baseline.speed_scaling import speed_scaling
 from scoring.detectors.detector import DetectorContext, Source
 from scoring.detectors.deviation import smoothed_deviation
 from scoring.detectors.drift import DEFAULT_REFERENCE_SIGMAS, DriftSettings
 from scoring.detectors.low_pass import LowPass
 from scoring.detectors.smoothed import SmoothedSettings
-from scoring.healthy_residual import FanOffsets
 from scoring.limits import Limits
 
 CLIP_LIMITS = 2.0  # a residual counts as so many limits of the smoothed one at most: one outlier raises no alarm

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.messages import Array
-from scoring.healthy_residual import FanOffsets
+from scoring.baseline.healthy_residual import FanOffsets
 
 MIN_FANS = 3
 MIN_RUNS = 12

@@ -16,6 +16,7 @@ import numpy as np
 
 from schemas.messages import Array
 from scoring.baseline.fan_offsets import fan_offsets
+from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.calibration.alarm_rate import rate_interval
 from scoring.calibration.healthy_statistics import HealthyStatistics, Runs, healthy_statistics, truncate_runs
 from scoring.calibration.healthy_variation import (
@@ -33,7 +34,6 @@ from scoring.detectors.deviation import smoothed_deviation
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import rows
 from scoring.fan_scorer import RESIDUALS
-from scoring.healthy_residual import HealthyResidual
 from scoring.limits import DeclaredRate, Limits, Timing
 
 DAY_S = 86_400.0

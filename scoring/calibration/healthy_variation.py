@@ -10,12 +10,12 @@ from scipy.optimize import brentq
 from scipy.stats import t
 
 from schemas.messages import Array
+from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.baseline.settings import BaselineSettings
 from scoring.calibration.healthy_statistics import HealthyStatistics, Runs, healthy_statistics
 from scoring.calibration.residual_moments import MOTION_BINS, SPEED_BINS, ResidualMoments
 from scoring.detectors.detector import UNREACHED, Source
 from scoring.fan_scorer import RESIDUALS
-from scoring.healthy_residual import HealthyResidual
 from scoring.limits import Limits
 
 KNOT_S = 300.0  # of healthy running for each point of a curve over speed

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.messages import Statistic
+from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.baseline.settings import BaselineSettings
 from scoring.baseline.speed_scaling import speed_scaling
 from scoring.detectors.detector import DetectorSettings
@@ -22,7 +23,6 @@ from scoring.detectors.table import rows
 from scoring.detectors.tacho import SensorSettings
 from scoring.detectors.variance_growth import VarianceGrowthSettings
 from scoring.fan_scorer import FanScorer, ScoredBlock
-from scoring.healthy_residual import HealthyResidual
 from scoring.limits import Limits, Timing
 from scoring.samples import Samples
 from tests.support.healthy_residuals import autoregressive, rows_of, samples_of

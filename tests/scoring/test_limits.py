@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from scoring.baseline.healthy_residual import FanOffsets, HealthyResidual
 from scoring.baseline.settings import BaselineSettings
 from scoring.detectors.deviation import smoothed_deviation, summed_deviation
 from scoring.detectors.drift import DriftSettings
@@ -16,7 +17,6 @@ from scoring.detectors.low_pass import LowPass
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.tacho import SensorSettings
 from scoring.detectors.variance_growth import VarianceGrowthSettings
-from scoring.healthy_residual import FanOffsets, HealthyResidual
 from scoring.limits import FORMAT_VERSION, DeclaredRate, Limits, Timing, uncalibrated
 from tests.support.healthy_residuals import autoregressive
 

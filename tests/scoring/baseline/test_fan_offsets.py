@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scoring.baseline.fan_offsets import Cells, fan_offsets
-from scoring.healthy_residual import FanOffsets
+from scoring.baseline.healthy_residual import FanOffsets
 
 BINS, STEP_S = 6, 0.01
 CENTRES = np.arange(BINS) * 100.0 + 50.0
