@@ -137,10 +137,10 @@ def test_the_alarm_comes_within_the_forecast(after_eight_days) -> None:
     assert days[0] - 0.5 < (raised.t_ns - EPOCH_NS) / DAY_NS < days[2] + 0.5
 
 
-def test_while_the_baseline_may_go_no_further_the_line_goes_on(after_eight_days) -> None:
+def test_the_trend_is_extrapolated_while_the_baseline_is_at_its_limit(after_eight_days) -> None:
     successor = restored(after_eight_days[0])
     assert list(live_through(successor, 12, from_day=8)) == []
-    assert "baseline of fan 1 may drift no further" in successor.problem()
+    assert "baseline of fan 1 is at its adaptation limit" in successor.problem()
     assert worn(WORN, "balance", successor)["per_day"]["value"] == pytest.approx(GROWTH_PER_DAY, rel=0.1)
     assert worn(WORN, "balance", successor)["change"] == pytest.approx(12 * GROWTH_PER_DAY, rel=0.1)
 
