@@ -38,9 +38,9 @@ def main(
 ) -> None:
     """Print the coverage of the 95 % intervals, the bias and the scatter of each parameter."""
     rows = []
-    for said, command in COMMANDS.items():
-        progress(f"{runs} runs: {said}")
-        rows += _rows(said, command, runs)
+    for command_name, command in COMMANDS.items():
+        progress(f"{runs} runs: {command_name}")
+        rows += _rows(command_name, command, runs)
     scatter = np.sqrt(0.95 * 0.05 / runs)
     notes = [f"asked: {MUST_COVER[0]:.0%} to {MUST_COVER[1]:.0%}; the count itself scatters by {scatter:.1%}"]
     show({f"95 % intervals over {runs} runs of each kind": rows}, notes, as_json=json_output)
@@ -58,10 +58,10 @@ COMMANDS: dict[str, Callable[[int], Array]] = {
 }
 
 
-def _rows(said: str, command: Callable[[int], Array], runs: int) -> list[dict[str, Any]]:
+def _rows(command_name: str, command: Callable[[int], Array], runs: int) -> list[dict[str, Any]]:
     found, low, high = [], [], []
     for seed in range(runs):
-        identified = identify([published_fan(command(seed), seed, said).run])
+        identified = identify([published_fan(command(seed), seed, command_name).run])
         found.append(identified.parameters[0, : len(TRUE)])
         interval = identified.interval_95[0, : len(TRUE)]
         low.append(interval[:, 0])
@@ -72,7 +72,7 @@ def _rows(said: str, command: Callable[[int], Array], runs: int) -> list[dict[st
         covered = (below[:, column] <= true) & (true <= above[:, column])
         rows.append(
             {
-                "command": said,
+                "command": command_name,
                 "parameter": name,
                 "coverage": f"{covered.mean():.1%}",
                 "as asked": "yes" if MUST_COVER[0] <= covered.mean() <= MUST_COVER[1] else "no",

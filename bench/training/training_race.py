@@ -92,13 +92,13 @@ def _ours_to_the_target(simulated: SimulatedRun, seed: int) -> dict[str, Any]:
 
 
 def _ours(simulated: SimulatedRun, seed: int, physics: Physics, iterations: int | None = None) -> dict[str, Any]:
-    said = f"ours, physics {physics}"
-    progress(said if iterations is None else f"{said}, --iterations {iterations}")
+    name = f"ours, physics {physics}"
+    progress(name if iterations is None else f"{name}, --iterations {iterations}")
     start_s = time.perf_counter()
     twin = train_twin([simulated.run], [], "hybrid", name="race", seed=seed, physics=physics, max_iterations=iterations)
     took_s, best = time.perf_counter() - start_s, _error(twin, simulated)
     reached_s = took_s if best <= TARGET else None
-    return _row(said, "placed", best, took_s, reached_s, twin.card.training.iterations, 0.0)
+    return _row(name, "placed", best, took_s, reached_s, twin.card.training.iterations, 0.0)
 
 
 def _published(simulated: SimulatedRun, identification: Identification, seed: int, limit_s: float) -> dict[str, Any]:

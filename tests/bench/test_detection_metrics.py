@@ -186,10 +186,10 @@ def test_the_filtered_balance_is_learned_and_shows_a_load() -> None:
     effort = 3.0 + 0.5 * speed + 0.8 * np.gradient(speed, 1.0 / RATE_HZ, axis=0)
     healthy = _block(0, 3000, command=effort, measured_speed_rad_s=speed + 0.01 * rng.normal(size=speed.shape))
     coefficients = fitted_balance([[healthy]])
-    quiet = FilteredBalance(coefficients).take(healthy)
+    healthy_balance = FilteredBalance(coefficients).take(healthy)
     loaded = _block(0, 3000, command=effort + 2.0 * (seconds > 15.0)[:, np.newaxis], measured_speed_rad_s=speed)
     shown = FilteredBalance(coefficients).take(loaded)
-    assert np.nanmax(quiet) < 0.3
+    assert np.nanmax(healthy_balance) < 0.3
     assert shown[2000:].mean() == pytest.approx(2.0, rel=0.05)
 
 
@@ -204,12 +204,12 @@ def test_anomalous_rows_less_than_a_second_apart_are_one_event() -> None:
 
 def test_a_knob_stays_within_its_levels_and_turns_at_its_pace() -> None:
     knobs = Knobs([BY_HAND, Knob(0.3, 0.3, (1e9, 1e9))], seed=4)
-    said = np.array([knobs.at(row / RATE_HZ) for row in range(6000)])
-    assert BY_HAND.low <= said[:, 0].min() < 0.3
-    assert 0.7 < said[:, 0].max() <= BY_HAND.high
-    steps = np.abs(np.diff(said[:, 0]))
+    values = np.array([knobs.at(row / RATE_HZ) for row in range(6000)])
+    assert BY_HAND.low <= values[:, 0].min() < 0.3
+    assert 0.7 < values[:, 0].max() <= BY_HAND.high
+    steps = np.abs(np.diff(values[:, 0]))
     assert 0.0 < steps.max() <= (BY_HAND.high - BY_HAND.low) / BY_HAND.turn_s[0] / RATE_HZ + 1e-12
-    assert np.all(said[:, 1] == 0.3)
+    assert np.all(values[:, 1] == 0.3)
 
 
 def _at_level(

@@ -86,8 +86,8 @@ def test_an_alarm_is_raised_exactly_at_the_end_of_the_on_delay() -> None:
 
 def test_from_one_and_a_half_limits_on_a_warning_is_an_alarm() -> None:
     _, alarms = feed(unsmoothed(), [prediction_of(np.array([9.0] * 8 + [12.1] * 2))])
-    told = [(a.transition, a.severity) for a in alarms]
-    assert told == [(Transition.RAISED, Severity.WARNING), (Transition.SEVERITY, Severity.ALARM)]
+    reported = [(a.transition, a.severity) for a in alarms]
+    assert reported == [(Transition.RAISED, Severity.WARNING), (Transition.SEVERITY, Severity.ALARM)]
 
 
 def test_an_excursion_one_sample_too_short_raises_nothing_and_is_counted() -> None:

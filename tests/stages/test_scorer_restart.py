@@ -174,13 +174,13 @@ def raised() -> ScorerCore:
 
 def test_a_restarted_scorer_tells_again_what_stands_and_who_acknowledged_it() -> None:
     successor = core_of(3)
-    memory, *told = successor.restore(snapshot_of(raised()))
+    memory, *emitted = successor.restore(snapshot_of(raised()))
     assert isinstance(memory, ScorerSnapshot) and memory.restored
-    assert [(alarm.fan, alarm.transition) for alarm in told if isinstance(alarm, Alarm)] == [
+    assert [(alarm.fan, alarm.transition) for alarm in emitted if isinstance(alarm, Alarm)] == [
         (0, Transition.REPUBLISHED),
         (1, Transition.REPUBLISHED),
     ]
-    first, second = told
+    first, second = emitted
     assert isinstance(first, Alarm) and isinstance(second, Alarm)
     assert (first.active, first.acknowledged, first.operator_name, first.comment) == (True, True, "Ann", "ordered")
     assert (second.active, second.shelved_until_t_ns > 0) == (False, True)
@@ -206,10 +206,10 @@ def test_a_baseline_is_that_of_the_session_before() -> None:
     np.testing.assert_allclose(score.speed_baseline_rad_s, 3.0, rtol=1e-5)
 
 
-def standing_of(told: Sequence[Any]) -> list[CurrentAlarm]:
+def standing_of(emitted: Sequence[Any]) -> list[CurrentAlarm]:
     """How the alarms stand for who has followed them from `raised` on."""
     former = raised().restore(snapshot_of(raised()))
-    messages = [*(("former", each) for each in former), *(("successor", each) for each in told)]
+    messages = [*(("former", each) for each in former), *(("successor", each) for each in emitted)]
     return current_alarms(
         replace(message, header=Header(producer, number, "tray1"))
         for number, (producer, message) in enumerate(messages)
@@ -219,11 +219,11 @@ def standing_of(told: Sequence[Any]) -> list[CurrentAlarm]:
 
 def test_from_a_snapshot_of_another_twin_only_operator_settings_are_restored() -> None:
     successor = core_of(3, sha256="another")
-    memory, *told = successor.restore(snapshot_of(raised()))
+    memory, *emitted = successor.restore(snapshot_of(raised()))
     assert isinstance(memory, ScorerSnapshot) and memory.restored
     assert successor.counters()["snapshots_of_another_twin"] == 1
     assert "the snapshot is of another twin" in successor.problem()
-    acknowledged, shelved = standing_of(told)
+    acknowledged, shelved = standing_of(emitted)
     assert (is_retained(acknowledged.newest), acknowledged.newest.message) == (False, "fan 0: stands no longer")
     assert (is_silenced(shelved.newest), shelved.newest.message) == (True, "fan 1: still stands")
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
@@ -240,11 +240,11 @@ def test_from_a_snapshot_read_in_part_operator_settings_are_restored(of: str) ->
     state["wear"]["last_attempt"] = 5
     state[of].popitem()
     successor = core_of(3)
-    first, *told = successor.restore(replace(memory, state_json=json.dumps(state)))
+    first, *emitted = successor.restore(replace(memory, state_json=json.dumps(state)))
     assert isinstance(first, ScorerSnapshot) and first.restored
     assert successor.counters()["snapshots_not_understood"] == 1
     assert "can be read in part only" in successor.problem()
-    acknowledged, shelved = standing_of(told)
+    acknowledged, shelved = standing_of(emitted)
     assert (is_retained(acknowledged.newest), is_silenced(shelved.newest)) == (False, True)
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
@@ -334,8 +334,8 @@ def test_alarms_of_a_discarded_snapshot_are_no_longer_current() -> None:
     restated = successor.restore(snapshot_of(raised()))
     assert [is_listed(each.newest) for each in standing_of(restated)] == [True, True]
     later = successor.step(prediction_of(np.zeros((20, 3)), first=-HOUR, producer="integrator-2"))
-    told = [message for message in later if isinstance(message, Alarm)]
-    assert [alarm.transition for alarm in told] == [Transition.REPUBLISHED] * 2
+    emitted = [message for message in later if isinstance(message, Alarm)]
+    assert [alarm.transition for alarm in emitted] == [Transition.REPUBLISHED] * 2
     assert [is_listed(each.newest) for each in standing_of([*restated, *later])] == [False, False]
     assert [is_listed(each.newest) for each in standing_of(later)] == [False, False], "nothing was restated"
 

@@ -17,7 +17,7 @@ def fantwin(name: str, *arguments: object) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-def said_instead(name: str, *arguments: object) -> str:
+def error_of(name: str, *arguments: object) -> str:
     """The one line of a command that could not be done."""
     error = fantwin(name, *arguments).exception
     assert isinstance(error, UserError), error

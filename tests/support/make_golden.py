@@ -96,8 +96,8 @@ def keep(recording: Path) -> None:
 
 def run(*words: object) -> None:
     """A command that must succeed."""
-    told = fantwin(*words, timeout_s=600)
-    assert told.returncode == 0, told.stderr
+    result = fantwin(*words, timeout_s=600)
+    assert result.returncode == 0, result.stderr
 
 
 if __name__ == "__main__":

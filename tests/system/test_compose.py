@@ -74,9 +74,10 @@ def test_the_configuration_fits_the_services():
     assert (config.bus.mode, config.bus.endpoint) == ("client", f"tcp/router:{listen.rpartition(':')[2]}")
     (tray,) = config.trays
     simulate = next(words for words in fantwin_commands("acquisition") if words[0] == "simulate")
-    told = dict(pairwise(simulate))
+    options = dict(pairwise(simulate))
     assert isinstance(tray.source, SerialConfig)
-    assert (told["--fans"], told["--link"], told["--speed-unit"]) == (str(tray.fans), tray.source.port, tray.speed_unit)
+    source_options = tuple(options[name] for name in ("--fans", "--link", "--speed-unit"))
+    assert source_options == (str(tray.fans), tray.source.port, tray.speed_unit)
     assert f"runs:{config.run_folder}" in SERVICES["recorder"]
     assert f"runs:{config.run_folder}" in SERVICES["viewer"]
     assert f"runs:{config.run_folder}" in SERVICES["scorer"], "it keeps its snapshot there"

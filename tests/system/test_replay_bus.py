@@ -149,11 +149,11 @@ def test_at_full_speed_the_stages_take_every_message_and_decide_every_sample(tmp
         status, account = up.end(), up.output()
     finally:
         chain.close()
-    told = json.loads(done.stdout)
-    assert done.returncode == 0, (told, done.stderr)
-    assert told["messages"] == {"raw": 3000}
-    assert (told["lost"], told["behind"], told["stopped"]) == ({}, [], False)
-    assert set(told["listeners"]) == {"recorder", "resampler"}
+    report = json.loads(done.stdout)
+    assert done.returncode == 0, (report, done.stderr)
+    assert report["messages"] == {"raw": 3000}
+    assert (report["lost"], report["behind"], report["stopped"]) == ({}, [], False)
+    assert set(report["listeners"]) == {"recorder", "resampler"}
     assert status == 0, account
     entries = list(read_recording(tmp_path / "recording.mcap"))
     found = {
@@ -217,9 +217,9 @@ def test_at_a_terminal_it_steps_and_quits_and_gives_the_terminal_back(site, tmp_
     status, out, err = terminal.end()
     assert status == 0, err
     assert terminal.is_restored()
-    told = json.loads(out)
-    assert told["stopped"]
-    assert told["messages"] == {"raw": 3}
+    report = json.loads(out)
+    assert report["stopped"]
+    assert report["messages"] == {"raw": 3}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -265,8 +265,8 @@ def test_beside_a_stage_that_writes_the_same_it_is_refused_and_says_from_where_t
     site.start("resampler")
     refused = site.replay(recording)
     assert refused.returncode == 1
-    said = "resampler of site 'demo' is running and writes grid itself: replay with --from raw, or stop it"
-    assert refused.stderr == f"fantwin: {said}\n"
+    expected = "resampler of site 'demo' is running and writes grid itself: replay with --from raw, or stop it"
+    assert refused.stderr == f"fantwin: {expected}\n"
     assert all(q.empty() for q in site.heard.values()), "nothing was published, not even health"
     assert site.replay(recording, "--from", "raw", "--rate", "max").returncode == 0
 
@@ -291,14 +291,14 @@ def test_it_says_when_nobody_listens_and_where_it_looked(tmp_path, endpoint):
 
 def test_what_could_not_be_read_is_told_and_the_exit_code_says_so(tmp_path, endpoint):
     whole = write_raw(tmp_path / "whole.mcap", 2000)
-    torn = tmp_path / "torn.mcap"
-    torn.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    done = fantwin("replay", torn, "--rate", "max", "--set", f"bus.endpoint={endpoint}", "--json")
+    truncated = tmp_path / "truncated.mcap"
+    truncated.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    done = fantwin("replay", truncated, "--rate", "max", "--set", f"bus.endpoint={endpoint}", "--json")
     assert done.returncode == 3
-    assert "torn.mcap" in done.stderr
-    told = json.loads(done.stdout)
-    assert told["damage"]
-    assert 0 < told["messages"]["raw"] < 2000
+    assert "truncated.mcap" in done.stderr
+    report = json.loads(done.stdout)
+    assert report["damage"]
+    assert 0 < report["messages"]["raw"] < 2000
 
 
 def test_topics_that_the_recording_does_not_have_are_one_line(tmp_path, endpoint):

@@ -59,8 +59,8 @@ def operate(chain: Chain) -> list[dict[str, Any]]:
     ask(chain, "shelve", TRAY, FAULTY, "--for", "30m", "--operator", "Bob")
     ask(chain, "out-of-service", TRAY, 5)
     refused = fantwin(*chain.words("alarms"), "ack", TRAY, FAULTY)
-    said = f"fantwin: {TRAY}: fan {FAULTY}: refused: it is acknowledged already\n"
-    assert (refused.returncode, refused.stderr) == (1, said)
+    expected = f"fantwin: {TRAY}: fan {FAULTY}: refused: it is acknowledged already\n"
+    assert (refused.returncode, refused.stderr) == (1, expected)
     alarms = current_alarms(chain)
     assert [(a["fan"], a["acknowledged_by"], a["retained"], a["presented"], a["out_of_service"]) for a in alarms] == [
         (FAULTY, "Ann", True, False, False),

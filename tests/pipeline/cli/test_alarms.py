@@ -23,7 +23,7 @@ from scoring.alarms.alarm_state import AlarmState, ConditionSettings
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.tray_alarms import Conditions
 from stages.scorer import ScorerConfig
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
 
 FANS = 8
@@ -129,7 +129,7 @@ class Site:
         return done.stdout
 
     def refused(self, *words: object) -> str:
-        return said_instead("alarms", *words, *self.words)
+        return error_of("alarms", *words, *self.words)
 
     def listed(self, *words: object) -> list[dict[str, Any]]:
         return json.loads(self.ask("--json", *words))["alarms"]
@@ -191,8 +191,8 @@ def test_a_missing_diagnosis_is_explained_once():
 
 def test_an_acknowledgement_names_who_and_a_shelved_alarm_is_listed_and_not_presented(site):
     site.raise_alarm(3)
-    said = site.ask("ack", TRAY, 3, "--operator", "Ann", "--comment", "on my way")
-    assert said == f"{TRAY}: fan 3: acknowledged\n"
+    output = site.ask("ack", TRAY, 3, "--operator", "Ann", "--comment", "on my way")
+    assert output == f"{TRAY}: fan 3: acknowledged\n"
     assert site.core.conditions.alarm_state(3).comment == "on my way"
     (answer,) = json.loads(site.ask("shelve", TRAY, 3, "--for", "30m", "--json"))["answers"]
     assert (answer["transition"], answer["fan"]) == ("shelved", 3)
@@ -244,19 +244,19 @@ def test_watching_prints_what_happens_as_it_happens(site):
 
 def test_a_scorer_that_does_not_answer_is_reported_after_the_timeout(site):
     site.core.deaf = True
-    said = site.refused("ack", TRAY, 3, "--timeout", 0.5)
-    assert said == f"tray {TRAY}: no answer for fan 3 within 0.5 s: does a scorer run for this tray?"
+    error = site.refused("ack", TRAY, 3, "--timeout", 0.5)
+    assert error == f"tray {TRAY}: no answer for fan 3 within 0.5 s: does a scorer run for this tray?"
 
 
 @pytest.mark.parametrize("words", [(), ("ack", TRAY, 3)], ids=["list", "ack"])
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, monkeypatch):
     monkeypatch.setattr("pipeline.cli.watch.alarms._DISCOVERY_S", 0.3)
-    said = said_instead("alarms", *words, "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
-    assert f"alarms unknown: no scorer of site '{SITE}' answers at {endpoint}" in said
+    error = error_of("alarms", *words, "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
+    assert f"alarms unknown: no scorer of site '{SITE}' answers at {endpoint}" in error
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         ("ack", "name a tray: fantwin alarms ack TRAY [FAN] (trays: tray1)"),
         ("ack nobody", "no tray called 'nobody'"),
@@ -268,8 +268,8 @@ def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, m
         ("--operator Ann", "--for, --comment and --operator need an action"),
     ],
 )
-def test_what_cannot_be_meant_is_one_line(words, said):
-    assert said in said_instead("alarms", *words.split(), "-c", DEMO / "demo.toml")
+def test_what_cannot_be_meant_is_one_line(words, expected):
+    assert expected in error_of("alarms", *words.split(), "-c", DEMO / "demo.toml")
 
 
 def test_every_action_can_be_typed():

@@ -14,7 +14,7 @@ from pipeline.cli.main import expand_variadic
 from pipeline.cli.twins.calibration_check import Check
 from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.limits import Limits, Timing
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 
 FANS = 2
 PER_DAY = 1500
@@ -99,19 +99,19 @@ def strict(folder: Path, calibrated: Path) -> Path:
 
 
 def test_the_output_is_readable(folder: Path) -> None:
-    told = calibrate(folder, "-o", folder / "said.onnx").stdout
-    assert "said.onnx: alarms calibrated on 0.06" in told
-    assert f"declared: {PER_DAY} false alarms per fan and day" in told
-    assert "--verify" in told
+    output = calibrate(folder, "-o", folder / "out.onnx").stdout
+    assert "out.onnx: alarms calibrated on 0.06" in output
+    assert f"declared: {PER_DAY} false alarms per fan and day" in output
+    assert "--verify" in output
 
 
 def test_json_is_one_document_of_the_limits_and_the_test_of_them(folder: Path) -> None:
     result = calibrate(folder, "-o", folder / "json.onnx", "--json", "--verify", folder / "other.mcap")
-    told = json.loads(result.stdout)
-    assert told["twin"].endswith("json.onnx")
-    Limits.model_validate(told["calibration"])
-    assert told["verify"]["kept"] is True
-    assert told["verify"]["fan_hours"] == pytest.approx(FANS * 60 / 3600, rel=0.1)
+    document = json.loads(result.stdout)
+    assert document["twin"].endswith("json.onnx")
+    Limits.model_validate(document["calibration"])
+    assert document["verify"]["kept"] is True
+    assert document["verify"]["fan_hours"] == pytest.approx(FANS * 60 / 3600, rel=0.1)
 
 
 def test_without_an_output_the_twin_itself_is_calibrated(folder: Path) -> None:
@@ -124,9 +124,9 @@ def test_without_an_output_the_twin_itself_is_calibrated(folder: Path) -> None:
 
 def test_too_little_is_refused_with_what_would_be_needed_and_the_twin_is_left_alone(folder: Path) -> None:
     before = (folder / "twin.onnx").read_bytes()
-    said = said_instead("calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1)
-    assert "fan-hours of healthy running cannot support 1 false alarm per fan and day: that takes 72" in said
-    assert "--extrapolate" in said
+    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1)
+    assert "fan-hours of healthy running cannot support 1 false alarm per fan and day: that takes 72" in error
+    assert "--extrapolate" in error
     assert (folder / "twin.onnx").read_bytes() == before
 
 
@@ -166,19 +166,19 @@ def test_the_printed_interval_decides(alarms: int) -> None:
 
 
 def test_a_twin_that_was_never_calibrated_has_nothing_to_verify(folder: Path) -> None:
-    said = said_instead("calibrate", folder / "twin.onnx", "--verify", folder / "other.mcap")
-    assert "never calibrated" in said
+    error = error_of("calibrate", folder / "twin.onnx", "--verify", folder / "other.mcap")
+    assert "never calibrated" in error
 
 
 def test_missing_arguments_are_named(folder: Path) -> None:
-    assert "nothing to calibrate on" in said_instead("calibrate", folder / "twin.onnx")
-    said = said_instead("calibrate", folder / "twin.onnx", folder / "healthy.mcap")
-    assert "--false-alarms-per-day" in said
+    assert "nothing to calibrate on" in error_of("calibrate", folder / "twin.onnx")
+    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap")
+    assert "--false-alarms-per-day" in error
 
 
 def test_a_missing_twin_is_reported_by_the_given_name(folder: Path) -> None:
-    said = said_instead("calibrate", folder / "no.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY)
-    assert said == f"{folder / 'no.onnx'}: there is no such twin: name the file that `fantwin train` wrote"
+    error = error_of("calibrate", folder / "no.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY)
+    assert error == f"{folder / 'no.onnx'}: there is no such twin: name the file that `fantwin train` wrote"
 
 
 def test_all_that_follows_verify_is_verified(folder: Path, calibrated: Path) -> None:
@@ -193,19 +193,19 @@ def test_arguments_consumed_by_verify_are_reported(folder: Path, calibrated: Pat
     other, healthy, twin = folder / "other.mcap", folder / "healthy.mcap", folder / "twin.onnx"
     for option in (("--false-alarms-per-day", PER_DAY), ("--extrapolate",), ("-o", folder / "never.onnx")):
         words = expand_variadic(list(map(str, ("calibrate", twin, *option, "--verify", other, healthy))))
-        said = said_instead(*words)
-        assert "those after --verify only test; name HEALTHY.mcap... before it" in said
+        error = error_of(*words)
+        assert "those after --verify only test; name HEALTHY.mcap... before it" in error
     words = expand_variadic(list(map(str, ("calibrate", calibrated, "--verify", other, twin))))
-    assert f"{twin}: --verify takes recordings" in said_instead(*words)
+    assert f"{twin}: --verify takes recordings" in error_of(*words)
 
 
 def test_a_recording_in_which_something_was_wrong_is_named(folder: Path) -> None:
     bad = folder / "bad.mcap"
     simulated(bad, 5, 60, "--fault", "inlet:fan=1,start=20,stop=50,size=1.6")
-    said = (f"{bad}: tray1 fan 1 goes to", "times the limits that were found", "calibrate without this recording")
+    expected = (f"{bad}: tray1 fan 1 goes to", "times the limits that were found", "calibrate without this recording")
     result = calibrate(folder, bad, "-o", folder / "doubtful.onnx", "--json")
     (warning,) = json.loads(result.stdout)["warnings"]
-    assert all(part in warning for part in said)
+    assert all(part in warning for part in expected)
     assert warning in result.stderr.splitlines()
     result = calibrate(folder, folder / "other.mcap", "-o", folder / "sure.onnx", "--json")
     assert json.loads(result.stdout)["warnings"] == []
@@ -222,49 +222,49 @@ def test_files_of_another_kind_are_named_in_one_line(folder: Path, wrong: str, t
         recording.write_bytes(b"nothing of the kind")
     else:
         recording = tmp_path / "missing.mcap"
-    said = said_instead("calibrate", twin, recording, "--false-alarms-per-day", PER_DAY)
-    assert str(twin if wrong == "twin" else recording) in said
+    error = error_of("calibrate", twin, recording, "--false-alarms-per-day", PER_DAY)
+    assert str(twin if wrong == "twin" else recording) in error
 
 
 def test_an_output_that_cannot_be_written_is_said_in_one_line(folder: Path) -> None:
-    said = said_instead(
+    error = error_of(
         "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY,
         "-o", folder / "no-folder" / "twin.onnx",
     )  # fmt: skip
-    assert "cannot write the twin" in said
+    assert "cannot write the twin" in error
 
 
 def test_a_folder_as_output_is_said_before_anything_is_judged(folder: Path) -> None:
-    said = said_instead(
+    error = error_of(
         "calibrate", folder / "twin.onnx", folder / "missing.mcap", "--false-alarms-per-day", PER_DAY, "-o", folder
     )
-    assert "cannot write the twin" in said
+    assert "cannot write the twin" in error
     assert not folder.with_name(folder.name + ".new").exists()
 
 
 def test_a_recording_counts_once(folder: Path) -> None:
     healthy, verify = folder / "healthy.mcap", ("--verify", folder / "healthy.mcap")
     twin, rate = folder / "twin.onnx", ("--false-alarms-per-day", PER_DAY)
-    assert "named twice" in said_instead("calibrate", twin, healthy, healthy, *rate)
-    assert "named twice" in said_instead("calibrate", twin, healthy, *rate, *verify)
+    assert "named twice" in error_of("calibrate", twin, healthy, healthy, *rate)
+    assert "named twice" in error_of("calibrate", twin, healthy, *rate, *verify)
 
 
 def test_the_twins_own_recordings_cannot_verify_it_under_any_name(folder: Path, calibrated: Path) -> None:
     copy = folder / "copy.mcap"
     copy.write_bytes((folder / "healthy.mcap").read_bytes())
-    said = said_instead("calibrate", calibrated, "--verify", folder / "other.mcap", "--verify", copy)
-    assert f"{copy}: {calibrated} was calibrated on it, so it proves nothing" in said
-    said = said_instead("calibrate", calibrated, "--verify", folder / "training.mcap")
-    assert f"{calibrated} was trained on it" in said
+    error = error_of("calibrate", calibrated, "--verify", folder / "other.mcap", "--verify", copy)
+    assert f"{copy}: {calibrated} was calibrated on it, so it proves nothing" in error
+    error = error_of("calibrate", calibrated, "--verify", folder / "training.mcap")
+    assert f"{calibrated} was trained on it" in error
 
 
 def test_limits_are_found_for_the_times_that_the_scorer_is_set_to(folder: Path, calibrated: Path) -> None:
     output = folder / "slow.onnx"
     result = calibrate(folder, "-o", output, "--set", "scorer.smoothing_s=1.0")
     assert result.exit_code == 0, result.output
-    slow, usual = (Limits.model_validate(load_tray_twin(twin).card.calibration) for twin in (output, calibrated))
-    assert (usual.timing, slow.timing) == (Timing(), Timing(smoothing_s=1.0))
-    assert slow.detectors["speed_smoothed"] != usual.detectors["speed_smoothed"]
+    slow, default = (Limits.model_validate(load_tray_twin(twin).card.calibration) for twin in (output, calibrated))
+    assert (default.timing, slow.timing) == (Timing(), Timing(smoothing_s=1.0))
+    assert slow.detectors["speed_smoothed"] != default.detectors["speed_smoothed"]
 
 
 def test_recordings_of_scorers_with_other_times_are_refused(folder: Path) -> None:
@@ -273,16 +273,16 @@ def test_recordings_of_scorers_with_other_times_are_refused(folder: Path) -> Non
         "replay", folder / "other.mcap", "--offline", "--twin", twin, "--set", "scorer.on_delay_s=1.0", "-o", slow
     )
     assert result.exit_code == 0, result.output
-    said = said_instead("calibrate", twin, folder / "healthy.mcap", slow, "--false-alarms-per-day", PER_DAY)
-    assert f"healthy.mcap and {slow} differ in scorer.on_delay_s, which limits depend on: choose one" in said
+    error = error_of("calibrate", twin, folder / "healthy.mcap", slow, "--false-alarms-per-day", PER_DAY)
+    assert f"healthy.mcap and {slow} differ in scorer.on_delay_s, which limits depend on: choose one" in error
 
 
 def test_settings_that_do_not_affect_calibration_are_refused(folder: Path, calibrated: Path) -> None:
-    said = said_instead(
+    error = error_of(
         "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY,
         "--set", "scorer.limit_factor=2",
     )  # fmt: skip
-    assert "--set scorer.limit_factor: does not affect calibration" in said
+    assert "--set scorer.limit_factor: does not affect calibration" in error
     result = fantwin("calibrate", calibrated, "--verify", folder / "other.mcap", "--set", "scorer.off_delay_s=2.0")
     assert result.exit_code == 0, result.output
 
@@ -303,6 +303,6 @@ def test_recordings_with_grids_of_different_rates_are_refused_by_name(folder: Pa
         "replay", folder / "other.mcap", "--offline", "--twin", twin, "--set", "resampler.rate_hz=50", "-o", slow
     )
     assert result.exit_code == 0, result.output
-    said = said_instead("calibrate", twin, folder / "healthy.mcap", slow, "--false-alarms-per-day", PER_DAY)
-    assert f"healthy.mcap and {slow} have grids of different rates, 100 Hz and 50 Hz" in said
-    assert "\n" not in said
+    error = error_of("calibrate", twin, folder / "healthy.mcap", slow, "--false-alarms-per-day", PER_DAY)
+    assert f"healthy.mcap and {slow} have grids of different rates, 100 Hz and 50 Hz" in error
+    assert "\n" not in error

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.cli.watch.command import _message
 from pipeline.config.models import TrayConfig
-from tests.support.fantwin_command import said_instead
+from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO, Chain, Running, fantwin
 
 
@@ -39,8 +39,8 @@ def test_a_command_that_the_line_did_not_take_is_one_line_that_says_why(chain, a
 def test_without_an_acquisition_nobody_takes_the_command(chain):
     done = fantwin(*chain.words("command"), "--fan", 3, 0.5)
     assert done.returncode == 1
-    said = "fantwin: no acquisition of tray tray1 received the command: is `fantwin up` running?\n"
-    assert done.stderr == said
+    expected = "fantwin: no acquisition of tray tray1 received the command: is `fantwin up` running?\n"
+    assert done.stderr == expected
 
 
 def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():
@@ -50,7 +50,7 @@ def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         ("--fan 8 0.5", "tray tray1 has fans 0 to 7"),
         ("--fan -1 0.5", "tray tray1 has fans 0 to 7"),
@@ -61,5 +61,5 @@ def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():
         ("--tray nobody --fan 2 0.5", "no tray called 'nobody'"),
     ],
 )
-def test_what_the_tray_cannot_carry_out_is_refused_in_one_line(words, said):
-    assert said in said_instead("command", "-c", DEMO / "demo.toml", *words.split())
+def test_what_the_tray_cannot_carry_out_is_refused_in_one_line(words, expected):
+    assert expected in error_of("command", "-c", DEMO / "demo.toml", *words.split())

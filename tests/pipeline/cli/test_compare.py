@@ -8,7 +8,7 @@ import pytest
 
 from tests.pipeline.cli.test_train_commands import record
 from tests.support.fan_data import rough_run
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 from twin.build import train_twin
 from twin.comparison import Contender, all_candidates, best
 from twin.errors import TwinError
@@ -113,11 +113,11 @@ def test_nothing_that_can_be_trained_is_an_error_that_says_why():
 
 def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
     healthy = folder / "healthy.mcap"
-    assert "--model hybird: no such model; known: physical" in said_instead("compare", healthy, "--model", "hybird")
-    assert "cannot read the recording" in said_instead("compare", healthy, "--test", tmp_path / "nowhere.mcap")
+    assert "--model hybird: no such model; known: physical" in error_of("compare", healthy, "--model", "hybird")
+    assert "cannot read the recording" in error_of("compare", healthy, "--test", tmp_path / "nowhere.mcap")
     (tmp_path / "file").touch()
     unwritable = ("-o", tmp_path / "file" / "twins", "--model", "physical")
-    assert "cannot be created" in said_instead("compare", healthy, *unwritable)
+    assert "cannot be created" in error_of("compare", healthy, *unwritable)
     still = rough_run(1, 5.0)
     record(tmp_path / "still.mcap", Run("still", still.t_s, np.full_like(still.command, 50.0), still.speed_rad_s))
-    assert "command" in said_instead("compare", tmp_path / "still.mcap")
+    assert "command" in error_of("compare", tmp_path / "still.mcap")

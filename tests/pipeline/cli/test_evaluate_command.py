@@ -11,7 +11,7 @@ from rich.console import Console
 from pipeline.cli.twins.evaluate import _fan_table
 from tests.pipeline.cli.test_train_commands import record
 from tests.support import fan_data
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 from tests.support.twin_files import write_twin
 from twin.build import evaluate, train_twin
 from twin.errors import TwinError
@@ -251,8 +251,8 @@ def test_a_card_names_the_fans_it_is_of_and_a_fan_is_judged_by_its_own_parameter
 )
 def test_where_the_fans_are_not_those_of_the_twin_one_line_says_so(tray: Path, arguments: tuple, words: str) -> None:
     file, *options = arguments
-    assert words in said_instead("evaluate", tray / "twin.onnx", tray / file, *options)
-    assert words in said_instead("report", tray / "twin.onnx", tray / file, *options, "-o", tray / "none.html")
+    assert words in error_of("evaluate", tray / "twin.onnx", tray / file, *options)
+    assert words in error_of("report", tray / "twin.onnx", tray / file, *options, "-o", tray / "none.html")
 
 
 def test_a_twin_made_before_cards_named_fans_is_still_read_and_serves_as_many(tray: Path) -> None:
@@ -262,13 +262,13 @@ def test_a_twin_made_before_cards_named_fans_is_still_read_and_serves_as_many(tr
     for options in (("two.mcap",), ("three.mcap", "--fans", "0,2")):
         result = json.loads(fantwin("evaluate", old, tray / options[0], *options[1:], "--json").stdout)
         assert len(result["fans"]) == 2
-    assert "has 2 fans and does not say which" in said_instead("evaluate", old, tray / "two.mcap", "--fans", "1")
+    assert "has 2 fans and does not say which" in error_of("evaluate", old, tray / "two.mcap", "--fans", "1")
 
 
 @pytest.mark.parametrize("rate", ["0", "-50", "fast", "nan", "inf"])
 def test_a_rate_that_is_none_is_told_in_one_line(recorded: tuple[Path, Path], rate: str) -> None:
-    assert f"--rate {rate}: give a rate in Hz" in said_instead("evaluate", *recorded, f"--rate={rate}")
+    assert f"--rate {rate}: give a rate in Hz" in error_of("evaluate", *recorded, f"--rate={rate}")
 
 
 def test_a_rate_too_low_for_the_recording_is_told_in_one_line(recorded: tuple[Path, Path]) -> None:
-    assert "no run is long enough to be judged at 0.01 Hz" in said_instead("evaluate", *recorded, "--rate", "0.01")
+    assert "no run is long enough to be judged at 0.01 Hz" in error_of("evaluate", *recorded, "--rate", "0.01")

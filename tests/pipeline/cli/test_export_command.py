@@ -21,7 +21,7 @@ from pipeline.recordings.writing import RecordingWriter
 from schemas.codec import proto_type
 from schemas.messages import MESSAGE_TYPES, FanState, Health, ModelCard, Raw, Statistic
 from tests.pipeline.recordings.test_arrays import GOLDEN, alarm, raw, write
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 from tests.support.score_data import START_NS, made_up_tray
 
 READING = Path(__file__).parents[3] / "docs" / "how-to" / "read-recordings.md"
@@ -98,13 +98,13 @@ def test_parquet_has_timestamps_and_describes_its_source(tmp_path):
     assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
     assert frame["time"].astype("int64").tolist() == frame["t_ns"].tolist()
     assert str(frame["state"].dtype) == "category"
-    said = {name.decode(): value.decode() for name, value in pq.read_schema(path).metadata.items()}
-    assert said["fantwin.site"] == "plant"
-    assert said["fantwin.tray"] == "tray1"
-    assert said["fantwin.topic"] == "score"
-    assert said["fantwin.speed_unit"] == "rpm"
-    assert said["fantwin.exported_by"] == f"fantwin {version('fantwin')}"
-    assert "fantwin.damage" not in said
+    metadata = {name.decode(): value.decode() for name, value in pq.read_schema(path).metadata.items()}
+    assert metadata["fantwin.site"] == "plant"
+    assert metadata["fantwin.tray"] == "tray1"
+    assert metadata["fantwin.topic"] == "score"
+    assert metadata["fantwin.speed_unit"] == "rpm"
+    assert metadata["fantwin.exported_by"] == f"fantwin {version('fantwin')}"
+    assert "fantwin.damage" not in metadata
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -217,11 +217,11 @@ def test_an_existing_table_is_replaced_only_with_force_and_only_by_a_complete_on
     out = tmp_path / "out"
     out.mkdir()
     (out / "r.tray1.score.csv").write_text("mine")
-    said = said_instead("export", path, "--to", "csv", "-o", out)
-    assert said == f"{out}/r.tray1.score.csv: exists; name another folder or file with -o, or replace it with --force"
+    error = error_of("export", path, "--to", "csv", "-o", out)
+    assert error == f"{out}/r.tray1.score.csv: exists; name another folder or file with -o, or replace it with --force"
     with disk_of(20_000):
-        said = said_instead("export", path, "--to", "csv", "-o", out, "--force")
-    assert "r.tray1.score.csv: cannot be written: File too large" in said
+        error = error_of("export", path, "--to", "csv", "-o", out, "--force")
+    assert "r.tray1.score.csv: cannot be written: File too large" in error
     assert (out / "r.tray1.score.csv").read_text() == "mine"
     assert fantwin("export", path, "--to", "csv", "-o", out, "--force").exit_code == 0
     assert len(table(out / "r.tray1.score.csv")) == 600
@@ -232,8 +232,8 @@ def test_an_existing_table_is_replaced_only_with_force_and_only_by_a_complete_on
 def test_a_full_disk_is_a_one_line_error_and_leaves_no_file(tmp_path, form):
     path = recording(tmp_path)
     with disk_of(2000):
-        said = said_instead("export", path, "--to", form, "-o", tmp_path / "out")
-    assert said == (
+        error = error_of("export", path, "--to", form, "-o", tmp_path / "out")
+    assert error == (
         f"{tmp_path}/out/r.tray1.score.{form}: cannot be written: File too large; name another folder with -o"
     )
     assert names(tmp_path / "out") == []
@@ -242,7 +242,7 @@ def test_a_full_disk_is_a_one_line_error_and_leaves_no_file(tmp_path, form):
 def test_one_file_holds_one_table(tmp_path):
     path = recording(tmp_path, trays=("left", "right"))
     one = tmp_path / "one.csv"
-    assert said_instead("export", path, "--to", "csv", "-o", one) == (
+    assert error_of("export", path, "--to", "csv", "-o", one) == (
         f"{one}: would hold both score of left and score of right: name a folder with -o, or choose with --topic and "
         "--tray"
     )
@@ -256,7 +256,7 @@ def test_the_same_tray_of_two_sites_does_not_become_one_table(tmp_path):
     with RecordingWriter(path, {}) as writer:
         for site in ("here", "there"):
             writer.add_message(f"fantwin/{site}/tray1/raw", raw(0), 1)
-    assert "would hold both" in said_instead("export", path, "--to", "csv", "-o", tmp_path / "out")
+    assert "would hold both" in error_of("export", path, "--to", "csv", "-o", tmp_path / "out")
 
 
 @pytest.mark.parametrize(
@@ -270,7 +270,7 @@ def test_the_same_tray_of_two_sites_does_not_become_one_table(tmp_path):
 )
 def test_what_cannot_be_exported_is_a_one_line_error(tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
-    assert words in said_instead("export", recording(tmp_path), *arguments)
+    assert words in error_of("export", recording(tmp_path), *arguments)
     assert names(tmp_path) == ["r.mcap"]
 
 
@@ -278,7 +278,7 @@ def test_without_pyarrow_parquet_names_the_extra_and_csv_works(tmp_path, monkeyp
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     path = recording(tmp_path)
-    assert ".venv/bin/pip install -e '.[parquet]'" in said_instead("export", path, "--to", "parquet", "-o", tmp_path)
+    assert ".venv/bin/pip install -e '.[parquet]'" in error_of("export", path, "--to", "parquet", "-o", tmp_path)
     assert fantwin("export", path, "--to", "csv", "-o", tmp_path).exit_code == 0
 
 

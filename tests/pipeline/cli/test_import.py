@@ -9,7 +9,7 @@ import pytest
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.runs import read_runs
 from schemas.messages import Array, Raw
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 
 
 def measured(folder: Path, rows: int = 1234, start_s: float = 0.0) -> tuple[Path, Array]:
@@ -63,7 +63,7 @@ def test_json_output_has_the_counts(tmp_path):
 
 def test_units_that_were_not_given_are_reported_with_their_option(tmp_path):
     path, _ = measured(tmp_path)
-    for given, said in (
+    for given, assumption in (
         (
             ("--time", "t", "--command", "u", "--speed", "y1"),
             "times in s and speeds in rad/s assumed; if that is wrong, use for example --time t:ms and --speed y1:rpm",
@@ -78,8 +78,8 @@ def test_units_that_were_not_given_are_reported_with_their_option(tmp_path):
         ),
     ):
         words = ("import", path, *given, "-o", tmp_path / "r.mcap", "--force")
-        assert fantwin(*words).stdout.splitlines()[1] == f"  no unit given, {said}"
-        assert json.loads(fantwin(*words, "--json").stdout)["assumed"] == f"no unit given, {said}"
+        assert fantwin(*words).stdout.splitlines()[1] == f"  no unit given, {assumption}"
+        assert json.loads(fantwin(*words, "--json").stdout)["assumed"] == f"no unit given, {assumption}"
     words = ("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--force")
     assert "assumed" not in fantwin(*words).stdout
     assert json.loads(fantwin(*words, "--json").stdout)["assumed"] == ""
@@ -115,7 +115,7 @@ def test_an_existing_recording_is_replaced_only_when_forced(tmp_path):
     recording = tmp_path / "r.mcap"
     recording.write_bytes(b"precious")
     arguments = ("import", path, *ARGUMENTS, "-o", recording)
-    assert said_instead(*arguments) == f"{recording}: exists; name another file with -o, or replace it with --force"
+    assert error_of(*arguments) == f"{recording}: exists; name another file with -o, or replace it with --force"
     assert recording.read_bytes() == b"precious"
     assert fantwin(*arguments, "--force").exit_code == 0
     assert len(list(read_recording(recording))) == 13
@@ -123,7 +123,7 @@ def test_an_existing_recording_is_replaced_only_when_forced(tmp_path):
 
 def test_a_table_that_cannot_be_read_leaves_no_recording(tmp_path):
     path, _ = measured(tmp_path)
-    assert "no column 'y3'; did you mean" in said_instead(
+    assert "no column 'y3'; did you mean" in error_of(
         "import", path, "--time", "t", "--command", "u", "--speed", "y3", "-o", tmp_path / "r.mcap"
     )
     assert [p.name for p in tmp_path.iterdir()] == ["measured.csv"]
@@ -132,7 +132,7 @@ def test_a_table_that_cannot_be_read_leaves_no_recording(tmp_path):
 @pytest.mark.parametrize("tray", ["a/b", "", "health", "tray 1"])
 def test_a_tray_name_that_cannot_be_part_of_a_key_is_refused(tmp_path, tray):
     path, _ = measured(tmp_path)
-    assert "use letters, digits" in said_instead("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--tray", tray)
+    assert "use letters, digits" in error_of("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--tray", tray)
 
 
 def test_training_reads_the_numbers_of_the_table(tmp_path):

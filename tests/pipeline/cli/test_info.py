@@ -17,7 +17,7 @@ from schemas.messages import Counter, Header, Health, ModelCard, StageStatus
 from schemas.topics import health_key, tray_key
 from tests.pipeline.recordings.test_parts import part, parts_in
 from tests.pipeline.recordings.test_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 
 METADATA = {"site": "plant", "trays": "tray1", "fans.tray1": "2", "speed_unit.tray1": "rpm", "made_by": "fantwin"}
 SECOND_NS = 1_000_000_000
@@ -83,7 +83,7 @@ def test_metadata_twins_and_stages_are_in_the_json(tmp_path):
 
 
 def test_the_text_shows_the_same(tmp_path):
-    said = fantwin("info", recording(tmp_path / "r.mcap")).stdout
+    output = fantwin("info", recording(tmp_path / "r.mcap")).stdout
     for words in (
         "r.mcap: 0.0",
         "8 messages",
@@ -93,8 +93,8 @@ def test_the_text_shows_the_same(tmp_path):
         "attached: configuration.toml, tray1.onnx",
         "acquisition/tray1: the line is silent: look at the cable; 3 lost",
     ):
-        assert words in said
-    (line,) = (line for line in said.splitlines() if "tray1/raw" in line)
+        assert words in output
+    (line,) = (line for line in output.splitlines() if "tray1/raw" in line)
     assert line.split()[1:4] == ["5", "2", "1"]
 
 
@@ -197,9 +197,9 @@ def test_a_part_that_does_not_begin_where_the_one_before_ended_is_reported(tmp_p
 def test_a_pause_is_shown(tmp_path):
     about = {"paused_t_ns": "1", "resumed_t_ns": "2500000001", "paused_because": "no room", "lost_in_pause": "7"}
     parts_in(tmp_path).begin(0, SequenceLedger(), about).finish()
-    said = fantwin("info", tmp_path / "r.mcap").stdout
-    assert "before this part nothing was recorded for 2.5 s; messages lost: 7" in said
-    assert "reason: no room" in said
+    output = fantwin("info", tmp_path / "r.mcap").stdout
+    assert "before this part nothing was recorded for 2.5 s; messages lost: 7" in output
+    assert "reason: no room" in output
 
 
 def test_a_file_without_fantwin_channels_is_shown_as_such(tmp_path):
@@ -212,9 +212,9 @@ def test_a_file_without_fantwin_channels_is_shown_as_such(tmp_path):
         writer.finish()
     (found,) = shown(path)["files"]
     assert (found["topics"], found["other_topics"]) == ({}, {"/camera": 1})
-    said = fantwin("info", path).stdout
-    assert "not a recording of fantwin: it has no channel of fantwin" in said
-    assert "/camera" in said
+    output = fantwin("info", path).stdout
+    assert "not a recording of fantwin: it has no channel of fantwin" in output
+    assert "/camera" in output
 
 
 def test_a_recording_without_messages_is_shown_too(tmp_path):
@@ -235,4 +235,4 @@ def test_a_file_that_is_not_a_recording_is_refused_in_one_line(tmp_path, content
     path = tmp_path / "r.mcap"
     if content is not None:
         path.write_bytes(content)
-    assert f"{path}: " in said_instead("info", path)
+    assert f"{path}: " in error_of("info", path)

@@ -17,19 +17,19 @@ def test_without_a_terminal_a_line_tells_every_few_seconds_how_far_a_training_is
     now_s = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now_s[0])
     with progress.training_progress(TRAINING_DATA) as start:
-        tell = start("hybrid")
+        report = start("hybrid")
         for iteration in range(1, 14):
             now_s[0] += 1.0
-            tell(iteration, 60, 0.5)
+            report(iteration, 60, 0.5)
         start("NARX")
-    said = capsys.readouterr()
-    assert said.err.splitlines() == [
+    output = capsys.readouterr()
+    assert output.err.splitlines() == [
         "hybrid: identifying",
         "hybrid: 5/60, free-run rmse 5 rpm, 5 s",
         "hybrid: 10/60, free-run rmse 5 rpm, 10 s",
         "NARX: identifying",
     ]
-    assert said.out == ""
+    assert output.out == ""
 
 
 def test_without_a_terminal_work_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:

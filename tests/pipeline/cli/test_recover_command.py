@@ -16,7 +16,7 @@ from schemas.messages import Header, Health, Output, StageStatus
 from schemas.topics import health_key
 from tests.pipeline.recordings.test_recordings import RAW_KEY, raw
 from tests.pipeline.recordings.test_repair import chunk_ends, read_by_others, small
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 
 
 @pytest.fixture
@@ -136,8 +136,8 @@ def test_info_reports_the_possible_losses_of_a_truncated_file_after_its_repair(t
 
 
 def test_an_output_that_cannot_be_written_is_refused_with_advice(tmp_path, whole):
-    said = said_instead("recover", whole, "-o", tmp_path / "nowhere" / "out.mcap")
-    assert "No such file or directory; whole.mcap is left as it was; name another file with -o" in said
+    error = error_of("recover", whole, "-o", tmp_path / "nowhere" / "out.mcap")
+    assert "No such file or directory; whole.mcap is left as it was; name another file with -o" in error
 
 
 def test_messages_that_health_reports_as_published_and_that_are_not_there_are_reported(tmp_path):
@@ -165,7 +165,7 @@ def test_messages_that_health_reports_as_published_and_that_are_not_there_are_re
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "expected"),
     [
         (b"", "not a recording (MCAP)"),
         (b"t,u,y\n1,2,3\n", "not a recording (MCAP)"),
@@ -173,9 +173,9 @@ def test_messages_that_health_reports_as_published_and_that_are_not_there_are_re
         (None, "cannot read the recording: No such file or directory"),
     ],
 )
-def test_if_nothing_can_be_recovered_the_reason_is_shown_and_no_file_written(tmp_path, content, said):
+def test_if_nothing_can_be_recovered_the_reason_is_shown_and_no_file_written(tmp_path, content, expected):
     path = tmp_path / "r.mcap"
     if content is not None:
         path.write_bytes(content)
-    assert said in said_instead("recover", path, "-o", tmp_path / "out.mcap")
+    assert expected in error_of("recover", path, "-o", tmp_path / "out.mcap")
     assert [p.name for p in tmp_path.iterdir()] == ([] if content is None else ["r.mcap"])

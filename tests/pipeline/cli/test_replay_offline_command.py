@@ -24,10 +24,10 @@ def replay(*words: object):
 
 
 def test_equal_is_exit_code_0():
-    told = replay("--verify", GOLDEN)
-    assert told.returncode == 0, told.stderr
-    assert "equal:" in told.stdout and "to the bit" in told.stdout
-    assert "2 restarts of stages" in told.stdout
+    result = replay("--verify", GOLDEN)
+    assert result.returncode == 0, result.stderr
+    assert "equal:" in result.stdout and "to the bit" in result.stdout
+    assert "2 restarts of stages" in result.stdout
 
 
 def test_a_difference_is_exit_code_1_and_named(tmp_path):
@@ -37,9 +37,9 @@ def test_a_difference_is_exit_code_1_and_named(tmp_path):
             entry.message.residual_rad_s[:] *= 2
         return entry.message
 
-    told = replay("--verify", changed(GOLDEN, tmp_path / "doubled.mcap", doubled))
-    assert told.returncode == 1
-    assert "DIFFERS" in told.stdout and "residual_rad_s" in told.stdout
+    result = replay("--verify", changed(GOLDEN, tmp_path / "doubled.mcap", doubled))
+    assert result.returncode == 1
+    assert "DIFFERS" in result.stdout and "residual_rad_s" in result.stdout
 
 
 @pytest.mark.parametrize("words", [("--twin",), ("--set", "scorer.on_delay_s=1"), ("--start", "2")])
@@ -47,27 +47,27 @@ def test_what_is_not_as_recorded_cannot_be_compared_exit_code_2(tmp_path, words)
     if words == ("--twin",):
         (tmp_path / "twin.onnx").write_bytes(read_metadata(GOLDEN).attachments["tray1.onnx"])
         words = ("--twin", tmp_path / "twin.onnx")
-    told = replay("--verify", GOLDEN, *words)
-    assert told.returncode == 2
-    assert "leave out" in told.stderr and len(told.stderr.strip().splitlines()) == 1
+    result = replay("--verify", GOLDEN, *words)
+    assert result.returncode == 2
+    assert "leave out" in result.stderr and len(result.stderr.strip().splitlines()) == 1
 
 
 def test_no_scores_cannot_be_compared_exit_code_2(tmp_path):
     raw = changed(GOLDEN, tmp_path / "raw.mcap", lambda entry: entry.message if entry.topic == "raw" else None)
-    told = replay("--verify", "--json", raw)
-    assert told.returncode == 2
-    assert json.loads(told.stdout)["verified"] is None
-    assert "nothing to compare with" in told.stderr
+    result = replay("--verify", "--json", raw)
+    assert result.returncode == 2
+    assert json.loads(result.stdout)["verified"] is None
+    assert "nothing to compare with" in result.stderr
 
 
 def test_the_decision_as_json():
-    told = json.loads(replay("--json", GOLDEN).stdout)
-    (alarm,) = told["alarms"]
+    document = json.loads(replay("--json", GOLDEN).stdout)
+    (alarm,) = document["alarms"]
     assert alarm["fan"] == 1 and alarm["raised_ns"] < alarm["cleared_ns"]
     assert alarm["severity"] == "alarm" and alarm["residual"] < 0
-    assert told["samples"] > 400 and told["lost"] == 0
-    not_judged = sum(told["not_judged"]["tray1"].values()) / 2
-    assert told["hours"] == pytest.approx((told["samples"] - not_judged) * 0.02 / 3600, abs=1e-4)
+    assert document["samples"] > 400 and document["lost"] == 0
+    not_judged = sum(document["not_judged"]["tray1"].values()) / 2
+    assert document["hours"] == pytest.approx((document["samples"] - not_judged) * 0.02 / 3600, abs=1e-4)
 
 
 def test_the_list_names_severity_and_probable_cause_and_is_not_wide():
@@ -75,8 +75,8 @@ def test_the_list_names_severity_and_probable_cause_and_is_not_wide():
     first, what = alarm["causes"][0], alarm["message"].partition(": ")[2][:12]
     lines = replay(GOLDEN).stdout.splitlines()
     (row,) = [line for line in lines if line.lstrip().startswith("tray1")]
-    for told in (alarm["severity"], f"{first['cause']} {100 * first['probability']:.0f} %", what):
-        assert told in row
+    for expected in (alarm["severity"], f"{first['cause']} {100 * first['probability']:.0f} %", what):
+        assert expected in row
     what_if = replay(GOLDEN, "--set", "scorer.limit_factor=1000").stdout.splitlines()
     (gone,) = [line for line in what_if if line.lstrip().startswith("tray1")]
     assert alarm["severity"] in gone and first["cause"] in gone
@@ -84,16 +84,17 @@ def test_the_list_names_severity_and_probable_cause_and_is_not_wide():
 
 
 def test_counts_of_stages_and_reasons_of_not_judging_have_names_of_their_own():
-    told = json.loads(replay("--json", GOLDEN).stdout)
+    document = json.loads(replay("--json", GOLDEN).stdout)
     reasons = {why.name.lower() for why in InvalidReason}
-    assert set(told["not_judged"]["tray1"]) <= reasons
-    assert reasons.isdisjoint(told["counts"]["tray1"]) and "not_predicted_out_of_range" in told["counts"]["tray1"]
+    assert set(document["not_judged"]["tray1"]) <= reasons
+    counts = document["counts"]["tray1"]
+    assert reasons.isdisjoint(counts) and "not_predicted_out_of_range" in counts
 
 
 def test_another_threshold_says_what_is_gained_and_lost():
-    told = json.loads(replay("--json", GOLDEN, "--set", "scorer.limit_factor=1000").stdout)
-    assert told["alarms"] == [] and told["what_if"]["gained"] == []
-    assert [alarm["fan"] for alarm in told["what_if"]["lost"]] == [1]
+    document = json.loads(replay("--json", GOLDEN, "--set", "scorer.limit_factor=1000").stdout)
+    assert document["alarms"] == [] and document["what_if"]["gained"] == []
+    assert [alarm["fan"] for alarm in document["what_if"]["lost"]] == [1]
     assert "1 alarms lost" in replay(GOLDEN, "--set", "scorer.limit_factor=1000").stdout
 
 
@@ -109,8 +110,8 @@ def test_another_configuration_file_is_taken(tmp_path):
 
 def test_the_output_is_a_whole_recording(tmp_path):
     out = tmp_path / "out.mcap"
-    told = replay(GOLDEN, "-o", out)
-    assert told.returncode == 0 and str(out) in told.stdout
+    result = replay(GOLDEN, "-o", out)
+    assert result.returncode == 0 and str(out) in result.stdout
     samples = [t_ns for entry in read_recording(out, ("score",)) for t_ns in entry.message.t_ns.tolist()]  # type: ignore[union-attr]
     assert len(samples) == len(set(samples)) == json.loads(replay("--json", GOLDEN).stdout)["samples"]
     assert read_metadata(out).attachments.keys() == read_metadata(GOLDEN).attachments.keys()
@@ -135,17 +136,17 @@ def test_an_imported_table_is_judged_at_the_twins_own_rate(tmp_path):
     with RecordingWriter(bare, {"source": "a table"}) as writer:
         for entry in read_recording(table):
             writer.add_message(entry.key, entry.message, entry.received_t_ns)
-    told = replay("--json", bare)
-    assert told.returncode == 1 and "--twin" in told.stderr
-    told = replay("--json", bare, "--twin", tmp_path / "twin.onnx")
-    assert told.returncode == 0, told.stderr
-    assert json.loads(told.stdout)["samples"] > 550
-    told = json.loads(
+    result = replay("--json", bare)
+    assert result.returncode == 1 and "--twin" in result.stderr
+    result = replay("--json", bare, "--twin", tmp_path / "twin.onnx")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["samples"] > 550
+    document = json.loads(
         replay("--json", bare, "--twin", tmp_path / "twin.onnx", "--set", "scorer.limit_factor=1000").stdout
     )
-    assert told["alarms"] == [], "keys are set on top of the defaults"
-    told = replay("--json", bare, "--twin", tmp_path / "twin.onnx", "--set", "no.such_key=1")
-    assert told.returncode == 1 and "no.such_key" in told.stderr.replace("'no'", "no.such_key")
+    assert document["alarms"] == [], "keys are set on top of the defaults"
+    result = replay("--json", bare, "--twin", tmp_path / "twin.onnx", "--set", "no.such_key=1")
+    assert result.returncode == 1 and "no.such_key" in result.stderr.replace("'no'", "no.such_key")
     out = tmp_path / "out.mcap"
     assert replay(bare, "--twin", tmp_path / "twin.onnx", "-o", out).returncode == 0
     assert json.loads(replay("--json", out).stdout)["samples"] > 550, "what was made of a table can be judged again"
@@ -157,24 +158,24 @@ def test_no_file_is_ever_written_over(tmp_path):
     active = tmp_path / "other.mcap.active"
     active.write_bytes(b"what a recorder is writing")
     for words in ((copy, "-o", copy), (copy, "-o", tmp_path / "other.mcap"), (copy, "-o", tmp_path)):
-        told = replay(*words)
-        assert told.returncode == 1 and "exists already" in told.stderr
+        result = replay(*words)
+        assert result.returncode == 1 and "exists already" in result.stderr
     assert copy.read_bytes() == GOLDEN.read_bytes() and active.read_bytes() == b"what a recorder is writing"
 
 
 def test_a_part_of_time_is_judged_and_compared_with_what_was_recorded_in_it():
-    told = json.loads(replay("--json", GOLDEN, "--end", "3", "--set", "scorer.on_delay_s=0.2").stdout)
-    assert told["what_if"] == {"gained": [], "lost": [], "kept": []}, "the alarm comes later"
-    assert 120 < told["samples"] < 160
-    told = replay("--json", GOLDEN, "--start", "1000")
-    assert told.returncode == 1 and "--start" in told.stderr
+    document = json.loads(replay("--json", GOLDEN, "--end", "3", "--set", "scorer.on_delay_s=0.2").stdout)
+    assert document["what_if"] == {"gained": [], "lost": [], "kept": []}, "the alarm comes later"
+    assert 120 < document["samples"] < 160
+    result = replay("--json", GOLDEN, "--start", "1000")
+    assert result.returncode == 1 and "--start" in result.stderr
 
 
 def test_parts_of_two_runs_are_refused(tmp_path):
     site = Site(tmp_path, seed=1)
     site.run(100)
-    told = replay(GOLDEN, site.finished())
-    assert told.returncode == 1 and "two runs" in told.stderr
+    result = replay(GOLDEN, site.finished())
+    assert result.returncode == 1 and "two runs" in result.stderr
 
 
 def test_an_attachment_is_written_nowhere_else(tmp_path):
@@ -195,24 +196,24 @@ def test_damaged_metadata_are_one_line(tmp_path, metadata):
     with RecordingWriter(path, {**head.metadata, **metadata}, head.attachments) as writer:
         for entry in read_recording(GOLDEN, ("raw",)):
             writer.add_message(entry.key, entry.message, entry.received_t_ns)
-    told = replay(path)
-    assert told.returncode == 1 and "[odd].mcap: its metadata are damaged" in told.stderr
-    assert len(told.stderr.strip().splitlines()) == 1
+    result = replay(path)
+    assert result.returncode == 1 and "[odd].mcap: its metadata are damaged" in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
 
 
 def test_a_torn_recording_is_judged_as_far_as_it_goes_exit_code_3(tmp_path):
-    torn = tmp_path / "torn.mcap"
-    shutil.copy(GOLDEN, torn)
-    with torn.open("r+b") as file:
+    truncated = tmp_path / "truncated.mcap"
+    shutil.copy(GOLDEN, truncated)
+    with truncated.open("r+b") as file:
         file.truncate(GOLDEN.stat().st_size // 2)
-    told = replay("--json", torn)
-    assert told.returncode == 3
-    assert "is truncated" in json.loads(told.stdout)["damage"][0]
+    result = replay("--json", truncated)
+    assert result.returncode == 3
+    assert "is truncated" in json.loads(result.stdout)["damage"][0]
 
 
 def test_a_file_that_is_not_there_is_one_line():
-    told = replay("nothing.mcap")
-    assert told.returncode == 1 and len(told.stderr.strip().splitlines()) == 1
+    result = replay("nothing.mcap")
+    assert result.returncode == 1 and len(result.stderr.strip().splitlines()) == 1
 
 
 def test_a_twin_that_is_set_by_a_key_is_the_one_that_judges(tmp_path):
@@ -222,8 +223,8 @@ def test_a_twin_that_is_set_by_a_key_is_the_one_that_judges(tmp_path):
         for words in (("--twin", other), ("--set", f"tray.0.twin='{other}'"))
     )
     assert by_key["alarms"] == by_option["alarms"] and by_key["what_if"]["gained"]
-    told = replay(GOLDEN, "--twin", tmp_path / "none.onnx")
-    assert told.returncode == 1 and "correct --twin" in told.stderr
+    result = replay(GOLDEN, "--twin", tmp_path / "none.onnx")
+    assert result.returncode == 1 and "correct --twin" in result.stderr
 
 
 def test_the_output_goes_from_second_to_second(tmp_path):

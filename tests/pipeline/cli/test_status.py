@@ -162,7 +162,7 @@ def test_json_has_stages_rates_losses_and_alarms(site):
 
 
 def test_alarms_are_shown_with_their_states_and_probable_causes(site):
-    def tell(number: int, transition: Transition, **more: Any) -> None:
+    def publish(number: int, transition: Transition, **more: Any) -> None:
         header, t_ns = Header("scorer-all-1", number, TRAY), ALARM.t_ns + number
         site.alarm.put(
             encode(replace(ALARM, header=header, t_ns=t_ns, transition=transition, **{"confirmed": True} | more))
@@ -170,12 +170,12 @@ def test_alarms_are_shown_with_their_states_and_probable_causes(site):
 
     over = {"active": False, "acknowledged": True}
     cause = Diagnosis(cause="drag_up", probability=0.87)
-    tell(0, Transition.RAISED)
-    tell(1, Transition.DIAGNOSED, causes=(cause,), message="fan 2: more drag")
-    tell(2, Transition.ACKNOWLEDGED, causes=(cause,), acknowledged=True, message="fan 2: acknowledged")
-    tell(3, Transition.RAISED, fan=3, onset_t_ns=7)
-    tell(4, Transition.CLEARED, fan=3, onset_t_ns=7, **over)
-    tell(5, Transition.SHELVED, fan=4, onset_t_ns=0, severity=Severity.NONE, shelved_until_t_ns=2**63 - 1, **over)
+    publish(0, Transition.RAISED)
+    publish(1, Transition.DIAGNOSED, causes=(cause,), message="fan 2: more drag")
+    publish(2, Transition.ACKNOWLEDGED, causes=(cause,), acknowledged=True, message="fan 2: acknowledged")
+    publish(3, Transition.RAISED, fan=3, onset_t_ns=7)
+    publish(4, Transition.CLEARED, fan=3, onset_t_ns=7, **over)
+    publish(5, Transition.SHELVED, fan=4, onset_t_ns=0, severity=Severity.NONE, shelved_until_t_ns=2**63 - 1, **over)
     watcher = Watcher(site.outside, SITE)
     view(site, watcher, HEALTH)
     watcher.ask_for_past_alarms()

@@ -11,7 +11,7 @@ from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Raw
 from schemas.topics import tray_key
 from tests.support.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, published_run
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 from twin.runs import Run
 
 RPM = 60 / (2 * np.pi)
@@ -149,34 +149,34 @@ def test_each_fan_of_a_tray_is_evaluated_and_fans_can_be_chosen(folder, twin):
 
 def test_what_is_damaged_in_a_recording_is_told(folder, twin, tmp_path):
     whole = (folder / "healthy.mcap").read_bytes()
-    torn = tmp_path / "torn.mcap"
-    torn.write_bytes(whole[:-100])
-    result = fantwin("evaluate", twin, torn, "--json")
+    truncated = tmp_path / "truncated.mcap"
+    truncated.write_bytes(whole[:-100])
+    result = fantwin("evaluate", twin, truncated, "--json")
     assert json.loads(result.stdout)["samples"] == 4000
-    assert "torn.mcap: it is truncated" in result.stderr
+    assert "truncated.mcap: it is truncated" in result.stderr
 
 
 def test_what_cannot_be_done_is_told_in_one_line(folder, twin, tmp_path):
     healthy, out = folder / "healthy.mcap", tmp_path / "t.onnx"
-    assert "in different units, rad/s" in said_instead("train", healthy, folder / "healthy-rpm.mcap", "-o", out)
-    assert "cannot read the recording" in said_instead("train", tmp_path / "nowhere.mcap", "-o", out)
-    assert "not a recording" in said_instead("evaluate", twin, twin)
-    assert "nowhere.onnx" in said_instead("evaluate", tmp_path / "nowhere.onnx", healthy)
-    assert "runs of [1, 2] fans are mixed" in said_instead("train", healthy, folder / "two.mcap", "-o", out)
+    assert "in different units, rad/s" in error_of("train", healthy, folder / "healthy-rpm.mcap", "-o", out)
+    assert "cannot read the recording" in error_of("train", tmp_path / "nowhere.mcap", "-o", out)
+    assert "not a recording" in error_of("evaluate", twin, twin)
+    assert "nowhere.onnx" in error_of("evaluate", tmp_path / "nowhere.onnx", healthy)
+    assert "runs of [1, 2] fans are mixed" in error_of("train", healthy, folder / "two.mcap", "-o", out)
     (tmp_path / "file").touch()
     unwritable = tmp_path / "file" / "t.onnx"
-    assert "cannot be created" in said_instead("train", healthy, "--model", "physical", "-o", unwritable)
+    assert "cannot be created" in error_of("train", healthy, "--model", "physical", "-o", unwritable)
 
 
 def test_nothing_is_overwritten_or_judged_by_mistake(folder, tmp_path):
     healthy, physical = folder / "healthy.mcap", ("--model", "physical")
     before = healthy.read_bytes()
-    assert "ends in .onnx" in said_instead("train", healthy, *physical, "-o", healthy)
+    assert "ends in .onnx" in error_of("train", healthy, *physical, "-o", healthy)
     assert healthy.read_bytes() == before
     twin = tmp_path / "twin.onnx"
-    same = said_instead("train", healthy, "--validate", healthy, *physical, "-o", twin)
+    same = error_of("train", healthy, "--validate", healthy, *physical, "-o", twin)
     assert "overlaps the training data" in same
-    other_unit = said_instead("train", healthy, "--validate", folder / "healthy-rpm.mcap", *physical, "-o", twin)
+    other_unit = error_of("train", healthy, "--validate", folder / "healthy-rpm.mcap", *physical, "-o", twin)
     assert "speeds in rpm, the training data are in rad/s" in other_unit
     assert not twin.exists()
     parts = fantwin("train", healthy, "--to", 20, "--validate", healthy, "--validate-from", 20, *physical, "-o", twin)
@@ -206,7 +206,7 @@ def test_a_command_that_never_changes_is_told_in_one_line(tmp_path):
     run = published_run(1, duration_s=5.0)
     still = Run("still", run.t_s, np.full_like(run.command, 50.0), run.speed_rad_s)
     path = record(tmp_path / "still.mcap", still)
-    assert "command" in said_instead("identify", path)
+    assert "command" in error_of("identify", path)
 
 
 @pytest.mark.parametrize("command", ["identify", "train", "evaluate"])
@@ -224,4 +224,4 @@ def test_a_missing_extra_is_reported_with_what_to_install(folder, twin, monkeypa
         "train": (folder / "healthy.mcap", "-o", folder / "t.onnx"),
         "evaluate": (twin, folder / "healthy.mcap"),
     }[command]
-    assert said_instead(command, *arguments).endswith(".venv/bin/pip install -e '.[train]'")
+    assert error_of(command, *arguments).endswith(".venv/bin/pip install -e '.[train]'")

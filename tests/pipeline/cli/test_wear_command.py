@@ -22,7 +22,7 @@ from schemas.topics import tray_key
 from scoring.former_snapshot_keys import FORMER_PARAMETER_KEYS
 from stages.scorer import ScorerConfig
 from tests.scoring.wear.test_wear_monitor import DAY_NS, GROWTH_PER_DAY, HEALTHY, LIMIT, WORN, core, live_through
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, SITE, TRAY
 from tests.support.scored_blocks import EPOCH_NS, snapshot_of
 
@@ -105,8 +105,8 @@ def test_a_fan_without_points_is_named_below_the_table(tmp_path, notes):
 def test_a_tray_without_points_is_one_line(tmp_path, notes):
     path = recording(tmp_path / "r.mcap", [without_points(notes[0], HEALTHY, WORN)])
     for words in ((), ("--json",)):
-        said = said_instead("wear", path, *words)
-        assert said.startswith(
+        error = error_of("wear", path, *words)
+        assert error.startswith(
             f"no data yet for any fan of {TRAY}: a fan has its first point some time after commissioning"
         )
 
@@ -124,18 +124,18 @@ def test_recordings_of_earlier_versions_are_shown_alike(tmp_path, notes, former)
 @pytest.mark.parametrize("state", ["{}", "no json", '{"wear": 3}', '{"wear": {"fans": [{}]}}'])
 def test_a_recording_without_wear_is_one_line(tmp_path, notes, state):
     path = recording(tmp_path / "r.mcap", [replace(notes[0], state_json=state)])
-    assert said_instead("wear", path) == f"no wear in {path}: a scorer records it every minute and when it stops"
+    assert error_of("wear", path) == f"no wear in {path}: a scorer records it every minute and when it stops"
 
 
 def test_what_could_not_be_read_in_full_is_shown_as_far_as_it_is_known(tmp_path, notes):
     path = recording(tmp_path / "r.mcap", notes[:1])
     whole = path.read_bytes()
-    with RecordingWriter(tmp_path / "torn.mcap", {}) as writer:
+    with RecordingWriter(tmp_path / "truncated.mcap", {}) as writer:
         writer.add_message(KEY, notes[0], notes[0].t_ns)
         writer.flush()
-        torn = (tmp_path / "torn.mcap.active").read_bytes()
-    path.write_bytes(torn)
-    assert len(torn) < len(whole)
+        truncated = (tmp_path / "truncated.mcap.active").read_bytes()
+    path.write_bytes(truncated)
+    assert len(truncated) < len(whole)
     done = fantwin("wear", path, "--json")
     assert done.exit_code == 3
     assert json.loads(done.stdout)["wear"]
@@ -152,8 +152,8 @@ class SnapshotSender(Core):
         return []
 
     def tick(self, now_ns: int) -> Sequence[Message]:
-        said, self._notes = self._notes, []
-        return said
+        notes, self._notes = self._notes, []
+        return notes
 
 
 @pytest.fixture
@@ -188,10 +188,10 @@ def test_a_running_site_reports_the_same(site, tmp_path, notes):
 
 @pytest.mark.parametrize("site", [False], indirect=True)
 def test_a_scorer_that_has_noted_nothing_yet_is_one_line(site):
-    assert said_instead("wear", *site) == "no scorer has recorded wear so far: it does so every minute; try again later"
+    assert error_of("wear", *site) == "no scorer has recorded wear so far: it does so every minute; try again later"
 
 
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, monkeypatch):
     monkeypatch.setattr("pipeline.cli.watch.alarms._DISCOVERY_S", 0.3)
-    said = said_instead("wear", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
-    assert f"wear unknown: no scorer of site '{SITE}' answers at {endpoint}" in said
+    error = error_of("wear", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
+    assert f"wear unknown: no scorer of site '{SITE}' answers at {endpoint}" in error

@@ -177,7 +177,7 @@ def test_a_column_whose_name_has_a_colon_is_found(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "expected"),
     [
         ({"time": "T1me"}, "no column 'T1me'"),
         ({"speed": ("speeed",)}, r"no column 'speeed'; it has t, u, y"),
@@ -193,14 +193,14 @@ def test_a_column_whose_name_has_a_colon_is_found(tmp_path):
         ({"speed": ("y:rpm", "y:hz")}, "speeds in rpm, hz: give all in one unit"),
     ],
 )
-def test_a_wrong_description_of_the_table_is_a_one_line_error(tmp_path, arguments, said):
-    with pytest.raises(UserError, match=said) as raised:
+def test_a_wrong_description_of_the_table_is_a_one_line_error(tmp_path, arguments, expected):
+    with pytest.raises(UserError, match=expected) as raised:
         table(tmp_path, "t,u,y\n0,1,10\n1,2,20\n", **arguments)
     assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "expected"),
     [
         ("", "must name the columns"),
         ("t,u,y\n", "has no times|has no numbers|fewer than two"),
@@ -211,8 +211,8 @@ def test_a_wrong_description_of_the_table_is_a_one_line_error(tmp_path, argument
         (b"MATLAB 5.0 MAT-file\0\0\0\1", "not a text file with columns"),
     ],
 )
-def test_a_file_that_is_not_such_a_table_is_a_one_line_error(tmp_path, content, said):
-    with pytest.raises(UserError, match=said) as raised:
+def test_a_file_that_is_not_such_a_table_is_a_one_line_error(tmp_path, content, expected):
+    with pytest.raises(UserError, match=expected) as raised:
         table(tmp_path, content)
     assert "\n" not in str(raised.value)
 

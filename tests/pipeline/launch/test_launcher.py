@@ -49,16 +49,16 @@ def test_the_process_list_has_one_acquisition_for_each_tray_in_the_order_of_the_
 def test_no_source_is_started_when_stopped_before_all_are_ready(chain):
     """Sources start last: nobody could take their samples earlier."""
     stop = threading.Event()
-    said: list[str] = []
+    lines: list[str] = []
 
     def say(line: str) -> None:
-        said.append(line)
+        lines.append(line)
         if line.startswith("resampler: started"):
             stop.set()
 
     outcome = Launcher(load_config(DEMO / "demo.toml", chain.settings), chain.settings, say).run(stop)
     assert outcome.killed == []
-    assert [line.split(":")[0] for line in said if ": started" in line] == [
+    assert [line.split(":")[0] for line in lines if ": started" in line] == [
         "recorder",
         "scorer",
         "twin_integrator",

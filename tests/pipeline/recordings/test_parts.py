@@ -47,13 +47,13 @@ def test_parts_are_numbered_and_name_the_part_before(tmp_path):
         part(place, range(first, first + 10), ledger).finish()
         ledger = ledger.for_next_part()
     assert names(tmp_path) == ["r-2.mcap", "r-3.mcap", "r.mcap"]
-    said = [read_metadata(tmp_path / name).metadata for name in ("r.mcap", "r-2.mcap", "r-3.mcap")]
-    assert [(m["part"], m["session"], m.get("continues")) for m in said] == [
+    metadata = [read_metadata(tmp_path / name).metadata for name in ("r.mcap", "r-2.mcap", "r-3.mcap")]
+    assert [(m["part"], m["session"], m.get("continues")) for m in metadata] == [
         ("1", "s1", None),
         ("2", "s1", "r.mcap"),
         ("3", "s1", "r-2.mcap"),
     ]
-    assert said[2]["started_t_ns"] == "5000000000"
+    assert metadata[2]["started_t_ns"] == "5000000000"
     assert contents_of(tmp_path / "r-3.mcap").before == {STREAM: 20}
 
 

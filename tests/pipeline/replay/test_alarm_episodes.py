@@ -15,9 +15,9 @@ DRAG, GAIN = Diagnosis(cause="drag_up", probability=0.6), Diagnosis(cause="gain_
 def alarm(
     t_ns: int, transition: Transition = Transition.RAISED, *, fan: int = 0, tray: str = "a", **more: Any
 ) -> Alarm:
-    told: dict[str, Any] = {"active": transition != Transition.CLEARED, "severity": Severity.WARNING, "onset_t_ns": 5}
-    told |= {"residual_rad_s": float(t_ns), "limit_rad_s": 1.0, "message": transition.name.lower()}
-    return Alarm(header=Header("p", 0, tray), fan=fan, t_ns=t_ns, transition=transition, **told | more)
+    fields: dict[str, Any] = {"active": transition != Transition.CLEARED, "severity": Severity.WARNING, "onset_t_ns": 5}
+    fields |= {"residual_rad_s": float(t_ns), "limit_rad_s": 1.0, "message": transition.name.lower()}
+    return Alarm(header=Header("p", 0, tray), fan=fan, t_ns=t_ns, transition=transition, **fields | more)
 
 
 def one(*alarms: Alarm) -> Episode:
@@ -39,17 +39,17 @@ def test_an_episode_goes_from_the_raise_to_the_clear_with_the_highest_severity_a
 
 
 def test_the_json_has_what_the_issue_asks_for() -> None:
-    told = json.loads(json.dumps(one(alarm(10, causes=(DRAG,))).as_json()))
-    assert told["cleared_ns"] is None
-    assert {"fan", "raised_ns", "cleared_ns", "severity", "residual", "causes"} <= set(told)
-    assert (told["causes"][0]["cause"], told["causes"][0]["probability"]) == ("drag_up", 0.6)
+    document = json.loads(json.dumps(one(alarm(10, causes=(DRAG,))).as_json()))
+    assert document["cleared_ns"] is None
+    assert {"fan", "raised_ns", "cleared_ns", "severity", "residual", "causes"} <= set(document)
+    assert (document["causes"][0]["cause"], document["causes"][0]["probability"]) == ("drag_up", 0.6)
 
 
 def test_a_residual_that_nobody_knew_is_null_and_not_zero() -> None:
-    told = one(alarm(10, residual_rad_s=0.0, torque_balance_command=2.5)).as_json()
-    assert (told["residual"], told["torque_balance"]) == (None, 2.5)
-    told = one(alarm(10, residual_rad_s=-1e-9, torque_balance_command=0.0)).as_json()
-    assert (told["residual"], told["torque_balance"]) == (-1e-9, None)
+    document = one(alarm(10, residual_rad_s=0.0, torque_balance_command=2.5)).as_json()
+    assert (document["residual"], document["torque_balance"]) == (None, 2.5)
+    document = one(alarm(10, residual_rad_s=-1e-9, torque_balance_command=0.0)).as_json()
+    assert (document["residual"], document["torque_balance"]) == (-1e-9, None)
 
 
 def test_what_is_told_again_after_a_restart_is_the_same_episode() -> None:
@@ -63,8 +63,8 @@ def test_a_scorer_without_a_memory_that_raises_it_again_goes_on_with_it() -> Non
 
 
 def test_what_is_said_of_an_alarm_that_is_not_active_begins_none() -> None:
-    quiet = {"active": False, "severity": Severity.NONE}
-    assert episodes([alarm(1, Transition.SHELVED, **quiet), alarm(2, Transition.REFUSED, **quiet)]) == []
+    inactive = {"active": False, "severity": Severity.NONE}
+    assert episodes([alarm(1, Transition.SHELVED, **inactive), alarm(2, Transition.REFUSED, **inactive)]) == []
     found = episodes([alarm(10), alarm(20, Transition.CLEARED), alarm(25, Transition.ACKNOWLEDGED, active=False)])
     assert len(found) == 1
 

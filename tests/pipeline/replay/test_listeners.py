@@ -26,7 +26,7 @@ def there(*labels: str) -> list[Present]:
 
 
 @pytest.mark.parametrize(
-    ("labels", "topics", "said"),
+    ("labels", "topics", "expected"),
     [
         (["viewer", "recorder"], ALL, []),
         ([], ALL, []),
@@ -45,11 +45,11 @@ def there(*labels: str) -> list[Present]:
         (["twin_integrator"], ("prediction", "twin"), ["writes prediction itself", "--from grid"]),
     ],
 )
-def test_nothing_is_replayed_that_a_running_stage_writes_nor_what_was_asked_of_it_long_ago(labels, topics, said):
+def test_nothing_is_replayed_that_a_running_stage_writes_nor_what_was_asked_of_it_long_ago(labels, topics, expected):
     line = conflict(there(*labels), topics, {"a"}, "plant")
-    assert bool(line) == bool(said)
+    assert bool(line) == bool(expected)
     assert "\n" not in line
-    for words in said:
+    for words in expected:
         assert words in line
 
 

@@ -123,9 +123,9 @@ def test_what_operators_asked_for_is_asked_for_again_at_the_same_samples(tmp_pat
     site.ask(Action.COMMISSION, 1)
     site.run(400)
     path = site.finished()
-    told = {alarm.transition for alarm in alarms_of(path)}
+    transitions = {alarm.transition for alarm in alarms_of(path)}
     wanted = {Transition.RAISED, Transition.ACKNOWLEDGED, Transition.SHELVED, Transition.UNSHELVED, Transition.CLEARED}
-    assert {*wanted, Transition.COMMISSIONING} <= told
+    assert {*wanted, Transition.COMMISSIONING} <= transitions
     tray = verified(path)
     assert made_equal(tray) > 550
     assert tray.comparison and tray.comparison.alarms_equal == len(alarms_of(path))

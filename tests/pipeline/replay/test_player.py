@@ -82,8 +82,8 @@ def raws(count: int, period_ns: int = STEP_NS, samples: int = 1) -> list[tuple[i
 
 
 def alarm(log_ns: int, sequence: int) -> Envelope:
-    said: dict[str, Any] = {"residual_rad_s": 0, "limit_rad_s": 0, "message": ""}
-    message = Alarm(fan=0, active=True, severity=Severity.ALARM, t_ns=log_ns, onset_t_ns=log_ns, **said)
+    fields: dict[str, Any] = {"residual_rad_s": 0, "limit_rad_s": 0, "message": ""}
+    message = Alarm(fan=0, active=True, severity=Severity.ALARM, t_ns=log_ns, onset_t_ns=log_ns, **fields)
     return Envelope.of("fantwin/demo/tray1/alarm", message, log_ns)
 
 
@@ -187,8 +187,8 @@ def test_a_step_is_one_message_of_the_first_topic_and_all_recorded_before_it():
     )
     by_second = [[topic for at_s, topic, _ in sent.messages if round(at_s) == second] for second in (1, 2, 3, 4)]
     assert by_second == [["raw"], ["raw"], ["raw"], ["alarm", "raw"]]
-    told = [t_ns for at_s, t_ns, _ in sent.clocks if 4.1 < at_s < 4.9]
-    assert set(told) == {3 * STEP_NS}
+    reported = [t_ns for at_s, t_ns, _ in sent.clocks if 4.1 < at_s < 4.9]
+    assert set(reported) == {3 * STEP_NS}
 
 
 def test_after_a_step_it_goes_on_from_there():

@@ -138,13 +138,13 @@ def test_whatever_is_a_time_since_the_epoch_is_called_so():
 
 def test_a_torn_part_is_played_as_far_as_it_goes_and_told(tmp_path):
     whole = write_raw(tmp_path / "whole.mcap", 3000)
-    torn = tmp_path / "torn.mcap"
-    torn.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    playback = RecordingPlayback([torn], ("raw",))
+    truncated = tmp_path / "truncated.mcap"
+    truncated.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    playback = RecordingPlayback([truncated], ("raw",))
     count = sum(1 for _ in playback)
     assert 0 < count < 3000
-    (said,) = playback.damage
-    assert "torn.mcap" in said
+    (damage,) = playback.damage
+    assert "truncated.mcap" in damage
     assert playback.end_s() is None
 
 

@@ -12,7 +12,7 @@ from pipeline.cli.recordings.replay import status_line
 from pipeline.replay.live.player import Progress
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from stages.resampler import ResamplerConfig, ResamplerCore
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 from tests.support.replay_data import START_NS, STEP_NS, write_raw
 
 
@@ -22,7 +22,7 @@ def recording(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         ("--rate 0", "'0': give a number above 0, to 1e+06, or max"),
         ("--rate 1e308", "give a number above 0"),
@@ -49,16 +49,16 @@ def recording(tmp_path):
         ("--offline --from raw", "--from cannot be used with --offline"),
     ],
 )
-def test_what_makes_no_sense_is_wrong_usage(recording, words, said):
+def test_what_makes_no_sense_is_wrong_usage(recording, words, expected):
     done = fantwin("replay", recording, *words.split())
     assert done.exit_code == 2
-    assert said in " ".join(done.stderr.replace("│", " ").split())
+    assert expected in " ".join(done.stderr.replace("│", " ").split())
 
 
 def test_a_tray_that_the_configuration_lacks_is_one_line(recording, tmp_path):
     config = tmp_path / "c.toml"
     config.write_text('[[tray]]\nname = "rig"\nfans = 8\n')
-    assert said_instead("replay", recording, "-c", config) == f"{config}: no tray called 'tray1'; known: rig"
+    assert error_of("replay", recording, "-c", config) == f"{config}: no tray called 'tray1'; known: rig"
 
 
 def test_deciding_again_is_handed_over_as_it_was_asked_for(recording, tmp_path, monkeypatch):

@@ -247,9 +247,9 @@ def test_a_producer_that_publishes_one_message_and_leaves_causes_no_loss(config)
             assert bench.next(Grid).t_ns.tolist() == [number]
     health = bench.health_with(lambda health: len(health.inputs) == 3)
     last = bench.end()
-    for said, status in ((health, StageStatus.OK), (last, StageStatus.STOPPED)):
-        assert (said.status, said.problem, said.lost) == (status, "", 0)
-        assert [(line.received, line.missing, line.duplicated) for line in said.inputs] == [(1, 0, 0)] * 3
+    for reported, status in ((health, StageStatus.OK), (last, StageStatus.STOPPED)):
+        assert (reported.status, reported.problem, reported.lost) == (status, "", 0)
+        assert [(line.received, line.missing, line.duplicated) for line in reported.inputs] == [(1, 0, 0)] * 3
     assert losses([health, last]) == {"resampler": 0}
 
 

@@ -87,8 +87,8 @@ def test_errors_in_an_older_card_have_no_correlations(tmp_path: Path) -> None:
 
 def test_a_calibration_is_kept_as_it_is(tmp_path: Path) -> None:
     assert TwinFile.load(write_twin(tmp_path / "never.onnx"), 1).card.calibration is None
-    told = {"limits": [1.5, {"kind": "fast"}]}
-    assert TwinFile.load(write_twin(tmp_path / "twin.onnx", calibration=told), 1).card.calibration == told
+    calibration = {"limits": [1.5, {"kind": "fast"}]}
+    assert TwinFile.load(write_twin(tmp_path / "twin.onnx", calibration=calibration), 1).card.calibration == calibration
 
 
 def test_a_balance_that_makes_no_sense_is_refused_by_name(tmp_path: Path) -> None:

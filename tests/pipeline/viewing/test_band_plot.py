@@ -123,7 +123,7 @@ def test_what_cannot_be_plotted_is_a_one_line_error(tmp_path: Path) -> None:
     both = record(tmp_path / "both.mcap", [*scores, *others], [])
     empty = record(tmp_path / "empty.mcap", [], [])
     output = tmp_path / "bands.png"
-    for said, call in {
+    for expected, call in {
         "holds no scores": lambda: plot_recording([empty], output),
         "choose one with --tray: tray1, tray2": lambda: plot_recording([both], output),
         "no tray called 'x'; there are tray1, tray2": lambda: plot_recording([both], output, tray="x"),
@@ -131,7 +131,7 @@ def test_what_cannot_be_plotted_is_a_one_line_error(tmp_path: Path) -> None:
         "not a truth file": lambda: plot_recording([both], output, tray="tray1", truth=tmp_path / "none.json"),
         "cannot write the plot": lambda: plot_recording([both], tmp_path / "bands.wrong", tray="tray1"),
     }.items():
-        with pytest.raises(UserError, match=said) as caught:
+        with pytest.raises(UserError, match=expected) as caught:
             call()
         assert "\n" not in str(caught.value)
     assert not output.exists()

@@ -83,8 +83,8 @@ def test_the_command_writes_the_picture_and_lists_its_views(
 ) -> None:
     output = tmp_path / "view.png"
     picture(view_file, output, fans="2", json_output=True)
-    said = json.loads(capsys.readouterr().out)
-    assert said["picture"] == str(output) and "tray1 / fan 2 speed (rpm)" in said["views"]
+    document = json.loads(capsys.readouterr().out)
+    assert document["picture"] == str(output) and "tray1 / fan 2 speed (rpm)" in document["views"]
     assert Image.open(output).width == 1920
 
 
@@ -116,7 +116,7 @@ def test_a_missing_driver_is_a_one_line_error(view_file: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "expected"),
     [
         ({"tray": "x"}, "no tray called 'x'; there are tray1"),
         ({"fans": [7]}, "tray1 has no fan 7; it has fans 0 to 2"),
@@ -124,18 +124,18 @@ def test_a_missing_driver_is_a_one_line_error(view_file: Path, monkeypatch: pyte
 )
 @needs_a_driver
 def test_an_unknown_tray_fan_or_view_is_a_one_line_error(
-    view_file: Path, options: dict[str, object], said: str
+    view_file: Path, options: dict[str, object], expected: str
 ) -> None:
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=expected):
         rerun_picture.draw_picture(view_file, **options)
 
 
 @needs_a_driver
 def test_a_file_that_is_not_a_view_is_a_one_line_error(tmp_path: Path) -> None:
-    for path, said in ((tmp_path / "none.rrd", "no such file"), (tmp_path / "wrong.rrd", "not a Rerun file")):
-        if said != "no such file":
+    for path, expected in ((tmp_path / "none.rrd", "no such file"), (tmp_path / "wrong.rrd", "not a Rerun file")):
+        if expected != "no such file":
             path.write_bytes(b"not a view, and long enough to be read as a header")
-        with pytest.raises(UserError, match=said):
+        with pytest.raises(UserError, match=expected):
             rerun_picture.draw_picture(path)
 
 

@@ -35,7 +35,7 @@ def test_a_deviation_of_the_speed_is_in_the_trays_unit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "expected"),
     [
         ({"statistic": Statistic.SPEED_DRIFT}, "71 rad/s below the twin (limit 8), for long"),
         ({"statistic": Statistic.SPEED_VARIANCE_GROWTH}, "unsteady, 8.9 times the limit"),
@@ -48,9 +48,9 @@ def test_a_deviation_of_the_speed_is_in_the_trays_unit() -> None:
         ({"statistic": Statistic.SENSOR}, "the tacho repeats one reading, or gives none"),
     ],
 )
-def test_every_statistic_has_its_words(more: dict[str, Any], said: str) -> None:
-    assert line(**more) == f"fan 2: {said}"
-    assert line(Transition.SEVERITY, **more) == f"fan 2: {said}"
+def test_every_statistic_has_its_words(more: dict[str, Any], expected: str) -> None:
+    assert line(**more) == f"fan 2: {expected}"
+    assert line(Transition.SEVERITY, **more) == f"fan 2: {expected}"
 
 
 def test_the_first_cause_is_named_with_its_probability_and_evidence_where_there_is_one() -> None:
@@ -75,9 +75,9 @@ def test_every_transition_is_one_line_that_names_the_fan(transition: Transition)
 
 def test_a_republished_alarm_says_whether_it_is_still_listed() -> None:
     over: dict[str, Any] = {"active": False, "acknowledged": True, "confirmed": True}
-    quiet: dict[str, Any] = {"suppressed": True}
+    suppressed: dict[str, Any] = {"suppressed": True}
     assert line(Transition.REPUBLISHED) == "fan 2: still stands"
-    assert line(Transition.REPUBLISHED, **over, **quiet) == "fan 2: still stands"
+    assert line(Transition.REPUBLISHED, **over, **suppressed) == "fan 2: still stands"
     assert line(Transition.REPUBLISHED, **over) == "fan 2: stands no longer"
 
 

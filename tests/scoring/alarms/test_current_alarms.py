@@ -101,8 +101,8 @@ def test_states_in_words():
     assert one(alarm()).states() == ["active", "unacknowledged"]
     over = one(alarm(active=False, acknowledged=True, confirmed=False, latched=True))
     assert over.states() == ["cleared", "acknowledged", "unconfirmed", "latched"]
-    quiet = one(alarm(shelved_until_t_ns=UNTIL_IT_CLEARS_T_NS, suppressed=True, out_of_service=True))
-    assert quiet.states()[2:] == ["shelved until it clears", "suppressed", "out of service"]
+    silenced = one(alarm(shelved_until_t_ns=UNTIL_IT_CLEARS_T_NS, suppressed=True, out_of_service=True))
+    assert silenced.states()[2:] == ["shelved until it clears", "suppressed", "out of service"]
     never = one(alarm(active=False, severity=Severity.NONE, acknowledged=True, suppressed=True))
     assert never.states() == ["never raised", "suppressed"]
 

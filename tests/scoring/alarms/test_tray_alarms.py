@@ -352,7 +352,7 @@ def test_raised_and_cleared_take_turns_and_are_what_the_states_say(history, chos
             ]
         )
         known = [(s[fan] in (ALARM, RETURNING), bool(a)) for s, a in zip(state, active, strict=True) if s[fan]]
-        assert all(said == counted for said, counted in known)
+        assert all(reported == counted for reported, counted in known)
 
 
 @pytest.mark.parametrize(

@@ -284,9 +284,9 @@ def test_one_outlier_raises_no_alarm(white_limits: Limits) -> None:
 
 
 def test_a_run_alarms_if_it_starts_with_an_offset_beyond_healthy_ones(white_limits: Limits) -> None:
-    usual = white_limits.speed.baseline.commissioning_limit_sigmas
-    assert alarms_on_white(white_limits, 60.0, 0.9 * usual) == []
-    alarms = alarms_on_white(white_limits, 60.0, usual + 2.0)
+    commissioning_limit = white_limits.speed.baseline.commissioning_limit_sigmas
+    assert alarms_on_white(white_limits, 60.0, 0.9 * commissioning_limit) == []
+    alarms = alarms_on_white(white_limits, 60.0, commissioning_limit + 2.0)
     assert {alarm.fan for alarm in alarms} == {0, 1, 2, 3}
     assert max(alarm.t_s for alarm in alarms[:4]) < 2.0
 

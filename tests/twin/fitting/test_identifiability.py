@@ -24,7 +24,7 @@ def warnings_of(*runs: Run) -> tuple[str, ...]:
     return identifiability_warnings(runs, found.parameters, found.covariance)
 
 
-def said(lines: tuple[str, ...], *words: str) -> bool:
+def has_line_with(lines: tuple[str, ...], *words: str) -> bool:
     """Whether one of the lines holds all the words."""
     return any(all(word in line for word in words) for line in lines)
 
@@ -123,9 +123,9 @@ def test_the_published_and_the_rough_fan_are_never_warned_about_but_for_a_lag() 
 def test_settled_speeds_determine_the_drag_but_not_the_inertia() -> None:
     levels = [commanded(np.full((1500, 1), level), seed=1, warm_up_s=5.0) for level in (10.0, 40.0, 70.0, 100.0)]
     lines = warnings_of(*levels)
-    assert said(lines, "little excitation: the command changes 0 time(s) only")
-    assert said(lines, "J is poorly determined", "transients alone")
-    assert not said(lines, "cannot be distinguished")
+    assert has_line_with(lines, "little excitation: the command changes 0 time(s) only")
+    assert has_line_with(lines, "J is poorly determined", "transients alone")
+    assert not has_line_with(lines, "cannot be distinguished")
 
 
 @pytest.mark.parametrize("noise_rad_s", [fan_data.NOISE_RAD_S, 0.1])
@@ -195,8 +195,8 @@ def test_a_loop_is_noticed_through_missing_speeds_and_gaps() -> None:
 def test_a_loop_at_one_set_point_is_told_with_what_is_biased_and_what_is_not_told() -> None:
     lines = warnings_of(controlled(np.full((4000, 4), 120.0), seed=5))
     for fan in range(4):
-        assert said(lines, f"fan {fan}: closed loop", "J and lag_s", "controller off")
-        assert said(lines, f"fan {fan}: alpha and C_D cannot be distinguished", "the speed keeps between 11")
+        assert has_line_with(lines, f"fan {fan}: closed loop", "J and lag_s", "controller off")
+        assert has_line_with(lines, f"fan {fan}: alpha and C_D cannot be distinguished", "the speed keeps between 11")
 
 
 def test_a_narrow_range_of_speed_determines_only_the_sum_of_alpha_and_drag() -> None:
@@ -215,12 +215,12 @@ def test_a_command_that_hardly_moves_is_little_excitation() -> None:
     levels = np.random.default_rng(4).choice([50.0, 51.0], 14).repeat(100)[:, None]
     lines = warnings_of(commanded(levels, seed=4, warm_up_s=4.0))
     for reason in ("moves by 2.0%", "2 level(s) only", "hardly more than its noise"):
-        assert said(lines, "little excitation", reason, "three or more levels")
+        assert has_line_with(lines, "little excitation", reason, "three or more levels")
 
 
 def test_a_single_step_is_too_few() -> None:
     command = np.repeat([20.0, 90.0], 800)[:, None]
-    assert said(warnings_of(commanded(command, seed=4)), "the command changes 1 time(s) only")
+    assert has_line_with(warnings_of(commanded(command, seed=4)), "the command changes 1 time(s) only")
 
 
 def judged(run: Run, **values_and_errors: tuple[float, float]) -> tuple[str, ...]:
@@ -252,7 +252,7 @@ def test_a_lag_below_the_sampling_step_or_within_its_error_is_not_told() -> None
     assert judged(run, lag_s=(0.03, 0.002)) == ()
     (line,) = judged(run, lag_s=(0.006, 0.001))
     assert line.startswith("fan 0: lag_s (6 ± 2 ms) is not determined by samples every 10 ms")
-    assert said(judged(run, lag_s=(0.03, 0.02)), "lag_s (30 ± 40 ms) is not determined")
+    assert has_line_with(judged(run, lag_s=(0.03, 0.02)), "lag_s (30 ± 40 ms) is not determined")
 
 
 def rosa(folder: Path, number: int) -> Run:
@@ -266,7 +266,7 @@ def rosa(folder: Path, number: int) -> Run:
 def test_the_rotor_under_speed_control_is_noticed_in_every_healthy_run(measured_data) -> None:
     for number in (44, 98, 103, 105, 110, 113, 118, 120):
         assert feedback_share(rosa(measured_data, number).split_at_gaps(), 0) > 0.2, number
-    assert said(warnings_of(rosa(measured_data, 103)), "closed loop")
+    assert has_line_with(warnings_of(rosa(measured_data, 103)), "closed loop")
 
 
 @pytest.mark.data
@@ -283,5 +283,5 @@ def test_motors_driven_in_the_open_are_not_said_to_be_controlled(measured_data) 
         Run("crazyflie", 0.01 * np.arange(float(len(rpm))), pwm, rpm * RPM),
         run_from_samples("motor", motor["t"], motor["u"], np.deg2rad(motor["y"])),
     ):
-        assert not said(warnings_of(run), "closed loop"), run.name
-        assert not said(warnings_of(run), "cannot be distinguished"), run.name
+        assert not has_line_with(warnings_of(run), "closed loop"), run.name
+        assert not has_line_with(warnings_of(run), "cannot be distinguished"), run.name

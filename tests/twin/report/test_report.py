@@ -22,7 +22,7 @@ from simulation.published_fan import published_fan
 from tests.pipeline.cli.test_train_commands import record
 from tests.support.browser import seen_in_browser
 from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run
-from tests.support.fantwin_command import fantwin, said_instead
+from tests.support.fantwin_command import error_of, fantwin
 from twin.export.onnx_twin import OnnxTwin
 from twin.fitting.identification import identify
 from twin.models.physical import PhysicalModel
@@ -123,8 +123,8 @@ def test_the_page_holds_every_section_and_every_figure(page):
     assert parsed.sections == SECTIONS
     assert [title for title in TITLES if title in parsed.text] == TITLES
     assert page.count("<svg ") == len(TITLES) + 1  # time is drawn twice: for wide screens and for phones
-    for said in ("physical twin of 1 fan", "held-out data", "95%", "sha256"):
-        assert said in parsed.text
+    for expected in ("physical twin of 1 fan", "held-out data", "95%", "sha256"):
+        assert expected in parsed.text
 
 
 def test_the_figures_are_those_of_evaluate(folder, page):
@@ -340,7 +340,7 @@ def test_a_band_that_is_too_wide_and_figures_of_few_errors_are_reported(twin):
 
 
 @pytest.mark.parametrize(
-    ("value", "form", "said"),
+    ("value", "form", "expected"),
     [
         (38.449, ".4g", "38.45"),
         (123456.7, ".4g", "123457"),
@@ -351,8 +351,8 @@ def test_a_band_that_is_too_wide_and_figures_of_few_errors_are_reported(twin):
         (None, ".1%", "undefined"),
     ],
 )
-def test_numbers_are_whole_and_have_an_exponent_only_beyond_reason(value, form, said):
-    assert shown(value, form) == said
+def test_numbers_are_whole_and_have_an_exponent_only_beyond_reason(value, form, expected):
+    assert shown(value, form) == expected
 
 
 def test_ticks_of_small_figures_leave_room_for_large_speeds(twin):
@@ -377,15 +377,15 @@ def test_errors_are_gathered_by_speed_and_few_samples_make_no_point():
 
 def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
     twin, held_out = folder / "healthy.onnx", folder / "held-out.mcap"
-    assert "has fans 0, 1, the runs have 0, 1, 2" in said_instead("report", folder / "two.onnx", folder / "three.mcap")
-    assert "no such file" in said_instead("report", tmp_path / "nowhere.onnx", held_out)
-    assert "not an ONNX file" in said_instead("report", held_out, held_out)
-    assert "cannot read the recording" in said_instead("report", twin, tmp_path / "nowhere.mcap")
+    assert "has fans 0, 1, the runs have 0, 1, 2" in error_of("report", folder / "two.onnx", folder / "three.mcap")
+    assert "no such file" in error_of("report", tmp_path / "nowhere.onnx", held_out)
+    assert "not an ONNX file" in error_of("report", held_out, held_out)
+    assert "cannot read the recording" in error_of("report", twin, tmp_path / "nowhere.mcap")
     (tmp_path / "file").touch()
-    assert "cannot be created" in said_instead("report", twin, held_out, "-o", tmp_path / "file" / "page.html")
-    assert "name a file that ends in .html" in said_instead("report", twin, held_out, "-o", tmp_path)
+    assert "cannot be created" in error_of("report", twin, held_out, "-o", tmp_path / "file" / "page.html")
+    assert "name a file that ends in .html" in error_of("report", twin, held_out, "-o", tmp_path)
     (tmp_path / "folder.html").mkdir()
-    assert "cannot be written" in said_instead("report", twin, held_out, "-o", tmp_path / "folder.html")
+    assert "cannot be written" in error_of("report", twin, held_out, "-o", tmp_path / "folder.html")
 
 
 @pytest.mark.parametrize(("command", "missing"), [("report", "jinja2"), ("report", "matplotlib"), ("compare", "onnx")])
