@@ -9,8 +9,8 @@ target:
 - Adam through torchdiffeq, float64.
 
 The last two minimise the mean square over stretches with learned initial speeds, at the rates and lengths that did
-best of those tried. Each has its natural start: random hidden units without output yet, and for ours the
-placement of twin.fitting.initial_weights. diffrax runs from our placement too, to tell the start's share from the rest.
+best of those tried. Each has its natural start: random hidden units without output yet, and for ours the placement of
+twin.fitting.initial_weights. diffrax also runs from our placement, to separate the effect of the start from the rest.
 All are evaluated alike: one free run over the whole 80 s from the measured start, in multiples of the noise as it fell.
 """
 

@@ -63,7 +63,7 @@ def prediction(twin: str = "t", sigma: float = 1.0) -> Prediction:
 
 
 @given(MESSAGES, st.lists(st.integers(0, 5), max_size=3))
-def test_what_was_cut_is_joined_to_the_same_message(message: Any, marks: list[int]) -> None:
+def test_a_cut_message_is_joined_to_the_same_message(message: Any, marks: list[int]) -> None:
     ends = sorted({0, len(times(message)), *(min(mark, len(times(message))) for mark in marks)})
     parts = [cut(message, first, end) for first, end in pairwise(ends)] or [message]
     assert equal(join(parts), message)

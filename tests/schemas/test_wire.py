@@ -261,7 +261,7 @@ def test_a_person_can_type_commands() -> None:
         ("binary", SetPointFrame((0.0,) * 65), "65 fans"),
     ],
 )
-def test_what_cannot_be_sent_is_refused(protocol: Protocol, frame: Frame, message: str) -> None:
+def test_a_message_that_cannot_be_sent_is_refused(protocol: Protocol, frame: Frame, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         encode(protocol, frame)
 

@@ -168,7 +168,7 @@ def test_the_sequence_may_wrap() -> None:
     assert core.counters().get("device_restarts", 0) == 0
 
 
-def test_a_loss_across_the_wrap_is_counted_as_what_it_is() -> None:
+def test_a_loss_across_the_sequence_wrap_is_counted_exactly() -> None:
     core = make_core()
     feed_sequences(core, [2**32 - 2, 3])
     assert core.counters()["lost_on_line"] == 4

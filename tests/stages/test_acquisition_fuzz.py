@@ -146,7 +146,7 @@ def is_within(wanted: list[Sample], found: list[Sample]) -> bool:
 
 
 def outcomes_by_kind(protocol: Protocol, stream: bytes) -> Counter[str]:
-    """What one uncut pass of the decoder makes of a stream."""
+    """Samples and faults by kind that the decoder finds in a stream fed in one piece."""
     found = Decoder(protocol, FANS).feed(stream)
     return Counter(item.kind.value if isinstance(item, Fault) else "samples" for item in found)
 

@@ -109,7 +109,7 @@ def in_blocks(items: Iterable[Raw | ByTime], sizes: Iterable[int]) -> Iterable[R
 
 
 def driven(items: Iterable[Raw | ByTime], **config: float) -> tuple[list[bytes], dict[str, int], str]:
-    """All columns, to the bit, and what the core says of itself."""
+    """All columns, to the bit, and the counters and problem of the core."""
     core, grids = ResamplerCore(3, ResamplerConfig.model_validate(config)), []
     with np.errstate(invalid="ignore"):
         for item in items:

@@ -406,7 +406,7 @@ def eventful_prediction(seed: int, samples: int, change_s: float) -> Prediction:
 
 
 def judged(core: ScorerCore, items: Iterable[Prediction | Request]) -> tuple[Any, ...]:
-    """All columns, to the bit, what else the core says and remembers; each alarm as it reads."""
+    """All columns, to the bit, the counters, problem and snapshot of the core, and the repr of each alarm."""
     with np.errstate(all="ignore"):
         scores, alarms = feed(core, items)
     bits = {name: np.concatenate([getattr(s, name) for s in scores]).tobytes() for name in columns(Score) if scores}
@@ -461,7 +461,7 @@ def test_the_synthetic_predictions_raise_and_clear_alarms_and_are_diagnosed() ->
     assert any(alarm.causes for alarm in alarms)
 
 
-# what else it says
+# other output
 
 
 def test_a_score_carries_all_that_a_viewer_draws() -> None:

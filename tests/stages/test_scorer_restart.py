@@ -172,7 +172,7 @@ def raised() -> ScorerCore:
     return scorer
 
 
-def test_a_restarted_scorer_tells_again_what_stands_and_who_acknowledged_it() -> None:
+def test_a_restarted_scorer_republishes_current_alarms_and_who_acknowledged_them() -> None:
     successor = core_of(3)
     memory, *emitted = successor.restore(snapshot_of(raised()))
     assert isinstance(memory, ScorerSnapshot) and memory.restored
@@ -188,7 +188,7 @@ def test_a_restarted_scorer_tells_again_what_stands_and_who_acknowledged_it() ->
     assert alarms == [] and (score.state[:, 0] == FanState.ALARM).all()
 
 
-def test_a_successor_tells_of_it_at_once_and_once(tmp_path: Path) -> None:
+def test_a_successor_publishes_its_restored_state_at_once_and_only_once(tmp_path: Path) -> None:
     snapshot_store = SnapshotStore(tmp_path / "m")
     snapshot_store.save(snapshot_of(raised()))
     successor = core_of(3, snapshot_store=snapshot_store)
@@ -249,7 +249,7 @@ def test_from_a_snapshot_read_in_part_operator_settings_are_restored(of: str) ->
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
     assert (score.state == FanState.COMMISSIONING).all()
-    assert json.loads(snapshot_of(successor).state_json)["wear"]["last_attempt"] == 0, "wear begins anew"
+    assert json.loads(snapshot_of(successor).state_json)["wear"]["last_attempt"] == 0, "wear starts again"
 
 
 def test_a_snapshot_that_was_not_used_is_reported_for_a_minute() -> None:
@@ -282,12 +282,12 @@ def test_a_snapshot_that_cannot_be_read_is_counted(state: str) -> None:
     feed(successor, [prediction_of(np.zeros((200, 3)))])
 
 
-@pytest.mark.parametrize("where", ["told", "due", "onset_t_ns"])
+@pytest.mark.parametrize("where", ["last_emitted", "due", "onset_t_ns"])
 def test_a_snapshot_of_a_fan_that_does_not_exist_is_refused(where: str) -> None:
     memory = snapshot_of(raised())
     state = json.loads(memory.state_json)
-    fans = state["alarms"]["last_emitted"] if where == "told" else state["alarms"]["diagnoser"][where]
-    fans["99"] = next(iter(fans.values())) if where == "told" else {"due": [0], "onset_t_ns": 0}[where]
+    fans = state["alarms"]["last_emitted"] if where == "last_emitted" else state["alarms"]["diagnoser"][where]
+    fans["99"] = next(iter(fans.values())) if where == "last_emitted" else {"due": [0], "onset_t_ns": 0}[where]
     successor = core_of(3)
     assert successor.restore(replace(memory, state_json=json.dumps(state))) == []
     assert successor.counters()["snapshots_not_understood"] == 1
@@ -302,14 +302,14 @@ def test_a_snapshot_of_another_number_of_fans_is_refused() -> None:
 
 
 def restored(first: int, producer: str) -> tuple[ScorerCore, list[Any]]:
-    """A successor of `raised`, which began at sample -1101 and ended at 100, and what it makes of its first block."""
+    """A successor of `raised`, which began at sample -1101 and ended at 100, and its output for its first block."""
     successor = core_of(3)
     successor.restore(snapshot_of(raised()))
     return successor, list(successor.step(prediction_of(np.zeros((20, 3)), first=first, producer=producer)))
 
 
 @pytest.mark.parametrize(
-    ("first", "producer", "is_anew"),
+    ("first", "producer", "discarded"),
     [
         (50, "integrator-1", False),  # what it still keeps
         (-HOUR, "integrator-1", False),  # at a slow rate that may be of long ago
@@ -319,11 +319,11 @@ def restored(first: int, producer: str) -> tuple[ScorerCore, list[Any]]:
         (-1101, "integrator-2", True),  # the same is played again
     ],
 )
-def test_a_snapshot_of_later_times_is_discarded_unless_producers_repeat_samples(first, producer, is_anew) -> None:
+def test_a_snapshot_of_later_times_is_discarded_unless_producers_repeat_samples(first, producer, discarded) -> None:
     successor, messages = restored(first, producer)
-    assert successor.counters().get("snapshots_of_other_times", 0) == is_anew
+    assert successor.counters().get("snapshots_of_other_times", 0) == discarded
     scores = [message for message in messages if isinstance(message, Score)]
-    if is_anew:
+    if discarded:
         assert (scores[0].state == FanState.COMMISSIONING).all()
     else:
         assert not scores or scores[0].t_ns[0] > prediction_of(np.zeros(1), first=99).t_ns[0]

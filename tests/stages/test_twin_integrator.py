@@ -84,7 +84,7 @@ def grid_of(command: Floats, speed: Floats | None = None, *, first: int = 0, per
 
 
 def silent(samples: int, first: int, command: float, why: InvalidReason = InvalidReason.GAP) -> Grid:
-    """What the resampler says while the line is silent: the command held, no speed."""
+    """The grid of the resampler while the link is silent: the command held, no speed."""
     grid = grid_of(np.full(samples, command), np.full(samples, NAN), first=first)
     grid.invalid_reason[:] = why
     return grid
@@ -384,7 +384,7 @@ def test_what_was_measured_goes_through_untouched() -> None:
     np.testing.assert_array_equal(prediction.sigma_rad_s, [3.0])
 
 
-def test_another_number_of_fans_is_lost_and_said_to_be() -> None:
+def test_a_block_with_another_number_of_fans_is_counted_as_lost_and_reported() -> None:
     core = core_of()
     core.step(grid_of(stairs(5, 2)))
     assert core.counters()["lost_wrong_fan_count"] == 5
@@ -396,7 +396,7 @@ def _context(folder: Path, twin: Path | None) -> Context:
     return Context("site", (tray,), TwinIntegratorConfig(), folder, folder, EPOCH_NS)
 
 
-def test_a_tray_without_a_twin_is_told_what_to_set(tmp_path: Path) -> None:
+def test_a_tray_without_a_twin_gets_an_error_that_names_the_setting(tmp_path: Path) -> None:
     with pytest.raises(StageError, match=r'tray tray1 has no twin: set \[\[tray\]\] twin = "FILE.onnx"'):
         STAGE.build(_context(tmp_path, None))
 
@@ -422,7 +422,7 @@ def test_a_bridge_of_absurdly_many_samples_is_not_run() -> None:
     assert core.counters()["free_runs"] == 2
 
 
-def test_a_problem_is_said_only_until_a_grid_comes_that_fits() -> None:
+def test_a_problem_is_reported_only_until_a_matching_grid_arrives() -> None:
     core = core_of()
     core.step(grid_of(np.zeros((1, 2))))
     assert "grid of 2 fans" in core.problem()

@@ -108,7 +108,7 @@ def grid_where(happenings: Iterable[tuple[str, int]], seed: int) -> Grid:
 
 
 def predicted(core: TwinIntegratorCore, grids: Iterable[Grid]) -> tuple[Any, ...]:
-    """All columns, to the bit, and what else the core says."""
+    """All columns, to the bit, and the counters and problem of the core."""
     prediction = feed(core, grids)
     bits = {name: getattr(prediction, name).tobytes() for name in columns(Prediction)}
     return bits, core.counters(), core.problem()

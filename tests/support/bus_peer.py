@@ -1,6 +1,6 @@
-"""A process on the bus for tests: `publish COUNT` or `collect COUNT`, told and heard over standard streams.
+"""A process on the bus for tests: `publish COUNT` or `collect COUNT`, controlled over standard streams.
 
-publish: puts COUNT alarms as fast as it can, prints "published", then one more for every line it is told.
+publish: puts COUNT alarms as fast as it can, prints "published", then one more for every line on standard input.
 collect: puts what comes in sequence, prints the sequence numbers when it has COUNT of them.
 """
 

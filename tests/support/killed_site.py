@@ -1,6 +1,6 @@
-"""A site without processes or a bus: sources and stage cores stepped as the runner does, killed and begun anew at will.
+"""A site without processes or a bus: sources and stage cores stepped as the runner does, killed and restarted at will.
 
-What it records says what each session was fed, as the real thing does, but in a moment and the same at every run.
+Its recordings show the input of each session like those of a real site, but take no time and are the same at every run.
 """
 
 from __future__ import annotations
@@ -190,7 +190,7 @@ class Site(Stages):
     def __init__(
         self, folder: Path, seed: int, block_size: int = 1, *, calibrated: bool = False, remembers: bool = True
     ) -> None:
-        """remembers: whether a scorer that begins anew finds what the one before has kept."""
+        """remembers: whether a restarted scorer finds the snapshot of the one before it."""
         card = {"calibration": CALIBRATION} if calibrated else {}
         write_twin(folder / "twin.onnx", small_hybrid(), fans=FANS, **card)
         (folder / "site.toml").write_text(CONFIGURATION % block_size)

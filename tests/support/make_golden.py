@@ -1,9 +1,9 @@
-"""Makes tests/data/golden.mcap anew: python tests/make_golden.py
+"""Makes tests/support/data/golden.mcap again: python -m tests.support.make_golden
 
 A real site watches a simulated tray of two fans for some ten seconds; one inlet is covered and set free, its alarm is
 acknowledged, the other fan's is shelved, and the twin integrator and the scorer are killed on the way, so that the
 scorer goes on from its memory. The twin is a physical one, which needs no function whose last bit depends on the
-machine, and its alarms are calibrated. Make it anew only when what the stages decide is meant to change, and say why
+machine, and its alarms are calibrated. Make it again only when what the stages decide is meant to change, and say why
 in the commit.
 """
 
@@ -84,7 +84,7 @@ def record(chain: Chain) -> None:
 
 
 def keep(recording: Path) -> None:
-    """What is decided and of what, without what tells of the machine: health, ports and folders."""
+    """Write the golden recording: all decisions and their input, without health, ports and folders of the machine."""
     head = read_metadata(recording)
     metadata = {key: value for key, value in head.metadata.items() if key != "overrides"}
     GOLDEN.parent.mkdir(exist_ok=True)

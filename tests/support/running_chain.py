@@ -111,7 +111,7 @@ class Running:
 
 
 class Chain:
-    """A tray that sends until told to stop, all stages judging it, and a watcher on their bus."""
+    """A tray that sends until stopped, all stages judging it, and a watcher on their bus."""
 
     def __init__(
         self,

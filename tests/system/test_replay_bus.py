@@ -260,7 +260,7 @@ def test_the_viewer_draws_every_score_of_a_replay(site, tmp_path):
     assert "dropped" not in counters
 
 
-def test_beside_a_stage_that_writes_the_same_it_is_refused_and_says_from_where_to_replay(site, tmp_path):
+def test_replay_beside_a_stage_that_writes_the_same_topic_is_refused_with_the_from_option(site, tmp_path):
     recording = write_raw(tmp_path / "source.mcap", 100)
     site.start("resampler")
     refused = site.replay(recording)
@@ -280,7 +280,7 @@ def test_a_stage_that_comes_later_and_writes_the_same_ends_the_replay(site, tmp_
     assert "recorded commands are not for the fans of today" in replay.lines[-1]
 
 
-def test_it_says_when_nobody_listens_and_where_it_looked(tmp_path, endpoint):
+def test_a_replay_without_listeners_is_reported_with_the_endpoint(tmp_path, endpoint):
     recording = write_raw(tmp_path / "source.mcap", 10)
     done = fantwin("replay", recording, "--rate", "max", "--set", f"bus.endpoint={endpoint}", "--json")
     assert done.returncode == 0
@@ -289,7 +289,7 @@ def test_it_says_when_nobody_listens_and_where_it_looked(tmp_path, endpoint):
     assert json.loads(done.stdout)["messages"] == {"raw": 10}
 
 
-def test_what_could_not_be_read_is_told_and_the_exit_code_says_so(tmp_path, endpoint):
+def test_unreadable_parts_are_reported_in_the_output_and_the_exit_code(tmp_path, endpoint):
     whole = write_raw(tmp_path / "whole.mcap", 2000)
     truncated = tmp_path / "truncated.mcap"
     truncated.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])

@@ -33,7 +33,7 @@ def client(endpoint: str, stop: threading.Event | None = None) -> Bus:
 
 
 def exchange(listener: Bus, speaker: Bus) -> bytes:
-    """What the one hears of the other; said again until it is, since nobody knows when they have met."""
+    """The payload that `listener` receives from `speaker`, published repeatedly until discovery has connected them."""
     heard: queue.Queue[bytes] = queue.Queue()
     listener.subscribe(KEY, lambda _key, payload: heard.put(payload))
     publisher = speaker.publisher(KEY, BY_NAME["alarm"], "x", "speaker")

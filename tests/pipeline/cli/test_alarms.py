@@ -33,7 +33,7 @@ CAUSES = (
 )
 
 
-class ToldScorer(Core):
+class AlarmOnRequestScorer(Core):
     """The conditions of a tray whose ratios a test sets; answers requests as a scorer does."""
 
     def __init__(self) -> None:
@@ -94,7 +94,7 @@ class Site:
     """The scorer in a thread, and the words that lead a command to its bus."""
 
     def __init__(self, endpoint: str) -> None:
-        self.core = ToldScorer()
+        self.core = AlarmOnRequestScorer()
         self.words = ("-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
         stage = Stage(
             name="scorer",
@@ -151,7 +151,7 @@ def handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def test_the_list_has_what_stands_and_with_all_what_is_over(site):
+def test_the_list_shows_current_alarms_and_with_all_also_those_that_are_over(site):
     assert site.listed() == []
     assert site.ask() == "no alarms\n"
     site.raise_alarm(3)
@@ -172,18 +172,18 @@ def test_the_list_has_what_stands_and_with_all_what_is_over(site):
 
 
 def test_an_alarm_of_a_newer_scorer_is_listed_with_its_number():
-    newest = replace(told_of_one_fan()[0], severity=Severity(7), transition=Transition(88), active=True)
+    newest = replace(alarms_of_one_fan()[0], severity=Severity(7), transition=Transition(88), active=True)
     assert "UNKNOWN (7)" in alarm_lines(CurrentAlarm(newest, newest.message, (), "")).plain
 
 
-def told_of_one_fan() -> list[Alarm]:
-    scorer = ToldScorer()
+def alarms_of_one_fan() -> list[Alarm]:
+    scorer = AlarmOnRequestScorer()
     scorer.ratio[0] = 2.0
     return [alarm for t_ns in range(3) for alarm in scorer.tick(t_ns) if isinstance(alarm, Alarm)]
 
 
 def test_a_missing_diagnosis_is_explained_once():
-    (raised,) = [alarm for alarm in told_of_one_fan() if alarm.transition == Transition.RAISED]
+    (raised,) = [alarm for alarm in alarms_of_one_fan() if alarm.transition == Transition.RAISED]
     unknown = (Diagnosis(cause="cannot_tell", probability=0.6, evidence="cannot tell yet: the command is not moving"),)
     _, cause, message = alarm_lines(CurrentAlarm(raised, "too slow", unknown, "")).plain.splitlines()
     assert (cause.strip(), message.strip()) == ("cannot_tell 60 %: the command is not moving", "too slow")
@@ -204,11 +204,11 @@ def test_an_acknowledgement_names_who_and_a_shelved_alarm_is_listed_and_not_pres
     assert site.listed()[0]["presented"]
 
 
-def test_what_is_refused_is_one_line_that_says_why(site):
+def test_a_refused_request_is_one_line_with_the_reason(site):
     assert site.refused("ack", TRAY, 2) == f"{TRAY}: fan 2: refused: no alarm has been raised"
 
 
-def test_a_request_for_all_fans_is_well_if_it_could_be_granted_for_one(site):
+def test_a_request_for_all_fans_succeeds_if_it_is_granted_for_at_least_one(site):
     site.raise_alarm(3)
     lines = site.ask("ack", TRAY).splitlines()
     assert lines[3] == f"{TRAY}: fan 3: acknowledged"
@@ -268,7 +268,7 @@ def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, m
         ("--operator Ann", "--for, --comment and --operator need an action"),
     ],
 )
-def test_what_cannot_be_meant_is_one_line(words, expected):
+def test_wrong_arguments_are_a_one_line_error(words, expected):
     assert expected in error_of("alarms", *words.split(), "-c", DEMO / "demo.toml")
 
 

@@ -143,7 +143,7 @@ def test_extrapolated_limits_declare_a_target_only(folder: Path) -> None:
     assert rate.extrapolated
 
 
-def test_what_was_declared_is_kept_on_other_healthy_running(folder: Path, calibrated: Path) -> None:
+def test_the_declared_rate_is_kept_on_other_healthy_recordings(folder: Path, calibrated: Path) -> None:
     result = fantwin("calibrate", calibrated, "--verify", folder / "other.mcap")
     assert result.exit_code == 0, result.output
     assert "kept" in result.stdout
@@ -226,7 +226,7 @@ def test_files_of_another_kind_are_named_in_one_line(folder: Path, wrong: str, t
     assert str(twin if wrong == "twin" else recording) in error
 
 
-def test_an_output_that_cannot_be_written_is_said_in_one_line(folder: Path) -> None:
+def test_an_output_that_cannot_be_written_is_a_one_line_error(folder: Path) -> None:
     error = error_of(
         "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", PER_DAY,
         "-o", folder / "no-folder" / "twin.onnx",
@@ -234,7 +234,7 @@ def test_an_output_that_cannot_be_written_is_said_in_one_line(folder: Path) -> N
     assert "cannot write the twin" in error
 
 
-def test_a_folder_as_output_is_said_before_anything_is_judged(folder: Path) -> None:
+def test_a_folder_as_output_is_refused_before_anything_is_judged(folder: Path) -> None:
     error = error_of(
         "calibrate", folder / "twin.onnx", folder / "missing.mcap", "--false-alarms-per-day", PER_DAY, "-o", folder
     )
@@ -249,7 +249,7 @@ def test_a_recording_counts_once(folder: Path) -> None:
     assert "named twice" in error_of("calibrate", twin, healthy, *rate, *verify)
 
 
-def test_the_twins_own_recordings_cannot_verify_it_under_any_name(folder: Path, calibrated: Path) -> None:
+def test_recordings_that_a_twin_was_made_from_cannot_verify_it_under_any_name(folder: Path, calibrated: Path) -> None:
     copy = folder / "copy.mcap"
     copy.write_bytes((folder / "healthy.mcap").read_bytes())
     error = error_of("calibrate", calibrated, "--verify", folder / "other.mcap", "--verify", copy)

@@ -36,7 +36,7 @@ def test_a_command_that_the_line_did_not_take_is_one_line_that_says_why(chain, a
     assert str(chain.port) in done.stderr
 
 
-def test_without_an_acquisition_nobody_takes_the_command(chain):
+def test_without_an_acquisition_the_command_is_reported_as_not_received(chain):
     done = fantwin(*chain.words("command"), "--fan", 3, 0.5)
     assert done.returncode == 1
     expected = "fantwin: no acquisition of tray tray1 received the command: is `fantwin up` running?\n"
@@ -61,5 +61,5 @@ def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():
         ("--tray nobody --fan 2 0.5", "no tray called 'nobody'"),
     ],
 )
-def test_what_the_tray_cannot_carry_out_is_refused_in_one_line(words, expected):
+def test_a_command_that_the_tray_cannot_carry_out_is_refused_in_one_line(words, expected):
     assert expected in error_of("command", "-c", DEMO / "demo.toml", *words.split())

@@ -111,7 +111,7 @@ def test_nothing_that_can_be_trained_is_an_error_that_says_why():
         best([Contender(candidate, invalid_reason="nothing moved") for candidate in all_candidates()])
 
 
-def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
+def test_invalid_input_is_a_one_line_error(folder, tmp_path):
     healthy = folder / "healthy.mcap"
     assert "--model hybird: no such model; known: physical" in error_of("compare", healthy, "--model", "hybird")
     assert "cannot read the recording" in error_of("compare", healthy, "--test", tmp_path / "nowhere.mcap")

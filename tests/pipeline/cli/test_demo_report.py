@@ -165,6 +165,6 @@ def test_the_parts_of_a_run_are_counted_together(tmp_path):
     assert summary.samples_recorded == 2 * SAMPLES
 
 
-def test_without_the_trays_own_account_there_is_none(tmp_path):
+def test_without_the_report_of_the_simulated_tray_there_is_no_summary(tmp_path):
     with pytest.raises(UserError, match="no report of the simulated tray"):
         summarise(tmp_path / "truth.json", [], {})

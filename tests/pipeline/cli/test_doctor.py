@@ -63,7 +63,7 @@ def test_a_configuration_in_order_can_start(capsys, tmp_path, port):
         ("scorer.on_dealy_s=1", ["scorer.on_dealy_s", "did you mean 'on_delay_s'"]),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line_with_what_to_do(capsys, tmp_path, port, setting, words):
+def test_each_problem_is_one_line_that_says_what_to_do(capsys, tmp_path, port, setting, words):
     settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", setting]
     code, found = examine(capsys, DEMO / "demo.toml", *settings)
     assert code == 1
@@ -123,7 +123,7 @@ def test_little_disk_is_a_problem(capsys, tmp_path, port, monkeypatch):
     assert "make room" in found["problems"][0]
 
 
-def test_for_people_problems_stand_out_from_what_is_in_order(capsys):
+def test_the_text_marks_problems_apart_from_passed_checks(capsys):
     with pytest.raises(typer.Exit):
         doctor(DEMO / "demo.toml", ["tray.0.port='/dev/none'"])
     out = capsys.readouterr().out

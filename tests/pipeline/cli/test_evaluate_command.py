@@ -166,7 +166,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "twin.onnx", recording
 
 
-def test_evaluate_tells_machines_of_other_grids_and_of_what_is_left(recorded: tuple[Path, Path]) -> None:
+def test_the_json_of_evaluate_has_other_grids_and_the_residual_analysis(recorded: tuple[Path, Path]) -> None:
     arguments = ("--rate", "50", "--rate", "irregular", "--json")
     result = json.loads(fantwin("evaluate", *recorded, *arguments).stdout)
     assert [(grid["rate"], grid["samples"], len(grid["fans"])) for grid in result["grids"][:1]] == [(50.0, 1500, 2)]
@@ -266,9 +266,9 @@ def test_a_twin_made_before_cards_named_fans_is_still_read_and_serves_as_many(tr
 
 
 @pytest.mark.parametrize("rate", ["0", "-50", "fast", "nan", "inf"])
-def test_a_rate_that_is_none_is_told_in_one_line(recorded: tuple[Path, Path], rate: str) -> None:
+def test_an_invalid_rate_is_a_one_line_error(recorded: tuple[Path, Path], rate: str) -> None:
     assert f"--rate {rate}: give a rate in Hz" in error_of("evaluate", *recorded, f"--rate={rate}")
 
 
-def test_a_rate_too_low_for_the_recording_is_told_in_one_line(recorded: tuple[Path, Path]) -> None:
+def test_a_rate_too_low_for_the_recording_is_a_one_line_error(recorded: tuple[Path, Path]) -> None:
     assert "no run is long enough to be judged at 0.01 Hz" in error_of("evaluate", *recorded, "--rate", "0.01")

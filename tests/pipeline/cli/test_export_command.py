@@ -125,7 +125,7 @@ def test_columns_that_the_messages_lack_are_empty(tmp_path, form):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_alarms_are_a_table_of_their_own(tmp_path, form):
+def test_alarms_are_a_separate_table(tmp_path, form):
     result = fantwin("export", recording(tmp_path), "--to", form, "--topic", "alarm", "-o", tmp_path)
     assert result.exit_code == 0
     (row,) = table(tmp_path / f"r.tray1.alarm.{form}").to_dict("records")
@@ -268,7 +268,7 @@ def test_the_same_tray_of_two_sites_does_not_become_one_table(tmp_path):
         (("--to", "csv", "-o", "x.parquet"), "x.parquet: name a file that ends in .csv with -o, or a folder"),
     ],
 )
-def test_what_cannot_be_exported_is_a_one_line_error(tmp_path, monkeypatch, arguments, words):
+def test_a_request_that_cannot_be_exported_is_a_one_line_error(tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     assert words in error_of("export", recording(tmp_path), *arguments)
     assert names(tmp_path) == ["r.mcap"]

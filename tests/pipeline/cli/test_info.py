@@ -102,9 +102,9 @@ def test_a_file_without_an_index_is_read_in_full_with_the_same_result(tmp_path):
     whole = recording(tmp_path / "r.mcap")
     truncated = tmp_path / "truncated.mcap"
     truncated.write_bytes(whole.read_bytes()[:-50])
-    (of_whole,), (of_torn,) = (shown(path, exit_code=3)["files"] for path in (whole, truncated))
-    assert of_torn["damage"] == ["it has no index"]
-    different = {name for name in of_whole if of_whole[name] != of_torn[name]}
+    (of_whole,), (of_truncated,) = (shown(path, exit_code=3)["files"] for path in (whole, truncated))
+    assert of_truncated["damage"] == ["it has no index"]
+    different = {name for name in of_whole if of_whole[name] != of_truncated[name]}
     assert different == {"file", "size_bytes", "damage"}
 
 
@@ -122,7 +122,7 @@ def test_a_truncated_file_is_reported(tmp_path):
     assert "it is truncated, as after a crash; repair it with `fantwin recover`" in fantwin("info", path).stdout
 
 
-def test_a_file_that_is_still_being_written_is_shown_as_far_as_it_is_on_the_disk(tmp_path):
+def test_a_file_that_is_still_being_written_is_shown_up_to_what_is_on_disk(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
         writer.add_message(RAW_KEY, raw(0), 1)
         writer.flush()

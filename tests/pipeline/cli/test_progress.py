@@ -1,4 +1,4 @@
-"""What is said on stderr while a command works and nobody watches a terminal."""
+"""Progress on stderr while a command works without a terminal."""
 
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 TRAINING_DATA = cast("TrainingData", SimpleNamespace(rad_s_per_unit=0.1, speed_unit="rpm"))
 
 
-def test_without_a_terminal_a_line_tells_every_few_seconds_how_far_a_training_is(monkeypatch, capsys) -> None:
+def test_without_a_terminal_a_line_reports_training_progress_every_few_seconds(monkeypatch, capsys) -> None:
     now_s = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now_s[0])
     with progress.training_progress(TRAINING_DATA) as start:
@@ -32,7 +32,7 @@ def test_without_a_terminal_a_line_tells_every_few_seconds_how_far_a_training_is
     assert output.out == ""
 
 
-def test_without_a_terminal_work_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_terminal_work_is_reported_once(capsys: pytest.CaptureFixture[str]) -> None:
     with progress.working("drawing page.html"):
         pass
     assert capsys.readouterr().err == "drawing page.html\n"

@@ -43,7 +43,7 @@ def test_a_difference_is_exit_code_1_and_named(tmp_path):
 
 
 @pytest.mark.parametrize("words", [("--twin",), ("--set", "scorer.on_delay_s=1"), ("--start", "2")])
-def test_what_is_not_as_recorded_cannot_be_compared_exit_code_2(tmp_path, words):
+def test_verifying_with_other_settings_is_refused_exit_code_2(tmp_path, words):
     if words == ("--twin",):
         (tmp_path / "twin.onnx").write_bytes(read_metadata(GOLDEN).attachments["tray1.onnx"])
         words = ("--twin", tmp_path / "twin.onnx")
@@ -83,7 +83,7 @@ def test_the_list_names_severity_and_probable_cause_and_is_not_wide():
     assert max(map(len, lines + what_if)) <= 100
 
 
-def test_counts_of_stages_and_reasons_of_not_judging_have_names_of_their_own():
+def test_counts_of_stages_and_reasons_for_unscored_samples_have_distinct_names():
     document = json.loads(replay("--json", GOLDEN).stdout)
     reasons = {why.name.lower() for why in InvalidReason}
     assert set(document["not_judged"]["tray1"]) <= reasons
@@ -91,7 +91,7 @@ def test_counts_of_stages_and_reasons_of_not_judging_have_names_of_their_own():
     assert reasons.isdisjoint(counts) and "not_predicted_out_of_range" in counts
 
 
-def test_another_threshold_says_what_is_gained_and_lost():
+def test_another_threshold_shows_which_alarms_are_gained_and_lost():
     document = json.loads(replay("--json", GOLDEN, "--set", "scorer.limit_factor=1000").stdout)
     assert document["alarms"] == [] and document["what_if"]["gained"] == []
     assert [alarm["fan"] for alarm in document["what_if"]["lost"]] == [1]
@@ -127,7 +127,7 @@ def test_the_output_has_the_requests_that_its_alarms_answer(tmp_path):
     assert answered == {f"{asked.header.producer}/{asked.header.sequence}" for asked in made}
 
 
-def test_an_imported_table_is_judged_at_the_twins_own_rate(tmp_path):
+def test_an_imported_table_is_judged_at_the_rate_of_the_twin(tmp_path):
     site = Site(tmp_path, seed=1)
     site.run(600)
     path = site.finished()
@@ -163,7 +163,7 @@ def test_no_file_is_ever_written_over(tmp_path):
     assert copy.read_bytes() == GOLDEN.read_bytes() and active.read_bytes() == b"what a recorder is writing"
 
 
-def test_a_part_of_time_is_judged_and_compared_with_what_was_recorded_in_it():
+def test_a_time_range_is_judged_and_compared_with_the_recorded_alarms_of_that_range():
     document = json.loads(replay("--json", GOLDEN, "--end", "3", "--set", "scorer.on_delay_s=0.2").stdout)
     assert document["what_if"] == {"gained": [], "lost": [], "kept": []}, "the alarm comes later"
     assert 120 < document["samples"] < 160
@@ -201,7 +201,7 @@ def test_damaged_metadata_are_one_line(tmp_path, metadata):
     assert len(result.stderr.strip().splitlines()) == 1
 
 
-def test_a_torn_recording_is_judged_as_far_as_it_goes_exit_code_3(tmp_path):
+def test_a_truncated_recording_is_judged_as_far_as_it_can_be_read_exit_code_3(tmp_path):
     truncated = tmp_path / "truncated.mcap"
     shutil.copy(GOLDEN, truncated)
     with truncated.open("r+b") as file:

@@ -95,7 +95,7 @@ def site(endpoint: str) -> Iterator[Site]:
 
 
 def view(site: Site, watcher: Watcher, *healths: Health) -> StageView:
-    """What the watcher makes of healths, said until it has heard the last of them."""
+    """The view of the watcher after `healths`, each published until the watcher shows it."""
     for health in healths:
 
         def heard(health: Health = health) -> StageView | None:

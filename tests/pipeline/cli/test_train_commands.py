@@ -117,7 +117,7 @@ def test_without_held_out_recordings_it_says_so(folder, tmp_path):
     assert "  training data, free run: rmse" in result.stdout
 
 
-def test_the_healthy_torque_balance_is_told(folder, tmp_path):
+def test_train_reports_the_healthy_torque_balance(folder, tmp_path):
     command = ("train", folder / "two.mcap", "--model", "physical", "--command-unit", "%", "-o", tmp_path / "t.onnx")
     result = json.loads(fantwin(*command, "--json").stdout)
     assert result["balance_source"] == ["physics"] * 2
@@ -147,7 +147,7 @@ def test_each_fan_of_a_tray_is_evaluated_and_fans_can_be_chosen(folder, twin):
     assert one["fans"] == [both["fans"][1]]
 
 
-def test_what_is_damaged_in_a_recording_is_told(folder, twin, tmp_path):
+def test_damage_of_a_recording_is_reported(folder, twin, tmp_path):
     whole = (folder / "healthy.mcap").read_bytes()
     truncated = tmp_path / "truncated.mcap"
     truncated.write_bytes(whole[:-100])
@@ -156,7 +156,7 @@ def test_what_is_damaged_in_a_recording_is_told(folder, twin, tmp_path):
     assert "truncated.mcap: it is truncated" in result.stderr
 
 
-def test_what_cannot_be_done_is_told_in_one_line(folder, twin, tmp_path):
+def test_invalid_input_is_a_one_line_error(folder, twin, tmp_path):
     healthy, out = folder / "healthy.mcap", tmp_path / "t.onnx"
     assert "in different units, rad/s" in error_of("train", healthy, folder / "healthy-rpm.mcap", "-o", out)
     assert "cannot read the recording" in error_of("train", tmp_path / "nowhere.mcap", "-o", out)
@@ -202,7 +202,7 @@ def test_outliers_are_left_out_alike_wherever_a_twin_is_judged(tmp_path):
     assert any("of the speeds are outliers" in line for line in evaluated["warnings"])
 
 
-def test_a_command_that_never_changes_is_told_in_one_line(tmp_path):
+def test_a_command_that_never_changes_is_a_one_line_error(tmp_path):
     run = published_run(1, duration_s=5.0)
     still = Run("still", run.t_s, np.full_like(run.command, 50.0), run.speed_rad_s)
     path = record(tmp_path / "still.mcap", still)

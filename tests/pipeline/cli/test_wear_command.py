@@ -112,7 +112,7 @@ def test_a_tray_without_points_is_one_line(tmp_path, notes):
 
 
 @pytest.mark.parametrize("former", sorted(FORMER_PARAMETER_KEYS))
-def test_recordings_of_earlier_versions_are_shown_alike(tmp_path, notes, former):
+def test_recordings_of_earlier_versions_are_shown_in_the_same_way(tmp_path, notes, former):
     state = json.loads(notes[-1].state_json)
     for fan in state["wear"]["fans"]:
         for parameter in fan["parameters"].values():
@@ -127,7 +127,7 @@ def test_a_recording_without_wear_is_one_line(tmp_path, notes, state):
     assert error_of("wear", path) == f"no wear in {path}: a scorer records it every minute and when it stops"
 
 
-def test_what_could_not_be_read_in_full_is_shown_as_far_as_it_is_known(tmp_path, notes):
+def test_a_recording_that_cannot_be_read_in_full_is_shown_as_far_as_it_is_readable(tmp_path, notes):
     path = recording(tmp_path / "r.mcap", notes[:1])
     whole = path.read_bytes()
     with RecordingWriter(tmp_path / "truncated.mcap", {}) as writer:

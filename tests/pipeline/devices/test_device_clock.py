@@ -127,7 +127,7 @@ def test_a_correction_does_not_grow_while_no_samples_arrive() -> None:
     after = sampled(5, jitter_ms=0.1, starts_ns=EPOCH_NS + 300 * NS_PER_S, clock_starts_us=300_000_000)
     error_ns = joined(late, before, after).error_ns()
     assert error_ns[501] - error_ns[500] < 0
-    assert error_ns[501] > error_ns[500] - 11 * MS  # one bucket's worth, not 300 s of it
+    assert error_ns[501] > error_ns[500] - 11 * MS  # the drift of one bucket, not of 300 s
 
 
 @pytest.mark.parametrize("set_by_s", [30, 3600, -3600])

@@ -1,4 +1,4 @@
-"""Measured tables: what real files hold is read, mended and counted."""
+"""Measured tables: the rows of real files are read, repaired and counted."""
 
 import csv
 from pathlib import Path
@@ -211,7 +211,7 @@ def test_a_wrong_description_of_the_table_is_a_one_line_error(tmp_path, argument
         (b"MATLAB 5.0 MAT-file\0\0\0\1", "not a text file with columns"),
     ],
 )
-def test_a_file_that_is_not_such_a_table_is_a_one_line_error(tmp_path, content, expected):
+def test_a_file_that_is_not_a_measured_table_is_a_one_line_error(tmp_path, content, expected):
     with pytest.raises(UserError, match=expected) as raised:
         table(tmp_path, content)
     assert "\n" not in str(raised.value)

@@ -287,7 +287,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
     assert long < in_the_long_one / 4
 
 
-def test_what_cannot_be_read_is_a_one_line_error(tmp_path):
+def test_unknown_topics_and_unreadable_files_are_a_one_line_error(tmp_path):
     path = write(tmp_path / "r.mcap", [raw(0)])
     with pytest.raises(RecordingError, match=r"no topic is called 'scor'; known: raw, grid, prediction, score"):
         read_arrays(path, "scor")

@@ -136,7 +136,7 @@ def test_other_readers_need_no_code_of_fantwin(tmp_path):
     np.testing.assert_array_equal(proto.speed_rad_s, raw(2).speed_rad_s.ravel())
 
 
-def test_the_embedded_schema_stands_on_its_own(tmp_path):
+def test_the_embedded_schema_needs_no_other_file(tmp_path):
     from google.protobuf.descriptor_pb2 import FileDescriptorSet  # noqa: PLC0415
 
     path = write(tmp_path / "r.mcap", 1)
@@ -471,7 +471,7 @@ def test_a_missing_file_is_reported_in_one_line(tmp_path):
         read_recording(tmp_path / "r.mcap")
 
 
-def test_every_key_gets_a_channel_of_its_own(tmp_path):
+def test_every_key_gets_its_own_channel(tmp_path):
     keys = [tray_key("plant", "a", "command"), tray_key("plant", "b", "command")]
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
         for key in keys:

@@ -1,5 +1,4 @@
-"""pipeline.replay.offline.alarm_episodes: alarms from raised to cleared, over everything that is said of them in
-between."""
+"""pipeline.replay.offline.alarm_episodes: alarms from raised to cleared, across all messages in between."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ def one(*alarms: Alarm) -> Episode:
     return episode
 
 
-def test_an_episode_goes_from_the_raise_to_the_clear_with_the_highest_severity_and_what_was_known_last() -> None:
+def test_an_episode_lasts_from_raised_to_cleared_with_the_highest_severity_and_the_latest_values() -> None:
     episode = one(
         alarm(10, causes=(DRAG,), torque_balance_command=3.0),
         alarm(11, Transition.DIAGNOSED, causes=(GAIN, DRAG)),
@@ -45,14 +44,14 @@ def test_the_json_has_what_the_issue_asks_for() -> None:
     assert (document["causes"][0]["cause"], document["causes"][0]["probability"]) == ("drag_up", 0.6)
 
 
-def test_a_residual_that_nobody_knew_is_null_and_not_zero() -> None:
+def test_an_unknown_residual_is_null_and_not_zero() -> None:
     document = one(alarm(10, residual_rad_s=0.0, torque_balance_command=2.5)).as_json()
     assert (document["residual"], document["torque_balance"]) == (None, 2.5)
     document = one(alarm(10, residual_rad_s=-1e-9, torque_balance_command=0.0)).as_json()
     assert (document["residual"], document["torque_balance"]) == (-1e-9, None)
 
 
-def test_what_is_told_again_after_a_restart_is_the_same_episode() -> None:
+def test_an_alarm_republished_after_a_restart_is_the_same_episode() -> None:
     episode = one(alarm(10), alarm(10, Transition.REPUBLISHED), alarm(30, Transition.CLEARED))
     assert (episode.raised_ns, episode.cleared_ns) == (10, 30)
 
@@ -62,14 +61,14 @@ def test_a_scorer_without_a_memory_that_raises_it_again_goes_on_with_it() -> Non
     assert (episode.raised_ns, episode.onset_ns, episode.cleared_ns) == (10, 5, 30)
 
 
-def test_what_is_said_of_an_alarm_that_is_not_active_begins_none() -> None:
+def test_messages_of_an_alarm_that_is_not_active_begin_no_episode() -> None:
     inactive = {"active": False, "severity": Severity.NONE}
     assert episodes([alarm(1, Transition.SHELVED, **inactive), alarm(2, Transition.REFUSED, **inactive)]) == []
     found = episodes([alarm(10), alarm(20, Transition.CLEARED), alarm(25, Transition.ACKNOWLEDGED, active=False)])
     assert len(found) == 1
 
 
-def test_fans_and_trays_are_kept_apart_and_told_by_time() -> None:
+def test_episodes_are_per_fan_and_tray_in_order_of_time() -> None:
     found = episodes([alarm(30), alarm(10, fan=1), alarm(20, tray="b"), alarm(40, Transition.CLEARED, fan=1)])
     assert [(e.tray, e.fan, e.raised_ns, e.cleared_ns) for e in found] == [
         ("a", 1, 10, 40),

@@ -45,7 +45,7 @@ def there(*labels: str) -> list[Present]:
         (["twin_integrator"], ("prediction", "twin"), ["writes prediction itself", "--from grid"]),
     ],
 )
-def test_nothing_is_replayed_that_a_running_stage_writes_nor_what_was_asked_of_it_long_ago(labels, topics, expected):
+def test_topics_that_a_running_stage_writes_and_past_requests_to_it_are_not_replayed(labels, topics, expected):
     line = conflict(there(*labels), topics, {"a"}, "plant")
     assert bool(line) == bool(expected)
     assert "\n" not in line
@@ -54,7 +54,7 @@ def test_nothing_is_replayed_that_a_running_stage_writes_nor_what_was_asked_of_i
 
 
 class FakeStage:
-    """A stage on the bus that says what a test wants it to."""
+    """A stage on the bus that reports the health that a test gives it."""
 
     def __init__(self, bus: Bus, stage: str) -> None:
         self.stage = stage
@@ -97,7 +97,7 @@ def settled(listeners: Listeners, stop: threading.Event, say) -> list[str]:
     return listeners.wait_until_drained("replay-1", {GRID: 100}, stop, say)
 
 
-def test_it_waits_until_those_who_are_there_have_said_how_they_are(sites):
+def test_discovery_waits_for_the_health_of_every_present_stage(sites):
     bus, listeners = sites
     stages = [FakeStage(bus, "twin_integrator"), FakeStage(bus, "viewer")]
     eventually(lambda: len(listeners.present()) == 2, "their tokens are seen")
@@ -120,7 +120,7 @@ def test_it_waits_until_those_who_are_there_have_said_how_they_are(sites):
     eventually(lambda: listeners.lost("replay-1", {}) == {"twin_integrator": 2}, "what is lost since is")
 
 
-def test_it_is_settled_when_all_has_been_taken_down_the_whole_chain(sites):
+def test_the_replay_is_drained_when_the_whole_chain_has_consumed_everything(sites):
     bus, listeners = sites
     twin, scorer = FakeStage(bus, "twin_integrator"), FakeStage(bus, "scorer")
     eventually(lambda: len(listeners.present()) == 2, "their tokens are seen")
@@ -142,7 +142,7 @@ def test_it_is_settled_when_all_has_been_taken_down_the_whole_chain(sites):
     scorer.say()
     eventually(lambda: len(listeners._views()) == 2, "both are known")
     assert settled(listeners, threading.Event(), beat) == []
-    assert not steps, "not before the last of them has said it has all"
+    assert not steps, "drained only after the last stage reported that it has consumed everything"
 
 
 def test_whoever_stops_changing_and_is_behind_is_named(sites, monkeypatch):

@@ -1,4 +1,4 @@
-"""Offline replay: the same decisions to the bit, whatever was killed; and it can tell when they are not the same."""
+"""Offline replay: the same decisions to the bit, whatever was killed; and a difference is detected."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_what_operators_asked_for_is_asked_for_again_at_the_same_samples(tmp_pat
     assert without and not without.is_equal, "the requests are what made the difference"
 
 
-def test_a_restarted_scorer_goes_on_from_what_it_remembers_and_so_does_a_replay(tmp_path):
+def test_a_restarted_scorer_continues_from_its_snapshot_and_so_does_a_replay(tmp_path):
     site = Site(tmp_path, 1, calibrated=True)
     site.run(210)
     site.ask(Action.ACKNOWLEDGE, 0)
@@ -178,7 +178,7 @@ def test_without_the_memory_it_began_with_a_session_cannot_be_made_the_same(tmp_
         verified(path)
 
 
-def test_a_part_that_begins_with_a_restarted_scorer_still_needs_what_it_was_fed(tmp_path):
+def test_a_part_that_begins_with_a_restarted_scorer_still_needs_its_earlier_input(tmp_path):
     site = Site(tmp_path, 1, calibrated=True)
     site.run(210)
     site.records = False
@@ -266,7 +266,7 @@ def test_a_recording_without_raw_samples_is_never_equal(tmp_path):
         verified(no_raw)
 
 
-def test_what_a_killed_stage_sent_and_the_recorder_never_got_is_made_anew(tmp_path):
+def test_messages_of_a_killed_stage_that_the_recorder_never_got_are_made_again(tmp_path):
     site = Site(tmp_path, seed=4)
     site.run(150)
     integrator = site.stages["twin_integrator"].producer
@@ -379,7 +379,7 @@ def test_an_alarm_that_was_never_raised_is_found(tmp_path):
     assert first.message in found.named[0] and "none recorded" in found.named[0]
 
 
-def test_scores_that_nobody_made_are_found(tmp_path):
+def test_scores_that_no_stage_made_are_found(tmp_path):
     site = Site(tmp_path, seed=6)
     site.run(200)
 

@@ -117,7 +117,7 @@ def test_what_publishing_costs_does_not_add_up():
     assert sent.messages[-1][0] == pytest.approx(2.99)
 
 
-def test_twenty_times_a_second_it_is_told_what_time_it_is_and_once_a_second_how_it_is():
+def test_the_clock_is_published_twenty_times_a_second_and_health_once_a_second():
     sent, _ = play(raws(301))
     assert len(sent.clocks) == pytest.approx(3.0 / BEAT_S, abs=3)
     for at_s, t_ns, rate in sent.clocks:
@@ -126,7 +126,7 @@ def test_twenty_times_a_second_it_is_told_what_time_it_is_and_once_a_second_how_
     assert len(sent.healths) == 3 + 1 + 1  # once at the start, once at the end
 
 
-def test_the_time_is_told_before_the_first_message():
+def test_the_time_is_published_before_the_first_message():
     sent, _ = play(raws(3))
     assert sent.clocks[0] == (0.0, 0, 1.0)
     order: list[str] = []
@@ -158,9 +158,9 @@ def test_the_clock_goes_on_through_a_silence_of_the_line():
     assert [t_ns for at_s, t_ns, _ in sent.clocks if 1.0 < at_s < 2.0][-1] == pytest.approx(2e9, abs=6e7)
 
 
-def test_the_told_time_never_runs_back():
+def test_the_published_time_never_runs_back():
     rounds = raws(4, samples=100)
-    rounds.insert(1, (0, alarm(START_NS + 1_500_000_000, 0)))  # told before samples that are older
+    rounds.insert(1, (0, alarm(START_NS + 1_500_000_000, 0)))  # published before older samples
     sent, _ = play(rounds, keys=[(1.0, Key.FASTER), (1.2, Key.PAUSE), (1.5, Key.STEP), (1.6, Key.PAUSE)])
     times = [t_ns for _, t_ns, _ in sent.clocks]
     assert times == sorted(times)

@@ -70,7 +70,7 @@ def test_a_stretch_begins_and_ends_in_seconds_since_the_first_message(tmp_path):
     assert RecordingPlayback([tmp_path / "r.mcap"], ("raw",)).end_s() == pytest.approx(4.99)
 
 
-def test_the_twin_that_was_in_force_is_told_at_the_start_of_a_stretch(tmp_path):
+def test_a_time_range_starts_with_the_card_of_the_twin_then_in_force(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {"trays": "tray1"}) as writer:
         for number in range(2):
             card = ModelCard(
@@ -136,7 +136,7 @@ def test_whatever_is_a_time_since_the_epoch_is_called_so():
     }
 
 
-def test_a_torn_part_is_played_as_far_as_it_goes_and_told(tmp_path):
+def test_a_truncated_part_is_played_as_far_as_it_can_be_read_and_reported(tmp_path):
     whole = write_raw(tmp_path / "whole.mcap", 3000)
     truncated = tmp_path / "truncated.mcap"
     truncated.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])

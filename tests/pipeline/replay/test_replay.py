@@ -49,7 +49,7 @@ def recording(tmp_path):
         ("--offline --from raw", "--from cannot be used with --offline"),
     ],
 )
-def test_what_makes_no_sense_is_wrong_usage(recording, words, expected):
+def test_contradictory_options_are_wrong_usage(recording, words, expected):
     done = fantwin("replay", recording, *words.split())
     assert done.exit_code == 2
     assert expected in " ".join(done.stderr.replace("│", " ").split())
@@ -73,7 +73,7 @@ def test_deciding_again_is_handed_over_as_it_was_asked_for(recording, tmp_path, 
     assert (str(asked["twin"]), str(asked["output"]), asked["overrides"]) == ("t.onnx", "out.mcap", ["site=x"])
 
 
-def test_the_line_tells_time_place_rate_and_messages():
+def test_the_status_line_shows_time_position_rate_and_messages():
     progress = Progress(START_NS + 12_500_000_000, 4.0, paused=False, round=0, messages=12345)
     line = status_line(progress, 12.5, 60.0)
     for words in ("2023-11-14 22:13:32.500 UTC", "12.50 s of 60.00 s", "x 4 ", "12,345 sent", "space"):

@@ -41,7 +41,7 @@ def test_a_configuration_that_is_given_goes_before_the_one_in_the_recording(tmp_
     assert place(path, tmp_path / "other.toml").site == "desk"
 
 
-def test_what_was_set_when_it_was_recorded_is_set_again_and_what_is_set_now_goes_before_it(tmp_path):
+def test_recorded_overrides_apply_again_and_new_ones_take_precedence(tmp_path):
     recorded = ["bus.endpoint=tcp/127.0.0.1:7002", "site=hall"]
     metadata = {"trays": "tray1", "overrides": json.dumps(recorded)}
     path = recording(tmp_path / "r.mcap", metadata, {"configuration.toml": TOML.encode()})

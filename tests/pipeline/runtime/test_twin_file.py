@@ -91,7 +91,7 @@ def test_a_calibration_is_kept_as_it_is(tmp_path: Path) -> None:
     assert TwinFile.load(write_twin(tmp_path / "twin.onnx", calibration=calibration), 1).card.calibration == calibration
 
 
-def test_a_balance_that_makes_no_sense_is_refused_by_name(tmp_path: Path) -> None:
+def test_an_invalid_balance_is_refused_by_name(tmp_path: Path) -> None:
     whole = asdict(made_up_balance((PARAMETERS,)))
     for changes, named in (
         ({"sigma_command": [0.0]}, "balance.sigma_command"),
@@ -188,7 +188,7 @@ def test_a_card_without_a_format_is_refused(tmp_path: Path) -> None:
         ({"n_state": 1, "state_layout": {"speed": 1, "command": 0}}, "state is ['fans', 2], the card says (fans, 1)"),
     ],
 )
-def test_a_card_that_makes_no_sense_is_refused_by_name(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
+def test_an_invalid_card_is_refused_by_name(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
     assert named in _refusal(write_twin(tmp_path / "twin.onnx", **changes))
 
 

@@ -117,7 +117,7 @@ def test_the_command_plots_a_recording_with_its_true_faults(tmp_path: Path) -> N
     assert coverage(output, band_plot.FAULT) > 0.001
 
 
-def test_what_cannot_be_plotted_is_a_one_line_error(tmp_path: Path) -> None:
+def test_a_plot_that_cannot_be_drawn_is_a_one_line_error(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=1)
     others, _ = made_up_tray(seconds=1, tray="tray2")
     both = record(tmp_path / "both.mcap", [*scores, *others], [])

@@ -29,7 +29,7 @@ OVER = {"active": False, "acknowledged": True, "confirmed": True}
     ],
     ids=str,
 )
-def test_a_state_and_its_message_are_retained_silenced_presented_and_listed_alike(flags, retained, silenced):
+def test_a_state_and_its_message_agree_on_retained_silenced_presented_and_listed(flags, retained, silenced):
     message = Alarm(
         fan=0, severity=Severity.ALARM, t_ns=1, onset_t_ns=1, residual_rad_s=0.0, limit_rad_s=0.0, message="", **flags
     )

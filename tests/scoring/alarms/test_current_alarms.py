@@ -30,7 +30,7 @@ def one(*messages: Alarm) -> CurrentAlarm:
     return standing
 
 
-def test_the_newest_message_of_each_fan_says_how_it_stands_whatever_the_order():
+def test_the_newest_message_of_each_fan_decides_its_state_in_any_order():
     reported = [alarm(fan=1), alarm(), alarm(Transition.CLEARED, 5, active=False), alarm(tray="b", t_ns=9)]
     for messages in itertools.permutations(reported):
         found = [(each.newest.header.tray, each.newest.fan, each.newest.active) for each in current_alarms(messages)]
@@ -71,7 +71,7 @@ def test_of_several_scorers_the_one_that_spoke_last_counts_whatever_its_times():
     assert one(before, again, taken_back, after).newest is after
 
 
-def test_an_answer_takes_neither_message_nor_causes_away():
+def test_an_answer_keeps_the_message_and_the_causes():
     causes = (Diagnosis(cause="drag_up", probability=0.8),)
     standing = one(
         alarm(),

@@ -104,7 +104,7 @@ def test_severity_rises_at_its_ratio_and_does_not_fall_before_the_next_alarm():
     ]
 
 
-def test_every_change_says_how_the_alarm_stood_at_its_own_row():
+def test_every_event_shows_the_alarm_as_it_was_at_its_row():
     result = take(at_once(), [UP, LOW, UP])
     assert [change.alarm_state.active for change in result.events] == [True, False, True]
 
@@ -184,7 +184,7 @@ def test_a_latched_alarm_stays_until_it_is_reset_in_its_turn():
         ((), Action.NONE, "no action is named"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_plain_words_and_changes_nothing(before, action, why):
+def test_an_invalid_request_is_refused_in_plain_words_and_changes_nothing(before, action, why):
     conditions = at_once()
     for event in before:
         if isinstance(event, Action):
@@ -203,7 +203,7 @@ def test_a_time_that_no_shelving_can_have_is_refused(duration_ns):
 
 
 @pytest.mark.parametrize("duration_ns", [math.nan, math.inf])
-def test_the_time_of_what_is_no_shelving_does_not_matter(duration_ns):
+def test_a_duration_is_ignored_for_actions_other_than_shelving(duration_ns):
     granted = (Transition.SUPPRESSED, "")
     assert asked(at_once(), Action.SUPPRESS, now_t_ns=5, duration_ns=duration_ns) == granted
 
@@ -360,7 +360,7 @@ def test_raised_and_cleared_take_turns_and_are_what_the_states_say(history, chos
     [{}, {"fans": []}, {"fans": [{}]}, {"fans": 3}, {"fans": [{"state": 0}]}, {"fans": [{"state": "x"}]}],
     ids=str,
 )
-def test_what_is_no_snapshot_is_refused_and_changes_nothing(kept):
+def test_an_invalid_snapshot_is_refused_and_changes_nothing(kept):
     conditions = at_once()
     take(conditions, [UP])
     before = conditions.snapshot()

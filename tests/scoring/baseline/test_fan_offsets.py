@@ -32,7 +32,7 @@ def found_of(runs: list[Cells]) -> np.ndarray:
     return without_its_mean(np.array(found.offset_sigmas))
 
 
-def test_what_is_there_every_day_is_found_whatever_else_the_days_are() -> None:
+def test_an_offset_of_every_day_is_found_despite_daily_noise() -> None:
     own = without_its_mean(np.random.default_rng(2).normal(0.0, 1.0, (10, BINS)))
     np.testing.assert_allclose(found_of(runs_of(own, 12, noise=0.0)), own, atol=1e-3)
     error = found_of(runs_of(own, 24, noise=0.2, seen=0.5)) - own
@@ -56,11 +56,11 @@ def test_a_fan_never_seen_at_a_speed_is_there_as_the_others_are() -> None:
 
 
 @pytest.mark.parametrize(("fans", "days"), [(2, 20), (10, 11)])
-def test_of_few_fans_or_days_nothing_is_said(fans: int, days: int) -> None:
+def test_too_few_fans_or_days_give_no_offsets(fans: int, days: int) -> None:
     assert fan_offsets(runs_of(np.zeros((fans, BINS)), days, noise=1.0), CENTRES, STEP_S) is None
 
 
-def test_of_runs_that_were_nowhere_for_long_nothing_is_said() -> None:
+def test_runs_too_short_at_every_speed_give_no_offsets() -> None:
     short = [Cells(run.known_as, run.count / 20.0, run.total) for run in runs_of(np.zeros((5, BINS)), 12, noise=1.0)]
     assert fan_offsets(short, CENTRES, STEP_S) is None
 

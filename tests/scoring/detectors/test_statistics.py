@@ -156,7 +156,7 @@ def test_on_white_noise_the_cusum_runs_as_long_as_the_textbook_says() -> None:
     assert average_run_length(autoregressive(8000, 1500, 0.0, 3), 0.5, 5.0) == pytest.approx(465, rel=0.08)
 
 
-def test_a_residual_with_a_memory_makes_textbook_limits_worth_nothing() -> None:
+def test_an_autocorrelated_residual_invalidates_textbook_limits() -> None:
     memory = -1.0 / math.log(0.7)  # in samples: AR(1) of 0.7
     assert average_run_length(autoregressive(3000, 1500, memory, 4, step_s=1.0), 0.5, 5.0) == pytest.approx(35, rel=0.1)
 

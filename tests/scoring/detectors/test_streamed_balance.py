@@ -55,7 +55,7 @@ def test_it_is_the_balance_of_the_twin_once_it_is_settled() -> None:
     np.testing.assert_allclose(balance[SETTLED_ROWS:], whole[SETTLED_ROWS:], rtol=1e-9, atol=1e-9)
 
 
-def test_after_an_unknown_sample_it_begins_anew_as_the_twin_does_and_other_fans_go_on() -> None:
+def test_after_an_unknown_sample_a_fan_starts_again_like_the_twin_and_other_fans_continue() -> None:
     command, speed, known = wandering(400)
     known[150:153, 1] = False
     unknown = np.where(known, speed, np.nan)
@@ -95,7 +95,7 @@ def test_cuts_change_no_bit(
     np.testing.assert_array_equal(streamed(command, speed, known, range(200)), whole)
 
 
-def test_a_drive_that_is_off_says_nothing_and_it_begins_anew_with_it() -> None:
+def test_the_balance_is_unknown_while_a_drive_is_off_and_starts_again_with_it() -> None:
     command, speed, known = wandering(300)
     command[100:150, 0] = 2.0  # less than friction takes
     balance = streamed(command, speed, known)
@@ -131,11 +131,11 @@ def test_another_step_is_taken_as_it_is() -> None:
     np.testing.assert_allclose(after[SETTLED_ROWS:], whole[SETTLED_ROWS:], rtol=1e-9, atol=1e-9)
 
 
-def test_it_says_nothing_below_the_lowest_and_above_the_highest_speed() -> None:
+def test_the_balance_is_unknown_below_the_lowest_and_above_the_highest_speed() -> None:
     command, speed, known = wandering(200)
     speed[100:110], speed[160:165] = 5.0, 5000.0
     balance = TorqueBalance(balance_model(lowest=20.0, highest=1000.0)).update(STEP_S, command, speed, known)
-    assert np.isnan(balance[100 : 110 + SETTLED_ROWS]).all()  # begins anew: what held the rotor must be forgotten
+    assert np.isnan(balance[100 : 110 + SETTLED_ROWS]).all()  # starts again: the filter must forget what held the rotor
     assert np.isfinite(balance[110 + SETTLED_ROWS : 160]).all()
     assert np.isnan(balance[160:165]).all()
     assert np.isfinite(balance[165:]).all()

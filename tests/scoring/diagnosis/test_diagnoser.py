@@ -50,7 +50,7 @@ def fed(samples: int, block: int, from_s: float = 10.0, keep: slice = slice(None
     return diagnoser
 
 
-def test_what_takes_more_at_a_held_speed_is_found_to_do_so() -> None:
+def test_a_fan_that_needs_more_command_at_a_held_speed_is_diagnosed() -> None:
     diagnoser = fed(1300, 100)
     at = int(times(1300)[-1])
     diagnoser.raised(0, at, EPOCH_NS + 10 * S)
@@ -80,7 +80,7 @@ def test_only_the_last_seconds_are_looked_at_whatever_came_before() -> None:
     assert whole.diagnose(0, at) == late.diagnose(0, at)
 
 
-def test_what_is_the_fans_own_is_no_fault() -> None:
+def test_the_known_offset_of_a_fan_is_no_fault() -> None:
     command, speed = loaded(1600, 0.0)
     diagnoser = Diagnoser([balance_of_a_fan()])
     diagnoser.take(times(1600), STEP_NS, command, speed, np.full_like(speed, 20.0))
@@ -118,7 +118,7 @@ def test_without_samples_there_is_no_diagnosis() -> None:
     assert fed(100, 100).diagnose(0, EPOCH_NS + 3600 * S) == ()
 
 
-def test_a_successor_goes_on_with_what_is_to_be_done() -> None:
+def test_a_successor_continues_with_the_pending_diagnoses() -> None:
     diagnoser = fed(1300, 100)
     diagnoser.raised(0, EPOCH_NS + 12 * S, EPOCH_NS + 10 * S)
     successor = Diagnoser([balance_of_a_fan()])
@@ -138,7 +138,7 @@ def test_a_very_fast_grid_costs_no_more_than_a_fast_one() -> None:
     assert diagnoser.diagnose(0, int(fast_ns[-1]))
 
 
-def test_what_is_the_fans_own_is_known_the_better_the_longer_it_was_seen() -> None:
+def test_the_offset_of_a_fan_is_known_more_precisely_after_longer_observation() -> None:
     command, speed = loaded(1600, 0.0, torque=2.0)
     errors = []
     for seconds in (1.0, 100.0):

@@ -200,7 +200,7 @@ def test_samples_that_the_line_lost_are_no_dropout_of_the_sensor() -> None:
     assert of(found, "sensor_dropout").probability == 0.0
 
 
-def test_a_twin_that_is_known_poorly_accuses_nobody() -> None:
+def test_a_poorly_determined_twin_names_no_cause() -> None:
     command = data.moving_command(6)
     readings = data.measured(data.speeds(command), 6)
     wrong = replace(data.HEALTHY, drag=data.HEALTHY.drag * 0.85, viscous=data.HEALTHY.viscous * 1.04)

@@ -163,7 +163,7 @@ def test_a_limit_within_days_is_reported_in_health_and_raises_no_alarm(after_eig
     assert list(live_through(restored(core), 8.5, from_day=8)) == []
 
 
-def test_what_is_far_away_is_not_told() -> None:
+def test_wear_that_is_far_from_its_limit_is_not_reported() -> None:
     slow = core()
     assert list(live_through(slow, 4, growth_per_day=0.04, swing=0.002)) == []
     assert worn(WORN, "balance", slow)["reached_t_ns"] is not None
@@ -220,7 +220,7 @@ def core_after_one_sample() -> ScorerCore:
 
 
 @pytest.mark.parametrize("broken", [{"fans": []}, {"tried": "x"}, {"fans": 3}])
-def test_what_is_no_wear_is_set_aside(broken) -> None:
+def test_an_invalid_wear_snapshot_is_discarded(broken) -> None:
     memory = snapshot_of(core_after_one_sample())
     state = json.loads(memory.state_json)
     state["wear"] |= broken

@@ -1,4 +1,4 @@
-"""Runs on other grids, and what twins make of them."""
+"""Runs on other grids, and the errors of twins on them."""
 
 import numpy as np
 import pytest
@@ -98,7 +98,7 @@ def test_long_gaps_are_left_out_and_short_stretches_too() -> None:
     assert len(on_grid([run, run], "irregular")) == 2
 
 
-def test_what_cannot_be_resampled_is_refused_in_one_line() -> None:
+def test_a_run_that_cannot_be_resampled_is_refused_in_one_line() -> None:
     run = fan_data.published_run(6, 1.0)
     with pytest.raises(TwinError, match="a rate of 0.0 Hz; give a positive number"):
         resampled(run, 0.0)
@@ -156,7 +156,7 @@ def test_a_hybrid_is_as_good_on_every_grid(inputs: tuple[str, ...]) -> None:
     assert errors_in_noise(PhysicalModel(), parameters, run)["own"] > 2.0
 
 
-def test_narx_knows_no_step_and_holds_on_no_other_grid_however_good_it_is_on_its_own() -> None:
+def test_narx_has_no_time_step_and_fails_on_every_grid_but_its_own() -> None:
     parameters = parameters_of(**LINEAR)
     run = simulated(PhysicalModel(), parameters)
     narx = exact_narx_of_the_linear_fan()

@@ -224,7 +224,7 @@ def test_the_card_holds_the_tails_of_the_healthy_residual() -> None:
     assert card.independent_samples[1] == pytest.approx(100_000, rel=0.2)
 
 
-def test_where_nothing_can_be_said_nothing_is() -> None:
+def test_undefined_figures_are_nan() -> None:
     diverged = np.r_[np.zeros(SAMPLES - 1), np.inf]
     never_measured = np.full(SAMPLES, np.nan)
     for residual in (diverged, never_measured, np.ones(SAMPLES)):

@@ -113,7 +113,7 @@ def test_what_a_fan_needs_is_known_better_than_any_one_of_its_coefficients(plant
     assert one_by_one > 4.0 * known
 
 
-def test_friction_makes_good_what_the_physics_are_wrong_by(published) -> None:
+def test_friction_compensates_errors_of_the_physics(published) -> None:
     run, identification = published
     fit = fit_balance([run], [], identification)
     assert fit.sources == ("physics",)

@@ -192,7 +192,7 @@ def test_a_loop_is_noticed_through_missing_speeds_and_gaps() -> None:
     assert all(feedback_share(pieces, fan) > 0.2 for fan in range(2))
 
 
-def test_a_loop_at_one_set_point_is_told_with_what_is_biased_and_what_is_not_told() -> None:
+def test_a_loop_at_one_set_point_is_reported_with_biased_and_indistinguishable_parameters() -> None:
     lines = warnings_of(controlled(np.full((4000, 4), 120.0), seed=5))
     for fan in range(4):
         assert has_line_with(lines, f"fan {fan}: closed loop", "J and lag_s", "controller off")
@@ -247,7 +247,7 @@ def test_each_parameter_is_judged_by_its_own_interval() -> None:
     assert line.startswith("fan 0: J is poorly determined (0.15 ± 0.1)")
 
 
-def test_a_lag_below_the_sampling_step_or_within_its_error_is_not_told() -> None:
+def test_a_lag_below_the_sampling_step_or_within_its_error_is_reported_as_undetermined() -> None:
     run = published_run(1)
     assert judged(run, lag_s=(0.03, 0.002)) == ()
     (line,) = judged(run, lag_s=(0.006, 0.001))
@@ -270,7 +270,7 @@ def test_the_rotor_under_speed_control_is_noticed_in_every_healthy_run(measured_
 
 
 @pytest.mark.data
-def test_motors_driven_in_the_open_are_not_said_to_be_controlled(measured_data) -> None:
+def test_motors_in_open_loop_are_not_reported_as_controlled(measured_data) -> None:
     esc = pd.read_csv(measured_data / "esc_test" / "f40_steps_5-2.csv")
     stamps = pd.to_datetime(esc["Timestamp"], format="%Y-%m-%d %H:%M:%S:%f")
     seconds = (stamps - stamps.iloc[0]).dt.total_seconds()

@@ -67,7 +67,7 @@ def test_tacho_noise_comes_out_as_inertia_times_lambda_times_noise_whatever_the_
     np.testing.assert_allclose(settled.std(axis=0), implied, rtol=0.1)
 
 
-def test_after_an_unknown_speed_the_filter_starts_anew_and_the_other_fan_goes_on() -> None:
+def test_after_an_unknown_speed_the_filter_starts_again_and_the_other_fan_continues() -> None:
     command, speed = wandering(200)
     whole = torque_balance(command, speed, STEP_S, COEFFICIENTS, LAG_S)
     broken = speed.copy()

@@ -56,7 +56,7 @@ def test_a_free_run_solved_at_once_is_the_one_stepped_through(guess: str) -> Non
     np.testing.assert_allclose(final, end, rtol=1e-12)
 
 
-def test_a_runaway_beside_it_does_not_spoil_a_fan() -> None:
+def test_a_diverging_fan_does_not_affect_the_others() -> None:
     parameters = np.array([PARAMETERS[0], [0.15, -3.0, 0.0, 0.0]])
     command, step_s = np.full((150, 2), 60.0), np.full(150, 0.01)
     speed, _ = free_run(right_hand_side(parameters), np.array([5.0, 5.0]), command, step_s)

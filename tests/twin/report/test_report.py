@@ -200,7 +200,7 @@ def test_the_worst_fan_decides_and_is_named(twin):
     assert "A twin of one fan is used for 3: fans differ, and so may their errors." in judged.warnings
 
 
-def test_what_lessens_the_figures_is_told(twin):
+def test_limitations_of_the_figures_are_reported_as_warnings(twin):
     run = published_run(7, 20.0)
     trained_on = DataCard("healthy.mcap", twin.card.training.data[0].sha256, 1, run.samples)
     assert "too optimistic" in assess(report_content(twin, [run], [trained_on], RAD_S)).warnings[0]
@@ -375,7 +375,7 @@ def test_errors_are_gathered_by_speed_and_few_samples_make_no_point():
     assert speed_bins(np.full(5, np.nan), np.zeros(5)) == ()
 
 
-def test_what_cannot_be_done_is_told_in_one_line(folder, tmp_path):
+def test_invalid_input_is_a_one_line_error(folder, tmp_path):
     twin, held_out = folder / "healthy.onnx", folder / "held-out.mcap"
     assert "has fans 0, 1, the runs have 0, 1, 2" in error_of("report", folder / "two.onnx", folder / "three.mcap")
     assert "no such file" in error_of("report", tmp_path / "nowhere.onnx", held_out)
