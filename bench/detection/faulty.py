@@ -1,7 +1,7 @@
 """Simulated faults whose beginning is known: five severities of each kind, in open loop and under a speed loop.
 
-One fault for each fan of each run. Half of the fans are held at a level, half are moved all the time: only there can a
-cause be told from another. Faults begin some minutes after the run, in the half minute after `commissioned_s`, and
+One fault for each fan of each run. Half of the fans are held at a level, half are moved all the time: only there can
+causes be distinguished. Faults begin some minutes after the run begins, in the half minute after `commissioned_s`, and
 stay; wear grows all the while.
 """
 

@@ -1,1 +1,1 @@
-"""Replay: a recording published anew on the bus, or judged anew without one."""
+"""Replay: a recording is published on the bus again, or scored again without a bus."""

@@ -21,7 +21,7 @@ Trainer = Literal["levenberg-marquardt", "adam"]
 
 DEFAULT_ITERATIONS: dict[Trainer, int] = {"levenberg-marquardt": 120, "adam": 400}
 NARX_ITERATIONS = 100
-SILENT_NETWORK = "the network stays silent: free runs with it were no better than those of the physics alone"
+SILENT_NETWORK = "the network is not used: free runs with it were no better than those of the physics alone"
 
 
 @dataclass(frozen=True, eq=False)
