@@ -230,7 +230,7 @@ class TwinCard:
         if len(self.fan_numbers) != self.fans:
             raise ValueError("training.fans must name each fan, or none")
         if not self.command_range[0] < self.command_range[1]:
-            raise ValueError("command_range must rise")
+            raise ValueError("command_range must be in ascending order")
         return self
 
     @property

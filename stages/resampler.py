@@ -46,7 +46,7 @@ class ResamplerConfig(StageConfig):
     @model_validator(mode="after")
     def _check_order(self) -> Self:
         if not self.gap_limit_s <= self.watermark_s <= self.stale_for_s:
-            raise ValueError("gap_limit_s, watermark_s and stale_for_s must rise in this order")
+            raise ValueError("gap_limit_s, watermark_s and stale_for_s must not decrease in this order")
         return self
 
 

@@ -58,7 +58,7 @@ class TrainedTwin:
         try:
             target.write_bytes(export_onnx(self.model, self.card))
         except OSError as error:
-            raise TwinError(f"{target}: cannot be written ({error.strerror}); choose another place") from error
+            raise TwinError(f"{target}: cannot be written ({error.strerror}); choose another path") from error
         return target
 
 

@@ -30,7 +30,7 @@ def fan_numbers(text: str | None) -> list[int] | None:
     try:
         numbers = [int(part) for part in text.split(",")]
         if numbers != sorted(set(numbers)):
-            raise UserError(f"--fans {text}: give each fan once, and in rising order")
+            raise UserError(f"--fans {text}: give each fan once, in ascending order")
         return numbers
     except ValueError as error:
         raise UserError(f"--fans {text}: give fan numbers counted from 0, with commas: --fans 2,5") from error

@@ -114,7 +114,7 @@ def _override(table: dict[str, Any], override: str) -> None:
             here = here[part] if isinstance(part, int) else here.setdefault(part, {})
         here[last] = value
     except (IndexError, TypeError, AttributeError) as error:
-        raise ConfigError(f"--set {override}: the configuration has no such place") from error
+        raise ConfigError(f"--set {override}: the configuration has no such key") from error
 
 
 _Model = TypeVar("_Model", bound=BaseModel)

@@ -88,7 +88,7 @@ class SerialSource:
         if not self._path.exists():
             return [f"{self._path}: no such port; connect the device, or correct [[tray]] port"]
         if not os.access(self._path, os.R_OK | os.W_OK):
-            return [f"{self._path}: may not be read and written by this user; join its group (often dialout)"]
+            return [f"{self._path}: this user may not read and write it; join its group (often dialout)"]
         return []
 
 

@@ -21,7 +21,7 @@ from schemas.topics import alive_key
 _POLL_S = 0.05
 _DISCOVERY_S = 10.0  # by then a process that was there before has been discovered, however busy the machine
 _OTHERS_S = 2.0  # after the first, by then all of them have been
-_ORDERLY = (0, 3)  # exit status of a stage that stopped in order: all well, or something was lost
+_ORDERLY = (0, 3)  # exit status of a stage that stopped in order: without losses, or with losses
 _READY_TIMEOUT_S = 30.0
 _STABLE_S = 10.0  # a stage that ran this long starts again at the shortest delay
 
@@ -49,7 +49,7 @@ class Outcome:
 
     @property
     def exit_code(self) -> int:
-        """0: stopped in order; 3: something was lost; 1: a stage failed at the end, or had to be killed."""
+        """0: stopped in order; 3: data were lost; 1: a stage failed at the end, or had to be killed."""
         if self.killed or self.failed:
             return 1
         return 3 if any(self.lost.values()) else 0
@@ -158,7 +158,7 @@ class Launcher:
             name, problem = label(view.health), view.health.problem
             if view.alive and problem != self._reported.get(name, ""):
                 self._reported[name] = problem
-                self._say(f"{name}: {problem or 'no problem any more'}")
+                self._say(f"{name}: {problem or 'the problem is resolved'}")
         for current in self._watcher.current_alarms():
             alarm = current.newest
             fan = f"{alarm.header.tray} fan {alarm.fan}"

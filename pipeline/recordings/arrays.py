@@ -53,7 +53,7 @@ class Block:
         """
         enum = block_columns(BY_NAME[self.topic].message)[column].enum
         if enum is None:
-            raise ValueError(f"{self.topic}.{column} is no enum")
+            raise ValueError(f"{self.topic}.{column} is not an enum")
         return enum_names(enum)[self.columns[column]]
 
     @property

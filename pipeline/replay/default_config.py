@@ -45,7 +45,7 @@ def first_raw(paths: Sequence[Path], metadata: RecordingMetadata) -> dict[str, l
         if trays and all(samples.get(name, 0) >= _SAMPLED for name in trays):
             break
     if not found:
-        raise RecordingError(f"{paths[0]}: no raw samples in this recording: there is nothing to judge")
+        raise RecordingError(f"{paths[0]}: no raw samples in this recording: there is nothing to score")
     return {tray: found[tray] for tray in sorted(found)}
 
 

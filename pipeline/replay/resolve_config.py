@@ -59,7 +59,7 @@ def _recorded_overrides(file: Path, metadata: RecordingMetadata) -> list[str]:
     try:
         return [str(override) for override in json.loads(metadata.metadata.get("overrides", "[]"))]
     except (ValueError, TypeError) as error:
-        raise RecordingError(f"{file}: its metadata are damaged: overrides are no list") from error
+        raise RecordingError(f"{file}: its metadata are damaged: overrides are not a list") from error
 
 
 def trays_of(files: Iterable[Path]) -> set[str]:

@@ -83,11 +83,11 @@ def _check_graph(path: Path, session: Any, card: TwinCard) -> None:
     if set(inputs) != set(GRAPH_INPUTS) or not set(GRAPH_OUTPUTS) <= set(outputs):
         raise StageError(
             f"{path}: not a twin's graph: it has inputs {', '.join(inputs)} and outputs {', '.join(outputs)}; "
-            f"needed are {', '.join(GRAPH_INPUTS)} and {', '.join(GRAPH_OUTPUTS)}"
+            f"expected {', '.join(GRAPH_INPUTS)} and {', '.join(GRAPH_OUTPUTS)}"
         )
     for name, node in (inputs | {name: outputs[name] for name in GRAPH_OUTPUTS}).items():
         if node.type != "tensor(double)":
-            raise StageError(f"{path}: {name} is {node.type}, needed is tensor(double); export it again")
+            raise StageError(f"{path}: {name} is {node.type}, expected tensor(double); export it again")
     for name, width in (("state", card.n_state), ("parameters", len(card.parameter_names))):
         shape = inputs[name].shape
         if len(shape) != 2 or (isinstance(shape[1], int) and shape[1] != width):
@@ -107,7 +107,7 @@ def _check_run(path: Path, twin: TwinFile) -> None:
     if speed_rad_s.shape != command.shape or state_out.shape != state.shape:
         raise StageError(
             f"{path}: the twin gives speeds {speed_rad_s.shape} and state {state_out.shape}, "
-            f"needed are {command.shape} and {state.shape}; export it again"
+            f"expected {command.shape} and {state.shape}; export it again"
         )
 
 

@@ -18,7 +18,7 @@ class FanOffsets(BaseModel):
     @model_validator(mode="after")
     def _consistent(self) -> FanOffsets:
         if list(self.speeds_rad_s) != sorted(set(self.speeds_rad_s)):
-            raise ValueError("speeds_rad_s must rise")
+            raise ValueError("speeds_rad_s must be in strictly ascending order")
         if any(len(row) != len(self.speeds_rad_s) for row in self.offset_sigmas):
             raise ValueError("offset_sigmas must have one value for each of speeds_rad_s")
         return self
@@ -70,7 +70,7 @@ class HealthyResidual(BaseModel):
         if len(self.persistent_std) not in (1, knots):
             raise ValueError("persistent_std must have one value, or one for each of speeds_rad_s")
         if list(self.speeds_rad_s) != sorted(set(self.speeds_rad_s)):
-            raise ValueError("speeds_rad_s must rise")
+            raise ValueError("speeds_rad_s must be in strictly ascending order")
         if min(*self.residual_std, *self.persistent_std) <= 0:
             raise ValueError("residual_std and persistent_std must be above zero")
         return self

@@ -351,7 +351,7 @@ def test_samples_of_another_number_of_fans_are_counted_and_reported() -> None:
 
 
 def test_limits_in_the_wrong_order_are_refused() -> None:
-    with pytest.raises(ValidationError, match="must rise"):
+    with pytest.raises(ValidationError, match="must not decrease"):
         ResamplerConfig(gap_limit_s=1.0, watermark_s=0.5)
 
 

@@ -2,9 +2,9 @@
 
 A real site watches a simulated tray of two fans for some ten seconds; one inlet is covered and uncovered, its alarm is
 acknowledged, that of the other fan is shelved, and the twin integrator and the scorer are killed on the way, so that
-the scorer continues from its snapshot. The twin is a physical one, which needs no function whose last bit depends on the
-machine, and its alarms are calibrated. Make it again only when what the stages decide is meant to change, and say why
-in the commit.
+the scorer continues from its snapshot. The twin is a physical one, which needs no function whose last bit depends on
+the machine, and its alarms are calibrated. Make it again only when what the stages decide is meant to change, and say
+why in the commit.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ def evaluation_pieces(runs: Sequence[Run]) -> list[Run]:
     common_fans(runs)
     pieces = [piece for run in runs for piece in run.split_at_gaps()]
     if not pieces:
-        raise TwinError("the runs hold nothing but gaps; give runs with two samples in a row or more")
+        raise TwinError("the runs contain only gaps; give runs with at least two successive samples")
     return pieces
 
 

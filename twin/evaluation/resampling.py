@@ -73,7 +73,7 @@ def on_grid(runs: Sequence[Run], grid: Grid, seed: int = 0) -> list[Run]:
         made = [resampled(piece, grid) for piece in pieces if piece.duration_s * grid >= 1.0]
     if not made:
         said = "at irregular steps" if grid == "irregular" else f"at {grid:g} Hz"
-        raise TwinError(f"no run is long enough to be judged {said}; give longer ones")
+        raise TwinError(f"no run is long enough to be evaluated {said}; give longer ones")
     return made
 
 

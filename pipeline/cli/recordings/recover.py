@@ -30,7 +30,7 @@ def recover(
     """Repair a truncated or damaged recording, and list what it contains and what is missing.
 
     Without -o the repaired recording takes the name of FILE, which is kept as FILE.original. Exit code 0: nothing was
-    lost; 3: something was lost, or may be; 1: nothing could be recovered.
+    lost; 3: data were lost, or may have been; 1: nothing could be recovered.
 
     Example: fantwin recover runs/recording.mcap.active
     """

@@ -1,4 +1,4 @@
-"""`fantwin replay`: play a recording on the bus, or judge it again offline."""
+"""`fantwin replay`: play a recording on the bus, or score it again offline."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ LONGEST_S = 1e10
 """three centuries, which still fits in ns"""
 _Show: TypeAlias = Callable[[Progress], None]
 _VIEWING = "Viewing"
-_DECIDING = "Judging again, without a bus"
+_DECIDING = "Scoring again, without a bus"
 
 
 def replay(
@@ -69,7 +69,7 @@ def replay(
         typer.Option(
             "--from",
             metavar="TOPIC",
-            help="Publish only what the stages that read TOPIC need (raw, grid or prediction); they judge again.",
+            help="Publish only the input of the stages that read TOPIC (raw, grid or prediction).",
             rich_help_panel=_VIEWING,
         ),
     ] = None,
@@ -88,7 +88,7 @@ def replay(
         bool, typer.Option("--offline", help="Run the stages in this process.", rich_help_panel=_DECIDING)
     ] = False,
     twin: Annotated[
-        Path | None, typer.Option(metavar="TWIN.onnx", help="Judge with another twin.", rich_help_panel=_DECIDING)
+        Path | None, typer.Option(metavar="TWIN.onnx", help="Score with another twin.", rich_help_panel=_DECIDING)
     ] = None,
     output: Annotated[
         Path | None,
@@ -99,7 +99,7 @@ def replay(
         typer.Option("--verify", help="Compare with the recorded result, bit for bit.", rich_help_panel=_DECIDING),
     ] = False,
 ) -> None:
-    """Publish a recording on the bus in recorded time, for the viewer or the stages; or judge it again offline.
+    """Publish a recording on the bus in recorded time, for the viewer or the stages; or score it again offline.
 
     In a terminal: space pauses, right arrow or s steps to the next sample, up and down double and halve the rate, q
     quits. Topics that a running stage writes are not published. Exit code 3 if a stage lost messages or part of the
@@ -153,7 +153,7 @@ def replay(
     for line in outcome.damage:
         console.print(line, markup=False, soft_wrap=True)
     for name in outcome.behind:
-        console.print(f"{name} has not received everything: see `fantwin status`", markup=False, soft_wrap=True)
+        console.print(f"{name} has not received all messages: see `fantwin status`", markup=False, soft_wrap=True)
     if json_output:
         typer.echo(json.dumps({"files": [str(file) for file in playback.files], **asdict(outcome)}))
     else:

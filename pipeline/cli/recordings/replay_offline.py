@@ -1,4 +1,4 @@
-"""`fantwin replay --offline`: judge a recording again, compare, and print the result."""
+"""`fantwin replay --offline`: score a recording again, compare, and print the result."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def run_offline(
     end_s: float,
     json_output: bool,
 ) -> None:
-    """Judge, print, and exit with 0: success, 1: failed, 3: something was lost. With `verify`: 0 equal, 1 different,
+    """Score, print, and exit with 0: success, 1: failed, 3: data were lost. With `verify`: 0 equal, 1 different,
     2 not comparable.
 
     Raises:
@@ -85,7 +85,7 @@ def _judged(replay_input: ReplayInput, output: Path | None, verify: bool) -> lis
 
         def progress(tray: str, t_ns: int) -> None:
             since_s = (t_ns - first.setdefault(tray, t_ns)) / NS_PER_S
-            shown.update(task, description=f"judging {tray}: {since_s:.0f} s of it")
+            shown.update(task, description=f"scoring {tray}: {since_s:.0f} s so far")
 
         return judge(replay_input, output, verify, progress)
 
@@ -144,7 +144,7 @@ def _print_result(trays: Sequence[JudgedTray], result: dict[str, Any], output: P
     )
     for tray in trays:
         if tray.problem:
-            console.print(f"[bold yellow]not judged:[/bold yellow] {escape(tray.problem)}")
+            console.print(f"[bold yellow]not scored:[/bold yellow] {escape(tray.problem)}")
     if result["restarts"]:
         console.print(f"{result['restarts']} restarts of stages, replayed as recorded")
     for damage in result["damage"]:

@@ -53,7 +53,7 @@ def calibrate(
         bool,
         typer.Option(
             "--extrapolate",
-            help="Set limits beyond what so little data can show; the declared rate is then a target only.",
+            help="Set limits by extrapolation if there are too few data for the rate, which is then only a target.",
         ),
     ] = False,
     output: Annotated[
@@ -63,7 +63,7 @@ def calibrate(
     seed: Annotated[int, typer.Option(help="Seed of the bootstrap.")] = 0,
     json_output: JsonOption = False,
 ) -> None:
-    """Set the alarm limits of a twin by healthy recordings, and write them into its card.
+    """Set the alarm limits of a twin from healthy recordings, and write them into its card.
 
     Every recording is scored as a live fan is, from its own start. Limits are set where false alarms are as frequent as
     declared. A rate that the data cannot support is refused, with the amount that it needs. Alarms of a twin without
@@ -229,8 +229,8 @@ def _print(output: Path, limits: Limits) -> None:
     console.print(table)
     declared = _rate(rate.false_alarms_per_day)
     if rate.extrapolated:
-        console.print(f"[yellow]target: {declared}; so little data cannot show whether these limits keep it[/yellow]")
+        console.print(f"[yellow]target: {declared}; the data are too few to show whether these limits keep it[/yellow]")
     else:
         low, high = rate.interval_95
-        console.print(f"declared: {declared} (95 % by these data: {low:.3g} to {high:.3g})")
+        console.print(f"declared: {declared} (95 % interval from these data: {low:.3g} to {high:.3g})")
     console.print("test it on other healthy recordings: fantwin calibrate TWIN.onnx --verify OTHER.mcap")

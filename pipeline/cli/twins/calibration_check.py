@@ -58,7 +58,7 @@ class Check:
         if self.is_broken:
             return f"{found}: not kept"
         if self.expected < 1.0:
-            return f"{found}: kept, as far as so little running can show ({self.expected:.2g} alarms were expected)"
+            return f"{found}: kept, as far as so few data can show ({self.expected:.2g} alarms were expected)"
         return f"{found}: kept"
 
     def as_json(self) -> dict[str, Any]:

@@ -96,7 +96,7 @@ def alarms(
             _list(bus, settings, stop, show_all=show_all, watch=watch, json_output=json_output)
         return
     if show_all or watch:
-        raise UserError(f"--all and --watch belong to the list: leave them out with {asked}")
+        raise UserError(f"--all and --watch apply to the list only: leave them out with {asked}")
     number, name = _named(settings, asked, tray, fan)
     request = Request(
         t_ns=time.time_ns(),
@@ -180,7 +180,7 @@ def _seconds(asked: OperatorAction, duration: str | None) -> float:
     if duration is None:
         return 0.0
     if asked is not OperatorAction.SHELVE:
-        raise UserError(f"--for belongs to shelve, not to {asked}")
+        raise UserError(f"--for can be used with shelve only, not with {asked}")
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", duration)
     if not match or float(match[1]) == 0:
         raise UserError(f"--for {duration}: give a time such as 90s, 30m, 8h or 2d")

@@ -50,7 +50,7 @@ def demo(
 ) -> None:
     """Run a simulated tray of eight fans through the whole pipeline; cover one inlet, disturb one rotor.
 
-    Exit code 1 if a fault was missed, a healthy fan raised an alarm, or anything was lost.
+    Exit code 1 if a fault was missed, a healthy fan raised an alarm, or data were lost.
 
     Example: fantwin demo -o runs/demo
     """

@@ -18,7 +18,7 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
     """Start all stages, restart those that die, stop all in order on Ctrl-C.
 
     Exit codes: 0 stopped in order, nothing lost; 1 could not start, or a stage failed or was killed at the end;
-    3 something was lost.
+    3 data were lost.
 
     Example: fantwin up -c fantwin.toml
     """

@@ -45,7 +45,7 @@ class Outcome:
 
     @property
     def exit_code(self) -> int:
-        """0: success; 3: something was lost, or could not be read."""
+        """0: success; 3: data were lost, or could not be read."""
         return 3 if self.lost or self.behind or self.damage else 0
 
 

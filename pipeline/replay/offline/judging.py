@@ -61,7 +61,7 @@ class JudgedTray:
         if not self.not_judged:
             return f"{self.tray}: no sample lies between --start and --end"
         reasons = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in self.not_judged.most_common(3))
-        return f"{self.tray}: no sample could be judged (of fans: {reasons}): does the twin fit this recording?"
+        return f"{self.tray}: no sample could be scored (of fans: {reasons}): does the twin fit this recording?"
 
     @property
     def lost(self) -> int:
@@ -139,7 +139,7 @@ def _refuse_meaningless(where: str, found: Comparison, judged: JudgedTray) -> No
     if found.is_equal:
         return
     if judged.raw_missing:
-        raise CannotCompareError(f"{where}: the recording lacks {judged.raw_missing} raw messages that were judged")
+        raise CannotCompareError(f"{where}: the recording lacks {judged.raw_missing} raw messages that were scored")
     if any(session.is_guessed for session in judged.plan.first):
         raise CannotCompareError(
             f"{where}: some raw messages never reached the first stage, and the recording does not say which"

@@ -164,10 +164,12 @@ def _refuse_another_run(first: Path, metadata: RecordingMetadata, path: Path) ->
     other = read_metadata(path)
     for what, key in (("site", "site"), ("keys set on the command line", "overrides")):
         if metadata.metadata.get(key) != other.metadata.get(key):
-            raise RecordingError(f"{first} and {path} are of two runs: they differ in {what}; judge them one by one")
+            raise RecordingError(
+                f"{first} and {path} belong to two runs: they differ in {what}; replay them one by one"
+            )
     if dict(metadata.attachments) != dict(other.attachments):
         raise RecordingError(
-            f"{first} and {path} are of two runs: they differ in configuration or twin; judge them one by one"
+            f"{first} and {path} belong to two runs: they differ in configuration or twin; replay them one by one"
         )
 
 
@@ -203,4 +205,4 @@ def _started_t_ns(path: Path, metadata: RecordingMetadata, first: Mapping[str, S
     try:
         return int(started)
     except ValueError as error:
-        raise RecordingError(f"{path}: its metadata are damaged: started_t_ns is no number") from error
+        raise RecordingError(f"{path}: its metadata are damaged: started_t_ns is not a number") from error

@@ -67,7 +67,7 @@ def refuse_unverifiable(where: str, plan: TrayPlan | None, *, is_part: bool) -> 
     if is_part:
         raise CannotCompareError(f"{where}: a part of a run cannot be compared: leave out --start and --end")
     if plan is None:
-        raise CannotCompareError(f"{where}: no scores that say what they were made of: nothing to compare with")
+        raise CannotCompareError(f"{where}: the scores have no input positions: nothing to compare with")
     sessions = [session for sessions in plan.sessions.values() for session in sessions]
     began_before = sorted(session.producer for session in sessions if not session.can_be_repeated)
     if began_before:

@@ -263,8 +263,8 @@ def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, m
         ("ack tray1 8", "fan 8: tray tray1 has fans 0 to 7"),
         ("shelve tray1 3 --for 3", "--for 3: give a time such as 90s, 30m, 8h or 2d"),
         ("shelve tray1 3 --for 0m", "--for 0m: give a time such as 90s, 30m, 8h or 2d"),
-        ("ack tray1 3 --for 3m", "--for belongs to shelve, not to ack"),
-        ("ack tray1 3 --watch", "--all and --watch belong to the list: leave them out with ack"),
+        ("ack tray1 3 --for 3m", "--for can be used with shelve only, not with ack"),
+        ("ack tray1 3 --watch", "--all and --watch apply to the list only: leave them out with ack"),
         ("--operator Ann", "--for, --comment and --operator need an action"),
     ],
 )

@@ -137,7 +137,7 @@ def test_extrapolated_limits_declare_a_target_only(folder: Path) -> None:
         "-o", output,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    assert "so little data cannot show whether these limits keep it" in result.stdout
+    assert "the data are too few to show whether these limits keep it" in result.stdout
     rate = Limits.model_validate(load_tray_twin(output).card.calibration).declared_rate
     assert rate
     assert rate.extrapolated

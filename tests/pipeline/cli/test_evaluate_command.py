@@ -271,4 +271,4 @@ def test_an_invalid_rate_is_a_one_line_error(recorded: tuple[Path, Path], rate: 
 
 
 def test_a_rate_too_low_for_the_recording_is_a_one_line_error(recorded: tuple[Path, Path]) -> None:
-    assert "no run is long enough to be judged at 0.01 Hz" in error_of("evaluate", *recorded, "--rate", "0.01")
+    assert "no run is long enough to be evaluated at 0.01 Hz" in error_of("evaluate", *recorded, "--rate", "0.01")

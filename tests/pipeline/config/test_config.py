@@ -103,8 +103,8 @@ def test_overrides_set_nested_keys_and_keep_their_types():
     ("override", "words"),
     [
         ("on_delay", "KEY=VALUE"),
-        ("tray.4.port=x", "no such place"),
-        ("tray.².port=x", "no such place"),
+        ("tray.4.port=x", "no such key"),
+        ("tray.².port=x", "no such key"),
         ("run_folder='/tmp/it's here'", "not a TOML string"),
     ],
 )

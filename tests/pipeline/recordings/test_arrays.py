@@ -113,7 +113,7 @@ def test_the_columns_are_those_of_the_messages(tmp_path):
     assert block["invalid_reason"][120, 1] == InvalidReason.GAP
     assert block.names("invalid_reason")[120].tolist() == ["NONE", "GAP", "NONE"]
     assert set(block.names("statistic").ravel()) <= {statistic.name for statistic in Statistic}
-    with pytest.raises(ValueError, match=r"score\.command is no enum"):
+    with pytest.raises(ValueError, match=r"score\.command is not an enum"):
         block.names("command")
     assert np.isnan(block["measured_speed_rad_s"][120, 1])
 

@@ -228,7 +228,7 @@ def _of_the_right_names(path: Path, dtype: int, nodes: list[onnx.NodeProto], car
 @pytest.mark.parametrize(
     ("dtype", "second", "named"),
     [
-        (TensorProto.FLOAT, ("Identity", ["state"]), "state is tensor(float), needed is tensor(double)"),
+        (TensorProto.FLOAT, ("Identity", ["state"]), "state is tensor(float), expected tensor(double)"),
         (TensorProto.DOUBLE, ("MatMul", ["state", "parameters"]), "the twin does not run"),
         (TensorProto.DOUBLE, ("MatMul", ["state", "command"]), "the twin gives speeds"),
     ],

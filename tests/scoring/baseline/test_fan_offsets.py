@@ -68,5 +68,5 @@ def test_runs_too_short_at_every_speed_give_no_offsets() -> None:
 def test_a_table_with_a_hole_is_refused() -> None:
     with pytest.raises(ValueError, match="one value for each"):
         FanOffsets(speeds_rad_s=(1.0, 2.0), offset_sigmas=((0.0, 0.0), (0.0,)))
-    with pytest.raises(ValueError, match="must rise"):
+    with pytest.raises(ValueError, match="ascending order"):
         FanOffsets(speeds_rad_s=(2.0, 1.0), offset_sigmas=((0.0, 0.0),))

@@ -104,9 +104,9 @@ def test_a_run_that_cannot_be_resampled_is_refused_in_one_line() -> None:
         resampled(run, 0.0)
     with pytest.raises(TwinError, match="0.99 s are shorter than one step at 1 Hz"):
         resampled(run, 1.0)
-    with pytest.raises(TwinError, match="no run is long enough to be judged at 0.5 Hz"):
+    with pytest.raises(TwinError, match="no run is long enough to be evaluated at 0.5 Hz"):
         on_grid([run], 0.5)
-    with pytest.raises(TwinError, match="no run is long enough to be judged at irregular steps"):
+    with pytest.raises(TwinError, match="no run is long enough to be evaluated at irregular steps"):
         on_grid([run.rows(0, 3)], "irregular")
 
 
