@@ -66,14 +66,14 @@ def test_an_event_is_found_by_an_alarm_that_is_raised_in_it_and_by_no_other() ->
     assert (found.delay_s, found.cause) == (1.0, "drag_up")
 
 
-def test_what_no_event_explains_is_a_false_alarm() -> None:
+def test_an_alarm_that_no_event_explains_is_a_false_alarm() -> None:
     event = Event("run", 2, 10 * S, 20 * S, "inlet")
     within, recovering = RaisedAlarm("run", 2, 15 * S), RaisedAlarm("run", 2, 23 * S)
     false = [RaisedAlarm("run", 2, 9 * S), RaisedAlarm("run", 2, 26 * S), RaisedAlarm("run", 1, 15 * S)]
     assert false_alarms([within, recovering, *false], [event]) == false
 
 
-def test_the_confusion_matrix_counts_what_was_found_and_what_was_not_told() -> None:
+def test_the_confusion_matrix_counts_named_causes_and_alarms_without_one() -> None:
     made = [Event("run", fan, 0, 10 * S, "inlet", "drag_up") for fan in range(4)]
     alarms = [
         RaisedAlarm("run", 0, S, causes=("drag_up", "gain_down")),
@@ -235,7 +235,7 @@ def _tray() -> FanParameters:
 
 
 @pytest.mark.parametrize("kind", ["inlet", "blade", "rotor", "supply", "tacho-scaling"])
-def test_a_fault_in_open_loop_moves_the_speed_by_what_was_wanted(kind: str) -> None:
+def test_a_fault_in_open_loop_moves_the_speed_by_the_requested_amount(kind: str) -> None:
     fans, nothing = _tray(), np.zeros(TRAY_FANS)
     healthy = severities.held_speed_rad_s(severities.given_v(np.full(TRAY_FANS, 0.6), fans), fans)
     size = severities.size(kind, healthy, fans, np.full(TRAY_FANS, 20.0), nothing)
@@ -246,7 +246,7 @@ def test_a_fault_in_open_loop_moves_the_speed_by_what_was_wanted(kind: str) -> N
 
 
 @pytest.mark.parametrize("kind", ["inlet", "blade", "rotor", "supply", "tacho-scaling"])
-def test_a_fault_under_the_loop_moves_the_command_by_what_was_wanted(kind: str) -> None:
+def test_a_fault_in_closed_loop_moves_the_command_by_the_requested_amount(kind: str) -> None:
     fans, nothing = _tray(), np.zeros(TRAY_FANS)
     speed = np.full(TRAY_FANS, 450.0)
     size = severities.size(kind, speed, fans, nothing, np.full(TRAY_FANS, 0.04))

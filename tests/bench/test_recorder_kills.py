@@ -17,7 +17,7 @@ def outcome(folder, endpoint, history: int) -> Outcome:
         kills.close()
 
 
-def test_nothing_is_lost_that_the_bus_still_holds(tmp_path, endpoint):
+def test_messages_that_the_bus_still_holds_are_not_lost(tmp_path, endpoint):
     found = outcome(tmp_path, endpoint, history=1024)
     assert found.unreadable == []
     assert found.recorded > 1000

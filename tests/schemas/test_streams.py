@@ -27,7 +27,7 @@ def test_a_message_that_comes_again_counts_as_duplicated_only():
     assert (state.received, state.missing, state.duplicated) == (2, 0, 1)
 
 
-def test_skipping_counts_what_never_came_once_it_is_known_to_be_published():
+def test_skipping_counts_published_messages_that_never_came():
     state = StreamState()
     assert state.skip_to(3) == 0, "nothing was known of the stream: this is history"
     assert state.skip_to(5) == 2

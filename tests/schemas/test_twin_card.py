@@ -32,7 +32,7 @@ def test_a_card_survives_its_own_json() -> None:
     ("kind", "fixed_rate", "used"),
     [("hybrid", False, 4), ("physical", False, 4), ("neural-ode", False, 1), ("narx", True, 0)],
 )
-def test_what_early_cards_do_not_say_follows_from_their_kind(kind: str, fixed_rate: bool, used: int) -> None:
+def test_fields_missing_from_early_cards_follow_from_their_kind(kind: str, fixed_rate: bool, used: int) -> None:
     early = asdict(made_up_card(PhysicalModel(), 1)) | {"kind": kind}
     del early["fixed_rate"], early["used_parameters"]
     card = TwinCard.from_json(json.dumps(early))
@@ -52,7 +52,7 @@ def test_fields_of_a_later_card_are_ignored_and_its_kind_needs_not_be_known() ->
     assert TwinCard.from_json(json.dumps(later)).kind == "of tomorrow"
 
 
-def test_a_card_of_an_unknown_kind_must_say_itself_what_an_early_kind_implies() -> None:
+def test_a_card_of_an_unknown_kind_must_state_the_fields_that_an_early_kind_implies() -> None:
     later = asdict(made_up_card(PhysicalModel(), 1)) | {"kind": "of tomorrow"}
     del later["fixed_rate"]
     with pytest.raises(CardError, match="fixed_rate"):

@@ -230,7 +230,7 @@ def test_the_checksum_finds_every_flipped_bit(position: int) -> None:
         (b"S 1 2 0.5 1e60 1 0\n", Sample(1, 2, (0.5, 1.0), (math.inf, 0.0))),
     ],
 )
-def test_text_takes_what_sketches_print(line: bytes, expected: Sample) -> None:
+def test_text_lines_as_printed_by_arduino_sketches_are_read(line: bytes, expected: Sample) -> None:
     (found,) = joined("text").feed(line)
     assert same(found, expected)
 

@@ -24,14 +24,14 @@ STEP_S = 0.01
 
 
 @pytest.mark.parametrize("memory_s", [0.0, 0.05, 0.5])
-def test_the_deviation_of_a_smoothed_residual_is_what_it_is_on_simulated_ones(memory_s: float) -> None:
+def test_the_deviation_of_a_smoothed_residual_agrees_with_simulation(memory_s: float) -> None:
     residual = autoregressive(20_000, 50, memory_s, 1)
     smoothed = LowPass(50, 0.2).update(residual, np.ones(residual.shape, np.bool_), STEP_S)[500:]
     assert smoothed.std() == pytest.approx(smoothed_deviation(0.2, memory_s, STEP_S), rel=0.03)
 
 
 @pytest.mark.parametrize("memory_s", [0.0, 0.05, 0.5])
-def test_the_deviation_of_a_long_sum_is_what_it_is_on_simulated_ones(memory_s: float) -> None:
+def test_the_deviation_of_a_long_sum_agrees_with_simulation(memory_s: float) -> None:
     sums = autoregressive(10_000, 400, memory_s, 2).sum(axis=0) * STEP_S
     assert sums.std() == pytest.approx(summed_deviation(memory_s, STEP_S) * math.sqrt(100.0), rel=0.1)
 

@@ -27,8 +27,8 @@ WHAT_HAPPENS = (
 ByTime: TypeAlias = Callable[[ResamplerCore], list[Grid]]
 
 
-class Line:
-    """Makes one raw message a sample, and what the host's time does in between, of a line to which much happens."""
+class ScriptedLink:
+    """A link with many disturbances: raw messages of one sample each, and ticks of the host clock in between."""
 
     def __init__(self, seed: int, clock_us: int | None) -> None:
         self._rng = np.random.default_rng(seed)
@@ -40,7 +40,7 @@ class Line:
         self._device_sequence = 0
 
     def items(self, what: str, count: int) -> list[Raw | ByTime]:
-        """Messages, and what the host's time does to the core between them."""
+        """Messages, and calls of the core by the time of the host between them."""
         items: list[Raw | ByTime] = []
         if what == "silence":
             items += [self._sample(self._rng.uniform(0.6, 8.0))]
@@ -138,7 +138,7 @@ def test_blocks_of_any_size_give_the_same_grid_to_the_bit(
     clock_us: int | None,
     rate_hz: float,
 ) -> None:
-    line = Line(seed, clock_us)
+    line = ScriptedLink(seed, clock_us)
     items = [item for what, count in happenings for item in line.items(what, count)]
     single = driven(items, rate_hz=rate_hz)
     assert driven(in_blocks(items, sizes), rate_hz=rate_hz, block_size=out_block) == single

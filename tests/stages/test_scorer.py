@@ -84,7 +84,7 @@ def test_an_alarm_is_raised_exactly_at_the_end_of_the_on_delay() -> None:
     assert (alarm.acknowledged, alarm.confirmed) == (False, True)
 
 
-def test_from_one_and_a_half_limits_on_a_warning_is_an_alarm() -> None:
+def test_a_warning_becomes_an_alarm_at_one_and_a_half_limits() -> None:
     _, alarms = feed(unsmoothed(), [prediction_of(np.array([9.0] * 8 + [12.1] * 2))])
     reported = [(a.transition, a.severity) for a in alarms]
     assert reported == [(Transition.RAISED, Severity.WARNING), (Transition.SEVERITY, Severity.ALARM)]
@@ -327,8 +327,8 @@ def test_a_calibration_that_cannot_be_used_is_reported_in_one_line(tmp_path: Pat
 
 @pytest.mark.parametrize("fans", [1, 3])
 def test_a_calibration_of_another_number_of_fans_is_reported_in_one_line(tmp_path: Path, fans: int) -> None:
-    own = {"speeds_rad_s": [100.0], "offset_sigmas": [[0.5]] * fans}
-    context = context_of(tmp_path, calibration=CALIBRATION | {"speed": {"fan_offsets": own}})
+    fan_offsets = {"speeds_rad_s": [100.0], "offset_sigmas": [[0.5]] * fans}
+    context = context_of(tmp_path, calibration=CALIBRATION | {"speed": {"fan_offsets": fan_offsets}})
     (problem,) = STAGE.check(context)
     assert f"its calibration is of {fans} fans, the tray has 2; calibrate it again" in problem
     with pytest.raises(StageError, match="calibrate it again"):

@@ -331,13 +331,13 @@ def test_a_snapshot_of_later_times_is_discarded_unless_producers_repeat_samples(
 
 def test_alarms_of_a_discarded_snapshot_are_no_longer_current() -> None:
     successor = core_of(3)
-    restated = successor.restore(snapshot_of(raised()))
-    assert [is_listed(each.newest) for each in standing_of(restated)] == [True, True]
+    republished = successor.restore(snapshot_of(raised()))
+    assert [is_listed(each.newest) for each in standing_of(republished)] == [True, True]
     later = successor.step(prediction_of(np.zeros((20, 3)), first=-HOUR, producer="integrator-2"))
     emitted = [message for message in later if isinstance(message, Alarm)]
     assert [alarm.transition for alarm in emitted] == [Transition.REPUBLISHED] * 2
-    assert [is_listed(each.newest) for each in standing_of([*restated, *later])] == [False, False]
-    assert [is_listed(each.newest) for each in standing_of(later)] == [False, False], "nothing was restated"
+    assert [is_listed(each.newest) for each in standing_of([*republished, *later])] == [False, False]
+    assert [is_listed(each.newest) for each in standing_of(later)] == [False, False], "nothing was republished"
 
 
 def test_only_the_first_prediction_can_discard_a_snapshot() -> None:

@@ -377,7 +377,7 @@ def test_the_card_is_published_once() -> None:
     assert [type(m) for m in replayed] == [ModelCard, Prediction]
 
 
-def test_what_was_measured_goes_through_untouched() -> None:
+def test_measured_speeds_are_passed_on_unchanged() -> None:
     speed = np.random.default_rng(0).normal(size=(20, 1))
     prediction = feed(core_of(), [grid_of(stairs(20), speed)])
     np.testing.assert_array_equal(prediction.measured_speed_rad_s, speed)

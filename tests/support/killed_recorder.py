@@ -139,8 +139,8 @@ class Kills:
             found = scan(active)
             ledger = found.counts.ledger
             due = {key: ledger.next[key, producer] for key, producer in ledger.counts if producer == PRODUCER}
-            own = found.counts.healths.get(health_key(SITE, "recorder", "all"))
-            has_caught_up = own is not None and own.status == StageStatus.OK
+            recorder_health = found.counts.healths.get(health_key(SITE, "recorder", "all"))
+            has_caught_up = recorder_health is not None and recorder_health.status == StageStatus.OK
             if has_caught_up and found.index.first_ns is not None:
                 self._killed.append(_Killed(found.index.first_ns, at_ns, due, found.index.last_ns))
 

@@ -75,12 +75,12 @@ def main(endpoint: str, trays: int, fans: int, history: int, file: Path) -> None
                 key = tray_key(SITE, tray, name)
                 publishers[tray, name] = bus.publisher(key, topic, type_name(topic.message), PRODUCER)
                 sent_ns[key] = []
-        own = bus.publisher(health_key(SITE, STAGE, "all"), BY_NAME["health"], type_name(Health), PRODUCER)
+        health_publisher = bus.publisher(health_key(SITE, STAGE, "all"), BY_NAME["health"], type_name(Health), PRODUCER)
         bus.declare_alive(alive_key(SITE, STAGE, "all"))
 
         def put_health(status: StageStatus) -> None:
             health = Health(
-                header=Header(PRODUCER, own.published, ""),
+                header=Header(PRODUCER, health_publisher.published, ""),
                 stage=STAGE,
                 instance="all",
                 status=status,
@@ -90,7 +90,7 @@ def main(endpoint: str, trays: int, fans: int, history: int, file: Path) -> None
                     Output(key=publisher.key, published=publisher.published) for publisher in publishers.values()
                 ),
             )
-            own.put(encode(health))
+            health_publisher.put(encode(health))
 
         print("feeding", flush=True)
         began_s, number = time.monotonic(), 0

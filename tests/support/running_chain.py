@@ -56,7 +56,7 @@ def is_running(process_id: int) -> bool:
         return False
 
 
-class Running:
+class RunningCommand:
     """A `fantwin` command in a process of its own, and the lines it writes to standard error."""
 
     def __init__(self, words: Iterable[object], stdout: int = subprocess.PIPE) -> None:
@@ -131,15 +131,15 @@ class Chain:
             *("viewer.serve=false", f"launcher.stages={json.dumps(stages)}", *settings),
         ]
         self.stages = [f"acquisition/{TRAY}", *stages[1:]]
-        self.tray: Running | None = None
-        self.up: Running | None = None
+        self.tray: RunningCommand | None = None
+        self.up: RunningCommand | None = None
 
     def words(self, command: str) -> list[str]:
         return [command, "-c", str(self.configuration), *(w for s in self.settings for w in ("--set", s))]
 
-    def start_tray(self, *words: str) -> Running:
+    def start_tray(self, *words: str) -> RunningCommand:
         truth = self.folder / "truth.json"
-        self.tray = Running(
+        self.tray = RunningCommand(
             [
                 *("simulate", "--fans", FANS, "--speed-unit", "rpm", "--link", self.port, "--truth", truth),
                 *("--wait-for-reader", "--json", *words),
@@ -148,8 +148,8 @@ class Chain:
         self.tray.line_with("fans on")
         return self.tray
 
-    def start_up(self) -> Running:
-        self.up = Running([*self.words("up"), "--json"])
+    def start_up(self) -> RunningCommand:
+        self.up = RunningCommand([*self.words("up"), "--json"])
         return self.up
 
     @contextmanager

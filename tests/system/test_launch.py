@@ -23,7 +23,7 @@ from tests.support.running_chain import (
     SITE,
     TRAY,
     Chain,
-    Running,
+    RunningCommand,
     eventually,
     fantwin,
     is_running,
@@ -44,7 +44,7 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
         chain.close()
 
 
-def start(chain: Chain) -> Running:
+def start(chain: Chain) -> RunningCommand:
     """The tray and all stages; scores flow."""
     chain.start_tray()
     up = chain.start_up()
@@ -105,7 +105,7 @@ def a_second_up_is_refused(chain: Chain) -> None:
 
 def a_stage_of_its_own_comes_and_goes(chain: Chain) -> None:
     """Ctrl-C ends a stage that was started by itself, while the others go on."""
-    alone = Running([*chain.words("run"), "scorer"])
+    alone = RunningCommand([*chain.words("run"), "scorer"])
     try:
         with chain.watcher() as watcher:
             eventually(
@@ -136,7 +136,7 @@ def test_visitors_change_nothing_and_ctrl_c_stops_in_order_with_everything_recor
     check_whole(chain)
 
 
-def test_a_recorder_that_is_down_at_the_end_is_brought_back_for_what_it_missed(chain):
+def test_a_recorder_that_is_down_at_the_end_is_restarted_to_record_what_it_missed(chain):
     up = start(chain)
     os.kill(chain.process_ids()["recorder"], signal.SIGKILL)
     up.line_with("recorder: was ended by signal 9")

@@ -16,7 +16,7 @@ import pytest
 from pipeline.recordings.reading import read_recording
 from schemas.messages import Message, ModelCard, Raw, Score
 from tests.support.fantwin_command import fantwin
-from tests.support.running_chain import DEADLINE_S, Running
+from tests.support.running_chain import DEADLINE_S, RunningCommand
 
 pytestmark = [pytest.mark.slow, pytest.mark.data, pytest.mark.real_time]
 
@@ -76,13 +76,13 @@ def train_on_the_first_part(rig: Rig, measured_data: Path, folder: Path) -> None
     assert done.exit_code == 0, done.exception
 
 
-def play(rig: Rig, measured_data: Path, folder: Path) -> Running:
+def play(rig: Rig, measured_data: Path, folder: Path) -> RunningCommand:
     """The rest of the file, as if the rig measured it now."""
     begin_s, end_s = rig.played_s
     line = ("--link", folder / f"{rig.tray}.line", "--speed-unit", "rpm", "--wait-for-reader")
     truth = ("--truth", folder / f"{rig.tray}.json", "--json")
     csv = ("--from-csv", measured_data / rig.file, *rig.columns, "--from", begin_s, "--to", end_s)
-    return Running(["simulate", *csv, *line, *truth])
+    return RunningCommand(["simulate", *csv, *line, *truth])
 
 
 def check(rig: Rig, folder: Path, messages: list[Message]) -> None:
@@ -112,7 +112,7 @@ def test_the_rest_of_measured_files_comes_through_whole_and_the_residuals_are_sm
     config.write_text(SITE.format(folder=tmp_path, endpoint=endpoint) + trays)
     with ExitStack() as ends:
         played = [play(rig, measured_data, tmp_path) for rig in RIGS]
-        up = Running(["up", "-c", config, "--json"])
+        up = RunningCommand(["up", "-c", config, "--json"])
         for running in (*played, up):
             ends.callback(running.kill)
         for running in played:

@@ -25,7 +25,17 @@ from schemas.codec import decode
 from schemas.messages import Clock, Grid, Header, Health, Message, ModelCard, StageStatus
 from schemas.topics import health_key, tray_key
 from tests.support.replay_data import START_NS, STEP_NS, write_raw
-from tests.support.running_chain import DEADLINE_S, FANTWIN, SITE, TRAY, Chain, Running, eventually, fantwin, view_of
+from tests.support.running_chain import (
+    DEADLINE_S,
+    FANTWIN,
+    SITE,
+    TRAY,
+    Chain,
+    RunningCommand,
+    eventually,
+    fantwin,
+    view_of,
+)
 from tests.support.score_data import made_up_tray
 
 pytestmark = pytest.mark.real_time
@@ -40,7 +50,7 @@ class Site:
         self.heard: dict[type[Message], queue.Queue[Message]] = {kind: queue.Queue() for kind in (Grid, Clock, Health)}
         self.bus = Bus(BusConfig(endpoint=endpoint))
         self.watcher = Watcher(self.bus, SITE)
-        self.running: list[Running] = []
+        self.running: list[RunningCommand] = []
         for topic, kind in (("grid", Grid), ("clock", Clock)):
             self.bus.subscribe(tray_key(SITE, TRAY, topic), lambda _key, data, kind=kind: self.hear(kind, data))
         self.bus.subscribe(health_key(SITE, "replay", "all"), lambda _key, data: self.hear(Health, data))
@@ -48,8 +58,8 @@ class Site:
     def hear(self, kind: type[Message], data: bytes) -> None:
         self.heard[kind].put(decode(kind, data))
 
-    def start(self, label: str) -> Running:
-        running = Running(["run", label.split("/", maxsplit=1)[0], *self.chain.words("run")[1:], "--json"])
+    def start(self, label: str) -> RunningCommand:
+        running = RunningCommand(["run", label.split("/", maxsplit=1)[0], *self.chain.words("run")[1:], "--json"])
         self.running.append(running)
 
         def is_there() -> bool:
@@ -272,7 +282,7 @@ def test_replay_beside_a_stage_that_writes_the_same_topic_is_refused_with_the_fr
 
 
 def test_a_stage_that_comes_later_and_writes_the_same_ends_the_replay(site, tmp_path):
-    replay = Running(site.words(write_raw(tmp_path / "source.mcap", 3000), "--topics", "raw,command"))
+    replay = RunningCommand(site.words(write_raw(tmp_path / "source.mcap", 3000), "--topics", "raw,command"))
     site.running.append(replay)
     site.next(Clock)
     site.start(f"acquisition/{TRAY}")

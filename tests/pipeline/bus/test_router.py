@@ -15,14 +15,14 @@ from pipeline.bus.errors import BusError
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from schemas.topics import BY_NAME, tray_key
-from tests.support.running_chain import DEMO, Running, eventually, fantwin
+from tests.support.running_chain import DEMO, RunningCommand, eventually, fantwin
 
 KEY = tray_key("site", "tray", "alarm")
 
 
 @pytest.fixture
-def started() -> Iterator[list[Running]]:
-    processes: list[Running] = []
+def started() -> Iterator[list[RunningCommand]]:
+    processes: list[RunningCommand] = []
     yield processes
     for process in processes:
         process.kill()
@@ -47,7 +47,7 @@ def exchange(listener: Bus, speaker: Bus) -> bytes:
 
 
 def test_two_clients_hear_each_other_through_the_router(endpoint, started):
-    router = Running(["router", "--listen", endpoint, "--json"])
+    router = RunningCommand(["router", "--listen", endpoint, "--json"])
     started.append(router)
     with client(endpoint, threading.Event()) as one, client(endpoint) as other:
         assert exchange(one, other) == b"hello"
@@ -64,7 +64,7 @@ def test_clients_that_start_before_the_router_connect_once_it_runs(endpoint, sta
             with pytest.raises(BusError, match="no router answers"):
                 client(endpoint)  # there is none yet, and this one does not wait
             assert not any(bus.done() for bus in waiting)
-            started.append(Running(["router", "--listen", endpoint]))
+            started.append(RunningCommand(["router", "--listen", endpoint]))
             one, other = (bus.result(timeout=60) for bus in waiting)
         finally:
             never.set()
@@ -75,7 +75,7 @@ def test_clients_that_start_before_the_router_connect_once_it_runs(endpoint, sta
 def test_waiting_for_a_router_ends_on_stop(endpoint, started):
     """In another process, by a signal: it must not be deaf to it."""
     words = ["run", "scorer", "-c", DEMO / "demo.toml", "--set", "bus.mode=client", "--set"]
-    stage = Running([*words, f"bus.endpoint={endpoint}"])
+    stage = RunningCommand([*words, f"bus.endpoint={endpoint}"])
     started.append(stage)
     eventually(lambda: catches_interrupts(stage.process.pid), "it handles Ctrl-C")
     assert stage.end() == 1
@@ -89,7 +89,7 @@ def catches_interrupts(process_id: int) -> bool:
 
 
 def test_a_second_router_at_the_same_place_is_refused_in_one_line(endpoint, started):
-    first = Running(["router", "--listen", endpoint])
+    first = RunningCommand(["router", "--listen", endpoint])
     started.append(first)
     client(endpoint, threading.Event()).close()  # it is there
     done = fantwin("router", "--listen", endpoint)

@@ -122,7 +122,7 @@ def test_without_an_output_the_twin_itself_is_calibrated(folder: Path) -> None:
     assert load_tray_twin(twin).card.calibration is not None
 
 
-def test_too_little_is_refused_with_what_would_be_needed_and_the_twin_is_left_alone(folder: Path) -> None:
+def test_too_little_data_is_refused_with_the_amount_needed_and_the_twin_is_unchanged(folder: Path) -> None:
     before = (folder / "twin.onnx").read_bytes()
     error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1)
     assert "fan-hours of healthy running cannot support 1 false alarm per fan and day: that takes 72" in error

@@ -11,7 +11,7 @@ import pytest
 from pipeline.cli.watch.command import _message
 from pipeline.config.models import TrayConfig
 from tests.support.fantwin_command import error_of
-from tests.support.running_chain import DEMO, Chain, Running, fantwin
+from tests.support.running_chain import DEMO, Chain, RunningCommand, fantwin
 
 
 @pytest.fixture
@@ -22,8 +22,8 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
 
 
 @pytest.fixture
-def acquisition(chain: Chain) -> Iterator[Running]:
-    running = Running(["run", "acquisition", *chain.words("run")[1:]])
+def acquisition(chain: Chain) -> Iterator[RunningCommand]:
+    running = RunningCommand(["run", "acquisition", *chain.words("run")[1:]])
     yield running
     running.kill()
 

@@ -106,7 +106,7 @@ def test_a_model_that_cannot_be_trained_is_a_row_and_not_the_end(folder, monkeyp
     assert "NARX: not trained: the narx model diverges" in shown.stderr
 
 
-def test_nothing_that_can_be_trained_is_an_error_that_says_why():
+def test_if_no_model_could_be_trained_the_error_has_the_reason():
     with pytest.raises(TwinError, match="nothing moved"):
         best([Contender(candidate, invalid_reason="nothing moved") for candidate in all_candidates()])
 

@@ -59,7 +59,7 @@ def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
     assert verified["samples_equal"] > 3100 and verified["alarms_equal"] >= 4
 
 
-def test_a_wheel_brings_what_the_demo_reads(tmp_path):
+def test_a_wheel_contains_the_files_that_the_demo_reads(tmp_path):
     root = Path(__file__).parents[3]
     for part in ("pyproject.toml", "README.md", "LICENSE"):  # a copy: a build leaves its traces in the source
         shutil.copy(root / part, tmp_path)

@@ -137,7 +137,7 @@ def test_its_json_has_the_fields_that_others_rely_on(tmp_path):
         ({"scored": SAMPLES - 1, "twice": 9}, "1 samples or messages were lost"),
     ],
 )
-def test_what_went_wrong_is_a_problem(tmp_path, changes, problem):
+def test_each_failure_is_a_problem_of_the_summary(tmp_path, changes, problem):
     assert problem in Run(tmp_path, **changes).summary().problems
 
 

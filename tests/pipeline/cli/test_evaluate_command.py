@@ -249,7 +249,7 @@ def test_a_card_names_the_fans_it_is_of_and_a_fan_is_judged_by_its_own_parameter
         (("two.mcap",), "has fans 0, 2, the runs have 0, 1;"),
     ],
 )
-def test_where_the_fans_are_not_those_of_the_twin_one_line_says_so(tray: Path, arguments: tuple, words: str) -> None:
+def test_fans_that_do_not_match_the_twin_are_a_one_line_error(tray: Path, arguments: tuple, words: str) -> None:
     file, *options = arguments
     assert words in error_of("evaluate", tray / "twin.onnx", tray / file, *options)
     assert words in error_of("report", tray / "twin.onnx", tray / file, *options, "-o", tray / "none.html")

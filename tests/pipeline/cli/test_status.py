@@ -37,7 +37,7 @@ from schemas.messages import (
 )
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from schemas.units import NS_PER_S
-from tests.support.running_chain import DEMO, SITE, TRAY, Running, eventually, fantwin
+from tests.support.running_chain import DEMO, SITE, TRAY, RunningCommand, eventually, fantwin
 
 HEALTH = Health(
     header=Header("scorer-all-1", 0, ""),
@@ -215,7 +215,7 @@ def test_a_stage_that_vanished_is_shown_as_gone(site):
     assert "no alarms" not in text
 
 
-def test_where_nothing_runs_there_is_no_empty_table_and_no_good_news(endpoint):
+def test_without_running_stages_no_table_is_shown_and_alarms_are_unknown(endpoint):
     with Bus(BusConfig(endpoint=endpoint)) as bus:
         text = shown(Watcher(bus, SITE))
     assert "no stage of site 'demo' answers at tcp/" in text
@@ -246,7 +246,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Callable[[], str
 
 def test_on_a_terminal_the_view_stays_live_until_it_is_stopped(site, terminal):
     written, slave = terminal
-    live = Running(
+    live = RunningCommand(
         ["status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{site.buses[0]._config.endpoint}'"], stdout=slave
     )
 
@@ -265,7 +265,7 @@ def test_on_a_terminal_the_view_stays_live_until_it_is_stopped(site, terminal):
 
 def test_on_a_terminal_a_live_view_that_found_no_stage_says_so_at_the_end(endpoint, terminal):
     _, slave = terminal
-    live = Running(["status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'"], stdout=slave)
+    live = RunningCommand(["status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'"], stdout=slave)
     with Bus(BusConfig(endpoint=endpoint)) as bus:
         eventually(bus._session.info.peers_zid, "the live view has come")
         assert live.end() == 1

@@ -168,7 +168,7 @@ def test_invalid_input_is_a_one_line_error(folder, twin, tmp_path):
     assert "cannot be created" in error_of("train", healthy, "--model", "physical", "-o", unwritable)
 
 
-def test_nothing_is_overwritten_or_judged_by_mistake(folder, tmp_path):
+def test_a_recording_is_not_overwritten_and_training_data_are_not_used_for_validation(folder, tmp_path):
     healthy, physical = folder / "healthy.mcap", ("--model", "physical")
     before = healthy.read_bytes()
     assert "ends in .onnx" in error_of("train", healthy, *physical, "-o", healthy)

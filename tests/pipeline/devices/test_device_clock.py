@@ -19,11 +19,11 @@ from schemas.units import NS_PER_S
 EPOCH_NS = 1_700_000_000_000_000_000
 MS, US = 1_000_000, 1_000
 STEP_NS = 10 * MS
-LEAST_DELAY_NS = 300 * US
+SMALLEST_DELAY_NS = 300 * US
 
 
 @dataclass(frozen=True)
-class Line:
+class ClockReadings:
     """The clock readings of a device, their host times of receipt, and the true times, which only the test knows."""
 
     true_t_ns: NDArray[np.int64]
@@ -37,7 +37,7 @@ class Line:
 
     def error_ns(self, clock: DeviceClock | None = None) -> NDArray[np.int64]:
         """Error against the true time plus the smallest delay, which the host cannot know."""
-        return self.mapped(clock) - self.true_t_ns - LEAST_DELAY_NS
+        return self.mapped(clock) - self.true_t_ns - SMALLEST_DELAY_NS
 
 
 def sampled(
@@ -49,19 +49,21 @@ def sampled(
     clock_starts_us: int = 0,
     starts_ns: int = EPOCH_NS,
     seed: int = 1,
-) -> Line:
+) -> ClockReadings:
     """100 Hz; delays are exponential, some a 30 ms stall. A positive drift is a clock that runs slow."""
     rng = np.random.default_rng(seed)
     n = round(duration_s * 100)
     true_t_ns = starts_ns + np.arange(n) * STEP_NS
     clock_us = clock_starts_us + np.rint((true_t_ns - starts_ns) * (1 - drift) / US).astype(np.int64)
-    delay_ns = LEAST_DELAY_NS + rng.exponential(jitter_ms * MS, n) + 30 * MS * (rng.random(n) < stall_share)
+    delay_ns = SMALLEST_DELAY_NS + rng.exponential(jitter_ms * MS, n) + 30 * MS * (rng.random(n) < stall_share)
     receive_t_ns = np.maximum.accumulate(true_t_ns + delay_ns.astype(np.int64))
-    return Line(true_t_ns, clock_us % UINT32, receive_t_ns)
+    return ClockReadings(true_t_ns, clock_us % UINT32, receive_t_ns)
 
 
-def joined(*lines: Line) -> Line:
-    return Line(*(np.concatenate([getattr(line, name) for line in lines]) for name in Line.__dataclass_fields__))
+def joined(*lines: ClockReadings) -> ClockReadings:
+    return ClockReadings(
+        *(np.concatenate([getattr(line, name) for line in lines]) for name in ClockReadings.__dataclass_fields__)
+    )
 
 
 @pytest.mark.parametrize("drift", [200e-6, -200e-6, 5e-3])
@@ -87,7 +89,9 @@ def test_neighbouring_samples_keep_their_distance_within_a_few_ppm() -> None:
 
 
 def test_times_approach_a_new_line_and_never_jump_to_it() -> None:
-    late = Line(*(np.array([v]) for v in (EPOCH_NS, 0, EPOCH_NS + 400 * MS)))  # the first sample hung in a buffer
+    late = ClockReadings(
+        *(np.array([v]) for v in (EPOCH_NS, 0, EPOCH_NS + 400 * MS))
+    )  # the first sample hung in a buffer
     line = sampled(120, jitter_ms=0.1, starts_ns=EPOCH_NS + STEP_NS, clock_starts_us=10_000)
     error_ns = joined(late, line).error_ns()
     assert error_ns[1] > 390 * MS
@@ -122,7 +126,7 @@ def test_a_silence_in_which_the_clock_may_have_wrapped_begins_a_new_segment() ->
 
 
 def test_a_correction_does_not_grow_while_no_samples_arrive() -> None:
-    late = Line(*(np.array([v]) for v in (EPOCH_NS, 0, EPOCH_NS + 400 * MS)))
+    late = ClockReadings(*(np.array([v]) for v in (EPOCH_NS, 0, EPOCH_NS + 400 * MS)))
     before = sampled(5, jitter_ms=0.1, starts_ns=EPOCH_NS + STEP_NS, clock_starts_us=10_000)
     after = sampled(5, jitter_ms=0.1, starts_ns=EPOCH_NS + 300 * NS_PER_S, clock_starts_us=300_000_000)
     error_ns = joined(late, before, after).error_ns()
@@ -134,7 +138,7 @@ def test_a_correction_does_not_grow_while_no_samples_arrive() -> None:
 def test_a_host_clock_that_is_set_begins_a_new_segment(set_by_s: int) -> None:
     line = sampled(60, jitter_ms=0.1)
     shift_ns = np.where(np.arange(6000) >= 3000, set_by_s * NS_PER_S, 0)
-    moved = Line(line.true_t_ns + shift_ns, line.clock_us, line.receive_t_ns + shift_ns)
+    moved = ClockReadings(line.true_t_ns + shift_ns, line.clock_us, line.receive_t_ns + shift_ns)
     clock = DeviceClock()
     error_ns = moved.error_ns(clock)
     assert clock.segments == 2
@@ -146,7 +150,7 @@ def test_a_host_that_stalls_for_three_seconds_does_not_disturb_the_times() -> No
     stalled = (line.receive_t_ns > EPOCH_NS + 30 * NS_PER_S) & (line.receive_t_ns < EPOCH_NS + 33 * NS_PER_S)
     receive_t_ns = np.where(stalled, EPOCH_NS + 33 * NS_PER_S, line.receive_t_ns)
     clock = DeviceClock()
-    assert np.abs(Line(line.true_t_ns, line.clock_us, receive_t_ns).error_ns(clock)).max() < 1 * MS
+    assert np.abs(ClockReadings(line.true_t_ns, line.clock_us, receive_t_ns).error_ns(clock)).max() < 1 * MS
     assert clock.segments == 1
 
 
@@ -154,7 +158,7 @@ def test_old_samples_that_come_again_change_nothing() -> None:
     line = sampled(30, jitter_ms=0.1)
     clock = DeviceClock()
     times = line.mapped(clock)
-    old = Line(line.true_t_ns[-1500:], line.clock_us[-1500:], line.receive_t_ns[-1500:]).mapped(clock)
+    old = ClockReadings(line.true_t_ns[-1500:], line.clock_us[-1500:], line.receive_t_ns[-1500:]).mapped(clock)
     assert np.abs(old - times[-1500:]).max() < 100 * US
     assert clock.segments == 1
     assert clock.to_host_ns(int(line.clock_us[-1]) + 10_000, int(line.receive_t_ns[-1]) + STEP_NS) == pytest.approx(
@@ -180,7 +184,7 @@ def test_times_rise_and_never_stray_beyond_the_delays(
     error_ns = line.error_ns(clock)
     assert clock.segments == 1
     assert (np.diff(line.mapped()) > 0).all()
-    first_delay_ns = line.receive_t_ns[0] - line.true_t_ns[0] - LEAST_DELAY_NS
+    first_delay_ns = line.receive_t_ns[0] - line.true_t_ns[0] - SMALLEST_DELAY_NS
     assert np.abs(error_ns).max() <= first_delay_ns + 25 * MS
 
 

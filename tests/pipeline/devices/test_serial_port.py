@@ -173,7 +173,7 @@ def test_a_device_may_vanish_and_return_more_than_once(device: Device, line: Ser
         items.skip_until(LinkUp)
 
 
-def test_stop_delivers_what_had_arrived_and_then_nothing_more(device: Device) -> None:
+def test_stop_delivers_the_bytes_that_had_arrived_and_no_more(device: Device) -> None:
     device.plug_in()
     items = Items()
     line = SerialPort(str(device.path), 115200)

@@ -37,7 +37,7 @@ def test_an_episode_lasts_from_raised_to_cleared_with_the_highest_severity_and_t
     assert (episode.residual_rad_s, episode.torque_balance_command, episode.message) == (10.0, 3.0, "raised")
 
 
-def test_the_json_has_what_the_issue_asks_for() -> None:
+def test_the_json_has_fan_times_severity_residual_and_causes() -> None:
     document = json.loads(json.dumps(one(alarm(10, causes=(DRAG,))).as_json()))
     assert document["cleared_ns"] is None
     assert {"fan", "raised_ns", "cleared_ns", "severity", "residual", "causes"} <= set(document)

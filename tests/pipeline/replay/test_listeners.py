@@ -154,7 +154,7 @@ def test_whoever_stops_changing_and_is_behind_is_named(sites, monkeypatch):
     assert settled(listeners, threading.Event(), lambda: twin.say(line(GRID, "replay-1", 99))) == ["twin_integrator"]
 
 
-def test_what_was_sent_before_a_listener_heard_it_counts_as_lost_if_it_was_there_from_the_start(sites):
+def test_messages_before_the_first_received_one_count_as_lost_for_listeners_present_from_the_start(sites):
     bus, listeners = sites
     twin, recorder = FakeStage(bus, "twin_integrator"), FakeStage(bus, "recorder")
     twin.say()

@@ -114,7 +114,7 @@ def alarms_of(path: Path) -> list[Alarm]:
 
 
 @pytest.mark.parametrize("block_size", [1, 4])
-def test_what_operators_asked_for_is_asked_for_again_at_the_same_samples(tmp_path, block_size):
+def test_requests_of_operators_are_replayed_at_the_same_samples(tmp_path, block_size):
     site = Site(tmp_path, 1, block_size, calibrated=True)
     site.run(210)
     site.ask(Action.ACKNOWLEDGE, 0)
@@ -148,8 +148,8 @@ def test_a_restarted_scorer_continues_from_its_snapshot_and_so_does_a_replay(tmp
     path = site.finished()
     alarms = alarms_of(path)
     successor = next(alarm.header.producer for alarm in alarms if alarm.transition == Transition.REPUBLISHED)
-    restated = [alarm for alarm in alarms if alarm.transition == Transition.REPUBLISHED]
-    stood = {alarm.fan: (alarm.active, alarm.acknowledged, alarm.out_of_service) for alarm in restated}
+    republished = [alarm for alarm in alarms if alarm.transition == Transition.REPUBLISHED]
+    stood = {alarm.fan: (alarm.active, alarm.acknowledged, alarm.out_of_service) for alarm in republished}
     assert stood[0] == (True, True, False)
     assert stood[2][2]
     assert len([alarm for alarm in alarms if alarm.request]) == 2, "what was answered is not answered again"
@@ -159,7 +159,7 @@ def test_a_restarted_scorer_continues_from_its_snapshot_and_so_does_a_replay(tmp
     assert tray.comparison and tray.comparison.alarms_equal == len(alarms)
     found = episodes(tray.alarms)
     assert found == episodes(alarms)
-    first = next(episode for episode in found if episode.fan == 0 and episode.onset_ns == restated[0].onset_t_ns)
+    first = next(episode for episode in found if episode.fan == 0 and episode.onset_ns == republished[0].onset_t_ns)
     raised = [a for a in alarms if a.transition == Transition.RAISED and a.fan == 0 and a.onset_t_ns == first.onset_ns]
     assert len(raised) == 1 and raised[0].t_ns == first.raised_ns, "one alarm, over the restart"
 
@@ -190,7 +190,7 @@ def test_a_part_that_begins_with_a_restarted_scorer_still_needs_its_earlier_inpu
         verified(site.finished())
 
 
-def test_with_other_limits_a_session_goes_on_from_what_the_one_before_finds_now(tmp_path):
+def test_with_other_limits_a_session_continues_from_the_replayed_state_of_the_one_before(tmp_path):
     site = Site(tmp_path, 1, calibrated=True)
     site.run(215)
     site.kill("scorer")
@@ -309,7 +309,7 @@ def test_grids_of_a_session_that_are_nowhere_leave_nothing_to_compare(tmp_path):
     assert tray.judged > 200
 
 
-def test_what_never_came_to_the_resampler_is_not_made_up(tmp_path):
+def test_samples_that_never_reached_the_resampler_are_not_invented(tmp_path):
     site = Site(tmp_path, seed=5, block_size=10)
     site.run(205)
     site.loses(3)
@@ -334,7 +334,7 @@ def test_an_undecodable_alarm_costs_that_alarm_only(tmp_path):
 
 
 @pytest.mark.parametrize("topic", ["grid", "prediction"])
-def test_a_recording_that_lacks_what_lay_between_is_compared_all_the_same(tmp_path, topic):
+def test_a_recording_without_the_messages_of_a_stage_in_between_is_still_compared(tmp_path, topic):
     site = Site(tmp_path, seed=4)
     site.run(150)
     site.kill("twin_integrator")
@@ -400,7 +400,7 @@ def test_a_recording_without_scores_cannot_be_compared(tmp_path):
         verified(raw)
 
 
-def test_a_part_from_the_middle_cannot_be_compared_and_says_what_is_missing(tmp_path):
+def test_a_part_from_the_middle_cannot_be_compared_and_the_reason_is_shown(tmp_path):
     site = Site(tmp_path, seed=8)
     site.run(400)
     half = 200

@@ -28,7 +28,7 @@ def test_waiting_too_long_for_one_message_does_not_delay_those_after_it():
     assert pace.due_in_s(102 * S, 8.5) == pytest.approx(0.5)
 
 
-def test_nothing_is_due_while_it_is_paused_and_the_pause_is_no_recorded_time():
+def test_while_paused_nothing_is_due_and_recorded_time_stands_still():
     pace = paced()
     pace.change(pace.position_ns(8.0, 200 * S), 8.0, paused=True)
     assert pace.due_in_s(101 * S, 1000.0) == math.inf

@@ -112,7 +112,7 @@ def test_messages_go_out_at_their_recorded_distances_over_the_rate(rate, apart_s
     assert player.ended_s - player.began_s == pytest.approx(299 * apart_s)
 
 
-def test_what_publishing_costs_does_not_add_up():
+def test_the_time_that_publishing_takes_does_not_accumulate():
     sent, _ = play(raws(300), cost_s=0.004)
     assert sent.messages[-1][0] == pytest.approx(2.99)
 

@@ -38,7 +38,7 @@ def sequences(entries) -> list[int]:
     return [entry.message.header.sequence for entry in entries]
 
 
-def test_parts_are_played_in_the_order_of_their_times_and_what_two_parts_hold_is_played_once(tmp_path):
+def test_parts_are_played_in_order_of_time_and_messages_in_two_parts_only_once(tmp_path):
     parts = [part(tmp_path / "z.mcap", range(20)), part(tmp_path / "b.mcap", range(15, 40), 1.0)]
     parts.append(part(tmp_path / "a.mcap", range(40, 50), 2.0))
     random.Random(3).shuffle(parts)

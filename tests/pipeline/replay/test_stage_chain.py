@@ -42,7 +42,7 @@ def test_a_stage_beside_the_chain_changes_nothing(smoother):
     assert derive_chain([*REGISTERED, smoother]) == decision_chain()
 
 
-def test_a_replay_starts_with_all_topics_of_the_stage_that_it_stands_for():
+def test_a_replay_starts_with_all_topics_of_the_stage_that_it_replaces():
     assert replay_starts() == {"raw": ("raw",), "grid": ("grid",), "prediction": ("prediction", "twin")}
 
 

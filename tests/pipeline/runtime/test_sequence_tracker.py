@@ -67,7 +67,7 @@ def test_a_gap_is_filled_in_order_from_what_the_producer_keeps():
     assert (line.received, line.missing, line.duplicated, line.next_sequence) == (5, 0, 0, 5)
 
 
-def test_what_the_producer_no_longer_keeps_is_counted_missing():
+def test_messages_that_the_producer_no_longer_keeps_are_counted_as_missing():
     tracker = SequenceTracker(Producer([2]).recover)
     list(tracker.accept(packet(0)))
     assert sequences(tracker.accept(packet(5))) == [2, 5]

@@ -63,7 +63,7 @@ def test_title_axis_and_legend_name_everything_with_its_unit(tmp_path: Path) -> 
     assert (tmp_path / "bands.svg").stat().st_size > 0
 
 
-def test_nothing_is_drawn_over_the_legend_or_the_title() -> None:
+def test_the_legend_and_the_title_are_not_drawn_over() -> None:
     scores, _ = made_up_tray(fans=3)
     figure = band_plot._figure(trace_of("tray1", scores, "rpm"), [0, 1, 2], [FAULT])
     figure.draw_without_rendering()

@@ -55,12 +55,12 @@ def test_a_log_says_what_happened_and_how_bad_it_is(transition, more, line):
     assert one(alarm(transition, **more)).line() == line
 
 
-def test_of_messages_at_the_same_sample_the_one_sent_later_counts():
+def test_the_later_sent_of_two_messages_at_the_same_sample_counts():
     first, second = alarm(), alarm(Transition.ACKNOWLEDGED, acknowledged=True)
     assert one(second, first).newest is second
 
 
-def test_of_several_scorers_the_one_that_spoke_last_counts_whatever_its_times():
+def test_the_scorer_that_published_last_counts_regardless_of_its_times():
     before = alarm(t_ns=900, producer="killed")
     again = alarm(Transition.REPUBLISHED, 900, producer="b")
     taken_back = alarm(Transition.REPUBLISHED, 5, producer="b", active=False, severity=Severity.NONE, acknowledged=True)
@@ -92,7 +92,7 @@ def test_a_new_occurrence_has_nothing_of_the_one_before():
     assert (standing.message, standing.causes, standing.acknowledged_by) == ("RAISED at 9", (), "")
 
 
-def test_who_acknowledged_is_known_from_what_a_restarted_scorer_reports_again():
+def test_who_acknowledged_is_known_from_alarms_that_a_restarted_scorer_republishes():
     standing = one(alarm(Transition.REPUBLISHED, acknowledged=True, operator_name="Ann"))
     assert standing.acknowledged_by == "Ann"
 

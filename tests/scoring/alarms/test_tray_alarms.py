@@ -340,7 +340,7 @@ def test_going_on_from_a_snapshot_is_as_if_nothing_had_been(history, chosen, cut
 
 @given(HISTORIES, SETTINGS)
 @settings(max_examples=100, deadline=None)
-def test_raised_and_cleared_take_turns_and_are_what_the_states_say(history, chosen):
+def test_raised_and_cleared_alternate_and_agree_with_the_states(history, chosen):
     state, changes, *_ = played(Conditions(2, chosen), history, set())
     for fan in (0, 1):
         turns = [t for _, its_fan, t, _ in changes if its_fan == fan and t in (RAISED, CLEARED)]

@@ -10,19 +10,21 @@ BINS, STEP_S = 6, 0.01
 CENTRES = np.arange(BINS) * 100.0 + 50.0
 
 
-def runs_of(own: np.ndarray, days: int, noise: float, seed: int = 1, seen: float = 1.0) -> list[Cells]:
-    """Runs of fans that are off by own (fans, bins), each day by another constant; bins seen by chance, for 20 s."""
+def runs_of(offsets: np.ndarray, days: int, noise: float, seed: int = 1, seen: float = 1.0) -> list[Cells]:
+    """Daily runs of fans with `offsets` (fans, bins) and a constant per day and fan; bins seen by chance for 20 s."""
     rng = np.random.default_rng(seed)
     made = []
     for _ in range(days):
-        count = np.where(rng.random(own.shape) < seen, 2000.0, 0.0)
-        of_day = rng.normal(0.0, 1.0, (len(own), 1))
-        made.append(Cells(range(len(own)), count, count * (own + of_day + rng.normal(0.0, noise, own.shape))))
+        count = np.where(rng.random(offsets.shape) < seen, 2000.0, 0.0)
+        of_day = rng.normal(0.0, 1.0, (len(offsets), 1))
+        made.append(
+            Cells(range(len(offsets)), count, count * (offsets + of_day + rng.normal(0.0, noise, offsets.shape)))
+        )
     return made
 
 
 def without_its_mean(table: np.ndarray) -> np.ndarray:
-    """What no baseline takes away."""
+    """The part of a table that remains after a baseline, which is constant over speed."""
     return table - table.mean(axis=1, keepdims=True)
 
 
@@ -33,25 +35,25 @@ def found_of(runs: list[Cells]) -> np.ndarray:
 
 
 def test_an_offset_of_every_day_is_found_despite_daily_noise() -> None:
-    own = without_its_mean(np.random.default_rng(2).normal(0.0, 1.0, (10, BINS)))
-    np.testing.assert_allclose(found_of(runs_of(own, 12, noise=0.0)), own, atol=1e-3)
-    error = found_of(runs_of(own, 24, noise=0.2, seen=0.5)) - own
+    offsets = without_its_mean(np.random.default_rng(2).normal(0.0, 1.0, (10, BINS)))
+    np.testing.assert_allclose(found_of(runs_of(offsets, 12, noise=0.0)), offsets, atol=1e-3)
+    error = found_of(runs_of(offsets, 24, noise=0.2, seen=0.5)) - offsets
     assert np.sqrt(np.mean(error**2)) < 0.15
 
 
-def test_what_varies_from_day_to_day_alone_is_not_taken_for_the_fans() -> None:
+def test_variation_from_day_to_day_is_not_attributed_to_the_fans() -> None:
     alike = np.tile(np.linspace(-1.0, 1.0, BINS), (50, 1))
     found = found_of(runs_of(alike, 12, noise=0.9))
     assert np.sqrt(np.mean((found - alike) ** 2)) < 0.1, "means of twelve days are off by 0.26"
 
 
-def test_a_fan_never_seen_at_a_speed_is_there_as_the_others_are() -> None:
-    own = np.random.default_rng(3).normal(0.0, 0.3, (10, BINS)) + np.linspace(0.0, 3.0, BINS)
+def test_a_fan_never_seen_at_a_speed_gets_the_mean_offset_of_the_others_there() -> None:
+    offsets = np.random.default_rng(3).normal(0.0, 0.3, (10, BINS)) + np.linspace(0.0, 3.0, BINS)
     runs = [
         Cells(run.known_as, np.where(np.arange(10)[:, np.newaxis] == 4, 0.0, run.count), run.total)
-        for run in runs_of(own, 12, noise=0.01)
+        for run in runs_of(offsets, 12, noise=0.01)
     ]
-    of_others = without_its_mean(np.delete(own, 4, axis=0)).mean(axis=0)
+    of_others = without_its_mean(np.delete(offsets, 4, axis=0)).mean(axis=0)
     np.testing.assert_allclose(found_of(runs)[4], of_others, atol=0.02)
 
 

@@ -92,7 +92,7 @@ def test_correlation_time_and_deviation_of_healthy_residuals_are_found() -> None
         assert limits.balance.autocorrelation_time_s == pytest.approx(memory_s, rel=0.1)
 
 
-def test_too_little_running_is_refused_with_what_would_be_needed() -> None:
+def test_too_little_running_is_refused_with_the_amount_needed() -> None:
     with pytest.raises(TooLittleError) as caught:
         calibrate(healthy(0.0, 5, runs=1, samples=3000), TOP_RAD_S, Timing(), 1.0)
     had = FANS * 29.0 / 3600  # the first second commissions
@@ -322,7 +322,7 @@ def test_the_tail_of_exponential_values_is_found_and_extrapolated(probability: f
     assert np.mean(levels) == pytest.approx(5.0 - 2.0 * np.log(probability), rel=0.03)
 
 
-def test_of_a_normal_tail_the_level_is_rather_too_high() -> None:
+def test_the_level_of_a_normal_tail_errs_on_the_high_side() -> None:
     levels = [Tail.fit(np.random.default_rng(seed).normal(size=2000), 1e-5).level(1e-5) for seed in range(40)]
     assert 4.26 < np.mean(levels) < 6.0  # 4.26 is exact
 
@@ -358,7 +358,7 @@ def test_alarms_that_come_together_widen_the_interval_and_none_gives_an_upper_en
     assert rate_interval(np.zeros(10), exposures, 1) == (0.0, pytest.approx(0.369, abs=0.001))
 
 
-def test_a_window_counts_by_what_was_held_for_the_on_delay_however_blocks_are_cut() -> None:
+def test_a_window_counts_the_score_held_for_the_on_delay_regardless_of_how_blocks_are_cut() -> None:
     score = np.zeros((2500, 1))
     score[500:511] = 3.0  # eleven samples last 0.1 s
     score[700:705] = 9.0

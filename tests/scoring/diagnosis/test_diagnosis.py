@@ -28,12 +28,12 @@ ALL_CAUSES = {
 
 
 def of(diagnosis: Diagnosis, cause: str) -> RankedCause:
-    return next(suspect for suspect in diagnosis.causes if suspect.cause == cause)
+    return next(ranked for ranked in diagnosis.causes if ranked.cause == cause)
 
 
-def evidence_of(suspect: RankedCause) -> Evidence:
-    assert suspect.evidence is not None
-    return suspect.evidence
+def evidence_of(ranked: RankedCause) -> Evidence:
+    assert ranked.evidence is not None
+    return ranked.evidence
 
 
 def faulty_speed(cause: str, command: np.ndarray, seed: int) -> tuple[np.ndarray, float]:
@@ -74,8 +74,8 @@ def test_under_a_moving_command_the_cause_comes_first_and_its_interval_holds_the
 def test_probabilities_add_up_to_one_over_all_causes_and_fall() -> None:
     command = data.moving_command(0)
     found = diagnose(data.window(command, faulty_speed("drag_up", command, 0)[0]), data.HEALTHY)
-    probabilities = [suspect.probability for suspect in found.causes]
-    assert {suspect.cause for suspect in found.causes} == ALL_CAUSES
+    probabilities = [ranked.probability for ranked in found.causes]
+    assert {ranked.cause for ranked in found.causes} == ALL_CAUSES
     assert sum(probabilities) == pytest.approx(1.0)
     assert probabilities == sorted(probabilities, reverse=True)
 
@@ -94,13 +94,13 @@ def test_the_evidence_of_cannot_tell_fits_its_probability() -> None:
     command = data.moving_command(0)
     for readings in (faulty_speed("drag_up", command, 0)[0], data.measured(data.speeds(command), 0)):
         found = diagnose(data.window(command, readings), data.HEALTHY)
-        doubt = of(found, "cannot_tell")
-        others = [suspect for suspect in found.causes if suspect is not doubt]
-        if 2.0 * doubt.probability < others[0].probability:
+        cannot_tell = of(found, "cannot_tell")
+        others = [ranked for ranked in found.causes if ranked is not cannot_tell]
+        if 2.0 * cannot_tell.probability < others[0].probability:
             sure = f"little doubt: {others[0].cause} is more than twice as probable as all others together"
-            assert doubt.sentence == sure and found.first is others[0]
+            assert cannot_tell.sentence == sure and found.first is others[0]
         else:
-            assert doubt.sentence.startswith("cannot tell yet: ") and found.first is doubt
+            assert cannot_tell.sentence.startswith("cannot tell yet: ") and found.first is cannot_tell
 
 
 def test_95_percent_intervals_hold_the_change_about_so_often() -> None:
@@ -124,10 +124,10 @@ def test_at_a_constant_speed_faults_that_look_alike_share_the_probability(cause)
     assert found.first.cause == "cannot_tell"
     assert found.first.sentence == "cannot tell yet: the command is not moving"
     assert of(found, cause).probability > 0.08
-    assert all(suspect.probability < 0.4 for suspect in found.causes)
+    assert all(ranked.probability < 0.4 for ranked in found.causes)
 
 
-def test_what_comes_at_once_is_a_torque_and_what_grows_is_friction() -> None:
+def test_an_abrupt_change_is_diagnosed_as_torque_and_a_growing_one_as_friction() -> None:
     command = data.moving_command(3)
     abrupt = diagnose(data.window(command, faulty_speed("external_torque", command, 3)[0]), data.HEALTHY)
     growing = diagnose(data.window(command, faulty_speed("friction_up", command, 3)[0]), data.HEALTHY)
@@ -262,7 +262,7 @@ def test_a_deviation_that_calibration_expects_at_a_speed_is_no_fault() -> None:
     assert diagnose(some, data.HEALTHY).first.cause == "cannot_tell"
 
 
-def test_what_the_fan_showed_at_commissioning_is_no_fault() -> None:
+def test_an_offset_present_at_commissioning_is_no_fault() -> None:
     command = data.moving_command(7)
     readings = data.measured(data.speeds(command, torque=0.03), 7)
     whole = data.window(command, readings)
@@ -344,7 +344,7 @@ def test_windows_without_usable_samples_are_accepted(samples) -> None:
     for readings in (np.full(samples, np.nan), np.zeros(samples), np.full(samples, 300.0)):
         for onset in (0, samples // 2, samples):
             found = diagnose(Window(data.STEP_S, command, readings, onset), data.HEALTHY)
-            assert sum(suspect.probability for suspect in found.causes) == pytest.approx(1.0)
+            assert sum(ranked.probability for ranked in found.causes) == pytest.approx(1.0)
     assert diagnose(Window(data.STEP_S, command * np.nan, command * np.nan, 1), data.HEALTHY).causes
 
 

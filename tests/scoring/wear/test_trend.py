@@ -33,7 +33,7 @@ def times_of(forecast: LimitForecast) -> tuple[int, int, int]:
 
 
 @pytest.mark.parametrize(("correlation", "wrong"), [(0.0, 0.08), (0.5, 0.1), (0.8, 0.12)])
-def test_where_there_is_no_trend_one_is_found_about_as_rarely_as_declared(correlation, wrong) -> None:
+def test_without_a_trend_one_is_found_about_as_rarely_as_declared(correlation, wrong) -> None:
     trends = [series(10, 20, 0.0, seed, correlation).trend() for seed in range(200)]
     reported = [trend for trend in trends if trend is not None]  # residuals correlated for too long give no trend
     assert len(reported) > 190

@@ -307,7 +307,7 @@ def test_after_a_restart_it_is_known_how_far_back_a_fault_is() -> None:
     assert first_point_s(WORN, successor) == 50.0
 
 
-def test_no_point_looks_back_on_what_was_before_a_fan_was_commissioned_again() -> None:
+def test_no_wear_point_uses_samples_from_before_a_fan_was_commissioned_again() -> None:
     one, block = core(), burst(0, seconds=60.0)
     feed(one, [cut(block, 0, 500), request_of(Action.COMMISSION, WORN), cut(block, 500, 3000)])
     assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)

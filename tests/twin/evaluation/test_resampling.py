@@ -66,7 +66,7 @@ def test_irregular_steps_are_one_to_three_of_the_runs_own_and_the_same_for_the_s
     assert irregular(run, seed=2).samples != thin.samples or np.any(irregular(run, seed=2).t_s != thin.t_s)
 
 
-def test_where_the_grids_hardly_meet_speeds_lie_between_their_neighbours_and_gaps_stay_gaps() -> None:
+def test_on_grids_with_few_common_times_speeds_are_interpolated_and_gaps_stay_gaps() -> None:
     # A step of 16.1 ms against one of 20 ms: they meet in one time out of 161.
     t_s = np.arange(400, dtype=np.float64) * 0.0161
     speed = 3.0 + 2.0 * t_s

@@ -110,7 +110,7 @@ def test_a_bound_for_white_signals_would_be_wrong_for_slow_ones() -> None:
 
 
 @pytest.mark.parametrize("gain", [0.3, -0.3])
-def test_what_follows_the_command_is_seen_at_its_lag_with_its_sign(gain: float) -> None:
+def test_a_residual_that_follows_the_command_peaks_at_its_lag_with_its_sign(gain: float) -> None:
     rng = np.random.default_rng(5)
     command = rng.normal(size=SAMPLES)
     analysis = analysed(white(rng) + gain * np.roll(command, 25), command)

@@ -64,7 +64,7 @@ def within_run(run: Run, fit: BalanceFit) -> Array:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("make", [published_fan.published_training, published_fan.published_test])
-def test_where_the_physics_are_the_whole_truth_they_are_kept(make, seed) -> None:
+def test_exact_physics_are_kept(make, seed) -> None:
     run = make(seed).run
     identification = identify([run])
     fit = fit_balance([run], [], identification)
@@ -74,7 +74,7 @@ def test_where_the_physics_are_the_whole_truth_they_are_kept(make, seed) -> None
     assert abs(fit.coefficients[0, 3]) < 4.0 * fit.std_errors[0, 3]
 
 
-def test_sigma_is_what_the_noise_of_the_tacho_makes(published) -> None:
+def test_sigma_follows_from_the_noise_of_the_tacho(published) -> None:
     run, identification = published
     fit = fit_balance([run], [], identification)
     assert fit.sigma_command[0] == pytest.approx(fit.coefficients[0, 0] * FILTER_RATE_PER_S * NOISE_RAD_S, rel=0.08)
@@ -82,7 +82,7 @@ def test_sigma_is_what_the_noise_of_the_tacho_makes(published) -> None:
     assert fit.lowest_speed_rad_s[0] == pytest.approx(0.05 * np.quantile(run.speed_rad_s, 0.99))
 
 
-def test_where_there_is_friction_least_squares_find_it_and_the_rest(plants) -> None:
+def test_with_friction_least_squares_find_it_and_the_other_coefficients(plants) -> None:
     run, identification = plants
     fit = fit_balance([run], [], identification)
     assert fit.sources.count("least-squares") > 0.9 * run.fans
@@ -100,7 +100,7 @@ def test_standard_errors_are_about_the_scatter_from_recording_to_recording(plant
     assert np.all((ratio > 0.6) & (ratio < 2.5)), ratio
 
 
-def test_what_a_fan_needs_is_known_better_than_any_one_of_its_coefficients(plants) -> None:
+def test_the_command_a_fan_needs_is_known_better_than_any_one_coefficient(plants) -> None:
     run, identification = plants
     fit = fit_balance([run], [], identification)
     chosen = np.array(fit.sources) == "least-squares"
@@ -135,7 +135,7 @@ def test_held_out_runs_judge_and_teach_nothing(published) -> None:
     assert judged.sigma_command[0] == pytest.approx(within_run(other, judged).std(), rel=0.02)
 
 
-def test_what_differs_from_run_to_run_is_no_part_of_sigma(published) -> None:
+def test_differences_between_runs_are_no_part_of_sigma(published) -> None:
     run, identification = published
     thirds = [replace(run.rows(first, first + 1200), name=str(first)) for first in (400, 1600, 2800)]
     shifted = [replace(part, command=part.command + 5.0 * k) for k, part in enumerate(thirds)]

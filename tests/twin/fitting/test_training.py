@@ -116,7 +116,7 @@ def test_a_fan_that_was_not_measured_in_the_held_out_run_is_refused(rough) -> No
         train_twin([run], [Run("blind", run.t_s, run.command, speed)], "physical", name="x")
 
 
-def test_where_no_data_speak_the_hybrid_keeps_to_its_physics(rough) -> None:
+def test_without_data_the_hybrid_follows_its_physics(rough) -> None:
     """Trained on the upper half of the commands alone, run from rest through the lower half."""
     upper = fan_data.rough_run(5, 60.0, low=50.0)
     twin, physical = (train_twin([upper], [], kind, name="x") for kind in ("hybrid", "physical"))

@@ -156,14 +156,14 @@ def test_left_out_blocks_are_a_fourth_and_the_two_parts_share_only_the_start() -
     assert np.all(np.isfinite(judged.speed_rad_s[out]))
 
 
-def test_of_several_runs_each_is_left_out_once() -> None:
+def test_each_of_several_runs_is_left_out_once() -> None:
     runs = [replace(fan_data.published_run(seed, 2.0), name=str(seed)) for seed in range(5)]
     folds = leave_out(runs)
     assert sorted(run.name for _, judged in folds for run in judged) == ["0", "1", "2", "3", "4"]
     assert all({run.name for run in kept}.isdisjoint(run.name for run in judged) for kept, judged in folds)
 
 
-def test_of_long_recordings_only_so_many_samples_are_drawn() -> None:
+def test_long_recordings_are_sampled_up_to_a_limit() -> None:
     runs = [fan_data.published_run(1, 20.0, fans=2)] * 6
     drawn = draw_stretches(runs, np.random.default_rng(0))
     assert 15_000 <= sum(run.samples for run in drawn) <= 16_000

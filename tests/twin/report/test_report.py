@@ -225,7 +225,7 @@ def test_a_free_run_that_diverges_is_reported_and_still_drawn(twin):
     assert Page(report_page(lost)).numbers["row-0"][0] == np.inf
 
 
-def test_of_many_fans_the_worst_are_drawn(twin):
+def test_the_worst_of_many_fans_are_drawn(twin):
     many = published_run(9, 4.0, fans=MOST_FANS_DRAWN + 3)
     speed = many.speed_rad_s.copy()
     speed[:, -1] *= 0.7
