@@ -30,7 +30,7 @@ ALLOWED_S = 1.1
 
 def main(
     kills: Annotated[int, typer.Option(min=1, help="Kills of each load.")] = 100,
-    seed: Annotated[int, typer.Option(help="Of the times at which it is killed.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the times at which it is killed.")] = 1,
     folder: Annotated[Path | None, typer.Option(help="Where to record; a temporary folder if not given.")] = None,
     json_output: JsonOption = False,
 ) -> None:

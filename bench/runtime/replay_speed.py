@@ -31,7 +31,7 @@ from tests.support.running_chain import DEMO, fantwin
 
 
 def main(
-    minutes: Annotated[float, typer.Option(help="Of recording.")] = 10.0,
+    minutes: Annotated[float, typer.Option(help="Length of the recording.")] = 10.0,
     json_output: JsonOption = False,
 ) -> None:
     """Print how long reading, judging and verifying take, as ratios."""
@@ -61,7 +61,7 @@ def main(
 
 
 def row(name: str, took_s: float, minutes: float, messages: int, bare_s: float) -> dict[str, Any]:
-    """What one way took."""
+    """The row of one way to replay: its time and rates."""
     return {
         "way": name,
         "s": took_s,
@@ -72,21 +72,21 @@ def row(name: str, took_s: float, minutes: float, messages: int, bare_s: float) 
 
 
 def timed(work: Callable[[], object]) -> float:
-    """Seconds that it takes."""
+    """Seconds that `work` takes."""
     began_s = time.perf_counter()
     work()
     return time.perf_counter() - began_s
 
 
 def judged(path: Path, output: Path | None, *, verify: bool) -> None:
-    """Judge, and see that it came out the same."""
+    """Replay offline; with `verify`, assert that the result equals the recording."""
     with open_replay_input([path], None, (), None) as material:
         (tray,) = judge(material, output, verify)
     assert tray.comparison is None or tray.comparison.is_equal, tray.comparison
 
 
 def recording(folder: Path, seconds: float) -> Path:
-    """What a site leaves that watches the demo's tray for so long, with a fault now and then."""
+    """The recording of a site that watches the tray of the demo for `seconds`, with a fault every two minutes."""
     recording = folder / "raw.mcap"
     faults = [
         w

@@ -15,7 +15,7 @@ NO_FIGURES = Figures(np.inf, np.inf, -np.inf, np.inf, 0.0, 0)
 
 
 def held_out_figures(contender: Contender, runs: Sequence[Run]) -> Figures:
-    """Of the free run, all fans together. Infinite where it diverges, or where the model could not be trained."""
+    """Figures of the free run, pooled over the fans. Infinite if it diverges or the model could not be trained."""
     return evaluate(contender.twin, runs).pooled if contender.twin else NO_FIGURES
 
 

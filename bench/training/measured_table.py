@@ -19,7 +19,7 @@ from twin.comparison import Contender, all_candidates, contend
 
 def main(
     only: Annotated[str, typer.Option(help="Only sets whose name begins so.")] = "",
-    seed: Annotated[int, typer.Option(help="Of the weights' start.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the initial weights.")] = 0,
     json_output: JsonOption = False,
 ) -> None:
     """Print, for each measured set, the free-run error of each model over runs or parts held out."""

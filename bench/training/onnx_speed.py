@@ -42,7 +42,7 @@ FANS = (1, 8, 1_000, 10_000)
 EQUAL_WITHIN = 1e-5
 
 Engine: TypeAlias = Callable[[Array, Array], Any]
-"""(initial speeds (fans,), commands (n, fans)) to whatever comes of it; waits until it is there."""
+"""Runs a twin from initial speeds (fans,) through commands (n, fans) and waits for the result."""
 
 
 def main(

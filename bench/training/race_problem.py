@@ -103,7 +103,7 @@ class TimedEvaluation:
 
     @property
     def spent_s(self) -> float:
-        """What the running stopwatch shows."""
+        """Seconds since the start of the running stopwatch."""
         return time.perf_counter() - self._started_s
 
     def due(self) -> bool:

@@ -46,7 +46,7 @@ OUR_ITERATIONS = (5, 10, 15, 20, 30, 45)
 
 def main(
     limit: Annotated[float, typer.Option(min=1, help="Seconds given to each of the others.")] = 300.0,
-    seed: Annotated[int, typer.Option(help="Of the data and the starts.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the data and the starts.")] = 1,
     json_output: JsonOption = False,
 ) -> None:
     """Print who reaches 1.01 x the noise floor on the training data, after how long, and the ratio to ours."""

@@ -141,7 +141,7 @@ def test_the_block_size_does_not_change_a_bit_of_the_prediction(tmp_path: Path, 
 
 
 def test_the_grid_rate_changes_the_prediction_by_the_integration_error_only(tmp_path: Path) -> None:
-    """Of order four without a lag. With one of order two: the lagged command acts by its mean over each step."""
+    """Order four without a lag, order two with one: the lagged command acts by its mean over each step."""
 
     def difference_rad_s(lag_s: float, every: int) -> float:
         path = write_twin(tmp_path / "twin.onnx", small_hybrid(), parameters=[[*PARAMETERS[:LAG], lag_s]])
@@ -155,7 +155,7 @@ def test_the_grid_rate_changes_the_prediction_by_the_integration_error_only(tmp_
     assert 0 < difference_rad_s(0.0, 2) < 1e-4
     lagged = difference_rad_s(0.05, 2)
     assert 0 < lagged < 0.01 * SIGMA_RAD_S
-    # What the two grids differ by goes with step^2: 5^2 - 1 to 2^2 - 1.
+    # The difference of the two grids is proportional to step^2: 5^2 - 1 to 2^2 - 1.
     assert difference_rad_s(0.05, 5) / lagged == pytest.approx(24 / 3, rel=0.1)
 
 

@@ -67,7 +67,7 @@ WHAT_HAPPENS = (
 
 
 def grid_where(happenings: Iterable[tuple[str, int]], seed: int) -> Grid:
-    """What happens, one thing after the other, each for so many samples."""
+    """A grid with these happenings in order, each for its number of samples."""
     rng = np.random.default_rng(seed)
     t_ns, command, speed, invalid_reason = (
         [EPOCH_NS],

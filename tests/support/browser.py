@@ -42,7 +42,7 @@ document.getElementById("page").onload = event => {{
 
 
 def browser() -> str:
-    """The browser's path; skips, with a word, where there is none."""
+    """The browser's path; skips the test where there is none."""
     for name in BROWSERS:
         if found := shutil.which(name):
             return found

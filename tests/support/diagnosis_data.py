@@ -1,4 +1,4 @@
-"""Windows of one fan of which everything is known: its equation, its noise, and what went wrong when."""
+"""Windows of one simulated fan with known equation, noise, and fault with its time."""
 
 import numpy as np
 

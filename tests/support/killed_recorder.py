@@ -91,7 +91,7 @@ class Kills:
         self._start()
         eventually(self._has_caught_up, "the recorder records")
         for number in range(kills):
-            time.sleep(chance.uniform(0.0, 4.0))  # whatever it does then, starting and mending included
+            time.sleep(chance.uniform(0.0, 4.0))  # at any moment, also while it starts or repairs
             self._kill()
             self._start()
             progress(number + 1)

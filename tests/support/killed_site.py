@@ -94,11 +94,11 @@ class Stages:
         self.stages = {stage: self._begin(stage) for stage in CHAIN}
 
     def take(self, raw: Raw) -> None:
-        """What acquisition would publish next."""
+        """Publish this message as acquisition would."""
         self._publish(self.source, raw, None)
 
     def ask(self, action: Action, fan: int = -1, duration_s: float = 0.0) -> None:
-        """What an operator asks for."""
+        """Publish a request of an operator."""
         name = f"{action.name.lower()} by Ann"
         self._publish(
             self.operator,
@@ -216,7 +216,7 @@ class Site(Stages):
             self.tick()
 
     def fall_silent(self, seconds: float) -> None:
-        """Nothing comes for a while; then half of what was measured comes, too late for some of the grid."""
+        """No samples for a while; then half of those measured arrive, too late for part of the grid."""
         late: list[Raw] = []
         for _ in range(int(seconds * 100)):
             self.now_ns += 10_000_000

@@ -57,7 +57,7 @@ def is_running(process_id: int) -> bool:
 
 
 class RunningCommand:
-    """A `fantwin` command in a process of its own, and the lines it writes to standard error."""
+    """A `fantwin` command in its own process, and the lines it writes to standard error."""
 
     def __init__(self, words: Iterable[object], stdout: int = subprocess.PIPE) -> None:
         """stdout: a file descriptor to write to, such as a terminal; a pipe for `output` where it is not given."""
@@ -99,7 +99,7 @@ class RunningCommand:
         return self.process.wait(DEADLINE_S)
 
     def output(self) -> Any:
-        """What it printed, as JSON; it must have ended."""
+        """The JSON it printed; it must have ended."""
         return json.loads(self._output.get(timeout=DEADLINE_S))
 
     def kill(self) -> None:
@@ -158,13 +158,13 @@ class Chain:
             yield Watcher(bus, SITE)
 
     def process_ids(self) -> dict[str, int]:
-        """Of every process that `up` says it has started last."""
+        """The ids of the processes that `up` last reported as started, by label."""
         assert self.up
         found = (re.match(r"(\S+): started, process (\d+)", line) for line in self.up.lines)
         return {match[1]: int(match[2]) for match in found if match}
 
     def kill(self, watcher: Watcher, label: str) -> float:
-        """kill -9 of a stage; how long until its successor was on the bus, s."""
+        """Kill a stage with SIGKILL; returns the seconds until its successor was on the bus."""
         old = self.process_ids()[label]
         began_s = time.monotonic()
         os.kill(old, signal.SIGKILL)
@@ -189,7 +189,7 @@ class Chain:
 
 
 def view_of(watcher: Watcher, label: str) -> StageView | None:
-    """What a watcher knows of a stage."""
+    """The view of a stage that a watcher has, or None."""
     stage, _, tray = label.partition("/")
     return next((v for v in watcher.stages() if v.health.stage == stage and v.health.instance == (tray or "all")), None)
 

@@ -1,4 +1,4 @@
-"""compose.yaml, read as text: no container engine is needed. What it takes to bring it up is in
+"""compose.yaml, read as text: no container engine is needed. How to bring it up is in
 docs/how-to/deployment.md."""
 
 from __future__ import annotations

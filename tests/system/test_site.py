@@ -1,7 +1,7 @@
-"""One site in processes of its own: a fault is raised, operators answer, every stage is killed, nothing is forgotten.
+"""One site in its own processes: a fault is raised, operators answer, every stage is killed, nothing is forgotten.
 
-The whole chain runs once. What operators do comes first, because it must survive the kills; the recorder is killed
-before the other stages, because its death alone must lose nothing.
+The whole chain runs once. The requests of operators come first because they must survive the kills. The recorder is
+killed before the other stages, because its death alone must lose nothing.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a run accepts, and how it is cut."""
+"""Valid and invalid runs, and how a run is cut."""
 
 from itertools import pairwise
 

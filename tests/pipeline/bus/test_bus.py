@@ -37,7 +37,7 @@ def line_of(process: subprocess.Popen[str]) -> str:
 
 
 def collected(collector: subprocess.Popen[str], publisher: subprocess.Popen[str]) -> str:
-    """What the collector prints at the end; until then the publisher publishes one more message at a time."""
+    """The line that the collector prints at the end; until then the publisher publishes one message at a time."""
     result: queue.Queue[str] = queue.Queue()
     threading.Thread(target=lambda: result.put(line_of(collector)), daemon=True).start()
     assert publisher.stdin

@@ -123,7 +123,7 @@ class Site:
         eventually(lambda: self.core.conditions.alarm_state(fan).active, f"fan {fan} has an alarm")
 
     def ask(self, *words: object) -> str:
-        """What the command prints; it must end well."""
+        """The output of the command, which must succeed."""
         done = fantwin("alarms", *words, *self.words)
         assert done.exit_code == 0, done.exception
         return done.stdout

@@ -1,4 +1,4 @@
-"""What the stages say, before they start, would keep them from working."""
+"""Problems that the stages report before they start."""
 
 from __future__ import annotations
 

@@ -149,7 +149,7 @@ def test_an_imported_table_is_judged_at_the_rate_of_the_twin(tmp_path):
     assert result.returncode == 1 and "no.such_key" in result.stderr.replace("'no'", "no.such_key")
     out = tmp_path / "out.mcap"
     assert replay(bare, "--twin", tmp_path / "twin.onnx", "-o", out).returncode == 0
-    assert json.loads(replay("--json", out).stdout)["samples"] > 550, "what was made of a table can be judged again"
+    assert json.loads(replay("--json", out).stdout)["samples"] > 550, "the output made from a table can be judged again"
 
 
 def test_no_file_is_ever_written_over(tmp_path):

@@ -31,7 +31,7 @@ KEY = tray_key(SITE, TRAY, "snapshot")
 
 @pytest.fixture(scope="module")
 def notes() -> list[ScorerSnapshot]:
-    """What a scorer noted after three days and after six."""
+    """The snapshots of a scorer after three days and after six."""
     worn, noted = core(), []
     for number, (from_day, days) in enumerate(((0, 3), (3, 6))):
         assert list(live_through(worn, days, from_day, swing=0.005)) == []

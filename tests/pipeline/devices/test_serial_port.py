@@ -58,7 +58,7 @@ class Device:
 
 
 class Items:
-    """What a line delivered, in order."""
+    """The items that a link delivered, in order."""
 
     def __init__(self) -> None:
         self.queue: queue.Queue[LinkUp | LinkDown | ReceivedBytes] = queue.Queue()

@@ -1,4 +1,4 @@
-"""What was lost over all sessions, computed from the last health of each."""
+"""Losses over all sessions, computed from the last health of each."""
 
 from __future__ import annotations
 

@@ -334,7 +334,7 @@ def test_an_undecodable_alarm_costs_that_alarm_only(tmp_path):
 
 
 @pytest.mark.parametrize("topic", ["grid", "prediction"])
-def test_a_recording_without_the_messages_of_a_stage_in_between_is_still_compared(tmp_path, topic):
+def test_a_recording_that_lacks_intermediate_messages_is_still_compared(tmp_path, topic):
     site = Site(tmp_path, seed=4)
     site.run(150)
     site.kill("twin_integrator")

@@ -1,4 +1,4 @@
-"""What is played: parts in order, each message once, a stretch of it, and round after round."""
+"""Playback of recordings: parts in order, each message once, a time range, and in a loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The time a stage goes by."""
+"""The clock that a stage uses."""
 
 from __future__ import annotations
 

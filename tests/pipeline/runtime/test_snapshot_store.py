@@ -1,4 +1,4 @@
-"""The snapshot store: the file is whole whatever happens, and one that cannot be read is one line."""
+"""The snapshot store: the file is always complete, and an unreadable file is reported in one line."""
 
 from __future__ import annotations
 

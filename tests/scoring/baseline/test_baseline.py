@@ -15,7 +15,7 @@ ADAPTATION_INTERVALS = 60.0
 
 
 def baseline_of(settings: BaselineSettings = SETTINGS, **changes: float) -> Baseline:
-    """Of two fans."""
+    """A baseline of two fans."""
     return Baseline(2, settings.model_copy(update=changes), ADAPTATION_INTERVALS)
 
 

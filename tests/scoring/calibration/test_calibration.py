@@ -44,7 +44,7 @@ def healthy(memory_s: float, seed: int, fans: int = FANS, runs: int = RUNS, samp
 
 @pytest.fixture(scope="module")
 def white_limits() -> Limits:
-    """Of white residuals, as few false alarms as five fan-hours can show."""
+    """Limits for white residuals, at the lowest false alarm rate that five fan-hours can support."""
     return calibrate(healthy(0.0, 1), TOP_RAD_S, Timing(), 15.0)
 
 
@@ -67,7 +67,7 @@ def sensor_of(limits: Limits) -> SensorSettings:
     return sensor
 
 
-# What is declared
+# The declared rate
 
 
 @pytest.mark.parametrize("memory_s", [0.0, 0.3, 3.0])
@@ -151,7 +151,7 @@ def test_the_limit_of_missing_readings_stays_below_a_dead_tacho() -> None:
     assert 0.5 < sensor_of(limits).missing_share < 1.0
 
 
-# What differs from day to day
+# Differences between days
 
 
 def days(
@@ -266,7 +266,7 @@ def test_the_tacho_has_its_own_limits_and_widens_no_others() -> None:
     np.testing.assert_allclose(_with_alarms_at_most(found, ones, 0), expected)
 
 
-# What they find
+# Alarms at these limits
 
 
 @pytest.mark.parametrize(("size", "within_s"), [(3.0, 0.25), (1.5, 0.5), (0.5, 10.0)])

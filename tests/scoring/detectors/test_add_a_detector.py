@@ -28,11 +28,11 @@ from scoring.limits import Limits, Timing
 from tests.support.healthy_residuals import autoregressive, in_blocks, samples_of
 from tests.support.scored_blocks import CALIBRATION, commissioned, core_of, feed, prediction_of, snapshot_of
 
-# What a file in scoring/detectors/ would hold.
+# The contents of a new file in scoring/detectors/.
 
 
 class PeakSettings(SingleLimit):
-    """Of Peak."""
+    """The settings of Peak."""
 
 
 class Peak(Detector):

@@ -144,7 +144,7 @@ def test_an_extreme_number_counts_as_the_largest() -> None:
 
 
 def average_run_length(z: np.ndarray, reference: float, limit: float) -> float:
-    """Of many streams, (n, streams), which must all end in an alarm."""
+    """Mean run length over streams z (n, streams), each of which must end in an alarm."""
     sums = Cusum(z.shape[1], reference, math.inf).update(z, np.ones(z.shape, np.bool_), 1.0)
     beyond = sums > limit
     assert beyond.any(axis=0).all()

@@ -92,7 +92,7 @@ def test_memory_is_bounded_and_merging_keeps_the_trend() -> None:
     trend = trend_of(points)
     assert trend.significant and trend.low <= 0.001 <= trend.high
     assert trend.slope_per_day == pytest.approx(0.001, rel=0.02)
-    # What merged points claim as their errors is that of their means.
+    # The error of a merged point is that of its mean.
     assert points.snapshot()["std_error"][0] < 0.2 * 0.01
 
 

@@ -1,4 +1,4 @@
-"""scoring.wear.wear_monitor, through the scorer: days of bearing wear, of which 30 s of each hour are measured."""
+"""scoring.wear.wear_monitor, through the scorer: days of bearing wear, with 30 s measured in each hour."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def burst(
     seconds: float = 30.0,
     speed: float | None = None,
 ) -> Prediction:
-    """Of two fans whose speed is held, another one each hour; the second one's friction grows."""
+    """Predictions of two fans at a held speed that differs from hour to hour; the friction of the second grows."""
     rng = np.random.default_rng(round(hour * 4))
     fan, n = balance_of_a_fan(), round(seconds * 1e9 / STEP_NS)
     t_ns = EPOCH_NS + round(hour * HOUR_NS) + np.arange(n) * STEP_NS
@@ -273,7 +273,7 @@ def test_a_fan_gets_a_point_once_its_disturbance_is_out_of_the_window() -> None:
 
 
 def with_a_fault(first_s: int = 7) -> Prediction:
-    """Of the second fan, for 2 s: it takes 2 more of the command."""
+    """A block in which the second fan needs 2 more of the command for 2 s."""
     block = burst(0, seconds=60.0)
     more = np.zeros((len(block.t_ns), 2))
     more[50 * first_s : 50 * (first_s + 2), WORN] = 2.0

@@ -167,7 +167,7 @@ def test_narx_has_no_time_step_and_fails_on_every_grid_but_its_own() -> None:
 
 
 def exact_narx_of_the_linear_fan() -> Narx:
-    """w[k+1] = a w[k] + b u[k] at 100 Hz, by one unit of which only the linear part is reached."""
+    """w[k+1] = a w[k] + b u[k] at 100 Hz, by one hidden unit that stays in its linear range."""
     a = np.exp(-LINEAR["alpha"] / LINEAR["J"] / fan_data.RATE_HZ)
     small = 1e-6
     rows = np.zeros((INPUTS + 2, NARX_UNITS))

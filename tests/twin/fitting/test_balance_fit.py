@@ -27,7 +27,7 @@ TRUTH = (
     np.array([PLANT.J, PLANT.alpha, PLANT.C_D, PLANT.coulomb_v + PLANT.duty_dead / DUTY_PER_V], dtype=np.float64)
     * DUTY_PER_V
 )
-"""Of PLANT, in duty: friction and the dead zone of its bridge are one."""
+"""The balance coefficients of PLANT, in duty; friction and the dead zone of its bridge are one term."""
 
 
 @pytest.fixture(scope="module")

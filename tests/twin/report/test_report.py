@@ -53,7 +53,7 @@ SMALLEST_TEXT_UNITS = 8.5 * 0.88
 
 
 class Page(HTMLParser):
-    """What a page holds: ids, references, section ids, captions, machine-readable numbers by table row."""
+    """The contents of a page: ids, references, section ids, captions, machine-readable numbers by table row."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
