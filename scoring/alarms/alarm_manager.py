@@ -255,7 +255,7 @@ def _from_json(stored: Mapping[str, Any]) -> Alarm:
             **stored,
             "severity": Severity.known(stored["severity"]),
             "transition": Transition.known(stored["transition"]),
-            "statistic": Statistic.known(stored["statistic"]),
+            "statistic": Statistic(stored["statistic"]),  # a detector may be added before its name
             "causes": tuple(Diagnosis(**cause) for cause in stored["causes"]),
         }
     )

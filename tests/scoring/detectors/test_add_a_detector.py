@@ -120,6 +120,16 @@ def test_its_state_is_in_the_snapshot_and_continues_to_the_bit() -> None:
     assert len(state["balance_peak"]["peak"]) == 1
 
 
+def test_its_alarm_survives_a_restart() -> None:
+    core = commissioned(core_of(calibration=PEAK_ONLY))
+    feed(core, [prediction_of(np.zeros(100), balance=np.where(np.arange(100) < 50, 0.0, 3.0))])
+    successor = core_of(calibration=PEAK_ONLY)
+    _, republished = successor.restore(snapshot_of(core))
+    assert isinstance(republished, Alarm)
+    assert (republished.active, republished.statistic) == (True, Statistic(100))
+    assert "snapshots_not_understood" not in successor.counters()
+
+
 def test_a_snapshot_from_before_it_was_added_is_restored_and_it_starts_new() -> None:
     speed, balance = autoregressive(300, 2, 0.0, 1), autoregressive(300, 2, 0.0, 2)
     before = FanScorer(2, Limits.model_validate(CALIBRATION))
