@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+FORMER_FORMAT_VERSION = 1
 FORMER_PERIOD_S = 0.01  # the deviation of a summed residual was that of this period, whatever the rate of the runs
 FORMER_SENSOR = {"stuck_s": 5.0, "missing_share": 0.25}
 FORMER_NAMES = {"stuck_s": "detectors.sensor.stuck_s", "missing_share": "detectors.sensor.missing_share"} | {

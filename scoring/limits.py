@@ -17,7 +17,7 @@ from scoring.detectors.detector import DetectorSettings, Source
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import rows
 from scoring.detectors.tacho import SensorSettings
-from scoring.former_limits import upgraded
+from scoring.former_limits import FORMER_FORMAT_VERSION, upgraded
 
 FORMAT_VERSION = 2
 NEVER_S = 1e9
@@ -69,7 +69,7 @@ class Limits(_Entry):
     @classmethod
     def _of_older_card(cls, card: Any) -> Any:
         is_older = isinstance(card, Mapping) and isinstance(card.get("speed"), Mapping) and "detectors" not in card
-        return upgraded(card) if is_older and card.get("format_version", 1) < FORMAT_VERSION else card
+        return upgraded(card) if is_older and card.get("format_version", 1) == FORMER_FORMAT_VERSION else card
 
     @field_validator("detectors", mode="before")
     @classmethod

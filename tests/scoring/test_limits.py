@@ -100,6 +100,12 @@ def test_wrong_limits_are_refused_by_name(wrong: dict[str, object], where: str) 
         Limits.model_validate(card)
 
 
+@pytest.mark.parametrize("version", ["1", "x", None, [1]])
+def test_a_format_version_that_is_no_number_is_refused(version: object) -> None:
+    with pytest.raises(ValidationError):
+        Limits.model_validate({"format_version": version, "speed": {}, "balance": {}, "stuck_s": 5.0})
+
+
 def test_a_card_of_format_1_is_read_with_its_former_names() -> None:
     former = {
         "format_version": 1,
