@@ -40,7 +40,7 @@ def parse_source(values: Any) -> SourceConfig:
     if not isinstance(values, Mapping) or "kind" not in values:
         raise ValueError(f'write source = {{ kind = "...", ... }}; kinds: {", ".join(SOURCE_KINDS)}')
     kind = values["kind"]
-    if kind not in SOURCE_KINDS:
+    if not isinstance(kind, str) or kind not in SOURCE_KINDS:
         raise ValueError(f"unknown kind {kind!r}; known: {', '.join(SOURCE_KINDS)}")
     model: type[SourceConfig] = _load(SOURCE_KINDS[kind].config)
     for key in values:
