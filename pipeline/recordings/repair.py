@@ -23,7 +23,6 @@ from pipeline.recordings.contents import NOT_A_RECORD, losses_outside_counts
 from pipeline.recordings.disk import AtomicAppendFile, not_being_written, refused, sync_folder
 from pipeline.recordings.index import SHORT_ENDING
 from pipeline.recordings.records import (
-    CORRUPT_DATA_ERRORS,
     MESSAGE,
     RecordingError,
     RecordReader,
@@ -146,6 +145,7 @@ def _add_name(path: Path, name: Path) -> None:
 def _written_copy(found: Scan, target: Path) -> Path:
     """A repaired copy, on the disk under a temporary name. Raises OSError, and leaves no file then."""
     unfinished = target.with_name(target.name + _UNFINISHED_SUFFIX)
+    lock = AtomicAppendFile(unfinished)  # against a second repair to the same target
     try:
         with unfinished.open("wb") as file:
             if found.is_intact:
@@ -158,6 +158,8 @@ def _written_copy(found: Scan, target: Path) -> Path:
     except BaseException:
         unfinished.unlink(missing_ok=True)
         raise
+    finally:
+        lock.close()
     return unfinished
 
 
@@ -171,6 +173,8 @@ def _write_repaired(found: Scan, file: BinaryIO) -> None:
         for c in found.index.channels.values()
     }
     for record in RecordReader(found.path):
+        if record.offset in found.damaged_offsets:
+            continue
         data = b""
         match record.parsed:
             case Metadata(name=name, metadata=metadata):
@@ -180,8 +184,7 @@ def _write_repaired(found: Scan, file: BinaryIO) -> None:
             case Attachment() as a:
                 writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
             case Chunk() as chunk:
-                with suppress(*CORRUPT_DATA_ERRORS):
-                    data = chunk_data(chunk)
+                data = chunk_data(chunk)
             case None if record.opcode == Opcode.MESSAGE:
                 data = record.data
             case None if record.opcode == Opcode.DATA_END:

@@ -70,6 +70,8 @@ class Scan:
     """messages whose channel was described in a damaged chunk"""
     discarded_bytes: int = 0
     """in records that are not whole"""
+    damaged_offsets: set[int] = field(default_factory=set)
+    """where the damaged chunks, attachments and other records are"""
     data_end: int = len(MCAP0_MAGIC)
     """offset after the last intact chunk or other record of the data"""
     missing_indexes: bytes = b""
@@ -136,6 +138,7 @@ class _Scanner:
         try:
             self._add(record)
         except CORRUPT_DATA_ERRORS:
+            found.damaged_offsets.add(record.offset)
             found.discarded_bytes += record.end - record.offset
             found.damaged_chunks += record.opcode == Opcode.CHUNK
             found.damaged_attachments += record.opcode == Opcode.ATTACHMENT

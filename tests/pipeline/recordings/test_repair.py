@@ -6,22 +6,25 @@ import os
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
+from zlib import crc32
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from pipeline.recordings.contents import contents_of, damage_of
+from pipeline.recordings.disk import AtomicAppendFile
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.records import RECORD, RecordReader
+from pipeline.recordings.records import RECORD, RecordReader, record_bytes
 from pipeline.recordings.repair import recover, repair_in_place
 from pipeline.recordings.scan import scan
-from pipeline.recordings.sequence_ledger import StreamCounts
+from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
 from pipeline.recordings.writing import RecordingWriter
 from tests.pipeline.recordings.test_recordings import ALARM_KEY, RAW_KEY, alarm, disk_of, raw, write
 
@@ -313,6 +316,43 @@ def test_a_damaged_attachment_is_left_out_and_reported(tmp_path, whole):
     assert damage_of(found)[-1] == "damaged attachments: 1"
     assert read_metadata(path).attachments == {}
     assert len(read_by_others(path)) == 41
+
+
+def test_a_chunk_that_holds_no_messages_in_spite_of_its_checksum_is_left_out(tmp_path, whole):
+    data = RECORD.pack(Opcode.MESSAGE, 1000) + bytes(50)
+    chunk = Chunk(
+        "", data, message_end_time=1, message_start_time=1, uncompressed_crc=crc32(data), uncompressed_size=59
+    )
+    content, (at, _) = whole.read_bytes(), chunk_ends(whole)[0]
+    path = tmp_path / "r.mcap"
+    path.write_bytes(content[:at] + record_bytes(chunk) + content[at:])
+    found = recover(path).found
+    assert (found.damaged_chunks, found.messages) == (1, 41)
+    assert scan(path).is_intact
+    assert len(read_by_others(path)) == 41
+
+
+def test_a_damaged_metadata_record_is_left_out(tmp_path):
+    path = tmp_path / "r.mcap"
+    with RecordingWriter(path, {}, ledger=SequenceLedger({STREAM: 7})) as writer:
+        writer.add_message(RAW_KEY, raw(7), 1000)
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"acquisition-1\x01\x00\x00\x007", b"acquisition-1\x01\x00\x00\x00x"))
+    assert recover(path).found.damaged_records == 1
+    assert scan(path).is_intact
+    assert len(read_by_others(path)) == 1
+
+
+def test_two_repairs_do_not_write_the_same_file(tmp_path, whole):
+    path = tmp_path / "r.mcap"
+    path.write_bytes(whole.read_bytes()[:-300])
+    other = AtomicAppendFile(tmp_path / "r.mcap.recovering")
+    other.write(b"of the other")
+    with pytest.raises(RecordingError, match="r.mcap is left as it was"):
+        recover(path)
+    assert (tmp_path / "r.mcap.recovering").read_bytes() == b"of the other"
+    other.close()
+    assert len(read_by_others(recover(path).path)) == 41
 
 
 @pytest.mark.parametrize("room", [0, 100, 10_000])
