@@ -62,8 +62,8 @@ class SequenceLedger:
     def add(self, key: str, producer: str, sequence: int, received_t_ns: int) -> None:
         """Count a recorded message. The card of a twin is repeated at the start of each part and counts once."""
         stream = (key, producer)
-        state = self._state(stream)
-        if state.is_duplicate(sequence) and key.endswith("/twin"):
+        state = self._streams.get(stream) or self._state(stream)
+        if key.endswith("/twin") and state.is_duplicate(sequence):
             return
         counts = self.counts.get(stream)
         if counts is None:
