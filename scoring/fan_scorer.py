@@ -15,7 +15,7 @@ import numpy as np
 
 from schemas.messages import Array, Statistic
 from schemas.units import NS_PER_S
-from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Source
+from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Signal
 from scoring.detectors.motion import Motion
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.state import restore_column
@@ -26,7 +26,7 @@ from scoring.residual import Residual
 from scoring.samples import Samples
 
 HALF_LIMIT = 0.5  # once a fan is commissioned, baselines learn only below this score
-RESIDUALS: tuple[Source, ...] = ("speed", "balance")
+RESIDUALS: tuple[Signal, ...] = ("speed", "balance")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,11 +59,11 @@ class Observation:
 
     ratios: Array
     """(rows of the table, n, fans) every statistic in multiples of its limit"""
-    persistent: dict[Source, Array]
+    persistent: dict[Signal, Array]
     """(n, fans) of each residual, see DetectorInput"""
-    expected: dict[Source, Array]
+    expected: dict[Signal, Array]
     """(n, fans) the expected residual at these speeds, sigma"""
-    motion_rad_s: Array
+    transient_rad_s: Array
     """(n, fans) see scoring.detectors.motion"""
 
 
@@ -84,12 +84,14 @@ class _ScoredResidual:
 class FanScorer:
     """Scores one tray's fans. The result does not depend on how samples are cut into blocks."""
 
-    def __init__(self, fans: int, limits: Limits, *, observing: bool = False) -> None:
+    def __init__(self, fans: int, limits: Limits, *, for_calibration: bool = False) -> None:
         """observing: keep what calibration needs, for `observed`; statistics then grow beyond their limits."""
         self.limits = limits
         self.residuals = {source: Residual(fans, source, limits) for source in RESIDUALS}
-        contexts = {source: residual.context(fans, capped=not observing) for source, residual in self.residuals.items()}
-        of_tacho = DetectorContext(fans=fans, smoothing_s=limits.timing.smoothing_s, capped=not observing)
+        contexts = {
+            source: residual.context(fans, capped=not for_calibration) for source, residual in self.residuals.items()
+        }
+        of_tacho = DetectorContext(fans=fans, smoothing_s=limits.timing.smoothing_s, capped=not for_calibration)
         self._rows = rows()
         self.detectors: dict[str, Detector] = {
             row.name: row.detector(limits.detectors[row.name], contexts.get(row.source, of_tacho))
@@ -110,7 +112,7 @@ class FanScorer:
         self.origin_t_ns: int | None = None
         self._interval = 0
         self._interval_ns = max(1, round(limits.timing.baseline_s * NS_PER_S))
-        self._observations: list[Observation] | None = [] if observing else None
+        self._observations: list[Observation] | None = [] if for_calibration else None
 
     @property
     def held_baselines(self) -> Array:
@@ -137,7 +139,7 @@ class FanScorer:
         return ScoredBlock(**{name: np.concatenate([getattr(s, name) for s in scored]) for name in vars(scored[0])})
 
     def observed(self) -> list[Observation]:
-        """Observations since the last call, in the order of their samples; only if `observing`."""
+        """Observations since the last call, in the order of their samples; only if `for_calibration`."""
         assert self._observations is not None
         observations, self._observations = self._observations, []
         return observations
@@ -151,22 +153,22 @@ class FanScorer:
             detector.reset(fans)
         self._below_half_limit[fans] = self._within_limit[fans] = True
 
-    def limit_sigmas(self, source: Source, step_s: float) -> float:
+    def limit_sigmas(self, source: Signal, period_s: float) -> float:
         """How far the smoothed residual may be from its baseline, sigma; infinite without that limit."""
         limits = [
-            self.detectors[row.name].limit_sigmas(step_s)
+            self.detectors[row.name].limit_sigmas(period_s)
             for row in self._rows
             if row.source == source and row.detector.settings is SmoothedSettings and row.name in self.detectors
         ]
         return min(limits, default=np.inf)
 
-    def persistent_limit_sigmas(self, source: Source, step_s: float) -> float:
+    def persistent_limit_sigmas(self, source: Signal, period_s: float) -> float:
         """How far a shift that stays may be from the commissioned baseline, sigma; infinite without any limit.
 
         The baseline follows to its adaptation limit; the most sensitive detector reports what is left.
         """
         limits = [
-            self.detectors[row.name].limit_sigmas(step_s)
+            self.detectors[row.name].limit_sigmas(period_s)
             for row in self._rows
             if row.source == source and row.name in self.detectors
         ]
@@ -186,18 +188,18 @@ class FanScorer:
     def _score(self, block: Samples, stretch: slice) -> ScoredBlock:
         """Score samples of one interval."""
         speed_rad_s, alive = block.speed_rad_s[stretch], block.alive[stretch]
-        step_s = block.period_ns / NS_PER_S
-        motion_rad_s = self._motion.update(speed_rad_s, step_s)
+        period_s = block.period_ns / NS_PER_S
+        transient_rad_s = self._motion.update(speed_rad_s, period_s)
 
-        def residual(source: Source, values: Array, valid: Array) -> _ScoredResidual:
-            return self._score_residual(source, values[stretch], valid[stretch], speed_rad_s, motion_rad_s, step_s)
+        def residual(source: Signal, values: Array, valid: Array) -> _ScoredResidual:
+            return self._score_residual(source, values[stretch], valid[stretch], speed_rad_s, transient_rad_s, period_s)
 
         speed = residual("speed", block.speed_residual, block.speed_valid)
         balance = residual("balance", block.balance, block.balance_valid)
         inputs = {
             source: DetectorInput(
                 period_ns=block.period_ns,
-                step_s=step_s,
+                period_s=period_s,
                 valid=valid,
                 standardised=standardised,
                 persistent=persistent,
@@ -216,10 +218,10 @@ class FanScorer:
                 valid = inputs[row.source].valid
                 ratios[number] = np.where(valid, self.detectors[row.name].update(inputs[row.source]), 0.0)
         if self._observations is not None:
-            persistent: dict[Source, Array] = {"speed": speed.persistent, "balance": balance.persistent}
-            expected: dict[Source, Array] = {"speed": speed.expected, "balance": balance.expected}
+            persistent: dict[Signal, Array] = {"speed": speed.persistent, "balance": balance.persistent}
+            expected: dict[Signal, Array] = {"speed": speed.expected, "balance": balance.expected}
             self._observations.append(
-                Observation(ratios=ratios, persistent=persistent, expected=expected, motion_rad_s=motion_rad_s)
+                Observation(ratios=ratios, persistent=persistent, expected=expected, transient_rad_s=transient_rad_s)
             )
         largest = ratios.argmax(axis=0)
         score = np.take_along_axis(ratios, largest[np.newaxis], axis=0)[0]
@@ -249,20 +251,20 @@ class FanScorer:
         )
 
     def _score_residual(
-        self, source: Source, values: Array, valid: Array, speed_rad_s: Array, motion_rad_s: Array, step_s: float
+        self, source: Signal, values: Array, valid: Array, speed_rad_s: Array, transient_rad_s: Array, period_s: float
     ) -> _ScoredResidual:
         residual = self.residuals[source]
         expected = residual.expected(speed_rad_s)
         scaling = residual.scaling(speed_rad_s, valid)
         baseline = residual.baseline.value * scaling
-        residual.learn(values - expected, scaling, speed_rad_s, valid, step_s)
+        residual.learn(values - expected, scaling, speed_rad_s, valid, period_s)
         scored = valid & residual.baseline.is_set
         shift = values - expected - baseline
-        standardised, persistent = residual.standardise(shift, scaling, speed_rad_s, motion_rad_s, scored, step_s)
+        standardised, persistent = residual.standardise(shift, scaling, speed_rad_s, transient_rad_s, scored, period_s)
         return _ScoredResidual(
             valid=valid,
             scored=scored,
-            smoothed=residual.smooth(shift, scored, step_s),
+            smoothed=residual.smooth(shift, scored, period_s),
             baseline=baseline,
             expected=expected,
             commissioned=residual.baseline.commissioned * scaling,

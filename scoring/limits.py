@@ -13,10 +13,10 @@ from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny, ValidationErr
 from pydantic_core import PydanticCustomError
 
 from scoring.baseline.healthy_residual import HealthyResidual
-from scoring.detectors.detector import DetectorSettings, Source
+from scoring.detectors.detector import DetectorSettings, Signal
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import rows
-from scoring.detectors.tacho import SensorSettings
+from scoring.detectors.tacho import TachoSettings
 from scoring.former_limits import FORMER_FORMAT_VERSION, upgraded
 
 FORMAT_VERSION = 2
@@ -91,7 +91,7 @@ class Limits(_Entry):
 
         return self.model_copy(update={"speed": part(self.speed), "balance": part(self.balance)})
 
-    def residual(self, source: Source) -> HealthyResidual:
+    def residual(self, source: Signal) -> HealthyResidual:
         """The healthy residual of a source; ValueError for the tacho, which has none."""
         match source:
             case "speed":
@@ -101,7 +101,7 @@ class Limits(_Entry):
             case "tacho":
                 raise ValueError("the tacho has no residual")
 
-    def settings_of(self, source: Source, kind: type[Settings]) -> Settings | None:
+    def settings_of(self, source: Signal, kind: type[Settings]) -> Settings | None:
         """Settings of a kind of detector on a source; None where it is not used."""
         of_source = (self.detectors.get(row.name) for row in rows() if row.source == source)
         return next((settings for settings in of_source if isinstance(settings, kind)), None)
@@ -144,7 +144,7 @@ def uncalibrated(alarm_sigmas: float, timing: Timing) -> Limits:
         balance=HealthyResidual(),
         detectors={
             "speed_smoothed": SmoothedSettings(limit=alarm_sigmas),
-            "sensor": SensorSettings(stuck_s=NEVER_S, missing_share=1.0),
+            "sensor": TachoSettings(stuck_s=NEVER_S, missing_share=1.0),
         },
         timing=timing,
     )

@@ -11,7 +11,7 @@ from schemas.messages import Array
 from scoring.baseline.baseline import Baseline
 from scoring.baseline.healthy_residual import FanOffsets
 from scoring.baseline.speed_scaling import speed_scaling
-from scoring.detectors.detector import DetectorContext, Source
+from scoring.detectors.detector import DetectorContext, Signal
 from scoring.detectors.deviation import smoothed_deviation
 from scoring.detectors.drift import DEFAULT_REFERENCE_SIGMAS, DriftSettings
 from scoring.detectors.low_pass import LowPass
@@ -26,7 +26,7 @@ LARGEST_SIGMAS = 1e6  # so that sums and squares stay finite
 class Residual:
     """The speed residual or the torque balance, with the baseline of every fan."""
 
-    def __init__(self, fans: int, source: Source, limits: Limits) -> None:
+    def __init__(self, fans: int, source: Signal, limits: Limits) -> None:
         healthy = limits.residual(source)
         offsets = healthy.fan_offsets
         self._fan_offsets = np.array(offsets.offset_sigmas).T if offsets else np.zeros((1, fans))
@@ -71,31 +71,31 @@ class Residual:
         """(n, fans) the baseline at these speeds, relative to that at the reference speed."""
         return speed_scaling(self._healthy.baseline, speed_rad_s, valid)
 
-    def learn(self, residual: Array, scaling: Array, speed_rad_s: Array, valid: Array, step_s: float) -> None:
+    def learn(self, residual: Array, scaling: Array, speed_rad_s: Array, valid: Array, period_s: float) -> None:
         """Add samples to the interval of the baseline. All (n, fans); residual: less the expected one, sigma.
 
         Samples far from the baseline are clipped, so that one outlier does not move it.
         """
         limit = self._healthy.baseline.commissioning_limit_sigmas
-        reach = limit * scaling + self._clip(step_s) * self._residual_std(speed_rad_s, valid)
+        reach = limit * scaling + self._clip(period_s) * self._residual_std(speed_rad_s, valid)
         centre = self.baseline.value * scaling
         clipped = np.clip(np.where(valid, residual, centre), centre - reach, centre + reach)
         self.baseline.add(clipped, valid, scaling)
 
-    def smooth(self, shift: Array, valid: Array, step_s: float) -> Array:
+    def smooth(self, shift: Array, valid: Array, period_s: float) -> Array:
         """(n, fans) the low-passed residual less its baseline, sigma: what people are shown."""
-        return self._low_pass.update(_finite(shift, valid), valid, step_s)
+        return self._low_pass.update(_finite(shift, valid), valid, period_s)
 
     def standardise(
-        self, shift: Array, scaling: Array, speed_rad_s: Array, motion_rad_s: Array, valid: Array, step_s: float
+        self, shift: Array, scaling: Array, speed_rad_s: Array, transient_rad_s: Array, valid: Array, period_s: float
     ) -> tuple[Array, Array]:
         """The residual in healthy standard deviations, and in those of its low frequencies; see DetectorInput.
 
         All (n, fans). shift: the residual less the expected one and the baseline, sigma.
         """
-        clip = self._clip(step_s)
+        clip = self._clip(period_s)
         standardised = _finite(shift, valid) / self._residual_std(speed_rad_s, valid)
-        persistent = standardised / self._persistent_std(scaling, speed_rad_s, motion_rad_s, valid)
+        persistent = standardised / self._persistent_std(scaling, speed_rad_s, transient_rad_s, valid)
         return np.clip(standardised, -clip, clip), np.clip(persistent, -clip, clip)
 
     def reset(self, fans: Array) -> None:
@@ -111,8 +111,8 @@ class Residual:
         self.baseline.restore(state["baseline"])
         self._low_pass.restore(state["low_pass"])
 
-    def _clip(self, step_s: float) -> float:
-        deviation = smoothed_deviation(self._smoothing_s, self._healthy.autocorrelation_time_s, step_s)
+    def _clip(self, period_s: float) -> float:
+        deviation = smoothed_deviation(self._smoothing_s, self._healthy.autocorrelation_time_s, period_s)
         return max(MIN_CLIP_STDS, CLIP_LIMITS * deviation * self._smoothed_limit)
 
     def _residual_std(self, speed_rad_s: Array, valid: Array) -> Array | float:
@@ -121,7 +121,9 @@ class Residual:
             return healthy.residual_std[0]
         return np.where(valid, np.interp(np.abs(speed_rad_s), healthy.speeds_rad_s, healthy.residual_std), 1.0)
 
-    def _persistent_std(self, scaling: Array, speed_rad_s: Array, motion_rad_s: Array, valid: Array) -> Array | float:
+    def _persistent_std(
+        self, scaling: Array, speed_rad_s: Array, transient_rad_s: Array, valid: Array
+    ) -> Array | float:
         """Of the low-frequency residual, relative to its median: by speed, by motion, and by an uncertain baseline."""
         healthy = self._healthy
         relative: Array | float = healthy.persistent_std[0]
@@ -129,7 +131,7 @@ class Residual:
             at_speed = np.interp(np.abs(speed_rad_s), healthy.speeds_rad_s, healthy.persistent_std)
             relative = np.where(valid, at_speed, 1.0)
         if healthy.transient_scale_rad_s is not None:
-            relative = relative * np.sqrt(1.0 + np.square(motion_rad_s / healthy.transient_scale_rad_s))
+            relative = relative * np.sqrt(1.0 + np.square(transient_rad_s / healthy.transient_scale_rad_s))
         if healthy.baseline.rms_sigmas > 0.0:
             # an offset that is not known then stays within the reference value of the drift
             uncertainty = np.where(valid, self.baseline.offset_uncertainty(scaling), 0.0)

@@ -35,7 +35,7 @@ from pipeline.devices.sample_source import (
 )
 from pipeline.devices.source_kinds import build_source
 from pipeline.errors import UserError
-from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from schemas.messages import Array, Command, Raw
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
@@ -242,14 +242,14 @@ def build_tray_source(context: Context) -> SampleSource:
         raise StageError(f"[[tray]] {tray.name}: {error}") from error
 
 
-def build(context: Context) -> Parts:
+def build(context: Context) -> BuiltStage:
     """The core of one tray and its source.
 
     Raises:
         StageError: a setting of the source is missing.
     """
     source = build_tray_source(context)
-    return Parts(AcquisitionCore(context.tray, context.config, source, context.started_t_ns), source)
+    return BuiltStage(AcquisitionCore(context.tray, context.config, source, context.started_t_ns), source)
 
 
 def check(context: Context) -> list[str]:

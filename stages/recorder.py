@@ -26,7 +26,7 @@ from pipeline.recordings.metadata import recording_metadata
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.sequence_ledger import SequenceLedger
-from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from schemas.envelope import Envelope
 from schemas.messages import Health, Message
 from schemas.streams import StreamId
@@ -338,7 +338,7 @@ class Recorder(Core):
                     self._duplicated[line.key, line.producer] = line.duplicated
 
 
-def build(context: Context) -> Parts:
+def build(context: Context) -> BuiltStage:
     """Repair what a killed recorder left, and begin the first part.
 
     Raises:
@@ -366,7 +366,7 @@ def build(context: Context) -> Parts:
                 "start again, or use `fantwin recover`",
                 path,
             )
-        return Parts(Recorder(parts, config, context.started_t_ns))
+        return BuiltStage(Recorder(parts, config, context.started_t_ns))
     except RecordingError as error:
         raise StageError(f"{error} (recorder.file)") from error
 

@@ -24,7 +24,7 @@ from pydantic import Field, model_validator
 from pipeline.devices.device_clock import UINT32, DeviceClock
 from pipeline.devices.device_sequence import LARGEST_GAP
 from pipeline.devices.interpolation import NEVER_NS, LastReadings, Samples, all_true, interpolate_samples
-from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
 from schemas.blocks import cut, join
 from schemas.messages import Array, Grid, InvalidReason, Raw
 from schemas.units import NS_PER_S
@@ -286,9 +286,9 @@ class ResamplerCore(Core):
         return [grid] if rows == size else [cut(grid, k, min(k + size, count)) for k in range(0, count, size)]
 
 
-def build(context: Context) -> Parts:
+def build(context: Context) -> BuiltStage:
     """The core of one tray."""
-    return Parts(ResamplerCore(context.tray.fans, context.config))
+    return BuiltStage(ResamplerCore(context.tray.fans, context.config))
 
 
 STAGE = Stage(

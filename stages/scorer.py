@@ -7,7 +7,7 @@ fan's alarm), `snapshot` (what a restart needs).
 Timing: one score for every prediction, at once, block for block; delays count the time of valid samples.
 
 Four things are kept apart: the *statistics* on two residuals (scoring.fan_scorer), their *limits* (scoring.limits, from
-the twin's card), the *state* of each alarm after OPC UA Part 9 (scoring.alarms.tray_alarms), and its *diagnosis*
+the twin's card), the *state* of each alarm after OPC UA Part 9 (scoring.alarms.tray_conditions), and its *diagnosis*
 (scoring.diagnosis.diagnosis). See docs/explanation/deciding.md.
 """
 
@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from pipeline.runtime.snapshot_store import SnapshotStore
-from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from schemas.blocks import select
 from schemas.messages import (
@@ -39,8 +39,8 @@ from schemas.messages import (
 )
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_manager import AlarmContext, AlarmManager
-from scoring.alarms.alarm_state import ConditionSettings
 from scoring.alarms.alarm_text import AlarmText
+from scoring.alarms.fan_condition import ConditionSettings
 from scoring.alarms.unscored_monitor import UnscoredMonitor
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.diagnosis.regression_window import HealthyBalance
@@ -259,21 +259,21 @@ class ScorerCore(Core):
     def _score(self, item: Prediction) -> tuple[Score, list[Alarm]]:
         scored = self._scorer.update(samples_of(item))
         valid = np.isfinite(scored.score)
-        self._show_diagnoser(item, scored)
+        self._feed_diagnoser(item, scored)
         state, events = self._alarms.update(item.t_ns, item.period_ns, scored.score, valid)
         score = score_of(item, scored, state)
         self._unscored.update(item.period_ns, valid, score.invalid_reason)
-        self._show_wear(item, scored, state)
-        step_s = item.period_ns / NS_PER_S
+        self._feed_wear(item, scored, state)
+        period_s = item.period_ns / NS_PER_S
         sigma_command = item.torque_balance_sigma_command
         context = AlarmContext(
             balance_command=scored.balance_smoothed * sigma_command,
-            limit_rad_s=self._scorer.limit_sigmas("speed", step_s) * item.sigma_rad_s,
-            balance_limit_command=self._scorer.limit_sigmas("balance", step_s) * sigma_command,
+            limit_rad_s=self._scorer.limit_sigmas("speed", period_s) * item.sigma_rad_s,
+            balance_limit_command=self._scorer.limit_sigmas("balance", period_s) * sigma_command,
         )
         return score, self._alarms.emit(events, score, context)
 
-    def _show_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
+    def _feed_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
         unknown = np.isin(item.invalid_reason, (InvalidReason.GAP, InvalidReason.STALE))
         expected = np.where(np.isfinite(item.measured_speed_rad_s), scored.balance_expected, np.nan)
         self._diagnoser.take(
@@ -286,10 +286,10 @@ class ScorerCore(Core):
             expected * item.torque_balance_sigma_command,
         )
 
-    def _show_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:
+    def _feed_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:
         assert self._scorer.origin_t_ns is not None
         sigma_command, known = item.torque_balance_sigma_command, np.isfinite(item.torque_balance_command)
-        normal, step_s = state == FanState.NORMAL, item.period_ns / NS_PER_S
+        normal, period_s = state == FanState.NORMAL, item.period_ns / NS_PER_S
         self._wear.update(
             item.t_ns,
             self._scorer.origin_t_ns,
@@ -297,7 +297,7 @@ class ScorerCore(Core):
             disturbed=(scored.score >= HALF_LIMIT) | ~(normal | (state == FanState.UNKNOWN)),
             commissioned_command=scored.balance_commissioned * sigma_command,
             held=scored.balance_at_limit,
-            limit_command=self._scorer.persistent_limit_sigmas("balance", step_s) * sigma_command,
+            limit_command=self._scorer.persistent_limit_sigmas("balance", period_s) * sigma_command,
         )
 
     def _answer(self, request: Request) -> list[Alarm | ScorerSnapshot]:
@@ -333,7 +333,7 @@ class ScorerCore(Core):
         return [snapshot]
 
 
-def build(context: Context) -> Parts:
+def build(context: Context) -> BuiltStage:
     """The core of one tray.
 
     Raises:
@@ -342,7 +342,9 @@ def build(context: Context) -> Parts:
     tray = context.tray
     path = context.snapshot_folder / f"scorer-{tray.name}.snapshot" if context.snapshot_folder else None
     twin = _healthy_twin(context, load_tray_twin(twin_path(context), tray.fans))
-    return Parts(ScorerCore(tray.fans, tray.speed_unit, context.config, twin, SnapshotStore(path) if path else None))
+    return BuiltStage(
+        ScorerCore(tray.fans, tray.speed_unit, context.config, twin, SnapshotStore(path) if path else None)
+    )
 
 
 def limits_in_force(config: ScorerConfig, calibration: Mapping[str, Any] | None) -> Limits:

@@ -12,7 +12,7 @@ of the twin's range or too small to turn the rotor (OUT_OF_RANGE).
 
 The *torque balance* is computed as well: the command given minus the command that a healthy fan needs for the
 measured motion. It needs no free run and is available a third of a second after the first sample
-(scoring.detectors.torque_balance).
+(scoring.torque_balance).
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.runtime.free_run import FreeRun, FreeRunInputs
-from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from pipeline.runtime.twin_file import TwinFile, load_twin
 from schemas.blocks import select
 from schemas.messages import Array, Grid, InvalidReason, ModelCard, Prediction
 from schemas.units import NS_PER_S
-from scoring.detectors.torque_balance import BalanceModel, TorqueBalance
+from scoring.torque_balance import BalanceModel, TorqueBalance
 
 RANGE_MARGIN = 0.05  # of the width of the training range: a twin is used this far beyond it
 LONGEST_BRIDGE = (
@@ -259,13 +259,13 @@ def _balance_of(twin: TwinFile) -> TorqueBalance:
     )
 
 
-def build(context: Context) -> Parts:
+def build(context: Context) -> BuiltStage:
     """The core of one tray and its twin.
 
     Raises:
         StageError: the tray names no twin, or one that cannot be used.
     """
-    return Parts(TwinIntegratorCore(load_twin(context), context.config, context.started_t_ns))
+    return BuiltStage(TwinIntegratorCore(load_twin(context), context.config, context.started_t_ns))
 
 
 def check(context: Context) -> list[str]:

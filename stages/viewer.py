@@ -20,7 +20,7 @@ from pydantic import Field
 
 from pipeline.config.models import TrayConfig
 from pipeline.optional_dependencies import how_to_install
-from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from pipeline.viewing.loopback import check_free
 from pipeline.viewing.stages_page import StagesPage
 from pipeline.viewing.trace import Trace, state_changes, state_name, trace_of
@@ -210,7 +210,7 @@ class ViewerCore(Core):
                 self._sink.change_states(trace.tray, fan, np.asarray(t_ns), names)
 
 
-def build(context: Context) -> Parts:
+def build(context: Context) -> BuiltStage:
     """Open the file and serve the viewers.
 
     Raises:
@@ -233,7 +233,7 @@ def build(context: Context) -> Parts:
         web_port=(config.web_port or None) if config.serve else None,
         memory_limit=config.memory_limit,
     )
-    return Parts(ViewerCore(context.trays, sink))
+    return BuiltStage(ViewerCore(context.trays, sink))
 
 
 def check(context: Context) -> list[str]:

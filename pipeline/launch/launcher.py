@@ -15,7 +15,7 @@ from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
 from pipeline.launch.loss_accounting import label
 from pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, process_list
-from pipeline.launch.watcher import Watcher
+from pipeline.launch.site_watcher import SiteWatcher
 from schemas.topics import alive_key
 
 _POLL_S = 0.05
@@ -76,7 +76,7 @@ class Launcher:
         """
         with Bus(self._config.bus, stop) as bus:
             self._refuse_second_launcher(bus, stop)
-            self._watcher = Watcher(bus, self._config.site)
+            self._watcher = SiteWatcher(bus, self._config.site)
             try:
                 self._start_all(stop)
                 while not stop.wait(_POLL_S):

@@ -101,7 +101,7 @@ class FreeRun:
         self.running |= fans
         self.forget_readings(fans)
 
-    def advance(self, command: Array, step_s: float) -> tuple[Array, Array]:
+    def advance(self, command: Array, period_s: float) -> tuple[Array, Array]:
         """Run over a block, or over its first part. command: (n, fans), n >= 1.
 
         Returns speeds (m, fans), NaN where no free run is active, and which fans (fans,) diverged at the last of
@@ -111,7 +111,7 @@ class FreeRun:
         if not self.running.any():
             return np.full(command.shape, np.nan), np.zeros_like(self.running)
         while True:
-            speed_rad_s, state = self._twin.advance(self._state, command[:rows], np.full(rows, step_s))
+            speed_rad_s, state = self._twin.advance(self._state, command[:rows], np.full(rows, period_s))
             finite = np.isfinite(speed_rad_s)
             diverged = self.running & ~(finite.all(axis=0) & np.isfinite(state).all(axis=1))
             if rows == 1 or not diverged.any():

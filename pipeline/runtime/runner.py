@@ -24,7 +24,7 @@ from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness
 from pipeline.runtime.outputs import Outputs
 from pipeline.runtime.peers import Peers
 from pipeline.runtime.sequence_tracker import SequenceTracker
-from pipeline.runtime.stage import Context, Parts, Source, Stage
+from pipeline.runtime.stage import BuiltStage, Context, Source, Stage
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, StageStatus
@@ -73,7 +73,7 @@ class Runner:
             configuration_text=config.text,
             overrides=config.overrides,
         )
-        self._parts: dict[str, Parts] = (
+        self._parts: dict[str, BuiltStage] = (
             {t.name: stage.build(replace(context, trays=(t,))) for t in trays}
             if stage.core_per_tray
             else {"": stage.build(context)}

@@ -103,7 +103,7 @@ class Context:
 
 
 @dataclass(frozen=True)
-class Parts:
+class BuiltStage:
     """A built stage: the core, and the source that feeds it, if it has one."""
 
     core: Core
@@ -141,7 +141,7 @@ class Stage:
     reads: tuple[str, ...]
     writes: tuple[str, ...]
     config: type[StageConfig]
-    build: Callable[[Context], Parts]
+    build: Callable[[Context], BuiltStage]
     core_per_tray: bool = True
     wants_envelopes: bool = False
     may_drop: bool = False

@@ -112,8 +112,8 @@ def _check_run(path: Path, twin: TwinFile) -> None:
 
 
 def _advance(session: Any, parameters: Array) -> Advance:
-    def advance(state: Array, command: Array, step_s: Array) -> tuple[Array, Array]:
-        feed = {"state": state, "command": command, "step_s": step_s, "parameters": parameters}
+    def advance(state: Array, command: Array, period_s: Array) -> tuple[Array, Array]:
+        feed = {"state": state, "command": command, "step_s": period_s, "parameters": parameters}
         speed_rad_s, state_out = session.run(list(GRAPH_OUTPUTS), feed)
         return speed_rad_s, state_out
 

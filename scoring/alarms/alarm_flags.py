@@ -6,7 +6,7 @@ This is the only definition. The scorer's `AlarmState` and the `Alarm` message c
 from __future__ import annotations
 
 from schemas.messages import Alarm
-from scoring.alarms.alarm_state import AlarmState
+from scoring.alarms.fan_condition import AlarmState
 
 
 def is_retained(alarm: Alarm | AlarmState) -> bool:

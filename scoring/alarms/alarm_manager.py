@@ -21,9 +21,9 @@ from schemas.messages import (
 )
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed
-from scoring.alarms.alarm_state import AlarmState, ConditionSettings
 from scoring.alarms.alarm_text import AlarmText
-from scoring.alarms.tray_alarms import AlarmEvent, Conditions
+from scoring.alarms.fan_condition import AlarmState, ConditionSettings
+from scoring.alarms.tray_conditions import AlarmEvent, TrayConditions
 from scoring.detectors.table import row_of
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.former_snapshot_keys import FORMER_ALARM_KEYS, current_keys
@@ -46,7 +46,7 @@ class AlarmManager:
 
     def __init__(self, fans: int, settings: ConditionSettings, diagnoser: Diagnoser, alarm_text: AlarmText) -> None:
         self._fans = fans
-        self._conditions = Conditions(fans, settings)
+        self._conditions = TrayConditions(fans, settings)
         self._diagnoser = diagnoser
         self._alarm_text = alarm_text
         self._last_emitted: dict[int, Alarm] = {}

@@ -14,7 +14,7 @@ from typing import Any
 from schemas.messages import Alarm, Diagnosis, Severity, Transition
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_presented, is_retained, is_silenced
-from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
+from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 
 _DESCRIBES_THE_FAN = {
     Transition.NONE,

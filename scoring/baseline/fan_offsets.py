@@ -35,14 +35,14 @@ class Cells:
     total: Array
 
 
-def fan_offsets(runs: Sequence[Cells], centres_rad_s: Array, step_s: float) -> FanOffsets | None:
+def fan_offsets(runs: Sequence[Cells], centres_rad_s: Array, period_s: float) -> FanOffsets | None:
     """The offsets of all fans; None if there are too few fans or runs. centres_rad_s: (bins,)."""
     numbers = np.array([number for run in runs for number in run.known_as], int)
     if len(set(numbers.tolist())) < MIN_FANS or np.bincount(numbers).max() < MIN_RUNS:
         return None
     count = np.concatenate([run.count for run in runs])
     mean = np.concatenate([run.total for run in runs]) / np.maximum(count, 1.0)
-    seconds = count * step_s
+    seconds = count * period_s
     weight = np.where(seconds >= MIN_S, np.minimum(seconds / FULL_S, 1.0), 0.0)
     weights = _by_fan(weight, numbers)
     seen = weights.sum(axis=0) > 0.0

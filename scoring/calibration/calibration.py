@@ -29,7 +29,7 @@ from scoring.calibration.healthy_variation import (
 )
 from scoring.calibration.tail import Tail
 from scoring.calibration.windows import WindowMaxima, peaks
-from scoring.detectors.detector import UNREACHED, DetectorRow, DetectorSettings, HealthyEvidence, LimitRule, Source
+from scoring.detectors.detector import UNREACHED, DetectorRow, DetectorSettings, HealthyEvidence, LimitRule, Signal
 from scoring.detectors.deviation import smoothed_deviation
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import rows
@@ -120,13 +120,13 @@ def _with_variation(
     Detectors of a residual that was never valid are not used.
     """
     top_speed_rad_s, moments = found.top_speed_rad_s, found.moments
-    offsets = {s: fan_offsets(moments[s].cells, found.centres_rad_s, found.step_s) for s in RESIDUALS}
+    offsets = {s: fan_offsets(moments[s].cells, found.centres_rad_s, found.period_s) for s in RESIDUALS}
     limits = _each(limits, lambda residual, s: residual.model_copy(update={"fan_offsets": offsets[s]}))
     if found.fan_s > VARIATION_FAN_S or any(offsets.values()):
         found = healthy_statistics(runs, limits, top_speed_rad_s)
     found, baselines = baselines_over_speed(runs, limits, found, crossover_speed_rad_s)
 
-    def varying(_: HealthyResidual, source: Source) -> HealthyResidual:
+    def varying(_: HealthyResidual, source: Signal) -> HealthyResidual:
         residual = variation(found, source) or HealthyResidual(baseline=UNLIMITED)
         return with_baseline(residual, baselines[source]).model_copy(update={"fan_offsets": offsets[source]})
 
@@ -158,7 +158,7 @@ def _calibrated(limits: Limits, found: HealthyStatistics, rule: LimitRule, share
 
 
 def _with_adaptation_limit(
-    residual: HealthyResidual, source: Source, limits: Limits, found: HealthyStatistics
+    residual: HealthyResidual, source: Signal, limits: Limits, found: HealthyStatistics
 ) -> HealthyResidual:
     """A baseline may adapt as far as the limit of the smoothed residual."""
     smoothed = limits.settings_of(source, SmoothedSettings)
@@ -170,11 +170,11 @@ def _with_adaptation_limit(
 
 def _evidence(row: DetectorRow, limits: Limits, found: HealthyStatistics) -> HealthyEvidence:
     if row.source == "tacho":
-        return HealthyEvidence(period_s=found.step_s)
+        return HealthyEvidence(period_s=found.period_s)
     smoothed, moments = limits.settings_of(row.source, SmoothedSettings), found.moments[row.source]
     residual = limits.residual(row.source)
     return HealthyEvidence(
-        period_s=found.step_s,
+        period_s=found.period_s,
         mean_ratio=found.mean_ratio(row),
         smoothed_std=_smoothed_std(limits, row.source, found),
         smoothed_limit=smoothed.limit if smoothed else 0.0,
@@ -185,8 +185,8 @@ def _evidence(row: DetectorRow, limits: Limits, found: HealthyStatistics) -> Hea
     )
 
 
-def _smoothed_std(limits: Limits, source: Source, found: HealthyStatistics) -> float:
-    return smoothed_deviation(limits.timing.smoothing_s, limits.residual(source).autocorrelation_time_s, found.step_s)
+def _smoothed_std(limits: Limits, source: Signal, found: HealthyStatistics) -> float:
+    return smoothed_deviation(limits.timing.smoothing_s, limits.residual(source).autocorrelation_time_s, found.period_s)
 
 
 def _cautious(limits: Limits, found: HealthyStatistics) -> Limits:
@@ -216,7 +216,7 @@ def _with(
     return limits.model_copy(update={"detectors": detectors})
 
 
-def _each(limits: Limits, change: Callable[[HealthyResidual, Source], HealthyResidual]) -> Limits:
+def _each(limits: Limits, change: Callable[[HealthyResidual, Signal], HealthyResidual]) -> Limits:
     """Limits with both residuals changed."""
     return limits.model_copy(update={source: change(limits.residual(source), source) for source in RESIDUALS})
 

@@ -14,7 +14,7 @@ from schemas.units import NS_PER_S
 from scoring.baseline.fan_offsets import Cells
 from scoring.calibration.residual_moments import MOTION_BINS, SPEED_BINS, ResidualMoments, octaves
 from scoring.calibration.windows import WindowMaxima, Windows, peaks
-from scoring.detectors.detector import DetectorRow, Source
+from scoring.detectors.detector import DetectorRow, Signal
 from scoring.detectors.smoothed import Smoothed
 from scoring.detectors.table import rows
 from scoring.fan_scorer import RESIDUALS, FanScorer, Observation, ScoredBlock
@@ -57,7 +57,7 @@ class HealthyStatistics:
     period_ns: int = 0
     maxima: list[WindowMaxima] = field(default_factory=list)
     """of each run"""
-    moments: dict[Source, ResidualMoments] = field(
+    moments: dict[Signal, ResidualMoments] = field(
         default_factory=lambda: {source: ResidualMoments() for source in RESIDUALS}
     )
     ratio_sums: dict[str, float] = field(default_factory=lambda: defaultdict(float))
@@ -70,7 +70,7 @@ class HealthyStatistics:
     """of each detector, see Detector.observed"""
 
     @property
-    def step_s(self) -> float:
+    def period_s(self) -> float:
         """Sampling period of the runs."""
         return self.period_ns / NS_PER_S
 
@@ -82,7 +82,7 @@ class HealthyStatistics:
     @property
     def mean_speed_rad_s(self) -> float:
         """Mean speed of the samples that were scored."""
-        return self.speed_sum_rad_s * self.step_s / max(self.fan_s, 1e-9)
+        return self.speed_sum_rad_s * self.period_s / max(self.fan_s, 1e-9)
 
     @property
     def windows(self) -> int:
@@ -127,7 +127,7 @@ class _RunStatistics:
     def __init__(self, found: HealthyStatistics, run: HealthyRun, limits: Limits) -> None:
         self._found = found
         self._run = run
-        self._scorer = FanScorer(run.fans, limits, observing=True)
+        self._scorer = FanScorer(run.fans, limits, for_calibration=True)
         self._windows = Windows(run.fans, len(rows()), limits.timing.on_delay_s)
         self._seconds = {source: _SecondMeans() for source in RESIDUALS}
         self._standardised_seconds = {source: _SecondMeans() for source in RESIDUALS}
@@ -140,13 +140,13 @@ class _RunStatistics:
         ratios = np.concatenate([one.ratios for one in seen], axis=1)
         has_score = np.isfinite(scored.score)
         self._windows.add(block.t_ns, block.period_ns, ratios, has_score)
-        found.fan_s += float(has_score.sum()) * found.step_s
+        found.fan_s += float(has_score.sum()) * found.period_s
         found.speed_sum_rad_s += float(np.nansum(np.abs(block.speed_rad_s), where=has_score))
         self._add_residual("speed", block, scored, seen, ratios)
         self._add_residual("balance", block, scored, seen, ratios)
 
     def _add_residual(
-        self, source: Source, block: Samples, scored: ScoredBlock, seen: list[Observation], ratios: Array
+        self, source: Signal, block: Samples, scored: ScoredBlock, seen: list[Observation], ratios: Array
     ) -> None:
         is_speed = source == "speed"
         residual, valid = (
@@ -163,8 +163,8 @@ class _RunStatistics:
         found, moments = self._found, self._found.moments[source]
         speed = np.abs(block.speed_rad_s) / found.top_speed_rad_s * SPEED_BINS
         bins = np.clip(speed, 0, SPEED_BINS - 1)
-        motion_rad_s = np.concatenate([one.motion_rad_s for one in seen])
-        octave = np.log2(np.maximum(motion_rad_s / found.top_speed_rad_s, 1e-9))
+        transient_rad_s = np.concatenate([one.transient_rad_s for one in seen])
+        octave = np.log2(np.maximum(transient_rad_s / found.top_speed_rad_s, 1e-9))
         moving = np.clip(np.ceil(octave) + MOTION_BINS - 1, 0, MOTION_BINS - 1).astype(int)
         for number, row in enumerate(rows()):
             if row.source == source:
@@ -174,11 +174,11 @@ class _RunStatistics:
                     moments.smoothed_by_speed += _sums(bins[use].astype(int), SPEED_BINS, squares)
         expected = np.concatenate([one.expected[source] for one in seen])
         shift = np.clip(np.where(use, residual - expected - baseline, np.nan), -LARGEST_SIGMAS, LARGEST_SIGMAS)
-        _add_shift(moments, self._cells[source], shift, bins, self._seconds[source].of(shift, found.step_s))
+        _add_shift(moments, self._cells[source], shift, bins, self._seconds[source].of(shift, found.period_s))
         persistent = np.concatenate([one.persistent[source] for one in seen])
-        means = self._standardised_seconds[source].of(np.where(use, persistent, np.nan), found.step_s)
+        means = self._standardised_seconds[source].of(np.where(use, persistent, np.nan), found.period_s)
         moments.standardised_octaves += octaves(np.square(means))
-        motions = np.square(motion_rad_s[use])
+        motions = np.square(transient_rad_s[use])
         moments.by_motion += _sums(moving[use], MOTION_BINS, motions, np.square(smoothed[use]))
 
     def end(self) -> None:
@@ -224,9 +224,9 @@ class _SecondMeans:
     def __init__(self) -> None:
         self._rest: Array | None = None
 
-    def of(self, shift: Array, step_s: float) -> Array:
+    def of(self, shift: Array, period_s: float) -> Array:
         """(m,) finite means that are complete now; shift: (n, fans)."""
-        second = max(1, round(1.0 / step_s))
+        second = max(1, round(1.0 / period_s))
         samples = shift if self._rest is None else np.concatenate((self._rest, shift))
         whole = len(samples) // second * second
         self._rest = samples[whole:].copy()

@@ -14,7 +14,7 @@ from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.baseline.settings import BaselineSettings
 from scoring.calibration.healthy_statistics import HealthyStatistics, Runs, healthy_statistics
 from scoring.calibration.residual_moments import MOTION_BINS, SPEED_BINS, ResidualMoments
-from scoring.detectors.detector import UNREACHED, Source
+from scoring.detectors.detector import UNREACHED, Signal
 from scoring.fan_scorer import RESIDUALS
 from scoring.limits import Limits
 
@@ -34,7 +34,7 @@ UNLIMITED = BaselineSettings(commissioning_limit_sigmas=UNREACHED, adaptation_li
 
 def baselines_over_speed(
     runs: Runs, limits: Limits, found: HealthyStatistics, crossover_speed_rad_s: float | None
-) -> tuple[HealthyStatistics, dict[Source, dict[str, Any]]]:
+) -> tuple[HealthyStatistics, dict[Signal, dict[str, Any]]]:
     """Whether the offset of a fan changes with its speed, for each residual.
 
     It is taken to, if the residual less such a baseline varies less over the runs. With few runs, which say little of
@@ -46,7 +46,7 @@ def baselines_over_speed(
         return found, {source: {} for source in RESIDUALS}
     common = {"ridge": INITIAL_RIDGE, "reference_speed_rad_s": max(found.mean_speed_rad_s, 1e-9)}
     exponent = SPEED_EXPONENT if crossover_speed_rad_s else SPEED_EXPONENT - 1
-    settings: dict[Source, dict[str, Any]] = {
+    settings: dict[Signal, dict[str, Any]] = {
         "speed": {"speed_exponent": exponent, "crossover_speed_rad_s": crossover_speed_rad_s, **common},
         "balance": {"speed_exponent": SPEED_EXPONENT, **common},
     }
@@ -71,7 +71,7 @@ def with_baseline(residual: HealthyResidual, changes: dict[str, Any]) -> Healthy
     return residual.model_copy(update={"baseline": residual.baseline.model_copy(update=changes)})
 
 
-def variation(found: HealthyStatistics, source: Source) -> HealthyResidual | None:
+def variation(found: HealthyStatistics, source: Signal) -> HealthyResidual | None:
     """How the healthy residual varies over speed, in time, and from run to run; None where it was never valid."""
     moments = found.moments[source]
     if not moments.count.sum():
@@ -83,7 +83,7 @@ def variation(found: HealthyStatistics, source: Source) -> HealthyResidual | Non
         speeds_rad_s=speeds,
         expected_residual_sigmas=means,
         residual_std=deviations,
-        autocorrelation_time_s=_autocorrelation_time_s(of_means**2, found.step_s),
+        autocorrelation_time_s=_autocorrelation_time_s(of_means**2, found.period_s),
         transient_scale_rad_s=_transient_scale_rad_s(moments.by_motion),
         baseline=UNLIMITED.model_copy(update={"commissioning_limit_sigmas": _largest_baseline(moments.baselines)}),
     )
@@ -141,7 +141,7 @@ def _over_speed(
     groups: list[list[int]] = [[]]
     for number in range(SPEED_BINS):
         groups[-1].append(number)
-        if moments.count[groups[-1]].sum() * found.step_s >= KNOT_S:
+        if moments.count[groups[-1]].sum() * found.period_s >= KNOT_S:
             groups.append([])
     if len(groups) > 1:
         last = groups.pop()
@@ -161,16 +161,16 @@ def between_runs_std(moments: ResidualMoments, residual: HealthyResidual) -> flo
     return float(np.concatenate(moments.baselines).std()) / residual.mean_residual_std
 
 
-def _autocorrelation_time_s(variance_of_means: float, step_s: float) -> float:
+def _autocorrelation_time_s(variance_of_means: float, period_s: float) -> float:
     """Of a first-order residual whose means over a second have this variance, relative to its own."""
 
     def beyond(time_s: float) -> float:
         kept = math.exp(-1.0 / time_s)
         return 2.0 * time_s * (1.0 - time_s * (1.0 - kept)) - variance_of_means
 
-    if variance_of_means <= step_s or beyond(0.5 * step_s) >= 0.0:
+    if variance_of_means <= period_s or beyond(0.5 * period_s) >= 0.0:
         return 0.0
     if beyond(MAX_AUTOCORRELATION_TIME_S) <= 0.0:
         return MAX_AUTOCORRELATION_TIME_S
-    found: Any = brentq(beyond, 0.5 * step_s, MAX_AUTOCORRELATION_TIME_S)
+    found: Any = brentq(beyond, 0.5 * period_s, MAX_AUTOCORRELATION_TIME_S)
     return float(found)

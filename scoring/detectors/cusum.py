@@ -30,10 +30,10 @@ class Cusum:
         """Start again for some fans, (fans,) of bool."""
         self.sums[:, fans] = 0
 
-    def update(self, z: Array, valid: Array, step_s: float) -> Array:
+    def update(self, z: Array, valid: Array, period_s: float) -> Array:
         """Take a block, (n, fans) each; invalid samples leave the sums as they are. Returns max(C+, C-)."""
         shift = np.clip(np.where(valid, z, 0.0), -LARGEST_SIGMAS, LARGEST_SIGMAS)
-        gains = np.stack((shift - self._reference, -shift - self._reference)) * (step_s * ONE)
+        gains = np.stack((shift - self._reference, -shift - self._reference)) * (period_s * ONE)
         gains = np.where(valid, np.rint(gains), 0.0).astype(np.int64)  # (2, n, fans)
         totals = self.sums[:, np.newaxis] + np.cumsum(gains, axis=1)
         sums = totals - np.minimum(np.minimum.accumulate(totals, axis=1), 0)

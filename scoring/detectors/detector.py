@@ -18,7 +18,7 @@ from schemas.messages import Alarm, Array
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.state import ColumnState
 
-Source = Literal["speed", "balance", "tacho"]
+Signal = Literal["speed", "balance", "tacho"]
 """What a detector watches: the speed residual, the torque balance, or the readings of the tacho themselves."""
 UNREACHED = 1e6  # a limit that no healthy fan reaches; calibration starts from it
 
@@ -126,7 +126,7 @@ class DetectorInput:
     """A block of samples for detectors, (n, fans) each. Both residuals are less expected residual and baseline."""
 
     period_ns: int
-    step_s: float
+    period_s: float
     """the same in seconds"""
     valid: Array
     """whether the sample counts; where not, a detector keeps its state"""
@@ -157,7 +157,7 @@ class Detector(ColumnState):
         """Start again for some fans, (fans,) of bool."""
 
     @abstractmethod
-    def limit_sigmas(self, step_s: float) -> float:
+    def limit_sigmas(self, period_s: float) -> float:
         """The smallest constant shift of the residual that the statistic ends up reporting, sigma; inf: it reports
         none."""
 
@@ -167,7 +167,7 @@ class Detector(ColumnState):
 
     @classmethod
     @abstractmethod
-    def text(cls, alarm: Alarm, source: Source, units: AlarmUnits) -> str:
+    def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
         """What an alarm raised by this statistic says to people, without the fan's number."""
 
 
@@ -179,5 +179,5 @@ class DetectorRow:
     """in the twin's card and in snapshots"""
     statistic: int
     """the value of schemas.messages.Statistic that scores and alarms carry"""
-    source: Source
+    source: Signal
     detector: type[Detector]

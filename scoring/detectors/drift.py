@@ -15,8 +15,8 @@ from scoring.detectors.detector import (
     DetectorContext,
     DetectorInput,
     HealthyEvidence,
+    Signal,
     SingleLimit,
-    Source,
 )
 from scoring.detectors.deviation import summed_deviation
 
@@ -71,13 +71,13 @@ class Drift(Detector):
 
     def update(self, block: DetectorInput) -> Array:
         """See Detector."""
-        return self._cusum.update(block.persistent, block.valid, block.step_s) / self._limit_sigma_s
+        return self._cusum.update(block.persistent, block.valid, block.period_s) / self._limit_sigma_s
 
     def reset(self, fans: Array) -> None:
         """See Detector."""
         self._cusum.reset(fans)
 
-    def limit_sigmas(self, step_s: float) -> float:
+    def limit_sigmas(self, period_s: float) -> float:
         """What is above the reference value adds up, and reaches the limit in the end."""
         return self._settings.reference_sigmas * self._mean_residual_std
 
@@ -86,6 +86,6 @@ class Drift(Detector):
         return {"sums": self._cusum.sums}
 
     @classmethod
-    def text(cls, alarm: Alarm, source: Source, units: AlarmUnits) -> str:
+    def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
         """See Detector."""
         return f"{units.shift(alarm, source)}, for long"

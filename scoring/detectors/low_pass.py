@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.messages import Array
 from scoring.detectors.state import ColumnState
-from scoring.detectors.torque_balance import filter_rows
+from scoring.torque_balance import filter_rows
 
 
 class LowPass(ColumnState):
@@ -19,17 +19,17 @@ class LowPass(ColumnState):
         self.value = np.full(columns, start)
         """(columns,) the last output"""
 
-    def keep(self, step_s: float) -> float:
+    def keep(self, period_s: float) -> float:
         """Weight of the previous output after one step."""
-        return math.exp(-step_s / self._time_constant_s) if self._time_constant_s > 0 else 0.0
+        return math.exp(-period_s / self._time_constant_s) if self._time_constant_s > 0 else 0.0
 
     def reset(self, columns: Array, to: float = 0.0) -> None:
         """Start again for some columns, (columns,) of bool."""
         self.value[columns] = to
 
-    def update(self, x: Array, valid: Array, step_s: float) -> Array:
+    def update(self, x: Array, valid: Array, period_s: float) -> Array:
         """Take a block, (n, columns) each, and return the output after each sample."""
-        keep = self.keep(step_s)
+        keep = self.keep(period_s)
         whole = valid.all(axis=0)
         if len(x) == 1:
             y = np.where(valid, (1.0 - keep) * x + keep * self.value, self.value)

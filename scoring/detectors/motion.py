@@ -23,7 +23,7 @@ class Motion(ColumnState):
         self.past = LowPass(fans, TIME_CONSTANT_S, np.nan)
         """rad/s; NaN before the first reading"""
 
-    def update(self, speed_rad_s: Array, step_s: float) -> Array:
+    def update(self, speed_rad_s: Array, period_s: float) -> Array:
         """Take speeds, (n, fans) rad/s. Returns the measure, (n, fans) rad/s, 0 where there is no reading."""
         valid = np.isfinite(speed_rad_s)
         new = np.isnan(self.past.value) & valid.any(axis=0)
@@ -31,7 +31,7 @@ class Motion(ColumnState):
             first = valid[:, new].argmax(axis=0)
             self.past.value[new] = speed_rad_s[first, np.flatnonzero(new)]
         speed = np.where(valid, speed_rad_s, 0.0)
-        return np.where(valid, np.abs(speed - self.past.update(speed, valid, step_s)), 0.0)
+        return np.where(valid, np.abs(speed - self.past.update(speed, valid, period_s)), 0.0)
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""

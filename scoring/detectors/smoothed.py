@@ -15,8 +15,8 @@ from scoring.detectors.detector import (
     DetectorInput,
     HealthyEvidence,
     LimitRule,
+    Signal,
     SingleLimit,
-    Source,
 )
 from scoring.detectors.deviation import smoothed_deviation
 from scoring.detectors.low_pass import LowPass
@@ -53,25 +53,25 @@ class Smoothed(Detector):
 
     def update(self, block: DetectorInput) -> Array:
         """See Detector."""
-        smoothed = self._low_pass.update(block.persistent, block.valid, block.step_s)
-        return np.abs(smoothed) / (self._deviation(block.step_s) * self._settings.limit)
+        smoothed = self._low_pass.update(block.persistent, block.valid, block.period_s)
+        return np.abs(smoothed) / (self._deviation(block.period_s) * self._settings.limit)
 
     def reset(self, fans: Array) -> None:
         """See Detector."""
         self._low_pass.reset(fans)
 
-    def limit_sigmas(self, step_s: float) -> float:
+    def limit_sigmas(self, period_s: float) -> float:
         """The mean over speeds; at one speed, or in motion, it is more or less as the healthy residual varies."""
-        return self._deviation(step_s) * self._settings.limit * self._context.mean_residual_std
+        return self._deviation(period_s) * self._settings.limit * self._context.mean_residual_std
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
         return {"low_pass": self._low_pass.value}
 
     @classmethod
-    def text(cls, alarm: Alarm, source: Source, units: AlarmUnits) -> str:
+    def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
         """See Detector."""
         return units.shift(alarm, source)
 
-    def _deviation(self, step_s: float) -> float:
-        return smoothed_deviation(self._context.smoothing_s, self._context.autocorrelation_time_s, step_s)
+    def _deviation(self, period_s: float) -> float:
+        return smoothed_deviation(self._context.smoothing_s, self._context.autocorrelation_time_s, period_s)

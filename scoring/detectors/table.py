@@ -6,7 +6,7 @@ from schemas.messages import Statistic
 from scoring.detectors.detector import DetectorRow
 from scoring.detectors.drift import Drift
 from scoring.detectors.smoothed import Smoothed
-from scoring.detectors.tacho import Sensor
+from scoring.detectors.tacho import Tacho
 from scoring.detectors.variance_growth import VarianceGrowth
 
 DETECTORS = (
@@ -16,7 +16,7 @@ DETECTORS = (
     DetectorRow("balance_smoothed", Statistic.BALANCE_SMOOTHED, "balance", Smoothed),
     DetectorRow("balance_drift", Statistic.BALANCE_DRIFT, "balance", Drift),
     DetectorRow("balance_variance_growth", Statistic.BALANCE_VARIANCE_GROWTH, "balance", VarianceGrowth),
-    DetectorRow("sensor", Statistic.SENSOR, "tacho", Sensor),
+    DetectorRow("sensor", Statistic.SENSOR, "tacho", Tacho),
 )
 
 

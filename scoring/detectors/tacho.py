@@ -23,7 +23,7 @@ from scoring.detectors.detector import (
     DetectorInput,
     DetectorSettings,
     LimitRule,
-    Source,
+    Signal,
 )
 from scoring.detectors.low_pass import LowPass
 
@@ -32,7 +32,7 @@ STUCK_MARGIN, MIN_STUCK_S = 3.0, 2.0  # times the longest repetition of healthy 
 MISSING_MARGIN, MIN_MISSING_SHARE, MAX_MISSING_SHARE = 3.0, 0.25, 0.9  # times the largest share of healthy runs
 
 
-class SensorSettings(DetectorSettings):
+class TachoSettings(DetectorSettings):
     """Of Sensor."""
 
     rule: ClassVar[LimitRule] = LimitRule.FIXED
@@ -40,12 +40,12 @@ class SensorSettings(DetectorSettings):
     missing_share: float = Field(default=0.25, gt=0, le=1, description="share of readings that may be missing")
 
     @classmethod
-    def unreached(cls) -> SensorSettings:
+    def unreached(cls) -> TachoSettings:
         """See DetectorSettings."""
         return cls(stuck_s=UNREACHED, missing_share=1.0)
 
     @classmethod
-    def fixed(cls, observed: Mapping[str, float]) -> SensorSettings:
+    def fixed(cls, observed: Mapping[str, float]) -> TachoSettings:
         """Limits by the longest repetition and the largest missing share of healthy runs."""
         share = max(MIN_MISSING_SHARE, MISSING_MARGIN * observed.get("missing_share", 0.0))
         return cls(
@@ -53,17 +53,17 @@ class SensorSettings(DetectorSettings):
             missing_share=min(MAX_MISSING_SHARE, share),
         )
 
-    def scaled(self, factor: float) -> SensorSettings:
+    def scaled(self, factor: float) -> TachoSettings:
         """The limit of repetition scales; a share of missing readings cannot go far beyond its limit."""
         return self.model_copy(update={"stuck_s": self.stuck_s * factor})
 
 
-class Sensor(Detector):
+class Tacho(Detector):
     """How long each reading has repeated, or the share of missing ones, whichever is closer to its limit."""
 
-    settings = SensorSettings
+    settings = TachoSettings
 
-    def __init__(self, settings: SensorSettings, context: DetectorContext) -> None:
+    def __init__(self, settings: TachoSettings, context: DetectorContext) -> None:
         self._settings = settings
         self._last = np.full(context.fans, np.nan)
         """(fans,) the last reading, rad/s"""
@@ -76,7 +76,7 @@ class Sensor(Detector):
         """See Detector. An invalid sample is one at which the line was silent."""
         known = block.valid & np.isfinite(block.speed_rad_s)
         stuck_s = self._stuck_s(np.where(known, block.speed_rad_s, np.nan), block.period_ns)
-        share = self._missing.update(block.missing.astype(np.float64), block.valid, block.step_s)
+        share = self._missing.update(block.missing.astype(np.float64), block.valid, block.period_s)
         self._longest_s = max(self._longest_s, float(stuck_s.max()))
         self._largest_share = max(self._largest_share, float(share.max()))
         return np.maximum(stuck_s / self._settings.stuck_s, share / self._settings.missing_share)
@@ -96,7 +96,7 @@ class Sensor(Detector):
         self._repeated_ns[fans] = 0
         self._missing.reset(fans)
 
-    def limit_sigmas(self, step_s: float) -> float:
+    def limit_sigmas(self, period_s: float) -> float:
         """It does not watch a residual."""
         return math.inf
 
@@ -109,6 +109,6 @@ class Sensor(Detector):
         return {"last": self._last, "repeated_ns": self._repeated_ns, "missing": self._missing.value}
 
     @classmethod
-    def text(cls, alarm: Alarm, source: Source, units: AlarmUnits) -> str:
+    def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
         """See Detector."""
         return "the tacho repeats one reading, or gives none"

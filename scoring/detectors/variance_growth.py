@@ -18,8 +18,8 @@ from scoring.detectors.detector import (
     DetectorContext,
     DetectorInput,
     HealthyEvidence,
+    Signal,
     SingleLimit,
-    Source,
 )
 from scoring.detectors.low_pass import LowPass
 
@@ -69,19 +69,19 @@ class VarianceGrowth(Detector):
     def update(self, block: DetectorInput) -> Array:
         """See Detector."""
         healthy = self._settings.healthy
-        deviation = self._deviation(block.standardised, block.valid, block.step_s)
+        deviation = self._deviation(block.standardised, block.valid, block.period_s)
         return np.maximum(deviation - healthy, 0.0) / (self._settings.limit - healthy)
 
-    def _deviation(self, residual: Array, valid: Array, step_s: float) -> Array:
-        beyond = np.where(valid, residual - self._mean.update(residual, valid, step_s), 0.0)
-        return np.sqrt(self._square.update(beyond**2, valid, step_s))
+    def _deviation(self, residual: Array, valid: Array, period_s: float) -> Array:
+        beyond = np.where(valid, residual - self._mean.update(residual, valid, period_s), 0.0)
+        return np.sqrt(self._square.update(beyond**2, valid, period_s))
 
     def reset(self, fans: Array) -> None:
         """From zero: only growth is reported, and the statistic rises to its healthy value from below."""
         self._mean.reset(fans)
         self._square.reset(fans)
 
-    def limit_sigmas(self, step_s: float) -> float:
+    def limit_sigmas(self, period_s: float) -> float:
         """A constant shift does not raise the variance."""
         return math.inf
 
@@ -90,6 +90,6 @@ class VarianceGrowth(Detector):
         return {"mean": self._mean.value, "square": self._square.value}
 
     @classmethod
-    def text(cls, alarm: Alarm, source: Source, units: AlarmUnits) -> str:
+    def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
         """See Detector."""
         return f"unsteady, {alarm.score:.1f} times the limit"

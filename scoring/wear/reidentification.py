@@ -28,7 +28,7 @@ MIN_ROWS = 20
 
 
 @dataclass(frozen=True)
-class Drift:
+class ParameterShift:
     """Change of one parameter since health, and its standard error from noise alone: the twin's errors are constant."""
 
     parameter: str
@@ -36,7 +36,7 @@ class Drift:
     std_error: float
 
 
-def parameter_drifts(window: Window, healthy: HealthyBalance) -> tuple[Drift, ...]:
+def parameter_shifts(window: Window, healthy: HealthyBalance) -> tuple[ParameterShift, ...]:
     """Drag, friction and gain over a window; empty when too few rows count. The window's onset is ignored."""
     regression = RegressionWindow(window, healthy)
     if regression.rows < MIN_ROWS:
@@ -54,5 +54,5 @@ def parameter_drifts(window: Window, healthy: HealthyBalance) -> tuple[Drift, ..
         change = float(direction @ residual) / size
         residual_variance = float(np.square(residual - change * direction).sum()) / (regression.rows - 1)
         noise = max(residual_variance, healthy.sigma_command**2 * variance)
-        drifts.append(Drift(parameter, change, float(np.sqrt(noise * inflation / size))))
+        drifts.append(ParameterShift(parameter, change, float(np.sqrt(noise * inflation / size))))
     return tuple(drifts)

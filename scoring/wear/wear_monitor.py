@@ -19,7 +19,7 @@ from schemas.units import NS_PER_S
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.former_snapshot_keys import FORMER_WEAR_KEYS, current_keys
-from scoring.wear.reidentification import parameter_drifts
+from scoring.wear.reidentification import parameter_shifts
 from scoring.wear.trend import NS_PER_DAY, LimitForecast, Trend, WearSeries, forecast_limit
 
 UNITS = {"balance": "command", "drag": "relative", "friction": "command", "gain": "relative"}
@@ -159,7 +159,7 @@ class WearMonitor:
         window = self._diagnoser.window(fan, at_ns, at_ns, WINDOW_S)
         if window is None:
             return False
-        drifts = parameter_drifts(replace(window, fan_offset=commissioned), self._healthy[fan])
+        drifts = parameter_shifts(replace(window, fan_offset=commissioned), self._healthy[fan])
         points = {drift.parameter: (drift.change, drift.std_error) for drift in drifts}
         if points and not held:
             points["balance"] = window.fan_offset - commissioned, window.fan_offset_std_error

@@ -20,7 +20,7 @@ from scoring.detectors.detector import DetectorSettings
 from scoring.detectors.drift import DriftSettings
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import rows
-from scoring.detectors.tacho import SensorSettings
+from scoring.detectors.tacho import TachoSettings
 from scoring.detectors.variance_growth import VarianceGrowthSettings
 from scoring.fan_scorer import FanScorer, ScoredBlock
 from scoring.limits import Limits, Timing
@@ -38,7 +38,7 @@ def detectors(stuck_s: float) -> dict[str, DetectorSettings]:
         "variance_growth": VarianceGrowthSettings(limit=1.4, healthy=0.97),
     }
     of_residuals = {f"{source}_{kind}": kinds[kind] for source in ("speed", "balance") for kind in kinds}
-    return of_residuals | {"sensor": SensorSettings(stuck_s=stuck_s)}
+    return of_residuals | {"sensor": TachoSettings(stuck_s=stuck_s)}
 
 
 LIMITS = Limits(speed=RESIDUAL, balance=RESIDUAL, detectors=detectors(2.0))
@@ -309,12 +309,12 @@ def test_smoothed_residuals_are_in_sigma_of_the_card() -> None:
 def test_while_observing_a_drift_grows_beyond_its_limit() -> None:
     samples = white(3000)
     samples.speed_residual[1000:] += 0.6
-    scorer, observing = FanScorer(FANS, LIMITS), FanScorer(FANS, LIMITS, observing=True)
+    scorer, for_calibration = FanScorer(FANS, LIMITS), FanScorer(FANS, LIMITS, for_calibration=True)
     scored = scored_of(scorer, samples)
     assert scored.score[scored.statistic == Statistic.SPEED_DRIFT].max() < 1.1
-    scored_of(observing, samples)
+    scored_of(for_calibration, samples)
     number = next(number for number, row in enumerate(rows()) if row.statistic == Statistic.SPEED_DRIFT)
-    assert max(one.ratios[number].max() for one in observing.observed()) > 3.0
+    assert max(one.ratios[number].max() for one in for_calibration.observed()) > 3.0
 
 
 def test_an_offset_scales_with_the_speed_as_the_physics_say() -> None:

@@ -15,7 +15,7 @@ from scoring.detectors.deviation import smoothed_deviation, summed_deviation
 from scoring.detectors.drift import DriftSettings
 from scoring.detectors.low_pass import LowPass
 from scoring.detectors.smoothed import SmoothedSettings
-from scoring.detectors.tacho import SensorSettings
+from scoring.detectors.tacho import TachoSettings
 from scoring.detectors.variance_growth import VarianceGrowthSettings
 from scoring.limits import FORMAT_VERSION, DeclaredRate, Limits, Timing, uncalibrated
 from tests.support.healthy_residuals import autoregressive
@@ -37,10 +37,10 @@ def test_the_deviation_of_a_long_sum_agrees_with_simulation(memory_s: float) -> 
 
 
 @pytest.mark.parametrize("step_s", [0.002, 0.01, 0.1])
-def test_without_a_calibration_the_limit_is_in_sigma_of_the_speed_whatever_the_rate(step_s: float) -> None:
+def test_without_a_calibration_the_limit_is_in_sigma_of_the_speed_whatever_the_rate(period_s: float) -> None:
     limits = uncalibrated(2.0, Timing())
     memory_s = limits.speed.autocorrelation_time_s
-    assert smoothed_deviation(limits.timing.smoothing_s, memory_s, step_s) == pytest.approx(1.0, rel=1e-6)
+    assert smoothed_deviation(limits.timing.smoothing_s, memory_s, period_s) == pytest.approx(1.0, rel=1e-6)
     assert limits.detectors.keys() == {"speed_smoothed", "sensor"}
     assert limits.detectors["speed_smoothed"] == SmoothedSettings(limit=2.0)
 
@@ -57,7 +57,7 @@ def calibrated() -> Limits:
         "speed_smoothed": SmoothedSettings(limit=4.0),
         "speed_drift": DriftSettings(limit=10.0, period_s=0.02),
         "speed_variance_growth": VarianceGrowthSettings(limit=1.4, healthy=1.0),
-        "sensor": SensorSettings(stuck_s=3.0),
+        "sensor": TachoSettings(stuck_s=3.0),
     }
     return Limits(speed=speed, balance=HealthyResidual(), detectors=detectors, declared_rate=rate)
 
@@ -74,7 +74,7 @@ def test_a_factor_scales_every_limit_and_voids_the_declared_rate() -> None:
     growth = limits.settings_of("speed", VarianceGrowthSettings)
     assert growth
     assert growth.limit == pytest.approx(1.8)  # twice as far from its healthy value
-    assert limits.settings_of("tacho", SensorSettings) == SensorSettings(stuck_s=6.0)
+    assert limits.settings_of("tacho", TachoSettings) == TachoSettings(stuck_s=6.0)
     assert limits.settings_of("balance", SmoothedSettings) is None
     assert limits.speed.baseline.adaptation_limit_sigmas == 2.0
     assert limits.declared_rate is None
@@ -138,7 +138,7 @@ def test_a_card_of_format_1_is_read_with_its_former_names() -> None:
         "speed_drift": DriftSettings(limit=10.0, reference_sigmas=0.7, period_s=0.01),
         "speed_variance_growth": VarianceGrowthSettings(limit=1.4, healthy=1.0),
         "balance_smoothed": SmoothedSettings(limit=5.0),
-        "sensor": SensorSettings(stuck_s=3.0, missing_share=0.5),
+        "sensor": TachoSettings(stuck_s=3.0, missing_share=0.5),
     }
     assert limits.timing == Timing(smoothing_s=0.3)
     assert limits.declared_rate and limits.declared_rate.runs == 3

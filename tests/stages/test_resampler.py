@@ -170,8 +170,8 @@ def test_after_a_long_silence_the_grid_ends() -> None:
     assert core.counters()["grid_samples_in_gaps"] == 359_999
 
 
-def _ticks(core: ResamplerCore, from_s: float, to_s: float, step_s: float = 0.05) -> list[Grid]:
-    return [grid for t in np.arange(from_s, to_s, step_s) for grid in core.tick(int(at(t)[0]))]
+def _ticks(core: ResamplerCore, from_s: float, to_s: float, period_s: float = 0.05) -> list[Grid]:
+    return [grid for t in np.arange(from_s, to_s, period_s) for grid in core.tick(int(at(t)[0]))]
 
 
 def test_a_replay_gives_the_grid_that_was_published_during_a_silence() -> None:

@@ -68,9 +68,9 @@ class ScriptedLink:
             items += [self._sample(steps_s.get(what, 0.01), what) for _ in range(count)]
         return items
 
-    def _sample(self, step_s: float, what: str = "regular") -> Raw:
+    def _sample(self, period_s: float, what: str = "regular") -> Raw:
         jitter_s = self._rng.uniform(-0.004, 0.004) if what == "jitter" else 0.0
-        self._now_s = max(0.0, self._now_s + step_s + jitter_s)
+        self._now_s = max(0.0, self._now_s + period_s + jitter_s)
         speed = self._rng.normal(0.0, 1.0, 3)
         if what == "missing readings":
             speed[self._rng.random(3) < 0.4] = NAN

@@ -31,7 +31,7 @@ from schemas.messages import (
     Transition,
 )
 from scoring.detectors.smoothed import SmoothedSettings
-from scoring.detectors.tacho import SensorSettings
+from scoring.detectors.tacho import TachoSettings
 from scoring.detectors.variance_growth import VarianceGrowthSettings
 from scoring.limits import Timing
 from stages.scorer import STAGE, ScorerConfig, ScorerCore, limits_in_force
@@ -296,7 +296,7 @@ def test_settings_change_the_times_of_the_limits_in_the_card() -> None:
     factor = limits_in_force(ScorerConfig(limit_factor=2.0), card)
     assert factor.settings_of("balance", SmoothedSettings) == SmoothedSettings(limit=8.0)
     assert factor.settings_of("speed", VarianceGrowthSettings) == VarianceGrowthSettings(limit=6.0)
-    assert factor.settings_of("tacho", SensorSettings) == SensorSettings(stuck_s=4.0, missing_share=0.5)
+    assert factor.settings_of("tacho", TachoSettings) == TachoSettings(stuck_s=4.0, missing_share=0.5)
     assert factor.declared_rate is None
 
 

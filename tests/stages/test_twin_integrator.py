@@ -30,19 +30,19 @@ NAN = float("nan")
 Floats = NDArray[np.float64]
 
 
-def run_freely(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+def run_freely(state: Floats, command: Floats, period_s: Floats) -> tuple[Floats, Floats]:
     """The lag and the equation of motion themselves, sample by sample in NumPy."""
     parameters = np.tile(PARAMETERS, (command.shape[1], 1))
-    acting, lagged = effective_command(command, step_s[:, np.newaxis], parameters[:, LAG], state[:, 1])
-    speed, last = step_through(lambda w, u: physics.acceleration(w, u, parameters), state[:, 0], acting, step_s)
+    acting, lagged = effective_command(command, period_s[:, np.newaxis], parameters[:, LAG], state[:, 1])
+    speed, last = step_through(lambda w, u: physics.acceleration(w, u, parameters), state[:, 0], acting, period_s)
     return speed, np.column_stack((last, lagged))
 
 
 def physical_twin(fans: int = 1, fixed_rate: bool = False, **changes: Any) -> TwinFile:
-    def advance(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+    def advance(state: Floats, command: Floats, period_s: Floats) -> tuple[Floats, Floats]:
         assert np.isfinite(state).all()
         assert np.isfinite(command).all()
-        return run_freely(state, command, step_s)
+        return run_freely(state, command, period_s)
 
     card = replace(made_up_card(PhysicalModel(), fans), speed_range_rad_s=(0.0, 1e9))
     return TwinFile(
@@ -326,7 +326,7 @@ def test_a_twin_that_diverges_is_not_valid_and_is_restarted() -> None:
 
 
 def test_a_fan_whose_twin_diverged_never_feeds_nan_to_the_graph() -> None:
-    def advance(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+    def advance(state: Floats, command: Floats, period_s: Floats) -> tuple[Floats, Floats]:
         assert np.isfinite(state).all()
         speed = np.where(command > 50, np.inf, command)
         return speed, np.column_stack((speed[-1], command[-1]))
@@ -357,9 +357,9 @@ def test_a_discrete_twin_at_another_rate_says_so_and_judges_nothing() -> None:
 def test_the_whole_block_of_all_fans_is_one_run_of_the_graph() -> None:
     twin, shapes = physical_twin(4), []
 
-    def counted(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+    def counted(state: Floats, command: Floats, period_s: Floats) -> tuple[Floats, Floats]:
         shapes.append(command.shape)
-        return twin.advance(state, command, step_s)
+        return twin.advance(state, command, period_s)
 
     core = core_of(TwinFile(**{**vars(twin), "advance": counted}))
     core.step(grid_of(stairs(50, 4)))
@@ -410,7 +410,7 @@ def test_a_bridge_of_absurdly_many_samples_is_not_run() -> None:
     steps: list[int] = []
     twin = physical_twin()
 
-    def counted(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+    def counted(state: Floats, command: Floats, period_s: Floats) -> tuple[Floats, Floats]:
         steps.append(len(command))
         return np.zeros(command.shape), state
 

@@ -37,7 +37,7 @@ FANS = 8  # of the demo's twin
 def unstable_twin() -> TwinFile:
     """A fan whose command is above 85 is no number from the next sample on."""
 
-    def advance(state: Floats, command: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+    def advance(state: Floats, command: Floats, period_s: Floats) -> tuple[Floats, Floats]:
         assert np.isfinite(state).all()
         speed, now = np.empty_like(command), state[:, 0]
         for k, wanted in enumerate(command):

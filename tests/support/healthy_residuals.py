@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 
 from schemas.messages import Array, Statistic, Transition
 from schemas.units import NS_PER_S
-from scoring.alarms.alarm_state import ConditionSettings
-from scoring.alarms.tray_alarms import Conditions
+from scoring.alarms.fan_condition import ConditionSettings
+from scoring.alarms.tray_conditions import TrayConditions
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits
 from scoring.samples import Samples
@@ -21,12 +21,12 @@ STEP_NS = 10_000_000
 BLOCK = 512
 
 
-def autoregressive(samples: int, fans: int, memory_s: float, seed: int, step_s: float = 0.01) -> Array:
+def autoregressive(samples: int, fans: int, memory_s: float, seed: int, period_s: float = 0.01) -> Array:
     """(samples, fans) of variance one; memory_s 0: white."""
     noise = np.random.default_rng(seed).normal(size=(samples, fans))
     if not memory_s:
         return noise
-    phi = math.exp(-step_s / memory_s)
+    phi = math.exp(-period_s / memory_s)
     noise[1:] *= math.sqrt(1.0 - phi**2)
     made = lfilter([1.0], [1.0, -phi], noise, axis=0)
     return np.asarray(made)
@@ -72,7 +72,7 @@ def alarms_of(limits: Limits, blocks: Iterable[Samples], fans: int) -> list[Rais
     """Alarms that a scorer would raise."""
     scorer = FanScorer(fans, limits)
     settings = ConditionSettings(round(limits.timing.on_delay_s * NS_PER_S), NS_PER_S)
-    conditions = Conditions(fans, settings)
+    conditions = TrayConditions(fans, settings)
     raised: list[Raised] = []
     for block in blocks:
         scored = scorer.update(block)

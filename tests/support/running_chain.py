@@ -18,7 +18,7 @@ from typing import Any
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
-from pipeline.launch.watcher import StageView, Watcher
+from pipeline.launch.site_watcher import SiteWatcher, StageView
 
 DEMO = Path(__file__).parents[2] / "pipeline" / "demo"
 SITE, TRAY, FANS = "demo", "tray1", 8
@@ -153,9 +153,9 @@ class Chain:
         return self.up
 
     @contextmanager
-    def watcher(self) -> Iterator[Watcher]:
+    def watcher(self) -> Iterator[SiteWatcher]:
         with Bus(BusConfig(endpoint=self.endpoint), listens=False) as bus:
-            yield Watcher(bus, SITE)
+            yield SiteWatcher(bus, SITE)
 
     def process_ids(self) -> dict[str, int]:
         """The ids of the processes that `up` last reported as started, by label."""
@@ -163,7 +163,7 @@ class Chain:
         found = (re.match(r"(\S+): started, process (\d+)", line) for line in self.up.lines)
         return {match[1]: int(match[2]) for match in found if match}
 
-    def kill(self, watcher: Watcher, label: str) -> float:
+    def kill(self, watcher: SiteWatcher, label: str) -> float:
         """Kill a stage with SIGKILL; returns the seconds until its successor was on the bus."""
         old = self.process_ids()[label]
         began_s = time.monotonic()
@@ -188,7 +188,7 @@ class Chain:
                 os.kill(process_id, signal.SIGKILL)
 
 
-def view_of(watcher: Watcher, label: str) -> StageView | None:
+def view_of(watcher: SiteWatcher, label: str) -> StageView | None:
     """The view of a stage that a watcher has, or None."""
     stage, _, tray = label.partition("/")
     return next((v for v in watcher.stages() if v.health.stage == stage and v.health.instance == (tray or "all")), None)

@@ -18,7 +18,7 @@ import pytest
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
-from pipeline.launch.watcher import Watcher
+from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.recordings.reading import read_recording
 from pipeline.recordings.writing import RecordingWriter
 from schemas.codec import decode
@@ -49,7 +49,7 @@ class Site:
         self.chain = Chain(folder, endpoint, viewer=False)
         self.heard: dict[type[Message], queue.Queue[Message]] = {kind: queue.Queue() for kind in (Grid, Clock, Health)}
         self.bus = Bus(BusConfig(endpoint=endpoint))
-        self.watcher = Watcher(self.bus, SITE)
+        self.watcher = SiteWatcher(self.bus, SITE)
         self.running: list[RunningCommand] = []
         for topic, kind in (("grid", Grid), ("clock", Clock)):
             self.bus.subscribe(tray_key(SITE, TRAY, topic), lambda _key, data, kind=kind: self.hear(kind, data))

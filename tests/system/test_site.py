@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.launch.watcher import Watcher
+from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.recordings.reading import read_recording
 from schemas.messages import Alarm, Request, Transition
 from tests.support.running_chain import TRAY, Chain, eventually, fantwin, is_running, published, received, view_of
@@ -69,7 +69,7 @@ def operate(chain: Chain) -> list[dict[str, Any]]:
     return alarms
 
 
-def kill(chain: Chain, watcher: Watcher, label: str) -> None:
+def kill(chain: Chain, watcher: SiteWatcher, label: str) -> None:
     """Kill a stage and wait until samples flow through the whole chain again: it alone has been replaced."""
     before = chain.process_ids()
     chain.kill(watcher, label)

@@ -23,7 +23,7 @@ from pipeline.cli.watch.request import ask
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.errors import UserError
-from pipeline.launch.watcher import Watcher
+from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
 from schemas.messages import Action, Alarm, Diagnosis, Request, Severity, Transition, newest_t_ns
@@ -108,7 +108,7 @@ def alarms(
     )
     stop_on_signals(stop)
     with Bus(settings.bus, stop, listens=False) as bus:
-        wait_for_stages(bus, Watcher(bus, settings.site), settings, stop)
+        wait_for_stages(bus, SiteWatcher(bus, settings.site), settings, stop)
         fans = set(range(settings.tray(name).fans)) if number < 0 else {number}
         answers = ask(bus, settings.site, name, request, fans, timeout_s, stop)
     _report(asked, name, answers, json_output)
@@ -118,7 +118,7 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
     key = tray_key(config.site, "*", "alarm")
     news: queue.Queue[Alarm] = queue.Queue()
     bus.subscribe(key, lambda _key, payload: _decoded(payload, news.put))
-    wait_for_stages(bus, Watcher(bus, config.site), config, stop)
+    wait_for_stages(bus, SiteWatcher(bus, config.site), config, stop)
     known: list[Alarm] = []
     for _, payload in bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_POLL_S)):
         _decoded(payload, known.append)
@@ -145,7 +145,9 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
             console.print(_transition_line(alarm))
 
 
-def wait_for_stages(bus: Bus, watcher: Watcher, config: Config, stop: threading.Event, what: str = "alarms") -> None:
+def wait_for_stages(
+    bus: Bus, watcher: SiteWatcher, config: Config, stop: threading.Event, what: str = "alarms"
+) -> None:
     """Wait until every stage that is alive has sent its health: requests and answers then reach all of them.
 
     Raises:

@@ -18,7 +18,7 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.config.loading import load_config
 from pipeline.config.models import TrayConfig
 from pipeline.errors import UserError
-from pipeline.launch.watcher import Watcher
+from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import encode, type_name
 from schemas.messages import Command, Header, Health
@@ -56,7 +56,7 @@ def command(
     stop = threading.Event()
     stop_on_signals(stop)
     with Bus(settings.bus, stop, listens=False) as bus:
-        _send(bus, Watcher(bus, settings.site), settings.site, chosen.name, message, stop)
+        _send(bus, SiteWatcher(bus, settings.site), settings.site, chosen.name, message, stop)
     kind, unit = ("set-point", f" {chosen.speed_unit}") if set_point else ("command", "")
     if json_output:
         typer.echo(json.dumps({"tray": chosen.name, "fan": number, "kind": kind, "value": value, "unit": unit.strip()}))
@@ -78,7 +78,7 @@ def _message(tray: TrayConfig, fan: int, value: float, is_set_point: bool) -> Co
     return Command(fans=tray.fans, t_ns=time.time_ns(), command=columns[0], set_point_rad_s=columns[1])
 
 
-def _send(bus: Bus, watcher: Watcher, site: str, tray: str, message: Command, stop: threading.Event) -> None:
+def _send(bus: Bus, watcher: SiteWatcher, site: str, tray: str, message: Command, stop: threading.Event) -> None:
     """Publish the command once acquisition is alive, and wait until its health confirms that it was received.
 
     Raises:

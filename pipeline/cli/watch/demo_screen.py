@@ -10,7 +10,7 @@ from rich.text import Text
 from pipeline.bus.session import Bus
 from pipeline.cli.watch.status import stage_table
 from pipeline.config.models import Config
-from pipeline.launch.watcher import Watcher
+from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import decode
 from schemas.messages import FanState, InvalidReason, Score
 from schemas.topics import tray_key
@@ -25,7 +25,7 @@ class DemoScreen:
     def __init__(self, config: Config, bus: Bus) -> None:
         self._config = config
         self._tray = config.trays[0]
-        self._watcher = Watcher(bus, config.site)
+        self._watcher = SiteWatcher(bus, config.site)
         self._score: Score | None = None
         bus.subscribe(tray_key(config.site, self._tray.name, "score"), self._on_score)
 

@@ -20,7 +20,7 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.errors import UserError
-from pipeline.launch.watcher import StageView, Watcher
+from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.runtime.signals import stop_on_signals
 from schemas.messages import Severity, StageStatus
 from schemas.units import NS_PER_S
@@ -49,7 +49,7 @@ def status(
     stop = threading.Event()
     stop_on_signals(stop)
     with Bus(settings.bus, listens=False) as bus:
-        watcher = Watcher(bus, settings.site)
+        watcher = SiteWatcher(bus, settings.site)
         if once or json_output or not sys.stdout.isatty():
             stop.wait(_LISTEN_S)
             watcher.ask_for_past_alarms()
@@ -68,7 +68,7 @@ def status(
             raise typer.Exit(3)
 
 
-def _require_a_stage(watcher: Watcher, config: Config) -> None:
+def _require_a_stage(watcher: SiteWatcher, config: Config) -> None:
     if not watcher.stages():
         raise UserError(f"{_no_stage(config)}; is `fantwin up -c {config.path}` running?")
 
@@ -77,7 +77,7 @@ def _no_stage(config: Config) -> str:
     return f"no stage of site {config.site!r} answers at {config.bus.endpoint}"
 
 
-def stage_table(watcher: Watcher, config: Config) -> Group:
+def stage_table(watcher: SiteWatcher, config: Config) -> Group:
     """The page for people: a row for each stage, then problems, then alarms."""
     table = Table("stage", "state", title="stages", title_justify="left", box=SIMPLE_HEAD)
     for column in ("in /s", "out /s", "p50 ms", "p99 ms", "lost"):
@@ -124,7 +124,7 @@ def _alarm_line(current: CurrentAlarm) -> Text:
     return text.append(f"; {about}") if about else text
 
 
-def as_json(watcher: Watcher) -> dict[str, object]:
+def as_json(watcher: SiteWatcher) -> dict[str, object]:
     """The same for machines (`--json`)."""
     return {
         "stages": [

@@ -22,7 +22,7 @@ from pipeline.cli.progress import working
 from pipeline.cli.watch.alarms import wait_for_stages
 from pipeline.config.loading import load_config
 from pipeline.errors import UserError
-from pipeline.launch.watcher import Watcher
+from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.recordings.reading import read_recording
 from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
@@ -63,7 +63,7 @@ def wear(
         stop = threading.Event()
         stop_on_signals(stop)
         with Bus(settings.bus, stop, listens=False) as bus:
-            wait_for_stages(bus, Watcher(bus, settings.site), settings, stop, what="wear")
+            wait_for_stages(bus, SiteWatcher(bus, settings.site), settings, stop, what="wear")
             key = tray_key(settings.site, "*", "snapshot")
             replies = bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_POLL_S))
             snapshots = [snapshot for _, payload in replies for snapshot in _decoded(payload)]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pipeline.bus.session import Bus
 from pipeline.config.registry import STAGES
 from pipeline.launch.loss_accounting import label
-from pipeline.launch.watcher import StageView, Watcher
+from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.replay.stage_chain import replay_starts
 from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.stage import Stage, load_stage
@@ -82,7 +82,7 @@ class Listeners:
     def __init__(self, bus: Bus, site: str) -> None:
         """Start watching, before the replay itself is on the bus."""
         self._site = site
-        self._watcher = Watcher(bus, site)
+        self._watcher = SiteWatcher(bus, site)
         self._alive: set[str] = set()
         bus.watch_alive(alive_key(site, "*", "*"), self._set_alive)
         self._before: dict[str, int] = {}

@@ -17,11 +17,11 @@ import pytest
 from pipeline.cli.watch.alarms import OperatorAction, alarm_lines
 from pipeline.config.loading import load_config
 from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import Core, Parts, Stage
+from pipeline.runtime.stage import BuiltStage, Core, Stage
 from schemas.messages import Action, Alarm, Diagnosis, Header, Message, Request, Severity, StageStatus, Transition
-from scoring.alarms.alarm_state import AlarmState, ConditionSettings
 from scoring.alarms.current_alarms import CurrentAlarm
-from scoring.alarms.tray_alarms import Conditions
+from scoring.alarms.fan_condition import AlarmState, ConditionSettings
+from scoring.alarms.tray_conditions import TrayConditions
 from stages.scorer import ScorerConfig
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
@@ -37,7 +37,7 @@ class AlarmOnRequestScorer(Core):
     """The conditions of a tray whose ratios a test sets; answers requests as a scorer does."""
 
     def __init__(self) -> None:
-        self.conditions = Conditions(FANS, ConditionSettings(0, 0))
+        self.conditions = TrayConditions(FANS, ConditionSettings(0, 0))
         self.ratio: dict[int, float] = {}
         self.deaf = False
         self._now_ns = 0
@@ -102,7 +102,7 @@ class Site:
             reads=("prediction", "request"),
             writes=("alarm",),
             config=ScorerConfig,
-            build=lambda _context: Parts(self.core),
+            build=lambda _context: BuiltStage(self.core),
         )
         self._stop = threading.Event()
         config = load_config(DEMO / "demo.toml", [f"bus.endpoint='{endpoint}'"])

@@ -21,7 +21,7 @@ from pipeline.bus.session import Bus
 from pipeline.cli.watch.status import as_json, stage_table
 from pipeline.config.loading import load_config
 from pipeline.config.models import BusConfig
-from pipeline.launch.watcher import StageView, Watcher
+from pipeline.launch.site_watcher import SiteWatcher, StageView
 from schemas.codec import encode, type_name
 from schemas.messages import (
     Alarm,
@@ -94,7 +94,7 @@ def site(endpoint: str) -> Iterator[Site]:
     site.close()
 
 
-def view(site: Site, watcher: Watcher, *healths: Health) -> StageView:
+def view(site: Site, watcher: SiteWatcher, *healths: Health) -> StageView:
     """The view of the watcher after `healths`, each published until the watcher shows it."""
     for health in healths:
 
@@ -108,7 +108,7 @@ def view(site: Site, watcher: Watcher, *healths: Health) -> StageView:
     return last
 
 
-def shown(watcher: Watcher) -> str:
+def shown(watcher: SiteWatcher) -> str:
     console = Console(width=120, file=io.StringIO(), record=True)
     console.print(stage_table(watcher, load_config(DEMO / "demo.toml")))
     return console.export_text()
@@ -131,7 +131,7 @@ def test_rates_are_what_came_between_two_healths():
 
 
 def test_a_session_that_follows_another_takes_its_place_and_the_losses_add_up(site):
-    watcher = Watcher(site.outside, SITE)
+    watcher = SiteWatcher(site.outside, SITE)
     view(site, watcher, HEALTH)
     follower = replace(HEALTH, header=Header("scorer-all-2", 0, ""), t_ns=HEALTH.t_ns + NS_PER_S, inputs=(), lost=2)
     assert view(site, watcher, follower).health.header.producer == "scorer-all-2"
@@ -141,14 +141,14 @@ def test_a_session_that_follows_another_takes_its_place_and_the_losses_add_up(si
 def test_alarms_raised_before_the_watcher_came_are_fetched_and_the_last_of_a_fan_counts(site):
     site.alarm.put(encode(ALARM))
     site.alarm.put(encode(replace(ALARM, active=False, t_ns=ALARM.t_ns + 1, header=Header("scorer-all-1", 1, TRAY))))
-    watcher = Watcher(site.outside, SITE)
+    watcher = SiteWatcher(site.outside, SITE)
     view(site, watcher, HEALTH)  # they have met
     watcher.ask_for_past_alarms()
     assert [(alarm.fan, alarm.active) for alarm in watcher.alarms()] == [(2, False)]
 
 
 def test_json_has_stages_rates_losses_and_alarms(site):
-    watcher = Watcher(site.outside, SITE)
+    watcher = SiteWatcher(site.outside, SITE)
     site.alarm.put(encode(ALARM))
     view(site, watcher, HEALTH)
     watcher.ask_for_past_alarms()
@@ -176,7 +176,7 @@ def test_alarms_are_shown_with_their_states_and_probable_causes(site):
     publish(3, Transition.RAISED, fan=3, onset_t_ns=7)
     publish(4, Transition.CLEARED, fan=3, onset_t_ns=7, **over)
     publish(5, Transition.SHELVED, fan=4, onset_t_ns=0, severity=Severity.NONE, shelved_until_t_ns=2**63 - 1, **over)
-    watcher = Watcher(site.outside, SITE)
+    watcher = SiteWatcher(site.outside, SITE)
     view(site, watcher, HEALTH)
     watcher.ask_for_past_alarms()
     text = shown(watcher)
@@ -196,7 +196,7 @@ def test_alarms_are_shown_with_their_states_and_probable_causes(site):
     ],
 )
 def test_problems_of_stages_are_shown(site, health, word):
-    watcher = Watcher(site.outside, SITE)
+    watcher = SiteWatcher(site.outside, SITE)
     view(site, watcher, health)
     text = shown(watcher)
     assert word in text
@@ -204,7 +204,7 @@ def test_problems_of_stages_are_shown(site, health, word):
 
 
 def test_a_stage_that_vanished_is_shown_as_gone(site):
-    watcher = Watcher(site.outside, SITE)
+    watcher = SiteWatcher(site.outside, SITE)
     view(site, watcher, HEALTH)
     site.buses[0].close()
     eventually(lambda: not watcher.stages()[0].alive, "the watcher sees it go")
@@ -217,7 +217,7 @@ def test_a_stage_that_vanished_is_shown_as_gone(site):
 
 def test_without_running_stages_no_table_is_shown_and_alarms_are_unknown(endpoint):
     with Bus(BusConfig(endpoint=endpoint)) as bus:
-        text = shown(Watcher(bus, SITE))
+        text = shown(SiteWatcher(bus, SITE))
     assert "no stage of site 'demo' answers at tcp/" in text
     assert "alarms unknown: no scorer is alive" in text
     assert "stages" not in text

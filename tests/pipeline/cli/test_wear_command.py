@@ -16,7 +16,7 @@ import pytest
 from pipeline.config.loading import load_config
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import Core, Parts, Stage
+from pipeline.runtime.stage import BuiltStage, Core, Stage
 from schemas.messages import Header, Message, ScorerSnapshot
 from schemas.topics import tray_key
 from scoring.former_snapshot_keys import FORMER_PARAMETER_KEYS
@@ -166,7 +166,7 @@ def site(endpoint: str, request: pytest.FixtureRequest, notes: list[ScorerSnapsh
         reads=("prediction", "request"),
         writes=("snapshot",),
         config=ScorerConfig,
-        build=lambda _context: Parts(core),
+        build=lambda _context: BuiltStage(core),
     )
     stop = threading.Event()
     words = ("-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")

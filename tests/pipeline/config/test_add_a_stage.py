@@ -19,7 +19,7 @@ from pipeline.config.models import ConfigError
 from pipeline.config.registry import STAGES, StageRow
 from pipeline.launch.processes import process_list
 from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, load_stage
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, load_stage
 from schemas.codec import decode, encode, type_name
 from schemas.messages import Alarm, Header, Health, Message, Severity, StageStatus
 from schemas.topics import BY_NAME, health_key, tray_key
@@ -56,8 +56,8 @@ class AlarmLog(Core):
         return {"lines": self._lines}
 
 
-def build(context: Context) -> Parts:
-    return Parts(AlarmLog(context.resolve(context.config.file)))
+def build(context: Context) -> BuiltStage:
+    return BuiltStage(AlarmLog(context.resolve(context.config.file)))
 
 
 STAGE = Stage(

@@ -15,7 +15,7 @@ from pipeline.config.models import ConfigError
 from pipeline.devices.sample_source import SourceEvent
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.source_kinds import SOURCE_KINDS, SourceKind
-from pipeline.runtime.stage import Context, Parts
+from pipeline.runtime.stage import BuiltStage, Context
 from schemas.messages import Command, Raw
 from stages.acquisition import STAGE
 from tests.support.toy_source import ToyConfig, ToySource
@@ -43,7 +43,7 @@ def context(text: str = CONFIGURATION) -> Context:
     return Context("site", config.trays, config.sections["acquisition"], Path(), Path("runs"), started_t_ns=0)
 
 
-def built(text: str = CONFIGURATION) -> tuple[Parts, ToySource]:
+def built(text: str = CONFIGURATION) -> tuple[BuiltStage, ToySource]:
     parts = STAGE.build(context(text))
     assert isinstance(parts.source, ToySource)
     return parts, parts.source

@@ -19,7 +19,7 @@ from schemas.envelope import Envelope
 from schemas.fields import columns
 from schemas.messages import MESSAGE_TYPES, Alarm, Grid, Header, InvalidReason, ModelCard, Severity
 from schemas.topics import tray_key
-from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
+from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.support.replay_data import START_NS, STEP_NS, raw_of, write_raw
 
 RAW = tray_key("demo", "tray1", "raw")

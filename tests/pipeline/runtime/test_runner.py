@@ -16,7 +16,7 @@ from pipeline.config.models import BusConfig, Config, LauncherConfig, TrayConfig
 from pipeline.launch.loss_accounting import losses
 from pipeline.runtime.inbox import INBOX_SIZE
 from pipeline.runtime.runner import Runner
-from pipeline.runtime.stage import Context, Core, Parts, Stage, StageConfig, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from schemas.codec import decode, encode, type_name
 from schemas.messages import Command, Grid, Header, Health, InputPosition, Message, Output, Raw, StageStatus
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
@@ -76,7 +76,7 @@ class Burst:
             self.deliver(item)
 
 
-def toy(build: Callable[[Context], Parts] = lambda _context: Parts(Passer()), **declared: Any) -> Stage:
+def toy(build: Callable[[Context], BuiltStage] = lambda _context: BuiltStage(Passer()), **declared: Any) -> Stage:
     defaults = {"name": "resampler", "about": "", "reads": ("raw",), "writes": ("grid",), "config": ToyConfig}
     return Stage(**{**defaults, **declared}, build=build)
 
@@ -194,7 +194,7 @@ def test_an_output_made_because_time_passed_says_so(config):
             held, self.held = self.held, []
             return held
 
-    bench = Bench(toy(lambda _context: Parts(Waits())), config)
+    bench = Bench(toy(lambda _context: BuiltStage(Waits())), config)
     bench.feed(TRAY_A, 10)
     position = bench.next(Grid).header.input_position
     bench.end()
@@ -215,7 +215,7 @@ def send_once(bus: Bus, producer: str, t_ns: int) -> None:
 
 
 def test_a_side_input_does_not_advance_the_input_position(config):
-    bench = Bench(toy(lambda _context: Parts(Answers()), reads=("raw", "command")), config)
+    bench = Bench(toy(lambda _context: BuiltStage(Answers()), reads=("raw", "command")), config)
     send_once(bench.bus, "operator", 5)
     bench.feed(TRAY_A, 10)
     send_once(bench.bus, "another", 6)
@@ -237,7 +237,7 @@ def test_a_producer_that_publishes_one_message_and_leaves_causes_no_loss(config)
         def counters(self):
             return {}
 
-    bench = Bench(toy(lambda _context: Parts(Careful()), reads=("raw", "command")), config)
+    bench = Bench(toy(lambda _context: BuiltStage(Careful()), reads=("raw", "command")), config)
     for number in range(3):  # sessions that nobody has a word of health from
         with Bus(config.bus) as visitor:
             met = threading.Event()
@@ -287,7 +287,7 @@ def test_undecodable_bytes_are_counted_and_the_stage_goes_on(config):
 
 def test_items_a_source_delivers_while_stopping_are_processed_before_the_end(config):
     items = [raw(t_ns) for t_ns in range(50)]
-    stage = toy(lambda _context: Parts(Passer(), Burst(items)), name="acquisition")
+    stage = toy(lambda _context: BuiltStage(Passer(), Burst(items)), name="acquisition")
     bench = Bench(stage, config, TRAY_A)
     last = bench.end()
     grids = []
@@ -307,7 +307,7 @@ def test_messages_of_trays_that_are_not_configured_are_not_read(config):
 
 
 def test_a_stage_that_may_drop_recovers_messages_published_on_change(config):
-    stage = toy(lambda _context: Parts(Silent()), reads=("command", "raw"), may_drop=True)
+    stage = toy(lambda _context: BuiltStage(Silent()), reads=("command", "raw"), may_drop=True)
     bench = Bench(stage, config)
     for topic, kind in (("command", Command), ("raw", Raw)):
         publisher = bench.bus.publisher(tray_key("s", TRAY_A, topic), BY_NAME[topic], type_name(kind), "x")
@@ -337,7 +337,7 @@ def test_a_stage_that_may_drop_discards_its_oldest_items_and_counts_them(config)
                 newest.set()
             return []
 
-    bench = Bench(toy(lambda _context: Parts(Slow()), may_drop=True), config)
+    bench = Bench(toy(lambda _context: BuiltStage(Slow()), may_drop=True), config)
     for t_ns in range(count):
         bench.feed(TRAY_A, t_ns)
     eventually(lambda: bench.runner._inbox.dropped, "the inbox has overflowed")
@@ -378,7 +378,7 @@ def test_the_last_health_of_a_stage_that_crashed_says_why(config):
         def step(self, item: Any) -> Sequence[Message]:
             raise ZeroDivisionError("on purpose")
 
-    bench = Bench(toy(lambda _context: Parts(Broken())), config)
+    bench = Bench(toy(lambda _context: BuiltStage(Broken())), config)
     bench.feed(TRAY_A, 1)
     last = bench.health_with(lambda health: "crashed" in health.problem)
     bench.thread.join(20)
@@ -420,9 +420,9 @@ def test_a_core_that_crashed_saves_and_publishes_nothing_and_its_successor_takes
     CrashesOnce.saved.clear()
     cores: dict[str, CrashesOnce] = {}
 
-    def build(context: Context, crash_t_ns: int = 2) -> Parts:
+    def build(context: Context, crash_t_ns: int = 2) -> BuiltStage:
         cores[context.tray.name] = CrashesOnce(context.tray.name, crash_t_ns)
-        return Parts(cores[context.tray.name])
+        return BuiltStage(cores[context.tray.name])
 
     bench = Bench(toy(build), config)
     bench.feed(TRAY_B, 1)
@@ -469,7 +469,7 @@ class OfAllTrays(Core):
 
 
 def test_a_core_of_all_trays_publishes_from_tick_and_close_for_the_tray_in_the_header(config):
-    bench = Bench(toy(lambda _context: Parts(OfAllTrays()), core_per_tray=False), config)
+    bench = Bench(toy(lambda _context: BuiltStage(OfAllTrays()), core_per_tray=False), config)
     bench.feed(TRAY_A, 1)
     grids = [bench.next(Grid), bench.next(Grid)]
     bench.stop.set()
@@ -485,7 +485,7 @@ def test_a_core_of_all_trays_publishes_from_tick_and_close_for_the_tray_in_the_h
 def test_an_output_without_a_tray_is_refused_in_one_line(config):
     stop = threading.Event()
     stop.set()
-    runner = Runner(toy(lambda _context: Parts(OfAllTrays("")), core_per_tray=False), config, None, stop)
+    runner = Runner(toy(lambda _context: BuiltStage(OfAllTrays("")), core_per_tray=False), config, None, stop)
     with pytest.raises(StageError, match="'resampler' serves all trays and returned a grid without one: set header"):
         runner.run()
 
@@ -493,7 +493,7 @@ def test_an_output_without_a_tray_is_refused_in_one_line(config):
 def test_an_output_that_is_not_declared_is_refused_in_one_line(config):
     stop = threading.Event()
     stop.set()
-    runner = Runner(toy(lambda _context: Parts(OfAllTrays()), core_per_tray=False, writes=()), config, None, stop)
+    runner = Runner(toy(lambda _context: BuiltStage(OfAllTrays()), core_per_tray=False, writes=()), config, None, stop)
     with pytest.raises(StageError, match="message of topic 'grid': add it to `writes` of its declaration"):
         runner.run()
 
@@ -505,8 +505,8 @@ def test_a_stage_with_an_unknown_topic_is_refused_when_it_is_declared(declared):
 
 
 def test_sources_in_one_process_for_all_trays_feed_each_the_core_of_its_tray(config):
-    def build(context: Context) -> Parts:
-        return Parts(Passer(), Burst([raw(1 if context.tray.name == TRAY_A else 2)]))
+    def build(context: Context) -> BuiltStage:
+        return BuiltStage(Passer(), Burst([raw(1 if context.tray.name == TRAY_A else 2)]))
 
     bench = Bench(toy(build, reads=()), config)
     bench.end()
@@ -524,7 +524,7 @@ def test_a_stage_that_crashes_with_a_full_inbox_leaves_the_bus_at_once(config):
             fed.wait(20)
             raise ZeroDivisionError("on purpose")
 
-    bench = Bench(toy(lambda _context: Parts(BrokenLater())), config)
+    bench = Bench(toy(lambda _context: BuiltStage(BrokenLater())), config)
     for t_ns in range(INBOX_SIZE + 500):
         bench.feed(TRAY_A, t_ns)
     fed.set()

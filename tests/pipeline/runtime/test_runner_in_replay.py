@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
-from pipeline.runtime.stage import Context, Parts
+from pipeline.runtime.stage import BuiltStage, Context
 from schemas.codec import encode, type_name
 from schemas.messages import Clock, Command, Grid, Header, Health, Message, StageStatus
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
@@ -56,9 +56,9 @@ def tickers(config):
     """A bench whose cores record their ticks, and the two cores."""
     cores: dict[str, Ticker] = {}
 
-    def build(context: Context) -> Parts:
+    def build(context: Context) -> BuiltStage:
         cores[context.tray.name] = Ticker()
-        return Parts(cores[context.tray.name])
+        return BuiltStage(cores[context.tray.name])
 
     bench = Bench(toy(build), config)
     yield bench, cores[TRAY_A], cores[TRAY_B]
@@ -105,7 +105,7 @@ def test_latency_is_measured_in_the_time_of_the_replay_and_not_while_it_is_pause
 def test_a_stage_with_a_device_refuses_replayed_commands_and_keeps_the_hosts_time(config):
     core = Ticker()
     declared = {"name": "acquisition", "reads": ("command",)}
-    bench = Bench(toy(lambda _context: Parts(core, Burst([])), **declared), config, TRAY_A)
+    bench = Bench(toy(lambda _context: BuiltStage(core, Burst([])), **declared), config, TRAY_A)
     publishers = {
         who: bench.bus.publisher(tray_key("s", TRAY_A, "command"), BY_NAME["command"], type_name(Command), who)
         for who in ("replay-all-1", "command-1")

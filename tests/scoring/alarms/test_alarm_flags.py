@@ -6,7 +6,7 @@ import pytest
 
 from schemas.messages import Alarm, Severity
 from scoring.alarms.alarm_flags import is_listed, is_presented, is_retained, is_silenced
-from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, AlarmState
+from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, AlarmState
 
 ACTIVE = {"active": True, "acknowledged": False, "confirmed": True}
 OVER = {"active": False, "acknowledged": True, "confirmed": True}

@@ -11,8 +11,8 @@ import pytest
 
 from schemas.messages import Alarm, Diagnosis, Header, Severity, Transition
 from scoring.alarms.alarm_flags import is_retained
-from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms
+from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 
 _numbers = itertools.count()
 

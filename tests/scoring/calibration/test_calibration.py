@@ -22,7 +22,7 @@ from scoring.calibration.windows import WindowMaxima, Windows, peaks
 from scoring.detectors.detector import SingleLimit
 from scoring.detectors.drift import DriftSettings
 from scoring.detectors.table import rows
-from scoring.detectors.tacho import SensorSettings
+from scoring.detectors.tacho import TachoSettings
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits, Timing
 from tests.support.healthy_residuals import Raised, alarms_of, autoregressive, in_blocks, samples_of
@@ -61,8 +61,8 @@ def limit_of(limits: Limits, name: str) -> float:
     return settings.limit
 
 
-def sensor_of(limits: Limits) -> SensorSettings:
-    sensor = limits.settings_of("tacho", SensorSettings)
+def sensor_of(limits: Limits) -> TachoSettings:
+    sensor = limits.settings_of("tacho", TachoSettings)
     assert sensor
     return sensor
 

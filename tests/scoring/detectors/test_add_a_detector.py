@@ -20,8 +20,8 @@ from scoring.detectors.detector import (
     DetectorInput,
     DetectorRow,
     LimitRule,
+    Signal,
     SingleLimit,
-    Source,
 )
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits, Timing
@@ -59,7 +59,7 @@ class Peak(Detector):
         """See Detector."""
         self._peak[fans] = 0.0
 
-    def limit_sigmas(self, step_s: float) -> float:
+    def limit_sigmas(self, period_s: float) -> float:
         """See Detector."""
         return self._limit
 
@@ -68,7 +68,7 @@ class Peak(Detector):
         return {"peak": self._peak}
 
     @classmethod
-    def text(cls, alarm: Alarm, source: Source, units: AlarmUnits) -> str:
+    def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
         """See Detector."""
         return f"peaks of the {source}, {alarm.score:.1f} times the limit"
 

@@ -16,7 +16,7 @@ from scoring.detectors.detector import Detector, DetectorContext, DetectorInput
 from scoring.detectors.drift import Drift, DriftSettings
 from scoring.detectors.low_pass import LowPass
 from scoring.detectors.smoothed import Smoothed, SmoothedSettings
-from scoring.detectors.tacho import Sensor, SensorSettings
+from scoring.detectors.tacho import Tacho, TachoSettings
 from scoring.detectors.variance_growth import VarianceGrowth, VarianceGrowthSettings
 from tests.support.healthy_residuals import autoregressive
 
@@ -45,7 +45,7 @@ def block_of(
     """A block with one residual for all uses."""
     return DetectorInput(
         period_ns=STEP_NS,
-        step_s=STEP_S,
+        period_s=STEP_S,
         valid=valid,
         standardised=residual,
         persistent=residual,
@@ -55,13 +55,13 @@ def block_of(
 
 
 def readings(
-    sensor: Sensor, speed: np.ndarray, missing: np.ndarray | None = None, alive: np.ndarray | None = None
+    sensor: Tacho, speed: np.ndarray, missing: np.ndarray | None = None, alive: np.ndarray | None = None
 ) -> np.ndarray:
     return sensor.update(block_of(speed, np.ones(speed.shape, np.bool_) if alive is None else alive, missing=missing))
 
 
-def sensor_of(fans: int, stuck_s: float, missing_share: float = 0.25) -> Sensor:
-    return Sensor(SensorSettings(stuck_s=stuck_s, missing_share=missing_share), context(fans))
+def sensor_of(fans: int, stuck_s: float, missing_share: float = 0.25) -> Tacho:
+    return Tacho(TachoSettings(stuck_s=stuck_s, missing_share=missing_share), context(fans))
 
 
 def growth_of(fans: int, smoothing_s: float) -> VarianceGrowth:
@@ -158,7 +158,9 @@ def test_on_white_noise_the_cusum_runs_as_long_as_the_textbook_says() -> None:
 
 def test_an_autocorrelated_residual_invalidates_textbook_limits() -> None:
     memory = -1.0 / math.log(0.7)  # in samples: AR(1) of 0.7
-    assert average_run_length(autoregressive(3000, 1500, memory, 4, step_s=1.0), 0.5, 5.0) == pytest.approx(35, rel=0.1)
+    assert average_run_length(autoregressive(3000, 1500, memory, 4, period_s=1.0), 0.5, 5.0) == pytest.approx(
+        35, rel=0.1
+    )
 
 
 @pytest.mark.parametrize(("shift", "expected"), [(1.0, 10.4), (2.0, 4.01)])

@@ -1,4 +1,4 @@
-"""scoring.detectors.torque_balance: the balance of a stream is that of the whole, however the stream is cut."""
+"""scoring.torque_balance: the balance of a stream is that of the whole, however the stream is cut."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scoring.detectors.torque_balance import SETTLED, BalanceModel, TorqueBalance
+from scoring.torque_balance import SETTLED, BalanceModel, TorqueBalance
 from twin.fitting.balance import FILTER_RATE_PER_S, torque_balance
 
 STEP_S = 0.01

@@ -8,7 +8,7 @@ import pytest
 
 from scoring.diagnosis.diagnosis import Diagnosis, Evidence, RankedCause, diagnose
 from scoring.diagnosis.regression_window import FIRST_ERROR, HealthyBalance, RegressionWindow, Window, acting_command
-from scoring.wear.reidentification import parameter_drifts
+from scoring.wear.reidentification import parameter_shifts
 from simulation.faults import Fault
 from simulation.tray import SimulatedTray, TraySettings
 from tests.support import diagnosis_data as data
@@ -228,17 +228,17 @@ def test_errors_that_make_good_for_one_another_are_small_where_the_fan_was_seen(
 
 def held_by_a_loop(seed: int, per_rad_s: float, per_rad: float, drag: float = 1.3, duration_s: float = 60.0) -> Window:
     """A fan whose speed a PI controller holds by a noisy tacho; more drag in the second half."""
-    rng, fan, step_s = np.random.default_rng(seed), data.HEALTHY, data.STEP_S
-    samples, set_point = round(duration_s / step_s), 450.0
+    rng, fan, period_s = np.random.default_rng(seed), data.HEALTHY, data.STEP_S
+    samples, set_point = round(duration_s / period_s), 450.0
     needed = fan.viscous * set_point + fan.drag * set_point**2 + fan.friction
     speed, total, command, readings = set_point, needed, np.empty(samples), np.empty(samples)
     for k in range(samples):
         readings[k] = speed + data.NOISE_RAD_S * rng.normal()
-        total += per_rad * step_s * (set_point - readings[k])
+        total += per_rad * period_s * (set_point - readings[k])
         command[k] = total + per_rad_s * (set_point - readings[k])
         takes = fan.viscous * speed + (drag if 2 * k >= samples else 1.0) * fan.drag * speed**2 + fan.friction
-        speed += step_s * (command[k] - takes) / fan.inertia
-    return Window(step_s, command, readings, samples // 2)
+        speed += period_s * (command[k] - takes) / fan.inertia
+    return Window(period_s, command, readings, samples // 2)
 
 
 @pytest.mark.parametrize(("per_rad_s", "per_rad"), [(0.001, 0.002), (0.005, 0.02), (0.02, 0.02)])
@@ -361,7 +361,7 @@ def test_drifts_of_parameters_are_found_within_their_errors() -> None:
     for seed in range(20):
         command = data.moving_command(seed, 30.0)
         readings = data.measured(data.speeds(command, drag=1.1), seed)
-        drag, friction, gain = parameter_drifts(data.window(command, readings), data.HEALTHY)
+        drag, friction, gain = parameter_shifts(data.window(command, readings), data.HEALTHY)
         assert (drag.parameter, friction.parameter, gain.parameter) == ("drag", "friction", "gain")
         assert drag.std_error < 0.01
         found.append((drag.change - 0.1) / drag.std_error)
@@ -371,7 +371,7 @@ def test_drifts_of_parameters_are_found_within_their_errors() -> None:
 
 def test_a_window_that_is_too_short_reports_no_drift() -> None:
     command = data.moving_command(0)[:30]
-    assert parameter_drifts(Window(data.STEP_S, command, data.speeds(command), 0), data.HEALTHY) == ()
+    assert parameter_shifts(Window(data.STEP_S, command, data.speeds(command), 0), data.HEALTHY) == ()
 
 
 # Severities of each kind, from what is just seen to what nobody can miss.

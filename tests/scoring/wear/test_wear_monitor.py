@@ -12,7 +12,7 @@ import pytest
 
 from schemas.blocks import cut
 from schemas.messages import Action, Alarm, Header, Prediction, ScorerSnapshot, Transition
-from scoring.detectors.torque_balance import BalanceModel, TorqueBalance
+from scoring.torque_balance import BalanceModel, TorqueBalance
 from stages.scorer import ScorerCore
 from tests.support.scored_blocks import (
     CALIBRATION,

@@ -60,7 +60,7 @@ class TorqueBalance:
         """Start again: samples are missing."""
         self._speed[:] = self._command[:] = self._lagged[:] = np.nan
 
-    def update(self, step_s: float, command: Array, speed_rad_s: Array, known: Array) -> Array:
+    def update(self, period_s: float, command: Array, speed_rad_s: Array, known: Array) -> Array:
         """The balance at each sample, NaN where it is not settled. All (n, fans); command: held to the next sample."""
         model = self._model
         drives = command >= self._off_below  # a drive that is off may brake or coast, which the model does not cover
@@ -69,11 +69,11 @@ class TorqueBalance:
         before, given = np.vstack((self._speed, speed))[:-1], np.vstack((self._command, command))[:-1]
         self._speed, self._command = speed[-1].copy(), command[-1].copy()
         linked = np.isfinite(before) & np.isfinite(speed) & np.isfinite(given)
-        acting = self._acting(step_s, given, linked)
+        acting = self._acting(period_s, given, linked)
         mean = 0.5 * (before + speed)
         drag = (model.viscous + model.drag * np.abs(mean)) * mean
-        excess = acting - model.inertia * (speed - before) / step_s - drag - model.friction
-        keep = float(np.exp(-model.filter_rate_per_s * step_s))
+        excess = acting - model.inertia * (speed - before) / period_s - drag - model.friction
+        keep = float(np.exp(-model.filter_rate_per_s * period_s))
         if linked.all():
             filtered, weight = self._all(excess, keep)
         else:
@@ -104,15 +104,15 @@ class TorqueBalance:
                 filtered[rows, fan], weight[rows, fan] = made.T
         return filtered, weight
 
-    def _acting(self, step_s: float, given: Array, linked: Array) -> Array:
+    def _acting(self, period_s: float, given: Array, linked: Array) -> Array:
         """The command that acts over the step before each sample, after the electrical lag: lag i' + i = command."""
         lag_s = self._model.lag_s
         if not lag_s.any():
             return given
         if len(given) == 1:
-            return self._acting_once(step_s, given[0])[np.newaxis]
+            return self._acting_once(period_s, given[0])[np.newaxis]
         acting = given.copy()
-        keeps, shares = self._lagging(step_s)
+        keeps, shares = self._lagging(period_s)
         for fan in np.flatnonzero(lag_s).tolist():
             keep, share = float(keeps[fan]), float(shares[fan])
             lagged = self._lagged[fan : fan + 1]
@@ -127,19 +127,19 @@ class TorqueBalance:
             self._lagged[fan] = lagged[0] if np.isfinite(given[-1, fan]) else np.nan
         return acting
 
-    def _acting_once(self, step_s: float, given: Array) -> Array:
+    def _acting_once(self, period_s: float, given: Array) -> Array:
         """The same for one sample, (fans,): all fans at once."""
-        keep, share = self._lagging(step_s)
+        keep, share = self._lagging(period_s)
         start = np.where(np.isnan(self._lagged), given, self._lagged)
         after = (1.0 - keep) * given + keep * start
         self._lagged = np.where(np.isfinite(given), after, np.nan)
         return np.where(self._model.lag_s > 0.0, given + (start - given) * share, given)
 
-    def _lagging(self, step_s: float) -> tuple[Array, Array]:
+    def _lagging(self, period_s: float) -> tuple[Array, Array]:
         """The rest of a deviation after a step, and its mean over the step, (fans,) each, as shares of it."""
-        if step_s != self._lag_step_s:
-            steps = step_s / np.where(self._model.lag_s > 0.0, self._model.lag_s, 1.0)
-            self._lag_step_s, self._lag_shares = step_s, (np.exp(-steps), -np.expm1(-steps) / steps)
+        if period_s != self._lag_step_s:
+            steps = period_s / np.where(self._model.lag_s > 0.0, self._model.lag_s, 1.0)
+            self._lag_step_s, self._lag_shares = period_s, (np.exp(-steps), -np.expm1(-steps) / steps)
         return self._lag_shares
 
 

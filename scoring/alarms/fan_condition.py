@@ -60,7 +60,7 @@ class AlarmState:
     """of the last granted request that had one"""
 
 
-class Condition:
+class FanCondition:
     """One fan's alarm. `fan_state`: NORMAL, SUSPECT (on-delay runs), ALARM, RETURNING (off-delay runs)."""
 
     def __init__(self, settings: ConditionSettings) -> None:

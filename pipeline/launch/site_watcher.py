@@ -40,7 +40,7 @@ class StageView:
         return (now - count(self.previous)) / ((self.health.t_ns - self.previous.t_ns) / NS_PER_S)
 
 
-class Watcher:
+class SiteWatcher:
     """Keeps the last health of each session, and the messages about the last alarm of each fan. Thread-safe."""
 
     def __init__(self, bus: Bus, site: str) -> None:

@@ -1,4 +1,4 @@
-"""scoring.alarms.tray_alarms: the states of alarms, what operators may ask, and that nothing is forgotten."""
+"""scoring.alarms.tray_conditions: the states of alarms, what operators may ask, and that nothing is forgotten."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from schemas.messages import Action, FanState, Severity, Transition
 from scoring.alarms.alarm_flags import is_retained, is_silenced
-from scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, ConditionSettings
-from scoring.alarms.tray_alarms import BlockResult, Conditions
+from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, ConditionSettings
+from scoring.alarms.tray_conditions import BlockResult, TrayConditions
 
 STEP_NS = 10
 NORMAL, SUSPECT, ALARM, RETURNING = FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING
@@ -24,16 +24,16 @@ RAISED, CLEARED, UNSHELVED = Transition.RAISED, Transition.CLEARED, Transition.U
 UP, MID, LOW, HIGH = 1.2, 0.8, 0.1, 1.6  # beyond the limit, between it and the return, returned, of severity ALARM
 
 
-def conditions_of(fans: int = 1, on_delay_ns: int = 50, off_delay_ns: int = 100, **more: Any) -> Conditions:
-    return Conditions(fans, ConditionSettings(on_delay_ns, off_delay_ns, **more))
+def conditions_of(fans: int = 1, on_delay_ns: int = 50, off_delay_ns: int = 100, **more: Any) -> TrayConditions:
+    return TrayConditions(fans, ConditionSettings(on_delay_ns, off_delay_ns, **more))
 
 
-def at_once(**more: Any) -> Conditions:
+def at_once(**more: Any) -> TrayConditions:
     return conditions_of(on_delay_ns=0, off_delay_ns=0, **more)
 
 
 def take(
-    conditions: Conditions, ratios: Sequence[float], valid: Sequence[bool] | None = None, first_t_ns: int = 0
+    conditions: TrayConditions, ratios: Sequence[float], valid: Sequence[bool] | None = None, first_t_ns: int = 0
 ) -> BlockResult:
     ratio = np.array(ratios, float)[:, None]
     mask = np.ones(ratio.shape, np.bool_) if valid is None else np.array(valid)[:, None]
@@ -45,11 +45,13 @@ def happened(result: BlockResult) -> list[tuple[int, Transition]]:
     return [(change.row, change.transition) for change in result.events]
 
 
-def states(conditions: Conditions, ratios: Sequence[float], valid: Sequence[bool] | None = None) -> list[int]:
+def states(conditions: TrayConditions, ratios: Sequence[float], valid: Sequence[bool] | None = None) -> list[int]:
     return take(conditions, ratios, valid).state[:, 0].tolist()
 
 
-def asked(conditions: Conditions, action: Action, now_t_ns: int = 0, duration_ns: float = 0) -> tuple[Transition, str]:
+def asked(
+    conditions: TrayConditions, action: Action, now_t_ns: int = 0, duration_ns: float = 0
+) -> tuple[Transition, str]:
     ((_, transition, why),) = conditions.request(action, [0], now_t_ns, duration_ns, "Ann", "looked at it")
     return transition, why
 
@@ -303,7 +305,9 @@ SETTINGS = st.builds(
 CUTS = st.sets(st.integers(1, SAMPLES - 1))
 
 
-def played(conditions: Conditions, history: dict[str, Any], cuts: set[int], restart: ConditionSettings | None = None):
+def played(
+    conditions: TrayConditions, history: dict[str, Any], cuts: set[int], restart: ConditionSettings | None = None
+):
     """Everything that comes of a history cut at `cuts`; with `restart`, by a new object after every block."""
     ratio, valid = np.array(history["ratio"]), np.array(history["valid"])
     states, changes, answers, too_short = [], [], [], 0
@@ -318,7 +322,7 @@ def played(conditions: Conditions, history: dict[str, Any], cuts: set[int], rest
         too_short += result.too_short
         if restart:
             kept = json.loads(json.dumps(conditions.snapshot()))
-            conditions = Conditions(2, restart)
+            conditions = TrayConditions(2, restart)
             conditions.restore(kept)
     return np.concatenate(states).tolist(), changes, answers, too_short, conditions.snapshot()
 
@@ -326,22 +330,22 @@ def played(conditions: Conditions, history: dict[str, Any], cuts: set[int], rest
 @given(HISTORIES, SETTINGS, CUTS)
 @settings(max_examples=150, deadline=None)
 def test_the_blocks_make_no_difference(history, chosen, cuts):
-    whole = played(Conditions(2, chosen), history, set())
-    assert played(Conditions(2, chosen), history, cuts) == whole
-    assert played(Conditions(2, chosen), history, set(range(1, SAMPLES))) == whole
+    whole = played(TrayConditions(2, chosen), history, set())
+    assert played(TrayConditions(2, chosen), history, cuts) == whole
+    assert played(TrayConditions(2, chosen), history, set(range(1, SAMPLES))) == whole
 
 
 @given(HISTORIES, SETTINGS, CUTS)
 @settings(max_examples=150, deadline=None)
 def test_going_on_from_a_snapshot_is_as_if_nothing_had_been(history, chosen, cuts):
-    whole = played(Conditions(2, chosen), history, cuts)
-    assert played(Conditions(2, chosen), history, cuts, restart=chosen) == whole
+    whole = played(TrayConditions(2, chosen), history, cuts)
+    assert played(TrayConditions(2, chosen), history, cuts, restart=chosen) == whole
 
 
 @given(HISTORIES, SETTINGS)
 @settings(max_examples=100, deadline=None)
 def test_raised_and_cleared_alternate_and_agree_with_the_states(history, chosen):
-    state, changes, *_ = played(Conditions(2, chosen), history, set())
+    state, changes, *_ = played(TrayConditions(2, chosen), history, set())
     for fan in (0, 1):
         turns = [t for _, its_fan, t, _ in changes if its_fan == fan and t in (RAISED, CLEARED)]
         assert turns == [RAISED if i % 2 == 0 else CLEARED for i in range(len(turns))]

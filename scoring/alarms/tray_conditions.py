@@ -13,7 +13,14 @@ from typing import Any
 import numpy as np
 
 from schemas.messages import Action, Array, FanState, Transition
-from scoring.alarms.alarm_state import NORMAL, SUSPECT, UNTIL_IT_CLEARS_T_NS, AlarmState, Condition, ConditionSettings
+from scoring.alarms.fan_condition import (
+    NORMAL,
+    SUSPECT,
+    UNTIL_IT_CLEARS_T_NS,
+    AlarmState,
+    ConditionSettings,
+    FanCondition,
+)
 
 UNKNOWN = int(FanState.UNKNOWN)
 
@@ -39,12 +46,12 @@ class BlockResult:
     """number of excursions that ended before their on-delay"""
 
 
-class Conditions:
+class TrayConditions:
     """One condition for each fan of a tray."""
 
     def __init__(self, fans: int, settings: ConditionSettings) -> None:
         self._settings = settings
-        self._conditions = [Condition(settings) for _ in range(fans)]
+        self._conditions = [FanCondition(settings) for _ in range(fans)]
         self._refresh_all()
 
     def update(self, t_ns: Array, period_ns: int, ratio: Array, valid: Array) -> BlockResult:
@@ -117,7 +124,7 @@ class Conditions:
             ValueError: it is not a snapshot of alarm conditions, or one of another number of fans.
         """
         try:
-            conditions = [Condition.restore(self._settings, each) for each in snapshot["fans"]]
+            conditions = [FanCondition.restore(self._settings, each) for each in snapshot["fans"]]
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise ValueError(f"not a snapshot of alarm conditions: {error!r}") from error
         if len(conditions) != len(self._conditions):
