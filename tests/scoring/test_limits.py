@@ -111,7 +111,7 @@ def test_a_card_of_format_1_is_read_with_its_former_names() -> None:
         "format_version": 1,
         "speed": {
             "fans": {"speeds_rad_s": [1.0], "offset_sigmas": [[0.5]]}, "speeds_rad_s": [50.0, 100.0],
-            "offset_sigmas": [0.1, 0.2], "spread": [0.9, 1.1], "lasting": [1.0, 1.2], "motion_rad_s": 3.0,
+            "offset_sigmas": [0.1, 0.2], "spread": [0.9, 1.1], "lasting": [1.0, 1.2], "motion_rad_s": 3.0,  # FORMER
             "autocorrelation_time_s": 0.3, "step": 4.0, "drift": 10.0, "reference_sigmas": 0.7, "growth": 1.4,
             "usual_growth": 1.0, "baseline_sigmas": 2.0, "adaptation_sigmas": 0.8, "baseline_power": 2,
             "baseline_speed_rad_s": 70.0, "baseline_bend_rad_s": 20.0, "baseline_ridge": 0.2,
