@@ -1,6 +1,6 @@
 """Faults of the simulated tray, on a schedule.
 
-Each acts on one fan from `start_s` until `stop_s`, and leaves nothing behind. The meaning of `size` by kind:
+Each acts on one fan from `start_s` until `stop_s`, and has no effect afterwards. The meaning of `size` by kind:
 
 | kind | what it is | size | default |
 |---|---|---|---|

@@ -1,4 +1,4 @@
-"""The ground truth of a simulated run: which fault acted on which fan and when, to judge alarms by.
+"""The ground truth of a simulated run: which fault acted on which fan and when, to evaluate alarms.
 
 A JSON file beside the run. It is written at the start (`complete` false, times unknown) and replaced at the end. The
 times of a fault, ns since the epoch, are those of the first samples with it and without it. A fault still active at

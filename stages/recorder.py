@@ -3,7 +3,7 @@
 Reads   every topic marked as recorded in schemas/topics.py, of all trays, and the health of all stages
 Writes  nothing on the bus; a recording of one or more parts, docs/reference/recordings.md
 Units   as in the messages: their bytes are not changed
-Timing  at most `flush_interval_s` after its receipt a message survives a crash, of the machine too
+Timing  a message survives a crash, also of the machine, at most `flush_interval_s` after its receipt
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Scorer: compares what was measured with the twin, and keeps each fan's alarm.
+"""Scorer: compares the measurements with the twin, and maintains the alarm of each fan.
 
 Reads: topic `prediction` (measured and predicted speed rad/s, torque balance in command units), and `request` (what
 operators want done with alarms).
 Writes: topic `score` (residuals, baselines, the statistic closest to its limit, state), `alarm` (every transition of a
-fan's alarm), `snapshot` (what a restart needs).
-Timing: one score for every prediction, at once, block for block; delays count the time of valid samples.
+fan's alarm), `snapshot` (the state to continue from after a restart).
+Timing: one score message for every prediction message, immediately; delays count the time of valid samples.
 
 Four things are kept apart: the *statistics* on two residuals (scoring.fan_scorer), their *limits* (scoring.limits, from
 the twin's card), the *state* of each alarm after OPC UA Part 9 (scoring.alarms.tray_conditions), and its *diagnosis*

@@ -2,7 +2,8 @@
 
 Reads: topic `grid` (command, measured speed rad/s, uniform time).
 Writes: topic `prediction` (measured and predicted speed rad/s, sigma rad/s), and `twin` (the model card) at start.
-Timing: one prediction for every grid message, at once, of the same size; one run of the graph per message for all fans.
+Timing: one prediction message for every grid message, immediately and of the same size; the graph runs once per message
+for all fans.
 
 The prediction is a *free run*: it starts from the mean of the first measured speeds and is never corrected by a
 measurement again. It needs commands only, so a missing reading does not disturb it. While no samples arrive, the last

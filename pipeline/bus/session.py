@@ -4,7 +4,7 @@ Processes are peers that need no router. The first to start on a host listens on
 connect there and discover each other. When the first dies, the rest stay connected, and the next process to start
 listens on the endpoint. (Retrying to listen would take the endpoint over at once, but a session that still retries
 takes at least ten seconds to close: measured with Zenoh 1.10.) A command that connects only briefly does not listen:
-after it had left, a new process would find nobody at the endpoint and discover the others late.
+after it left, a new process would find no listener at the endpoint and discover the others late.
 
 Data is published with congestion control BLOCK. Each publisher keeps its last messages, so that a consumer that was not
 yet connected, or was restarted, can request what it missed.

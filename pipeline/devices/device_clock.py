@@ -3,7 +3,7 @@
 The host time of receipt is the time of the sample plus a delay that is never negative, often milliseconds, sometimes
 far more. The offset `receipt - device clock` is therefore bounded from below by a straight line. Its slope is the drift
 of the device clock, its height the smallest delay. It is estimated as the edge of the lower convex hull below the mean
-of the points: of all lines under all points this one is highest on average (Moon, Skelly and Towsley, Estimation and
+of the points: of all lines below all points, this one is highest on average (Moon, Skelly and Towsley, Estimation and
 removal of clock skew from network delay measurements, INFOCOM 1999; by hull: Zhang, Liu and Xia, INFOCOM 2002). The
 points are those of a sliding window, one (the least delayed sample) per bucket.
 

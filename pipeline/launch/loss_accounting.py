@@ -1,7 +1,7 @@
 """What a site has lost, over all sessions of its stages, computed from the last health of each session.
 
-A stage counts what it misses while it runs. Two kinds of loss no stage can see by itself; comparing the healths of all
-sessions shows them:
+A stage counts what it misses while it runs. No stage can detect two kinds of loss by itself; comparing the healths of
+all sessions reveals them:
 
 * a producer was killed, and a message had reached one consumer and not another;
 * a consumer was killed, and a message published meanwhile was no longer kept when the consumer came back.

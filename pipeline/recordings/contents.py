@@ -1,4 +1,4 @@
-"""What is in a recording: by its index and ledger, or, where it lacks them, by going through all of it."""
+"""The contents of a recording: from its index and ledger, or, without these, by reading all of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The index of an MCAP file: where everything is, and the end of the file that says so.
+"""The index of an MCAP file: where each chunk, channel and attachment is, and the end of the file that contains it.
 
 It is kept while a file is written, and rebuilt from a truncated file. The end can be written at any time and lists only
 what is on the disk; the Writer of the `mcap` library also counts messages whose chunk the disk refused.

@@ -1,4 +1,4 @@
-"""Going through all of a file: what it holds, what is damaged, and what must be missing."""
+"""Reading all of a file: what it contains, what is damaged, and what must be missing."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The time a stage goes by: the host's, or the replay's while a recording is replayed.
+"""The time that a stage uses: the host's, or the replay's while a recording is replayed.
 
-Stages with an input use the time of their samples; only sources use the host clock. While a recording is replayed,
-slowly, paused or faster than real time, a tray must not look silent because of the replay's pace. So ticks carry the
-time that the replay has reached. Stages with a source, and stages that serve all trays at once, keep the host's time.
+Stages with an input use the time of their samples; only sources use the host clock. A replay may be slow, paused or
+faster than real time, and a tray must not look silent because of its pace. So ticks carry the time that the replay has
+reached. Stages with a source, and stages that serve all trays at once, keep the host's time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The one loop that every stage runs in: receive, check the sequence, step, stamp, publish, count.
 
 Everything a stage reacts to comes through one bounded inbox: messages from the bus, items from the stage's sources, and
-the appearing and leaving of other stages. While the inbox is full, publishers wait. Only a stage that may drop (the
+the arrival and departure of other stages. While the inbox is full, publishers wait. Only a stage that may drop (the
 viewer) discards its oldest items instead, and counts them.
 """
 

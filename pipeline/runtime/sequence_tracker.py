@@ -1,4 +1,5 @@
-"""Puts arriving messages in sequence: gaps are asked for again, duplicates dropped, and what stays missing counted."""
+"""Puts arriving messages in sequence: missing messages are requested, duplicates dropped, and messages that remain
+missing counted."""
 
 from __future__ import annotations
 

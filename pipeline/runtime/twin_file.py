@@ -1,7 +1,7 @@
 """A twin ready to run: its card (pipeline.runtime.tray_twin) and its graph in onnxruntime.
 
-schemas/twin_card.py describes card and graph. The graph is checked before it runs, so that a file that cannot serve is
-refused when a stage starts, and not while fans run.
+schemas/twin_card.py describes card and graph. The graph is checked before it runs, so that an unusable file is refused
+when the stage starts, not while fans run.
 """
 
 from __future__ import annotations

@@ -65,9 +65,9 @@ def calibrate(
 ) -> None:
     """Set the alarm limits of a twin from healthy recordings, and write them into its card.
 
-    Every recording is scored as a live fan is, from its own start. Limits are set where false alarms are as frequent as
-    declared. A rate that the data cannot support is refused, with the amount that it needs. Alarms of a twin without
-    calibration depend on its speed band alone.
+    Every recording is scored like a live fan, with commissioning at its start. Limits are set so that false alarms are
+    as frequent as declared. If the data cannot support the rate, the command refuses and says how much is needed.
+    Without calibration only the speed band raises alarms.
 
     Exit codes: 0 success; 1 error; 3 --verify found more false alarms than declared.
 

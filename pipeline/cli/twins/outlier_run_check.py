@@ -1,4 +1,4 @@
-"""Whether a recording that a twin was calibrated on was not healthy: its scores went far beyond the others."""
+"""Whether a recording used for calibration was probably not healthy: its scores are far above the others."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OUTLIER_RATIO = 3.0  # times the median: healthy fans that ran alike came to 1.7
 
 
 class Outlier(NamedTuple):
-    """The fan of a run whose score went furthest."""
+    """The fan of a run with the highest score."""
 
     run: int
     """number of the run"""
@@ -29,7 +29,7 @@ class Outlier(NamedTuple):
 
 
 def outlier_warning(runs: HealthyRuns, limits: Limits, top_speed_rad_s: float) -> str:
-    """One line on the fan of a recording whose score went far beyond the others; empty if none did.
+    """A warning about the fan of a recording whose score is far above the others; empty if there is none.
 
     limits: those that were found on these runs. Of more than five fan-days only the first part of each run is scored.
 
@@ -50,7 +50,7 @@ def outlier_warning(runs: HealthyRuns, limits: Limits, top_speed_rad_s: float) -
 
 
 def outlier(scores: Sequence[Array]) -> Outlier | None:
-    """The fan of a run that went furthest, if that is far beyond the others.
+    """The fan of a run with the highest score, if that is far above the others.
 
     scores: of each run (windows, fans), NaN where a fan was not scored.
     """

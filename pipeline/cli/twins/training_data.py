@@ -1,4 +1,4 @@
-"""What the commands that train and evaluate twins share: recordings as runs, and errors in one line."""
+"""Shared by the commands that train and evaluate twins: recordings as runs, and errors in one line."""
 
 from __future__ import annotations
 

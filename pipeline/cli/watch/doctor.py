@@ -1,4 +1,4 @@
-"""`fantwin doctor`: problems of an installation or a configuration, each with what to do about it."""
+"""`fantwin doctor`: problems of an installation or a configuration, each with its remedy."""
 
 from __future__ import annotations
 

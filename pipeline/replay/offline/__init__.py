@@ -1,1 +1,1 @@
-"""A recording judged again without a bus, and compared with what was recorded."""
+"""A recording scored again without a bus, and compared with what was recorded."""

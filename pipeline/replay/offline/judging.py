@@ -1,4 +1,4 @@
-"""Judging a recording again: every tray's stages run over its raw samples, in one process and without a bus."""
+"""Scoring a recording again: the stages of every tray run over its raw samples, in one process and without a bus."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from schemas.streams import LOSS_PREFIX
 from schemas.units import NS_PER_S
 
 Progress = Callable[[str, int], None]
-"""Called with the tray, and the time of the newest judged sample in ns since the epoch."""
+"""Called with the tray, and the time of the newest scored sample in ns since the epoch."""
 
 
 @dataclass
@@ -33,9 +33,9 @@ class JudgedTray:
     samples: int = 0
     """scored samples of the tray, each once"""
     judged: int = 0
-    """those of them that could be judged for at least one fan"""
+    """those that could be scored for at least one fan"""
     not_judged: Counter[str] = field(default_factory=Counter)
-    """samples of fans that could not be judged, by reason"""
+    """samples of fans that could not be scored, by reason"""
     period_ns: int = 0
     start_ns: int = 0
     end_ns: int = 0
@@ -50,12 +50,12 @@ class JudgedTray:
 
     @property
     def hours(self) -> float:
-        """How long the tray was judged."""
+        """How long the tray was scored."""
         return self.judged * self.period_ns / NS_PER_S / 3600
 
     @property
     def problem(self) -> str:
-        """Why nothing was judged; empty if something was."""
+        """Why nothing was scored; empty if something was."""
         if self.judged:
             return ""
         if not self.not_judged:

@@ -1,7 +1,7 @@
-"""The stages that decide, run without a bus: raw samples of one tray in, scores and alarms out, as fast as possible.
+"""The stages from raw samples to alarms, run without a bus: raw samples of one tray in, scores and alarms out.
 
-The cores are those of the running stages, built from the same declarations and connected by what these read and write.
-They are given larger blocks; what they make does not depend on the size of a block.
+The cores are those of the running stages, built from the same declarations and connected by the topics that these read
+and write. They run as fast as possible, on larger blocks; their output does not depend on the block size.
 """
 
 from __future__ import annotations

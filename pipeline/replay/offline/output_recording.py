@@ -1,4 +1,5 @@
-"""The recording that `fantwin replay --offline -o` writes: what was judged and what it gave, each sample once."""
+"""The recording that `fantwin replay --offline -o` writes: the raw samples used and everything computed from them, each
+sample once."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ _TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
 
 
 def output_writer(replay_input: ReplayInput, output: Path) -> RecordingWriter:
-    """The writer of a new recording, with the configuration and the twins that judge.
+    """The writer of a new recording, with the configuration and the twins that are used.
 
     Raises:
         UserError: the file exists.

@@ -1,7 +1,7 @@
-"""Which input each session of each stage consumed, as the input positions of its outputs tell.
+"""Which input each session of each stage consumed, reconstructed from the input positions of its outputs.
 
-A stage that was killed restarts and takes again the messages that its producers still keep. A replay that is to make
-the same decisions has to feed each session what the recorded session consumed. Raw messages are identified by their
+A stage that was killed restarts and consumes again the messages that its producers still keep. To make the same
+decisions, a replay must feed each session what the recorded session consumed. Raw messages are identified by their
 sequence number; samples of grids, predictions and scores by their time.
 """
 
@@ -223,7 +223,7 @@ def _open_ends(plan: TrayPlan) -> None:
     """Let sessions produce more than was recorded of them, as far as the next stage wants it.
 
     The last messages of a killed session may have reached the next stage and not the recorder. What the last sessions
-    had not yet consumed when the recording ended is judged as well.
+    had not yet consumed when the recording ended is processed as well.
     """
     *producing, deciding = plan.sessions.values()
     for session in (*(session for sessions in producing for session in sessions), deciding[-1]):

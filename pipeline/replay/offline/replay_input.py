@@ -1,4 +1,4 @@
-"""What an offline replay judges: a recording's raw samples, with its own configuration and twins or with others."""
+"""The input of an offline replay: a recording's raw samples, with its own configuration and twins or with others."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from schemas.messages import Alarm, Message, Raw
 
 @dataclass
 class ReplayInput:
-    """A recording of one or several parts, ready to be judged."""
+    """A recording of one or several parts, ready to be replayed."""
 
     paths: tuple[Path, ...]
     metadata: RecordingMetadata
@@ -42,18 +42,18 @@ class ReplayInput:
     stages: StageChain
     start_s: float = 0.0
     end_s: float = math.inf
-    """the part that is judged, in seconds since the tray's first raw sample"""
+    """the part that is replayed, in seconds since the tray's first raw sample"""
     damage: dict[Path, str] = field(default_factory=dict)
     """what could not be read of a file, one line"""
 
     @property
     def is_part(self) -> bool:
-        """Whether only a part of the recording is judged."""
+        """Whether only a part of the recording is replayed."""
         return self.start_s > 0 or self.end_s < math.inf
 
     @property
     def trays(self) -> tuple[TrayConfig, ...]:
-        """The trays that are judged."""
+        """The trays that are replayed."""
         return self.config.trays
 
     def envelopes(self, tray: str, topics: Iterable[str]) -> Iterator[Envelope]:
@@ -67,7 +67,7 @@ class ReplayInput:
     def read_plan(self, tray: str) -> tuple[TrayPlan | None, list[Alarm]]:
         """What each session of a tray's stages consumed, and the recorded alarms, each once.
 
-        The plan is None where the recording does not say, and where another grid or only a part is to be judged.
+        The plan is None if the recording does not contain it, or if another grid or only a part is replayed.
         """
         reader = PlanReader(self.stages)
         for envelope in self.envelopes(tray, (*self.stages.outputs, *self.stages.side_topics)):
@@ -83,7 +83,7 @@ class ReplayInput:
     def pipeline(
         self, tray: str, plan: TrayPlan | None = None, observe: Callable[[Message], None] = lambda _message: None
     ) -> OfflinePipeline:
-        """The stages of a tray, ready to run. Without a plan, one session of each judges everything."""
+        """The stages of a tray, ready to run. Without a plan, one session of each processes everything."""
         raw = RawBlocks(lambda: self.envelopes(tray, ("raw",)), observe, (self.start_s, self.end_s))
         contexts = self.contexts(self.config.tray(tray))
         return OfflinePipeline(self.stages, contexts, raw, plan or undisturbed_plan(self.stages), observe)
@@ -115,7 +115,7 @@ def open_replay_input(
     start_s: float = 0.0,
     end_s: float = math.inf,
 ) -> Iterator[ReplayInput]:
-    """Open the parts of a recording, to be judged with its own configuration and twins, or with others.
+    """Open the parts of a recording, to be replayed with its own configuration and twins, or with others.
 
     config: another configuration. overrides: keys set on top, as `key=value`. twin: for all trays.
 
