@@ -1,1 +1,4 @@
-"""From residuals to statistics, limits, alarm states and causes. Pure; docs/explanation/deciding.md explains it."""
+"""From residuals to statistics, limits, alarm states and causes, without bus, clock or files.
+
+docs/explanation/deciding.md explains the method.
+"""

@@ -1,7 +1,7 @@
 """Scores the fans of a tray: both residuals and the tachos through every detector of the table.
 
-The score of a fan is the statistic that is closest to its limit, in multiples of that limit. Above one the fan is not
-what it was. Whether that raises an alarm is decided by scoring.alarms.
+The score of a fan is the largest ratio of a statistic to its limit. Above 1 the fan deviates from its healthy
+behaviour. scoring.alarms decides whether that raises an alarm.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Calibrations as cards of format 1 held them, which are still read: pipeline/demo/twin.onnx is one."""
+"""Reads the calibrations of cards of format 1, such as that of pipeline/demo/twin.onnx."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One residual of a tray's fans: what of it a healthy fan explains, and the rest in healthy standard deviations."""
+"""One residual of a tray's fans: the expected part subtracted, the rest in healthy standard deviations."""
 
 from __future__ import annotations
 

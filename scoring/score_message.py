@@ -1,4 +1,4 @@
-"""The message `Score`: what a viewer draws of a block, in rad/s and command units."""
+"""The message `Score` of a block, in rad/s and command units."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Torque balance: the command given, less the command that a healthy fan needs for the measured motion.
+"""Torque balance: the command given minus the command that a healthy fan needs for the measured motion.
 
 A healthy fan needs J w' + alpha w + C_D w|w| + friction. The difference is filtered by 1 / (1 + s / lambda), so that no
 speed is differentiated: the filter turns J w' into J lambda (w - filtered w), as the filtering operator of Peng and
-Chen does (their equations 13 to 18). A speed controller cannot hide a fault from it: what it adds to the
-command to hold the speed appears here.
+Chen does (their equations 13 to 18). A speed controller cannot hide a fault from it: the command that it adds to hold
+the speed appears here.
 """
 
 from __future__ import annotations

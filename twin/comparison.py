@@ -1,4 +1,4 @@
-"""Several models trained on the same recordings and judged on the same others."""
+"""Several models trained on the same recordings and evaluated on the same other recordings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What an alarm still asks of operators: retained, silenced, presented, listed (OPC UA Part 9).
+"""Whether an alarm needs attention: retained, silenced, presented, listed (OPC UA Part 9).
 
 This is the only definition. The scorer's `AlarmState` and the `Alarm` message carry the same flags; both are accepted.
 """

@@ -1,4 +1,4 @@
-"""The alarms of a tray as messages: each transition with the distance from the twin and, where known, the causes."""
+"""The alarms of a tray as messages: each transition with its residuals and, if known, the causes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The alarm condition of one fan: its alarm, and what operators have done with it.
+"""The alarm condition of one fan: the state of its alarm, including the actions of operators.
 
 Names and rules are those of OPC UA Part 9 (OPC 10000-9, release 1.05.03): ActiveState with OnDelay and OffDelay
 (5.8.2), AckedState and ConfirmedState of one occurrence (4.3, 5.7; the rows of table B.1 are a test), LatchedState and

@@ -1,1 +1,1 @@
-"""What a residual owes to the fan and to the day, and not to a fault."""
+"""The part of a residual that is specific to the fan or the day and is not a fault."""

@@ -1,9 +1,9 @@
-"""Commissioning: the offset of a residual that belongs to this fan, or to this day, and is no fault.
+"""Baseline of a residual: its offset that is specific to the fan or the day and is not a fault.
 
 The time since the first sample of a session is cut into intervals. The mean residual of the first steady interval is
-the first baseline; a fan that starts from rest has no steady residual yet, and is waited for, but not for ever. While
-the fan is commissioned, the baseline is the median of the means of its intervals. Later intervals refine it, as a
-running mean first and with a fixed time constant in the long run.
+the first baseline. A fan that starts from rest has no steady residual yet; after a number of unsteady intervals the
+next one is accepted. During commissioning the baseline is the median of the means of its intervals. Later intervals
+refine it, as a running mean first and with a fixed time constant in the long run.
 
 Nothing is learned from an anomaly. While commissioning, an interval counts if no statistic exceeded its limit; later,
 if none exceeded half of it. The commissioned baseline is limited to the offsets of healthy fans, and the later one to
@@ -11,9 +11,9 @@ a distance from the commissioned one: slow wear reaches that distance, the resid
 
 The offset may change with the speed (scoring.baseline.speed_scaling). The mean of an interval is then a least-squares
 estimate of the offset at the reference speed, and its information is the mean square of the scaling in it. An error of
-the twin at low speed must not be extrapolated to a large offset at high speed, so estimates are drawn towards zero
+the twin at low speed must not be extrapolated to a large offset at high speed, so estimates are shrunk towards zero
 (ridge regression). Above the scaling at which most was learned, the offset is uncertain in proportion
-(`offset_uncertainty`). There the baseline is followed faster, and the commissioned one moves with it by at most that
+(`offset_uncertainty`). There the baseline adapts faster, and the commissioned one moves with it by at most that
 uncertainty.
 """
 

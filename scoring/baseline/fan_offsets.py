@@ -1,10 +1,10 @@
 """Mean healthy residual of each fan at each speed, beyond the baseline of a run.
 
-A twin has a small error for each fan at each speed, largest where it had little training data. The error is the same
-on all days, so several runs show it, and limits need not allow for it. The mean residual of fan f in run r and speed
-bin b is modelled as e_fb + c_fr, where c is the baseline of that day; both by least squares. e is then shrunk towards
-the mean of all fans, as far as its variance between fans and the remaining variance between runs say (empirical Bayes:
-Efron and Morris, JASA 70 (1975) 311).
+A twin has a small error for each fan at each speed, largest where it had little training data. The error is the same on
+all days, so several runs show it, and limits need not allow for it. The mean residual of fan f in run r and speed bin b
+is modelled as e_fb + c_fr, where c is the baseline of that day; both by least squares. e is then shrunk towards the
+mean of all fans, by an amount that follows from its variance between fans and the remaining variance between runs
+(empirical Bayes: Efron and Morris, JASA 70 (1975) 311).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Friction that differs from day to day shifts the torque balance by a constant (exponent 0). Another density of the air
 changes the drag, so the balance is off in proportion to the square of the speed (exponent 2), and the speed is off by
-that divided by what a little more speed needs, viscous + 2 drag w. The latter is constant at low speeds and
+that divided by the slope of the needed command over speed, viscous + 2 drag w. The slope is constant at low speeds and
 proportional to w at high ones, with the crossover at w = viscous / (2 drag).
 """
 

@@ -1,1 +1,1 @@
-"""Alarm limits from healthy running, for a declared false-alarm rate."""
+"""Alarm limits from healthy recordings, for a declared false-alarm rate."""

@@ -1,9 +1,9 @@
 """Confidence interval of a rate of alarms that were counted in blocks of running: runs, fans, or stretches of time.
 
-Alarms of one block come together: a day, or a fan, has many or none. The variance of the count over bootstrapped blocks
-shows how many independent alarms it is equivalent to (quasi-Poisson: Wedderburn, Biometrika 61 (1974) 439; block
-bootstrap: Kuensch, Annals of Statistics 17 (1989) 1217). The interval is that of Garwood (Biometrika 28 (1936) 437) for
-this number.
+Alarms cluster in blocks: a day, or a fan, has many or none. The variance of the count over bootstrapped blocks shows
+how many independent alarms it is equivalent to (quasi-Poisson: Wedderburn, Biometrika 61 (1974) 439; block bootstrap:
+Kuensch, Annals of Statistics 17 (1989) 1217). The interval is that of Garwood (Biometrika 28 (1936) 437) for this
+number.
 """
 
 from __future__ import annotations

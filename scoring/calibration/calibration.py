@@ -1,11 +1,11 @@
 """Limits from healthy runs, such that false alarms are as rare as declared.
 
-A healthy recording is scored as a live fan is: commissioned at its start, baselines followed, statistics run. For every
-window of ten seconds the highest value that each statistic held for the on-delay is kept. The limits by rarity
-(LimitRule) are set where these values are equally rare for every statistic, and so rare that alarms, by any statistic,
-are as frequent as declared. How much more frequent alarms by any statistic are than by one alone is counted at lower
-limits. An excursion over several windows counts as one alarm. A limit beyond all values seen is set at the upper end of
-the confidence interval of the extrapolated tail.
+A healthy recording is scored like a live fan, with commissioning, baselines and all statistics. For every window of ten
+seconds the highest value that each statistic held for the on-delay is kept. The limits by rarity (LimitRule) are set
+where these values are equally rare for every statistic, and so rare that alarms, by any statistic, are as frequent as
+declared. The ratio of alarms by any statistic to alarms by a single one is counted at lower limits, where alarms are
+frequent. An excursion over several windows counts as one alarm. A limit beyond all observed values is set at the upper
+end of the confidence interval of the extrapolated tail.
 """
 
 from __future__ import annotations

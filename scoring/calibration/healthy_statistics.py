@@ -1,4 +1,4 @@
-"""One pass over healthy runs, scored as live fans are: the statistics that calibration sets limits by."""
+"""One pass over healthy runs, scored as live fans are: the statistics from which calibration sets limits."""
 
 from __future__ import annotations
 

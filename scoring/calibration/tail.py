@@ -1,8 +1,8 @@
 """How rare a large value is: the tail of a sample of maxima, and levels beyond it.
 
 Excesses over a high threshold are taken to be exponential (peaks over threshold with shape zero: Pickands, Annals of
-Statistics 3 (1975) 119). Sums and averages of residuals have such tails or lighter ones, so levels are rather too high
-than too low.
+Statistics 3 (1975) 119). Sums and averages of residuals have such tails or lighter ones, so levels tend to be too high
+rather than too low.
 """
 
 from __future__ import annotations

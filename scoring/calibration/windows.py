@@ -1,7 +1,7 @@
-"""Windows of healthy running: the highest value of each statistic that would have raised an alarm.
+"""Windows of healthy data: the highest value of each statistic that would have raised an alarm.
 
-An alarm is raised when the score has been above its limit for the on-delay. So what counts in a window is not the
-highest value but the highest that was held for that long.
+An alarm is raised when the score has been above its limit for the on-delay. So the relevant value of a window is not
+its maximum but the highest value that was held for that long.
 """
 
 from __future__ import annotations

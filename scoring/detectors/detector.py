@@ -1,7 +1,7 @@
 """What a detector is: one statistic of every fan of a tray, in multiples of its limit.
 
-A detector is one file with its class and its settings, and one row in scoring/detectors/table.py. Nothing else names
-it: scores, limits, calibration, snapshots and alarm texts go through the table.
+A detector is one file with its class and its settings, and one row in scoring/detectors/table.py. No other code names
+it: scores, limits, calibration, snapshots and alarm texts use the table.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.state import ColumnState
 
 Signal = Literal["speed", "balance", "tacho"]
-"""What a detector watches: the speed residual, the torque balance, or the readings of the tacho themselves."""
+"""The input of a detector: the speed residual, the torque balance, or the readings of the tacho."""
 UNREACHED = 1e6  # a limit that no healthy fan reaches; calibration starts from it
 
 
@@ -33,7 +33,7 @@ class LimitRule(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class HealthyEvidence:
-    """What healthy runs show of what a detector watches, under the limits of that pass. The tacho has no residual."""
+    """Statistics of a detector's input over healthy runs, under the limits of that pass. The tacho has no residual."""
 
     period_s: float
     """sampling period of the runs"""
@@ -44,11 +44,11 @@ class HealthyEvidence:
     smoothed_limit: float = 0.0
     """limit of the low-passed residual, in these standard deviations"""
     second_mean_limit: float = 0.0
-    """99.9 % of the means of the standardised residual over a second are below, sigma"""
+    """99.9 % quantile of the means of the standardised residual over one second, in sigma"""
     between_runs_std: float = 0.0
     """standard deviation of the commissioned baselines, in that of the residual"""
     offset_unknown_at_other_speeds: bool = False
-    """whether a fan's offset at one speed says nothing of its offset at another"""
+    """whether a fan's offset at one speed is unrelated to its offset at another"""
 
 
 class DetectorSettings(BaseModel, ABC):

@@ -1,6 +1,6 @@
-"""Standard deviation of a low-passed and of a summed residual: what the limits of statistics are multiples of.
+"""Standard deviation of a low-passed and of a summed residual: the unit of the limits of statistics.
 
-The healthy residual is taken to be first-order autoregressive, with correlation phi from sample to sample.
+The healthy residual is assumed to be first-order autoregressive, with correlation phi from sample to sample.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A CUSUM of the residual: finds a small shift that stays."""
+"""A CUSUM of the residual: detects a small shift that stays."""
 
 from __future__ import annotations
 

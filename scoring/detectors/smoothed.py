@@ -1,4 +1,4 @@
-"""The low-passed residual: finds a step at once."""
+"""The low-passed residual: detects a step immediately."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""State that consists of arrays, as JSON and back: what a snapshot of a detector, a baseline or a filter is made of."""
+"""State that consists of arrays, to JSON and back: used by the snapshots of detectors, baselines and filters."""
 
 from __future__ import annotations
 

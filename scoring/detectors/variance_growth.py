@@ -1,7 +1,7 @@
-"""Growth of the residual's standard deviation: finds vibration, a loose blade, a noisy tacho.
+"""Growth of the residual's standard deviation: detects vibration, a loose blade, a noisy tacho.
 
 The statistic is the root of the low-passed square of the residual less its own low-pass, in sigma. A fault may raise it
-and leave the mean of the residual where it was.
+without changing the mean of the residual.
 """
 
 from __future__ import annotations

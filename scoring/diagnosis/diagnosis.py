@@ -8,8 +8,8 @@ Where the motion does not distinguish two faults, each keeps half the probabilit
 that naming the first cause would be wrong, because another is true or because nothing changed. It comes first exactly
 when the best cause is less probable than all the others together.
 
-A stuck sensor carries no information on the motion: its balance counts as explained as well as by the best of the
-others. A sensor that drops out is right whenever it gives a reading: its balance has to be healthy.
+A stuck sensor carries no information about the motion, so its hypothesis gets the same likelihood for the balance as
+the best of the others. A sensor that drops out is right whenever it gives a reading, so its balance has to be healthy.
 """
 
 from __future__ import annotations

@@ -13,9 +13,9 @@ The factor 1 / sqrt(A s^2) penalises a free size, Occam's factor (MacKay, Inform
 Algorithms, 2003, chapter 28). Two hypotheses that the motion does not distinguish get the same Z, without a special
 rule.
 
-sigma is summed over, from the healthy one upwards: a hypothesis that fits badly needs a larger sigma, which makes it
-less certain of everything. Errors of the healthy coefficients, and a slow torque where one is possible, are normal
-unknowns with zero mean. They are integrated out first, which changes the products of the columns and not the formulas.
+sigma is summed over, from the healthy one upwards: a hypothesis that fits badly needs a larger sigma, which widens all
+its uncertainties. Errors of the healthy coefficients, and a slow torque where one is possible, are normal unknowns with
+zero mean. They are integrated out first, which changes the products of the columns and not the formulas.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Stuck: from some sample on, each reading repeats the last exactly, up to now. A working sensor does so with the
 probability seen before (integrated out, as it is uncertain after a short time). Readings of zero count only if the
-sensor fell to zero within one sample: a rotor at standstill reads zero, too. The choice of the sample at which it stuck
-is accounted for, as every choice is.
+sensor fell to zero within one sample: a rotor at standstill reads zero, too. The likelihood accounts for the free
+choice of the sample at which it stuck.
 
 Dropout: more readings are missing than before. All shares larger than the one before have the same prior probability
 (a binomial with its share integrated out).

@@ -1,8 +1,8 @@
 """How far each parameter of a fan has drifted from health over a window, one at a time, with standard errors.
 
 The same filtered regression as in a diagnosis (scoring.diagnosis.regression_window), by plain least squares, for a
-change that lasts for the whole window: drag and gain relative, friction in units of the command. Each parameter is
-given the whole drift of the fan; which of them has really changed is a question for a diagnosis. scoring.wear.trend
+change that is present throughout the window: drag and gain relative, friction in units of the command. Each parameter
+is given the whole drift of the fan; which of them has really changed is a question for a diagnosis. scoring.wear.trend
 evaluates series of these drifts: use windows with the fan offset of commissioning, not with one that follows the fan.
 """
 

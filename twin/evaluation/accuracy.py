@@ -1,10 +1,9 @@
 """How well a model follows measured runs.
 
-The figures that count are those of the free run: it starts from the first five measured speeds, as a deployed twin
-does, and is driven by the commands alone. Runs are split at long gaps and restarted after them. The one-step error,
-from measured speeds to the next one, is given beside it and says little.
-Missing samples count nowhere. RMSE, maximum error and R2 are equations (32) to (34) of Peng and Chen, the band of two
-sigma (35) and (36).
+The main figures are those of the free run: it starts from the first five measured speeds, as a deployed twin does, and
+is driven by the commands alone. Runs are split at long gaps and restarted after them. The one-step error, from measured
+speeds to the next one, is given for comparison and is a weak measure. Missing samples are ignored. RMSE, maximum error
+and R2 are equations (32) to (34) of Peng and Chen, the band of two sigma (35) and (36).
 """
 
 import math

@@ -1,8 +1,8 @@
 """A run on another grid than it was recorded on, to see whether a twin depends on the grid it was trained on.
 
 The command of each new step is the mean of the held command over it (the exact integral of the zero-order hold), so
-that no impulse is lost. Speeds are measured ones wherever the grids meet: interpolation would lower their noise (midway
-between two samples by half its variance), and figures of different grids could not be compared.
+that no impulse is lost. Measured speeds are used where the times of both grids coincide: interpolation would lower
+their noise (midway between two samples by half its variance), and figures of different grids could not be compared.
 """
 
 from collections.abc import Sequence

@@ -1,14 +1,14 @@
-"""What is left of the speed once the free run is taken away: noise, or something the model should have said.
+"""The measured speed minus the free run: whether it is noise, or dynamics that the model lacks.
 
-A residual that is white and knows nothing of the command is all that a model can leave. Per fan: its autocorrelation
-with a whiteness test, and its cross-correlation with the command. Definitions and bounds: Ljung, System Identification,
-2nd ed., section 16.6; Soderstrom and Stoica, System Identification, sections 11.2 and C.1. Whiteness: Ljung and Box,
-Biometrika 65 (1978) 297; with missing samples as Stoffer and Toloi, Statistics & Probability Letters 13 (1992) 391.
+The residual of a perfect model is white and independent of the command. Per fan: its autocorrelation with a whiteness
+test, and its cross-correlation with the command. Definitions and bounds: Ljung, System Identification, 2nd ed., section
+16.6; Soderstrom and Stoica, System Identification, sections 11.2 and C.1. Whiteness: Ljung and Box, Biometrika 65
+(1978) 297; with missing samples as Stoffer and Toloi, Statistics & Probability Letters 13 (1992) 391.
 
 The first seconds of each run are left out: a free run starts from a measured speed, and forgets its error only within
 some time constants of the fan. Samples are laid on a grid of the runs' median step: a longer step leaves slots empty,
-jitter within a step is not seen.
-Runs lie apart by more than the longest lag, so that no product joins the end of one with the start of another.
+jitter within a step is not seen. Runs are separated by more than the longest lag, so that no product combines the end
+of one with the start of another.
 """
 
 from collections.abc import Sequence

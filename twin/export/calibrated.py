@@ -1,4 +1,4 @@
-"""A twin file with the calibration of its alarms in its card: the graph stays, byte for byte of its weights."""
+"""A twin file with the calibration of its alarms in its card: the graph and its weights are unchanged."""
 
 import json
 from typing import Any

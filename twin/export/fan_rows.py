@@ -1,4 +1,4 @@
-"""Which fan of a twin is which fan of some runs."""
+"""Matches the fans of a twin with the fans of runs."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""An exported twin, run by onnxruntime behind the interface of a model in memory: what ships is what is judged."""
+"""An exported twin, run by onnxruntime like a model in memory, so that the file itself is evaluated."""
 
 import os
 from pathlib import Path

@@ -1,19 +1,17 @@
-"""The torque balance: the command given, less the command that a healthy fan needs for the measured motion.
+"""The torque balance: the command given minus the command that a healthy fan needs for the measured motion.
 
-    needed = inertia w' + viscous w + drag w|w| + friction          friction: constant, against the turning
+    needed = inertia w' + viscous w + drag w|w| + friction          friction: constant, against the rotation
 
-In units of the command; positive where the fan takes more than a healthy one. Under a speed loop a fault shows here
-and hardly in the speed. Both sides go through lambda / (s + lambda), so that nothing is differentiated. On a uniform
-grid of period h, with a = exp(-lambda h), v_k the command that acts from k to k + 1 (after its lag, twin.models.lag)
-and m_k
+In units of the command; positive where the fan needs more than a healthy one. Under a speed loop a fault shows here and
+hardly in the speed. Both sides go through lambda / (s + lambda), so that nothing is differentiated. On a uniform grid
+of period h, with a = exp(-lambda h), v_k the command that acts from k to k + 1 (after its lag, twin.models.lag) and m_k
 the mean of w_k and w_k+1,
 
     x_k = v_k - inertia (w_k+1 - w_k) / h - viscous m_k - drag m_k |m_k| - friction
     f_k+1 = a f_k + (1 - a) x_k,    f_0 = 0,        balance_k = f_k / (1 - a^k)
 
-The filter weighs the difference quotient by (1 - a) / h, which is about lambda: white tacho noise of standard
-deviation s makes a balance of about inertia lambda s, whatever the rate. Where the coefficients are from:
-twin.fitting.balance_fit.
+The filter weighs the difference quotient by (1 - a) / h, which is about lambda: white tacho noise of standard deviation
+s makes a balance of about inertia lambda s, whatever the rate. twin.fitting.balance_fit finds the coefficients.
 """
 
 import numpy as np

@@ -1,9 +1,10 @@
 """The coefficients of the torque balance (twin.fitting.balance), and its healthy variation, from healthy runs.
 
 There are two candidates for each fan. *physics*: J, alpha, C_D and lag_s of the identification, and the friction by
-least squares. A noisy tacho does not bias them, but the physics know no dry friction, and a speed loop can spoil them.
-*least-squares*: all four coefficients by least squares on the filtered balance, none of the first three below zero;
-the lag is that of the physics. It knows friction and bears a loop, but noise in the speeds makes its inertia too small.
+least squares. A noisy tacho does not bias them, but the physics lack dry friction, and a speed loop can bias them.
+*least-squares*: all four coefficients by least squares on the filtered balance, none of the first three below zero; the
+lag is that of the physics. It includes friction and works under a loop, but noise in the speeds makes its inertia too
+small.
 
 The candidates are compared by the *residual standard deviation*: that of the balance about the mean of each run.
 (Commissioning removes constant differences between runs.) Least squares is cross-validated: each group of samples uses

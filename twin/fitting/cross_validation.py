@@ -1,4 +1,4 @@
-"""How far a network may depart from the physics, chosen by recordings left out.
+"""How far a network may depart from the physics, chosen by cross-validation over recordings.
 
 A free-running model that fits a handful of recordings to the last disturbance predicts the next one worse than its
 physics do. With several recordings and none held out, each third of them is left out in turn and predicted in free

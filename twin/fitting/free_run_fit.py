@@ -6,11 +6,11 @@ Minimises the sum of a pseudo-Huber loss of (measured - free run) / scale over e
     each fan's own physics (twin.models.physical: ln J, two ln dampings, lag), and
     the initial speed of each trajectory.
 
-The scale is a robust standard deviation of each fan's residual, so that outliers count
-linearly and fans of different noise count alike. Initial speeds meet the other unknowns only in their own trajectory,
-and physics only in their own fan: both
-are eliminated from the normal equations (Schur complements), so that a thousand trajectories and a hundred fans cost
-no more than their own integration. More, Numerical Analysis, LNM 630 (1978), for the damping by the diagonal.
+The scale is a robust standard deviation of each fan's residual, so that outliers count linearly and fans with different
+noise count equally. Initial speeds are coupled with other unknowns only in their own trajectory, and physics only in
+their own fan: both are eliminated from the normal equations (Schur complements), so that a thousand trajectories and a
+hundred fans cost no more than their own integration. More, Numerical Analysis, LNM 630 (1978), for the damping by the
+diagonal.
 
 Without shared weights every fan is damped, accepted and stopped by itself, as if it were fitted alone.
 """

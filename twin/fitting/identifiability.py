@@ -1,11 +1,10 @@
 """What a recording does not determine about a fan, why, and what to record instead.
 
 Whether a parameter is determined follows from the covariance of the estimates; the reason follows from the data. Two
-things the covariance cannot see are looked for in the data alone: a recording that hardly excites the fan, and a
+problems that the covariance cannot show are detected in the data alone: a recording that hardly excites the fan, and a
 controller that feeds the noise of the speed back into the command. Under such feedback the direct approach, which fits
-command to speed as if there were no loop, is biased unless its noise model is
-right, and ours, white noise on the speed, is not
-once the load fluctuates too (Ljung, System Identification, second edition, section 13.4).
+command to speed as if there were no loop, is biased unless its noise model is right. Ours, white noise on the speed, is
+not right once the load fluctuates, too (Ljung, System Identification, second edition, section 13.4).
 """
 
 from collections.abc import Sequence

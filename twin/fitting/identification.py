@@ -1,25 +1,22 @@
 """The physical parameters of each fan, with their confidence intervals.
 
 First the filtering operator (twin.fitting.filtering): least squares for a = alpha / J, a_N = C_D / J and b = 1 / J,
-equations
-(11) to (20) of Peng and Chen. Its one free choice, lambda, is made by the data: of a ladder of values, the largest
-whose parameters run freely nearly as well as the best's. A small lambda lives on slow drift, a large one on the
-response to the command, which is what has to be learned.
+equations (11) to (20) of Peng and Chen. Its one free choice, lambda, is made by the data: of a ladder of values, the
+largest whose parameters give nearly the smallest free-run error. A small lambda is sensitive to slow drift; a large one
+follows the response to the command, which is what has to be learned.
 
 Least squares on noisy regressors is biased, so that result only starts the refinement, a fit of the free run itself
-(twin.fitting.free_run_fit). The inertia stays anchored to the start: under closed-loop control the speed hardly
-moves, and a
-model so slow that it keeps its initial speed would otherwise be the best of all.
+(twin.fitting.free_run_fit). The inertia stays anchored to the start: under closed-loop control the speed hardly moves,
+and a model so slow that it keeps its initial speed would otherwise fit best.
 
-The lag of the command (twin.models.lag) is estimated with the rest and kept only where it is larger than its
-uncertainty;
+The lag of the command (twin.models.lag) is estimated with the rest and kept only if it is larger than its uncertainty;
 otherwise it is zero, and the model is the published one of three parameters.
 
 Covariances come from the jackknife over blocks of time, linearised: leaving out block b moves the estimate by
--(H - H_b)^-1 g_b, with g_b the summed score and H_b the curvature of that block. Unlike the plain inverse Hessian it
-stays honest when the residual is correlated in time, which it is whenever the physics are not the whole truth, and
-unlike the sandwich of raw scores when a few transients hold most of the information. Efron and Stein, Annals of
-Statistics 9 (1981).
+-(H - H_b)^-1 g_b, with g_b the summed score and H_b the curvature of that block. Unlike the plain inverse Hessian it remains
+valid when the residual is correlated in time, which is the case whenever the physics are incomplete, and unlike the
+sandwich of raw scores it remains valid when a few transients contain most of the information. Efron and Stein, Annals
+of Statistics 9 (1981).
 """
 
 from collections.abc import Sequence

@@ -1,13 +1,11 @@
-"""Where the hidden units of a network begin, before it is trained.
+"""Initial weights of the hidden units of a network, before it is trained.
 
-Training a small network goes astray mostly by its start: a unit that is flat over the data never finds the kink that
-it is needed for. What physics leave out of a fan is known well enough to look there first: friction changes where the
-rotor comes to rest, and a drive has its dead zone where the command begins. So in every other placement a third of the
-units are steps in speed near rest and a third steps in command near zero, both of many widths. All others are smooth
-and lie anywhere in the data. The output weights then follow by linear least squares through the filtering operator
-(twin.fitting.filtering), the hidden units being so many more regressors, and that is cheap enough to draw many
-placements and
-keep a few of each sort.
+Training of a small network fails mostly because of its start: a unit that is flat over the data never finds the kink
+that it is needed for. Where the physics are incomplete is known: friction changes where the rotor comes to rest, and a
+drive has its dead zone near zero command. So in every other placement a third of the units are steps in speed near rest
+and a third steps in command near zero, both of many widths. All others are smooth and lie anywhere in the data. The
+output weights then follow by linear least squares through the filtering operator (twin.fitting.filtering), with the
+hidden units as additional regressors. That is cheap enough to draw many placements and keep a few of each sort.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,8 +1,9 @@
-"""Whether a NARX network can be let run freely: it must forget where it started, and stay near where speeds have been.
+"""Whether the free run of a NARX network is stable: it must forget where it started, and stay near the recorded speeds.
 
-A recursion that fits its data can hold a second, false steady state where no data were, and a start or a jump of the
-command that training never saw takes it there for good. Probing finds that without any measured speed: commands held
-for long, over the range of training, are run from below the lowest and from above the highest speed of training.
+A recursion that fits its data can have a second, false steady state where there were no data, and a start or a jump of
+the command that was not in the training data can take it there permanently. Probing detects this without measured
+speeds: the network runs under long held commands over the range of training, from below the lowest and from above the
+highest speed of training.
 """
 
 import numpy as np

@@ -1,9 +1,9 @@
 """Where the training of NARX starts: tanh units that together act as the best first-order low-pass filter of the data.
 
-Small random weights keep each unit on the nearly straight part of its tanh, so the layer starts close to a linear
-model whose free run is stable and near the data, and curvature is for the training to add. The filter is fitted by
-output error on a grid of time constants: with the time constant given, gain and offset are linear in the data, so
-noise on the speeds biases nothing, and missing ones are left out.
+Small random weights keep each unit on the nearly straight part of its tanh, so the layer starts close to a linear model
+whose free run is stable and near the data; training adds the curvature. The filter is fitted by output error on a grid
+of time constants: with the time constant given, gain and offset are linear in the data, so noise on the speeds biases
+nothing, and missing ones are left out.
 """
 
 from collections.abc import Sequence

@@ -1,19 +1,21 @@
-"""Training of the NARX network: from the best linear filter to as much curvature as unseen speeds confirm.
+"""Training of the NARX network: from the best linear filter to as much curvature as improves the fit of unseen speeds.
 
 Fitting each next sample from measured ones (series-parallel, the published way) is biased by the noise in its own
-regressors, and a good one-step error promises little about the free run. So the free run itself is fitted (parallel
+regressors, and a small one-step error does not imply a good free run. So the free run itself is fitted (parallel
 training: Narendra and Parthasarathy, IEEE Transactions on Neural Networks 1, 1990):
 
 1. The start is a layer that acts as the best first-order filter of the data (twin.fitting.narx_start).
-2. Its 1151 weights are held to the start by a prior, those of old samples more firmly than those of recent ones. The
-   prior is firm at first and relaxed tenfold at a time, each fit starting from the one before (twin.fitting.narx_fit).
-3. Each precision of the prior is judged by the free run over speeds that its fit does not see: those of the held-out
-   runs; where none are given, those of whole runs left out in turn; of a single run, those of blocks left out. Relaxing
-   ends where it no longer helps.
-4. All speeds of the training runs are fitted at the precision chosen, or at the next firmer one whose free run forgets
-   its start (twin.fitting.narx_stability); the firmest, where none does.
+2. A prior ties its 1151 weights to the start, those of old samples more strongly than those of recent ones. The prior
+   is strong at first and relaxed by a factor of ten at a time, each fit starting from the previous one
+   (twin.fitting.narx_fit).
+3. Each precision of the prior is evaluated by the free run over speeds that were not fitted: those of the held-out
+   runs; if none are given, those of whole runs left out in turn; for a single run, those of blocks left out. Relaxing
+   ends when it no longer helps.
+4. All speeds of the training runs are fitted at the chosen precision, or at the next stronger one whose free run
+   forgets its start (twin.fitting.narx_stability); if none does, at the strongest.
 
-A fit costs by the sample: of long recordings, stretches of MAX_SAMPLES in all are drawn at random.
+The cost of a fit is proportional to its samples: from long recordings, stretches of MAX_SAMPLES in total are drawn at
+random.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
-"""Speeds that no fan turned at: tacho dropouts, double counts, glitches on the line.
+"""Speed readings that cannot be true: tacho dropouts, double counts, glitches on the line.
 
 The Hampel identifier (Pearson, Mining Imperfect Data, SIAM 2005, section 3.2): a sample is an outlier where it lies
-further from the median of its neighbours than several of their median absolute deviations. A transient that is sampled
-well has wide deviations around it and passes; what is missed still counts only linearly in a fit
+further from the median of its neighbours than several of their median absolute deviations. A well-sampled transient has
+wide deviations around it and passes; an outlier that is not detected counts only linearly in a fit
 (twin.fitting.free_run_fit). Bursts of up to five samples are found.
 """
 

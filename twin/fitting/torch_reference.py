@@ -1,8 +1,7 @@
 """The published training recipe in torch: Adam on the mean absolute error of the free run, integrated by RK4.
 
-It is the reference that twin.fitting.training is compared with, and a second implementation of the same mathematics
-that the
-exported graph is tested against. The recipe: Peng and Chen, equations (28) to (31).
+It is the reference for twin.fitting.training, and a second implementation of the same mathematics against which the
+exported graph is tested. The recipe: Peng and Chen, equations (28) to (31).
 """
 
 from collections.abc import Sequence

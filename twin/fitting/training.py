@@ -1,14 +1,12 @@
 """Training of the network of a neural ODE or hybrid on the free-run error.
 
 The published recipe is Adam on the mean absolute error (twin.fitting.torch_reference). This one needs tens of
-iterations
-instead of thousands, because the model is small enough for second-order steps with exact sensitivities:
+iterations instead of thousands, because the model is small enough for second-order steps with exact sensitivities:
 
-1. A few starts from twin.fitting.initial_weights, each taken some steps of Levenberg-Marquardt over stretches of a
-few time
-   constants, each stretch with its own initial speed (multiple shooting). The best one goes on.
-2. The same until nothing is gained.
-3. Over stretches as long as is practical and from their measured speeds: the free run itself.
+1. A few starts from twin.fitting.initial_weights, each taken some steps of Levenberg-Marquardt over stretches of a few
+   time constants, each stretch with its own initial speed (multiple shooting). The best one goes on.
+2. The same until it no longer improves.
+3. The free run itself, over stretches as long as practical, from their measured speeds.
 
 Every iterate is evaluated as it would be used: by its free run from the measured start, over the held-out runs, or over
 the training runs where none are given. The best one is kept. The untrained network (all weights zero: for a hybrid, its

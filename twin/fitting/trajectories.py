@@ -1,6 +1,6 @@
 """Runs cut into many short free runs that are integrated side by side.
 
-Time is the only axis that has to be walked in order, so fitting cuts runs into stretches of a few time constants and
+Time is the only axis that has to be processed in order, so fitting cuts runs into stretches of a few time constants and
 treats stretches and fans alike as one batch. Each stretch has its own initial speed.
 """
 

@@ -4,13 +4,12 @@ The command is held over each step (zero-order). One classical fourth-order step
 error of order 5, global error of order 4 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I,
 section II.1). The exported graph takes the same step, so that both give the same numbers.
 
-A free run is the solution of x[k + 1] = F_k(x[k]). Newton's method takes all these equations together: linearised
-about a guess of the whole run they are one bidiagonal system (twin.models.recursion), and for a fan, which forgets
-where it
-came from, four or five iterations reach rounding error. Stepping from sample to sample would cost a Python call per
-sample. (The idea: Lim et al., Parallelizing non-linear sequential models over the sequence length, ICLR 2024.) Where
-Newton does not converge the run is cut into shorter windows, and at last, as for a model that is unstable, the samples
-are stepped through one by one.
+A free run is the solution of x[k + 1] = F_k(x[k]). Newton's method takes all these equations together: linearised about
+a guess of the whole run they are one bidiagonal system (twin.models.recursion), and for a fan, which forgets its
+initial speed, four or five iterations reach rounding error. Stepping from sample to sample would cost a Python call per
+sample. (The idea: Lim et al., Parallelizing non-linear sequential models over the sequence length, ICLR 2024.) If
+Newton's method does not converge, the run is cut into shorter windows; if that fails, as for an unstable model, the
+samples are computed one by one.
 """
 
 from collections.abc import Callable

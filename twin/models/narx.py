@@ -2,8 +2,8 @@
 
 x = [w_k .. w_{k-9}, u_k, u_{k-1} .. u_{k-10}], w_{k+1} = W_o tanh(W_i x + b_i) + b_o with 50 units: the tenth order has
 ten speeds, and the present command beside ten delayed ones, so 50 * 21 + 50 + 50 + 1 = 1151 parameters. It is discrete:
-it knows no step length and no physics, and holds only at the rate it was trained at. Irregular samples are taken as if
-they came at their median rate.
+it has no step length and no physics, and is valid only at the rate it was trained at. Irregular samples are treated as
+if they had their median rate.
 """
 
 from dataclasses import dataclass

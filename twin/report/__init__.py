@@ -1,1 +1,1 @@
-"""A report on a twin: its content in numbers, a assessment in words, and one HTML page that needs nothing else."""
+"""A report on a twin: its content in numbers, an assessment in words, and one HTML page that needs nothing else."""

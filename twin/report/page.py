@@ -1,4 +1,4 @@
-"""The report as one self-contained HTML page: inline figures and style, no script, nothing to fetch."""
+"""The report as one self-contained HTML page: inline figures and style, no script, no external files."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Where in its range of speeds a twin is off."""
+"""The mean error of a twin over its range of speeds."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""The static curve: the speed a fan settles at under a command that stays, as measured and as the twin has it."""
+"""The static curve: the speed at which a fan settles under a held command, as measured and as predicted by the twin."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

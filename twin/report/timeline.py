@@ -1,4 +1,4 @@
-"""Where samples are drawn: recordings one after another, gaps left open, long ones thinned without losing a peak."""
+"""Where samples are drawn on the time axis: recordings one after another, gaps open, long ones thinned with their peaks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
