@@ -13,10 +13,10 @@ The lag of the command (twin.models.lag) is estimated with the rest and kept onl
 otherwise it is zero, and the model is the published one of three parameters.
 
 Covariances come from the jackknife over blocks of time, linearised: leaving out block b moves the estimate by
--(H - H_b)^-1 g_b, with g_b the summed score and H_b the curvature of that block. Unlike the plain inverse Hessian it remains
-valid when the residual is correlated in time, which is the case whenever the physics are incomplete, and unlike the
-sandwich of raw scores it remains valid when a few transients contain most of the information. Efron and Stein, Annals
-of Statistics 9 (1981).
+-(H - H_b)^-1 g_b, with g_b the summed score and H_b the curvature of that block. Unlike the plain inverse Hessian it
+remains valid when the residual is correlated in time, which is the case whenever the physics are incomplete, and unlike
+the sandwich of raw scores it remains valid when a few transients contain most of the information. Efron and Stein,
+Annals of Statistics 9 (1981).
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Where samples are drawn on the time axis: recordings one after another, gaps open, long ones thinned with their peaks."""
+"""The time axis of a report: recordings one after another, gaps open, long ones thinned without losing a peak."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
