@@ -11,17 +11,17 @@ from bench.detection.knobs import EVERYDAY, Knobs
 from bench.detection.methods import Calibration, Detector, Log, Method
 from bench.detection.metrics import RaisedAlarm
 from bench.detection.plant import RATE_HZ, Plant
-from bench.detection.simulated import Chain, Fleet, run_name
+from bench.detection.simulated import Fleet, PredictionStages, run_name
 from schemas.messages import Array, Prediction
 
 Progress = Callable[[str], None]
 KEPT_ROWS = 8
-"""of so many samples the largest score is kept"""
+"""the largest score of this many samples is kept"""
 
 
 @dataclass(frozen=True)
 class Healthy:
-    """What a method did in healthy running."""
+    """The alarms and scored time of a method in healthy running."""
 
     alarms: list[RaisedAlarm]
     fan_hours: float
@@ -37,13 +37,13 @@ def everyday(fleet: Fleet, runs: int, seed: int) -> Plant:
 
 
 def predictions(fleet: Fleet, plant: Plant, seconds: float, progress: Progress) -> Iterator[tuple[str, Prediction]]:
-    """Of every tray of every run, by its name, block by block."""
+    """(run name, prediction) of every tray of every run, block by block."""
     trays = len(fleet.twins)
-    chains: dict[int, Chain] = {}
+    chains: dict[int, PredictionStages] = {}
     reported = 0
     for number, blocks in enumerate(plant.blocks(seconds)):
         for unit, raw in enumerate(blocks):
-            chain = chains.setdefault(unit, Chain(fleet.twins[unit % trays]))
+            chain = chains.setdefault(unit, PredictionStages(fleet.twins[unit % trays]))
             for prediction in chain.take(raw):
                 yield run_name(unit, trays), prediction
         minutes = int(number * len(blocks[0].command) / RATE_HZ / 60)
@@ -55,9 +55,9 @@ def predictions(fleet: Fleet, plant: Plant, seconds: float, progress: Progress) 
 def calibrate(
     methods: Sequence[Method], stream: Iterator[tuple[str, Prediction]], alarms_per_hour: float
 ) -> Calibration | None:
-    """Set the limits that are not fixed, all by the same rule on the same runs. alarms_per_hour: of a fan.
+    """Set the limits that are not fixed, all by the same rule on the same runs. alarms_per_hour: per fan.
 
-    None where no method has such a limit; the stream is gone through all the same.
+    None if no method has such a limit; the stream is consumed in any case.
     """
     open_ones = [method for method in methods if not method.is_fixed]
     calibrations = {method.name: Calibration(alarms_per_hour) for method in open_ones}
@@ -72,7 +72,7 @@ def calibrate(
 
 
 class Watch:
-    """One method over all runs: what it raised, for how long it scored, and its scores, if they are kept."""
+    """One method over all runs: its alarms, the scored time, and its scores if they are kept."""
 
     def __init__(self, detector: Callable[[str, int], Detector], *, keep_scores: bool) -> None:
         self._new = detector
@@ -86,7 +86,7 @@ class Watch:
         self._end_ns: dict[str, int] = {}
 
     def take(self, run: str, block: Prediction) -> None:
-        """Judge a block of a run."""
+        """Score a block of a run."""
         if run not in self._detectors:
             self._detectors[run] = self._new(run, block.fans)
             self._start_ns[run] = int(block.t_ns[0])
@@ -98,7 +98,7 @@ class Watch:
             self._kept.setdefault(run, []).append(thinned(output.score).astype(np.float32))
 
     def healthy(self) -> Healthy:
-        """What it did, if all was healthy."""
+        """Its alarms and hours, for runs without faults."""
         alarms = self._log.alarms
         in_alarm_ns = sum((one.cleared_ns or self._end_ns[one.run]) - one.raised_ns for one in alarms)
         return Healthy(alarms, self._scored * self._step_ns / 3.6e12, in_alarm_ns / 3.6e12)

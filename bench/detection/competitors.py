@@ -1,7 +1,7 @@
 """Plain rules, each a few lines: the published band, a windowed Gaussian, a CUSUM, and a filtered torque balance.
 
-They learn from healthy runs only. Where a rule is known with a limit of its own, it is shown with that as well as with
-the limit that the same budget of false alarms gives it.
+They learn from healthy runs only. If a rule is published with a limit, it is shown with that limit and also with the
+limit that the common budget of false alarms gives it.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def fitted_balance(runs: Sequence[Sequence[Prediction]]) -> Array:
 
 
 def textbook_cusum_limit(samples_between: float, reference: float = CUSUM_REFERENCE) -> float:
-    """The limit at which a two-sided CUSUM of independent normal samples gives a false alarm every so many of them.
+    """The limit at which a two-sided CUSUM of independent normal samples gives one false alarm per `samples_between`.
 
     Siegmund's approximation: Sequential Analysis (1985), equation (2.57), with the correction of 1.166.
     """
@@ -142,7 +142,7 @@ def textbook_cusum_limit(samples_between: float, reference: float = CUSUM_REFERE
 
 
 def plain_methods(rate_hz: float, alarms_per_hour: float) -> list[Method]:
-    """All but the filtered balance. alarms_per_hour: the budget of a fan."""
+    """All but the filtered balance. alarms_per_hour: the budget per fan."""
     every_samples = rate_hz * 3600.0 / alarms_per_hour
     return [
         Method("+-2 sigma, as published", lambda _: Band(), PUBLISHED_BAND, is_fixed=True),

@@ -1,8 +1,8 @@
-"""Simulated faults whose beginning is known: five severities of each kind, in open loop and under a speed loop.
+"""Simulated faults with a known onset: five severities of each kind, in open loop and under a speed loop.
 
-One fault for each fan of each run. Half of the fans are held at a level, half are moved all the time: only there can
-causes be distinguished. Faults begin some minutes after the run begins, in the half minute after `commissioned_s`, and
-stay; wear grows all the while.
+Each fan of each run has one fault. Half of the fans are held at a level, half are moved all the time: only moving fans
+allow causes to be distinguished. Faults begin some minutes after the start of the run, within half a minute after
+`commissioned_s`, and stay; wear grows until the end.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FOREVER_S = (1e9, 1e9)
 
 @dataclass(frozen=True)
 class Cell:
-    """What a column shows. strength: the effect in sigma, or the size itself where the kind has sizes of its own."""
+    """The fault of a column. strength: the effect in sigma, or the size if the kind defines sizes."""
 
     kind: Kind
     strength: float

@@ -1,7 +1,8 @@
-"""The commands of a campaign: every column turns a knob of its own, holds it for a while, and turns again.
+"""The commands of a campaign: every column turns its own knob, holds it for a while, and turns again.
 
-A held level, a hand at the knob, random stairs and a random binary sequence are one thing: they differ in how long is
-held and turned, and in how many levels there are. Drawn as time goes on, so that no run is too long.
+A held level, a hand at the knob, random stairs and a random binary sequence are the same process: they differ
+in the times of holding and turning, and in the number of levels. Values are drawn as time advances, so that a run may
+have any length.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ class Features:
         """(m, fans, 4) for every ROWS-th sample; NaN where there is none."""
         residuals = np.stack((speed_sigmas(block), balance_sigmas(block)), axis=-1)
         means = self._moving.means(np.concatenate((residuals, np.square(residuals)), axis=-1))[::ROWS]
-        spread = np.sqrt(np.maximum(means[..., 2:] - np.square(means[..., :2]), 0.0))
-        return np.clip(np.concatenate((means[..., :2], spread), axis=-1), -LARGEST_SIGMAS, LARGEST_SIGMAS)
+        std = np.sqrt(np.maximum(means[..., 2:] - np.square(means[..., :2]), 0.0))
+        return np.clip(np.concatenate((means[..., :2], std), axis=-1), -LARGEST_SIGMAS, LARGEST_SIGMAS)
 
 
 class Scored:

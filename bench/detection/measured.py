@@ -67,7 +67,7 @@ class Measured:
 
 @dataclass
 class Scored:
-    """What a method made of the runs: alarms and scores of each, and how long it scored."""
+    """The results of a method: alarms, scores and scored hours of each run."""
 
     alarms: dict[str, list[RaisedAlarm]] = field(default_factory=dict)
     scores: dict[str, tuple[Array, Array]] = field(default_factory=dict)
@@ -77,7 +77,7 @@ class Scored:
 
 @dataclass
 class Tally:
-    """Over all folds."""
+    """The results of a method over all folds."""
 
     false: list[RaisedAlarm] = field(default_factory=list)
     healthy_hours: float = 0.0
@@ -87,7 +87,7 @@ class Tally:
 
 
 def measured_tables(progress: Progress, *, libraries: bool) -> tuple[dict[str, Rows], list[str]]:
-    """The tables of the rig, and what has to be said about them. Ends the program where the data are not there."""
+    """The tables of the rig, and notes on them. Exits with a message if the data are missing."""
     if not FOLDER.is_dir():
         raise SystemExit(
             f"{FOLDER}: not there; set FANTWIN_DATA to the folder of measured sets (docs/how-to/datasets.md)"
@@ -113,7 +113,7 @@ def measured_tables(progress: Progress, *, libraries: bool) -> tuple[dict[str, R
         "rosa: each event, by twins of how many folds it is found": _event_rows(tallies),
     }, [
         f"rosa: every healthy run was held out once, {minutes:.1f} min scored",
-        "rosa: limits for one false alarm in half an hour, of which the healthy runs are the sixth part: extrapolated",
+        "rosa: limits for one false alarm in half an hour, extrapolated from healthy runs of a sixth of that time",
         *(f"rosa: fantwin, false alarm: {one.run} at {one.raised_ns / 1e9:.2f} s" for one in tallies[NAME].false),
         "rosa: 'beside' are alarms of faulty runs outside of their events and the 5 s after them",
     ]
@@ -194,7 +194,7 @@ def scored_fold(
 
 
 def _score(run: Measured, twin: Path, place: Path, scored: Scored) -> list[Prediction]:
-    """What fantwin says of a run; its predictions, for the others."""
+    """Add the alarms and scores of fantwin for a run; returns its predictions, for the other methods."""
     written = place / f"{run.name}.mcap"
     result = json.loads(_fantwin("replay", run.recording, "--offline", "--twin", twin, "--json", "-o", written))
     scored.alarms[run.name] = [

@@ -1,7 +1,7 @@
-"""What is compared: a method is a name, a detector for each run, and whether its limit is ours to set.
+"""The methods compared: a method is a name, a detector for each run, and a limit that is fixed or set by the bench.
 
-The seam. A *detector* is handed the predictions of one tray's run block by block, as the scorer is, and gives for each
-block a score (n, fans), NaN where it has none, and the alarms it raised and cleared. Whatever only has a score
+A *detector* is handed the predictions of one tray's run block by block, as the scorer is, and gives for each
+block a score (n, fans), NaN where it has none, and the alarms it raised and cleared. A method that only has a score
 gets its alarms from `Limited`; the limit is set for all of them by one rule on the same healthy runs (`Calibration`).
 The scorer itself (`ours`) brings its own limits, in the twin's card, and its own alarms.
 """
@@ -18,13 +18,13 @@ from bench.detection.metrics import RaisedAlarm
 from schemas.messages import Array, Prediction
 
 OFF_DELAY_S = 1.0
-"""an alarm of a limit is over once the score has been below it for so long"""
+"""an alarm of a limit clears after the score has been below the limit for this time"""
 WINDOW_S = 60.0
-"""excursions of a fan within so much time count as one when a limit is set"""
+"""excursions of a fan within this time count as one when a limit is set"""
 
 
 @dataclass(frozen=True)
-class Change:
+class AlarmChange:
     """An alarm of a fan was raised or cleared, or its causes were reported; the most probable cause is the first."""
 
     fan: int
@@ -35,10 +35,10 @@ class Change:
 
 @dataclass(frozen=True)
 class MethodOutput:
-    """What a detector says of a block. score: (n, fans)."""
+    """The output of a detector for a block. score: (n, fans)."""
 
     score: Array
-    changes: list[Change]
+    changes: list[AlarmChange]
 
 
 class Scores(Protocol):
@@ -53,24 +53,24 @@ class Detector(Protocol):
     """Scores and alarms of one run."""
 
     def take(self, block: Prediction) -> MethodOutput:
-        """Judge a block; blocks come in the order of time."""
+        """Score a block; blocks come in order of time."""
         ...
 
 
 @dataclass
 class Method:
-    """One way to decide. limit: None until it is set; `is_fixed`: it came with the method and is left alone."""
+    """One method. limit: None until it is set; is_fixed: the limit comes with the method and is not set."""
 
     name: str
     scores: Callable[[int], Scores]
-    """for so many fans, one for each run"""
+    """makes the scores of one run, given its number of fans"""
     limit: float | None = None
     is_fixed: bool = False
     every: int = 1
-    """scores only one fan in so many: for methods that are too slow for all"""
+    """scores only one fan in this many, for methods that are too slow for all"""
 
     def detector(self, fans: int) -> Detector:
-        """A new one, for a run."""
+        """A new detector for a run."""
         assert self.limit is not None, self.name
         return Limited(self.scores(fans), fans, self.limit)
 
@@ -100,7 +100,7 @@ class Limited:
         self._was_active = active[-1]
         changed = zip(*np.nonzero(active != before), strict=True)
         return MethodOutput(
-            score, [Change(int(fan), int(block.t_ns[row]), bool(active[row, fan])) for row, fan in changed]
+            score, [AlarmChange(int(fan), int(block.t_ns[row]), bool(active[row, fan])) for row, fan in changed]
         )
 
 
@@ -148,7 +148,7 @@ class Log:
         self._closed: list[RaisedAlarm] = []
         self._open: dict[tuple[str, int], RaisedAlarm] = {}
 
-    def take(self, run: str, changes: list[Change]) -> None:
+    def take(self, run: str, changes: list[AlarmChange]) -> None:
         """Note what changed in a run."""
         for change in changes:
             place = (run, change.fan)

@@ -1,8 +1,8 @@
 """Figures of detection: false alarms an hour, delays and misses of events, causes, and the volume under the surface.
 
-An event is one fault of one fan. It is found when an alarm of that fan is raised between its beginning and its end; an
-alarm that was standing before finds nothing. An alarm that is raised neither in an event nor within `recovery_ns` after
-one is a false one. Nothing is adjusted by points, and no sample counts for the whole event that it lies in.
+An event is one fault of one fan. It is found if an alarm of that fan is raised between its start and its end; an alarm
+that was already active does not count. An alarm raised neither in an event nor within `recovery_ns` after one is false.
+There is no point adjustment: a detected sample does not count for the whole event around it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ NONE = "none reported"
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure and what it may truly be."""
+    """A figure and its confidence interval."""
 
     value: float
     low: float
@@ -33,7 +33,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Event:
-    """One fault of one fan of one run, in the run's own time. cause: what an alarm should say it is."""
+    """One fault of one fan, at times of its run. cause: the cause that an alarm should name."""
 
     run: str
     fan: int
@@ -45,7 +45,7 @@ class Event:
 
 @dataclass(frozen=True)
 class RaisedAlarm:
-    """An alarm of a fan of a run. cleared_ns: None where it still stands. causes: the most probable first."""
+    """An alarm of a fan of a run. cleared_ns: None if still active. causes: the most probable first."""
 
     run: str
     fan: int
@@ -56,7 +56,7 @@ class RaisedAlarm:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of an event. delay_s: NaN where it was missed. cause: the first one reported, empty where none was."""
+    """The outcome of an event. delay_s: NaN if it was missed. cause: the first one reported, empty without one."""
 
     event: Event
     delay_s: float
@@ -83,7 +83,7 @@ def share(hits: int, of: int, level: float = 0.95) -> Interval:
 
 
 def outcomes(events: Iterable[Event], alarms: Iterable[RaisedAlarm]) -> list[Outcome]:
-    """What came of each event, in their order."""
+    """The outcome of each event, in the order of the events."""
     raised: dict[tuple[str, int], list[RaisedAlarm]] = {}
     for alarm in sorted(alarms, key=lambda one: one.raised_ns):
         raised.setdefault((alarm.run, alarm.fan), []).append(alarm)
@@ -112,7 +112,7 @@ def false_alarms(
 
 
 def confusion(found: Iterable[Outcome]) -> dict[str, Counter[str]]:
-    """True cause to how often each cause was reported first, of the events that were found."""
+    """For the events that were found: true cause -> how often each cause was reported first."""
     table: dict[str, Counter[str]] = {}
     for one in found:
         if one.is_found:
@@ -123,7 +123,7 @@ def confusion(found: Iterable[Outcome]) -> dict[str, Counter[str]]:
 def vus_pr(anomalous: NDArray[np.bool_], score: NDArray[np.float64], buffers: Sequence[int]) -> float:
     """Volume under the precision-recall surface: the mean of the range-based areas over lengths of the buffer.
 
-    Around each event lie buffers of half a length on either side, where a prediction is worth sqrt(1 - distance /
+    Around each event lie buffers of half a length on either side, where a prediction counts sqrt(1 - distance /
     length); recall is multiplied by the share of events that were seen at all. Paparrizos et al., PVLDB 15 (2022) 2774,
     as the authors' package computes it (`RangeAUC_volume_opt`).
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.detection.methods import Change, MethodOutput
+from bench.detection.methods import AlarmChange, MethodOutput
 from bench.detection.plant import BLOCK, STEP_NS, TRAY_FANS
 from bench.detection.simulated import tray_number
 from pipeline.runtime.stage import Core
@@ -30,7 +30,7 @@ FLAGS = ("speed_valid", "balance_valid", "missing", "alive")
 
 
 class Scorer:
-    """The stage's core. Its score is the furthest of its statistics, in multiples of that one's limit."""
+    """The stage's core. Its score is the largest ratio of a statistic to its limit."""
 
     def __init__(self, core: Core) -> None:
         self._core = core
@@ -38,14 +38,14 @@ class Scorer:
     def take(self, block: Prediction) -> MethodOutput:
         """See methods.Detector."""
         scores: list[Array] = []
-        changes: list[Change] = []
+        changes: list[AlarmChange] = []
         for message in self._core.step(block):
             if isinstance(message, Score):
                 scores.append(message.score)
             elif isinstance(message, Alarm):
                 causes = sorted(message.causes, key=lambda one: -one.probability)
                 reported = tuple(one.cause for one in causes)
-                changes.append(Change(message.fan, message.t_ns, message.active, reported))
+                changes.append(AlarmChange(message.fan, message.t_ns, message.active, reported))
         return MethodOutput(np.concatenate(scores), changes)
 
 

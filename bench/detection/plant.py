@@ -40,7 +40,7 @@ class Faults:
 
 
 class Plant:
-    """The same fans in several runs, each on a day of its own."""
+    """The same fans in several runs, each on a different day."""
 
     def __init__(
         self,
@@ -103,7 +103,7 @@ class Plant:
         return (self._faults.start_s <= t_s) & (t_s < self._faults.stop_s)
 
     def _read(self, speed_rad_s: Array, active: Array | None) -> Array:
-        """What the tachos say; NaN where they say nothing."""
+        """The tacho readings; NaN where there is none."""
         faults = self._faults
         if faults is None or active is None:
             return self._tacho.read(speed_rad_s, self._noise)

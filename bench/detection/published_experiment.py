@@ -35,7 +35,7 @@ NO_ALARM = {"run": "", "fan": "none of 8", "raised": None, "cleared": None, "sev
 
 def main(
     folder: Annotated[Path, typer.Option(help="Where the pictures go.")] = ROOT / "docs",
-    seed: Annotated[int, typer.Option(help="Of commands and noise.")] = 7,
+    seed: Annotated[int, typer.Option(help="Seed of commands and noise.")] = 7,
     json_output: JsonOption = False,
 ) -> None:
     """Simulate, score and draw the three runs."""

@@ -1,4 +1,4 @@
-"""What every competitor looks at: both residuals of a prediction in healthy standard deviations, and moving windows."""
+"""The input of every competitor: both residuals of a prediction in healthy standard deviations, and moving windows."""
 
 from __future__ import annotations
 

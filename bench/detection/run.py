@@ -35,20 +35,22 @@ from scoring.calibration.calibration import TooLittleError
 def main(
     only: Annotated[str, typer.Option(help="simulated or measured; without it, both.")] = "",
     fans: Annotated[int, typer.Option(help="Simulated fans, in trays of 50.")] = 200,
-    declared_days: Annotated[float, typer.Option(help="One false alarm of a fan in so many days is declared.")] = 30.0,
+    declared_days: Annotated[float, typer.Option(help="Declared time between false alarms of a fan, in days.")] = 30.0,
     calibration_days: Annotated[float, typer.Option(help="Healthy fan-days to calibrate on.")] = 25.0,
     healthy_days: Annotated[float, typer.Option(help="Other healthy fan-days, to count false alarms in.")] = 50.0,
-    runs: Annotated[int, typer.Option(help="Healthy runs, of a day each, that they are parted into.")] = 8,
+    runs: Annotated[
+        int, typer.Option(help="Number of healthy runs that these fan-days are divided into, each on its own day.")
+    ] = 8,
     fault_runs: Annotated[int, typer.Option(help="Runs with a fault of every fan.")] = 20,
     commissioned_s: Annotated[
-        float, typer.Option(help="Faults begin so long after the run, or half a minute later.")
+        float, typer.Option(help="Faults begin this long after the start of a run, or up to half a minute later.")
     ] = 60.0,
     extrapolate: Annotated[bool, typer.Option(help="Set limits beyond what the healthy fan-days can show.")] = True,
     others: Annotated[
         bool, typer.Option(help="Other methods as well; without, the simulated part is ours alone.")
     ] = True,
     libraries: Annotated[bool, typer.Option(help="PyOD and river as well.")] = True,
-    seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
     json_output: JsonOption = False,
 ) -> None:
     """Print the tables of the simulated and of the measured part."""

@@ -99,7 +99,7 @@ def stage(name: str, twin: Path) -> Core:
     ).core
 
 
-class Chain:
+class PredictionStages:
     """Resampler and twin integrator of one tray in one run."""
 
     def __init__(self, twin: Path) -> None:
@@ -107,7 +107,7 @@ class Chain:
         self._integrator = stage("twin_integrator", twin)
 
     def take(self, raw: Raw) -> Iterator[Prediction]:
-        """What the stages make of a block."""
+        """The predictions for a block."""
         for grid in self._resampler.step(raw):
             assert isinstance(grid, Grid)
             for message in self._integrator.step(grid):
@@ -116,12 +116,12 @@ class Chain:
 
 
 def run_name(unit: int, trays: int) -> str:
-    """Of a tray's run, by its place among the plant's blocks."""
+    """The name of the run of a tray, from its index among the blocks of the plant."""
     return f"run{unit // trays + 1}/tray{unit % trays + 1}"
 
 
 def tray_number(run: str) -> int:
-    """Of a run so named, from 0 on."""
+    """The tray of a run with such a name, from 0."""
     return int(run.rpartition("tray")[2]) - 1
 
 

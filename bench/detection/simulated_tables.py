@@ -53,13 +53,13 @@ class Sizes:
     seed: int
 
     def seconds(self, fan_days: float) -> float:
-        """Of each run."""
+        """Length of each run."""
         return fan_days * 86_400.0 / self.fans / self.runs
 
 
 @dataclass
 class Bench:
-    """Everything that is compared, calibrated."""
+    """All methods compared, calibrated."""
 
     fleet: Fleet
     methods: list[Method]
@@ -78,7 +78,7 @@ class Bench:
         return {NAME: ours, **others}
 
     def every(self, name: str) -> int:
-        """The method scores one fan in so many."""
+        """The method scores one fan in this many."""
         return next((method.every for method in self.methods if method.name == name), 1)
 
     def _scorer(self, run: str, _fans: int) -> Scorer:
@@ -91,7 +91,7 @@ def prepared(
     """Train the twins, fit and calibrate all methods on the same healthy runs.
 
     Raises:
-        TooLittleError: so rare an alarm cannot be declared by so little healthy running.
+        TooLittleError: the healthy running is too short for a declared rate this low.
     """
     fleet = trained_fleet(folder, sizes.fans, sizes.seed, progress)
     per_hour = 1.0 / (24.0 * sizes.declared_days)
@@ -152,7 +152,7 @@ class Faulty:
     watches: dict[str, Watch]
 
     def outcomes(self, name: str, every: int = 1) -> list[tuple[Cell, Outcome]]:
-        """Of the events that a method could see."""
+        """The outcomes of the events of fans that the method scores."""
         pairs = [
             (cell, event)
             for cell, event in zip(self.shown.cells, self.shown.events, strict=True)
@@ -162,7 +162,7 @@ class Faulty:
         return [(cell, outcome) for (cell, _), outcome in zip(pairs, found, strict=True)]
 
     def false_alarms(self, name: str) -> list[RaisedAlarm]:
-        """That no fault explains."""
+        """Alarms that no fault explains."""
         return false_alarms(self.watches[name].alarms, self.shown.events)
 
     def volume(self, name: str, every: int) -> float:
@@ -223,7 +223,7 @@ def quartiles(delays_s: Sequence[float]) -> str:
 
 
 def kind_rows(faulty: Faulty) -> Rows:
-    """What our method made of each kind and strength."""
+    """The results of fantwin for each kind and strength."""
     pairs = faulty.outcomes(NAME)
     rows = []
     for kind in KINDS:
