@@ -117,7 +117,7 @@ class _PackedColumn:
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """What is known of a message type before any message is there."""
+    """What is known about a message type from its declaration alone."""
 
     name: str
     proto: type[ProtoMessage]

@@ -295,7 +295,7 @@ class ScorerSnapshot:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Command:
-    """Commands or set points for the fans, from an operator or a controller; NaN leaves a fan unchanged."""
+    """Commands or set-points for the fans, from an operator or a controller; NaN leaves a fan unchanged."""
 
     header: Header = Header()
     fans: int

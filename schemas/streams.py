@@ -26,10 +26,10 @@ StreamId: TypeAlias = tuple[str, str]
 
 @dataclass(slots=True)
 class StreamState:
-    """What a consumer knows of one stream."""
+    """What a consumer knows about one stream."""
 
     next_sequence: int | None = None
-    """the sequence number due next; None before anything is known of the stream"""
+    """the next expected sequence number; None before anything is known of the stream"""
     received: int = 0
     missing: int = 0
     duplicated: int = 0

@@ -54,7 +54,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("alarm", Alarm, ON_CHANGE, True, 1024, "transitions of alarms"),
     Topic("request", Request, ON_CHANGE, True, 64, "requests of operators about alarms"),
     Topic("snapshot", ScorerSnapshot, "on change, and each minute", True, 4, "state of a scorer for a restart"),
-    Topic("command", Command, ON_CHANGE, True, 64, "commands and set points for the fans"),
+    Topic("command", Command, ON_CHANGE, True, 64, "commands and set-points for the fans"),
     Topic("twin", ModelCard, ON_CHANGE, True, 8, "the twin in force"),
     Topic("clock", Clock, "20 Hz", False, 1, "position of a replay"),
     Topic("health", Health, "1 Hz for each stage", True, 8, "status and losses of a stage"),

@@ -1,6 +1,6 @@
 """The serial wire protocol in both directions: frames to bytes and back, without any input or output.
 
-A device sends samples; the host sends commands and set points. There are two equivalent forms: `binary` (COBS, CRC-32)
+A device sends samples; the host sends commands and set-points. There are two equivalent forms: `binary` (COBS, CRC-32)
 and `text` (lines that any sketch can print). Numbers are float32 in both, so that decoding inverts encoding exactly for
 float32 values. Reference: docs/reference/wire-protocol.md.
 """
@@ -53,7 +53,7 @@ class CommandFrame:
 
 @dataclass(frozen=True, slots=True)
 class SetPointFrame:
-    """Speed set points, one per fan, in the tray's speed unit, for a device with its own loop; NaN: unchanged."""
+    """Speed set-points, one per fan, in the tray's speed unit, for a device with its own loop; NaN: unchanged."""
 
     set_point: tuple[float, ...]
 
@@ -230,7 +230,7 @@ def _decode_text(line: bytes, fans: int) -> Frame:
 def encode(protocol: Protocol, frame: Frame) -> bytes:
     """Bytes of a frame with delimiters; `Decoder` turns them into the same frame in float32.
 
-    In text, a command or set point frame is one line for each fan that is not NaN, so possibly none.
+    In text, a command or set-point frame is one line for each fan that is not NaN, so possibly none.
 
     Raises:
         ValueError: no fans or more than 64, columns of different length, a clock or sequence outside 32 bits, or
@@ -256,7 +256,7 @@ class Decoder:
     """
 
     def __init__(self, protocol: Protocol, fans: int, end: End = "host") -> None:
-        """Every frame must have `fans` fans. The end `host` accepts samples, `device` commands and set points."""
+        """Every frame must have `fans` fans. The end `host` accepts samples, `device` commands and set-points."""
         self._text = protocol == "text"
         self._delimiter = b"\n" if self._text else b"\0"
         self._fans = fans

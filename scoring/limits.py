@@ -42,12 +42,10 @@ class DeclaredRate(_Entry):
 
     false_alarms_per_day: float = Field(gt=0, description="declared, for each fan")
     interval_95: tuple[float, float] = Field(
-        description="95 % confidence interval of the rate of these limits, by the healthy runs they were set on"
+        description="95 % confidence interval of the rate of these limits, from the healthy runs used to set them"
     )
-    extrapolated: bool = Field(
-        description="limits lie beyond what the healthy runs could show; the rate is a target only"
-    )
-    fan_hours: float = Field(gt=0, description="length of the healthy running, summed over fans")
+    extrapolated: bool = Field(description="limits are extrapolated beyond the healthy data; the rate is a target only")
+    fan_hours: float = Field(gt=0, description="length of the healthy runs, summed over fans")
     runs: int = Field(ge=1, description="number of runs")
     data: tuple[dict[str, Any], ...] = Field(default=(), description="the recordings: name and SHA-256")
     created: str = Field(default="", description="when, ISO 8601")
@@ -62,7 +60,7 @@ class Limits(_Entry):
     detectors: dict[str, SerializeAsAny[DetectorSettings]] = Field(
         default_factory=dict, description="settings of each detector by its name; one that is missing is not used"
     )
-    timing: Timing = Field(default=Timing(), description="the times that the limits hold for")
+    timing: Timing = Field(default=Timing(), description="the times for which the limits are valid")
     declared_rate: DeclaredRate | None = Field(default=None, description="null where these limits have none")
 
     @model_validator(mode="before")

@@ -194,7 +194,7 @@ class AcquisitionCore(Core):
         if not len(reading.command) == len(reading.speed) == tray.fans:
             return Rejected("wrong_fan_count", f"a reading of {len(reading.speed)} fans, this tray has {tray.fans}")
         for command in reading.command:
-            # Without the command that was really given no sample can be scored, and none may be invented.
+            # Without its actual command a sample cannot be scored, and a command must not be invented.
             if not within(command, tray.command_min, tray.command_max):
                 limits = f"{tray.command_min:g} to {tray.command_max:g}"
                 return Rejected("absurd_command", f"command {command:g} is outside {limits} of the [[tray]]")

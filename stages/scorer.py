@@ -1,7 +1,7 @@
 """Scorer: compares the measurements with the twin, and maintains the alarm of each fan.
 
 Reads: topic `prediction` (measured and predicted speed rad/s, torque balance in command units), and `request` (what
-operators want done with alarms).
+operators request about alarms).
 Writes: topic `score` (residuals, baselines, the statistic closest to its limit, state), `alarm` (every transition of a
 fan's alarm), `snapshot` (the state to continue from after a restart).
 Timing: one score message for every prediction message, immediately; delays count the time of valid samples.
@@ -53,8 +53,8 @@ from scoring.wear.wear_monitor import WearMonitor
 
 SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
 SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
-NEW_START = "baselines, alarms and wear start new"
-OPERATORS_KEPT = "what operators shelved, suppressed or took out of service stays so"
+NEW_START = "baselines, alarms and wear start from the beginning"
+OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
 ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
 READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_KEPT}"
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
@@ -68,7 +68,9 @@ class ScorerConfig(StageConfig):
     alarm_sigmas: float = Field(
         default=2.0, gt=0, description="limit on the smoothed speed residual of a twin without calibration, in sigma"
     )
-    limit_factor: float = Field(default=1.0, gt=0, description="on all limits; above 1: fewer alarms than declared")
+    limit_factor: float = Field(
+        default=1.0, gt=0, description="multiplies all limits; above 1: fewer alarms than declared"
+    )
     smoothing_s: float | None = Field(default=None, ge=0, description="time constant of the low-pass of residuals")
     baseline_s: float | None = Field(default=None, gt=0, description="length of an interval of commissioning")
     adaptation_s: float | None = Field(default=None, gt=0, description="time constant of the baseline in the long run")
@@ -82,7 +84,7 @@ class ScorerConfig(StageConfig):
     not_judged_s: float = Field(
         default=10.0,
         gt=0,
-        description="health reports a fan without a score for so long; set it above twin_integrator.warm_up_s",
+        description="health reports a fan without a score for this long; set it above twin_integrator.warm_up_s",
     )
 
     def timing(self, calibrated: Timing) -> Timing:
@@ -93,7 +95,7 @@ class ScorerConfig(StageConfig):
 
 @dataclass(frozen=True, eq=False)
 class HealthyTwin:
-    """What the scorer knows of the twin. sha256: identifies its file."""
+    """What the scorer knows about the twin. sha256: identifies its file."""
 
     sha256: str
     limits: Limits
@@ -189,7 +191,7 @@ class ScorerCore(Core):
         return at_start
 
     def step(self, item: Prediction | Request) -> list[Score | Alarm | ScorerSnapshot]:
-        """Score a block: its score, and then what happened to alarms; or answer a request."""
+        """Score a block and return its score and alarm transitions; or answer a request."""
         if isinstance(item, Request):
             return [*self.tick(0), *self._answer(item)]
         if item.fans != self._fans:
@@ -238,8 +240,8 @@ class ScorerCore(Core):
         return self._take_snapshot(at_once=True) if self._last_t_ns > np.iinfo(np.int64).min else []
 
     def _discard_if_of_other_times(self, item: Prediction) -> list[Alarm]:
-        """Start new if a snapshot is of later times than the first prediction: another recording is played, or the same
-        one again. Returns the messages on alarms that are discarded.
+        """Discard a restored snapshot if it is of later times than the first prediction, as when another recording is
+        played, or the same one again. Returns the messages on alarms that are discarded.
         """
         if not self._is_restored or not len(item.t_ns):
             return []

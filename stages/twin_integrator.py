@@ -44,7 +44,7 @@ RATE_TOLERANCE = 0.01  # a card holds the measured rate
 class TwinIntegratorConfig(StageConfig):
     """Section `[twin_integrator]`. The tray names the twin."""
 
-    start_samples: int = Field(default=5, ge=1, description="a free run starts from the mean of so many speeds")
+    start_samples: int = Field(default=5, ge=1, description="a free run starts from the mean of this many speeds")
     warm_up_s: float = Field(default=3.0, ge=0, description="a free run is not valid for this long after its start")
     hold_limit_s: float = Field(default=0.5, ge=0, description="how long the last command is held without samples")
 
@@ -96,7 +96,7 @@ class TwinIntegratorCore(Core):
         card = self._twin.card
         if card.fixed_rate and abs(grid.period_ns * card.rate_hz / NS_PER_S - 1) > RATE_TOLERANCE:
             self._problem = (
-                f"twin {card.name} holds at {card.rate_hz:g} Hz only, the grid has "
+                f"twin {card.name} is valid at {card.rate_hz:g} Hz only, the grid has "
                 f"{NS_PER_S / grid.period_ns:g} Hz: set [resampler] rate_hz = {card.rate_hz:g}"
             )
             messages.append(self._without_twin(grid))
@@ -119,7 +119,7 @@ class TwinIntegratorCore(Core):
         return self._problem
 
     def _only_new(self, grid: Grid) -> Grid:
-        """Without the samples that are not newer than those before them."""
+        """The block without the samples that are not newer than those before them."""
         before = np.concatenate(([np.iinfo(np.int64).min if self._last_t_ns is None else self._last_t_ns], grid.t_ns))
         new = grid.t_ns > np.maximum.accumulate(before)[:-1]
         if new.all():
@@ -146,7 +146,7 @@ class TwinIntegratorCore(Core):
             row = end
         in_range = (grid.command >= self._lowest_command) & (grid.command <= self._highest_command)
         in_range &= grid.command >= self._off_below
-        beyond = np.isfinite(grid.command) & ~in_range  # where it is unknown the free run has the last known
+        beyond = np.isfinite(grid.command) & ~in_range  # where it is unknown, the free run uses the last known command
         since_t_ns = np.maximum(started_t_ns, self._run.last_out_of_range(grid.t_ns, beyond))
         settled = running & ((grid.t_ns[:, np.newaxis] - since_t_ns >= self._warm_up_ns) | ~in_range)
         in_range &= np.isfinite(predicted) | ~running

@@ -23,7 +23,7 @@ def fan_numbers(text: str | None) -> list[int] | None:
     """The fans of an option such as `--fans 2,5`.
 
     Raises:
-        UserError: it is not a rising list of fan numbers.
+        UserError: it is not an ascending list of fan numbers.
     """
     if text is None:
         return None

@@ -85,7 +85,7 @@ class TrayConfig(Section):
     short_form_keys: ClassVar[tuple[str, ...]] = ("port", "baud", "protocol")
 
     name: Name
-    fans: int = Field(ge=1, le=64, description="how many fans every sample has")
+    fans: int = Field(ge=1, le=64, description="number of fans in every sample")
     source: Annotated[SourceConfig, BeforeValidator(parse_source)] = Field(
         default={"kind": "serial"}, validate_default=True, description="where samples come from; used by acquisition"
     )

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class StageRow:
-    """What is known of a stage without importing it.
+    """What is known about a stage without importing it.
 
     Attributes:
         name: also the name of its section in the configuration.

@@ -52,7 +52,7 @@ def _published_by_replaced(sessions: dict[str, list[Health]]) -> Counter[StreamI
 
 
 def _never_arrived(own: list[Health], published: Counter[StreamId]) -> int:
-    """Messages of replaced producers that others received. Known for certain only once this stage has stopped."""
+    """Messages of replaced producers that others received. Certain only once this stage has stopped."""
     if own[-1].status != StageStatus.STOPPED:
         return 0
     received: Counter[StreamId] = Counter()

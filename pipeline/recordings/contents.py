@@ -51,7 +51,7 @@ class Contents:
     others: Mapping[str, int]
     """messages on channels that are not fantwin's, by topic"""
     before: Mapping[StreamId, int]
-    """the sequence number due of each stream at the start of the file"""
+    """the next expected sequence number of each stream at the start of the file"""
     first_ns: int | None
     last_ns: int | None
     messages: int
@@ -67,7 +67,7 @@ class Contents:
 
     @property
     def next(self) -> dict[StreamId, int]:
-        """The sequence number due of each stream after this file."""
+        """The next expected sequence number of each stream after this file."""
         return next_sequences(self.before, self.streams)
 
 

@@ -52,7 +52,7 @@ class Scan:
     recorded: dict[StreamId, StreamCounts] | None = None
     """the ledger in the file; None if it was never finished"""
     before: dict[StreamId, int] = field(default_factory=dict)
-    """the sequence number due of each stream at the start of the file, from the parts before it"""
+    """the next expected sequence number of each stream at the start of the file, from the parts before it"""
     has_ended: bool = False
     """the recorder was stopped in order with this file, and not by an error"""
     recovered: tuple[str, ...] = ()
@@ -71,7 +71,7 @@ class Scan:
     discarded_bytes: int = 0
     """in records that are not whole"""
     damaged_offsets: set[int] = field(default_factory=set)
-    """where the damaged chunks, attachments and other records are"""
+    """positions of the damaged chunks, attachments and other records"""
     data_end: int = len(MCAP0_MAGIC)
     """offset after the last intact chunk or other record of the data"""
     missing_indexes: bytes = b""

@@ -20,7 +20,7 @@ ENDED = "ended"
 RECOVERED = "recovered"
 """its entry in a repaired file: what was lost, or may have been"""
 BEFORE_NAME = "fantwin.before"
-"""the metadata record, before the first message, that holds the sequence number due of each stream"""
+"""the metadata record, before the first message, that holds the next expected sequence number of each stream"""
 
 
 @dataclass(slots=True)
@@ -48,14 +48,14 @@ class SequenceLedger:
     """Counts messages in the order in which they are recorded."""
 
     def __init__(self, before: Mapping[StreamId, int] | None = None) -> None:
-        """before: the sequence number due of each stream, after the parts before this one."""
+        """before: the next expected sequence number of each stream, after the parts before this one."""
         self.counts: dict[StreamId, StreamCounts] = {}
         self._streams = {stream: StreamState(sequence) for stream, sequence in (before or {}).items()}
         self._published: dict[StreamId, int] = {}
 
     @property
     def next(self) -> dict[StreamId, int]:
-        """The sequence number due of each stream."""
+        """The next expected sequence number of each stream."""
         streams = self._streams.items()
         return {stream: state.next_sequence for stream, state in streams if state.next_sequence is not None}
 
@@ -191,7 +191,7 @@ def correct_for_damage(
 
 
 def next_sequences(before: Mapping[StreamId, int], streams: Mapping[StreamId, StreamCounts]) -> dict[StreamId, int]:
-    """The sequence number due of each stream after a part."""
+    """The next expected sequence number of each stream after a part."""
     last = {stream: counts.last_sequence for stream, counts in streams.items()}
     return dict(before) | {stream: sequence + 1 for stream, sequence in last.items() if sequence is not None}
 

@@ -18,7 +18,7 @@ REPLAY = "replay"
 
 
 def is_of_replay(producer: str) -> bool:
-    """Whether a message comes from a recording and not from a live fan."""
+    """Whether a message comes from a recording, not from a live fan."""
     return producer.startswith(f"{REPLAY}-")
 
 
@@ -31,7 +31,7 @@ class StageClock:
         """by tray: the last clock message of a replay, and the host time at which it was received"""
 
     def update(self, clock: Clock, received_t_ns: int) -> None:
-        """A replay has published its time: from now on it applies to that tray."""
+        """A replay has published its time, which from now on applies to that tray."""
         self._replay[clock.header.tray] = (clock, received_t_ns)
 
     def clear(self) -> None:

@@ -27,7 +27,7 @@ class StageError(UserError):
 
 
 class Core(Protocol):
-    """The pure part of a stage. Only `step` must be written; everything else has a neutral default.
+    """The pure part of a stage. Only `step` must be implemented; everything else has a neutral default.
 
     Messages are returned unstamped: the runner sets producer, sequence number, tray and input position. A core that
     serves all trays names the tray of what it returns in the header; without one, a message made by `step` belongs to
@@ -49,7 +49,7 @@ class Core(Protocol):
     def abort(self) -> None:
         """Called instead of `close` when this core raised: release adapters, save nothing.
 
-        The state may be half updated. Without a saved state the restarted stage takes the failed input again, or
+        The state may be half updated. Without a saved state the restarted stage consumes the failed input again, or
         counts it as lost.
         """
 
@@ -117,7 +117,7 @@ def no_problems(_context: Context) -> Sequence[str]:
 
 @dataclass(frozen=True)
 class Stage:
-    """The declaration of a stage: what the runner and the launcher need to know, and nothing of how it works.
+    """The declaration of a stage: what the runner and the launcher need to know, but not how it works.
 
     Attributes:
         name: as in the registry.
@@ -128,8 +128,8 @@ class Stage:
         build: builds the core, and its source if it has one.
         core_per_tray: a core for each tray, or one core that serves all trays of the process.
         wants_envelopes: whether `step` is given envelopes instead of messages.
-        may_drop: a consumer that may drop messages: its missing messages are no loss.
-        check: looks, without side effects, for what would keep the stage from working (a missing port, a twin that
+        may_drop: a consumer that may drop messages: its missing messages do not count as losses.
+        check: lists, without side effects, what would keep the stage from working (a missing port, a twin that
             does not fit); one line each. `fantwin doctor` prints them.
 
     Raises:

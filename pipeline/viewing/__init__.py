@@ -1,1 +1,1 @@
-"""What people look at: the Rerun view, pictures and plots."""
+"""Displays: the Rerun view, pictures and plots."""

@@ -11,7 +11,7 @@ class BaselineSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     commissioning_limit_sigmas: float = Field(
-        default=1.0, ge=0, description="largest offset that is learned while a fan is commissioned"
+        default=1.0, ge=0, description="largest offset that is learned during commissioning"
     )
     adaptation_limit_sigmas: float = Field(
         default=1.0, ge=0, description="how far the baseline may then move from the commissioned one"
@@ -19,9 +19,9 @@ class BaselineSettings(BaseModel):
     speed_exponent: int = Field(
         default=0, ge=0, le=2, description="the offset is proportional to this power of the speed"
     )
-    reference_speed_rad_s: float = Field(default=1.0, gt=0, description="speed that baselines are given for")
+    reference_speed_rad_s: float = Field(default=1.0, gt=0, description="speed for which baselines are given")
     crossover_speed_rad_s: float | None = Field(
-        default=None, gt=0, description="speed from which on the exponent is smaller by one; null: it stays"
+        default=None, gt=0, description="speed from which on the exponent is smaller by one; null: never"
     )
     ridge: float = Field(
         default=0.0,

@@ -36,7 +36,7 @@ class TachoSettings(DetectorSettings):
     """Of Sensor."""
 
     rule: ClassVar[LimitRule] = LimitRule.FIXED
-    stuck_s: float = Field(default=5.0, gt=0, description="for how long a reading may repeat itself")
+    stuck_s: float = Field(default=5.0, gt=0, description="how long a reading may repeat")
     missing_share: float = Field(default=0.25, gt=0, le=1, description="share of readings that may be missing")
 
     @classmethod

@@ -1,4 +1,4 @@
-"""`fantwin calibrate`: alarm limits from healthy running, with a declared number of false alarms."""
+"""`fantwin calibrate`: alarm limits from healthy recordings, for a declared false-alarm rate."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def _refuse_without_healthy(names: list[str]) -> None:
 
 
 def _named_once(recordings: list[Path]) -> None:
-    """A recording that counted twice would claim more running than there was, and cannot test its own calibration."""
+    """Refuse a recording that is named twice: it would count its time twice, and it cannot test its own calibration."""
     seen: set[Path] = set()
     for path in recordings:
         if path.resolve() in seen:
@@ -198,7 +198,7 @@ def _runs(count: int) -> str:
 
 
 def _round_up(rate: float) -> float:
-    """To two digits, upwards: a rate that is enough when it is typed."""
+    """Rounded up to two digits, so that the printed rate is sufficient."""
     unit = 10.0 ** (math.floor(math.log10(rate)) - 1)
     return math.ceil(rate / unit) * unit
 

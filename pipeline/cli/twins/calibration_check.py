@@ -23,7 +23,7 @@ NS_PER_HOUR = 3.6e12
 
 @dataclass(frozen=True)
 class Check:
-    """Alarms in so many fan-hours, and the declared rate per fan and day."""
+    """The number of alarms in a number of fan-hours, and the declared rate per fan and day."""
 
     alarms: int
     fan_hours: float

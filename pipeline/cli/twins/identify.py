@@ -99,7 +99,7 @@ def as_json(found: Identification, training_data: TrainingData) -> dict[str, Any
 
 
 def _interval(found: Identification, fan: int, index: int) -> list[float] | None:
-    """None for a parameter that was not estimated: a lag that was not seen."""
+    """None for a parameter that was not estimated: a lag that was not found."""
     return found.interval_95[fan, index].tolist() if found.covariance[fan, index, index] > 0.0 else None
 
 

@@ -13,7 +13,7 @@ from scoring.calibration.calibration import DAY_S, VARIATION_FAN_S
 from scoring.calibration.healthy_statistics import healthy_statistics, truncate_runs
 from scoring.limits import Limits
 
-MIN_FANS = 4  # fans of runs: of fewer nobody can say what is common
+MIN_FANS = 4  # fans, counted over all runs: with fewer the median says little
 OUTLIER_RATIO = 3.0  # times the median: healthy fans that ran alike came to 1.7, faulty ones to 3.5 and more
 
 

@@ -85,13 +85,13 @@ class JudgedTray:
 def judge(
     replay_input: ReplayInput, output: Path | None, verify: bool, progress: Progress = lambda _tray, _t_ns: None
 ) -> list[JudgedTray]:
-    """Judge every tray again.
+    """Score every tray again.
 
-    output: a recording to write, with the raw samples and all that was made of them. verify: compare scores and alarms
-    with the recorded ones.
+    output: a recording to write, with the raw samples and everything computed from them. verify: compare scores and
+    alarms with the recorded ones.
 
     Raises:
-        CannotCompareError: the recording has no scores, or lacks the input that they were made of.
+        CannotCompareError: the recording has no scores, or lacks the input from which they were computed.
         StageError: a stage cannot be built as configured.
         RecordingError: the output cannot be written.
         UserError: the output exists.
@@ -133,7 +133,7 @@ def _judge_tray(
 
 
 def _refuse_meaningless(where: str, found: Comparison, judged: JudgedTray) -> None:
-    """Raises CannotCompareError where a difference would say nothing about the code."""
+    """Raises CannotCompareError if a difference would not be a difference of the code."""
     if not (found.equal or found.different or found.not_made):
         raise CannotCompareError(f"{where}: no scores in the recording: nothing to compare with")
     if found.is_equal:

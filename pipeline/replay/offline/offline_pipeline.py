@@ -87,7 +87,7 @@ class OfflinePipeline:
             replayed_snapshot = next((message for message in closing if isinstance(message, ScorerSnapshot)), None)
 
     def predictions(self) -> Iterator[Prediction]:
-        """What the last stage, the scorer, would be given; it does not run.
+        """The input that the last stage, the scorer, would receive; it does not run.
 
         Raises:
             StageError, CodecError: see `run`.

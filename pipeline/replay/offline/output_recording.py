@@ -18,7 +18,7 @@ from schemas.messages import Grid, Header, Message, Prediction, Raw, Request, Sc
 from schemas.topics import TOPICS, tray_key
 
 MESSAGE_SAMPLES = 100
-"""samples a message: a player steps from one to the next, and a truncated file lacks few"""
+"""samples a message: few, for a player that steps by messages and for a file that is truncated"""
 _TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
 
 

@@ -220,7 +220,7 @@ def _continues(before: fan_pb2.InputPosition, position: fan_pb2.InputPosition) -
 
 
 def _open_ends(plan: TrayPlan) -> None:
-    """Let sessions produce more than was recorded of them, as far as the next stage wants it.
+    """Let sessions produce more than was recorded of them, as far as the next stage needs it.
 
     The last messages of a killed session may have reached the next stage and not the recorder. What the last sessions
     had not yet consumed when the recording ended is processed as well.
