@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from schemas.codec import decode, encode
 from schemas.messages import Message, newest_t_ns
@@ -21,8 +21,8 @@ class Envelope:
     topic: str
     payload: bytes
     received_t_ns: int
-    _message: Message | None = None
-    _newest_t_ns: int | None = None
+    _message: Message | None = field(default=None, compare=False, repr=False)
+    _newest_t_ns: int | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def of(cls, key: str, message: Message, received_t_ns: int) -> Envelope:

@@ -128,10 +128,10 @@ class RecordingWriter:
         """
         key, message = envelope.key, envelope.message
         channel, _ = self._channels.get(key) or self._register_channel(key, type(message))
-        self._filling.append(envelope)
         self._chunk.add(
             channel, message.header.sequence, envelope.received_t_ns, newest_t_ns(message), envelope.payload
         )
+        self._filling.append(envelope)  # counted as recorded only if it is in the chunk
         if self._chunk.size > CHUNK_BYTES:
             self._finish_chunk()
             if self._unsynced_bytes > UNSYNCED_BYTES:

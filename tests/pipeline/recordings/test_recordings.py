@@ -482,3 +482,19 @@ def test_every_key_gets_its_own_channel(tmp_path):
         summary = make_reader(file).get_summary()
     assert summary is not None
     assert (len(summary.channels), len(summary.schemas)) == (2, 1)
+
+
+def test_a_message_on_which_the_writer_crashes_is_not_counted_as_recorded(tmp_path, monkeypatch):
+    def fails(_message: Message) -> int:
+        raise ZeroDivisionError("on purpose")
+
+    writer = RecordingWriter(tmp_path / "r.mcap", {})
+    writer.add_message(RAW_KEY, raw(0), 1000)
+    with monkeypatch.context() as patch:
+        patch.setattr(writing, "newest_t_ns", fails)
+        with pytest.raises(ZeroDivisionError):
+            writer.add_message(RAW_KEY, raw(1), 1001)
+    writer.finish()
+    assert writer.written == {"raw": 1}
+    assert [counts.messages for counts in contents_of(writer.path).streams.values()] == [1]
+    assert len(list(read_recording(writer.path))) == 1
