@@ -16,11 +16,13 @@ FORMER_SUFFIX = ".memory"
 class SnapshotStore:
     """One file. A kill at any moment leaves the old file or the new one, never a part of either.
 
-    Where only a file with the former suffix exists, that one is loaded. Saving always writes the new one.
+    Where only a file with the former suffix exists, that one is loaded. Saving replaces it by the new one: whoever
+    removes the new one, to start without, must not get back the state before the upgrade.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._former = path.with_suffix(FORMER_SUFFIX)
         self.problem = ""
         """one line, while the last snapshot could not be saved"""
 
@@ -30,8 +32,7 @@ class SnapshotStore:
         Raises:
             StageError: there is one, and it cannot be read.
         """
-        former = self.path.with_suffix(FORMER_SUFFIX)
-        path = former if former.exists() and not self.path.exists() else self.path
+        path = self._former if self._former.exists() and not self.path.exists() else self.path
         try:
             message = decode(ScorerSnapshot, path.read_bytes())
         except FileNotFoundError:
@@ -55,6 +56,7 @@ class SnapshotStore:
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(self.path)
+            self._former.unlink(missing_ok=True)
             self.problem = ""
         except OSError as error:
             self.problem = (

@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.runtime.snapshot_store import SnapshotStore
 from pipeline.runtime.stage import StageError
+from schemas.codec import encode
 from schemas.messages import ScorerSnapshot
 
 
@@ -103,7 +104,15 @@ def test_a_file_that_cannot_be_read_is_refused_in_one_line(tmp_path: Path) -> No
 
 def test_a_snapshot_under_the_name_of_earlier_versions_is_loaded_until_there_is_a_newer_one(tmp_path: Path) -> None:
     store = SnapshotStore(tmp_path / "scorer-tray.1.snapshot")
-    SnapshotStore(tmp_path / "scorer-tray.1.memory").save(snapshot(1))
+    (tmp_path / "scorer-tray.1.memory").write_bytes(encode(snapshot(1)))
     assert saved(store.path) == 1
     store.save(snapshot(2))
     assert saved(store.path) == 2
+
+
+def test_a_removed_snapshot_does_not_bring_back_the_one_of_an_earlier_version(tmp_path: Path) -> None:
+    store = SnapshotStore(tmp_path / "scorer-tray1.snapshot")
+    (tmp_path / "scorer-tray1.memory").write_bytes(encode(snapshot(1)))
+    store.save(snapshot(2))
+    store.path.unlink()
+    assert store.load() is None
