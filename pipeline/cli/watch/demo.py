@@ -29,6 +29,7 @@ from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.errors import UserError
 from pipeline.runtime.signals import stop_on_signals
+from pipeline.runtime.snapshot_store import FORMER_SUFFIX
 from schemas.units import NS_PER_S
 
 DEMO_FOLDER = Path(__file__).parents[2] / "demo"
@@ -38,7 +39,10 @@ FAULTS = (
     ("inlet", "fan=2,start=8,stop=14,size=1.8"),
     ("rotor", "fan=5,start=18,stop=24,size=0.8"),
 )
-OUTPUTS = ("recording*.mcap*", "view*.rrd", "bands.png", "summary.json", "truth.json", "up.log", "tray", "*.snapshot")
+OUTPUTS = (
+    *("recording*.mcap*", "view*.rrd", "bands.png", "summary.json", "truth.json", "up.log", "tray"),
+    *("*.snapshot", f"*{FORMER_SUFFIX}"),
+)
 _START_TIMEOUT_S = 60.0
 _STOP_TIMEOUT_S = 60.0
 

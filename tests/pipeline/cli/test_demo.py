@@ -16,7 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from PIL import Image
 from rich.console import Console
 
-from pipeline.cli.watch.demo import DEMO_FOLDER, _run, demo
+from pipeline.cli.watch.demo import DEMO_FOLDER, _clear, _run, demo
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.devices.serial_config import SerialConfig
@@ -127,3 +127,10 @@ def test_a_folder_that_cannot_be_used_is_one_line(tmp_path):
     assert done.returncode == 1
     assert "cannot be used for the demo's files" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_demo_does_not_begin_with_the_state_of_an_earlier_one_and_leaves_other_files_alone(tmp_path):
+    for name in ("recording.mcap", "scorer-tray1.snapshot", "scorer-tray1.memory", "notes.txt"):
+        (tmp_path / name).touch()
+    _clear(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
