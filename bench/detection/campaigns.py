@@ -39,12 +39,12 @@ def everyday(fleet: Fleet, runs: int, seed: int) -> Plant:
 def predictions(fleet: Fleet, plant: Plant, seconds: float, progress: Progress) -> Iterator[tuple[str, Prediction]]:
     """(run name, prediction) of every tray of every run, block by block."""
     trays = len(fleet.twins)
-    chains: dict[int, PredictionStages] = {}
+    stages: dict[int, PredictionStages] = {}
     reported = 0
     for number, blocks in enumerate(plant.blocks(seconds)):
         for unit, raw in enumerate(blocks):
-            chain = chains.setdefault(unit, PredictionStages(fleet.twins[unit % trays]))
-            for prediction in chain.take(raw):
+            unit_stages = stages.setdefault(unit, PredictionStages(fleet.twins[unit % trays]))
+            for prediction in unit_stages.take(raw):
                 yield run_name(unit, trays), prediction
         minutes = int(number * len(blocks[0].command) / RATE_HZ / 60)
         if minutes >= reported + 10:
