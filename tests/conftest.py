@@ -19,7 +19,7 @@ settings.load_profile("house")
 
 @pytest.fixture
 def endpoint() -> str:
-    """A bus endpoint on loopback that nobody else uses."""
+    """A bus endpoint on loopback that nothing else uses."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -27,7 +27,7 @@ def endpoint() -> str:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """The folder of a disk of its own of a few MB; skips where none can be mounted."""
+    """The folder of a separate disk of a few MB; skips the test where none can be mounted."""
     place = tmp_path / "disk"
     place.mkdir()
     if not mount(place):
@@ -40,7 +40,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def measured_data() -> Path:
-    """The folder of the measured data sets; skips where they are not."""
+    """The folder of the measured data sets; skips the test where it is missing."""
     folder = Path(os.environ.get("FANTWIN_DATA", Path(__file__).parents[2] / "shared" / "data"))
     if not folder.is_dir():
         pytest.skip(f"no measured data at {folder}; set FANTWIN_DATA, see docs/how-to/datasets.md")

@@ -107,7 +107,7 @@ def test_without_a_buffer_a_perfect_score_has_all_of_the_volume_and_one_of_nothi
 
 
 class _Given:
-    """Scores that were written down."""
+    """Recorded scores."""
 
     def __init__(self, score: Array) -> None:
         self._score = score

@@ -43,7 +43,7 @@ def samples(draw: st.DrawFn, fans: int | None = None) -> Sample:
 
 
 def same(a: Frame | Fault, b: Frame | Fault) -> bool:
-    """Equality in which NaN equals NaN, to the last bit otherwise."""
+    """Equality to the last bit, with NaN equal to NaN."""
     return repr(a) == repr(b)
 
 

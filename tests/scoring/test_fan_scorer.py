@@ -72,7 +72,7 @@ def assert_same(one: ScoredBlock, other: ScoredBlock) -> None:
 
 
 def troubled(samples: int, seed: int) -> Samples:
-    """Faults, outliers, readings that miss or repeat themselves, what is not valid, and times that are missing."""
+    """Faults, outliers, missing and repeated readings, invalid samples, and missing times."""
     rng = np.random.default_rng(seed)
     made = white(samples, seed=seed)
     made.speed_residual[samples // 2 :, 0] += rng.choice([0.0, 0.6, 5.0])
@@ -222,7 +222,7 @@ def test_one_outlier_raises_no_alarm_however_large(size: float) -> None:
 
 
 def test_a_healthy_fan_continues_to_refine_its_baseline() -> None:
-    """The deviation of a healthy residual is near its limit all the time, and must not prevent that."""
+    """The deviation of a healthy residual is always near its limit, and must not prevent the refinement."""
     scorer = FanScorer(20, LIMITS)
     scored_of(scorer, white(6000, 20))
     assert scorer.residuals["speed"].baseline.intervals.min() > 30

@@ -15,7 +15,7 @@ QUIET = TraySettings(
 
 
 def speeds(*faults: str, duty: float = 0.6) -> np.ndarray:
-    """(n, 2) speeds of two like fans at one duty, the first of them with the faults."""
+    """(n, 2) speeds of two equal fans at one duty, the first with the faults."""
     tray = SimulatedTray(replace(QUIET, faults=tuple(map(parse_fault, faults))))
     tray.command(np.full(2, duty))
     rows = []

@@ -47,7 +47,7 @@ def feed(core: SerialCore, frames: Iterable[Frame], protocol: Protocol = "binary
 
 
 def feed_sequences(core: SerialCore, sequences: Iterable[int]) -> list[int]:
-    """Feed samples of these sequence numbers; which ones came out."""
+    """Feed samples with these sequence numbers; returns the numbers that came out."""
     return [int(raw.device_sequence[0]) for raw in feed(core, map(sample, sequences))]
 
 

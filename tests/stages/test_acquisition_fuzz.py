@@ -59,7 +59,7 @@ def make_pool(protocol: Protocol) -> list[tuple[Sample, bytes]]:
 
 
 def spoil(frame: bytes, chance: random.Random) -> bytes:
-    """A frame with one to three things done to it."""
+    """A frame with one to three mutations."""
     data = bytearray(frame)
     for _ in range(chance.randint(1, 3)):
         at = chance.randrange(len(data)) if data else 0
@@ -102,7 +102,7 @@ def noise(protocol: Protocol, chance: random.Random) -> bytes:
 def make_stream(
     protocol: Protocol, pool: list[tuple[Sample, bytes]], chance: random.Random
 ) -> tuple[bytes, list[Sample]]:
-    """A mutated stream, and the samples in it that nothing has touched, in order."""
+    """A mutated stream, and the samples in it that were not mutated, in order."""
     stream, untouched = b"", []
     start = chance.randrange(len(pool) - 6)
     for sample, frame in pool[start : start + chance.randint(2, 6)]:

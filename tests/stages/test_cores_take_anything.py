@@ -1,4 +1,4 @@
-"""Whatever decodes, no core raises on it: messages of the declared type with any values in them."""
+"""No core raises on a message that decodes: messages of the declared type with any values."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ LOW_LIMITS = CALIBRATION | {
 
 
 def all_valid_prediction(message: Message) -> Message:
-    """The prediction with rising times and all samples valid, which the scorer would mostly refuse otherwise."""
+    """The prediction with rising times and valid samples only; the scorer would refuse most others."""
     if not isinstance(message, Prediction):
         return message
     t_ns = np.sort(message.t_ns)

@@ -65,7 +65,7 @@ def raw(sequence: int, samples: int = 1) -> Raw:
 
 
 class Part:
-    """A stand-in for a part whose disk refuses after so many messages. `flush` puts them in the file for good."""
+    """A stand-in for a part whose disk refuses after some number of messages. `flush` makes them permanent."""
 
     def __init__(self, disk: Disk, name: str, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> None:
         self.path, self.t_ns, self.about, self.ledger = Path(name), t_ns, dict(about), ledger
@@ -109,7 +109,7 @@ class Part:
 
 
 class Disk:
-    """A stand-in for the place where parts begin."""
+    """A stand-in for the folder in which parts are created."""
 
     def __init__(self, before: dict[StreamId, int] | None = None) -> None:
         self.before = before or {}

@@ -1,4 +1,4 @@
-"""stages.resampler: a uniform grid from irregular samples, and nothing invented."""
+"""stages.resampler: a uniform grid from irregular samples, without invented values."""
 
 from __future__ import annotations
 

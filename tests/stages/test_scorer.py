@@ -376,7 +376,7 @@ def test_commissioning_takes_a_new_baseline_of_the_fan_it_is_asked_for() -> None
 
 
 def eventful_prediction(seed: int, samples: int, change_s: float) -> Prediction:
-    """Three fans: residuals that cross the limits, values that are no number, invalid stretches, repeats, jumps."""
+    """Three fans: residuals that cross the limits, NaN, invalid stretches, repeats, jumps."""
     rng = np.random.default_rng(seed)
     shape = (samples, 3)
     k = np.arange(samples)

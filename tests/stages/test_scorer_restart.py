@@ -53,7 +53,7 @@ def without_causes(alarms: Sequence[Alarm]) -> list[str]:
 
 
 def eventful() -> Prediction:
-    """Faults of some tenths of a second that come again and again, of each fan another, and a gap."""
+    """Repeated faults of some tenths of a second, a different one for each fan, and a gap."""
     rng = np.random.default_rng(1)
     k = np.arange(900)[:, np.newaxis]
     residual = rng.normal(0, 1, (900, 3)) + np.where(k % 300 > 240, [40.0, 0.0, 0.0], 0.0)

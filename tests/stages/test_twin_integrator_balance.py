@@ -27,11 +27,11 @@ from tests.stages.test_twin_integrator import (
 from tests.support.twin_files import SIGMA_COMMAND
 
 SETTLES = 31
-"""samples until it is there: a third of a second"""
+"""samples until it is known: a third of a second"""
 
 
 def healthy(samples: int = 400, extra: float = 0.0) -> Grid:
-    """A fan as the twin's card has it, on stairs; `extra` is given on top of what it needs, in the later half."""
+    """A fan that agrees with the card of the twin, on stairs; `extra` is added to its command in the second half."""
     command = stairs(samples) + 20.0
     start = np.array([[100.0, command[0, 0]]])
     speed, _ = run_freely(start, command, np.full(samples, STEP_NS / 1e9))
@@ -67,7 +67,7 @@ def test_the_balance_is_the_same_to_the_bit_for_every_block_size(size: int) -> N
 
 
 def where_known(found: Floats) -> list[int]:
-    """First and last sample of each stretch in which it is there."""
+    """First and last sample of each stretch in which it is present."""
     edges = np.flatnonzero(np.diff(np.isfinite(found).astype(int), prepend=0, append=0))
     return [int(edge) for edge in edges]
 

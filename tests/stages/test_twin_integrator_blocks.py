@@ -35,7 +35,7 @@ FANS = 8  # of the demo's twin
 
 
 def unstable_twin() -> TwinFile:
-    """A fan whose command is above 85 is no number from the next sample on."""
+    """The speed of a fan is infinite from the sample after its command exceeds 85."""
 
     def advance(state: Floats, command: Floats, period_s: Floats) -> tuple[Floats, Floats]:
         assert np.isfinite(state).all()

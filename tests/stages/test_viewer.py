@@ -49,7 +49,7 @@ LATER_NS = START_NS + 400 * 86_400 * 1_000_000_000  # the host's time while what
 
 @dataclass
 class FakeSink:
-    """Remembers what it was handed."""
+    """Remembers the items it received."""
 
     traces: list[Trace] = field(default_factory=list)
     states: list[tuple[str, int, list[int], list[str]]] = field(default_factory=list)

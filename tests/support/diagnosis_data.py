@@ -29,7 +29,7 @@ def moving_command(seed: int, duration_s: float = BEFORE_S + AFTER_S) -> np.ndar
 
 
 def still_command(seed: int) -> np.ndarray:
-    """(n,) the same all the time."""
+    """(n,) constant."""
     return np.full(round((BEFORE_S + AFTER_S) / STEP_S), np.random.default_rng(seed).uniform(0.4, 0.8))
 
 
@@ -73,5 +73,5 @@ def from_onset(command: np.ndarray, faulty: float, healthy: float = 0.0) -> np.n
 
 
 def window(command: np.ndarray, speed_rad_s: np.ndarray) -> Window:
-    """With the onset where faults begin."""
+    """A window with the onset where faults begin."""
     return Window(STEP_S, command, speed_rad_s, onset_of(command))

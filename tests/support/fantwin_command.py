@@ -18,7 +18,7 @@ def fantwin(name: str, *arguments: object) -> Result:
 
 
 def error_of(name: str, *arguments: object) -> str:
-    """The one line of a command that could not be done."""
+    """The one-line error of a command that must fail."""
     error = fantwin(name, *arguments).exception
     assert isinstance(error, UserError), error
     assert "\n" not in str(error)

@@ -38,9 +38,9 @@ class Outcome:
     recorded: int = 0
     """different messages in all parts"""
     repeated: int = 0
-    """messages that are in a part or in two more than once"""
+    """messages that occur more than once in the parts"""
     missing: int = 0
-    """sent after the first that was recorded, and in no part"""
+    """messages sent after the first recorded one that are in no part"""
     counted_missing: int = 0
     """the same by the ledgers"""
     kills_of_recording: int = 0
@@ -53,7 +53,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class _Killed:
-    """A recorder that had caught up with the bus: what it recorded from when to when, ns, and what was due, by key."""
+    """A killed recorder that had caught up with the bus: times in ns, and the messages due by key."""
 
     first_ns: int
     at_ns: int
@@ -145,7 +145,7 @@ class Kills:
                 self._killed.append(_Killed(found.index.first_ns, at_ns, due, found.index.last_ns))
 
     def _has_caught_up(self) -> bool:
-        """The recorder that runs now has put into its file what was sent in the last two seconds."""
+        """Whether the running recorder has written the messages of the last two seconds to its file."""
         for active in self._runs.glob("*.active"):
             try:
                 index = scan(active).index
@@ -191,7 +191,7 @@ class Kills:
 
 
 def _is_readable(path: Path) -> bool:
-    """By the official reader: with an index, all messages, all checksums right."""
+    """All messages, read by the official reader, which must find an index and correct checksums."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()

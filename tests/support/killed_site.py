@@ -66,7 +66,7 @@ class Session:
 
 
 class Stages:
-    """Three stages of one tray, and a recording of all that goes between them."""
+    """Three stages of one tray, and a recording of all messages between them."""
 
     def __init__(self, config: Config, path: Path, started_t_ns: int, *, remembers: bool = True) -> None:
         (tray,) = config.trays
@@ -86,7 +86,7 @@ class Stages:
         self.writer = RecordingWriter(path, metadata, attachments, t_ns=started_t_ns, overwrite=True)
         self.records = True
         self.lost_on_the_bus = 0
-        """raw messages that will be recorded and never come to the resampler"""
+        """raw messages that will be recorded and never reach the resampler"""
         self._lives = 0
         self._ticked_ns = started_t_ns
         self.source = Session("acquisition-0", None)
@@ -114,7 +114,7 @@ class Stages:
                 self._put_out(stage, self._core(stage).tick(self._ticked_ns), from_timer=True)
 
     def kill(self, stage: str) -> None:
-        """kill -9: what the core held is gone; its successor takes again what is still kept, topic after topic."""
+        """kill -9: the state of the core is lost; its successor takes the messages still kept again, topic by topic."""
         self.stages[stage] = self._begin(stage)
         feeding = self.source if stage == "resampler" else self.stages[CHAIN[CHAIN.index(stage) - 1]]
         kept = (*feeding.kept, *self.operator.kept)
@@ -124,7 +124,7 @@ class Stages:
                     self._step(stage, topic, message)
 
     def loses(self, messages: int) -> None:
-        """The next raw messages never come to the resampler."""
+        """The next raw messages never reach the resampler."""
         self.lost_on_the_bus = messages
 
     def restart_source(self) -> None:
@@ -133,7 +133,7 @@ class Stages:
         self.source = Session(f"acquisition-{self._lives}", None)
 
     def end(self) -> None:
-        """Stop in order."""
+        """Stop cleanly."""
         for stage in CHAIN:
             self._put_out(stage, self._core(stage).close(), from_timer=True)
         self.writer.finish()
@@ -226,7 +226,7 @@ class Site(Stages):
             self.take(raw)
 
     def finished(self) -> Path:
-        """Stop in order; the recording."""
+        """Stop cleanly; returns the recording."""
         self.end()
         return self.path
 

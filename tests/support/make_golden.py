@@ -66,7 +66,7 @@ def main() -> None:
 
 
 def record(chain: Chain) -> None:
-    """Some ten seconds with a fault and two deaths."""
+    """Some ten seconds with a fault and two killed stages."""
     tray = chain.start_tray(
         "--fans", str(FANS), "--rate", "50", "--fault", f"inlet:fan={FAULTY},start=3,stop=6,size=2.0"
     )

@@ -1,4 +1,4 @@
-"""A process on the bus that sends what trays of fans would, at 100 Hz, and knows what it has sent.
+"""A process on the bus that sends the messages of trays of fans at 100 Hz, and counts what it has sent.
 
 Words: ENDPOINT TRAYS FANS HISTORY FILE. Each tray has raw, grid, prediction and score messages of one sample. It keeps
 the last HISTORY messages of each for whoever missed them. When its standard input closes it ends like a stage, and

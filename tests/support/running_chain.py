@@ -39,7 +39,7 @@ def fantwin(*words: object, timeout_s: float = DEADLINE_S) -> subprocess.Complet
 
 
 def eventually(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S) -> Any:
-    """The first true answer of `condition`."""
+    """The first true result of `condition`."""
     until_s = time.monotonic() + deadline_s
     pause = threading.Event()
     while not (answer := condition()):

@@ -110,7 +110,7 @@ def prediction_of(
 
 
 def commissioned(core: ScorerCore, fans: int = 1, seconds: float = 11.0) -> ScorerCore:
-    """A core whose fans were healthy up to EPOCH_NS, for longer than commissioning takes."""
+    """A core whose fans were healthy up to EPOCH_NS, longer than commissioning needs."""
     samples = round(seconds * 100) + 1
     wobble = 1e-9 * (np.arange(samples) % 7 - 3.0)[:, np.newaxis]  # a tacho that repeats itself is stuck
     core.step(prediction_of(np.tile(wobble, (1, fans)).astype(np.float64), first=-samples))
@@ -132,6 +132,6 @@ def feed(core: ScorerCore, items: Iterable[Prediction | Request]) -> tuple[list[
 
 
 def snapshot_of(core: ScorerCore) -> ScorerSnapshot:
-    """The snapshot that it leaves at the end."""
+    """The snapshot that it saves at the end."""
     (snapshot,) = core.close()
     return snapshot

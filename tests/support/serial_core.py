@@ -15,7 +15,7 @@ from stages.acquisition import AcquisitionConfig, AcquisitionCore, Item
 
 
 class FakeLink:
-    """Stores what was written, and takes nothing while it is not `up`."""
+    """Stores the bytes written, and accepts none while it is not `up`."""
 
     def __init__(self) -> None:
         self.up = True

@@ -98,7 +98,7 @@ def made_up_balance(parameters: tuple[tuple[float, ...], ...]) -> BalanceCard:
 
 
 def still_balance(fans: int) -> Balance:
-    """made_up_balance as a stage has it."""
+    """made_up_balance in the form that a stage uses."""
     return Balance.from_card(made_up_balance((PARAMETERS,) * fans), fans)
 
 

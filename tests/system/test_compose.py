@@ -26,7 +26,7 @@ SERVICES: dict[str, str] = dict(re.findall(r"^  (\w+):\n((?:    .*\n|\n)+)", _BO
 
 
 def fantwin_commands(service: str) -> list[list[str]]:
-    """The words after `fantwin` of each command of a service; those commented out too, for users will take them."""
+    """The words after `fantwin` of each command of a service, including commented ones that users may enable."""
     lines = re.findall(r"(?:\bcommand: |\bfantwin )(.*?)(?: &)?$", SERVICES[service], re.M)
     return [shlex.split(line) for line in lines]
 

@@ -55,7 +55,7 @@ class Run:
 
 
 def assert_readable(path: Path) -> None:
-    """By the mcap library, with every checksum right."""
+    """Messages read by the mcap library, which must find every checksum correct."""
     with path.open("rb") as file:
         for _ in make_reader(file, validate_crcs=True).iter_messages():
             pass

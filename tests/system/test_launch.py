@@ -54,7 +54,7 @@ def start(chain: Chain) -> RunningCommand:
 
 
 def samples(chain: Chain, topic: str, column: str) -> set[int]:
-    """The values of a column of samples in all parts of the recording, an unfinished one too."""
+    """The values of a column of samples in all parts of the recording, including an unfinished one."""
     return {
         int(value)
         for path in chain.folder.glob("recording*.mcap*")
@@ -64,7 +64,7 @@ def samples(chain: Chain, topic: str, column: str) -> set[int]:
 
 
 def check_whole(chain: Chain) -> None:
-    """The recording is whole for a plain MCAP reader, and holds all that was sent, judged to the end."""
+    """The recording is complete for a plain MCAP reader and holds all sent messages, scored to the end."""
     (recording,) = chain.recordings()
     assert not list(chain.folder.glob("*.active"))
     with recording.open("rb") as file:

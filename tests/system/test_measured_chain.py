@@ -77,7 +77,7 @@ def train_on_the_first_part(rig: Rig, measured_data: Path, folder: Path) -> None
 
 
 def play(rig: Rig, measured_data: Path, folder: Path) -> RunningCommand:
-    """The rest of the file, as if the rig measured it now."""
+    """The rest of the file, as if the rig measured it live."""
     begin_s, end_s = rig.played_s
     line = ("--link", folder / f"{rig.tray}.line", "--speed-unit", "rpm", "--wait-for-reader")
     truth = ("--truth", folder / f"{rig.tray}.json", "--json")

@@ -43,7 +43,7 @@ WORKING = ["resampler", "twin_integrator", "scorer", "recorder"]
 
 
 class Site:
-    """Stages of the demo's site, and what is heard on their bus."""
+    """Stages of the site of the demo, and the messages received on their bus."""
 
     def __init__(self, folder: Path, endpoint: str) -> None:
         self.chain = Chain(folder, endpoint, viewer=False)

@@ -52,7 +52,7 @@ def ask(chain: Chain, *words: object) -> dict[str, Any]:
 
 
 def operate(chain: Chain) -> list[dict[str, Any]]:
-    """Acknowledge and shelve the alarm, take another fan out of service; the alarms as they stand then."""
+    """Acknowledge and shelve the alarm, take another fan out of service; returns the alarms after that."""
     (alarm,) = eventually(lambda: current_alarms(chain), "an alarm stands")
     assert (alarm["tray"], alarm["fan"], alarm["active"], alarm["presented"]) == (TRAY, FAULTY, True, True)
     ask(chain, "ack", TRAY, FAULTY, "--operator", "Ann")

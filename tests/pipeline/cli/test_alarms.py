@@ -144,7 +144,7 @@ def site(endpoint: str) -> Iterator[Site]:
 
 @pytest.fixture(autouse=True)
 def handlers() -> Iterator[None]:
-    """The commands run in this process: its signals are given back."""
+    """The commands run in this process: restores its signal handlers."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     yield
     for number, handler in before.items():

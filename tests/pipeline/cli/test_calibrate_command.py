@@ -86,7 +86,7 @@ def alarmed_s(replayed: str) -> float:
 
 
 def strict(folder: Path, calibrated: Path) -> Path:
-    """The twin with limits that healthy fans pass all the time, and a declared rate that says they never do."""
+    """The twin with limits that healthy fans exceed all the time, and a declared rate that is far lower."""
     from twin.export.calibrated import with_calibration  # noqa: PLC0415
 
     was = Limits.model_validate(load_tray_twin(calibrated).card.calibration)

@@ -1,4 +1,4 @@
-"""`make demo`, as a newcomer runs it."""
+"""`make demo`, run as by a new user."""
 
 from __future__ import annotations
 

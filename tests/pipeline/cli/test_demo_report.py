@@ -1,4 +1,4 @@
-"""The demo's account: the tray's truth against what was recorded, and nothing hidden."""
+"""The summary of the demo: the truth of the tray against the recording."""
 
 from __future__ import annotations
 

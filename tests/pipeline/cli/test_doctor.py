@@ -21,7 +21,7 @@ from tests.support.running_chain import DEMO
 
 @pytest.fixture
 def port() -> Iterator[str]:
-    """A serial port that is there."""
+    """A serial port that exists."""
     master, slave = os.openpty()
     tty.setraw(slave)
     yield os.ttyname(slave)

@@ -30,7 +30,7 @@ def shown(*files: Path, exit_code: int = 0) -> dict[str, Any]:
 
 
 def recording(path: Path) -> Path:
-    """With a gap, a repeated message, a twin, and a stage that reports a problem."""
+    """A recording with a gap, a repeated message, a twin, and a stage that reports a problem."""
     with RecordingWriter(path, METADATA, {"configuration.toml": b"", "tray1.onnx": b"twin"}) as writer:
         for number, sequence in enumerate((0, 1, 4, 5, 5)):
             writer.add_message(RAW_KEY, raw(sequence), number * SECOND_NS)

@@ -52,7 +52,7 @@ def truth_of(folder: Path) -> dict:
 
 
 class Reader:
-    """The host's end of the line."""
+    """The host end of the link."""
 
     def __init__(self, port: Path, protocol: wire.Protocol = "binary", fans: int = 8) -> None:
         self.serial = serial.Serial(str(port), timeout=5.0, exclusive=True)
@@ -62,7 +62,7 @@ class Reader:
         self.faults: list[wire.Fault] = []
 
     def read_some(self) -> bool:
-        """Whether the device is still there."""
+        """Whether the device still exists."""
         try:
             data = self.serial.read(1)
             data += self.serial.read(self.serial.in_waiting)
@@ -300,7 +300,7 @@ def test_a_program_that_opens_the_line_only_for_a_moment_is_not_a_reader(line: P
     ports = [os.open(line.port, os.O_RDONLY | os.O_NOCTTY)]
 
     class LeavesAtOnce(threading.Event):
-        """The first wait is the settling: the visitor leaves. The second is for the next reader: enough seen."""
+        """In the first wait, the settling time, the visitor leaves. The second, for the next reader, ends the test."""
 
         def wait(self, timeout: float | None = None) -> bool:
             if ports:

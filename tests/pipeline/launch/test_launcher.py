@@ -47,7 +47,7 @@ def test_the_process_list_has_one_acquisition_for_each_tray_in_the_order_of_the_
 
 @pytest.mark.slow
 def test_no_source_is_started_when_stopped_before_all_are_ready(chain):
-    """Sources start last: nobody could take their samples earlier."""
+    """Sources start last: before that no stage could receive their samples."""
     stop = threading.Event()
     lines: list[str] = []
 
@@ -79,7 +79,7 @@ class LateBus:
         return self.now_s
 
     def wait(self, seconds: float) -> bool:
-        """As an event that is never set."""
+        """Behaves as an event that is never set."""
         self.now_s += seconds
         return False
 

@@ -271,7 +271,7 @@ def test_a_truncated_part_is_read_up_to_its_end_and_reported(tmp_path):
 
 def test_memory_does_not_grow_with_the_file(tmp_path):
     def peak(messages: int) -> int:
-        """Bytes at most while all blocks of a recording are gone through, one at a time."""
+        """Peak memory in bytes while all blocks of a recording are read, one at a time."""
         path = write(tmp_path / "r.mcap", (raw(n, samples=100, fans=16) for n in range(messages)))
         tracemalloc.start()
         rows = sum(len(block) for block in read_arrays(path, "raw", rows=500))

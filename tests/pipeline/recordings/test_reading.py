@@ -1,4 +1,4 @@
-"""Reading messages as bytes: the same as the decoded ones, and past what is damaged."""
+"""Reading messages as bytes: they equal the decoded ones, and damage is skipped."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def small(path: Path) -> Path:
 
 
 def chunk_ends(path: Path) -> list[tuple[int, int]]:
-    """Where each chunk ends, and how many messages there are up to there."""
+    """The end of each chunk, and the number of messages up to it."""
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
         assert summary is not None
@@ -55,7 +55,7 @@ def chunk_ends(path: Path) -> list[tuple[int, int]]:
 
 
 def read_by_others(path: Path) -> list[tuple[str, int]]:
-    """All messages, by the library's own reader, which must find an index and every checksum right."""
+    """All messages, read by the reader of the library, which must find an index and correct checksums."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()

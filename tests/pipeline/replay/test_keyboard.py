@@ -1,4 +1,4 @@
-"""The keys of a terminal, and that the terminal is given back as it was."""
+"""The keys of a terminal, and that the terminal is restored."""
 
 from __future__ import annotations
 

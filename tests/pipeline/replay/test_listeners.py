@@ -1,4 +1,4 @@
-"""Who is on the bus with a replay: who must not be, who reads it, and what they lost."""
+"""Stages on the bus of a replay: which must not run, which read it, and what they lost."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def line(key: str, producer: str, received: int, first: int = 0, missing: int = 
 
 @pytest.fixture
 def sites(endpoint):
-    """The stages' side of a bus, and what a replay sees of it."""
+    """Stages on a bus, and the view that a replay has of them."""
     config = BusConfig(endpoint=endpoint)
     with Bus(config) as stages, Bus(config) as ours:
         yield stages, Listeners(ours, "s")

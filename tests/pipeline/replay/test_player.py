@@ -1,4 +1,4 @@
-"""A replay without a bus and without time: what goes out when, and what keys do to it."""
+"""A replay without a bus or a real clock: which messages are sent when, and the effect of the keys."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class FakeTime:
 
 @dataclass
 class Sent:
-    """Remembers what went out, and when."""
+    """Remembers which messages were sent, and when."""
 
     time: FakeTime
     messages: list[tuple[float, str, int]] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""Where a recording is replayed: what was given, what is in the recording, or what its keys say."""
+"""The site on which a recording is replayed: from the options, the recorded configuration, or the keys."""
 
 from __future__ import annotations
 

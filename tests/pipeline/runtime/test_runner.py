@@ -202,7 +202,7 @@ def test_an_output_made_because_time_passed_says_so(config):
 
 
 class Answers(Passer):
-    """Reads commands beside its raw samples, and makes a grid of each of them, too."""
+    """Reads commands besides raw samples, and makes a grid of each of them too."""
 
     def step(self, item: Any) -> Sequence[Message]:
         self.fans = item.fans

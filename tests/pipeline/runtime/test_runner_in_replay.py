@@ -31,7 +31,7 @@ class Ticker(Passer):
 
 
 class Replay:
-    """A replay on the bus of a bench, as far as a stage sees it."""
+    """The part of a replay on the bus of a bench that a stage sees."""
 
     def __init__(self, config: Config) -> None:
         self.bus = Bus(config.bus)

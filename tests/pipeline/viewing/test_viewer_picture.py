@@ -140,7 +140,7 @@ def test_a_file_that_is_not_a_view_is_a_one_line_error(tmp_path: Path) -> None:
 
 
 def shown_ns(viewer: Any) -> int:
-    """Where the cursor of a viewer's one recording is; 0 if it shows nothing in time yet."""
+    """The position of the cursor in the only recording of a viewer; 0 if it shows nothing in time yet."""
     return next((entry.current_time or 0 for entry in viewer.get_state().recordings), 0)
 
 

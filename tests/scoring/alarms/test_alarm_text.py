@@ -1,4 +1,4 @@
-"""scoring.alarms.alarm_text: one line for what happened, in the units of the tray."""
+"""scoring.alarms.alarm_text: one line per event, in the units of the tray."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""scoring.alarms.current_alarms: the messages of each fan reduced to how its alarm stands."""
+"""scoring.alarms.current_alarms: the messages of each fan reduced to the state of its alarm."""
 
 from __future__ import annotations
 

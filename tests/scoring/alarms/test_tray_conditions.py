@@ -308,7 +308,7 @@ CUTS = st.sets(st.integers(1, SAMPLES - 1))
 def played(
     conditions: TrayConditions, history: dict[str, Any], cuts: set[int], restart: ConditionSettings | None = None
 ):
-    """Everything that comes of a history cut at `cuts`; with `restart`, by a new object after every block."""
+    """The complete output for a history cut at `cuts`; with `restart`, from a new object after every block."""
     ratio, valid = np.array(history["ratio"]), np.array(history["valid"])
     states, changes, answers, too_short = [], [], [], 0
     for first, last in pairwise(sorted({0, SAMPLES, *cuts, *history["requests"]})):

@@ -20,7 +20,7 @@ def baseline_of(settings: BaselineSettings = SETTINGS, **changes: float) -> Base
 
 
 def feed(baseline: Baseline, level: float, intervals: int, good: np.ndarray = GOOD) -> None:
-    """good: within the limits, and below half of them."""
+    """good: whether each fan is within its limits, and also below half of them."""
     for _ in range(intervals):
         baseline.add(np.full((SAMPLES, 2), level), np.ones((SAMPLES, 2), np.bool_))
         baseline.end_interval(SAMPLES, good, good)
@@ -212,7 +212,7 @@ def _with(valid: np.ndarray, made: tuple[np.ndarray, np.ndarray]) -> tuple[np.nd
 
 
 def test_a_moment_at_a_higher_speed_does_not_undo_the_adaptation() -> None:
-    """The baseline follows there, and the commissioned one moves by at most the uncertainty."""
+    """The baseline follows to that level; the commissioned one moves by at most the uncertainty."""
     baseline = baseline_of(SCALED, adaptation_limit_sigmas=4.5, ridge=0.01, rms_sigmas=0.1)
     for level in np.linspace(0.0, 4.0, 600):
         baseline.add(np.full((SAMPLES, 2), level), EVERY, np.ones((SAMPLES, 2)))

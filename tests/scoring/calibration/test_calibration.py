@@ -49,7 +49,7 @@ def white_limits() -> Limits:
 
 
 def alarms_on_white(limits: Limits, seconds: float, shift: np.ndarray | float, fans: int = 4) -> list[Raised]:
-    """Alarms on white residuals with something added to the speed's, (n, 1) or one for all."""
+    """Alarms on white residuals with `shift` added to those of the speed, (n, 1) or one for all."""
     samples = round(seconds * 100)
     speed, balance = autoregressive(samples, fans, 0.0, 50), autoregressive(samples, fans, 0.0, 51)
     return alarms_of(limits, in_blocks(samples_of(speed + shift, balance)), fans)

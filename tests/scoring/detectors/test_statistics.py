@@ -42,7 +42,7 @@ def context(fans: int = FANS, smoothing_s: float = 0.2) -> DetectorContext:
 def block_of(
     residual: np.ndarray, valid: np.ndarray, speed: np.ndarray | None = None, missing: np.ndarray | None = None
 ) -> DetectorInput:
-    """A block with one residual for all uses."""
+    """A block in which every field has the same residual."""
     return DetectorInput(
         period_ns=STEP_NS,
         period_s=STEP_S,

@@ -33,7 +33,7 @@ def times(samples: int, first: int = 0) -> NDArray[np.int64]:
 
 
 def loaded(samples: int, from_s: float, torque: float = 20.0, seed: int = 1) -> tuple[Floats, Floats]:
-    """Commands and speeds of a fan, (n, 1), at a held speed, that takes more from some time on."""
+    """Commands and speeds (n, 1) of a fan at a held speed that needs more command from some time on."""
     rng = np.random.default_rng(seed)
     t_s = np.arange(samples) * STEP_NS / 1e9
     command = NEEDED + torque * (t_s >= from_s) + rng.normal(0, 0.1, samples)

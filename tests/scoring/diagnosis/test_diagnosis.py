@@ -37,7 +37,7 @@ def evidence_of(ranked: RankedCause) -> Evidence:
 
 
 def faulty_speed(cause: str, command: np.ndarray, seed: int) -> tuple[np.ndarray, float]:
-    """Readings of a fan with that fault, and the size of it."""
+    """Readings of a fan with this fault, and the size of the fault."""
     step = data.from_onset
     size = {"drag_up": 0.4, "drag_down": -0.3, "friction_up": 0.06, "gain_down": -0.12, "external_torque": 0.06}
     if cause == "sensor_scaling":
@@ -115,7 +115,7 @@ def test_95_percent_intervals_hold_the_change_about_so_often() -> None:
 
 @pytest.mark.parametrize("cause", ["drag_up", "gain_down", "external_torque"])
 def test_at_a_constant_speed_faults_that_look_alike_share_the_probability(cause) -> None:
-    """A controller holds the speed: the command alone rises, by what the fault takes."""
+    """A controller holds the speed: only the command rises, by the amount that the fault needs."""
     speed = np.full(1600, 500.0)
     needed = data.HEALTHY.viscous * speed + data.HEALTHY.drag * speed**2 + data.HEALTHY.friction
     command = np.empty_like(speed)
@@ -227,7 +227,7 @@ def test_errors_that_make_good_for_one_another_are_small_where_the_fan_was_seen(
 
 
 def held_by_a_loop(seed: int, per_rad_s: float, per_rad: float, drag: float = 1.3, duration_s: float = 60.0) -> Window:
-    """A fan whose speed a PI controller holds by a noisy tacho; more drag in the second half."""
+    """A fan at a speed held by a PI controller with a noisy tacho; more drag in the second half."""
     rng, fan, period_s = np.random.default_rng(seed), data.HEALTHY, data.STEP_S
     samples, set_point = round(duration_s / period_s), 450.0
     needed = fan.viscous * set_point + fan.drag * set_point**2 + fan.friction
@@ -388,7 +388,7 @@ FAULT_S, END_S = 90.0, 106.0
 
 
 def healthy_balance(command: np.ndarray, speed_rad_s: np.ndarray, lag_s: float) -> HealthyBalance:
-    """By least squares on blocks of filtered samples of one healthy fan, as a card would have it."""
+    """The balance model of one healthy fan, by least squares on blocks of filtered samples, as in a card."""
     rate, h = 3.0, data.STEP_S
     middle = (speed_rad_s[1:] + speed_rad_s[:-1]) / 2.0
     acting = acting_command(command, h, lag_s)[:-1]

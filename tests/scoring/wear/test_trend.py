@@ -1,4 +1,4 @@
-"""Trends per day with intervals that hold, in compressed time, and limits forecast only where they can be."""
+"""Trends per day in compressed time: their intervals hold, and limits are forecast only where that is possible."""
 
 import numpy as np
 import pytest

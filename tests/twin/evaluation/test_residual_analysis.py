@@ -1,4 +1,4 @@
-"""The residual analysis against residuals whose correlation is known. Many repetitions: the bounds are statements."""
+"""The residual analysis against residuals of known correlation, with many repetitions to test the stated bounds."""
 
 from collections.abc import Callable, Sequence
 

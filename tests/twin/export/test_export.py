@@ -53,7 +53,7 @@ FANS = 4
 
 
 def fleet(lag_s: float) -> np.ndarray:
-    """(4, 4) parameters of fans that differ in everything; the second never has a lag, the last a small one."""
+    """(4, 4) parameters of fans that differ in every parameter; the second has no lag, the last a small one."""
     scale = np.linspace(0.8, 1.3, FANS)[:, np.newaxis] ** np.array([1.0, -1.0, 2.0, 1.0])
     return scale * np.array([*fan_data.PUBLISHED_PARAMETERS, 0.0]) + lag_s * np.outer(
         [1.0, 0.0, 20.0, 1e-3], [0, 0, 0, 1]
@@ -69,7 +69,7 @@ def minute_of_commands() -> tuple[np.ndarray, np.ndarray]:
 
 
 def state_of(model: Model, command: np.ndarray) -> np.ndarray:
-    """Fans that turn, one of them backwards, after another command than the first one here."""
+    """Fans that turn, one of them backwards, after a command that differs from the first one here."""
     return model.state_layout.initial_state(np.array([20.0, 90.0, 0.0, -40.0]), command[0] + 30.0)
 
 

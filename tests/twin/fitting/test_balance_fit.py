@@ -176,7 +176,7 @@ def test_runs_too_short_are_refused_in_one_line(published) -> None:
 
 @pytest.mark.data
 def test_on_rosa_healthy_runs_lie_still_and_faults_stand_out(measured_data, tmp_path) -> None:
-    """A rotor with dry friction under a speed loop: what the physics say of it is absurd."""
+    """A rotor with dry friction under a speed loop: the coefficients from the physics are absurd."""
 
     def imported(name: str) -> Path:
         recording = tmp_path / f"{name}.mcap"

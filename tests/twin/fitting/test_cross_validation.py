@@ -1,4 +1,4 @@
-"""A network is used where it predicts recordings left out, and left away where it does not."""
+"""A network is used if it improves the prediction of recordings left out, and dropped if it does not."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Warnings: none on recordings that determine everything, the right one on each that does not."""
+"""Warnings: none for recordings that determine every parameter, and the right one for each that does not."""
 
 import re
 from pathlib import Path
@@ -224,7 +224,7 @@ def test_a_single_step_is_too_few() -> None:
 
 
 def judged(run: Run, **values_and_errors: tuple[float, float]) -> tuple[str, ...]:
-    """Warnings of estimates as given, the published ones and well known where nothing is given."""
+    """Warnings for the given estimates; by default the published ones with small errors."""
     estimates = {"J": (0.15, 0.001), "alpha": (0.012, 0.001), "C_D": (0.0025, 1e-5), "lag_s": (0.0, 0.0)}
     estimates |= values_and_errors
     parameters, errors = np.array([estimates[name] for name in PARAMETER_NAMES]).T

@@ -1,4 +1,4 @@
-"""twin.fitting.balance: the balance is what its recursion says, knows a fault's torque, and differentiates no noise."""
+"""twin.fitting.balance: the balance equals its recursion, shows the torque of a fault, and differentiates no noise."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ STEP_S = 0.01
 
 
 def wandering(samples: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Commands and speeds of two fans that have nothing to do with each other."""
+    """Commands and speeds of two fans that are independent of each other."""
     rng = np.random.default_rng(seed)
     return rng.uniform(0.0, 100.0, (samples, 2)), 150.0 + 50.0 * rng.normal(size=(samples, 2))
 

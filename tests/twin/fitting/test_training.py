@@ -22,7 +22,7 @@ def rough() -> tuple[Run, Run, Run]:
 
 @pytest.fixture(scope="module")
 def part(rough) -> Run:
-    """As much of the first as most need."""
+    """The part of the first recording that most tests need."""
     return rough[0].between(0.0, 80.0)
 
 

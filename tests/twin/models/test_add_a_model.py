@@ -29,7 +29,7 @@ from twin.runs import Array, Run
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """w[k + 1] = decay w[k] + gain u[k]: a discrete fan that knows nothing of physics."""
+    """w[k + 1] = decay w[k] + gain u[k]: a discrete fan without physics."""
 
     decay: float
     gain: float

@@ -1,4 +1,4 @@
-"""The lagged command: exact, with its whole impulse, and gone where there is no lag."""
+"""The lagged command: exact, with its whole impulse, and equal to the command without a lag."""
 
 import numpy as np
 import pytest
