@@ -44,9 +44,9 @@ class ScoredBlock:
     balance_smoothed: Array
     balance_baseline: Array
     balance_expected: Array
-    """the expected residual at this speed, which the baseline comes on top of"""
+    """the expected residual at this speed, to which the baseline is added"""
     balance_baseline_s: Array
-    """the baseline varies as a mean over so many seconds of healthy running; 0: there is none yet"""
+    """seconds of healthy data whose mean would vary as much as the baseline; 0: there is none yet"""
     balance_commissioned: Array
     """the baseline at the end of commissioning; NaN before"""
     balance_at_limit: Array
@@ -55,7 +55,7 @@ class ScoredBlock:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Observation:
-    """What calibration needs of a stretch of samples, beside the scores."""
+    """What calibration needs about a stretch of samples, beside the scores."""
 
     ratios: Array
     """(rows of the table, n, fans) every statistic in multiples of its limit"""
@@ -287,7 +287,7 @@ class FanScorer:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a snapshot for as many fans; if this raises, nothing has changed.
 
-        A detector that the snapshot does not know starts new, as after an update that added it.
+        A detector that is missing in the snapshot, as after an update that added it, starts from its initial state.
 
         Raises:
             ValueError, KeyError, TypeError: it is no snapshot of a FanScorer.

@@ -29,7 +29,7 @@ class _Entry(BaseModel):
 
 
 class Timing(_Entry):
-    """The times that limits hold for. With other times the false-alarm rate is another one."""
+    """The times for which limits are valid. With other times the false-alarm rate differs."""
 
     smoothing_s: float = Field(default=0.2, ge=0, description="time constant of the low-pass of residuals")
     baseline_s: float = Field(default=1.0, gt=0, description="length of an interval that a baseline is learned from")
@@ -38,7 +38,7 @@ class Timing(_Entry):
 
 
 class DeclaredRate(_Entry):
-    """The false-alarm rate that was declared, and the healthy running behind it."""
+    """The declared false-alarm rate, and the healthy data behind it."""
 
     false_alarms_per_day: float = Field(gt=0, description="declared, for each fan")
     interval_95: tuple[float, float] = Field(
@@ -105,7 +105,7 @@ class Limits(_Entry):
         return next((settings for settings in of_source if isinstance(settings, kind)), None)
 
     def times(self, factor: float) -> Limits:
-        """The same with every limit `factor` times as far. The declared rate does not hold for them."""
+        """The same with every limit `factor` times as far. The declared rate is not valid for them."""
         if factor == 1.0:
             return self
         return self.scaled({row.name: factor for row in rows()}).model_copy(update={"declared_rate": None})
@@ -137,7 +137,7 @@ def _settings_of(name: str, kind: type[DetectorSettings], entry: Any) -> Detecto
 def uncalibrated(alarm_sigmas: float, timing: Timing) -> Limits:
     """Limits of a twin that was not calibrated: alarm_sigmas on the smoothed speed residual, and nothing else."""
     return Limits(
-        # the low-pass takes nothing from a residual that hardly ever changes: the limit is in sigma at any rate
+        # a low-pass does not reduce a nearly constant residual: its limit is always in sigma
         speed=HealthyResidual(autocorrelation_time_s=NEVER_S),
         balance=HealthyResidual(),
         detectors={

@@ -18,7 +18,7 @@ from scoring.detectors.low_pass import LowPass
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.limits import Limits
 
-CLIP_LIMITS = 2.0  # a residual counts as so many limits of the smoothed one at most: one outlier raises no alarm
+CLIP_LIMITS = 2.0  # residuals are clipped to this many limits of the smoothed one: one outlier raises no alarm
 MIN_CLIP_STDS = 5.0
 LARGEST_SIGMAS = 1e6  # so that sums and squares stay finite
 
@@ -83,7 +83,7 @@ class Residual:
         self.baseline.add(clipped, valid, scaling)
 
     def smooth(self, shift: Array, valid: Array, period_s: float) -> Array:
-        """(n, fans) the low-passed residual less its baseline, sigma: what people are shown."""
+        """(n, fans) the low-passed residual less its baseline, sigma, as displayed."""
         return self._low_pass.update(_finite(shift, valid), valid, period_s)
 
     def standardise(
@@ -133,7 +133,7 @@ class Residual:
         if healthy.transient_scale_rad_s is not None:
             relative = relative * np.sqrt(1.0 + np.square(transient_rad_s / healthy.transient_scale_rad_s))
         if healthy.baseline.rms_sigmas > 0.0:
-            # an offset that is not known then stays within the reference value of the drift
+            # so that an unknown offset stays within the reference value of the drift
             uncertainty = np.where(valid, self.baseline.offset_uncertainty(scaling), 0.0)
             relative = relative + uncertainty / self._reference_sigmas
         return relative

@@ -23,7 +23,7 @@ class Samples:
     missing: Array
     """the tacho gave no reading"""
     alive: Array
-    """the line delivered something"""
+    """samples arrived on the line"""
 
 
 def samples_of(prediction: Prediction) -> Samples:

@@ -20,10 +20,10 @@ def is_silenced(alarm: Alarm | AlarmState) -> bool:
 
 
 def is_presented(alarm: Alarm | AlarmState) -> bool:
-    """Whether the alarm is to be put before an operator: retained and not silenced."""
+    """Whether operators should see the alarm: retained and not silenced."""
     return is_retained(alarm) and not is_silenced(alarm)
 
 
 def is_listed(alarm: Alarm | AlarmState) -> bool:
-    """Whether the alarm belongs on a list of current alarms: retained, or silenced so that nothing is hidden unseen."""
+    """Whether the alarm belongs on a list of current alarms: retained or silenced."""
     return is_retained(alarm) or is_silenced(alarm)

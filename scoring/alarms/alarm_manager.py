@@ -28,7 +28,9 @@ from scoring.detectors.table import row_of
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.former_snapshot_keys import FORMER_ALARM_KEYS, current_keys
 
-PERSISTING_SHARE = 0.5  # a fault persists while the torque balance is at least this share of what it was
+PERSISTING_SHARE = (
+    0.5  # a fault persists while the torque balance is at least this share of its value in the last message
+)
 MAX_REQUESTERS = 64  # the latest whose requests are remembered; docs/reference/alarms.md gives the consequences
 
 
@@ -64,7 +66,7 @@ class AlarmManager:
     def emit(self, events: list[AlarmEvent], score: Score, context: AlarmContext) -> list[Alarm]:
         """The messages for a block's events and diagnoses, in the order of its rows.
 
-        The diagnoser must have taken the block before.
+        The diagnoser must already have stored the block.
         """
         alarms: list[Alarm] = []
 
@@ -93,7 +95,7 @@ class AlarmManager:
         return alarms
 
     def _persists(self, row: int, fan: int, score: Score, context: AlarmContext) -> bool:
-        """Whether the fault of the last message persists. A diagnosis would take its end for part of the fault."""
+        """Whether the fault of the last message persists; otherwise a diagnosis would include its end."""
         now, before = abs(context.balance_command[row, fan]), abs(self._next_message(fan).torque_balance_command)
         detector = row_of(int(score.statistic[row, fan]))
         of_tacho = detector is not None and detector.source == "tacho"
@@ -192,7 +194,7 @@ class AlarmManager:
         return True
 
     def _next_message(self, fan: int) -> Alarm:
-        """The last message about a fan without what belonged to that message alone; a start for the next one."""
+        """The last message about a fan without the fields of that event alone: the template of the next one."""
         last = self._last_emitted.get(fan) or Alarm(
             fan=fan,
             active=False,

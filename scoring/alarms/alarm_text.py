@@ -37,7 +37,7 @@ TRANSITIONS = {
     Transition.IN_SERVICE: "in service",
     Transition.COMMISSIONING: "a new baseline is being taken",
 }
-"""transitions whose line does not depend on anything else"""
+"""transitions whose line depends on nothing else"""
 
 
 class AlarmText:

@@ -89,7 +89,7 @@ class CurrentAlarm:
 
 
 def current_alarms(messages: Iterable[Alarm]) -> list[CurrentAlarm]:
-    """One for each fan with a message, by tray and fan. messages: in the order in which they were received."""
+    """The alarm of each fan with a message, by tray and fan. messages: in the order received."""
     by_fan: dict[tuple[str, int], list[Alarm]] = {}
     for alarm in messages:
         by_fan.setdefault((alarm.header.tray, alarm.fan), []).append(alarm)

@@ -28,12 +28,12 @@ from scoring.detectors.state import ColumnState
 COMMISSIONING_INTERVALS = 10
 MIN_VALID_SHARE = 0.5  # of an interval's samples
 FIXED_POINT_ONE = 1 << 20  # one sigma, or one sigma squared; integer sums do not depend on how samples are cut
-LARGEST_SIGMAS = 1e3  # a larger residual counts as this
-MAX_STEADY_STD = 2.0  # of a healthy residual: an interval with more is not steady
-MAX_UNSTEADY_INTERVALS = 10  # then an unsteady interval is accepted
+LARGEST_SIGMAS = 1e3  # larger residuals are clipped to this
+MAX_STEADY_STD = 2.0  # standard deviation relative to a healthy one: an interval with more is not steady
+MAX_UNSTEADY_INTERVALS = 10  # intervals without a steady one, after which an unsteady one is accepted
 ROUNDING = 1e-9
 OFFSET_RANGE_RMS = 3.0  # an offset may be so many times the root mean square of healthy ones
-FASTER_INFORMATION = 1.5  # times the least information kept: such an interval is followed faster
+FASTER_INFORMATION = 1.5  # times the least information kept: the baseline adapts faster to such an interval
 MIN_INFORMATION = 1e-12
 
 
@@ -85,13 +85,13 @@ class Baseline(ColumnState):
 
     @property
     def independent_intervals(self) -> Array:
-        """(fans,) the baseline varies as the mean of so many independent intervals."""
+        """(fans,) the number of independent intervals whose mean would vary as much as the baseline."""
         in_the_long_run = 2.0 * self._adaptation_intervals - 1.0
         return np.minimum(self.total_information, in_the_long_run)
 
     @property
     def learned_scale(self) -> Array:
-        """(fans,) the scaling at which most was learned."""
+        """(fans,) weighted root-mean-square scaling of the learned intervals."""
         weights = np.square(self.interval_information)
         total = np.maximum(weights.sum(axis=0), MIN_INFORMATION)
         return np.sqrt((weights * self.interval_information).sum(axis=0) / total)

@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class BaselineSettings(BaseModel):
-    """How far the offset of a healthy fan goes, and how it changes with the speed."""
+    """The range of the offset of a healthy fan, and how it changes with the speed."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

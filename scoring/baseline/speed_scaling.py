@@ -13,7 +13,7 @@ import numpy as np
 from schemas.messages import Array
 from scoring.baseline.settings import BaselineSettings
 
-MAX_RELATIVE_SPEED = 3.0  # of the reference speed: beyond, the offset is taken to grow no further
+MAX_RELATIVE_SPEED = 3.0  # times the reference speed: above it, the offset is assumed not to grow further
 
 
 def speed_scaling(settings: BaselineSettings, speed_rad_s: Array, valid: Array) -> Array:

@@ -38,21 +38,19 @@ from scoring.limits import DeclaredRate, Limits, Timing
 
 DAY_S = 86_400.0
 NEEDED_ALARMS = 3.0  # false alarms expected in the healthy runs, for their rate to be distinguished from others
-VARIATION_FAN_S = (
-    5 * DAY_S
-)  # of running are enough to know how residuals vary; how rare large values are takes all of it
+VARIATION_FAN_S = 5 * DAY_S  # enough to measure how residuals vary; the frequency of large values needs all data
 ENOUGH_BLOCKS = 8
 MIN_WINDOWS = 6
 WINDOWS_OF_BLOCK = 6  # a minute
-MAX_ALARM_SHARE = 0.25  # of the windows: with more of them the limits would be within the noise
+MAX_ALARM_SHARE = 0.25  # share of the windows: with more of them the limits would be within the noise
 MIN_LEVEL = 0.1 / UNREACHED
-SECONDS_QUANTILE = 0.999  # a shift that fewer seconds than the rest exceed is no drift
+SECONDS_QUANTILE = 0.999  # quantile of one-second means: a shift that is exceeded more often is not a drift
 SEEN_WINDOWS = 50.0  # with an alarm, to count how often statistics alarm together
 ROUNDING = 1e-9
 
 
 class TooLittleError(Exception):
-    """The healthy running cannot support what is to be declared."""
+    """The healthy data cannot support the rate to be declared."""
 
     def __init__(self, fan_hours: float, needed_fan_hours: float, least_per_day: float) -> None:
         super().__init__(fan_hours, needed_fan_hours)
@@ -76,7 +74,7 @@ def calibrate(
     crossover_speed_rad_s: viscous / (2 drag) of the fans, see scoring.baseline.speed_scaling; None: not known.
 
     Raises:
-        TooLittleError: the runs are too short for that, and extrapolate is not set; or too short for any limit.
+        TooLittleError: the runs are too short for the rate, and extrapolate is not set; or too short for any limit.
         MixedRatesError: the runs are not all of one sampling period.
     """
     unlimited = HealthyResidual(baseline=UNLIMITED)
@@ -115,7 +113,7 @@ def calibrate(
 def _with_variation(
     runs: Runs, limits: Limits, found: HealthyStatistics, crossover_speed_rad_s: float | None
 ) -> Limits:
-    """Limits that know how the residuals vary. found: of all runs, by limits that nothing reaches.
+    """Limits with the variation of the residuals. found: of all runs, with limits that nothing reaches.
 
     Detectors of a residual that was never valid are not used.
     """
@@ -180,7 +178,7 @@ def _evidence(row: DetectorRow, limits: Limits, found: HealthyStatistics) -> Hea
         smoothed_limit=smoothed.limit if smoothed else 0.0,
         second_mean_limit=moments.second_mean_quantile(SECONDS_QUANTILE),
         between_runs_std=between_runs_std(moments, residual),
-        # the friction of a day shifts the balance alike at all speeds, but not the speed
+        # the friction of a day shifts the balance equally at all speeds, but not the speed
         offset_unknown_at_other_speeds=row.source == "speed" and residual.baseline.speed_exponent == 0,
     )
 
@@ -228,7 +226,9 @@ def _factors(found: HealthyStatistics, target: float) -> Array:
     at = np.array([_level(found, number, often / count) for number in range(count)])
     together = np.concatenate([peaks(_score(run, at)).ravel() for run in found.maxima])
     passed = float((together[np.isfinite(together)] > 1.0).mean())
-    independent = min(max(passed / (often / count), 1.0), float(count))  # they alarm as so many unrelated statistics
+    independent = min(
+        max(passed / (often / count), 1.0), float(count)
+    )  # the equivalent number of independent statistics
     factors = [
         1.0 if row.detector.settings.rule is LimitRule.FIXED else _level(found, number, target / independent)
         for number, row in enumerate(rows())
@@ -237,9 +237,9 @@ def _factors(found: HealthyStatistics, target: float) -> Array:
 
 
 def _with_alarms_at_most(found: HealthyStatistics, factors: Array, allowed: int) -> Array:
-    """Factors with which these runs have no more alarms than allowed: a tail over many fans says little of the worst.
+    """Factors with which these runs have no more alarms than allowed; a tail over many fans ignores the worst fan.
 
-    The limit that raises most alarms goes up, past a few excursions at a time.
+    The limit that raises most alarms is increased beyond a few excursions at a time.
     """
     factors = factors.copy()
     by_rarity = [number for number, row in enumerate(rows()) if row.detector.settings.rule is not LimitRule.FIXED]
@@ -273,7 +273,7 @@ def _score(run: WindowMaxima, factors: Array) -> Array:
 def _interval(found: HealthyStatistics, factors: Array, seed: int) -> tuple[float, float]:
     """95 % interval of the alarms per fan and day, with limits times their factors.
 
-    By blocks that are independent: whole runs where there are enough, else fans of runs, else minutes.
+    Alarms are counted in independent blocks: whole runs if there are enough, else fans of runs, else minutes.
     """
     window_days = found.fan_s / found.windows / DAY_S
     raised = [peaks(_score(run, factors)) > 1.0 for run in found.maxima]

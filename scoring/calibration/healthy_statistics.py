@@ -21,7 +21,7 @@ from scoring.fan_scorer import RESIDUALS, FanScorer, Observation, ScoredBlock
 from scoring.limits import Limits
 from scoring.samples import Samples
 
-LARGEST_SIGMAS = 100.0  # a larger residual counts as this
+LARGEST_SIGMAS = 100.0  # larger residuals are clipped to this
 
 
 class HealthyRun(NamedTuple):
@@ -36,11 +36,11 @@ class HealthyRun(NamedTuple):
 
 
 Runs = Callable[[], Iterable[HealthyRun]]
-"""Gives the healthy runs from the beginning at each call."""
+"""Returns the healthy runs from the beginning at each call."""
 
 
 class MixedRatesError(Exception):
-    """Healthy runs have grids of different rates, and limits hold for one."""
+    """Healthy runs have grids of different rates; limits are valid for one rate."""
 
     def __init__(self, first: tuple[str, int], other: tuple[str, int]) -> None:
         super().__init__(first, other)
@@ -51,7 +51,7 @@ class MixedRatesError(Exception):
 
 @dataclass
 class HealthyStatistics:
-    """What one pass over the healthy runs has found."""
+    """Statistics of one pass over the healthy runs."""
 
     top_speed_rad_s: float
     period_ns: int = 0
@@ -122,7 +122,7 @@ def healthy_statistics(runs: Runs, limits: Limits, top_speed_rad_s: float) -> He
 
 
 class _RunStatistics:
-    """Adds the statistics of one run to those of all."""
+    """Adds the statistics of one run to those of all runs."""
 
     def __init__(self, found: HealthyStatistics, run: HealthyRun, limits: Limits) -> None:
         self._found = found

@@ -24,7 +24,7 @@ BASELINE_MARGIN, BASELINE_COVERAGE = 1.5, 0.999
 MIN_RUNS, FEW_RUNS_LIMIT_SIGMAS = (
     3,
     5.0,
-)  # fewer runs say little of days: then so many sigma, or three times the largest
+)  # with fewer runs the limit is this many sigma, or three times the largest offset
 SPEED_EXPONENT = 2  # of the drag, which another density of the air changes
 MAX_REMAINING_SQUARE = 0.97  # baselines follow the speed if they leave at most so much of the mean square over seconds
 TRANSIENT_ALLOWANCE = 3.0  # times the mean square in motion: one fan has the same error in each transient
@@ -37,10 +37,12 @@ def baselines_over_speed(
 ) -> tuple[HealthyStatistics, dict[Signal, dict[str, Any]]]:
     """Whether the offset of a fan changes with its speed, for each residual.
 
-    It is taken to, if the residual less such a baseline varies less over the runs. With few runs, which say little of
-    the differences between days, it is not. crossover_speed_rad_s: see BaselineSettings; None where it is not known.
+    It does if subtracting such a baseline leaves less variation over the runs. With few runs, which say little about
+    the differences between days, it is assumed not to.
 
-    Returns the statistics, those of the baselines that are taken, and what these change in BaselineSettings.
+    crossover_speed_rad_s: see BaselineSettings; None if it is not known.
+
+    Returns the statistics with the chosen baselines, and the BaselineSettings that these change.
     """
     if len(found.maxima) < MIN_RUNS:
         return found, {source: {} for source in RESIDUALS}
@@ -106,7 +108,7 @@ def _transient_scale_rad_s(by_motion: Array) -> float | None:
 def _largest_baseline(runs: list[Array]) -> float:
     """How far the baseline of one more healthy run may be from zero: a prediction interval, by Student's t.
 
-    runs: baselines of the fans of each. Those of one run are of one day, and say little of other days.
+    runs: baselines of the fans of each. Those of one run are of one day, and say little about other days.
     """
     baselines = np.concatenate(runs)
     few = len(runs) if len(runs) > 1 else len(baselines)
@@ -157,7 +159,7 @@ def _over_speed(
 
 
 def between_runs_std(moments: ResidualMoments, residual: HealthyResidual) -> float:
-    """Standard deviation of healthy baselines, in that of the residual: a shift as large is no drift yet."""
+    """Standard deviation of healthy baselines, in that of the residual: a shift of this size is not a drift yet."""
     return float(np.concatenate(moments.baselines).std()) / residual.mean_residual_std
 
 

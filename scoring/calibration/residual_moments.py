@@ -49,7 +49,7 @@ class ResidualMoments:
         return self.second_mean_square / self.seconds if self.seconds else math.inf
 
     def typical_second_square(self) -> float:
-        """The same by the median, as if normal: transients, which are rare and large, have no part in it."""
+        """The same by the median, as if normal: transients, which are rare and large, do not affect it."""
         return _quantile(self.second_octaves, 0.5) / MEDIAN_OF_SQUARE
 
     def second_mean_quantile(self, share: float) -> float:

@@ -22,7 +22,7 @@ class AlarmUnits:
         return f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
 
     def shift(self, alarm: Alarm, source: str) -> str:
-        """How far the residual of an alarm is from its baseline, and how far it may be."""
+        """The distance of an alarm's residual from its baseline, and its limit."""
         if source == "speed":
             side = "below" if alarm.residual_rad_s < 0 else "above"
             size, limit = self.shown_speed(abs(alarm.residual_rad_s)), self.shown_speed(alarm.limit_rad_s)

@@ -13,7 +13,7 @@ import numpy as np
 from schemas.messages import Array
 
 ONE = 1 << 24  # fixed-point value of one sigma second
-LARGEST_SIGMAS = 1e4  # a larger residual counts as this
+LARGEST_SIGMAS = 1e4  # larger residuals are clipped to this
 
 
 class Cusum:

@@ -76,17 +76,17 @@ class DetectorSettings(BaseModel, ABC):
         return self
 
     def calibrated(self, level: float, evidence: HealthyEvidence) -> Self:
-        """The same with limits at `level` times the present ones, where excursions are as rare as wanted."""
+        """The same with limits at `level` times the present ones, which makes excursions as rare as required."""
         return self.scaled(level)
 
     def cautious_factor(self, evidence: HealthyEvidence) -> float | None:
-        """How much further limits go where the healthy running is too short for the declared rate; None: the detector
+        """Factor on limits if the healthy data are too short for the declared rate; None: the detector
         is not used then.
         """
         return 1.0
 
     def cautious(self, evidence: HealthyEvidence) -> Self:
-        """What else changes then, after the limits were scaled."""
+        """Other changes in that case, after the limits were scaled."""
         return self
 
 
@@ -162,13 +162,13 @@ class Detector(ColumnState):
         none."""
 
     def observed(self) -> dict[str, float]:
-        """The largest values so far, by name: what the rule FIXED may set a limit by."""
+        """The largest values so far, by name, from which the rule FIXED may set a limit."""
         return {}
 
     @classmethod
     @abstractmethod
     def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
-        """What an alarm raised by this statistic says to people, without the fan's number."""
+        """The alarm text of this statistic, without the fan's number."""
 
 
 @dataclass(frozen=True)

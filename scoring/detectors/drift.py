@@ -20,8 +20,8 @@ from scoring.detectors.detector import (
 )
 from scoring.detectors.deviation import summed_deviation
 
-CAP_LIMITS = 1.05  # the sum ends here: a long fault clears soon after it ends, and a mere drift stays a warning
-MIN_CAUTIOUS_LIMIT = 2.0  # standard deviations: without enough healthy running no limit is set below
+CAP_LIMITS = 1.05  # the sum is capped here: a long fault clears soon after it ends, and drift alone stays a warning
+MIN_CAUTIOUS_LIMIT = 2.0  # standard deviations: with too few healthy data no limit is set below this
 REFERENCE_SHARE = 0.25  # of the limit of the smoothed residual, and at least so many sigma
 DEFAULT_REFERENCE_SIGMAS = 0.5
 
@@ -43,7 +43,7 @@ class DriftSettings(SingleLimit):
         return cls(limit=UNREACHED, period_s=1.0)
 
     def prepared(self, evidence: HealthyEvidence) -> DriftSettings:
-        """The reference value is above what healthy residuals keep up for a second, and above their usual offsets."""
+        """The reference value is above the one-second means of healthy residuals, and above their typical offsets."""
         least = max(REFERENCE_SHARE, evidence.between_runs_std)
         of_smoothed = REFERENCE_SHARE * evidence.smoothed_limit * evidence.smoothed_std
         reference = max(of_smoothed, evidence.second_mean_limit, least)
@@ -78,7 +78,7 @@ class Drift(Detector):
         self._cusum.reset(fans)
 
     def limit_sigmas(self, period_s: float) -> float:
-        """What is above the reference value adds up, and reaches the limit in the end."""
+        """The reference value: any larger shift adds up until it reaches the limit."""
         return self._settings.reference_sigmas * self._mean_residual_std
 
     def columns(self) -> dict[str, Array]:

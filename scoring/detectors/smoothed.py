@@ -21,8 +21,8 @@ from scoring.detectors.detector import (
 from scoring.detectors.deviation import smoothed_deviation
 from scoring.detectors.low_pass import LowPass
 
-MIN_CAUTIOUS_LIMIT = 4.0  # standard deviations: without enough healthy running no limit is set below
-BETWEEN_RUNS_STDS = 3.0  # so far a healthy fan may be off at a speed at which its offset is not known
+MIN_CAUTIOUS_LIMIT = 4.0  # standard deviations: with too few healthy data no limit is set below this
+BETWEEN_RUNS_STDS = 3.0  # distance of a healthy fan from its baseline at a speed at which its offset is unknown
 
 
 class SmoothedSettings(SingleLimit):

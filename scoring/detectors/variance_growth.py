@@ -25,7 +25,7 @@ from scoring.detectors.low_pass import LowPass
 
 TIME_CONSTANT_S = 1.0
 MIN_GROWTH = 0.01  # a limit is at least by this share above the healthy value
-MIN_CAUTIOUS_LIMIT = 2.5  # times the healthy value: without enough healthy running no limit is set below
+MIN_CAUTIOUS_LIMIT = 2.5  # times the healthy value: with too few healthy data no limit is set below this
 
 
 class VarianceGrowthSettings(SingleLimit):

@@ -57,7 +57,7 @@ class Diagnoser:
         """Store a block; t_ns (n,), the others (n, fans).
 
         command: NaN where unknown. offset_command: the fan's own offset of the torque balance. offset_s: seconds of
-        healthy running from which the offset is known. expected_command: what a healthy balance is expected to be at
+        healthy running from which the offset is known. expected_command: the expected healthy balance at
         this speed, apart from the offset; NaN where the speed is unknown.
         """
         if period_ns != self._period_ns:

@@ -29,7 +29,7 @@ MIN_ROWS = 20
 
 @dataclass(frozen=True)
 class ParameterShift:
-    """Change of one parameter since health, and its standard error from noise alone: the twin's errors are constant."""
+    """Change of one parameter from its healthy value, and its standard error from noise; the twin's errors are constant."""
 
     parameter: str
     change: float

@@ -31,10 +31,10 @@ MIN_FORECAST_DAYS = 1.0
 REPORT_WITHIN_DAYS = 7.0
 """health reports a limit that is likely to be reached sooner"""
 WINDOW_S = 35.0
-"""how far a point looks back"""
+"""length of the window of a point"""
 NEVER_NS = int(np.iinfo(np.int64).min)
 MAX_CHANGE = 1e6
-"""larger changes are left out: no fan changes so much"""
+"""larger changes are ignored as implausible"""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class WearMonitor:
     ) -> None:
         """Process a block that the diagnoser has taken; (n, fans) each but t_ns, (n,), and limit_command, (fans,).
 
-        eligible: a point may be taken at this sample. disturbed: no point may look back on this sample.
+        eligible: a point may be taken at this sample. disturbed: this sample must not be within the window of a point.
         commissioned_command: baseline of the balance at the end of commissioning, NaN before. held: the baseline is at
         its bound, so that its value says nothing about wear. limit_command: the alarm comes at this distance from the
         commissioned baseline.
