@@ -44,7 +44,7 @@ from twin.runs import Array, Run, common_fans
 
 @dataclass(frozen=True, eq=False)
 class TrainedTwin:
-    """A model with everything that is known about it. parameters: (fans, 4)."""
+    """A trained model with its identification and validation. parameters: (fans, 4)."""
 
     model: Model
     parameters: Array
@@ -83,9 +83,9 @@ def train_twin(
     """Build a twin of healthy runs.
 
     validation_runs: held out of the fit; they choose the best weights and give the healthy sigmas and the card's
-    figures. Empty: the training runs do, and the card says so. network_inputs: of the hybrid's and neural ODE's
-    network. physics: whether a hybrid's physics are refined along with its network, or stay as they were identified.
-    trainer "adam" leaves them as they were, and its weights are those that did best in training.
+    figures. If empty, the training runs are used instead, and the card says so. network_inputs: of the hybrid's and
+    neural ODE's network. physics: whether a hybrid's physics are refined along with its network, or stay as they were
+    identified. trainer "adam" keeps them as identified, and keeps the weights with the smallest training error.
     fan_numbers (what the recordings call the runs' fans; default: counted from 0), command_unit, data and
     validation_data (the files that the runs are from) and created (default: now) go into the card. The same seed and
     runs give the same model.

@@ -16,8 +16,8 @@ from twin.models.physics import LAG, PARAMETER_NAMES
 from twin.runs import Run
 
 Source = Literal["test", "held-out", "training"]
-"""Which data a figure is of. test: seen by nobody. held-out: not fitted, but training stopped by them, and sigma is
-theirs. training: fitted, which flatters."""
+"""Which data a figure is of. test: not used in training. held-out: not fitted, but used to stop training and for
+sigma. training: fitted, so too optimistic."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Contender:
 
     @property
     def judged(self) -> Evaluation | None:
-        """Its figures over the data that least of its making depended on."""
+        """Its figures over the data of the comparison."""
         return self.test or self.held_out or self.training
 
     @property
@@ -69,7 +69,7 @@ class Contender:
 
 
 def source_of(validation_runs: Sequence[Run], test_runs: Sequence[Run]) -> Source:
-    """The data that candidates are judged by: the test runs, or else the held-out ones, or else the training runs."""
+    """The data for comparing candidates: the test runs, or else the held-out ones, or else the training runs."""
     return "test" if test_runs else "held-out" if validation_runs else "training"
 
 
@@ -89,7 +89,7 @@ def contend(
 ) -> Contender:
     """Train one candidate and evaluate it. Arguments as of build.train_twin; test_runs take no part in training.
 
-    A candidate that cannot be trained on runs that others can be trained on is a result, and not an error.
+    A candidate that cannot be trained, while others can, is a result and not an error.
     """
     try:
         trained = train_twin(
@@ -120,9 +120,9 @@ def contend(
 
 
 def best(contenders: Sequence[Contender]) -> Contender:
-    """The one with the smallest free-run rmse over the data they are judged by.
+    """The one with the smallest free-run rmse over the data of the comparison.
 
-    Raises TwinError when none could be trained: the reason of the first is that of all.
+    Raises TwinError when none could be trained, with the reason of the first.
     """
     able = [contender for contender in contenders if contender.judged is not None]
     if not able:

@@ -29,7 +29,8 @@ MIN_ROWS = 20
 
 @dataclass(frozen=True)
 class ParameterShift:
-    """Change of one parameter from its healthy value, and its standard error from noise; the twin's errors are constant."""
+    """Change of one parameter from its healthy value. std_error: from noise alone, as the twin's errors are
+    constant."""
 
     parameter: str
     change: float

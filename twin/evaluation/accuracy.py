@@ -110,8 +110,8 @@ def one_step_residuals(model: TwinModel, parameters: Array, pieces: Sequence[Run
 def _starting_state(model: TwinModel, parameters: Array, piece: Run) -> Array:
     """The state whose free run is nearest, in least squares, to the first five measured speeds of each fan.
 
-    Their mean is the speed in their midst: a fan that gathers speed would start too fast, the more so the wider its
-    samples lie apart.
+    Their mean is the speed at their middle: an accelerating fan would start too fast, the more so the longer its
+    sample period.
     """
     measured = np.isfinite(piece.speed_rad_s)
     early = measured & (np.cumsum(measured, axis=0) <= STARTING_SAMPLES)
@@ -144,7 +144,7 @@ def _one_step_residual(model: TwinModel, parameters: Array, piece: Run) -> Array
     """
     layout, samples = model.state_layout, piece.samples
     measured = np.isfinite(piece.speed_rad_s)
-    # A missing speed cannot stand in a state; what is predicted from the zero in its place is taken out again.
+    # A state cannot contain a missing speed; predictions from the zero in its place are removed again.
     speed = np.where(measured, piece.speed_rad_s, 0.0)
     length = math.isqrt(samples)
     starts = np.arange(0, samples, length)
@@ -154,7 +154,7 @@ def _one_step_residual(model: TwinModel, parameters: Array, piece: Run) -> Array
         starting_states.append(state)
         block = slice(first, first + length)
         _, state = model.advance(state, piece.command[block], piece.step_s[block], parameters)
-        # A diverging free run must not carry its speeds on.
+        # A diverging free run must not pass its speeds on.
         state = np.where(np.isfinite(state), state, 0.0)
     states = np.stack(starting_states)
     predicted = np.full_like(speed, np.nan)

@@ -28,7 +28,7 @@ def resampled(run: Run, rate_hz: float) -> Run:
     """The run at a constant rate from its first sample on.
 
     New times within a hundredth of a median step of a sample take its speed; the others have none. Where the run's own
-    steps are uneven (more than a tenth are no multiple of the median), or fewer than a tenth of the new times meet a
+    steps are uneven (more than a tenth are not a multiple of the median), or fewer than a tenth of the new times meet a
     sample, the samples met would be few or a choice of their own: then speeds are interpolated between measured
     neighbours, at most two and a half median steps apart, and their noise is lower than recorded.
     Raises TwinError when the rate is not positive or beyond 100 times that of the run, or the run is shorter than one

@@ -38,17 +38,17 @@ QUANTILES = (0.95, 0.99, 0.999)
 
 @dataclass(frozen=True, eq=False)
 class ResidualAnalysis:
-    """One fan's free-run residual. NaN where nothing can be said: too few samples, a diverged run, a still command.
+    """One fan's free-run residual. NaN where undefined: too few samples, a diverged run, a constant command.
 
-    samples: the measured ones. period_s: of the grid. mean_rad_s: what the fan is above the model on average.
-    independent_samples: the number of independent samples whose mean is equally certain; at most samples.
-    autocorrelation_time_s: half the time from one independent sample to the next; T where it decays as exp(-t / T).
-    lags_s, autocorrelation: (lags,) from one step on, about the mean. bound_95: white noise stays within it at 95 % of
-    the lags. ljung_box_p: how probable so much autocorrelation over the first ljung_box_lags is in white noise.
-    cross_lags_s, cross_correlation: (2 lags + 1,) of residual(t) with command(t - lag). A positive lag is causal: the
-    residual follows the command, and is positive where the fan does more than the model. A negative one is feedback:
-    the command answers the residual. cross_bound_95: two signals that are each correlated in themselves as these are,
-    and unrelated, stay within it at 95 % of the lags.
+    samples: the measured ones. period_s: of the grid. mean_rad_s: mean of measured minus free run. independent_samples:
+    the number of independent samples whose mean is equally certain; at most samples. autocorrelation_time_s: half the
+    time from one independent sample to the next; T where it decays as exp(-t / T). lags_s, autocorrelation: (lags,)
+    from one step on, about the mean. bound_95: white noise stays within it at 95 % of the lags. ljung_box_p:
+    probability of so much autocorrelation over the first ljung_box_lags in white noise. cross_lags_s,
+    cross_correlation: (2 lags + 1,) of residual(t) with command(t - lag). A positive lag is causal: the residual
+    follows the command, and is positive where the fan responds more than the model. A negative one is feedback: the
+    command answers the residual. cross_bound_95: two signals that are each correlated in themselves as these are, and
+    unrelated, stay within it at 95 % of the lags.
     """
 
     samples: int
@@ -77,7 +77,8 @@ class ResidualAnalysis:
 
     @property
     def cross_over_bound(self) -> float:
-        """The largest causal cross-correlation in bounds, with its sign. Up to 2 is chance: lags are many."""
+        """The largest causal cross-correlation in bounds, with its sign. Values up to 2 occur by chance, because there
+        are many lags."""
         return float(self.cross_correlation[self._causal_peak()] / self.cross_bound_95)
 
     def _causal_peak(self) -> int:
@@ -128,7 +129,7 @@ def analyse_residual(
 def healthy_residual(
     residual_rad_s: Array, pieces: Sequence[Run], *, settling_s: float = SETTLING_S
 ) -> HealthyResidual:
-    """What a card says of the healthy residual. Arguments and errors as of analyse_residual."""
+    """The healthy residual for a card. Arguments and errors as of analyse_residual."""
     settled = _settled(residual_rad_s, pieces, settling_s)
     sigma_rad_s = healthy_sigma_rad_s(settled)
     analyses = analyse_residual(residual_rad_s, pieces, settling_s=settling_s)
@@ -150,7 +151,7 @@ def _quantiles(in_sigma: Array) -> Array:
 
 
 def _settled(residual: Array, pieces: Sequence[Run], settling_s: float) -> Array:
-    """The residual without what a free run owes to its start. A divergence is never left out."""
+    """The residual without the first part of each run, which depends on its start. A divergence is never left out."""
     samples = sum(piece.samples for piece in pieces)
     if len(residual) != samples or samples == 0:
         raise TwinError(f"a residual of {len(residual)} samples, runs of {samples}; give the runs that it was made of")
@@ -214,7 +215,7 @@ def _of_fan(residual: Array, command: Array, grid: _Grid) -> ResidualAnalysis:
 
 
 def _integrated(autocorrelation: Array, weight: Array) -> tuple[float, float]:
-    """How much correlation inflates the variance of the mean, and the autocorrelation time in steps.
+    """Factor by which correlation inflates the variance of the mean, and the autocorrelation time in steps.
 
     The sums end where two neighbouring lags together are no longer positive: what follows is noise (the initial
     positive sequence of Geyer, Statistical Science 7 (1992) 473). weight: share of pairs that each lag has. Lags that

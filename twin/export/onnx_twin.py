@@ -64,7 +64,7 @@ def _session(path: Path) -> Any:
     import onnxruntime  # noqa: PLC0415
 
     options = onnxruntime.SessionOptions()
-    # Threads gain nothing on fifty tiny nodes: handing over costs more than the work.
+    # Threads do not help with fifty tiny nodes: their overhead exceeds the work.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 3

@@ -28,7 +28,8 @@ def torque_balance(command: Array, speed_rad_s: Array, period_s: float, coeffici
     """(n, fans) balance in units of the command; NaN at first, and wherever the speed was not known.
 
     command, speed_rad_s: (n, fans) on a grid of period_s; an unknown speed is NaN, and the filter restarts after it.
-    coefficients: (fans, 4) in the order of COEFFICIENTS. lag_s: (fans,), in which the command has long been the first.
+    coefficients: (fans, 4) in the order of COEFFICIENTS. lag_s: (fans,); before the first sample the command is taken
+    as constant.
     """
     terms, _ = filtered_terms(command, speed_rad_s, period_s, lag_s)
     return balance_of(terms, coefficients)
@@ -42,7 +43,7 @@ def balance_of(terms: Array, coefficients: Array) -> Array:
 def filtered_terms(command: Array, speed_rad_s: Array, period_s: float, lag_s: Array) -> tuple[Array, Array]:
     """The balance is linear: (n, fans, 5) filtered command and what each coefficient multiplies; arguments as above.
 
-    Beside it (n, fans) how much of the filter rests on what was seen, from 0 at a start to 1.
+    Beside it (n, fans) weight of measured samples in the filter, from 0 at a start to 1.
     """
     acting, _ = effective_command(command, np.full((len(command), 1), period_s), lag_s, command[0])
     middle = (speed_rad_s[1:] + speed_rad_s[:-1]) / 2.0
@@ -54,7 +55,7 @@ def filtered_terms(command: Array, speed_rad_s: Array, period_s: float, lag_s: A
     forcing = (1.0 - decay) * np.where(known[..., np.newaxis], terms, 0.0)
     start = np.zeros((1, *forcing.shape[1:]))
     filtered = linear_recursion(np.where(known, decay, 0.0), np.concatenate((start, forcing)))
-    # What the filter makes of a constant one is the divisor that takes away its start from zero.
+    # The filtered constant 1 is the divisor that corrects for the start from zero.
     weight = filtered[..., -1]
     with np.errstate(invalid="ignore"):
         return filtered[..., :-1] / weight[..., np.newaxis], weight

@@ -151,7 +151,7 @@ def _choose(
     runs = _by_run(learned, fan)
     parts = 1 if len(runs) >= ENOUGH_RUNS else -(-GROUPS // len(runs))
     groups = [np.array_split(run, parts) for run in runs]
-    # The triangular factor, five rows, holds all that least squares needs of a group.
+    # The triangular factor, five rows, contains all that least squares needs from a group.
     triangles = [np.linalg.qr(group).R for of_run in groups for group in of_run]
     free = _least_squares(triangles)
     without = [_least_squares([other for other in triangles if other is not left_out]) for left_out in triangles]
@@ -170,7 +170,7 @@ def _choose(
 def _physics(groups: Sequence[Array], identification: Identification, fan: int) -> tuple[Array, Array]:
     """(4,) identified coefficients with the friction that is left, and the (4, 4) covariance of their errors.
 
-    What the identified ones are wrong by, the friction makes good on the mean.
+    The friction compensates the mean error of the identified coefficients.
     """
     own = np.append(identification.parameters[fan, :LAG], 0.0)
     samples = np.array([len(group) for group in groups])
@@ -184,7 +184,7 @@ def _physics(groups: Sequence[Array], identification: Identification, fan: int) 
 
 
 def _least_squares(triangles: Sequence[Array]) -> Array:
-    """(4,) coefficients that leave the least balance."""
+    """(4,) coefficients with the smallest sum of squares of the balance."""
     stacked = np.concatenate(triangles)
     scale = np.linalg.norm(stacked[:, 1:], axis=0) + np.finfo(float).tiny
     return lsq_linear(stacked[:, 1:] / scale, stacked[:, 0], (LOWER_BOUNDS, np.inf), method="bvls").x / scale

@@ -31,7 +31,7 @@ def choose_prior_std(
 
     GRID_PRIOR_STD where there is a single run, or where the runs are too few to leave some out.
     """
-    # A recording in which some fan was never measured judges nothing.
+    # A recording in which some fan was never measured cannot be evaluated.
     runs = [run for run in runs if np.all(np.isfinite(run.speed_rad_s).any(axis=0))]
     folds = min(FOLDS, len(runs))
     if folds < 2:
@@ -43,7 +43,7 @@ def choose_prior_std(
         try:
             identification = identify(rest)
         except TwinError:
-            # What is left does not excite every fan: nothing can be learned from this choice.
+            # The remaining runs do not excite every fan: this choice cannot be fitted.
             return GRID_PRIOR_STD
         for index, prior_std in enumerate(prior_stds):
             trained, parameters, _ = train_network(

@@ -1,6 +1,6 @@
 """Levenberg-Marquardt on the free-run error, with exact sensitivities.
 
-Minimises the sum of a pseudo-Huber loss of (measured - free run) / scale over every measured sample. Unknown are
+Minimises the sum of a pseudo-Huber loss of (measured - free run) / scale over every measured sample. The unknowns are
 
     the weights of a network, shared by all fans,
     each fan's own physics (twin.models.physical: ln J, two ln dampings, lag), and
@@ -88,7 +88,7 @@ class NetworkPrior:
         return 0.5 * self.weight * float(error @ error)
 
     def normal_equations(self, network: TanhNetwork) -> tuple[Array, Array]:
-        """Their share of the Hessian (P, P) and of the downhill direction (P,)."""
+        """Their share of the Hessian (P, P) and of the descent direction (P,)."""
         value, _, _, by_theta = network.linearise(self.speed_rad_s, self.command)
         return self.weight * by_theta.T @ by_theta, self.weight * by_theta.T @ (self.acceleration_rad_s2 - value)
 
@@ -133,8 +133,8 @@ def fit_free_run(
     """Fit the weights of the model, where it has any, starting from its own, and the free ones of the physics unknowns.
 
     physics: (fans, 4) to start from. top_speed_rad_s: (fans,). free: (4,) or (fans, 4).
-    estimate_initial_speed: otherwise the first measured speeds stand, as they do in service; an unstable equilibrium
-    cannot then hide behind an initial speed that happens to balance on it. It stops when a step lowers the cost by
+    estimate_initial_speed: otherwise the first measured speeds are used, as in operation; an unstable equilibrium
+    then cannot be hidden by an initial speed that happens to lie on it. It stops when a step lowers the cost by
     less than tolerance, relative, or when none lowers it.
     """
     problem = FreeRunProblem(model, trajectories, top_speed_rad_s, free, prior, estimate_initial_speed)
@@ -158,7 +158,7 @@ def _descend(
     tolerance: float,
     iteration_done: IterationDone | None,
 ) -> tuple[Point, int, bool]:
-    """To the next minimum, one scale throughout. Returns whether it was stopped, too."""
+    """Iterate to the next minimum with a constant scale. Also returns whether it was stopped."""
     groups = problem.groups
     damping = np.full(groups, FIRST_DAMPING)
     cost = problem.total(point)
@@ -288,7 +288,7 @@ class FreeRunProblem:
         """The damped Gauss-Newton step: initial speeds eliminated first, then each fan's physics, then the weights."""
         fan_of, unknowns = self.trajectories.fan, point.unknowns
         damping_of_fan = damping[self.group_of_fan]
-        # An initial speed that is not estimated is one of infinite curvature: it takes no share and does not move.
+        # An initial speed that is not estimated gets infinite curvature, so that it does not change.
         known = 1.0 if self.estimate_initial_speed else np.inf
         by_initial = known * squares[:, -1, -1] * (1.0 + damping_of_fan[fan_of])
         coupling = squares[:, :-1, -1] / by_initial[:, np.newaxis]
@@ -335,9 +335,9 @@ class FreeRunProblem:
     def _physics_pivot(
         self, unknowns: Unknowns, reduced: Array, downhill: Array, diagonal: Array, damping: Array
     ) -> Array:
-        """(fans, 4, 4) the damped curvature of the physics unknowns; a very large one for those that are held."""
+        """(fans, 4, 4) the damped curvature of the physics unknowns; a very large one for those that are fixed."""
         held = np.broadcast_to(~self.free, diagonal.shape).copy()
-        # A lag of zero that would fall further stays where it is.
+        # A lag of zero that would decrease further stays at zero.
         held[:, LAG] |= (unknowns.physics[:, LAG] <= 0.0) & (downhill[:, LAG] <= 0.0)
         largest = diagonal.max(axis=1, keepdims=True) + 1.0
         # An unknown without any effect still needs a pivot: the floor keeps the system solvable and the step zero.
@@ -384,7 +384,7 @@ def robust_scale(residual: Array, trajectories: Trajectories) -> Array:
         measured = trajectories.measured[:, columns]
         magnitude = np.abs(residual[:, columns][measured])
         span = float(np.ptp(trajectories.speed_rad_s[:, columns][measured]))
-        # A magnitude beyond the range says nothing more, and may be infinite.
+        # A magnitude beyond the range carries no information and may be infinite.
         robust_std = float(np.quantile(np.fmin(magnitude, span), 0.9)) / NORMAL_90_PERCENT
         scale[fan] = max(robust_std, 1e-6 * span, np.finfo(float).tiny)
     return scale

@@ -19,7 +19,7 @@ J, ALPHA, C_D, LAG_S = (PARAMETER_NAMES.index(name) for name in ("J", "alpha", "
 
 # The half width of a 95 % interval in standard errors, for words; the intervals themselves are identification's.
 REACH = 2.0
-# The inertia cannot be zero, so that its interval holds zero is no measure: this share of it is.
+# The inertia cannot be zero, so this share of it, and not an interval that contains zero, is the criterion.
 UNCERTAIN_INERTIA = 0.25
 # alpha and C_D of a fan run from standstill to top speed correlate by -0.96 to -0.98, from two thirds of it by -0.99.
 TRADE_OFF_CORRELATION = -0.99
@@ -38,14 +38,14 @@ SMALL_COMMAND_RANGE = 0.1
 SMALL_SPEED_RANGE_IN_NOISE = 5.0
 
 LAGS = 5
-"""samples of the past that a command may follow from"""
+"""past samples that a command may depend on"""
 FEWEST_MOVES = 50
 """moves of the command needed for a decision; a controller makes them within seconds"""
 FALSE_ALARM_PROBABILITY = 1e-3
 FEEDBACK_SHARE = 0.05
-"""of the command's movement; excitation from outside that is twenty times stronger makes feedback harmless"""
+"""share of the command's variation; feedback is harmless if the external excitation is twenty times stronger"""
 LARGEST_MOVE = 5.0
-"""in median ones; what is larger is a step of the set-point and counts as this"""
+"""in median changes; a larger change is a step of the set-point and is clipped to this"""
 
 MORE_OF = {
     ALPHA: "record longer, with steps at low speed, where friction outweighs drag",
@@ -54,7 +54,7 @@ MORE_OF = {
 
 
 def identifiability_warnings(runs: Sequence[Run], parameters: Array, covariance: Array) -> tuple[str, ...]:
-    """One warning for each thing that the runs do not determine about a fan; none where they determine everything.
+    """One warning for each property of a fan that the runs do not determine; none if they determine everything.
 
     parameters: (fans, 4) in the order of PARAMETER_NAMES. covariance: (fans, 4, 4), zero for a parameter that was held.
     """
@@ -84,7 +84,7 @@ def misfit_warnings(pieces: Sequence[Run], rmse_rad_s: Array) -> tuple[str, ...]
 
 
 def feedback_share(pieces: Sequence[Run], fan: int) -> float:
-    """How much of the command's movement follows from the past noise of the measured speed; 0 where none is seen.
+    """Share of the command's variation explained by the past noise of the measured speed; 0 if none is found.
 
     The test of Granger for feedback (Caines and Chan, IEEE Transactions on Automatic Control 20, 1975): what of the
     speed its own past and that of the command do not predict is noise; a command given from outside does not follow
@@ -210,7 +210,7 @@ def _drag(pieces: Sequence[Run], fan: int, parameters: Array, covariance: Array)
 
 
 def _on_edge(pieces: Sequence[Run], fan: int, parameters: Array) -> bool:
-    """Whether the fit has run into the edge of the stable models, no damping at rest or none at top speed.
+    """Whether the fit is at the edge of the stable models: no damping at rest or none at top speed.
 
     The covariance there is that of a parameter that can no longer move.
     """
@@ -255,7 +255,7 @@ def _past(signal: Array) -> Array:
 
 
 def _residual(regressors: Array, target: Array) -> tuple[Array, int]:
-    """What least squares leaves of target (n,), NaN where a value is missing, and the rank of regressors (n, P)."""
+    """The residual of target (n,), NaN where a value is missing, and the rank of regressors (n, P)."""
     whole = np.isfinite(target) & np.all(np.isfinite(regressors), axis=1)
     size = np.linalg.norm(regressors[whole], axis=0) + np.finfo(float).tiny
     coefficients, _, rank, _ = np.linalg.lstsq(regressors[whole] / size, target[whole], rcond=1e-10)

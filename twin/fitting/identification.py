@@ -43,7 +43,7 @@ LAMBDA_LADDER = 9
 STRETCH_TIME_CONSTANTS = 10.0
 MAX_ITERATIONS = 60
 BLOCKS = 40
-# A lag counts from this many standard errors on: one fan in a thousand without any is then said to have some.
+# A lag counts from this many standard errors on: one fan in a thousand without a lag then gets one.
 LAG_IN_STANDARD_ERRORS = 3.3
 # Data that excite a fan hold ten or more units of information about ln J per sample, a hundred times this anchor.
 ANCHOR_PER_SAMPLE = 0.1
@@ -278,7 +278,7 @@ def _physical_basis(speed_rad_s: Array, command: Array) -> Array:
 
 
 def _top_speed_rad_s(speed_rad_s: Array) -> float:
-    """A speed that the fan reaches; the largest one where it hardly ever turns."""
+    """A speed that the fan reaches; the largest one if it hardly ever turns."""
     magnitude = np.abs(speed_rad_s)
     return float(np.nanquantile(magnitude, TOP_SPEED_QUANTILE)) or float(np.nanmax(magnitude))
 
@@ -291,6 +291,6 @@ def _pooled(runs: Sequence[Run], fan: int) -> tuple[Array, Array]:
 
 
 def _positive(time_constant_s: Array, pieces: Sequence[Run]) -> Array:
-    """Time constants, replaced by the longest run where the model has none, and never longer than that."""
+    """Time constants, limited to the longest run, which also replaces undefined ones."""
     longest_s = max(piece.duration_s for piece in pieces)
     return np.where(time_constant_s > 0.0, np.minimum(time_constant_s, longest_s), longest_s)

@@ -26,7 +26,7 @@ SILENT_NETWORK = "the network is not used: free runs with it were no better than
 
 @dataclass(frozen=True, eq=False)
 class FitRequest:
-    """What a model is fitted to, and how. See build.train_twin; max_iterations None: the default of the fit."""
+    """Data and settings of a fit. See build.train_twin; max_iterations None: the default of the fit."""
 
     runs: Sequence[Run]
     validation_runs: Sequence[Run]

@@ -30,7 +30,7 @@ IterationDone = Callable[[float], None]
 class OutputErrorFit:
     """Fits theta to stretches: runs of one fan each, every one started from its first measured speeds.
 
-    prior_mean, prior_weight: (1151,) where the weights are held, and how firmly, relative to one another.
+    prior_mean, prior_weight: (1151,) the mean of the prior of each weight, and its relative strength.
     """
 
     def __init__(self, stretches: Sequence[Run], scaling: Scaling, prior_mean: Array, prior_weight: Array) -> None:
@@ -59,7 +59,7 @@ class OutputErrorFit:
                 try:
                     factor = cho_factor(squares + np.diag(damping * diagonal + precision), lower=True)
                 except (np.linalg.LinAlgError, ValueError):
-                    # Sensitivities beyond all numbers, or no longer definite: only a firmer step can be taken.
+                    # Sensitivities are not finite, or the matrix is not definite: only a more damped step is possible.
                     damping *= 4.0
                     continue
                 trial = theta + cho_solve(factor, downhill, check_finite=False)

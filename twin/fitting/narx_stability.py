@@ -21,7 +21,7 @@ FORGOTTEN, MARGIN = 0.1, 0.5
 
 
 def forgets_its_start(model: Narx, time_constant_samples: float) -> bool:
-    """Whether the two runs of each level end together, and all within half the range of training's speeds outside it.
+    """Whether both runs of each level end at the same speed, at most half the training range of speeds outside it.
 
     time_constant_samples: of the fan at speed, in samples.
     """

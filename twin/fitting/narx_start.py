@@ -15,7 +15,7 @@ from twin.models.narx import INPUTS, ORDER, UNITS, regressor_rows
 from twin.runs import Array
 
 TIME_CONSTANTS_SAMPLES = np.geomspace(0.5, 2000.0, 40)
-# Older samples say less about the next one; seven tenths a lag leaves the oldest of ten about three hundredths.
+# Older samples say less about the next one; a factor of 0.7 per lag leaves about 0.03 for the oldest of ten.
 LAG_DECAY = 0.7
 # Standard deviation of a unit's input when all its regressors have standard deviation one.
 UNIT_SLOPE = 0.2

@@ -36,7 +36,7 @@ from twin.runs import STARTING_SAMPLES, Array, Run
 
 MAX_SAMPLES, DRAWN_STRETCHES = 16_000, 16
 PRIOR_PRECISIONS = (1e5, 1e4, 1e3, 1e2, 1e1, 1e0)
-# A looser prior must lower the error by this share: what is less is chance, and a firm one is safer on new commands.
+# A weaker prior must lower the error by this share: less is chance, and a strong one is safer on new commands.
 NEEDED_GAIN = 0.002
 ITERATIONS_A_PRECISION = 20
 # Of all iterations; the rest are for the fit at the precision chosen.
@@ -128,7 +128,7 @@ def leave_out_blocks(pieces: Sequence[Run]) -> tuple[list[Run], list[Run]]:
 
 
 class _Fold:
-    """A fit to some speeds, judged by others."""
+    """A fit to some speeds, evaluated on others."""
 
     def __init__(
         self, fitted: Sequence[Run], judged: Sequence[Run], start: Array, scaling: Scaling, rng: np.random.Generator
@@ -138,7 +138,7 @@ class _Fold:
         self.theta = start
 
     def residual(self) -> Array:
-        """(m,) measured minus free run, in rad/s, of the judged speeds."""
+        """(m,) measured minus free run, in rad/s, of the evaluated speeds."""
         unused = np.ones((self.judged[0].fans, len(PARAMETER_NAMES)))
         return free_run_residuals(Narx(self.theta, self.fit.scaling), unused, self.judged).ravel()
 
@@ -159,9 +159,9 @@ class _Count:
 
 
 def _relax_prior(folds: Sequence[_Fold], count: _Count, max_iterations: int) -> list[tuple[float, Array]]:
-    """Precisions of the prior, from the firmest to the best one, each with the weights (1151,) of the first fold.
+    """Precisions of the prior, from the strongest to the best one, each with the weights (1151,) of the first fold.
 
-    Fits at one precision after the other, until one brings nothing better.
+    Fits at one precision after the other, until one gives no improvement.
     """
     better: list[tuple[float, Array]] = []
     best_rmse_rad_s = np.inf

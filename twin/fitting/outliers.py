@@ -36,13 +36,14 @@ def without_outliers(run: Run) -> tuple[Run, Array]:
 
 
 def _are_outliers(speed_rad_s: Array) -> NDArray[np.bool_]:
-    """(n,) which of the measured speeds in a row are."""
+    """(n,) which of successive measured speeds are outliers."""
     reach = NEIGHBOURS // 2
     windows = sliding_window_view(np.pad(speed_rad_s, reach, mode="reflect"), NEIGHBOURS)
     median = np.median(windows, axis=1)
     deviation = NORMAL_DEVIATION * np.median(np.abs(windows - median[:, np.newaxis]), axis=1)
     low, high = np.quantile(speed_rad_s, (0.05, 0.95))
-    # A quantised speed often does not deviate at all: a step of its own, and a small part of the range, are no outlier.
+    # A quantised speed often does not deviate at all: one quantisation step, or a small part of the range, is no
+    # outlier.
     values = np.unique(speed_rad_s)
     step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
     least = max(

@@ -82,8 +82,8 @@ def train_network(
 ) -> tuple[NetworkOde, Array, int]:
     """Train the model's network. Returns the trained model, the parameters (fans, 4) and the iterations taken.
 
-    max_iterations: of the start that goes on; those of all starts come before. physics: "refined" fits J, alpha, C_D
-    and the lag of each fan along with the network; "fixed" leaves them as they were identified, as published.
+    max_iterations: of the start that is continued; those of all starts come before. physics: "refined" fits J, alpha,
+    C_D and the lag of each fan along with the network; "fixed" leaves them as they were identified, as published.
     prior_std: how far the network's acceleration may be from the physics where there are no data, in units of its scale
     (twin.fitting.cross_validation chooses it). Zero: the weights stay zero.
     """

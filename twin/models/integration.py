@@ -25,9 +25,9 @@ Acceleration = Callable[[Array, Array], Array]
 NEWTON_ITERATIONS = 25
 NEWTON_TOLERANCE = 1e-9
 SHORTEST_WINDOW = 16
-"""samples up to which steps are as cheap as one solution for all"""
+"""samples up to which stepping is as cheap as one solution for all"""
 WIDE_BATCH = 64
-"""fans from which NumPy spends more on arithmetic than on calls, so that steps are the cheaper way"""
+"""number of fans from which arithmetic dominates NumPy's call overhead, so that stepping is cheaper"""
 MAX_WINDOW = 250_000
 """samples times batch that are solved for at once: it bounds the memory"""
 
@@ -45,7 +45,7 @@ class RightHandSide(Protocol):
 
 
 class Linearised(RightHandSide, Protocol):
-    """One that knows its derivatives by its unknowns, too."""
+    """A right-hand side with the derivatives by its unknowns."""
 
     def linearise(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array, Array, Array]:
         """The acceleration and its derivatives by speed and by command (..., batch), and by theta (..., batch, P)."""
@@ -68,7 +68,7 @@ def free_run(
     """Integrate from one initial speed under the commands alone.
 
     initial_speed_rad_s: (batch,). command: (n, batch). step_s: (n,) or (n, batch), from sample k to k + 1.
-    guess_rad_s: (n, batch) speeds near the solution, where they are known: it saves iterations, nothing else.
+    guess_rad_s: (n, batch) speeds near the solution, if known; it only saves iterations.
     Returns the speed at each sample (n, batch), before that sample's command acts, and the speed (batch,) after the
     last step. An unstable model gives non-finite speeds, not an exception.
     """
@@ -117,7 +117,7 @@ def _solve(
         if not np.all(np.isfinite(largest)):
             return None
         if np.all(largest <= NEWTON_TOLERANCE * (1.0 + np.abs(speed).max(axis=0))):
-            # Convergence is quadratic: what is left is the square of this.
+            # Convergence is quadratic: the remaining error is the square of this.
             return speed[:-1], speed[-1].copy()
     return None
 

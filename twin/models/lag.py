@@ -37,7 +37,7 @@ def effective_command_by_lag(command: Array, step_s: Array, lag_s: Array, lagged
 
 
 def _decay_and_mean_share(step_s: Array, lag_s: Array) -> tuple[Array, Array]:
-    """(n, batch) how much of a distance is left after each step, and its mean over the step."""
+    """(n, batch) share of a deviation that remains after each step, and its mean over the step."""
     step_s = np.broadcast_to(step_s, (len(step_s), len(lag_s)))
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = np.where(step_s > 0.0, step_s / lag_s, 0.0)

@@ -13,7 +13,7 @@ from twin.runs import Array
 
 
 class TwinModel(Protocol):
-    """State and commands in, speeds and state out. A model in memory and a file in onnxruntime both are one."""
+    """State and commands in, speeds and state out. Both a model in memory and a file in onnxruntime implement it."""
 
     @property
     def state_layout(self) -> StateLayout:
@@ -33,7 +33,7 @@ class TwinModel(Protocol):
 class Model(TwinModel, Protocol):
     """A model of some kind, with all that the card and the ONNX file need to know about it.
 
-    fixed_rate: whether it holds only at the sample rate it was trained at. used_parameters: the names of a fan's own
+    fixed_rate: whether it is valid only at the sample rate it was trained at. used_parameters: the names of a fan's own
     parameters (twin.models.physics) that it uses.
     """
 

@@ -100,7 +100,7 @@ class TanhNetwork:
         hidden = self.hidden(speed_rad_s, command)
         rate = self.scaling.acceleration_scale_rad_s2
         per_speed = output_weights * (input_weights[0] / self.scaling.speed_scale_rad_s)
-        # (1 - h^2) . p as sum(p) - h^2 . p: one pass over the largest array less.
+        # (1 - h^2) . p as sum(p) - h^2 . p saves one pass over the largest array.
         by_speed = per_speed.sum() - (hidden * hidden) @ per_speed
         return rate * (hidden @ output_weights + output_bias), rate * by_speed
 

@@ -71,7 +71,7 @@ def _lag(body: Nodes) -> tuple[str, str]:
     """lag.effective_command for one sample: the command that acts, and the lagged one after the step.
 
     Without a lag both are the command itself, to the last bit. 1 - exp(-x) loses digits where steps are much shorter
-    than the lag: of sixteen, as many as x = step / lag has zeros behind the point.
+    than the lag: of sixteen digits, one for each zero of x = step / lag after the decimal point.
     """
     # The exponential belongs in here: over a whole block its last bit would depend on a sample's place in it.
     decay = body.add("Exp", ["exponent_k"], "decay")

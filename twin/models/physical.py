@@ -66,7 +66,7 @@ def physical_parameters(unknowns: Array, top_speed_rad_s: Array) -> Array:
     A lag below zero counts as zero.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        # A trial step may go beyond all numbers; the fit then rejects it.
+        # A trial step may overflow; the fit then rejects it.
         inertia, at_rest, at_top = np.exp(unknowns.T[:LAG])
         drag = (at_top - at_rest) / (2.0 * top_speed_rad_s)
     # Adding zero makes a lag of -0.0 one of 0.0.

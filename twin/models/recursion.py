@@ -20,7 +20,7 @@ def linear_recursion(factor: Array, forcing: Array) -> Array:
     beyond all numbers gives infinities or NaN, not an exception, and NaN in the columns after it, too.
     """
     samples, batch = forcing.shape[:2]
-    # All columns one after the other are one system: the factor across their seams is zero.
+    # All columns together form one system: the factor between the last row of one and the first of the next is zero.
     bands = np.zeros((2, batch, samples))
     bands[0] = 1.0
     bands[1, :, :-1] = -factor.T

@@ -15,7 +15,7 @@ from twin.models.network import TanhNetwork
 from twin.runs import Array
 
 ODE_LAYOUT = StateLayout(speed=1, command=1)
-"""The one command is the lagged one (twin.models.lag): what is left of the commands before."""
+"""The one command is the lagged one (twin.models.lag)."""
 
 
 @dataclass(frozen=True, eq=False)

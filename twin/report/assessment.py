@@ -34,7 +34,7 @@ FEW_INDEPENDENT = 0.5 / (AS_DECLARED - 1.0) ** 2
 
 @dataclass(frozen=True)
 class Assessment:
-    """The whole report in one line, and its warnings, one line each."""
+    """The level, the headline and the warnings, one line each."""
 
     level: Level
     headline: str
@@ -87,7 +87,7 @@ def _about_the_data(content: Content) -> Iterable[str]:
         )  # fmt: skip
     if card.fixed_rate and abs(content.rate_hz / card.rate_hz - 1.0) > RATE_TOLERANCE:
         yield (
-            f"This twin holds at {card.rate_hz:.4g} Hz only and was run at {content.rate_hz:.4g} Hz: "
+            f"This twin is valid at {card.rate_hz:.4g} Hz only and was run at {content.rate_hz:.4g} Hz: "
             "these figures are meaningless."
         )
 
@@ -101,8 +101,8 @@ def _about_the_fit(content: Content) -> Iterable[str]:
     yield from _of_fans(content, _unmeasured, "no speed was measured")
     yield from _of_fans(content, _diverged, "the free run diverges")
     yield from _of_fans(
-        content, _wide_band, f"the card's sigma is over {WIDE_BAND:g} times the scatter of the errors: "
-        "the assessment is generous"
+        content, _wide_band, f"the card's sigma is over {WIDE_BAND:g} times the standard deviation of the errors: "
+        "the assessment is too favourable"
     )  # fmt: skip
     if few := [fan for fan in content.fans if _few(fan)]:
         fewest = min(_independent(fan) for fan in few)

@@ -18,7 +18,7 @@ from twin.runs import Array, Run
 
 @dataclass(frozen=True)
 class SpeedUnit:
-    """The unit in which people are shown speeds, and how much of a rad/s one of it is."""
+    """The unit in which speeds are displayed, and its size in rad/s."""
 
     name: str
     rad_s: float
@@ -66,7 +66,8 @@ class FanContent:
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """All that a page shows. recordings: the files judged, the name of one appearing in Timeline without its ending."""
+    """All that a page shows. recordings: the files evaluated, the name of one appearing in Timeline without its
+    ending."""
 
     twin: OnnxTwin
     pieces: tuple[Run, ...]

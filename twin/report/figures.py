@@ -40,7 +40,7 @@ AROUND_PEAK_SAMPLES = 300
 HISTOGRAM_SIGMAS = 5.0
 HISTOGRAM_BINS = 50
 LONG_DECIMALS = re.compile(r"(\.\d\d)\d+")
-"""Of coordinates: a hundredth of a point cannot be seen, and half of the page would be digits."""
+"""Decimals of coordinates: a hundredth of a point is invisible, and more digits would double the page."""
 LINE = {"lw": 0.5, "color": MEASURED, "solid_joinstyle": "round"}
 
 
@@ -67,7 +67,7 @@ def over_time(content: Content, fan: FanContent, *, narrow: bool) -> str:
 
 
 def around_the_largest_error(content: Content, fan: FanContent) -> str:
-    """The same close up, where the free run was furthest off."""
+    """The same, enlarged around the largest error."""
     line, each = content.timeline, content.unit.rad_s
     errors = np.where(np.isfinite(fan.error_rad_s), np.abs(fan.error_rad_s), -1.0)
     peak = int(np.argmax(errors))
@@ -153,7 +153,7 @@ def static_curve(content: Content, fan: FanContent, curve: StaticCurve) -> str:
 
 
 def error_over_speed(content: Content, fan: FanContent) -> str:
-    """Mean and standard deviation of the error over the twin's speed: where in its range the twin is off."""
+    """Mean and standard deviation of the error over the twin's speed: over the range of the twin."""
     each = content.unit.rad_s
     half = 2.0 * fan.sigma_rad_s / each
     with _small_figure() as (figure, axes):

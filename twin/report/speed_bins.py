@@ -23,7 +23,7 @@ class SpeedBin:
 def speed_bins(predicted_rad_s: Array, error_rad_s: Array) -> tuple[SpeedBin, ...]:
     """Bins of equal width over the speeds of the free run; those with too few samples are left out.
 
-    predicted_rad_s, error_rad_s: (n,), anything not finite counts nowhere.
+    predicted_rad_s, error_rad_s: (n,), values that are not finite are ignored.
     """
     seen = np.isfinite(predicted_rad_s) & np.isfinite(error_rad_s)
     speed, error = predicted_rad_s[seen], error_rad_s[seen]

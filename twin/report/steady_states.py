@@ -10,9 +10,9 @@ from twin.models.model import TwinModel
 from twin.runs import Array, Run
 
 SETTLED = 0.01
-"""A fan has settled when what is left of its step is less than this share of its top speed."""
+"""A fan has settled when the rest of its step is less than this share of its top speed."""
 FEWEST_TIME_CONSTANTS = 1.0
-"""In less, noise hides the step."""
+"""A smaller step is hidden by noise."""
 ENDS = 0.1
 """Share of a hold, at its beginning and its end, over which the speeds of the step are averaged."""
 SAME_COMMAND = 1e-3
@@ -24,7 +24,7 @@ MOST_STEPS = 20_000
 
 @dataclass(frozen=True)
 class Hold:
-    """A command that stayed, for lasted_s; needed_s is what the fan takes to settle.
+    """A held command, for lasted_s; needed_s is the time that the fan takes to settle.
 
     speed_rad_s: the mean from there on, NaN where the hold was too short or nothing was measured.
     """

@@ -12,7 +12,8 @@ from twin.runs import Array, Run
 Indices = NDArray[np.int64]
 
 WIDEST_GAP = 0.04
-"""A gap is drawn no wider than this share of the measured time: a night of silence must not hide the day."""
+"""A gap is drawn no wider than this share of the measured time, so that a night without samples does not hide the
+day."""
 BETWEEN_RECORDINGS = 0.01
 
 

@@ -329,7 +329,7 @@ def test_a_band_that_is_too_wide_and_figures_of_few_errors_are_reported(twin):
     content = content_of(twin, run)
     wide = replace(content, fans=(replace(content.fans[0], sigma_rad_s=2.0 * content.fans[0].sigma_rad_s),))
     (line,) = assess(wide).warnings
-    assert line.startswith("This fan: the card's sigma is over 1.5 times the scatter of the errors")
+    assert line.startswith("This fan: the card's sigma is over 1.5 times the standard deviation of the errors")
     assert assess(wide).level == "as declared"
     (line,) = assess(content_of(twin, run.between(0.0, 0.9))).warnings
     assert re.search(r"\d+ independent errors determine the rmse to 1\d% only", line)
