@@ -68,7 +68,7 @@ def test_a_recorder_says_when_its_folder_cannot_be_made(tmp_path, monkeypatch):
     assert recorder.STAGE.check(here) == []
     (tmp_path / "run").touch()
     (problem,) = recorder.STAGE.check(here)
-    assert "no folder this user may write in" in problem
+    assert "is not a folder that this user can write to" in problem
     (tmp_path / "run").unlink()
     monkeypatch.setattr(os, "access", lambda *_: False)
     (problem,) = recorder.STAGE.check(here)
