@@ -169,7 +169,7 @@ def test_the_textbook_limit_is_that_of_the_tables() -> None:
 
 
 @pytest.mark.parametrize("cut", [1, 64])
-def test_moving_means_go_on_from_block_to_block(cut: int) -> None:
+def test_moving_means_continue_from_block_to_block(cut: int) -> None:
     values = np.random.default_rng(2).normal(size=(200, 3))
     values[50, 1] = np.nan
     moving = Moving(10)

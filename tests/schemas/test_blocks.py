@@ -110,7 +110,7 @@ def test_messages_that_differ_in_more_than_their_samples_are_not_joined(one: Any
         join([one, other])
 
 
-def test_predictions_of_one_twin_are_joined_although_each_brings_its_own_sigma() -> None:
+def test_predictions_of_one_twin_are_joined_although_each_has_its_own_sigma() -> None:
     assert join([prediction(), prediction()]).sigma_rad_s.tolist() == [1.0]
 
 

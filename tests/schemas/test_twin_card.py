@@ -23,7 +23,7 @@ DEMO_TWIN = Path(pipeline.__file__).parent / "demo" / "twin.onnx"
 GOLDEN = Path(__file__).parents[1] / "support" / "data" / "golden.mcap"
 
 
-def test_a_card_survives_its_own_json() -> None:
+def test_a_card_survives_conversion_to_json_and_back() -> None:
     card = made_up_card(small_hybrid(), 3)
     assert TwinCard.from_json(card.to_json()) == card
 

@@ -268,7 +268,7 @@ def test_nothing_is_learned_while_the_score_is_high() -> None:
     assert abs(scored.speed_baseline[-1, 0]) < 0.1
 
 
-def test_a_fan_is_commissioned_again_and_the_others_are_left_alone() -> None:
+def test_one_fan_is_commissioned_again_without_affecting_the_others() -> None:
     scorer, other = FanScorer(FANS, LIMITS), FanScorer(FANS, LIMITS)
     samples = white(1500)
     samples.speed_residual[500:, 0] += 0.9

@@ -62,7 +62,7 @@ def survives(core: Core, session: list[Message], tray: str = "tray1") -> None:
 
 @NO_SLOW_CHECK
 @given(sessions(Raw))
-def test_the_resampler_takes_anything(session: list[Message]) -> None:
+def test_the_resampler_survives_any_message(session: list[Message]) -> None:
     survives(ResamplerCore(FANS, ResamplerConfig()), session)
 
 
@@ -74,7 +74,7 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> TwinFile:
 
 @NO_SLOW_CHECK
 @given(session=sessions(Grid))
-def test_the_twin_integrator_takes_anything(twin: TwinFile, session: list[Message]) -> None:
+def test_the_twin_integrator_survives_any_message(twin: TwinFile, session: list[Message]) -> None:
     config = TwinIntegratorConfig(start_samples=1, warm_up_s=0.0)
     survives(TwinIntegratorCore(twin, config, 0), session)
 
@@ -110,7 +110,7 @@ def all_valid_prediction(message: Message) -> Message:
 
 @NO_SLOW_CHECK
 @given(sessions(Prediction, Request), st.sampled_from([None, CALIBRATION, LOW_LIMITS]), st.booleans())
-def test_the_scorer_takes_anything(session: list[Message], calibration: Any, all_valid: bool) -> None:
+def test_the_scorer_survives_any_message(session: list[Message], calibration: Any, all_valid: bool) -> None:
     core = core_of(FANS, "rpm", calibration=calibration, off_delay_s=0.0)
     survives(core, [all_valid_prediction(message) for message in session] if all_valid else session)
 
@@ -133,7 +133,7 @@ def test_a_fan_of_any_speed_and_command_is_diagnosed(period_ns: int, values: lis
 
 @settings(max_examples=60, deadline=None)
 @given(any_message(ScorerSnapshot))
-def test_the_scorer_begins_with_any_memory(memory: ScorerSnapshot) -> None:
+def test_the_scorer_survives_any_snapshot(memory: ScorerSnapshot) -> None:
     core = core_of(FANS)
     for kept in (memory, replace(memory, twin_sha256="twin")):
         core.restore(kept)
@@ -142,5 +142,5 @@ def test_the_scorer_begins_with_any_memory(memory: ScorerSnapshot) -> None:
 
 @NO_SLOW_CHECK
 @given(sessions(Score, Alarm, ModelCard, Health), st.sampled_from(["tray1", "tray1", "elsewhere"]))
-def test_the_viewer_takes_anything(session: list[Message], tray: str) -> None:
+def test_the_viewer_survives_any_message(session: list[Message], tray: str) -> None:
     survives(ViewerCore([TrayConfig(name="tray1", fans=FANS)], FakeSink()), session, tray)

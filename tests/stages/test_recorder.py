@@ -98,7 +98,7 @@ class Part:
 
     def finish(self, *, has_ended: bool = False) -> None:
         self.flush()
-        self.closed = "at the end" if has_ended else "and goes on"
+        self.closed = "at the end" if has_ended else "before the next"
 
     def _refuse(self) -> NoReturn:
         self.closed = "early"
@@ -351,7 +351,7 @@ def test_the_part_after_a_pause_states_the_gap(caplog):
         core.tick(NOW_NS + SECOND_NS)
         disk.gone = ""
         core.tick(NOW_NS + 5 * SECOND_NS)
-    assert disk.parts[0].closed == "and goes on", "nobody holds on to a file of a disk that is gone"
+    assert disk.parts[0].closed == "before the next", "no file of a missing disk stays open"
     shown = disk.parts[1].about
     assert int(shown["resumed_t_ns"]) - int(shown["paused_t_ns"]) == 4 * SECOND_NS
     assert shown["paused_because"].startswith("/mnt: the disk is no longer mounted")
@@ -393,7 +393,7 @@ def test_after_a_crash_the_file_is_finished_and_does_not_say_that_the_recorder_e
     core = recorder(disk)
     record(core, range(3))
     core.abort()
-    assert (sequences(disk.parts[0]), disk.parts[0].closed) == ([0, 1, 2], "and goes on")
+    assert (sequences(disk.parts[0]), disk.parts[0].closed) == ([0, 1, 2], "before the next")
 
 
 def test_without_enough_free_space_it_pauses_and_finishes_the_part():
@@ -402,7 +402,7 @@ def test_without_enough_free_space_it_pauses_and_finishes_the_part():
     record(core, range(3))
     disk.free = 49_000_000
     core.tick(NOW_NS + SECOND_NS)
-    assert disk.parts[0].closed == "and goes on"
+    assert disk.parts[0].closed == "before the next"
     assert core.problem().startswith("NOTHING IS RECORDED: 49.0 MB are free on the disk, but 50.0 MB are required")
     assert core.counters() == {"recorded_raw": 3, "lost_unwritten": 0, "parts": 1, "pauses": 1}
     disk.free = 50_000_001
@@ -458,7 +458,7 @@ def test_a_new_part_begins_at_the_size_limit():
     assert len(disk.parts) > 3
     assert all(1_000_000 <= part.size < 1_400_000 for part in disk.parts[:-1])
     assert [number for part in disk.parts for number in sequences(part)] == list(range(30))
-    assert [part.closed for part in disk.parts] == ["and goes on"] * (len(disk.parts) - 1) + ["at the end"]
+    assert [part.closed for part in disk.parts] == ["before the next"] * (len(disk.parts) - 1) + ["at the end"]
 
 
 def test_a_new_part_begins_at_the_time_limit():

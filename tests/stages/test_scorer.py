@@ -171,7 +171,7 @@ def test_a_step_of_three_sigma_raises_within_a_second() -> None:
     assert all(500 < samples(alarm.onset_t_ns) < 600 for alarm in alarms)
 
 
-def test_without_a_calibration_neither_torque_balance_nor_tacho_raises_anything() -> None:
+def test_without_a_calibration_torque_balance_and_tacho_raise_no_alarm() -> None:
     core = commissioned(core_of())
     dead = prediction_of(np.zeros(2000), balance=1000.0, first=500)
     dead.invalid_reason[1000:] = InvalidReason.NO_SPEED
@@ -261,7 +261,7 @@ def test_a_tacho_that_gives_nothing_is_found_without_any_residual() -> None:
     assert alarms[0].statistic == Statistic.SENSOR
 
 
-def test_a_silent_line_is_no_tacho_that_gives_nothing() -> None:
+def test_a_silent_link_is_not_reported_as_missing_tacho_readings() -> None:
     _, alarms = feed(calibrated(), [prediction_of(np.zeros(4000), np.zeros(4000, np.bool_))])
     assert alarms == []
 

@@ -233,7 +233,7 @@ def test_at_a_terminal_it_steps_and_quits_and_gives_the_terminal_back(site, tmp_
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_at_once_in_order_and_gives_the_terminal_back(site, tmp_path, terminals, number):
+def test_a_signal_ends_the_replay_cleanly_and_restores_the_terminal(site, tmp_path, terminals, number):
     recording = write_raw(tmp_path / "source.mcap", 500)
     terminal = Terminal(site.words(recording, "--rate", 0.01))
     terminals.append(terminal)

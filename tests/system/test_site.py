@@ -135,7 +135,7 @@ def check_alarms(chain: Chain, onset_t_ns: int) -> None:
     assert names == {alarm.request for alarm in alarms if alarm.request}
 
 
-def test_operators_are_answered_and_whatever_is_killed_comes_back_and_nothing_is_forgotten(chain):
+def test_operators_are_answered_and_killed_stages_come_back_without_losing_state(chain):
     chain.start_tray("--fault", f"inlet:fan={FAULTY},start=8,stop=600,size=2.5")
     up = chain.start_up()
     up.line_with("ALARM")

@@ -140,7 +140,7 @@ def test_a_publisher_keeps_the_newest_messages_that_fit_its_memory(endpoint):
         assert len(list(asker.recover(KEY, "big", 0, 2**63, wait))) == TOPIC.history
 
 
-def test_a_recovery_request_that_nobody_answers_ends_empty(endpoint):
+def test_an_unanswered_recovery_request_returns_nothing(endpoint):
     with Bus(BusConfig(endpoint=endpoint)) as bus:
         assert list(bus.recover(KEY, "nobody", 0, 5, lambda: None)) == []
 

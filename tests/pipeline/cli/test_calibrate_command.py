@@ -56,7 +56,7 @@ def card(twin: Path) -> dict[str, Any]:
     return json.loads(load_tray_twin(twin).card_json)
 
 
-def test_the_limits_are_in_the_card_and_all_else_of_the_twin_is_as_it_was(folder: Path, calibrated: Path) -> None:
+def test_the_limits_are_in_the_card_and_the_rest_of_the_twin_is_unchanged(folder: Path, calibrated: Path) -> None:
     before, after = folder / "twin.onnx", calibrated
     assert load_tray_twin(before).card.calibration is None
     assert {**card(after), "calibration": None} == {**card(before), "calibration": card(before).get("calibration")}

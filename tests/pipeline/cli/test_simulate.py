@@ -161,7 +161,7 @@ def test_when_stopped_before_anybody_reads_the_truth_is_that_nothing_happened(tm
     assert truth["faults"][0]["start_ns"] is None
 
 
-def test_samples_nobody_reads_are_counted_and_a_later_reader_sees_the_gap(tmp_path: Path) -> None:
+def test_unread_samples_are_counted_and_a_later_reader_sees_the_gap(tmp_path: Path) -> None:
     with simulated(tmp_path, "--wait-for-reader", "--duration", "1.5") as process:
         first = Reader(tmp_path / "tray")
         first.read_until(10)
@@ -410,7 +410,7 @@ TABLE = """t ms,duty,rpm,rpm2
 """
 
 
-def test_a_measured_file_is_played_at_its_own_times_in_its_own_units(tmp_path: Path) -> None:
+def test_a_measured_file_is_played_with_its_recorded_times_and_units(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text(TABLE)
     columns = ("--time", "t ms:ms", "--command", "duty", "--speed", "rpm:rpm", "--speed", "rpm2:rpm")
     options = ("--from-csv", str(tmp_path / "run.csv"), *columns, "--to", "1", "--speed-unit", "rpm")

@@ -130,7 +130,7 @@ def test_rates_are_what_came_between_two_healths():
     assert StageView(HEALTH, None, alive=True).rate_in_hz == 0.0
 
 
-def test_a_session_that_follows_another_takes_its_place_and_the_losses_add_up(site):
+def test_a_later_session_replaces_the_earlier_one_and_their_losses_add_up(site):
     watcher = SiteWatcher(site.outside, SITE)
     view(site, watcher, HEALTH)
     follower = replace(HEALTH, header=Header("scorer-all-2", 0, ""), t_ns=HEALTH.t_ns + NS_PER_S, inputs=(), lost=2)

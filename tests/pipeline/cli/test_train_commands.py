@@ -83,7 +83,7 @@ def test_each_model_is_trained_and_its_file_evaluates_to_the_printed_figures(fol
     assert evaluated["samples"] == 4000
 
 
-def test_a_good_twin_is_as_good_as_the_noise_lets_it(folder, twin):
+def test_the_error_of_a_good_twin_is_the_noise(folder, twin):
     result = json.loads(fantwin("evaluate", twin, folder / "held-out.mcap", "--json").stdout)
     assert result["rmse"] == pytest.approx(np.sqrt(10), rel=0.05)
     assert result["r2"] > 0.98
@@ -183,7 +183,7 @@ def test_a_recording_is_not_overwritten_and_training_data_are_not_used_for_valid
     assert parts.exit_code == 0, parts.output
 
 
-def test_outliers_are_left_out_alike_wherever_a_twin_is_judged(tmp_path):
+def test_outliers_are_left_out_in_every_evaluation_of_a_twin(tmp_path):
     run = published_run(7)
     speed = run.speed_rad_s.copy()
     speed[50::97] = 0.0

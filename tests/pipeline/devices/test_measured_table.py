@@ -20,7 +20,7 @@ def table(
     return read_table(path, time, command, speed, period=period)
 
 
-def test_a_plain_table_is_read_as_it_is(tmp_path):
+def test_a_plain_table_is_read_unchanged(tmp_path):
     read = table(tmp_path, "t,u,y\n0,1,10\n0.01,2,20\n0.03,3,30\n")
     assert read.t_ns.tolist() == [0, 10_000_000, 30_000_000]
     assert read.command.tolist() == [[1.0], [2.0], [3.0]]

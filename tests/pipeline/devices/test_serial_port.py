@@ -222,7 +222,7 @@ def test_stop_ends_a_line_that_never_came_up(line: SerialPort) -> None:
     assert items.rest() == []
 
 
-def test_a_device_that_takes_no_bytes_makes_write_say_so_instead_of_blocking(device: Device, line: SerialPort) -> None:
+def test_write_reports_a_device_that_accepts_no_bytes_instead_of_blocking(device: Device, line: SerialPort) -> None:
     device.plug_in()
     items = Items()
     line.start(items.queue.put)

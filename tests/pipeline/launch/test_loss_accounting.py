@@ -57,7 +57,7 @@ def test_a_message_of_a_killed_producer_that_only_another_stage_received_is_lost
     assert losses([KILLED, FOLLOWER, resampler, recorder]) == {"acquisition/t": 0, "resampler": 0, "recorder": 2}
 
 
-def test_a_message_that_a_killed_producer_reported_and_nobody_received_is_lost():
+def test_a_message_that_a_killed_producer_reported_and_that_was_never_received_is_lost():
     recorder = health("w", "recorder", 11, inputs=(line("a1", 0, 88), line("a2", 0, 50)))
     assert losses([KILLED, FOLLOWER, recorder])["recorder"] == 2
 

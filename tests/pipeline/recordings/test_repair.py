@@ -187,7 +187,7 @@ def test_a_kill_at_any_moment_leaves_the_recording_under_one_of_its_names(tmp_pa
     assert all(len(list(read_recording(path))) == 41 for path in found)
 
 
-def test_an_intact_file_is_left_as_it_is_or_copied(tmp_path, whole):
+def test_an_intact_file_is_left_unchanged_or_copied(tmp_path, whole):
     path = tmp_path / "r.mcap"
     path.write_bytes(whole.read_bytes())
     inode = path.stat().st_ino

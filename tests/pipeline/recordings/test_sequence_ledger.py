@@ -90,7 +90,7 @@ def test_messages_that_will_not_be_recorded_are_missing_at_the_end_if_no_later_o
     assert {line: account.missing for line, account in last.counts.items()} == {(KEY, "a"): 2, (KEY, "b"): 1}
 
 
-def test_a_part_is_due_to_begin_where_the_one_before_ended_whatever_was_lost():
+def test_a_part_is_expected_to_begin_where_the_one_before_ended_despite_losses():
     ledger = counted([0, 1]).for_next_part()
     ledger.add_lost(KEY, "a", 5)
     assert before_from_metadata(ledger.before_as_metadata()) == {(KEY, "a"): 2}

@@ -42,7 +42,7 @@ def test_without_a_terminal_there_are_no_keys(monkeypatch, tmp_path):
             assert keys.pressed() == []
 
 
-def test_keys_are_read_without_return_and_the_terminal_is_as_before_even_after_an_error(monkeypatch):
+def test_keys_are_read_without_return_and_the_terminal_is_restored_even_after_an_error(monkeypatch):
     ours, theirs = pty.openpty()
     monkeypatch.setattr(os, "tcgetpgrp", lambda _descriptor: os.getpgrp())  # as if this test were in its foreground
     with os.fdopen(theirs, "r") as terminal:

@@ -88,7 +88,7 @@ ASKED = (Action.ACKNOWLEDGE, Action.SHELVE, Action.COMMISSION, Action.OUT_OF_SER
         max_size=8,
     ),
 )
-def test_whatever_was_killed_and_asked_for_and_when_the_same_is_decided(
+def test_a_replay_decides_the_same_after_any_kills_and_requests(
     tmp_path_factory, seed, block_size, calibrated, remembers, events
 ):
     site = Site(tmp_path_factory.mktemp("site"), seed, block_size, calibrated=calibrated, remembers=remembers)
@@ -164,7 +164,7 @@ def test_a_restarted_scorer_continues_from_its_snapshot_and_so_does_a_replay(tmp
     assert len(raised) == 1 and raised[0].t_ns == first.raised_ns, "one alarm, over the restart"
 
 
-def test_without_the_memory_it_began_with_a_session_cannot_be_made_the_same(tmp_path):
+def test_a_session_cannot_be_reproduced_without_the_snapshot_it_began_with(tmp_path):
     site = Site(tmp_path, 1, calibrated=True)
     site.run(210)
     site.kill("scorer")

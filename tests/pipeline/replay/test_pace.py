@@ -39,7 +39,7 @@ def test_while_paused_nothing_is_due_and_recorded_time_stands_still():
     assert pace.paused_s == pytest.approx(992.0)
 
 
-def test_another_rate_holds_from_where_it_was_asked_for():
+def test_another_rate_applies_from_the_position_of_the_request():
     pace = paced()
     pace.change(pace.position_ns(9.0, 200 * S), 9.0, rate=10.0)
     assert pace.position_ns(9.5, 200 * S) == 107 * S

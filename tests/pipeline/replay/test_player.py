@@ -152,7 +152,7 @@ def test_the_clock_waits_before_samples_that_are_still_to_come_however_late_thei
     assert max(t_ns for _, t_ns, _ in sent.clocks) == oldest[-1]
 
 
-def test_the_clock_goes_on_through_a_silence_of_the_line():
+def test_the_clock_continues_through_a_silence_of_the_link():
     silent = [*raws(10), (0, alarm(START_NS + 3 * 10**9, 0))]
     sent, _ = play(silent)
     assert [t_ns for at_s, t_ns, _ in sent.clocks if 1.0 < at_s < 2.0][-1] == pytest.approx(2e9, abs=6e7)
@@ -166,7 +166,7 @@ def test_the_published_time_never_runs_back():
     assert times == sorted(times)
 
 
-def test_a_pause_holds_everything_but_the_clock_and_health_and_is_no_recorded_time():
+def test_in_a_pause_only_clock_and_health_are_sent_and_recorded_time_stands_still():
     sent, player = play(raws(200), keys=[(0.5, Key.PAUSE), (60.5, Key.PAUSE)])
     during = [message for message in sent.messages if 0.56 < message[0] < 60.5]
     assert during == []
@@ -191,7 +191,7 @@ def test_a_step_is_one_message_of_the_first_topic_and_all_recorded_before_it():
     assert set(reported) == {3 * STEP_NS}
 
 
-def test_after_a_step_it_goes_on_from_there():
+def test_after_a_step_the_replay_continues_from_there():
     sent, _ = play(raws(100), paused=True, keys=[(10.0, Key.STEP), (20.0, Key.PAUSE)])
     assert [at_s for at_s, _, _ in sent.messages[:3]] == pytest.approx([10.0, 20.01, 20.02], abs=0.051)
 
@@ -203,14 +203,14 @@ def test_up_and_down_double_and_halve_the_rate():
 
 
 @pytest.mark.parametrize("paused", [False, True])
-def test_the_end_is_at_once_when_it_is_asked_for(paused):
+def test_a_requested_end_takes_effect_at_once(paused):
     with pytest.raises(Stopped):
         play(raws(1000), paused=paused, until_s=2.345)
     with pytest.raises(Stopped):
         play(raws(1000), paused=paused, keys=[(3.0, Key.QUIT)])
 
 
-def test_whoever_looks_sees_where_it_is_and_may_end_it_with_an_error():
+def test_progress_is_reported_and_an_error_of_its_callback_ends_the_replay():
     seen: list[Progress] = []
 
     def look(progress: Progress) -> None:

@@ -86,7 +86,7 @@ def test_a_time_range_starts_with_the_card_of_the_twin_then_in_force(tmp_path):
     assert second.message.header.sequence == 100
 
 
-def test_rounds_go_on_in_time_without_a_gap_and_on_the_grid(tmp_path):
+def test_times_continue_from_round_to_round_without_a_gap_and_on_the_grid(tmp_path):
     rounds = islice(RecordingPlayback([write_raw(tmp_path / "r.mcap", 200)], ("raw",), 0.5).rounds(), 450)
     numbers, entries = zip(*rounds, strict=True)
     assert [numbers.count(n) for n in range(3)] == [150, 150, 150]
@@ -96,7 +96,7 @@ def test_rounds_go_on_in_time_without_a_gap_and_on_the_grid(tmp_path):
     assert sequences(entries)[:150] == sequences(entries)[150:300]
 
 
-def test_a_recording_without_such_messages_ends_even_in_a_loop(tmp_path):
+def test_a_recording_without_messages_to_replay_ends_even_in_a_loop(tmp_path):
     assert list(RecordingPlayback([write_raw(tmp_path / "r.mcap", 10)], ("score",)).rounds()) == []
 
 
@@ -129,7 +129,7 @@ def test_all_times_of_a_message_are_shifted_and_nothing_else():
     assert (moved.device_clock_us == raw.device_clock_us).all()  # type: ignore[union-attr]
 
 
-def test_whatever_is_a_time_since_the_epoch_is_called_so():
+def test_columns_in_ns_are_times_since_the_epoch_and_named_t_ns():
     assert {name for kind in MESSAGE_TYPES for name in columns(kind) if name.endswith("_ns")} == {
         "host_receive_t_ns",
         "t_ns",

@@ -253,7 +253,7 @@ def test_a_producer_that_publishes_one_message_and_leaves_causes_no_loss(config)
     assert losses([health, last]) == {"resampler": 0}
 
 
-def test_each_tray_has_a_core_and_a_sequence_of_its_own(config):
+def test_each_tray_has_its_own_core_and_sequence(config):
     bench = Bench(toy(), config)
     bench.feed(TRAY_A, 1)
     bench.feed(TRAY_B, 2)
@@ -277,7 +277,7 @@ def test_health_accounts_for_inputs_outputs_counters_and_losses(config):
     assert {output.key: output.published for output in health.outputs}[tray_key("s", TRAY_A, "grid")] == 6
 
 
-def test_undecodable_bytes_are_counted_and_the_stage_goes_on(config):
+def test_undecodable_bytes_are_counted_and_the_stage_continues(config):
     bench = Bench(toy(), config)
     bench.publisher[TRAY_A]._publisher.put(b"\xff\xff\xff")
     bench.feed(TRAY_A, 1)
@@ -351,7 +351,7 @@ def test_a_stage_that_may_drop_discards_its_oldest_items_and_counts_them(config)
     assert last.lost == 4  # the counters of the two cores: what it may drop is no loss
 
 
-def test_a_stage_stops_while_its_producer_goes_on(config):
+def test_a_stage_stops_while_its_producer_continues(config):
     bench = Bench(toy(), config)
     enough = threading.Event()
 
@@ -416,7 +416,7 @@ class CrashesOnce(Passer):
         self.aborted = True
 
 
-def test_a_core_that_crashed_saves_and_publishes_nothing_and_its_successor_takes_the_message_again(config):
+def test_a_crashed_core_saves_and_publishes_nothing_and_its_successor_gets_the_message_again(config):
     CrashesOnce.saved.clear()
     cores: dict[str, CrashesOnce] = {}
 

@@ -85,7 +85,7 @@ def test_errors_in_an_older_card_have_no_correlations(tmp_path: Path) -> None:
     assert "std_errors must have four numbers" in _refusal(write_twin(tmp_path / "twin.onnx", balance=older))
 
 
-def test_a_calibration_is_kept_as_it_is(tmp_path: Path) -> None:
+def test_a_calibration_is_kept_unchanged(tmp_path: Path) -> None:
     assert TwinFile.load(write_twin(tmp_path / "never.onnx"), 1).card.calibration is None
     calibration = {"limits": [1.5, {"kind": "fast"}]}
     assert TwinFile.load(write_twin(tmp_path / "twin.onnx", calibration=calibration), 1).card.calibration == calibration

@@ -270,7 +270,7 @@ def test_suppressed_or_out_of_service_hides_no_transition_and_presents_nothing(a
     assert is_retained(conditions.alarm_state(0)) and not is_silenced(conditions.alarm_state(0))
 
 
-def test_commissioning_is_granted_and_leaves_the_alarm_as_it_is():
+def test_commissioning_is_granted_and_does_not_change_the_alarm():
     conditions = at_once()
     take(conditions, [UP])
     before = conditions.alarm_state(0)
@@ -337,7 +337,7 @@ def test_the_blocks_make_no_difference(history, chosen, cuts):
 
 @given(HISTORIES, SETTINGS, CUTS)
 @settings(max_examples=150, deadline=None)
-def test_going_on_from_a_snapshot_is_as_if_nothing_had_been(history, chosen, cuts):
+def test_continuing_from_a_snapshot_changes_nothing(history, chosen, cuts):
     whole = played(TrayConditions(2, chosen), history, cuts)
     assert played(TrayConditions(2, chosen), history, cuts, restart=chosen) == whole
 

@@ -95,7 +95,7 @@ def of_sensor() -> Update:
 @given(
     seed=st.integers(0, 10_000), cuts=st.lists(st.integers(1, 119), max_size=8), share=st.sampled_from([0.0, 0.1, 0.9])
 )
-def test_neither_cuts_nor_invalid_samples_change_a_bit(
+def test_cuts_and_invalid_samples_change_no_bit(
     make: Callable[[], Update], seed: int, cuts: list[int], share: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -228,7 +228,7 @@ def test_missing_readings_are_judged_by_their_share(share: float, alarms: bool) 
     assert sensor.observed()["missing_share"] == pytest.approx(0.25 * made.max(), rel=0.05)
 
 
-def test_a_speed_that_is_no_number_is_no_reading_that_repeats_itself() -> None:
+def test_speeds_that_are_not_finite_do_not_count_as_repeated_readings() -> None:
     speed = np.full((500, 2), np.inf)
     speed[:, 1] = np.nan
     sensor = sensor_of(2, 0.1)

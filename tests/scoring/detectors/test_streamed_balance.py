@@ -121,7 +121,7 @@ def test_after_a_reset_nothing_of_before_is_left() -> None:
     np.testing.assert_array_equal(after, streamed(command[100:], speed[100:], known[100:]))
 
 
-def test_another_step_is_taken_as_it_is() -> None:
+def test_after_a_reset_the_balance_uses_another_step() -> None:
     command, speed, known = wandering(400)
     balance = TorqueBalance(balance_model())
     balance.update(STEP_S, command, speed, known)

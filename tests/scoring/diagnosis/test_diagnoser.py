@@ -72,7 +72,7 @@ def test_blocks_of_any_size_are_diagnosed_the_same(keep) -> None:
     assert all(each == found[0] for each in found)
 
 
-def test_only_the_last_seconds_are_looked_at_whatever_came_before() -> None:
+def test_only_the_last_seconds_affect_a_diagnosis() -> None:
     whole, late = fed(11_000, 10, from_s=109.0), fed(11_000, 10, from_s=109.0, keep=slice(1400, None))
     at = int(times(11_000)[-1])
     for diagnoser in (whole, late):

@@ -103,7 +103,7 @@ def test_the_evidence_of_cannot_tell_fits_its_probability() -> None:
             assert cannot_tell.sentence.startswith("cannot tell yet: ") and found.first is cannot_tell
 
 
-def test_95_percent_intervals_hold_the_change_about_so_often() -> None:
+def test_95_percent_intervals_hold_the_change_in_about_95_percent_of_cases() -> None:
     inside = []
     for seed in range(60):
         command = data.moving_command(seed)
@@ -114,7 +114,7 @@ def test_95_percent_intervals_hold_the_change_about_so_often() -> None:
 
 
 @pytest.mark.parametrize("cause", ["drag_up", "gain_down", "external_torque"])
-def test_at_a_constant_speed_faults_that_look_alike_share_the_probability(cause) -> None:
+def test_at_a_constant_speed_similar_faults_share_the_probability(cause) -> None:
     """A controller holds the speed: only the command rises, by the amount that the fault needs."""
     speed = np.full(1600, 500.0)
     needed = data.HEALTHY.viscous * speed + data.HEALTHY.drag * speed**2 + data.HEALTHY.friction
@@ -212,7 +212,7 @@ def test_a_poorly_determined_twin_names_no_cause() -> None:
     )
 
 
-def test_errors_that_make_good_for_one_another_are_small_where_the_fan_was_seen() -> None:
+def test_errors_that_compensate_each_other_are_small_at_the_observed_speeds() -> None:
     # Seen at one speed: the friction makes good what the viscous part is wrong by, and only at that speed.
     command = data.still_command(8)
     held = data.window(command, data.measured(data.speeds(command), 8))
@@ -270,7 +270,7 @@ def test_an_offset_present_at_commissioning_is_no_fault() -> None:
     assert diagnose(replace(whole, fan_offset=0.03), data.HEALTHY).first.cause == "cannot_tell"
 
 
-def test_a_stuck_sensor_is_reported_whatever_the_loop_does() -> None:
+def test_a_stuck_sensor_is_diagnosed_under_a_moving_command() -> None:
     for seed in range(5):
         command = data.moving_command(seed)
         readings = data.measured(data.speeds(command), seed)
@@ -280,7 +280,7 @@ def test_a_stuck_sensor_is_reported_whatever_the_loop_does() -> None:
         assert "readings are all the same" in found.first.sentence
 
 
-def test_a_rotor_that_stands_is_not_a_stuck_sensor() -> None:
+def test_a_rotor_at_standstill_is_not_a_stuck_sensor() -> None:
     command = data.moving_command(8)
     blocked = np.maximum(data.speeds(command, torque=data.from_onset(command, 1.2)), 0.0)
     readings = np.where(blocked > 0.0, data.measured(blocked, 8), 0.0)

@@ -111,7 +111,7 @@ def test_points_that_are_no_numbers_or_come_again_are_left_out() -> None:
     assert points.snapshot()["value"].tolist() == [1.0]
 
 
-def test_a_restored_series_goes_on_as_if_nothing_had_happened() -> None:
+def test_a_restored_series_continues_without_a_difference() -> None:
     straight, before = WearSeries(), WearSeries()
     for k in range(900):
         value = 0.001 * k + np.sin(k)

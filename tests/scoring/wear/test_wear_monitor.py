@@ -192,7 +192,7 @@ def test_a_restart_forgets_nothing_of_it(after_eight_days) -> None:
     assert worn(WORN, "friction", successor)["series"]["t_ns"][-1] > worn(WORN, "friction", core)["series"]["t_ns"][-1]
 
 
-def test_a_memory_from_before_wear_was_watched_is_taken() -> None:
+def test_a_snapshot_from_before_wear_was_monitored_is_restored() -> None:
     before = core()
     list(live_through(before, 0.2))
     memory = snapshot_of(before)
@@ -204,7 +204,7 @@ def test_a_memory_from_before_wear_was_watched_is_taken() -> None:
     assert wear_of(snapshot_of(successor)) == wear_of(snapshot_of(core_after_one_sample()))
 
 
-def test_a_memory_from_before_disturbances_were_kept_is_taken(after_eight_days) -> None:
+def test_a_snapshot_from_before_disturbances_were_stored_is_restored(after_eight_days) -> None:
     memory = snapshot_of(after_eight_days[0])
     state = json.loads(memory.state_json)
     del state["wear"]["disturbed_t_ns"]
@@ -280,7 +280,7 @@ def with_a_fault(first_s: int = 7) -> Prediction:
     return replace(block, command=block.command + more, torque_balance_command=block.torque_balance_command + more)
 
 
-def test_no_point_looks_back_on_a_fault_that_has_cleared() -> None:
+def test_no_wear_point_uses_samples_of_a_fault_that_has_cleared() -> None:
     one = core()
     _, alarms = feed(one, [with_a_fault()])
     cleared_s = [(alarm.t_ns - EPOCH_NS) / 1e9 for alarm in alarms if alarm.transition == Transition.CLEARED]
@@ -313,7 +313,7 @@ def test_no_wear_point_uses_samples_from_before_a_fan_was_commissioned_again() -
     assert (first_point_s(HEALTHY, one), first_point_s(WORN, one)) == (10.0, 50.0)
 
 
-def test_a_fan_that_stands_reports_nothing() -> None:
+def test_a_fan_at_standstill_reports_nothing() -> None:
     one = core()
     for hour in range(6):
         one.step(burst(hour, speed=10.0))

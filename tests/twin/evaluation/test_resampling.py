@@ -56,7 +56,7 @@ def test_speeds_are_the_measured_ones_wherever_the_grids_meet() -> None:
     np.testing.assert_allclose(same.command, run.command, rtol=1e-9)
 
 
-def test_irregular_steps_are_one_to_three_of_the_runs_own_and_the_same_for_the_same_seed() -> None:
+def test_irregular_steps_are_one_to_three_steps_of_the_run_and_depend_on_the_seed_only() -> None:
     run = fan_data.published_run(4, 10.0)
     thin = irregular(run, seed=1)
     steps = np.rint(np.diff(thin.t_s) * fan_data.RATE_HZ)

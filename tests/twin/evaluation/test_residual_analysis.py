@@ -77,7 +77,7 @@ def test_the_whiteness_test_rejects_as_much_white_noise_as_it_says(missing: floa
     assert np.mean(np.array(p) < 0.5) == pytest.approx(0.5, abs=0.075)
 
 
-def test_little_autocorrelation_is_found_and_no_more_than_that() -> None:
+def test_weak_autocorrelation_is_found_and_white_noise_is_white() -> None:
     rng = np.random.default_rng(3)
     drawn = white(rng)
     residual = drawn + 0.1 * np.roll(drawn, 1)

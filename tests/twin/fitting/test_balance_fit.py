@@ -175,7 +175,7 @@ def test_runs_too_short_are_refused_in_one_line(published) -> None:
 
 
 @pytest.mark.data
-def test_on_rosa_healthy_runs_lie_still_and_faults_stand_out(measured_data, tmp_path) -> None:
+def test_on_rosa_the_balance_is_small_in_healthy_runs_and_large_in_faults(measured_data, tmp_path) -> None:
     """A rotor with dry friction under a speed loop: the coefficients from the physics are absurd."""
 
     def imported(name: str) -> Path:

@@ -39,7 +39,7 @@ def test_it_is_the_recursion_sample_by_sample() -> None:
     assert np.isnan(balance[0]).all()
 
 
-def test_a_steady_fan_that_takes_more_shows_it_from_its_first_step_on() -> None:
+def test_the_balance_of_a_steady_fan_with_extra_command_is_right_from_its_first_step() -> None:
     speed = np.tile([100.0, -80.0], (50, 1))
     command = np.tile([needed_at(100.0, 0) + 1.5, needed_at(-80.0, 1) - 0.5], (50, 1))
     balance = torque_balance(command, speed, STEP_S, COEFFICIENTS, LAG_S)
@@ -58,7 +58,7 @@ def test_a_torque_that_sets_in_shows_as_the_filter_lets_it() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [50.0, 100.0, 400.0])
-def test_tacho_noise_comes_out_as_inertia_times_lambda_times_noise_whatever_the_rate(rate_hz: float) -> None:
+def test_tacho_noise_gives_inertia_times_lambda_times_noise_at_every_rate(rate_hz: float) -> None:
     noise_rad_s = 3.0
     speed = 100.0 + np.random.default_rng(2).normal(0.0, noise_rad_s, (round(60 * rate_hz), 2))
     balance = torque_balance(np.zeros_like(speed), speed, 1.0 / rate_hz, COEFFICIENTS, LAG_S)

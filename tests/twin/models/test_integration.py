@@ -28,7 +28,7 @@ def test_halving_the_step_divides_the_error_by_sixteen() -> None:
     np.testing.assert_allclose(orders, 4.0, atol=0.25)
 
 
-def test_each_speed_is_the_one_before_its_own_command_acts() -> None:
+def test_each_speed_is_the_one_before_the_command_of_its_sample_acts() -> None:
     command = np.array([[0.0], [100.0], [100.0]])
     speed, final = free_run(right_hand_side(PARAMETERS), np.zeros(1), command, np.full(3, 0.01))
     assert speed[0, 0] == 0.0

@@ -29,7 +29,7 @@ def test_each_step_acts_with_the_mean_of_the_lagged_command() -> None:
         assert after[fan] == pytest.approx(lagged, rel=1e-7)
 
 
-def test_without_lag_the_command_acts_as_it_is() -> None:
+def test_without_lag_the_command_acts_unchanged() -> None:
     acting, after = effective_command(COMMAND, STEP_S, np.zeros(2), BEFORE)
     np.testing.assert_array_equal(acting, COMMAND)
     np.testing.assert_array_equal(after, COMMAND[-1])
