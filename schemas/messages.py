@@ -7,7 +7,7 @@ and types from the declarations below, so that a new field needs an entry here a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, get_args
 
 import numpy as np
 
@@ -377,9 +377,7 @@ class Health:
 Message: TypeAlias = (
     Raw | Grid | Prediction | Score | Alarm | Request | ScorerSnapshot | Command | ModelCard | Clock | Health
 )
-MESSAGE_TYPES: tuple[type[Message], ...] = (
-    Raw, Grid, Prediction, Score, Alarm, Request, ScorerSnapshot, Command, ModelCard, Clock, Health,
-)  # fmt: skip
+MESSAGE_TYPES: tuple[type[Message], ...] = get_args(Message)
 
 
 def newest_t_ns(message: Message) -> int:
