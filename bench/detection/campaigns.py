@@ -21,7 +21,7 @@ KEPT_ROWS = 8
 
 @dataclass(frozen=True)
 class Healthy:
-    """The alarms and scored time of a method in healthy running."""
+    """The alarms and scored time of a method on healthy data."""
 
     alarms: list[RaisedAlarm]
     fan_hours: float

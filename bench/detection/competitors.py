@@ -25,7 +25,7 @@ BASELINE_S = 1.0
 
 
 class Band:
-    """The published rule: how far the speed is from the prediction, in sigma."""
+    """The published rule: distance of the speed from the prediction, in sigma."""
 
     def take(self, block: Prediction) -> Array:
         """See methods.Scores."""

@@ -61,7 +61,7 @@ def cells() -> list[Cell]:
 
 
 def campaign(fleet: Fleet, runs: int, commissioned_s: float, seed: int) -> Campaign:
-    """Every cell about equally often, on fans by chance."""
+    """Every cell about equally often, on random fans."""
     rng = np.random.default_rng(seed)
     columns = fleet.count * runs
     every = cells()

@@ -69,7 +69,7 @@ class Knobs:
         return self._to + self._slope * np.minimum(t_s - self._reached_s, 0.0)
 
     def _turn(self, which: Array, t_s: float) -> None:
-        """Some begin to turn now: to another level, which is then held."""
+        """Some knobs begin to turn now, to another level that is then held."""
         at, count = self._to[which], int(which.sum())
         turn_s = self._rng.uniform(*self._turn_s[:, which], size=count)
         self._to = self._to.copy()

@@ -1,4 +1,5 @@
-"""Detectors of well-kept libraries, on what an engineer would hand them: how the residuals have been this second.
+"""Detectors of established libraries, on typical features: mean and standard deviation of the residuals over one
+second.
 
 Every 0.16 s, mean and standard deviation over the last second of both residuals: four features. A model of PyOD is
 fitted to healthy fans of all trays together; the half-space trees of river learn on and on, for each fan alone, as is

@@ -1,4 +1,4 @@
-"""Measured data with labelled faults, the rosa rig (docs/how-to/datasets.md), as a newcomer would evaluate them.
+"""Measured data with labelled faults, the rosa rig (docs/how-to/datasets.md), evaluated as by a first-time user.
 
 `fantwin import`, `train`, `calibrate` and `replay --offline --json`, nothing else, and healthy runs alone decide on
 twins and limits. Healthy runs are held out in turn: of the others every second one by speed trains, the rest sets the

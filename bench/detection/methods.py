@@ -162,5 +162,5 @@ class Log:
 
     @property
     def alarms(self) -> list[RaisedAlarm]:
-        """All of them; those that stand are not cleared."""
+        """All alarms; active ones have no time of clearing."""
         return [*self._closed, *self._open.values()]

@@ -1,4 +1,4 @@
-"""The scorer itself as a detector, and its calibration on simulated running that is too long for a recording.
+"""The scorer itself as a detector, and its calibration on simulated data that are too long for a recording.
 
 `fantwin calibrate` does the same with recordings. Here the healthy samples of all trays lie in plain files of a
 temporary folder, in single precision, and one set of limits is found for the whole fleet.
@@ -68,7 +68,7 @@ class HealthySamples:
                 column.astype(np.float32 if name in COLUMNS else np.bool_).tofile(file)
 
     def __call__(self) -> Iterator[HealthyRun]:
-        """All runs from the beginning, as scoring.calibration.calibration wants them."""
+        """All runs from the beginning, as scoring.calibration.calibration expects them."""
         for run, fans in self._fans.items():
             yield HealthyRun(run, fans, self._blocks(run, fans), fans_of(tray_number(run)))
 
@@ -126,5 +126,5 @@ def calibrated_twins(
 
 
 def fans_of(tray: int) -> range:
-    """Which of the fleet's fans a tray has."""
+    """The fans of the fleet that a tray has."""
     return range(TRAY_FANS * tray, TRAY_FANS * (tray + 1))

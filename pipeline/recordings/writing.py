@@ -214,7 +214,7 @@ class RecordingWriter:
         try:
             self._file.write(record)
         except OSError as error:
-            self._sync()  # the chunks before it are saved all the same
+            self._sync()  # the chunks before it are still saved
             raise self._end_early(error) from error
         counts = {channel: len(flat) // 2 for channel, flat in self._chunk.entries.items()}
         self._unsynced.append(_WrittenChunk(index, counts, self._filling))

@@ -226,7 +226,7 @@ def _inflation(residual: Array) -> float:
     batches = batches - batches.mean()
     power = float(batches @ batches)
     found = float(batches[:-1] @ batches[1:]) / power if power > 0.0 else 0.0
-    # Fitting a line lowers the measured correlation by about two stretches' worth.
+    # Fitting a line lowers the measured correlation by about that of two stretches.
     rho = np.clip(found + 2.0 * (1.0 + 3.0 * max(found, 0.0)) / n, 0.0, 1.0 - 1.0 / n)
     within = size * (power / (n - 2.0)) / float(bounded.var()) if power > 0.0 else 1.0
     return float(max(within, 1.0) * (1.0 + rho) / (1.0 - rho))

@@ -270,7 +270,7 @@ def _name(alarm: Alarm) -> str:
 
 
 def _probable(causes: Iterable[Diagnosis]) -> str:
-    """The causes with a probability worth listing, the most probable first."""
+    """The causes with a probability that is listed, the most probable first."""
     return ", ".join(
         f"{each.cause} {100 * each.probability:.0f} %" for each in causes if each.probability >= _MIN_PROBABILITY
     )
