@@ -89,7 +89,7 @@ def publish(
         outcome.listeners = listeners.readers(topics)
         if not outcome.listeners:
             where = f"site {config.site!r} at {config.bus.endpoint}"
-            report(f"no stage on {where} reads {', '.join(topics)}; publishing nevertheless")
+            report(f"no stage on {where} reads {', '.join(topics)}; publishing anyway")
         sender = Sender(bus, config.site, trays)
         player = Player(sender, pace, RealTime(stop), keys=keys, look=look)
         outcome.stopped = True
