@@ -136,6 +136,8 @@ class RecordingMetadata:
 
     metadata: Mapping[str, str]
     attachments: Mapping[str, bytes]
+    is_damaged: bool = False
+    """something before the first message cannot be read: what is not here may have been there"""
 
     def speed_unit(self, tray: str) -> str:
         """The unit in which people see a tray's speeds: the tray's, the recording's, or rad/s."""
@@ -150,11 +152,14 @@ def read_metadata(path: Path) -> RecordingMetadata:
     """
     metadata: dict[str, str] = {}
     attachments: dict[str, bytes] = {}
-    for record in RecordReader(path):
+    is_damaged = False
+    reader = RecordReader(path)
+    for record in reader:
         if isinstance(record.parsed, Metadata) and record.parsed.name == METADATA_NAME:
             metadata.update(record.parsed.metadata)
         elif isinstance(record.parsed, Attachment):
             attachments[record.parsed.name] = record.parsed.data
         elif record.opcode == Opcode.CHUNK:
             break
-    return RecordingMetadata(metadata, attachments)
+        is_damaged |= record.parsed is None and record.opcode in (Opcode.METADATA, Opcode.ATTACHMENT)
+    return RecordingMetadata(metadata, attachments, is_damaged or bool(reader.damaged_ranges))

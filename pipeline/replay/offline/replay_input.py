@@ -139,6 +139,8 @@ def open_replay_input(
             base = load_config(config, overrides, stages.names)
         elif attached is not None:
             base = attached_config(ordered[0], metadata, stages.names, overrides) or attached
+        elif metadata.is_damaged:
+            raise RecordingError(f"{ordered[0]}: its configuration is missing, and may be damaged: name one with -c")
         else:
             any_twin = twin or next(iter(recorded.values()), None)
             if any_twin is None:

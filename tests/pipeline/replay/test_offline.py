@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.records import Attachment
 
+from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from pipeline.recordings.records import RecordReader
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.offline.alarm_episodes import episodes
 from pipeline.replay.offline.judging import JudgedTray, judge
@@ -463,6 +466,25 @@ def test_the_output_is_a_recording_that_is_decided_the_same(tmp_path):
 
 
 DATA = Path(__file__).parents[2] / "support" / "data"
+
+
+@pytest.mark.parametrize("damaged", ["content", "length"])
+def test_a_damaged_configuration_is_not_silently_replaced_by_defaults(tmp_path, damaged):
+    (configuration,) = (
+        record
+        for record in RecordReader(DATA / "golden.mcap")
+        if isinstance(record.parsed, Attachment) and record.parsed.name == CONFIGURATION
+    )
+    content = bytearray((DATA / "golden.mcap").read_bytes())
+    content[configuration.offset + 8 if damaged == "length" else configuration.end - 50] ^= 0x40
+    path = tmp_path / "r.mcap"
+    path.write_bytes(content)
+    twin = write_twin(tmp_path / "twin.onnx", fans=2)
+    with (
+        pytest.raises(RecordingError, match="its configuration is missing, and may be damaged: name one with -c"),
+        open_replay_input([path], None, (), twin),
+    ):
+        pass
 
 
 def test_the_golden_recording_is_decided_as_it_was():
