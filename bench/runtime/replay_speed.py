@@ -22,8 +22,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from pipeline.config.loading import load_config
 from pipeline.recordings.reading import read_recording
-from pipeline.replay.offline.judging import judge
 from pipeline.replay.offline.replay_input import open_replay_input
+from pipeline.replay.offline.rescoring import rescore
 from schemas.blocks import cut
 from schemas.messages import Raw
 from tests.support.killed_site import Stages
@@ -34,7 +34,7 @@ def main(
     minutes: Annotated[float, typer.Option(help="Length of the recording.")] = 10.0,
     json_output: JsonOption = False,
 ) -> None:
-    """Print how long reading, judging and verifying take, as ratios."""
+    """Print how long reading, scoring and verifying take, as ratios."""
     with tempfile.TemporaryDirectory() as folder:
         progress(f"making a recording of {minutes:g} min")
         path = recording(Path(folder), 60 * minutes)
@@ -48,16 +48,16 @@ def main(
         rows = []
         bare_s = timed(read)
         ways: list[tuple[str, Callable[[], object]]] = [
-            ("fantwin replay --offline", lambda: judged(path, None, verify=False)),
-            ("the same, --verify", lambda: judged(path, None, verify=True)),
-            ("the same, -o OUT.mcap", lambda: judged(path, Path(folder) / "out.mcap", verify=False)),
+            ("fantwin replay --offline", lambda: rescored(path, None, verify=False)),
+            ("the same, --verify", lambda: rescored(path, None, verify=True)),
+            ("the same, -o OUT.mcap", lambda: rescored(path, Path(folder) / "out.mcap", verify=False)),
         ]
         rows.append(row("bare mcap reading", bare_s, minutes, messages, bare_s))
         for name, way in ways:
             progress(name)
             rows.append(row(name, timed(way), minutes, messages, bare_s))
         notes = [f"{messages} messages, {path.stat().st_size / 2**20:.0f} MiB; without the start of Python"]
-        show({"judging a recording again": rows}, notes, as_json=json_output)
+        show({"scoring a recording again": rows}, notes, as_json=json_output)
 
 
 def row(name: str, took_s: float, minutes: float, messages: int, bare_s: float) -> dict[str, Any]:
@@ -78,10 +78,10 @@ def timed(work: Callable[[], object]) -> float:
     return time.perf_counter() - began_s
 
 
-def judged(path: Path, output: Path | None, *, verify: bool) -> None:
+def rescored(path: Path, output: Path | None, *, verify: bool) -> None:
     """Replay offline; with `verify`, assert that the result equals the recording."""
     with open_replay_input([path], None, (), None) as material:
-        (tray,) = judge(material, output, verify)
+        (tray,) = rescore(material, output, verify)
     assert tray.comparison is None or tray.comparison.is_equal, tray.comparison
 
 

@@ -18,8 +18,8 @@ from rich.table import Table
 
 from pipeline.errors import UserError
 from pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, episodes
-from pipeline.replay.offline.judging import JudgedTray, judge
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
+from pipeline.replay.offline.rescoring import RescoredTray, rescore
 from pipeline.replay.offline.verify import CannotCompareError, format_utc
 from schemas.units import NS_PER_S
 
@@ -56,7 +56,7 @@ def run_offline(
                     f"{files[0]}: --verify compares with the recording: leave out --twin, -c and --set, and give a "
                     "recording that holds its configuration"
                 )
-            trays = _judged(replay_input, output, verify)
+            trays = _rescored(replay_input, output, verify)
             took_s = time.monotonic() - began_s
             result = _result(replay_input, trays, took_s)
     except UserError as error:
@@ -69,7 +69,7 @@ def run_offline(
     else:
         _print_result(trays, result, output)
     problems = [tray.problem for tray in trays if tray.problem]
-    if problems and not verify and not any(tray.judged for tray in trays):
+    if problems and not verify and not any(tray.scored for tray in trays):
         raise UserError(f"{files[0]}: {'; '.join(problems)}")
     if verify:
         raise typer.Exit(0 if result["verified"]["equal"] else EXIT_DIFFERS)
@@ -77,7 +77,7 @@ def run_offline(
         raise typer.Exit(EXIT_LOST)
 
 
-def _judged(replay_input: ReplayInput, output: Path | None, verify: bool) -> list[JudgedTray]:
+def _rescored(replay_input: ReplayInput, output: Path | None, verify: bool) -> list[RescoredTray]:
     columns = (SpinnerColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         task = shown.add_task("reading what each stage consumed")
@@ -87,12 +87,12 @@ def _judged(replay_input: ReplayInput, output: Path | None, verify: bool) -> lis
             since_s = (t_ns - first.setdefault(tray, t_ns)) / NS_PER_S
             shown.update(task, description=f"scoring {tray}: {since_s:.0f} s so far")
 
-        return judge(replay_input, output, verify, progress)
+        return rescore(replay_input, output, verify, progress)
 
 
-def _result(replay_input: ReplayInput, trays: Sequence[JudgedTray], took_s: float) -> dict[str, Any]:
+def _result(replay_input: ReplayInput, trays: Sequence[RescoredTray], took_s: float) -> dict[str, Any]:
     now = episodes(alarm for tray in trays for alarm in tray.alarms)
-    judged_s = sum(tray.hours for tray in trays) * 3600
+    scored_s = sum(tray.hours for tray in trays) * 3600
     result: dict[str, Any] = {
         "alarms": [episode.as_json() for episode in now],
         "start_ns": min((tray.start_ns for tray in trays if tray.samples), default=0),
@@ -104,7 +104,7 @@ def _result(replay_input: ReplayInput, trays: Sequence[JudgedTray], took_s: floa
         "restarts": sum(tray.plan.restarts for tray in trays),
         "damage": list(replay_input.damage.values()),
         "took_s": took_s,
-        "times_real_time": judged_s / took_s if took_s else math.inf,
+        "times_real_time": scored_s / took_s if took_s else math.inf,
     }
     compared = [tray.comparison for tray in trays if tray.comparison]
     if compared:
@@ -132,7 +132,7 @@ def _what_if(found: AlarmDiff) -> dict[str, Any]:
     return {name: [episode.as_json() for episode in getattr(found, name)] for name in ("gained", "lost", "kept")}
 
 
-def _print_result(trays: Sequence[JudgedTray], result: dict[str, Any], output: Path | None) -> None:
+def _print_result(trays: Sequence[RescoredTray], result: dict[str, Any], output: Path | None) -> None:
     console = Console(highlight=False, soft_wrap=True)
     console.width = min(_WIDEST, console.width) if console.is_terminal else _WIDEST
     now, start_ns = result["alarms"], result["start_ns"]

@@ -12,8 +12,8 @@ from pipeline.cli.progress import working
 from pipeline.cli.twins.training_data import sha256_of
 from pipeline.errors import UserError
 from pipeline.replay.offline.alarm_episodes import episodes
-from pipeline.replay.offline.judging import judge
 from pipeline.replay.offline.replay_input import open_replay_input
+from pipeline.replay.offline.rescoring import rescore
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
 from scoring.calibration.alarm_rate import poisson_interval
 from scoring.limits import DeclaredRate, Limits
@@ -91,12 +91,12 @@ def check_declared_rate(twin: Path, recordings: Sequence[Path], overrides: Seque
         for path in recordings:
             show(f"verifying: {path}")
             with open_replay_input([path], None, overrides, twin) as replay_input:
-                for tray, judged in zip(replay_input.trays, judge(replay_input, None, False), strict=True):
-                    if judged.problem:
-                        raise UserError(f"{path}: {judged.problem}")
-                    alarms += len(episodes(judged.alarms))
-                    fan_samples = judged.samples * tray.fans - judged.not_judged.total()
-                    fan_hours += fan_samples * judged.period_ns / NS_PER_HOUR
+                for tray, rescored in zip(replay_input.trays, rescore(replay_input, None, False), strict=True):
+                    if rescored.problem:
+                        raise UserError(f"{path}: {rescored.problem}")
+                    alarms += len(episodes(rescored.alarms))
+                    fan_samples = rescored.samples * tray.fans - rescored.not_judged.total()
+                    fan_hours += fan_samples * rescored.period_ns / NS_PER_HOUR
     return Check(alarms, fan_hours, declared.false_alarms_per_day)
 
 

@@ -17,8 +17,8 @@ from pipeline.recordings.reading import RecordingError, read_metadata, read_reco
 from pipeline.recordings.records import RecordReader
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.offline.alarm_episodes import episodes
-from pipeline.replay.offline.judging import JudgedTray, judge
 from pipeline.replay.offline.replay_input import open_replay_input
+from pipeline.replay.offline.rescoring import RescoredTray, rescore
 from pipeline.replay.offline.verify import CannotCompareError
 from schemas import fan_pb2
 from schemas.messages import Action, Alarm, Score, Transition
@@ -26,14 +26,14 @@ from tests.support.killed_site import CHAIN, Site
 from tests.support.twin_files import write_twin
 
 
-def verified(*paths: Path) -> JudgedTray:
+def verified(*paths: Path) -> RescoredTray:
     with open_replay_input(paths, None, (), None) as replay_input:
-        (tray,) = judge(replay_input, None, verify=True)
+        (tray,) = rescore(replay_input, None, verify=True)
     assert tray.comparison
     return tray
 
 
-def made_equal(tray: JudgedTray) -> int:
+def made_equal(tray: RescoredTray) -> int:
     """How many samples were equal; none may differ."""
     found = tray.comparison
     assert found and found.is_equal, found
@@ -199,7 +199,7 @@ def test_with_other_limits_a_session_continues_from_the_replayed_state_of_the_on
     site.kill("scorer")
     site.run(100)
     with open_replay_input([site.finished()], None, ("scorer.limit_factor=1000",), None) as replay_input:
-        (tray,) = judge(replay_input, None, verify=False)
+        (tray,) = rescore(replay_input, None, verify=False)
     assert any(alarm.transition == Transition.REPUBLISHED for alarm in tray.recorded_alarms)
     assert tray.alarms == []
     assert tray.counts["snapshots_of_another_twin"] == 0
@@ -212,7 +212,7 @@ def test_with_another_twin_a_restart_costs_no_commissioning(tmp_path):
     site.run(100)
     other = write_twin(tmp_path / "other.onnx", fans=1)
     with open_replay_input([site.finished()], None, (), other) as replay_input:
-        (tray,) = judge(replay_input, None, verify=False)
+        (tray,) = rescore(replay_input, None, verify=False)
     assert tray.plan.restarts == 1
     assert tray.counts["snapshots_of_another_twin"] == 0
 
@@ -226,9 +226,9 @@ def test_a_recording_of_another_version_is_judged_from_its_raw_samples(tmp_path,
         old = [p if p.topic != "prediction" else replace(p, payload=_without(lacks, p.payload)) for p in envelopes]
         replay_input.envelopes = lambda tray, topics: (p for p in old if p.topic in topics)  # type: ignore[method-assign]
         plan, _ = replay_input.read_plan("tray1")
-        (tray,) = judge(replay_input, None, verify=False)
+        (tray,) = rescore(replay_input, None, verify=False)
     assert (plan is not None) == is_planned
-    assert tray.judged > 200
+    assert tray.scored > 200
 
 
 def _without(column: str, payload: bytes) -> bytes:
@@ -308,8 +308,8 @@ def test_grids_of_a_session_that_are_nowhere_leave_nothing_to_compare(tmp_path):
     with pytest.raises(CannotCompareError, match="nothing to compare with"):
         verified(no_grid)
     with open_replay_input([no_grid], None, (), None) as replay_input:
-        (tray,) = judge(replay_input, None, verify=False)
-    assert tray.judged > 200
+        (tray,) = rescore(replay_input, None, verify=False)
+    assert tray.scored > 200
 
 
 def test_samples_that_never_reached_the_resampler_are_not_invented(tmp_path):
@@ -434,7 +434,7 @@ def test_another_twin_is_a_what_if(tmp_path):
     other = write_twin(tmp_path / "other.onnx", fans=1)
     with open_replay_input([path], None, (), other) as replay_input:
         assert not replay_input.is_as_recorded
-        (tray,) = judge(replay_input, None, verify=False)
+        (tray,) = rescore(replay_input, None, verify=False)
     assert tray.samples == sum(len(score.t_ns) for score in recorded(path, "score"))
     assert 1 not in {alarm.fan for alarm in tray.recorded_alarms}
     assert {alarm.fan for alarm in tray.alarms} == {0, 1, 2}, "it is of another fan"
@@ -444,7 +444,7 @@ def test_another_threshold_is_a_what_if(tmp_path):
     site = Site(tmp_path, seed=1)
     site.run(600)
     with open_replay_input([site.finished()], None, ("scorer.alarm_sigmas=1000",), None) as replay_input:
-        (tray,) = judge(replay_input, None, verify=False)
+        (tray,) = rescore(replay_input, None, verify=False)
     assert tray.recorded_alarms and not tray.alarms
 
 
@@ -455,13 +455,13 @@ def test_the_output_is_a_recording_that_is_decided_the_same(tmp_path):
     site.run(100)
     path, out = site.finished(), tmp_path / "out.mcap"
     with open_replay_input([path], None, (), None) as replay_input:
-        (tray,) = judge(replay_input, out, verify=False)
+        (tray,) = rescore(replay_input, out, verify=False)
     raw = sum(len(message.host_receive_t_ns) for message in recorded(out, "raw"))
     assert raw == sum(len(message.host_receive_t_ns) for message in recorded(path, "raw"))
     scores = [score for score in recorded(out, "score") if isinstance(score, Score)]
     assert len({t_ns for score in scores for t_ns in score.t_ns.tolist()}) == tray.samples
     with open_replay_input([out], None, (), None) as replay_input:
-        (again,) = judge(replay_input, None, verify=False)
+        (again,) = rescore(replay_input, None, verify=False)
     assert again.samples == tray.samples and replay_input.is_as_recorded
 
 

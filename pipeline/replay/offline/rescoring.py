@@ -25,14 +25,14 @@ Progress = Callable[[str, int], None]
 
 
 @dataclass
-class JudgedTray:
+class RescoredTray:
     """The decisions on one tray."""
 
     tray: str
     plan: TrayPlan
     samples: int = 0
-    """scored samples of the tray, each once"""
-    judged: int = 0
+    """samples of the tray that have a score message, each once"""
+    scored: int = 0
     """those that could be scored for at least one fan"""
     not_judged: Counter[str] = field(default_factory=Counter)
     """samples of fans that could not be scored, by reason"""
@@ -51,12 +51,12 @@ class JudgedTray:
     @property
     def hours(self) -> float:
         """How long the tray was scored."""
-        return self.judged * self.period_ns / NS_PER_S / 3600
+        return self.scored * self.period_ns / NS_PER_S / 3600
 
     @property
     def problem(self) -> str:
         """Why nothing was scored; empty if something was."""
-        if self.judged:
+        if self.scored:
             return ""
         if not self.not_judged:
             return f"{self.tray}: no sample lies between --start and --end"
@@ -77,14 +77,14 @@ class JudgedTray:
         self._newest_t_ns = max(self._newest_t_ns, self.end_ns)
         valid = score.valid[new]
         self.samples += int(new.sum())
-        self.judged += int(valid.any(axis=1).sum())
+        self.scored += int(valid.any(axis=1).sum())
         for reason, count in zip(*np.unique(score.invalid_reason[new][~valid], return_counts=True), strict=True):
             self.not_judged[InvalidReason(reason).name.lower()] += int(count)
 
 
-def judge(
+def rescore(
     replay_input: ReplayInput, output: Path | None, verify: bool, progress: Progress = lambda _tray, _t_ns: None
-) -> list[JudgedTray]:
+) -> list[RescoredTray]:
     """Score every tray again.
 
     output: a recording to write, with the raw samples and everything computed from them. verify: compare scores and
@@ -97,50 +97,50 @@ def judge(
         UserError: the output exists.
     """
     if output is None:
-        return [_judge_tray(replay_input, tray.name, verify, None, progress) for tray in replay_input.trays]
+        return [_rescore_tray(replay_input, tray.name, verify, None, progress) for tray in replay_input.trays]
     with output_writer(replay_input, output) as writer:
-        return [_judge_tray(replay_input, tray.name, verify, writer, progress) for tray in replay_input.trays]
+        return [_rescore_tray(replay_input, tray.name, verify, writer, progress) for tray in replay_input.trays]
 
 
-def _judge_tray(
+def _rescore_tray(
     replay_input: ReplayInput, tray: str, verify: bool, writer: RecordingWriter | None, progress: Progress
-) -> JudgedTray:
+) -> RescoredTray:
     plan, recorded_alarms = replay_input.read_plan(tray)
     where = f"{replay_input.paths[0]}: {tray}"
     if verify:
         refuse_unverifiable(where, plan, is_part=replay_input.is_part)
-    judged = JudgedTray(tray, plan or undisturbed_plan(replay_input.stages), recorded_alarms=recorded_alarms)
+    rescored = RescoredTray(tray, plan or undisturbed_plan(replay_input.stages), recorded_alarms=recorded_alarms)
     output = TrayOutput(writer, replay_input.config.site, tray) if writer else None
-    pipeline = replay_input.pipeline(tray, judged.plan, output.add if output else _ignore)
+    pipeline = replay_input.pipeline(tray, rescored.plan, output.add if output else _ignore)
     verifier = TrayVerifier(tray, lambda: replay_input.envelopes(tray, ("score",))) if verify else None
     try:
         for replayed in pipeline.run():
             message = replayed.message
             if isinstance(message, Alarm):
-                judged.alarms.append(replace(message, header=Header(replayed.producer, 0, tray)))
+                rescored.alarms.append(replace(message, header=Header(replayed.producer, 0, tray)))
             elif isinstance(message, Score):
-                judged.add(message)
-                progress(tray, judged.end_ns)
+                rescored.add(message)
+                progress(tray, rescored.end_ns)
                 if verifier:
                     verifier.add(replayed.producer, message)
     except CodecError as error:
         raise UserError(f"{replay_input.paths[0]}: a message cannot be decoded: {error}; see `fantwin info`") from error
-    judged.counts, judged.raw_missing = pipeline.counts, pipeline.raw_missing
+    rescored.counts, rescored.raw_missing = pipeline.counts, pipeline.raw_missing
     if verifier:
-        judged.comparison = verifier.finish(judged.plan.last, judged.alarms, recorded_alarms)
-        _refuse_meaningless(where, judged.comparison, judged)
-    return judged
+        rescored.comparison = verifier.finish(rescored.plan.last, rescored.alarms, recorded_alarms)
+        _refuse_meaningless(where, rescored.comparison, rescored)
+    return rescored
 
 
-def _refuse_meaningless(where: str, found: Comparison, judged: JudgedTray) -> None:
+def _refuse_meaningless(where: str, found: Comparison, rescored: RescoredTray) -> None:
     """Raises CannotCompareError if a difference would not be a difference of the code."""
     if not (found.equal or found.different or found.not_made):
         raise CannotCompareError(f"{where}: no scores in the recording: nothing to compare with")
     if found.is_equal:
         return
-    if judged.raw_missing:
-        raise CannotCompareError(f"{where}: the recording lacks {judged.raw_missing} raw messages that were scored")
-    if any(session.is_guessed for session in judged.plan.first):
+    if rescored.raw_missing:
+        raise CannotCompareError(f"{where}: the recording lacks {rescored.raw_missing} raw messages that were scored")
+    if any(session.is_guessed for session in rescored.plan.first):
         raise CannotCompareError(
             f"{where}: some raw messages never reached the first stage, and the recording does not say which"
         )
