@@ -36,7 +36,7 @@ def test_the_deviation_of_a_long_sum_agrees_with_simulation(memory_s: float) -> 
     assert sums.std() == pytest.approx(summed_deviation(memory_s, STEP_S) * math.sqrt(100.0), rel=0.1)
 
 
-@pytest.mark.parametrize("step_s", [0.002, 0.01, 0.1])
+@pytest.mark.parametrize("period_s", [0.002, 0.01, 0.1])
 def test_without_a_calibration_the_limit_is_in_sigma_of_the_speed_at_every_rate(period_s: float) -> None:
     limits = uncalibrated(2.0, Timing())
     memory_s = limits.speed.autocorrelation_time_s
