@@ -14,7 +14,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate pyproject.toml
 TORCH := torch==2.13.0
 BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_table measured_table onnx_speed training_race) \
-	$(addprefix bench.runtime.,restart recorder_throughput recorder_kills replay_bus replay_speed)
+	$(addprefix bench.runtime.,restart recorder_throughput recorder_kills replay_bus replay_speed stage_memory)
 SOURCES := schemas scoring pipeline simulation stages twin tests bench
 
 .PHONY: demo test check bench schema twin lock clean
