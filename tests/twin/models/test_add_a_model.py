@@ -83,7 +83,7 @@ def linear_run(seed: int) -> Run:
     return Run("linear", np.arange(2000) / 100.0, command, speed + rng.normal(0.0, 0.1, speed.shape))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def trained() -> Iterator[TrainedTwin]:
     row = kinds.ModelKind("first-order", "first order", fit_first_order)
     kinds.KINDS.append(row)
