@@ -30,12 +30,12 @@ def test_the_published_fan_is_recovered_within_its_confidence_intervals(publishe
 
 @pytest.mark.slow
 def test_95_percent_intervals_hold_the_truth_in_95_percent_of_recordings() -> None:
-    runs = [fan_data.published_run(seed, duration_s=10.0, fans=20) for seed in range(100, 115)]
+    runs = [fan_data.published_run(seed, duration_s=10.0, fans=20) for seed in range(100, 108)]
     found = [identify([run]) for run in runs]
     low, high = (np.concatenate([one.interval_95[:, :3, side] for one in found]) for side in (0, 1))
     inside = (low <= fan_data.PUBLISHED_PARAMETERS) & (high >= fan_data.PUBLISHED_PARAMETERS)
-    # 300 recordings determine a share of 95 % to 1.3 %
-    assert np.all(np.abs(inside.mean(axis=0) - 0.95) < 0.035), inside.mean(axis=0)
+    # 160 recordings determine a share of 95 % to 1.7 %; the bound is 2.7 times that.
+    assert np.all(np.abs(inside.mean(axis=0) - 0.95) < 0.047), inside.mean(axis=0)
 
 
 def test_short_pieces_beside_a_long_run_do_not_widen_the_intervals() -> None:
