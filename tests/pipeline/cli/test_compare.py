@@ -21,7 +21,7 @@ FIGURES = ("rmse", "max_error", "r2", "one_step_rmse", "coverage_2_sigma")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recordings")
     for seed, name in ((1, "healthy"), (2, "held-out"), (3, "untouched")):
-        record(path / f"{name}.mcap", rough_run(seed, 20.0), unit="rpm")
+        record(path / f"{name}.mcap", rough_run(seed, 12.0), unit="rpm")
     return path
 
 
