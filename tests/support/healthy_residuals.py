@@ -68,9 +68,9 @@ class Raised:
     statistic: Statistic
 
 
-def alarms_of(limits: Limits, blocks: Iterable[Samples], fans: int) -> list[Raised]:
-    """Alarms that a scorer would raise."""
-    scorer = FanScorer(fans, limits)
+def alarms_of(limits: Limits, blocks: Iterable[Samples], fans: int, scorer: FanScorer | None = None) -> list[Raised]:
+    """Alarms that a scorer would raise, a new one unless it is given."""
+    scorer = scorer or FanScorer(fans, limits)
     settings = ConditionSettings(round(limits.timing.on_delay_s * NS_PER_S), NS_PER_S)
     conditions = TrayConditions(fans, settings)
     raised: list[Raised] = []
