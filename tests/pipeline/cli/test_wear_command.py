@@ -21,7 +21,15 @@ from schemas.messages import Header, Message, ScorerSnapshot
 from schemas.topics import tray_key
 from scoring.former_snapshot_keys import FORMER_PARAMETER_KEYS
 from stages.scorer import ScorerConfig
-from tests.scoring.wear.test_wear_monitor import DAY_NS, GROWTH_PER_DAY, HEALTHY, LIMIT, WORN, core, live_through
+from tests.scoring.wear.test_wear_monitor import (
+    DAY_NS,
+    GROWTH_PER_DAY,
+    HEALTHY,
+    LIMIT,
+    WORN,
+    core_for_days,
+    live_through,
+)
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, SITE, TRAY
 from tests.support.scored_blocks import EPOCH_NS, snapshot_of
@@ -32,7 +40,7 @@ KEY = tray_key(SITE, TRAY, "snapshot")
 @pytest.fixture(scope="module")
 def notes() -> list[ScorerSnapshot]:
     """The snapshots of a scorer after three days and after six."""
-    worn, noted = core(), []
+    worn, noted = core_for_days(), []
     for number, (from_day, days) in enumerate(((0, 3), (3, 6))):
         assert list(live_through(worn, days, from_day, swing=0.005)) == []
         noted.append(replace(snapshot_of(worn), header=Header("scorer-1", number, TRAY)))
