@@ -99,7 +99,7 @@ def troubled(samples: int, seed: int) -> Samples:
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     seed=st.integers(0, 100_000),
     cuts=st.lists(st.integers(1, 399), max_size=10),

@@ -417,7 +417,7 @@ def parts(whole: Prediction, marks: Iterable[int]) -> list[Prediction]:
     return [cut(whole, *part) for part in pairwise(marks)]
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 10_000),
     samples=st.integers(1, 300),

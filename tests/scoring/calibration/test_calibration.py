@@ -63,7 +63,7 @@ def coarse_and_short(memory_s: float, seed: int, runs: int = RUNS) -> Runs:
 @pytest.fixture(scope="module")
 def white_limits() -> Limits:
     """Limits for white residuals, at the lowest false alarm rate that five fan-hours can support."""
-    return calibrate(healthy(0.0, 1), TOP_RAD_S, Timing(), 15.0)
+    return calibrate(healthy(0.0, 1, fans=60, samples=10_000), TOP_RAD_S, Timing(), 15.0)
 
 
 def alarms_on_white(limits: Limits, seconds: float, shift: np.ndarray | float, fans: int = 4) -> list[Raised]:
