@@ -46,15 +46,17 @@ def speeds(
 ) -> np.ndarray:
     """(n,) true speed. drag, gain: factors; torque: taken in units of the command; each a number or (n,)."""
     n = len(command)
-    drag, torque, gain = (np.broadcast_to(np.asarray(value, float), n) for value in (drag, torque, gain))
-    fan, speed, all_speeds = HEALTHY, 0.0, np.empty(n)
+    # Plain floats: in a loop they are several times faster than those of numpy.
+    values = [np.broadcast_to(np.asarray(value, float), n).tolist() for value in (command, drag, torque, gain)]
+    inputs = list(zip(*values, strict=True))
+    speed, all_speeds = 0.0, []
     for _ in range(400):  # settles at the first command
-        speed += STEP_S * _acceleration(fan, speed, command[0], drag[0], torque[0], gain[0])
-    for k in range(n):
-        all_speeds[k] = speed
+        speed += STEP_S * _acceleration(HEALTHY, speed, *inputs[0])
+    for at_sample in inputs:
+        all_speeds.append(speed)
         for _ in range(SUBSTEPS):
-            speed += STEP_S / SUBSTEPS * _acceleration(fan, speed, command[k], drag[k], torque[k], gain[k])
-    return all_speeds
+            speed += STEP_S / SUBSTEPS * _acceleration(HEALTHY, speed, *at_sample)
+    return np.array(all_speeds)
 
 
 def _acceleration(fan: HealthyBalance, speed: float, command: float, drag: float, torque: float, gain: float) -> float:

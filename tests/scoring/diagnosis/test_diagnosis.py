@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from scoring.diagnosis.diagnosis import Diagnosis, Evidence, RankedCause, diagnose
 from scoring.diagnosis.regression_window import FIRST_ERROR, HealthyBalance, RegressionWindow, Window, acting_command
@@ -233,11 +234,11 @@ def held_by_a_loop(seed: int, per_rad_s: float, per_rad: float, drag: float = 1.
     needed = fan.viscous * set_point + fan.drag * set_point**2 + fan.friction
     speed, total, command, readings = set_point, needed, np.empty(samples), np.empty(samples)
     for k in range(samples):
-        readings[k] = speed + data.NOISE_RAD_S * rng.normal()
-        total += per_rad * period_s * (set_point - readings[k])
-        command[k] = total + per_rad_s * (set_point - readings[k])
+        readings[k] = reading = speed + data.NOISE_RAD_S * rng.normal()
+        total += per_rad * period_s * (set_point - reading)
+        command[k] = acting = total + per_rad_s * (set_point - reading)
         takes = fan.viscous * speed + (drag if 2 * k >= samples else 1.0) * fan.drag * speed**2 + fan.friction
-        speed += period_s * (command[k] - takes) / fan.inertia
+        speed += period_s * (acting - takes) / fan.inertia
     return Window(period_s, command, readings, samples // 2)
 
 
@@ -394,8 +395,7 @@ def healthy_balance(command: np.ndarray, speed_rad_s: np.ndarray, lag_s: float) 
     acting = acting_command(command, h, lag_s)[:-1]
     terms = np.stack((acting, np.diff(speed_rad_s) / h, middle, middle * np.abs(middle), np.ones_like(middle)))
     keep, filtered = np.exp(-rate * h), np.zeros_like(terms)
-    for k in range(1, terms.shape[1]):
-        filtered[:, k] = keep * filtered[:, k - 1] + (1.0 - keep) * terms[:, k]
+    filtered[:, 1:] = lfilter([1.0 - keep], [1.0, -keep], terms[:, 1:], axis=1)
     used = filtered[:, 300:]
     used = used[:, used[2] > 40.0]
     blocks = [used[:, part] for part in np.array_split(np.arange(used.shape[1]), 8)]
