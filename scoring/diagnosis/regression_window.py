@@ -117,7 +117,7 @@ class RegressionWindow:
         valid = np.add.reduceat(counts.astype(float), self._starts)
         self._enough = valid >= self.per_row / 2.0
         self._enough_before_onset = (self._ends <= window.onset)[self._enough]
-        self._weight = counts / np.repeat(np.maximum(valid, 1.0), self.per_row)[: len(counts)]
+        self._weight = counts / np.repeat(np.maximum(valid, 1.0), self._ends - self._starts)
         healthy_balance = (window.fan_offset + _bridged(np.broadcast_to(window.expected_command, speed.shape)))[:-1]
         residual = acting - coefficients @ motion - healthy_balance
         fixed = np.vstack((residual, _independent(errors) @ motion))
