@@ -55,13 +55,42 @@ def changed(path: Path, out: Path, change) -> Path:
     return out
 
 
-def test_a_run_that_nothing_disturbed_is_decided_the_same(tmp_path):
-    site = Site(tmp_path, seed=1)
-    site.run(600)
-    path = site.finished()
-    tray = verified(path)
-    assert made_equal(tray) == sum(len(score.t_ns) for score in recorded(path, "score")) > 550
-    assert tray.comparison and tray.comparison.alarms_equal == len(recorded(path, "alarm")) > 0
+def recording_of(folder: Path, seed: int, *samples: int, killed: str = "", calibrated: bool = False) -> Path:
+    """A recording of so many samples, with a stage killed after each number of them but the last."""
+    site = Site(folder, seed, calibrated=calibrated)
+    for number, count in enumerate(samples):
+        if number:
+            site.kill(killed)
+        site.run(count)
+    return site.finished()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Long enough for alarms to be raised and cleared."""
+    return recording_of(tmp_path_factory.mktemp("undisturbed"), 1, 600)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recording_of(tmp_path_factory.mktemp("short"), 3, 300)
+
+
+@pytest.fixture(scope="module")
+def integrator_killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recording_of(tmp_path_factory.mktemp("integrator"), 4, 150, 150, killed="twin_integrator")
+
+
+@pytest.fixture(scope="module")
+def scorer_killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scorer is killed while an alarm is active, and continues from its snapshot."""
+    return recording_of(tmp_path_factory.mktemp("scorer"), 1, 215, 100, killed="scorer", calibrated=True)
+
+
+def test_a_run_that_nothing_disturbed_is_decided_the_same(undisturbed):
+    tray = verified(undisturbed)
+    assert made_equal(tray) == sum(len(score.t_ns) for score in recorded(undisturbed, "score")) > 550
+    assert tray.comparison and tray.comparison.alarms_equal == len(recorded(undisturbed, "alarm")) > 0
     assert tray.plan.restarts == 0
 
 
@@ -79,16 +108,16 @@ def test_samples_that_time_had_given_up_are_given_up_again(tmp_path):
 ASKED = (Action.ACKNOWLEDGE, Action.SHELVE, Action.COMMISSION, Action.OUT_OF_SERVICE)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=20)
 @given(
     seed=st.integers(0, 1000),
     block_size=st.sampled_from([1, 1, 4]),
     calibrated=st.booleans(),
     remembers=st.sampled_from([True, True, False]),
     events=st.lists(
-        st.tuples(st.integers(5, 150), st.sampled_from([*CHAIN, "scorer", "acquisition", "silence", "loss", *ASKED])),
-        min_size=1,
-        max_size=8,
+        st.tuples(st.integers(5, 100), st.sampled_from([*CHAIN, "scorer", "acquisition", "silence", "loss", *ASKED])),
+        min_size=2,
+        max_size=5,
     ),
 )
 def test_a_replay_decides_the_same_after_any_kills_and_requests(
@@ -167,16 +196,12 @@ def test_a_restarted_scorer_continues_from_its_snapshot_and_so_does_a_replay(tmp
     assert len(raised) == 1 and raised[0].t_ns == first.raised_ns, "one alarm, over the restart"
 
 
-def test_a_session_cannot_be_reproduced_without_the_snapshot_it_began_with(tmp_path):
-    site = Site(tmp_path, 1, calibrated=True)
-    site.run(210)
-    site.kill("scorer")
-    site.run(100)
+def test_a_session_cannot_be_reproduced_without_the_snapshot_it_began_with(scorer_killed, tmp_path):
 
     def forgotten(entry):
         return None if entry.topic == "snapshot" else entry.message
 
-    path = changed(site.finished(), tmp_path / "forgotten.mcap", forgotten)
+    path = changed(scorer_killed, tmp_path / "forgotten.mcap", forgotten)
     with pytest.raises(CannotCompareError, match="begins in the middle of scorer"):
         verified(path)
 
@@ -193,35 +218,25 @@ def test_a_part_that_begins_with_a_restarted_scorer_still_needs_its_earlier_inpu
         verified(site.finished())
 
 
-def test_with_other_limits_a_session_continues_from_the_replayed_state_of_the_one_before(tmp_path):
-    site = Site(tmp_path, 1, calibrated=True)
-    site.run(215)
-    site.kill("scorer")
-    site.run(100)
-    with open_replay_input([site.finished()], None, ("scorer.limit_factor=1000",), None) as replay_input:
+def test_with_other_limits_a_session_continues_from_the_replayed_state_of_the_one_before(scorer_killed):
+    with open_replay_input([scorer_killed], None, ("scorer.limit_factor=1000",), None) as replay_input:
         (tray,) = rescore(replay_input, None, verify=False)
     assert any(alarm.transition == Transition.REPUBLISHED for alarm in tray.recorded_alarms)
     assert tray.alarms == []
     assert tray.counts["snapshots_of_another_twin"] == 0
 
 
-def test_with_another_twin_a_restart_costs_no_commissioning(tmp_path):
-    site = Site(tmp_path, 1, calibrated=True)
-    site.run(215)
-    site.kill("scorer")
-    site.run(100)
+def test_with_another_twin_a_restart_costs_no_commissioning(scorer_killed, tmp_path):
     other = write_twin(tmp_path / "other.onnx", fans=1)
-    with open_replay_input([site.finished()], None, (), other) as replay_input:
+    with open_replay_input([scorer_killed], None, (), other) as replay_input:
         (tray,) = rescore(replay_input, None, verify=False)
     assert tray.plan.restarts == 1
     assert tray.counts["snapshots_of_another_twin"] == 0
 
 
 @pytest.mark.parametrize(("lacks", "is_planned"), [("command", False), ("torque_balance_command", True)])
-def test_a_recording_of_another_version_is_judged_from_its_raw_samples(tmp_path, lacks, is_planned):
-    site = Site(tmp_path, 1)
-    site.run(300)
-    with open_replay_input([site.finished()], None, (), None) as replay_input:
+def test_a_recording_of_another_version_is_judged_from_its_raw_samples(short, lacks, is_planned):
+    with open_replay_input([short], None, (), None) as replay_input:
         envelopes = list(replay_input.envelopes("tray1", ("grid", "prediction", "score", "raw")))
         old = [p if p.topic != "prediction" else replace(p, payload=_without(lacks, p.payload)) for p in envelopes]
         replay_input.envelopes = lambda tray, topics: (p for p in old if p.topic in topics)  # type: ignore[method-assign]
@@ -250,21 +265,17 @@ def test_raw_messages_that_the_recorder_never_got_are_missed(tmp_path):
 
 
 @pytest.mark.parametrize(("first", "last"), [(10, 10**9), (0, 280)], ids=["head", "tail"])
-def test_raw_messages_that_are_missing_at_the_ends_are_missed(tmp_path, first, last):
-    site = Site(tmp_path, seed=3)
-    site.run(300)
+def test_raw_messages_that_are_missing_at_the_ends_are_missed(short, tmp_path, first, last):
 
     def without(entry):
         return entry.message if entry.topic != "raw" or first <= entry.message.header.sequence < last else None
 
     with pytest.raises(CannotCompareError, match="lacks .* raw messages"):
-        verified(changed(site.finished(), tmp_path / "without.mcap", without))
+        verified(changed(short, tmp_path / "without.mcap", without))
 
 
-def test_a_recording_without_raw_samples_is_never_equal(tmp_path):
-    site = Site(tmp_path, seed=3)
-    site.run(300)
-    no_raw = changed(site.finished(), tmp_path / "no.mcap", lambda e: None if e.topic == "raw" else e.message)
+def test_a_recording_without_raw_samples_is_never_equal(short, tmp_path):
+    no_raw = changed(short, tmp_path / "no.mcap", lambda e: None if e.topic == "raw" else e.message)
     with pytest.raises(RecordingError, match="no raw samples"):
         verified(no_raw)
 
@@ -286,25 +297,20 @@ def test_messages_of_a_killed_stage_that_the_recorder_never_got_are_made_again(t
     assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
 
 
-def test_an_alarm_after_the_last_recorded_score_is_no_difference(tmp_path):
-    site = Site(tmp_path, seed=1)
-    site.run(600)
-    path = site.finished()
-    raised = recorded(path, "alarm")[0]
+def test_an_alarm_after_the_last_recorded_score_is_no_difference(undisturbed, tmp_path):
+    raised = recorded(undisturbed, "alarm")[0]
 
     def until_then(entry):
         if entry.topic in ("grid", "prediction", "score"):
             return entry.message if entry.message.t_ns[0] <= raised.t_ns else None
         return None if entry.topic == "alarm" else entry.message
 
-    found = verified(changed(path, tmp_path / "cut.mcap", until_then)).comparison
+    found = verified(changed(undisturbed, tmp_path / "cut.mcap", until_then)).comparison
     assert found and found.is_equal and found.alarms_not_recorded > 0 and found.not_recorded > 0
 
 
-def test_grids_of_a_session_that_are_nowhere_leave_nothing_to_compare(tmp_path):
-    site = Site(tmp_path, seed=1)
-    site.run(300)
-    no_grid = changed(site.finished(), tmp_path / "no.mcap", lambda e: None if e.topic == "grid" else e.message)
+def test_grids_of_a_session_that_are_nowhere_leave_nothing_to_compare(short, tmp_path):
+    no_grid = changed(short, tmp_path / "no.mcap", lambda e: None if e.topic == "grid" else e.message)
     with pytest.raises(CannotCompareError, match="nothing to compare with"):
         verified(no_grid)
     with open_replay_input([no_grid], None, (), None) as replay_input:
@@ -321,12 +327,9 @@ def test_samples_that_never_reached_the_resampler_are_not_invented(tmp_path):
     assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
 
 
-def test_an_undecodable_alarm_costs_that_alarm_only(tmp_path):
-    site = Site(tmp_path, seed=1)
-    site.run(600)
-    path = site.finished()
-    alarms = recorded(path, "alarm")
-    with open_replay_input([path], None, (), None) as replay_input:
+def test_an_undecodable_alarm_costs_that_alarm_only(undisturbed):
+    alarms = recorded(undisturbed, "alarm")
+    with open_replay_input([undisturbed], None, (), None) as replay_input:
         envelopes = list(replay_input.envelopes("tray1", ("grid", "prediction", "score", "alarm")))
         first = next(n for n, envelope in enumerate(envelopes) if envelope.topic == "alarm")
         envelopes[first] = replace(envelopes[first], payload=b"\xff\xff")
@@ -337,22 +340,16 @@ def test_an_undecodable_alarm_costs_that_alarm_only(tmp_path):
 
 
 @pytest.mark.parametrize("topic", ["grid", "prediction"])
-def test_a_recording_that_lacks_intermediate_messages_is_still_compared(tmp_path, topic):
-    site = Site(tmp_path, seed=4)
-    site.run(150)
-    site.kill("twin_integrator")
-    site.run(150)
+def test_a_recording_that_lacks_intermediate_messages_is_still_compared(integrator_killed, tmp_path, topic):
     holes = changed(
-        site.finished(),
+        integrator_killed,
         tmp_path / "holes.mcap",
         lambda entry: None if entry.topic == topic and 80 <= entry.message.header.sequence < 90 else entry.message,
     )
     assert made_equal(verified(holes)) > 290
 
 
-def test_one_bit_is_found_and_named(tmp_path):
-    site = Site(tmp_path, seed=5)
-    site.run(300)
+def test_one_bit_is_found_and_named(short, tmp_path):
 
     def flip(entry):
         if entry.topic != "score" or entry.message.header.sequence != 200:
@@ -361,57 +358,48 @@ def test_one_bit_is_found_and_named(tmp_path):
         residual[0, 1] = np.nextafter(residual[0, 1], np.inf)
         return replace(entry.message, residual_rad_s=residual)
 
-    found = verified(changed(site.finished(), tmp_path / "flipped.mcap", flip)).comparison
+    found = verified(changed(short, tmp_path / "flipped.mcap", flip)).comparison
     assert found and not found.is_equal
     assert (found.different, found.not_made, found.alarms_different) == (1, 0, 0)
     (line,) = found.named
     assert "fan 1: residual_rad_s" in line
 
 
-def test_an_alarm_that_was_never_raised_is_found(tmp_path):
-    site = Site(tmp_path, seed=1)
-    site.run(600)
-    path = site.finished()
-    first = next(alarm for alarm in recorded(path, "alarm") if isinstance(alarm, Alarm))
+def test_an_alarm_that_was_never_raised_is_found(undisturbed, tmp_path):
+    first = next(alarm for alarm in recorded(undisturbed, "alarm") if isinstance(alarm, Alarm))
 
     def without(entry):
         return None if entry.topic == "alarm" and entry.message.header.sequence == 0 else entry.message
 
-    found = verified(changed(path, tmp_path / "without.mcap", without)).comparison
+    found = verified(changed(undisturbed, tmp_path / "without.mcap", without)).comparison
     assert found and not found.is_equal and found.alarms_different == 1
     assert first.message in found.named[0] and "none recorded" in found.named[0]
 
 
-def test_scores_that_no_stage_made_are_found(tmp_path):
-    site = Site(tmp_path, seed=6)
-    site.run(200)
+def test_scores_that_no_stage_made_are_found(short, tmp_path):
 
     def later(entry):
         if entry.topic != "score" or entry.message.header.sequence != 150:
             return entry.message
         return replace(entry.message, t_ns=entry.message.t_ns + 1)
 
-    found = verified(changed(site.finished(), tmp_path / "later.mcap", later)).comparison
+    found = verified(changed(short, tmp_path / "later.mcap", later)).comparison
     assert found and found.not_made == 1 and found.not_recorded == 1
 
 
-def test_a_recording_without_scores_cannot_be_compared(tmp_path):
-    site = Site(tmp_path, seed=7)
-    site.run(100)
-    raw = changed(site.finished(), tmp_path / "raw.mcap", lambda entry: entry.message if entry.topic == "raw" else None)
+def test_a_recording_without_scores_cannot_be_compared(short, tmp_path):
+    raw = changed(short, tmp_path / "raw.mcap", lambda entry: entry.message if entry.topic == "raw" else None)
     with pytest.raises(CannotCompareError, match="nothing to compare with"):
         verified(raw)
 
 
-def test_a_part_from_the_middle_cannot_be_compared_and_the_reason_is_shown(tmp_path):
-    site = Site(tmp_path, seed=8)
-    site.run(400)
-    half = 200
+def test_a_part_from_the_middle_cannot_be_compared_and_the_reason_is_shown(short, tmp_path):
+    half = 150
 
     def second_half(entry):
         return entry.message if entry.message.header.sequence >= half else None
 
-    part = changed(site.finished(), tmp_path / "part.mcap", second_half)
+    part = changed(short, tmp_path / "part.mcap", second_half)
     with pytest.raises(CannotCompareError, match="the parts before it"):
         verified(part)
 
@@ -427,30 +415,25 @@ def test_parts_that_overlap_are_one_recording(tmp_path):
     assert made_equal(verified(first, second)) >= 399
 
 
-def test_another_twin_is_a_what_if(tmp_path):
-    site = Site(tmp_path, seed=1)
-    site.run(600)
-    path = site.finished()
+def test_another_twin_is_a_what_if(undisturbed, tmp_path):
     other = write_twin(tmp_path / "other.onnx", fans=1)
-    with open_replay_input([path], None, (), other) as replay_input:
+    with open_replay_input([undisturbed], None, (), other) as replay_input:
         assert not replay_input.is_as_recorded
         (tray,) = rescore(replay_input, None, verify=False)
-    assert tray.samples == sum(len(score.t_ns) for score in recorded(path, "score"))
+    assert tray.samples == sum(len(score.t_ns) for score in recorded(undisturbed, "score"))
     assert 1 not in {alarm.fan for alarm in tray.recorded_alarms}
     assert {alarm.fan for alarm in tray.alarms} == {0, 1, 2}, "it is of another fan"
 
 
-def test_another_threshold_is_a_what_if(tmp_path):
-    site = Site(tmp_path, seed=1)
-    site.run(600)
-    with open_replay_input([site.finished()], None, ("scorer.alarm_sigmas=1000",), None) as replay_input:
+def test_another_threshold_is_a_what_if(undisturbed):
+    with open_replay_input([undisturbed], None, ("scorer.alarm_sigmas=1000",), None) as replay_input:
         (tray,) = rescore(replay_input, None, verify=False)
     assert tray.recorded_alarms and not tray.alarms
 
 
 def test_the_output_is_a_recording_that_is_decided_the_same(tmp_path):
     site = Site(tmp_path, seed=1)
-    site.run(600)
+    site.run(300)
     site.kill("scorer")
     site.run(100)
     path, out = site.finished(), tmp_path / "out.mcap"
