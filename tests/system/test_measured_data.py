@@ -61,14 +61,20 @@ def test_imrclab_is_imported_as_four_fans_of_one_command_without_times(measured_
     assert result["duration_s"] == pytest.approx((len(ours) - 1) * 0.01)
 
 
+@pytest.fixture(scope="module")
+def esc_recording(measured_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    recording = tmp_path_factory.mktemp("esc") / "esc.mcap"
+    imported(measured_data / "esc_test" / "f40_steps_5-2.csv", recording, *ESC_TEST)
+    return recording
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["physical", "hybrid"])
-def test_a_twin_of_the_first_part_of_esc_test_follows_the_rest(measured_data, tmp_path, model):
-    recording, twin = tmp_path / "esc.mcap", tmp_path / "esc.onnx"
-    imported(measured_data / "esc_test" / "f40_steps_5-2.csv", recording, *ESC_TEST)
-    trained = fantwin("train", recording, "--to", 90, "--model", model, "--iterations", 15, "-o", twin)
+def test_a_twin_of_the_first_part_of_esc_test_follows_the_rest(esc_recording, tmp_path, model):
+    twin = tmp_path / "esc.onnx"
+    trained = fantwin("train", esc_recording, "--to", 90, "--model", model, "--iterations", 8, "-o", twin)
     assert trained.exit_code == 0, trained.output
-    result = json.loads(fantwin("evaluate", twin, recording, "--from", 90, "--json").stdout)
+    result = json.loads(fantwin("evaluate", twin, esc_recording, "--from", 90, "--json").stdout)
     assert result["speed_unit"] == "rpm"
     assert result["r2"] > 0.98
     assert result["rmse"] < 900
