@@ -8,7 +8,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -27,6 +27,7 @@ from twin.export.onnx_twin import OnnxTwin
 from twin.fitting.identification import identify
 from twin.models.physical import PhysicalModel
 from twin.models.physics import PARAMETER_NAMES
+from twin.report import figures
 from twin.report.assessment import assess
 from twin.report.content import Content, SpeedUnit, report_content
 from twin.report.figures import error_over_speed, histogram
@@ -46,6 +47,16 @@ TITLES = [
     "Static curve",
     "Error over speed",
 ]
+FIGURES = (
+    "over_time",
+    "around_the_largest_error",
+    "histogram",
+    "autocorrelation",
+    "cross_correlation",
+    "static_curve",
+    "error_over_speed",
+)
+"""the functions that draw them"""
 COLUMNS = ["rmse", "sigma", "max_error", "r2", "coverage_2_sigma", "one_step_rmse", "samples", "rmse_in_sigma"]
 RAD_S = SpeedUnit("rad/s", 1.0)
 SMALLEST_TEXT_UNITS = 8.5 * 0.88
@@ -89,7 +100,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("report")
     record(path / "healthy.mcap", published_run(1, 30.0), unit="rpm")
     record(path / "held-out.mcap", published_run(2, 30.0), unit="rpm")
-    record(path / "two.mcap", published_run(3, 30.0, fans=2))
+    record(path / "two.mcap", published_run(3, 15.0, fans=2))
     record(path / "three.mcap", published_run(4, 5.0, fans=3))
     common = ("--model", "physical", "--command-unit", "%")
     for name, validate in (("healthy", ("--validate", path / "held-out.mcap")), ("two", ())):
@@ -110,6 +121,26 @@ def page(folder: Path) -> str:
     return (folder / "page.html").read_text(encoding="utf-8")
 
 
+@pytest.fixture(scope="module")
+def evaluated(folder: Path) -> dict[str, Any]:
+    return json.loads(fantwin("evaluate", folder / "healthy.onnx", folder / "held-out.mcap", "--json").stdout)
+
+
+@pytest.fixture(scope="module")
+def wide_page(twin: OnnxTwin) -> str:
+    """A page whose table of parameters has all its columns."""
+    content = content_of(twin, published_run(2, 10.0), unit=SpeedUnit("rpm", np.pi / 30.0))
+    refined = tuple(replace(parameter, in_force=1.1 * parameter.value) for parameter in content.fans[0].parameters)
+    return report_page(replace(content, fans=(replace(content.fans[0], parameters=refined),)))
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages without drawings, for what is asserted about their words."""
+    for name in FIGURES:
+        monkeypatch.setattr(figures, name, lambda *_, **__: "")
+
+
 def content_of(twin: OnnxTwin, *runs: Run, unit: SpeedUnit = RAD_S) -> Content:
     return report_content(twin, runs, [DataCard("runs.mcap", "0" * 64, runs[0].fans, runs[0].samples)], unit)
 
@@ -127,8 +158,7 @@ def test_the_page_holds_every_section_and_every_figure(page):
         assert expected in parsed.text
 
 
-def test_the_figures_are_those_of_evaluate(folder, page):
-    evaluated = json.loads(fantwin("evaluate", folder / "healthy.onnx", folder / "held-out.mcap", "--json").stdout)
+def test_the_figures_are_those_of_evaluate(evaluated, page):
     shown = dict(zip(COLUMNS, Page(page).numbers["row-0"], strict=True))
     for figure in ("rmse", "max_error", "r2", "coverage_2_sigma", "one_step_rmse", "samples"):
         assert shown[figure] == pytest.approx(evaluated[figure], rel=1e-12), figure
@@ -162,13 +192,12 @@ def test_ids_are_unique_and_every_reference_has_its_target(folder):
     assert set(parsed.numbers) > {"pooled", "row-0", "row-1"}
 
 
-def test_json_holds_the_same_figures(folder, page):
+def test_json_holds_the_same_figures(folder, page, evaluated):
     arguments = (folder / "healthy.onnx", folder / "held-out.mcap", "-o", folder / "again.html", "--json")
     reported = json.loads(fantwin("report", *arguments).stdout)
-    evaluated = json.loads(fantwin("evaluate", *arguments[:2], "--json").stdout)
-    figures = ("rmse", "max_error", "r2", "coverage_2_sigma", "one_step_rmse", "samples")
+    names = ("rmse", "max_error", "r2", "coverage_2_sigma", "one_step_rmse", "samples")
     assert reported["speed_unit"] == evaluated["speed_unit"]
-    for figure in figures:
+    for figure in names:
         assert reported[figure] == evaluated[figure]
         assert reported["fans"][0][figure] == evaluated["fans"][0][figure]
     assert (reported["assessment"], reported["fans"][0]["fan"]) == ("as declared", 0)
@@ -182,7 +211,7 @@ def test_a_healthy_fan_is_followed_as_declared_and_without_a_warning(twin):
     assert judged.headline == "The twin follows this fan as closely as its card says."
 
 
-def test_a_fan_that_runs_slow_is_not_followed_and_the_page_says_by_how_much(twin):
+def test_a_fan_that_runs_slow_is_not_followed_and_the_page_says_by_how_much(twin, undrawn):
     healthy = published_run(5, 30.0)
     content = content_of(twin, with_speed(healthy, 0.9 * healthy.speed_rad_s))
     judged = assess(content)
@@ -307,14 +336,14 @@ def test_a_staircase_of_two_and_a_half_seconds_a_step_gives_the_static_curve_of_
     curve = static_curve(PhysicalModel(), identify([run]).parameters[0], [run], 0, 100.0, top_rad_s)
     assert len(curve.holds) == 24
     assert len(curve.measured) > 8
-    for duty, measured in curve.measured:
-        settled = at_rest(1)
-        for _ in range(2000):
-            settled = advance(settled, np.array([duty]), 0.01, plant)
-        assert measured == pytest.approx(settled.speed_rad_s[0], abs=0.02 * top_rad_s)
+    duty, measured = curve.measured.T
+    settled = at_rest(len(duty))
+    for _ in range(2000):
+        settled = advance(settled, duty, 0.01, plant)
+    np.testing.assert_allclose(measured, settled.speed_rad_s, rtol=0.0, atol=0.02 * top_rad_s)
 
 
-def test_the_page_says_why_no_measured_point_is_on_the_static_curve(twin):
+def test_the_page_says_why_no_measured_point_is_on_the_static_curve(twin, undrawn):
     run = published_run(1, 10.0)
     hasty = published_fan(np.where(np.arange(1000) // 10 % 2, 20.0, 80.0)[:, np.newaxis], 1, "hasty").run
     never = report_page(content_of(twin, hasty))
@@ -422,10 +451,7 @@ def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(page, tm
 
 
 @pytest.mark.parametrize("width_px", [900, 1280])
-def test_on_a_desk_no_table_has_to_be_scrolled(twin, tmp_path, width_px):
-    content = content_of(twin, published_run(2, 10.0), unit=SpeedUnit("rpm", np.pi / 30.0))
-    refined = tuple(replace(parameter, in_force=1.1 * parameter.value) for parameter in content.fans[0].parameters)
-    page = report_page(replace(content, fans=(replace(content.fans[0], parameters=refined),)))
-    seen = seen_in_browser(page, width_px, tmp_path)
+def test_on_a_desk_no_table_has_to_be_scrolled(wide_page, tmp_path, width_px):
+    seen = seen_in_browser(wide_page, width_px, tmp_path)
     for (_, _, width, _), needed in zip(seen["tables"], seen["needed"], strict=True):
         assert needed <= np.ceil(width)
