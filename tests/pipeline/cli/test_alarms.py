@@ -136,7 +136,8 @@ class Site:
 
 
 @pytest.fixture
-def site(endpoint: str) -> Iterator[Site]:
+def site(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    monkeypatch.setattr("pipeline.runtime.runner.HEALTH_PERIOD_S", 0.05)  # every command waits for the next one
     site = Site(endpoint)
     yield site
     site.end()
