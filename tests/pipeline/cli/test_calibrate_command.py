@@ -41,11 +41,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def calibrated(folder: Path) -> Path:
-    output = folder / "calibrated.onnx"
-    result = calibrate(folder, "-o", output)
+def output_of_calibration(folder: Path) -> str:
+    result = calibrate(folder, "-o", folder / "calibrated.onnx")
     assert result.exit_code == 0, result.output
-    return output
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def calibrated(folder: Path, output_of_calibration: str) -> Path:
+    return folder / "calibrated.onnx"
 
 
 def calibrate(folder: Path, *more: object):
@@ -98,11 +102,10 @@ def strict(folder: Path, calibrated: Path) -> Path:
     return path
 
 
-def test_the_output_is_readable(folder: Path) -> None:
-    output = calibrate(folder, "-o", folder / "out.onnx").stdout
-    assert "out.onnx: alarms calibrated on 0.06" in output
-    assert f"declared: {PER_DAY} false alarms per fan and day" in output
-    assert "--verify" in output
+def test_the_output_is_readable(output_of_calibration: str) -> None:
+    assert "calibrated.onnx: alarms calibrated on 0.06" in output_of_calibration
+    assert f"declared: {PER_DAY} false alarms per fan and day" in output_of_calibration
+    assert "--verify" in output_of_calibration
 
 
 def test_json_is_one_document_of_the_limits_and_the_test_of_them(folder: Path) -> None:
