@@ -29,7 +29,7 @@ def info(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="A recording, or the parts of one.")],
     json_output: JsonOption = False,
 ) -> None:
-    """Show what a recording contains: time, trays, twins, messages of each topic with missing ones, problems of stages.
+    """Show what a recording contains: time, trays, twins, messages and losses of each topic, problems of stages.
 
     Several parts are also checked to continue one another. A file without an index is read in full, as far as
     possible. Exit code 3 if messages are missing or a file is damaged.
