@@ -153,7 +153,8 @@ def test_operators_are_answered_and_killed_stages_come_back_without_losing_state
         shown = fantwin(*chain.words("status"), "--json")
         (resampler,) = (stage for stage in json.loads(shown.stdout)["stages"] if stage["stage"] == "resampler")
         assert shown.returncode == 3, "a running site says that it has lost something"
-        assert resampler["counters"]["lost_between_sessions"] == resampler["lost"] > 0
+        # what the killed process had read and not yet sent is lost as well, and counted beside it
+        assert 0 < resampler["counters"]["lost_between_sessions"] <= resampler["lost"]
         for label in ("resampler", "twin_integrator", "viewer"):
             kill(chain, watcher, label)
 
