@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 
 from schemas.messages import Array
 
@@ -152,6 +151,9 @@ def filter_rows(keep: float, rows: Array, state: Array) -> tuple[Array, Array]:
 
     rows: (n, m). state: (1, m), keep times the y before the first. Returns y (n, m) and the state after.
     """
+    # a process that only shows alarms never filters, and this import takes longer than all its others
+    from scipy.signal import lfilter  # noqa: PLC0415
+
     made: Any = lfilter([1.0 - keep], [1.0, -keep], rows, axis=0, zi=state)
     return made[0], made[1]
 

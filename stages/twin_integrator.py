@@ -23,6 +23,7 @@ from collections.abc import Mapping
 from itertools import pairwise
 
 import numpy as np
+import scipy.signal  # noqa: F401  the torque balance loads it on first use: not while the first block waits
 from pydantic import Field
 
 from pipeline.runtime.free_run import FreeRun, FreeRunInputs

@@ -64,6 +64,16 @@ def test_the_process_of_a_stage_imports_no_rich_and_no_other_command():
     }
 
 
+@pytest.mark.parametrize("command", ["alarms", "command", "status", "up"])
+def test_a_command_beside_a_running_site_imports_nothing_that_is_slow(command: str):
+    look = (
+        f"import sys; from pipeline.cli import main; main._register(['{command}']);"
+        "print(sorted({'scipy', 'onnxruntime', 'pandas', 'matplotlib', 'rerun', 'torch'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recorded") / "tray.mcap"
