@@ -72,8 +72,8 @@ def on_grid(runs: Sequence[Run], grid: Grid, seed: int = 0) -> list[Run]:
     else:
         made = [resampled(piece, grid) for piece in pieces if piece.duration_s * grid >= 1.0]
     if not made:
-        said = "at irregular steps" if grid == "irregular" else f"at {grid:g} Hz"
-        raise TwinError(f"no run is long enough to be evaluated {said}; give longer ones")
+        rate = "at irregular steps" if grid == "irregular" else f"at {grid:g} Hz"
+        raise TwinError(f"no run is long enough to be evaluated {rate}; give longer ones")
     return made
 
 

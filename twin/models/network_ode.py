@@ -1,0 +1,49 @@
+"""A model whose right-hand side has a network: what the hybrid and the neural ODE share."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+from schemas.twin_card import NetworkCard, StateLayout
+from twin.models.network import TanhNetwork
+from twin.models.ode_graph import ode_graph
+from twin.models.onnx_nodes import Nodes
+from twin.models.physics import LAG
+from twin.models.right_hand_side import ODE_LAYOUT, FanEquation, advance
+from twin.runs import Array
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkOde:
+    """One network for all fans, beside the physics of each fan or alone. Shapes as in model.TwinModel."""
+
+    network: TanhNetwork
+    state_layout: StateLayout = ODE_LAYOUT
+
+    has_physics: ClassVar[bool]
+    fixed_rate: ClassVar[bool] = False
+
+    @property
+    def theta(self) -> Array:
+        """(P,) the weights of the network."""
+        return self.network.theta
+
+    @property
+    def network_card(self) -> NetworkCard:
+        """The size of the network."""
+        return self.network.card
+
+    def with_theta(self, theta: Array) -> Self:
+        """The same model with other weights."""
+        return replace(self, network=self.network.with_theta(theta))
+
+    def equation(self, parameters: Array) -> FanEquation:
+        """w' of a batch of fans with the physical parameters (batch, 4), which enter only if the model has physics."""
+        return FanEquation(parameters if self.has_physics else None, self.network)
+
+    def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
+        """Free run from state; see model.TwinModel."""
+        return advance(self.equation(parameters), state, command, step_s, parameters[:, LAG])
+
+    def graph(self) -> Nodes:
+        """See model.Model."""
+        return ode_graph(self.network, has_physics=self.has_physics)
