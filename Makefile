@@ -1,5 +1,5 @@
 # make demo   install what the demo needs into .venv and run it
-# make test   install what the tests need, check, and run all tests; those in real time come last, one at a time
+# make test   install what the tests need, check, and run all tests; those in real time come last, two at a time
 # make check  format, lint, types, direction of imports, generated code
 # make bench  measurements, as ratios
 # make schema regenerate the code of schemas/fan.proto
@@ -25,7 +25,7 @@ demo: $(VENV)/.runtime
 
 test: $(VENV)/.development check
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not real_time" --numprocesses 3 --dist worksteal
-	$(BIN)/python -m pytest -m real_time
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m real_time --numprocesses 2 --dist load --maxschedchunk 1
 
 check: $(VENV)/.development
 	$(BIN)/ruff format --check $(SOURCES)
