@@ -16,13 +16,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
 
 from pydantic import Field, field_validator
 
 from pipeline.recordings.disk import DiskError
 from pipeline.recordings.held_messages import HeldMessages
 from pipeline.recordings.metadata import recording_metadata
+from pipeline.recordings.open_part import OpenPart, PartsFolder
 from pipeline.recordings.parts import RecordingParts
 from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.sequence_ledger import SequenceLedger
@@ -41,6 +41,8 @@ DISK_CHECK_NS = NS_PER_S
 """how often the free space is checked"""
 ROOM_TO_RESUME = 1 << 20
 """bytes that must be free beyond the minimum to resume, so that recording does not pause again at once"""
+NEWS_SHOWN_NS = 60 * NS_PER_S
+"""how long health reports what another program did to the file"""
 _LOG = logging.getLogger(__name__)
 
 
@@ -74,31 +76,6 @@ class RecorderConfig(StageConfig):
         return value
 
 
-class OpenPart(Protocol):
-    """The methods of `pipeline.recordings.writing.RecordingWriter` that the core uses."""
-
-    path: Path
-    written: Counter[str]
-
-    @property
-    def pending(self) -> Sequence[Envelope]: ...  # noqa: D102
-    @property
-    def size(self) -> int: ...  # noqa: D102
-    def add(self, envelope: Envelope) -> None: ...  # noqa: D102
-    def flush(self) -> None: ...  # noqa: D102
-    def finish(self, *, has_ended: bool = False) -> None: ...  # noqa: D102
-
-
-class PartsFolder(Protocol):
-    """The methods of `pipeline.recordings.parts.RecordingParts` that the core uses."""
-
-    @property
-    def before(self) -> Mapping[StreamId, int]: ...  # noqa: D102
-    def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> OpenPart: ...  # noqa: D102
-    def free_bytes(self) -> int: ...  # noqa: D102
-    def delete_oldest(self) -> str | None: ...  # noqa: D102
-
-
 class Recorder(Core):
     """Adds every message to the open part, and begins new parts.
 
@@ -123,10 +100,10 @@ class Recorder(Core):
         self._recorded: Counter[str] = Counter()
         self._counts: Counter[str] = Counter(lost_unwritten=0)
         self._held = HeldMessages()
-        self._lost_in_pause = 0
-        self._problem = self._paused_because = ""
+        self._lost_in_pause = self._restored_reported = 0
+        self._problem = self._paused_because = self._news = ""
         self._now_ns = self._paused_ns = self._began_ns = self._checked_ns = now_ns
-        self._flushed_ns = 0
+        self._flushed_ns = self._news_ns = 0
         self._unflushed_ns: int | None = None
         """time of receipt of the oldest message that may not be on the disk yet"""
         try:
@@ -157,6 +134,7 @@ class Recorder(Core):
         if now_ns < self._now_ns - DISK_CHECK_NS:  # the host's clock was set back: restart all intervals
             self._checked_ns = self._began_ns = now_ns
             self._paused_ns = min(self._paused_ns, now_ns)
+            self._news_ns = min(self._news_ns, now_ns)
             self._flushed_ns = now_ns - int(self._config.flush_interval_s * NS_PER_S)
             self._unflushed_ns = None if self._unflushed_ns is None else self._flushed_ns  # due at once
         self._now_ns = now_ns
@@ -177,26 +155,27 @@ class Recorder(Core):
 
     def close(self) -> Sequence[Message]:
         """Finish the file; messages that could not be written are lost now."""
+        self._attempt(lambda: self._end_part(has_ended=True))
         if self._held:
             self._resume()
-        if self._part:
             self._attempt(lambda: self._end_part(has_ended=True))
         self._counts["lost_unwritten"] += len(self._held.take_all())
         return ()
 
     def abort(self) -> None:
         """Finish the file after a crash; it does not say that the recorder ended in order."""
-        if self._part:
-            self._attempt(self._end_part)
+        self._attempt(self._end_part)
 
     def counters(self) -> Mapping[str, int]:
-        """Messages of each topic that are on the disk, messages lost because they could not be written, and parts."""
+        """Messages of each topic that are on the disk, messages lost because they could not be written or because their
+        file was deleted, parts, and files that were restored."""
         recorded = self._recorded + (self._part.written if self._part else Counter())
         return {f"recorded_{topic}": count for topic, count in recorded.items()} | self._counts
 
     def problem(self) -> str:
-        """Why nothing is recorded now; empty if messages are recorded."""
-        return self._problem
+        """Why nothing is recorded now, or what another program did to the file; empty if all is well."""
+        is_news = self._now_ns - self._news_ns < NEWS_SHOWN_NS
+        return self._problem or (self._news if is_news else "")
 
     def _record(self, envelope: Envelope) -> None:
         if self._part is None:
@@ -217,7 +196,7 @@ class Recorder(Core):
     def _begin(self, about: Mapping[str, str]) -> None:
         held_since_ns = self._held.first_received_t_ns
         self._began_ns = self._now_ns if held_since_ns is None else min(held_since_ns, self._now_ns)
-        self._part = self._parts.begin(self._began_ns, self._ledger, about)
+        self._part, self._restored_reported = self._parts.begin(self._began_ns, self._ledger, about), 0
         self._counts["parts"] += 1
         self._problem = ""
         for card in self._cards.values():
@@ -241,7 +220,8 @@ class Recorder(Core):
 
     def _end_part(self, *, has_ended: bool = False) -> None:
         """Finish the open part. It is closed even if this raises RecordingError."""
-        assert self._part
+        if self._part is None:
+            return
         try:
             self._part.finish(has_ended=has_ended)
         finally:
@@ -249,8 +229,17 @@ class Recorder(Core):
 
     def _release_part(self) -> None:
         if self._part:
+            self._report_restored(self._part)
             self._recorded += self._part.written
-            self._ledger = self._ledger.for_next_part()
+            if self._part.lost:
+                self._counts["lost_deleted"] += self._part.lost
+                self._lost_in_pause += self._part.lost
+                self._news_ns = self._now_ns
+                self._news = (
+                    f"{self._part.path}: another program deleted or cut the file while it was written; messages "
+                )
+                self._news += f"lost with it: {self._part.lost}; keep other programs away from it"
+            self._ledger = self._ledger.as_lost() if self._part.lost else self._ledger.for_next_part()
             unwritten, self._part, self._unflushed_ns = self._part.pending, None, None
             self._hold(unwritten)
 
@@ -289,12 +278,26 @@ class Recorder(Core):
             with suppress(RecordingError):  # the reason is known already
                 self._end_part()
             self._pause(shortage)
+        elif self._part:
+            self._attempt(self._part.stay_in_place)
+        if self._part:
+            self._report_restored(self._part)
+
+    def _report_restored(self, part: OpenPart) -> None:
+        """Report that the file of a part was restored since it was last asked."""
+        if part.restored > self._restored_reported:
+            self._counts["files_restored"] += part.restored - self._restored_reported
+            self._restored_reported, self._news_ns = part.restored, self._now_ns
+            self._news = (
+                f"{part.path}: another program deleted, moved or replaced the file while it was written; it was "
+                "restored with all messages; keep other programs away from it"
+            )
+            _LOG.warning("%s", self._news)
 
     def _pause(self, reason: str) -> None:
         self._release_part()
         if not self._problem:
-            self._paused_ns, self._lost_in_pause = self._now_ns, 0
-            self._paused_because = reason
+            self._paused_ns, self._paused_because = self._now_ns, reason
             self._counts["pauses"] += 1
             _LOG.error("NOTHING IS RECORDED: %s", reason)
         self._problem = f"NOTHING IS RECORDED: {reason}; recording resumes automatically when this is resolved"
@@ -320,6 +323,7 @@ class Recorder(Core):
             (self._now_ns - self._paused_ns) / NS_PER_S,
             self._lost_in_pause,
         )
+        self._lost_in_pause = 0
         for envelope in self._held.take_all():
             self._record(envelope)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from pipeline.recordings.records import RecordingError
 
+_COPY_BYTES = 1 << 20
 _MAY_PASS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENODEV, errno.ENXIO, errno.EROFS, errno.ESTALE)
 
 
@@ -37,10 +38,8 @@ class AtomicAppendFile:
             BlockingIOError: another process is writing it.
             OSError: it cannot be opened, or does not exist and `keep` is set.
         """
-        flags = os.O_RDWR | os.O_CLOEXEC | (0 if keep else os.O_CREAT)
-        self._descriptor = os.open(path, flags, 0o644)
+        self._descriptor = _open_locked(path, os.O_RDWR | (0 if keep else os.O_CREAT))
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system unlocks it, also after kill -9
             self.size = os.fstat(self._descriptor).st_size if keep else 0
             self.cut(self.size)
         except OSError:
@@ -72,9 +71,56 @@ class AtomicAppendFile:
             os.fdatasync(self._descriptor)
             self._is_synced = True
 
+    def is_at(self, path: Path) -> bool:
+        """Whether `path` is still this file: not deleted, moved or replaced. OSError if the system cannot say."""
+        try:
+            found = path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        return os.path.samestat(found, os.fstat(self._descriptor))
+
+    def is_cut(self) -> bool:
+        """Whether somebody else has shortened it."""
+        return os.fstat(self._descriptor).st_size < self.size
+
+    def move_to(self, path: Path) -> None:
+        """Copy the content to a new file, flush that to the disk, and write there from now on. What was written can
+        still be read here after the file was deleted.
+
+        Raises:
+            FileExistsError: there is a file at `path`; it is left alone.
+            OSError: the disk refuses; nothing has changed.
+        """
+        descriptor = _open_locked(path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
+        try:
+            for start in range(0, self.size, _COPY_BYTES):
+                length = min(_COPY_BYTES, self.size - start)
+                rest = memoryview(os.pread(self._descriptor, length, start))
+                if len(rest) < length:
+                    raise OSError(errno.EIO, "it has been cut")
+                while rest:
+                    rest = rest[os.write(descriptor, rest) :]
+            os.fdatasync(descriptor)
+        except OSError:
+            path.unlink(missing_ok=True)
+            os.close(descriptor)
+            raise
+        os.close(self._descriptor)
+        self._descriptor, self._is_synced = descriptor, True
+
     def close(self) -> None:
         """Close and unlock it."""
         os.close(self._descriptor)
+
+
+def _open_locked(path: Path, flags: int) -> int:
+    descriptor = os.open(path, flags | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system unlocks it, also after kill -9
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
 
 
 @contextmanager
@@ -107,8 +153,12 @@ class Disk:
 
     def __init__(self, folder: Path) -> None:
         """The folder must exist. OSError otherwise."""
-        self._folder = folder.resolve(strict=True)
-        self._mounted_at = next(path for path in (self._folder, *self._folder.parents) if path.is_mount())
+        resolved = folder.resolve(strict=True)
+        self._mounted_at = next(path for path in (resolved, *resolved.parents) if path.is_mount())
+
+    def is_mounted(self) -> bool:
+        """Whether the disk is there."""
+        return self._mounted_at.is_mount()
 
     def free_bytes(self) -> int:
         """Free space for this user.
@@ -117,9 +167,9 @@ class Disk:
             DiskError: the disk is not there.
         """
         try:
-            if not self._mounted_at.is_mount():
+            if not self.is_mounted():
                 raise DiskError(f"{self._mounted_at}: the disk is no longer mounted; mount it again")
-            found = os.statvfs(self._folder)
+            found = os.statvfs(self._mounted_at)
         except OSError as error:
-            raise DiskError(f"{self._folder}: the folder is gone: {error.strerror}; restore it") from error
+            raise DiskError(f"{self._mounted_at}: the disk cannot be used: {error.strerror}; mount it again") from error
         return found.f_bavail * found.f_frsize

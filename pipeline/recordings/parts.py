@@ -59,7 +59,9 @@ class RecordingParts:
         except OSError as error:
             raise refused(f"{path}: cannot be written", error, "name another file or folder") from error
         last = self._last_part()
-        self._continues = last.path.name.removesuffix(ACTIVE_SUFFIX) if last else ""
+        self._last = last.path if last else None
+        """the part before the next one"""
+        self._writer: RecordingWriter | None = None
         self.before = last.next if last else {}
         """the sequence number due of each stream after the last part"""
 
@@ -69,23 +71,28 @@ class RecordingParts:
         Raises:
             RecordingError: it cannot be written.
         """
-        self._number += 1
+        self.free_bytes()  # raises if the disk is gone: do not write to its mount point
+        try:
+            self._number = 1 + max([self._number, *(number for number, _ in self._files())])
+        except OSError as error:
+            raise refused(f"{self._path.parent}: cannot be read", error, "name another folder") from error
+        if self._writer:
+            self._last = self._writer.path  # it may have been given another name since it began
         metadata = {
             **self._metadata,
             "part": str(self._part + 1),
             "started": datetime.fromtimestamp(t_ns / 1e9, UTC).isoformat(timespec="milliseconds"),
             "started_t_ns": str(t_ns),
-            **({"continues": self._continues} if self._continues else {}),
+            **({"continues": self._last.name.removesuffix(ACTIVE_SUFFIX)} if self._last else {}),
             **about,
         }
-        self.free_bytes()  # raises if the disk is gone: do not write to its mount point
         try:
             writer = RecordingWriter(self._name(self._number), metadata, self._attachments, t_ns=t_ns, ledger=ledger)
         except RecordingError:
             self._number -= 1
             raise
         self._part += 1
-        self._continues = writer.path.name
+        self._writer = writer
         return writer
 
     def free_bytes(self) -> int:
@@ -113,7 +120,8 @@ class RecordingParts:
         stem, suffix = re.escape(self._path.stem), re.escape(self._path.suffix)
         others = "|".join(map(re.escape, (ACTIVE_SUFFIX, ORIGINAL_SUFFIX, FORMER_ORIGINAL_SUFFIX)))
         pattern = re.compile(rf"{stem}(?:-(\d+))?{suffix}({others})?")
-        matches = ((pattern.fullmatch(path.name), path) for path in self._path.parent.iterdir())
+        paths = self._path.parent.iterdir() if self._path.parent.is_dir() else ()
+        matches = ((pattern.fullmatch(path.name), path) for path in paths)
         return [(int(match[1] or 1), path) for match, path in matches if match]
 
     def _is_ours(self, path: Path) -> bool:

@@ -119,6 +119,16 @@ class SequenceLedger:
         ledger._published = self._published
         return ledger
 
+    def as_lost(self) -> SequenceLedger:
+        """An empty ledger in place of this one, whose file is lost: what it counted is missing from now on."""
+        ledger = SequenceLedger()
+        ledger._published = self._published
+        for stream, state in self._streams.items():
+            if state.next_sequence is not None:
+                ledger._streams[stream] = StreamState(state.first_sequence)
+                ledger._published[stream] = max(state.next_sequence, self._published.get(stream, 0))
+        return ledger
+
     def before_as_metadata(self) -> dict[str, str]:
         """`next` as a metadata record; meant for the start of a part."""
         return {" ".join(stream): str(sequence) for stream, sequence in self.next.items()}

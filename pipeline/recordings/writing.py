@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import mimetypes
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple, NoReturn, Self
 
 from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
@@ -22,7 +22,7 @@ from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from pipeline.recordings.chunk import FillingChunk
-from pipeline.recordings.disk import AtomicAppendFile, refused, sync_folder
+from pipeline.recordings.disk import AtomicAppendFile, Disk, refused, sync_folder
 from pipeline.recordings.index import SHORT_ENDING, Index
 from pipeline.recordings.reading import METADATA_NAME
 from pipeline.recordings.records import RecordingError, record_bytes
@@ -76,6 +76,10 @@ class RecordingWriter:
         self.ledger = ledger or SequenceLedger()
         self.written: Counter[str] = Counter()
         """messages of each topic that are flushed to the disk"""
+        self.restored = 0
+        """how often another program had deleted, moved or replaced the file, and its content was written again"""
+        self.lost = 0
+        """messages that were flushed and are lost with the file, because it could not be restored"""
         self._filling: list[Envelope] = []
         """the messages of the chunk that is not written yet"""
         self._unsynced: list[_WrittenChunk] = []
@@ -89,6 +93,7 @@ class RecordingWriter:
         self._active = path.with_name(path.name + ACTIVE_SUFFIX)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            self._disk = Disk(path.parent)
             self._file = AtomicAppendFile(self._active)
         except BlockingIOError as error:
             raise RecordingError(
@@ -150,6 +155,22 @@ class RecordingWriter:
         self._finish_chunk()
         self._sync()
 
+    def stay_in_place(self) -> None:
+        """Restore the file if another program has deleted, moved or replaced it.
+
+        Raises:
+            RecordingError: it cannot be restored, or was cut: what was flushed is lost (`lost`, `ledger.as_lost`); what
+                was not flushed is pending.
+        """
+        try:
+            if self._file.is_cut():
+                self._lose("another program has cut it")
+            elif not self._file.is_at(self._active) and self._disk.is_mounted():
+                self._restore()
+        except OSError as error:  # whatever is not known to be on the disk is pending again
+            self._take_back()
+            raise self._end_early(error) from error
+
     def finish(self, *, has_ended: bool = False) -> None:
         """End the file and give it its name, `path`. Does nothing if the file has already ended.
 
@@ -209,6 +230,7 @@ class RecordingWriter:
     def _finish_chunk(self) -> None:
         if not self._filling:
             return
+        self.stay_in_place()  # before writing: a write to a file that was cut would hide that
         offset = self._file.size
         record, index = self._chunk.finish(offset)
         try:
@@ -228,6 +250,7 @@ class RecordingWriter:
         except OSError as error:  # the system drops what it could not write: a second attempt proves nothing
             self._take_back()
             raise self._end_early(error) from error
+        self.stay_in_place()
         for chunk in self._unsynced:
             self._count(chunk)
         self._unsynced, self._unsynced_bytes, self._synced_size = [], 0, self._file.size
@@ -247,6 +270,31 @@ class RecordingWriter:
         self._filling, self._unsynced = self.pending, []
         with suppress(OSError):
             self._file.cut(self._synced_size)
+
+    def _restore(self) -> None:
+        for path in _part_names(self.path):  # where another file has taken its name, under the next one
+            active = path.with_name(path.name + ACTIVE_SUFFIX)
+            if path == self.path or not path.exists():
+                try:
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    self._file.move_to(active)
+                    sync_folder(active.parent)
+                except FileExistsError:
+                    continue
+                except OSError as error:
+                    self._lose(f"it was deleted, moved or replaced and cannot be restored: {error.strerror}")
+                self.path, self._active = path, active
+                self.restored += 1
+                return
+
+    def _lose(self, why: str) -> NoReturn:
+        """End writing; what is in the file is lost, and what is not flushed is pending."""
+        self._filling, self._unsynced, self._ended = self.pending, [], True
+        self._file.close()
+        self.lost, self.written = self.written.total() - self.written["twin"], Counter()
+        raise RecordingError(
+            f"{self._active}: {why}; messages lost with it: {self.lost}; keep other programs away from it"
+        )
 
     def _write_metadata(self, name: str, values: Mapping[str, str]) -> None:
         metadata = Metadata(name=name, metadata=dict(values))
@@ -327,8 +375,11 @@ def write_ending(
 
 def free_name(path: Path) -> Path:
     """`path`, or if it exists the first of NAME-2, NAME-3 ... that does not."""
-    names = chain([path], (path.with_stem(f"{path.stem}-{number}") for number in count(2)))
-    return next(name for name in names if not name.exists())
+    return next(name for name in _part_names(path) if not name.exists())
+
+
+def _part_names(path: Path) -> Iterator[Path]:
+    return chain([path], (path.with_stem(f"{path.stem}-{number}") for number in count(2)))
 
 
 def _media_type(name: str) -> str:

@@ -73,7 +73,7 @@ class Part:
         self.written: Counter[str] = Counter()
         self.pending: list[Envelope] = []
         self.content: list[Envelope] = []
-        self.flushes = 0
+        self.flushes = self.restored = self.lost = 0
         self.closed = ""
         self.size = 0
 
@@ -95,6 +95,8 @@ class Part:
         self.content += self.pending
         self.pending = []
         self.flushes += 1
+
+    def stay_in_place(self) -> None: ...
 
     def finish(self, *, has_ended: bool = False) -> None:
         self.flush()
