@@ -142,6 +142,10 @@ class AcquisitionCore(Core):
         """Input by kind; docs/reference/wire-protocol.md explains each counter."""
         return dict(self._counts)
 
+    def samples_in(self, item: Item) -> int:
+        """The readings in a batch."""
+        return sum(isinstance(each, Reading) for each in item.items) if isinstance(item, ReadingBatch) else 0
+
     def problem(self) -> str:
         """What is wrong with the connection now."""
         name, silence_s = self._source.name, self._config.silence_s

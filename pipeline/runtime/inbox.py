@@ -50,15 +50,16 @@ class Inbox:
         self._closed = False
         self.dropped = 0
 
-    def put(self, item: Item) -> None:
-        """Add an item. Does nothing once the inbox is closed."""
+    def put(self, item: Item) -> bool:
+        """Add an item; False, and nothing is added, once the inbox is closed."""
         while not self._closed:
             try:
                 self._queue.put(item, block=not self._drops_oldest, timeout=_BLOCKED_CHECK_S)
-                return
+                return True
             except queue.Full:
                 if self._drops_oldest:
                     self._drop_one()
+        return False
 
     def get(self, timeout_s: float) -> Item | None:
         """The next item; None when there is none in time."""

@@ -7,6 +7,7 @@ viewer) discards its oldest items instead, and counts them.
 
 from __future__ import annotations
 
+import functools
 import secrets
 import threading
 import time
@@ -19,6 +20,7 @@ from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
+from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
 from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness
 from pipeline.runtime.outputs import Outputs
@@ -35,6 +37,8 @@ TICK_S = 0.05
 HEALTH_PERIOD_S = 1.0
 LOSS_REPORT_S = 0.2  # losses are reported this soon, so that a stage that is killed leaves few unreported
 PRODUCERS_END_LIMIT_S = 10.0  # how long a stage whose launcher has gone waits for its producers to end
+# When each part of the end must be over, as shares of launcher.stop_timeout_s: the rest is for the process itself.
+DRAINED, WORK_ENDED, SOURCES_STOPPED, CORES_CLOSED, HEALTH_SENT, BUS_LEFT = 0.5, 0.6, 0.65, 0.8, 0.85, 0.95
 
 
 class Runner:
@@ -81,7 +85,7 @@ class Runner:
         """by the tray that a core serves; an empty name: all"""
         self._has_source = any(parts.source for parts in self._parts.values())
         self._sources: list[Source] = []
-        """those that have been started and not yet stopped"""
+        """those that have been started"""
         self._clock = StageClock()
         self._bus = Bus(config.bus, stop)
         self._tracker = SequenceTracker(self._recover_rare if stage.may_drop else self._recover)
@@ -93,32 +97,56 @@ class Runner:
             tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
         }
         self._peers = Peers(self._read_keys)
-        self._crash = ""
+        self._ending = Ending(stage.name, config.launcher.stop_timeout_s)
         self._active_core: str | None = None
         """the core whose method is being called, or has raised"""
-        self._end_limit_s = 0.0
+        self._producers_end_limit_s = 0.0
+        self._sources_stop: Step | None = None
+        self._count_lock = threading.Lock()
+        """sources count from their own threads"""
 
     def run(self) -> Health:
         """Run to the end and return the last health, which is published whatever happens.
 
-        At the end cores are closed. A core that raised is aborted instead: its state may be half updated.
+        At the end cores are closed. A core that raised is aborted instead: its state may be half updated. The end takes
+        no longer than `launcher.stop_timeout_s`: what hangs, as with a consumer that takes no more messages, is left
+        behind. `is_hung` then says that the process cannot end in order.
+
+        Raises:
+            UserError: a part of the end did not end in time.
+            Exception: the first that the stage raised.
         """
-        try:
-            try:
-                self._start()
-                self._loop(until=self._should_end)
-                self._drain()
-            finally:
-                self._inbox.close()
-                self._stop_sources()
-                self._close_cores()
-        except BaseException as error:
-            self._crash = f"crashed: {type(error).__name__}: {error}"
-            raise
-        finally:
-            last = self._publish_health(StageStatus.DEGRADED if self._crash else StageStatus.STOPPED)
-            self._bus.close()
+        work, ending = Step(self._work), self._ending
+        while not work.wait(TICK_S):
+            if self.stop.is_set():
+                ending.begin()
+                ending.finish("processing what had arrived", work, WORK_ENDED)
+                break
+        else:
+            ending.begin()
+            if work.error is not None:
+                ending.fail(work.error, f"crashed: {type(work.error).__name__}: {work.error}")
+        self._inbox.close()
+        ending.finish("stopping the source", self._stop_sources(), SOURCES_STOPPED)
+        failed = self._active_core
+        for name, parts in self._parts.items():
+            self._close_core(name, parts, failed)
+        last = self._report_end()
+        ending.run("leaving the bus", self._bus.close, BUS_LEFT)
+        if ending.error is not None:
+            raise ending.error
         return last
+
+    @property
+    def is_hung(self) -> bool:
+        """Whether something was left behind in its thread: the interpreter must not wait for it."""
+        return self._ending.is_hung
+
+    def _work(self) -> None:
+        self._start()
+        self._loop(until=self._should_end)
+        self._ending.begin()
+        self._drain()
 
     def _start(self) -> None:
         for key in sorted(self._read_keys):
@@ -127,7 +155,7 @@ class Runner:
             for tray in self._parts:
                 self._bus.subscribe(tray_key(self._site, tray, "clock"), self._on_bus)
         self._bus.subscribe(health_key(self._site, "*", "*"), self._on_bus)
-        self._bus.watch_alive(alive_key(self._site, "*", "*"), lambda key, alive: self._inbox.put(Liveness(key, alive)))
+        self._bus.watch_alive(alive_key(self._site, "*", "*"), self._on_liveness)
         self._publish_health(StageStatus.STARTING)
         if not self.stage.may_drop:
             self._catch_up()
@@ -135,10 +163,13 @@ class Runner:
         for name, parts in self._parts.items():
             if parts.source:
                 self._sources.append(parts.source)
-                parts.source.start(lambda item, name=name: self._inbox.put(FromSource(name, item)))
+                parts.source.start(lambda item, name=name: self._deliver(FromSource(name, item)))
 
     def _on_bus(self, key: str, payload: bytes) -> None:
         self._inbox.put(FromBus(key, payload, time.time_ns()))
+
+    def _on_liveness(self, key: str, alive: bool) -> None:
+        self._inbox.put(Liveness(key, alive))
 
     def _loop(self, until: Callable[[], bool]) -> None:
         next_tick = next_health = next_loss = time.monotonic()
@@ -161,21 +192,21 @@ class Runner:
         if self.stop.is_set() or not self.launcher_gone.is_set():
             return self.stop.is_set()
         now = time.monotonic()
-        self._end_limit_s = self._end_limit_s or now + PRODUCERS_END_LIMIT_S
-        return now > self._end_limit_s or not self._peers.has_producer()
+        self._producers_end_limit_s = self._producers_end_limit_s or now + PRODUCERS_END_LIMIT_S
+        return now > self._producers_end_limit_s or not self._peers.has_producer()
 
     def _drain(self) -> None:
-        """Process what was sent to this stage before it was asked to stop, however much more is being sent."""
-        stopped = threading.Event()
+        """Process what was sent to this stage before it was asked to stop, however much more is being sent.
 
-        def stop_sources() -> None:
-            self._stop_sources()
-            stopped.set()
-
-        threading.Thread(target=stop_sources, daemon=True).start()
+        What there is no time for is counted as lost.
+        """
+        sources = self._stop_sources()
         left: int | None = None  # items still to be processed, known once everything expected has arrived
         while left != 0:
-            if left is None and stopped.is_set() and not self._peers.awaits_last_health():
+            if self._ending.left_s(DRAINED) < 0:
+                self._discard_waiting()
+                return
+            if left is None and sources.wait(0) and not self._peers.awaits_last_health():
                 left = self._inbox.waiting()
                 continue
             item = self._inbox.get(TICK_S)
@@ -183,17 +214,64 @@ class Runner:
                 self._handle(item)
                 left = None if left is None else left - 1
 
-    def _stop_sources(self) -> None:
-        while self._sources:
-            self._sources.pop().stop()
+    def _discard_waiting(self) -> None:
+        self._inbox.close()  # from now on `_deliver` counts what it refuses
+        while (item := self._inbox.get(0)) is not None:
+            if isinstance(item, FromSource):
+                self._count_lost(item)
+            elif isinstance(item, FromBus) and item.key in self._read_keys and not self.stage.may_drop:
+                self._counts["lost_at_stop"] += 1
 
-    def _close_cores(self) -> None:
-        failed = self._active_core
-        for name, parts in self._parts.items():
-            if name == failed:
-                parts.core.abort()
-            else:
-                self._call(name, parts.core.close, from_timer=True)
+    def _deliver(self, item: FromSource) -> None:
+        if not self._inbox.put(item):
+            self._count_lost(item)
+
+    def _count_lost(self, item: FromSource) -> None:
+        with self._count_lock:
+            self._counts["lost_at_stop"] += self._parts[item.core].core.samples_in(item.item)
+
+    def _stop_sources(self) -> Step:
+        """Stop all sources, once, in a thread: each delivers the rest of what it has while it is being stopped."""
+        if self._sources_stop is None:
+            self._sources_stop = Step(self._stop_each_source)
+        return self._sources_stop
+
+    def _stop_each_source(self) -> None:
+        errors: list[Exception] = []
+        for source in self._sources:
+            try:
+                source.stop()
+            except Exception as error:  # noqa: BLE001  the others are stopped as well
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+    def _close_core(self, name: str, parts: BuiltStage, failed: str | None) -> None:
+        what = name or "the core"
+        if name == failed:
+            self._ending.run(f"aborting {what}", parts.core.abort, CORES_CLOSED)
+        else:
+            close = functools.partial(self._call, name, parts.core.close, from_timer=True)
+            self._ending.run(f"closing {what}", close, CORES_CLOSED)
+
+    def _report_end(self) -> Health:
+        """Build and publish the last health; one without counts if those cannot be had."""
+        reported: list[Health] = []
+
+        def report() -> None:
+            status = StageStatus.DEGRADED if self._ending.error else StageStatus.STOPPED
+            try:
+                health = self._build_health(status)
+                payload = encode(health)
+            except Exception as error:  # noqa: BLE001  kept, and reported without what raised it
+                self._ending.fail(error, f"counting failed: {type(error).__name__}: {error}")
+                health = self._build_health(StageStatus.DEGRADED, with_counts=False)
+                payload = encode(health)
+            reported.append(health)
+            self._health_publisher.put(payload)
+
+        self._ending.run("reporting the last health", report, HEALTH_SENT)
+        return reported[0] if reported else self._build_health(StageStatus.DEGRADED, with_counts=False)
 
     def _handle(self, item: Item) -> None:
         if isinstance(item, FromSource):
@@ -230,7 +308,7 @@ class Runner:
             topic = topic_of(key)
             return Envelope(key, topic.name, payload, received_t_ns, decode(topic.message, payload))
         except (KeyError, CodecError):
-            self._counts["lost_undecodable"] += 1
+            self._counts["undecodable"] += 1
             return None
 
     def _step(self, envelope: Envelope) -> None:
@@ -293,19 +371,23 @@ class Runner:
     def _lost(self) -> int:
         return stage_losses(self._tracker.inputs(), self._counters(), may_drop=self.stage.may_drop)
 
-    def _publish_health(self, status: StageStatus) -> Health:
+    def _build_health(self, status: StageStatus, *, with_counts: bool = True) -> Health:
+        cores = [parts.core for parts in self._parts.values()] if with_counts else []
         health = self._health.build(
             status=status,
-            problems=[self._crash, *(parts.core.problem() for parts in self._parts.values())],
-            inputs=self._tracker.inputs(),
-            outputs=self._outputs.counts(),
-            counters=self._counters(),
+            problems=[self._ending.problem, *(core.problem() for core in cores)],
+            inputs=self._tracker.inputs() if with_counts else (),
+            outputs=self._outputs.counts() if with_counts else (),
+            counters=self._counters() if with_counts else {},
             now_ns=time.time_ns(),
         )
-        health = replace(health, header=Header(self.producer, self._health_publisher.published, ""))
+        return replace(health, header=Header(self.producer, self._health_publisher.published, ""))
+
+    def _publish_health(self, status: StageStatus) -> Health:
+        health = self._build_health(status)
         payload = encode(health)
         self._health_publisher.put(payload)
-        if "health" in self.stage.reads and status in (StageStatus.STARTING, StageStatus.OK):
-            # the bus does not return a session's own messages; closed cores take no more
+        if "health" in self.stage.reads:
+            # the bus does not return a session's own messages
             self._step(Envelope(self._health_publisher.key, "health", payload, time.time_ns(), health))
         return health

@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+import os
 import signal
-import sys
+import socket
 import threading
-from types import FrameType
 
 
 def stop_on_signals(stop: threading.Event) -> None:
-    """Set `stop` on the first SIGINT or SIGTERM; exit on the second."""
+    """Set `stop` on the first SIGINT or SIGTERM; exit on the second, with status 128 + its number.
 
-    def on_signal(number: int, _frame: FrameType | None) -> None:
-        if stop.is_set():
-            sys.exit(128 + number)
-        stop.set()
+    A handler in Python runs only when the main thread returns from whatever it has called, which may be never. So the
+    interpreter writes the number of the signal to a socket, at once, and a thread reads it.
+    """
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda _number, _frame: None)
+    threading.Thread(target=_obey, args=(reader, writer, stop), name="signals", daemon=True).start()
 
-    signal.signal(signal.SIGINT, on_signal)
-    signal.signal(signal.SIGTERM, on_signal)
+
+def _obey(reader: socket.socket, _writer: socket.socket, stop: threading.Event) -> None:
+    """`_writer` is held open for as long as this thread runs."""
+    while True:
+        for number in reader.recv(64):
+            if number not in (signal.SIGINT, signal.SIGTERM):
+                continue
+            if stop.is_set():
+                os._exit(128 + number)
+            stop.set()

@@ -57,6 +57,10 @@ class Core(Protocol):
         """What the core counts. Names that begin with `lost_` are losses and are summed up in health."""
         return {}
 
+    def samples_in(self, item: Any) -> int:
+        """How many samples an item of the source holds: so many are lost if there is no time to process it."""
+        return 1
+
     def problem(self) -> str:
         """One line on what is wrong now and what to do; empty when all is well."""
         return ""

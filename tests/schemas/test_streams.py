@@ -65,6 +65,6 @@ def test_health_carries_the_states_of_inputs_and_the_counts_of_outputs():
 
 def test_a_stage_that_may_drop_loses_only_what_its_loss_counters_say():
     inputs = [Input(key="k", producer="p", received=1, missing=3, duplicated=0, next_sequence=4)]
-    counters = {"lost_undecodable": 2, "dropped": 9}
+    counters = {"lost_commands": 2, "dropped": 9}
     assert stage_losses(inputs, counters, may_drop=False) == 5
     assert stage_losses(inputs, counters, may_drop=True) == 2

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import threading
+from contextlib import suppress
 from typing import Annotated
 
 import typer
@@ -48,14 +49,26 @@ def run(
         raise typer.Exit(EXIT_CANNOT_START) from error
     if until_stdin_closes:
         threading.Thread(target=_set_when_stdin_closes, args=(runner.launcher_gone,), daemon=True).start()
-    last = runner.run()
+    try:
+        last = runner.run()
+    except (OSError, UserError) as error:
+        _say(f"fantwin: {stage}: {error}" if isinstance(error, OSError) else f"fantwin: {error}")
+        if runner.is_hung:
+            os._exit(1)  # the end of the interpreter would wait for what hangs
+        raise typer.Exit(1) from error
     if json_output:
         typer.echo(
             json.dumps({"stage": stage, "lost": last.lost, "counters": {c.name: c.value for c in last.counters}})
         )
     if last.lost:
-        typer.echo(f"{stage}: {last.lost} lost, see the counters in `fantwin status` or in the recording", err=True)
+        _say(f"{stage}: {last.lost} lost, see the counters in `fantwin status` or in the recording")
         raise typer.Exit(3)
+
+
+def _say(line: str) -> None:
+    """To standard error; the launcher that reads it may have gone."""
+    with suppress(OSError):
+        os.write(sys.stderr.fileno(), f"{line}\n".encode())
 
 
 def _set_when_stdin_closes(launcher_gone: threading.Event) -> None:

@@ -1,0 +1,257 @@
+"""The end of a stage: it comes within its time, and leaves the bus, whatever raises or hangs on the way."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import LauncherConfig
+from pipeline.errors import UserError
+from pipeline.runtime.runner import Runner
+from pipeline.runtime.stage import BuiltStage, Context, Stage
+from schemas.codec import decode, encode
+from schemas.messages import Header, Health, Message, StageStatus
+from schemas.topics import health_key
+from tests.pipeline.runtime.test_runner import TRAY_A, TRAY_B, Bench, Burst, Passer, config, raw, toy
+from tests.support.running_chain import eventually
+
+__all__ = ["config"]  # a fixture
+
+
+class Ended:
+    """A stage that was run to its end in a thread, with what it raised and what others saw of it."""
+
+    def __init__(self, stage: Stage, config, *, tray: str | None = None, stop_timeout_s: float = 10.0) -> None:
+        config = replace(config, launcher=LauncherConfig(stop_timeout_s=stop_timeout_s))
+        self.stop = threading.Event()
+        self.error: Exception | None = None
+        self.healths: list[Health] = []
+        self.has_left_the_bus = False
+        with Bus(config.bus) as watching:
+            watching.subscribe(health_key("s", "*", "*"), self._keep)
+            self.runner = Runner(stage, config, tray, self.stop)
+            close = self.runner._bus.close
+
+            def close_and_say() -> None:
+                close()
+                self.has_left_the_bus = True
+
+            self.runner._bus.close = close_and_say
+            thread = threading.Thread(target=self._run, daemon=True)
+            thread.start()
+            eventually(lambda: any(h.status == StageStatus.OK for h in self.healths), "it runs")
+            self.stop.set()
+            thread.join(20)
+            self.has_ended = not thread.is_alive()
+            eventually(lambda: self.healths[-1].status != StageStatus.OK, "its last health arrived")
+
+    def _keep(self, _key: str, payload: bytes) -> None:
+        health = decode(Health, payload)
+        assert isinstance(health, Health)
+        self.healths.append(health)
+
+    def _run(self) -> None:
+        try:
+            self.runner.run()
+        except Exception as error:  # noqa: BLE001  looked at by the test
+            self.error = error
+
+    @property
+    def problem(self) -> str:
+        return self.healths[-1].problem
+
+
+class RaisesAtClose(Passer):
+    """Its file cannot be flushed."""
+
+    def close(self) -> Sequence[Message]:
+        raise OSError(30, "Read-only file system")
+
+    def abort(self) -> None:
+        raise OSError(30, "Read-only file system")
+
+
+def test_row_04_a_core_that_raises_while_it_is_closed_keeps_no_other_from_closing_and_is_reported(config):
+    closed: list[str] = []
+
+    def build(context: Context) -> BuiltStage:
+        class Closes(Passer):
+            def close(self) -> Sequence[Message]:
+                closed.append(context.tray.name)
+                return []
+
+        return BuiltStage(RaisesAtClose() if context.tray.name == TRAY_A else Closes())
+
+    ended = Ended(toy(build), config)
+    assert ended.has_ended
+    assert ended.has_left_the_bus
+    assert closed == [TRAY_B]
+    assert isinstance(ended.error, OSError)
+    assert ended.healths[-1].status == StageStatus.DEGRADED
+    assert "closing a failed: OSError: [Errno 30] Read-only file system" in ended.problem
+
+
+def test_row_04_a_stage_that_crashed_and_cannot_be_aborted_reports_the_crash(config):
+    class Broken(RaisesAtClose):
+        def step(self, item: Any) -> Sequence[Message]:
+            raise ZeroDivisionError("on purpose")
+
+    bench = Bench(toy(lambda _context: BuiltStage(Broken())), config)
+    bench.feed(TRAY_A, 1)
+    last = bench.health_with(lambda health: "crashed" in health.problem)
+    bench.thread.join(20)
+    bench.bus.close()
+    assert str(bench.crashes[0]) == "on purpose"
+    assert "ZeroDivisionError: on purpose" in last.problem
+
+
+def test_row_04_a_core_that_hangs_while_it_is_closed_is_left_behind_in_time(config):
+    release = threading.Event()
+
+    class Hangs(Passer):
+        def close(self) -> Sequence[Message]:
+            release.wait()
+            return []
+
+    ended = Ended(toy(lambda _context: BuiltStage(Hangs()), core_per_tray=False), config, stop_timeout_s=0.5)
+    release.set()
+    assert ended.has_ended
+    assert ended.has_left_the_bus
+    assert isinstance(ended.error, UserError)
+    assert "closing the core did not end in time" in ended.problem
+
+
+def test_row_04_a_loop_that_hangs_is_left_behind_in_time(config):
+    """As when a consumer hangs and takes no more of what is published."""
+    release, hanging = threading.Event(), threading.Event()
+
+    class Hangs(Passer):
+        def tick(self, now_ns: int) -> Sequence[Message]:
+            hanging.set()
+            release.wait()
+            return []
+
+    stop = threading.Event()
+    settings = replace(config, launcher=LauncherConfig(stop_timeout_s=0.5))
+    runner = Runner(toy(lambda _context: BuiltStage(Hangs()), core_per_tray=False), settings, None, stop)
+    errors: list[UserError] = []
+
+    def run() -> None:
+        with pytest.raises(UserError) as raised:
+            runner.run()
+        errors.append(raised.value)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    assert hanging.wait(20)
+    stop.set()
+    thread.join(20)
+    release.set()
+    assert "processing what had arrived did not end in time" in str(errors[0])
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_row_04_counts_that_no_health_can_hold_do_not_keep_the_stage_on_the_bus(config):
+    bench = Bench(toy(), config)
+    bench.publisher[TRAY_A].put(encode(replace(raw(1), header=Header("feeder", 2**64 - 1, TRAY_A))))
+    last = bench.health_with(lambda health: "crashed" in health.problem)
+    bench.thread.join(20)
+    bench.bus.close()
+    assert not bench.thread.is_alive()
+    assert last.status == StageStatus.DEGRADED
+
+
+class StopRaises(Burst):
+    """A source whose port is gone."""
+
+    def stop(self) -> None:
+        super().stop()
+        raise OSError(5, "Input/output error")
+
+
+def test_row_04_a_source_that_raises_while_it_is_stopped_does_not_keep_the_stage_from_ending(config):
+    stage = toy(lambda _context: BuiltStage(Passer(), StopRaises([raw(1)])), name="acquisition")
+    ended = Ended(stage, config, tray=TRAY_A)
+    assert ended.has_ended
+    assert "stopping the source failed: OSError: [Errno 5] Input/output error" in ended.problem
+    assert ended.healths[-1].outputs[0].published == 2, "what it had delivered was published"
+
+
+def test_row_04_each_source_is_stopped_once_before_its_core_is_closed_also_after_a_crash(config):
+    done: list[str] = []
+    may_stop = threading.Event()
+
+    class Slow(Burst):
+        def stop(self) -> None:
+            done.append("stop begins")
+            super().stop()
+            may_stop.wait(20)
+            done.append("stopped")
+
+    class Broken(Passer):
+        def step(self, item: Any) -> Sequence[Message]:
+            threading.Timer(0.1, may_stop.set).start()  # the crash comes first
+            raise ZeroDivisionError("on purpose")
+
+        def abort(self) -> None:
+            done.append("aborted")
+
+    ended = Ended(toy(lambda _context: BuiltStage(Broken(), Slow([raw(1)])), name="acquisition"), config, tray=TRAY_A)
+    assert isinstance(ended.error, ZeroDivisionError)
+    assert done == ["stop begins", "stopped", "aborted"]
+
+
+BLOCKED = """
+import ctypes, threading
+from pipeline.runtime.signals import stop_on_signals
+stop_on_signals(threading.Event())
+libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(64)
+libc.pthread_mutex_lock(mutex)
+print("blocked", flush=True)
+libc.pthread_mutex_lock(mutex)  # no signal interrupts this, as in a call of the bus
+"""
+
+
+def test_row_04_the_second_signal_ends_a_process_whose_main_thread_is_blocked():
+    process = subprocess.Popen([sys.executable, "-c", BLOCKED], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout
+        assert process.stdout.readline() == "blocked\n"
+
+        def ends_after_a_signal() -> bool:
+            process.terminate()
+            return process.poll() is not None
+
+        eventually(ends_after_a_signal, "it has ended", deadline_s=20)
+        assert process.returncode == 128 + 15
+    finally:
+        process.kill()
+        process.wait()
+        assert process.stdout
+        process.stdout.close()
+
+
+def test_row_18_what_is_not_processed_in_time_is_counted_as_lost(config):
+    """A device that sends faster than the stage can process."""
+
+    class Slow(Passer):
+        def step(self, item: Any) -> Sequence[Message]:
+            threading.Event().wait(0.05)
+            return super().step(item)
+
+    stage = toy(lambda _context: BuiltStage(Slow(), Burst([raw(t_ns) for t_ns in range(200)])), name="acquisition")
+    ended = Ended(stage, config, tray=TRAY_A, stop_timeout_s=2.0)
+    last = ended.healths[-1]
+    assert ended.error is None
+    assert last.status == StageStatus.STOPPED
+    counters = {counter.name: counter.value for counter in last.counters}
+    assert counters["lost_at_stop"] > 0
+    assert counters["lost_at_stop"] + last.outputs[0].published - 1 == 200
+    assert last.lost >= counters["lost_at_stop"]
