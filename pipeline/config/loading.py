@@ -18,6 +18,12 @@ from pydantic import BaseModel, Field, ValidationError
 from pipeline.config.models import BusConfig, Config, ConfigError, LauncherConfig, Name, Section, TrayConfig, nearest
 from pipeline.config.registry import STAGES
 
+LARGEST_FILE_BYTES = 1 << 20
+LONGEST_OVERRIDE = 1000
+"""characters of one `--set`"""
+LONGEST_SHOWN = 100
+"""characters of a key or value in an error"""
+
 
 class _File(Section):
     site: Name = "site"
@@ -36,10 +42,14 @@ def load_config(path: Path, overrides: Iterable[str] = (), stages: Iterable[str]
         stages: the stages whose sections are checked, and which are imported for that; None: all enabled stages.
 
     Raises:
-        ConfigError: the file is missing, is not UTF-8, is not TOML, or holds a wrong key or value.
+        ConfigError: the file is missing, too large, is not UTF-8, is not TOML, or holds a wrong key or value.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            content = file.read(LARGEST_FILE_BYTES + 1)
+        if len(content) > LARGEST_FILE_BYTES:
+            raise ConfigError(f"{path}: larger than {LARGEST_FILE_BYTES:,} bytes, so no configuration; see -c FILE")
+        text = content.decode("utf-8").replace("\r\n", "\n")
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the configuration: {error.strerror}; give one with -c FILE") from error
     except UnicodeDecodeError as error:
@@ -53,17 +63,26 @@ def parse_config(text: str, path: Path, overrides: Iterable[str] = (), stages: I
     Raises:
         ConfigError: see `load_config`.
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from error
     overrides = tuple(overrides)
-    for override in overrides:
-        _override(table, override)
+    try:
+        try:
+            table = tomllib.loads(text)
+        except ValueError as error:  # an integer of more than 4,300 digits is one, too
+            raise ConfigError(f"{path}: not valid TOML: {error}") from error
+        for override in overrides:
+            _override(table, override)
+        return _checked(table, text, path, overrides, stages)
+    except RecursionError as error:
+        raise ConfigError(f"{path}: tables or lists are nested too deeply; two levels are enough") from error
+
+
+def _checked(
+    table: dict[str, Any], text: str, path: Path, overrides: tuple[str, ...], stages: Iterable[str] | None
+) -> Config:
     own = {key: value for key, value in table.items() if key not in STAGES}
     for key in own:
         if key not in _File.model_fields:
-            raise ConfigError(f"{path}: unknown key {key!r}{nearest(key, [*_File.model_fields, *STAGES])}")
+            raise ConfigError(f"{path}: unknown key {_shown(key)}{nearest(key, [*_File.model_fields, *STAGES])}")
     file = _check(_File, own, path, "")
     enabled = enabled_stages(file.launcher, table)
     sections = {
@@ -98,6 +117,8 @@ def enabled_stages(launcher: LauncherConfig, table: Mapping[str, Any]) -> tuple[
 
 def _override(table: dict[str, Any], override: str) -> None:
     """Set one dotted key; `tray.0.port` is the port of the first tray."""
+    if len(override) > LONGEST_OVERRIDE:
+        raise ConfigError(f"--set {override[:LONGEST_SHOWN]}...: longer than {LONGEST_OVERRIDE:,} characters")
     dotted, equals, value_text = override.partition("=")
     if not equals:
         raise ConfigError(f"--set {override}: write KEY=VALUE, for example --set scorer.on_delay_s=1.0")
@@ -108,12 +129,12 @@ def _override(table: dict[str, Any], override: str) -> None:
         if value.startswith(("'", '"')):
             raise ConfigError(f"--set {override}: not a TOML string: {error}; write it in double quotes") from error
     here: Any = table
-    *parents, last = (int(part) if part.isascii() and part.isdecimal() else part for part in dotted.strip().split("."))
+    *parents, last = dotted.strip().split(".")
     try:
         for part in parents:
-            here = here[part] if isinstance(part, int) else here.setdefault(part, {})
-        here[last] = value
-    except (IndexError, TypeError, AttributeError) as error:
+            here = here[int(part)] if isinstance(here, list) else here.setdefault(part, {})
+        here[int(last) if isinstance(here, list) else last] = value
+    except (IndexError, TypeError, AttributeError, ValueError) as error:
         raise ConfigError(f"--set {override}: the configuration has no such key") from error
 
 
@@ -136,11 +157,17 @@ def _first_problem(error: ValidationError, model: type[BaseModel], section: str)
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     if first["type"] == "extra_forbidden":
         known = _keys_at(model, first["loc"][:-1])
-        return f"unknown key {where!r}{nearest(str(first['loc'][-1]), known)}{more}"
+        return f"unknown key {_shown(where)}{nearest(str(first['loc'][-1]), known)}{more}"
     if first["type"] == "missing":
         return f"{where!r} is missing{more}"
     message = first["msg"].removeprefix("Value error, ")
-    return f"{where} = {first['input']!r}: {message[0].lower()}{message[1:]}{more}"
+    given = "" if isinstance(first["input"], dict) else f" = {_shown(first['input'])}"
+    return f"{where}{given}: {message[0].lower()}{message[1:]}{more}"
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
 
 def _keys_at(model: type[BaseModel], location: Iterable[int | str]) -> list[str]:

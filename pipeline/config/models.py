@@ -9,9 +9,9 @@ import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from pipeline.config.registry import STAGES
 from pipeline.devices.sample_source import SourceConfig
@@ -21,6 +21,11 @@ from schemas.topics import RESERVED_TRAY_NAMES
 from schemas.units import SpeedUnit
 
 NAME_PATTERN = r"^[A-Za-z0-9_-]+$"
+LONGEST_S = 366 * 86_400
+"""seconds; no duration is longer: as ns it can be added to any time without leaving 64 bits"""
+LARGEST = 1 << 62
+SMALLEST = 1e-9
+"""of the magnitude of a number other than 0"""
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 
 
@@ -36,9 +41,21 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 class Section(BaseModel):
-    """Base of every section: frozen, unknown keys refused."""
+    """Base of every section: frozen, unknown keys refused, every number within bounds that arithmetic can take."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @field_validator("*")
+    @classmethod
+    def _within_bounds(cls, value: Any, info: ValidationInfo) -> Any:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            is_duration = (info.field_name or "").endswith("_s")
+            largest, words = (LONGEST_S, f"{LONGEST_S:,} s") if is_duration else (LARGEST, f"{LARGEST:.3g}")
+            if abs(value) > largest:
+                raise ValueError(f"too large: at most {words}")
+            if 0 < abs(value) < SMALLEST:
+                raise ValueError(f"too small: 0, or at least {SMALLEST:g}")
+        return value
 
 
 class BusConfig(Section):
@@ -116,6 +133,12 @@ class TrayConfig(Section):
         if value in RESERVED_TRAY_NAMES:
             raise ValueError(f"{value!r} is a reserved name")
         return value
+
+    @model_validator(mode="after")
+    def _commands_in_order(self) -> Self:
+        if self.command_min > self.command_max:
+            raise ValueError(f"command_min = {self.command_min:g} is greater than command_max = {self.command_max:g}")
+        return self
 
 
 @dataclass(frozen=True)

@@ -172,3 +172,16 @@ def test_train_takes_every_recording_after_validate_as_one_to_judge_by(recording
     done = fantwin(*words, "--json")
     assert done.returncode == 0, done.stderr
     assert '"evaluated_on": "held-out"' in done.stdout
+
+
+def test_row_15_a_lack_of_memory_is_one_line(monkeypatch, capsys):
+    def fail(_: list[str]) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(command_line, "_register", lambda _: None)
+    monkeypatch.setattr(command_line, "app", fail)
+    monkeypatch.setattr(sys, "argv", ["fantwin", "import", "x.csv"])
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    assert ended.value.code == 1
+    assert capsys.readouterr().err == "fantwin: not enough memory for this; use smaller files, or a machine with more\n"

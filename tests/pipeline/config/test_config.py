@@ -123,3 +123,39 @@ def test_a_file_that_is_not_utf_8_is_one_line(tmp_path):
     path.write_bytes('site = "Prüfstand"'.encode("latin-1"))
     with pytest.raises(ConfigError, match=r"fantwin.toml: the configuration is not UTF-8 \(byte 10\)"):
         load_config(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "overrides", "words"),
+    [
+        (GOOD, ["resampler.stale_for_s=1e300"], "resampler.stale_for_s = 1e+300: too large: at most 31,622,400 s"),
+        (GOOD, ["resampler.rate_hz=1e-300"], "resampler.rate_hz = 1e-300: too small: 0, or at least 1e-09"),
+        (
+            GOOD,
+            ["recorder.part_bytes=1" + 30 * "0"],
+            "recorder.part_bytes = 1000000000000000000000000000000: too large",
+        ),
+        (GOOD, ["recorder.part_bytes=" + 5000 * "9"], "longer than 1,000 characters"),
+        (GOOD + "smoothing_s = " + 5000 * "9", [], "not valid TOML: Exceeds the limit"),
+        (GOOD + "smoothing_s = " + 4000 * "9", [], "scorer.smoothing_s = 9999"),
+        (GOOD + "smoothing_s = " + 5000 * "[" + 5000 * "]", [], "nested too deeply"),
+        (GOOD, ["scorer.smoothing_s=" + 400 * "[" + 400 * "]"], "scorer.smoothing_s = [[[["),
+        (GOOD, [".".join(["scorer", *400 * ["a"]]) + "=1"], "unknown key 'scorer.a'"),
+        (GOOD, [400 * "9" + "=1"], "unknown key '9999"),
+        (GOOD, ["tray.0.command_min=1.5"], "tray.0: command_min = 1.5 is greater than command_max = 1"),
+    ],
+)
+def test_row_15_values_without_measure_are_one_line(text, overrides, words):
+    with pytest.raises(ConfigError) as caught:
+        parse(text, *overrides)
+    line = str(caught.value)
+    assert words in line
+    assert "\n" not in line
+    assert len(line) < 400
+
+
+def test_row_15_a_file_that_is_too_large_is_not_read(tmp_path):
+    path = tmp_path / "fan.toml"
+    path.write_bytes(b"#" * 2_000_000)
+    with pytest.raises(ConfigError, match=r"fan\.toml: larger than 1,048,576 bytes, so no configuration"):
+        load_config(path)
