@@ -13,6 +13,7 @@ from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
+from pipeline.launch.event_log import without_figures
 from pipeline.launch.loss_accounting import label
 from pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, process_list
 from pipeline.launch.site_watcher import SiteWatcher
@@ -156,8 +157,9 @@ class Launcher:
         """Report what has changed: problems of stages, and alarms."""
         for view in self._watcher.stages():
             name, problem = label(view.health), view.health.problem
-            if view.alive and problem != self._reported.get(name, ""):
-                self._reported[name] = problem
+            meaning = without_figures(problem)
+            if view.alive and meaning != self._reported.get(name, ""):
+                self._reported[name] = meaning
                 self._say(f"{name}: {problem or 'the problem is resolved'}")
         for current in self._watcher.current_alarms():
             alarm = current.newest

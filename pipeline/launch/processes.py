@@ -68,6 +68,7 @@ class Child:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
+            errors="replace",
             start_new_session=True,
         )
         self._on_line = on_line
@@ -84,7 +85,10 @@ class Child:
         return self._process.poll()
 
     def stop(self, timeout_s: float) -> int | None:
-        """Terminate it and wait; returns its exit status, None when it had to be killed."""
+        """Terminate it and wait; returns its exit status, None when it had to be killed.
+
+        A process that was still starting does not catch the signal yet. It ends by it, as asked: status 0.
+        """
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
         try:
@@ -93,6 +97,8 @@ class Child:
             self._process.kill()
             self._process.wait()
             status = None
+        if status == -signal.SIGTERM:
+            status = 0
         self._reader.join(timeout=1.0)
         return status
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from pipeline.bus.session import Bus
+from pipeline.config.models import NAME_PATTERN
 from pipeline.launch.loss_accounting import losses
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Health
@@ -58,8 +60,8 @@ class SiteWatcher:
     def ask_for_past_alarms(self) -> None:
         """Fetch the alarms that were raised before this watcher started."""
         key = tray_key(self._site, "*", "alarm")
-        for _, payload in self._bus.recover(key, "*", 0, 2**63, lambda: time.sleep(0.005)):
-            self._on_alarm("", payload)
+        for its_key, payload in self._bus.recover(key, "*", 0, 2**63, lambda: time.sleep(0.005)):
+            self._on_alarm(its_key, payload)
 
     def stages(self) -> list[StageView]:
         """The latest session of every stage instance, by name."""
@@ -99,15 +101,20 @@ class SiteWatcher:
                 before = self._healths.get(health.header.producer)
                 self._healths[health.header.producer] = (health, before[0] if before else None)
 
-    def _on_alarm(self, _key: str, payload: bytes) -> None:
+    def _on_alarm(self, key: str, payload: bytes) -> None:
+        """A message without a producer, or of another tray than its key says, is no alarm: no bytes decode as one."""
         alarm = _decoded(Alarm, payload)
-        if isinstance(alarm, Alarm):
+        if isinstance(alarm, Alarm) and alarm.header.producer and key == _alarm_key(self._site, alarm.header.tray):
             with self._lock:
                 messages = self._alarms.setdefault((alarm.header.tray, alarm.fan), {})
                 messages[alarm.header.producer, alarm.header.sequence] = alarm
                 newest = in_sequence(messages.values())[-1]
                 for name in [name for name, each in messages.items() if each.onset_t_ns != newest.onset_t_ns]:
                     del messages[name]
+
+
+def _alarm_key(site: str, tray: str) -> str:
+    return tray_key(site, tray, "alarm") if re.fullmatch(NAME_PATTERN, tray) else ""
 
 
 def _decoded(kind: type[Health] | type[Alarm], payload: bytes) -> object | None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 import threading
+from contextlib import suppress
 
 import typer
-from rich.console import Console
 
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.config.loading import load_config
-from pipeline.launch.launcher import Launcher
+from pipeline.launch.event_log import EventLog
+from pipeline.launch.launcher import Launcher, Outcome
 from pipeline.runtime.signals import stop_on_signals
 
 
@@ -23,25 +26,24 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
     Example: fantwin up -c fantwin.toml
     """
     settings = load_config(config, overrides or ())
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
     stop = threading.Event()
     stop_on_signals(stop)
-    launcher = Launcher(settings, overrides or (), lambda line: console.print(line, markup=False))
-    outcome = launcher.run(stop)
+    log = EventLog(sys.stderr.fileno())
+    try:
+        outcome = Launcher(settings, overrides or (), log.say).run(stop)
+        if not json_output:
+            losses = ", ".join(f"{name} {count}" for name, count in outcome.lost.items() if count)
+            log.say(f"stopped; lost: {losses or 'nothing'}; files in {outcome.run_folder}")
+    finally:
+        log.close()
     if json_output:
-        typer.echo(
-            json.dumps(
-                {
-                    "run_folder": outcome.run_folder,
-                    "restarts": outcome.restarts,
-                    "killed": outcome.killed,
-                    "failed": outcome.failed,
-                    "lost": outcome.lost,
-                }
-            )
-        )
-    else:
-        losses = ", ".join(f"{name} {count}" for name, count in outcome.lost.items() if count)
-        console.print(f"stopped; lost: {losses or 'nothing'}; files in {outcome.run_folder}", markup=False)
+        _print_json(outcome)
     if outcome.exit_code:
         raise typer.Exit(outcome.exit_code)
+
+
+def _print_json(outcome: Outcome) -> None:
+    """To standard output, where somebody may read it; the exit code stands whether or not it can be written."""
+    found = {name: getattr(outcome, name) for name in ("run_folder", "restarts", "killed", "failed", "lost")}
+    with suppress(OSError):
+        os.write(sys.stdout.fileno(), f"{json.dumps(found)}\n".encode())

@@ -1,0 +1,147 @@
+"""The output of `fantwin up`: a reader that goes away, a full disk and repetitions do no harm."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeline.launch.event_log import FOLD_S, QUEUE_SIZE, EventLog, RepeatedLines, without_figures
+from tests.support.running_chain import FANTWIN, Chain, eventually, view_of
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[int, int]]:
+    """The reading and the writing end of a pipe."""
+    ends = os.pipe()
+    yield ends
+    for end in ends:
+        try:
+            os.close(end)
+        except OSError:
+            continue
+
+
+def test_lines_arrive_in_order_and_repetitions_at_the_end(pipe):
+    log = EventLog(pipe[1])
+    for line in ("a", "b", "a", "a", "c"):
+        log.say(line)
+    log.close()
+    assert os.read(pipe[0], 1000).decode() == "a\nb\nc\na ... repeated 2 times\n"
+
+
+def test_row_08_a_reader_that_has_gone_ends_nothing(pipe):
+    os.close(pipe[0])
+    log = EventLog(pipe[1])
+    for number in range(5):
+        log.say(f"line {number}")
+    log.close()
+    assert not log._thread.is_alive()
+
+
+def test_row_08_a_reader_that_does_not_read_delays_nothing_and_learns_how_many_lines_are_missing(pipe):
+    os.set_blocking(pipe[0], False)
+    log = EventLog(pipe[1])
+    long = "x" * 200
+    for number in range(3 * QUEUE_SIZE):
+        log.say(f"{number} {long}")
+    read = b""
+
+    def is_empty() -> bool:
+        nonlocal read
+        try:
+            read += os.read(pipe[0], 1 << 20)
+        except BlockingIOError:
+            return log._queue.empty()
+        return False
+
+    eventually(is_empty, "all is read")
+    log.say("the end")
+    log.close()
+    read += os.read(pipe[0], 1 << 20)
+    lines = read.decode().splitlines()
+    missing = sum(int(line.split()[0].strip("(")) for line in lines if "lines could not be written" in line)
+    written = sum(line.endswith(long) for line in lines)
+    assert lines[-1] == "the end"
+    assert missing > 0
+    assert missing + written == 3 * QUEUE_SIZE
+
+
+def test_row_08_a_full_disk_under_the_log_ends_nothing(small_disk: Path):
+    path = small_disk / "up.log"
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    log = EventLog(descriptor)
+    log.say("before")
+    eventually(lambda: path.read_text() == "before\n", "the first line is written")
+    ballast = small_disk / "ballast"
+    with pytest.raises(OSError, match="No space left"):
+        ballast.write_bytes(bytes(64_000_000))
+    for number in range(100):
+        log.say(f"{number} {'x' * 200}")
+    eventually(log._queue.empty, "all lines were tried")
+    ballast.unlink()
+    log.say("after")
+    log.close()
+    os.close(descriptor)
+    assert "lines could not be written)\nafter\n" in path.read_text()
+
+
+def test_a_line_that_comes_every_second_is_written_less_and_less_often():
+    lines, written = RepeatedLines(), {}
+    for second in range(100):
+        written[second] = [*lines.due(second), *lines.add("the disk is full", second)]
+    assert {second: found for second, found in written.items() if found} == {
+        0: ["the disk is full"],
+        FOLD_S: ["the disk is full ... repeated 9 times"],
+        3 * FOLD_S: ["the disk is full ... repeated 20 times"],
+        7 * FOLD_S: ["the disk is full ... repeated 40 times"],
+    }
+
+
+def test_a_line_that_comes_again_later_is_written_again():
+    lines = RepeatedLines()
+    assert lines.add("a", 0) == ["a"]
+    assert lines.due(FOLD_S) == []
+    assert lines.add("a", FOLD_S) == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("12.3 MB are free, but 100.0 MB are required", "# MB are free, but # MB are required"),
+        ("tray1: nothing received for 2 s", "tray1: nothing received for # s"),
+        ("fan 3 is not scored: stale, for 10 s or more", "fan 3 is not scored: stale, for # s or more"),
+        ("fans 3, 4 are not scored", "fans 3, 4 are not scored"),
+    ],
+)
+def test_figures_are_not_part_of_what_a_line_means_and_numbers_of_fans_are(line, expected):
+    assert without_figures(line) == expected
+
+
+@pytest.mark.slow
+def test_row_08_when_the_reader_of_its_output_goes_away_up_continues(tmp_path, endpoint, pipe):
+    chain = Chain(tmp_path, endpoint, 'launcher.stages=["recorder"]')
+    up = subprocess.Popen([*FANTWIN, *chain.words("up"), "--json"], stdout=subprocess.PIPE, stderr=pipe[1], text=True)
+    try:
+        with chain.watcher() as watcher:
+            first = eventually(lambda: (view := view_of(watcher, "recorder")) and view.alive and view, "it runs")
+            os.close(pipe[0])  # nobody reads what it says from now on
+            os.kill(first.health.process_id, signal.SIGKILL)
+
+            def is_back() -> bool:
+                view = view_of(watcher, "recorder")
+                return bool(view and view.alive and view.health.process_id != first.health.process_id)
+
+            eventually(is_back, "the recorder is back", deadline_s=20)
+        up.send_signal(signal.SIGINT)
+        output, _ = up.communicate(timeout=20)
+        assert json.loads(output)["restarts"] == {"recorder": 1}
+        assert up.returncode == 0
+    finally:
+        up.kill()
+        up.communicate()

@@ -1,0 +1,52 @@
+"""What is seen of a site from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from pipeline.launch.site_watcher import SiteWatcher
+from schemas.codec import encode
+from schemas.messages import Alarm, Header
+from schemas.topics import tray_key
+from tests.support.bus_peer import alarm
+
+
+class StubBus:
+    """A bus of one process: the test publishes on it."""
+
+    def __init__(self) -> None:
+        self.subscribers: dict[str, Callable[[str, bytes], None]] = {}
+        self.kept: list[tuple[str, bytes]] = []
+
+    def subscribe(self, key: str, on_message: Callable[[str, bytes], None]) -> None:
+        self.subscribers[key] = on_message
+
+    def watch_alive(self, key: str, on_change: Callable[[str, bool], None]) -> None:
+        self.on_alive = on_change
+
+    def recover(self, *_args: Any) -> Iterator[tuple[str, bytes]]:
+        yield from self.kept
+
+
+@pytest.mark.parametrize("name", ["", "other", "tray/../x", "*"])
+def test_row_18_bytes_of_a_stranger_are_no_alarm(name):
+    bus: Any = StubBus()
+    watcher = SiteWatcher(bus, "s")
+    receive = bus.subscribers[tray_key("s", "*", "alarm")]
+    receive("fantwin/s/tray/alarm", b"")  # all fields at their defaults: it decodes
+    receive("fantwin/s/tray/alarm", encode(replace(alarm(0), header=Header("peer", 0, name))))
+    bus.kept = [("fantwin/s/tray/alarm", b"")]
+    watcher.ask_for_past_alarms()
+    assert watcher.alarms() == []
+
+
+def test_an_alarm_that_is_recovered_is_known():
+    bus: Any = StubBus()
+    watcher = SiteWatcher(bus, "s")
+    bus.kept = [("fantwin/s/tray/alarm", encode(alarm(3)))]
+    watcher.ask_for_past_alarms()
+    assert [type(each) for each in watcher.alarms()] == [Alarm]
