@@ -26,6 +26,7 @@ COMMANDS = {
     "wear": "watch.wear",
     "command": "watch.command",
     "doctor": "watch.doctor",
+    "selftest": "watch.selftest",
     "router": "watch.router",
     "replay": "recordings.replay",
     "info": "recordings.info",

@@ -1,0 +1,83 @@
+"""`fantwin selftest`: faults of practice on a site of its own; says what was promised and what was seen."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from pipeline.cli.options import JsonOption
+from pipeline.config.models import nearest
+from pipeline.errors import UserError
+from pipeline.selftest.scenarios import SCENARIOS, Scenario
+from pipeline.selftest.selftest import Row, run_scenarios
+
+_STATES = {True: "kept", False: "NOT KEPT", None: "not run"}
+_STYLES = {True: "green", False: "red", None: "yellow"}
+
+
+def selftest(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[SCENARIO]...", help="Which scenarios; default: all.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder for the files; default: a temporary one.")
+    ] = None,
+    list_scenarios: Annotated[bool, typer.Option("--list", help="List the scenarios and their promises.")] = False,
+    json_output: JsonOption = False,
+) -> None:
+    """Kill, hang, flood and disturb a simulated site on this computer, and check that it keeps its promises.
+
+    Touches no running site: it uses a port and a folder of its own. Takes about three minutes.
+    Exit code 1 if a promise was not kept.
+
+    Example: fantwin selftest
+
+    Example: fantwin selftest kill hang
+    """
+    chosen = _chosen(names or ())
+    console = Console(stderr=json_output, highlight=False, soft_wrap=True)
+    if list_scenarios:
+        for scenario in chosen:
+            console.print(f"{scenario.name:14} {scenario.promise}")
+        return
+    with tempfile.TemporaryDirectory(prefix="fantwin-selftest-") as temporary:
+        folder = out.resolve() if out else Path(temporary)
+        if out and out.exists() and any(out.iterdir()):
+            raise UserError(f"{out}: is not empty; name a new folder with -o")
+        with console.status(f"running {len(chosen)} scenarios"):
+            rows = run_scenarios(folder, chosen, lambda row: console.print(_line(row), markup=False))
+    is_kept = all(row.kept is not False for row in rows)
+    if json_output:
+        typer.echo(json.dumps({"rows": [asdict(row) for row in rows], "kept": is_kept}))
+    else:
+        console.print(_table(rows))
+    if not is_kept:
+        raise typer.Exit(1)
+
+
+def _chosen(names: list[str] | tuple[str, ...]) -> list[Scenario]:
+    by_name = {scenario.name: scenario for scenario in SCENARIOS}
+    for name in names:
+        if name not in by_name:
+            raise UserError(f"no scenario {name!r}{nearest(name, by_name)}")
+    return [by_name[name] for name in names] or list(SCENARIOS)
+
+
+def _line(row: Row) -> str:
+    return f"{_STATES[row.kept]:8}  {row.name}: {row.seen}"
+
+
+def _table(rows: list[Row]) -> Table:
+    table = Table("", "scenario", "promised", "seen", box=SIMPLE_HEAD)
+    for row in rows:
+        table.add_row(Text(_STATES[row.kept], style=_STYLES[row.kept]), row.name, row.promise, row.seen)
+    return table

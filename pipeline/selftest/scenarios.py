@@ -1,0 +1,236 @@
+"""The faults of a self-test. Each is a row: what is done to a running site, what is promised, and what was seen.
+
+A scenario returns what it saw, or raises `NotKept`. After each, the site has to judge all fans again, and no alarm may
+have been raised: all fans are healthy.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.selftest.scratch_site import FANS, SITE, STAGES, TRAY, ScratchSite
+from schemas.codec import encode, type_name
+from schemas.messages import Header, Raw
+from schemas.topics import BY_NAME, tray_key
+
+REPLACED_LIMIT_S = 30.0
+STALL_S = 8.0
+FAR_AHEAD_S = 3600.0
+NOISE_BYTES = 200_000
+GARBAGE_MESSAGES = 2_000
+STRANGERS = 10_000
+STRANGERS_LIMIT_MB = 20.0
+SMALL_DISK_BYTES = 64 << 20
+
+
+class NotKept(Exception):  # noqa: N818  a result, not an error
+    """A promise that was not kept; the text says what was seen instead."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A fault and its promise.
+
+    Attributes:
+        name: one word, as on the command line.
+        promise: what fantwin promises, one line.
+        run: does it to a site; returns what was seen.
+        needs_own_site: it leaves traces that others must not see.
+        needs_small_disk: the site's files lie on a disk of `SMALL_DISK_BYTES`, which only root may mount.
+        settings: of the site, `key=value`.
+    """
+
+    name: str
+    promise: str
+    run: Callable[[ScratchSite], str]
+    needs_own_site: bool = False
+    needs_small_disk: bool = False
+    settings: tuple[str, ...] = ()
+
+
+def _pause(seconds: float) -> None:
+    threading.Event().wait(seconds)
+
+
+def _require(condition: object, otherwise: str) -> None:
+    if not condition:
+        raise NotKept(otherwise)
+
+
+def _forged(t_ns: int) -> Raw:
+    """A raw sample that no device has sent."""
+    return Raw(
+        header=Header("stranger", 2**40, TRAY),
+        fans=FANS,
+        host_receive_t_ns=np.array([t_ns], np.int64),
+        device_clock_us=np.array([2**31], np.uint32),
+        device_sequence=np.array([2**31], np.uint32),
+        command=np.ones((1, FANS)),
+        speed_rad_s=np.zeros((1, FANS)),
+    )
+
+
+def _kills(site: ScratchSite) -> str:
+    seen: list[str] = []
+    for label in STAGES:
+        old = site.process_id(label)
+        os.kill(old, signal.SIGKILL)
+        took_s = site.replaced(label, old, REPLACED_LIMIT_S)
+        if took_s is None:
+            raise NotKept(f"{label} was not replaced within {REPLACED_LIMIT_S:.0f} s")
+        _require(site.seconds_until_judged(REPLACED_LIMIT_S), f"nothing was judged after {label} was replaced")
+        seen.append(f"{label} {took_s:.1f} s")
+    return "back after " + ", ".join(seen)
+
+
+def _hang(site: ScratchSite) -> str:
+    label = "twin_integrator"
+    old = site.process_id(label)
+    os.kill(old, signal.SIGSTOP)
+    took_s = site.replaced(label, old, REPLACED_LIMIT_S)
+    if took_s is None:
+        os.kill(old, signal.SIGCONT)
+        raise NotKept(f"{label} still hung after {REPLACED_LIMIT_S:.0f} s")
+    return f"killed and replaced after {took_s:.0f} s"
+
+
+def _silence(site: ScratchSite) -> str:
+    site.line.cut(True)
+    took_s = site.seconds_until(lambda: site.problem("resampler"), 20.0)
+    site.line.cut(False)
+    _require(took_s, "no stage reported the silence within 20 s")
+    return f"reported after {took_s:.1f} s: {site.problem('resampler') or 'resolved'}"
+
+
+def _backlog(site: ScratchSite) -> str:
+    before = len(site.raised)
+    site.line.hold()
+    _pause(STALL_S)
+    site.line.release()
+    judged_s = site.seconds_until_judged(60.0)
+    _require(judged_s, "nothing was judged in the minute after")
+    _require(len(site.raised) == before, f"{len(site.raised) - before} false alarms")
+    return f"judged again {judged_s:.1f} s after the line was back"
+
+
+def _noise(site: ScratchSite) -> str:
+    site.line.inject(bytes((index * 197 + index // 256 * 31) % 256 for index in range(NOISE_BYTES)))
+    _require(site.seconds_until_judged(60.0), "nothing was judged in the minute after")
+    return f"{NOISE_BYTES:,} bytes of noise skipped"
+
+
+def _garbage(site: ScratchSite) -> str:
+    publisher = site.bus.publisher(tray_key(SITE, TRAY, "raw"), BY_NAME["raw"], type_name(Raw), "stranger")
+    lost = sum(site.watcher.losses().values())
+    for _ in range(GARBAGE_MESSAGES):
+        publisher.put(b"\xff\xfe no message")
+    _require(site.seconds_until_judged(), "nothing was judged in the half minute after")
+    more = sum(site.watcher.losses().values()) - lost
+    _require(not more, f"counted as {more} losses of this site")
+    return f"{GARBAGE_MESSAGES:,} undecodable messages counted apart"
+
+
+def _far_ahead(site: ScratchSite) -> str:
+    view = site.view("resampler")
+    assert view
+    t_ns = view.health.t_ns + round(FAR_AHEAD_S * 1e9)
+    publisher = site.bus.publisher(tray_key(SITE, TRAY, "raw"), BY_NAME["raw"], type_name(Raw), "stranger")
+    publisher.put(encode(_forged(t_ns)))
+    judged_s = site.seconds_until_judged()
+    _require(judged_s, "nothing was judged in the half minute after")
+    return f"refused; judging went on ({judged_s:.1f} s for the next hundred samples)"
+
+
+def _second_owner(site: ScratchSite) -> str:
+    for words in (("up",), ("run", "acquisition")):
+        what = f"fantwin {' '.join(words)}"
+        try:
+            done = site.command(*words, *site.configured(), limit_s=REPLACED_LIMIT_S)
+        except subprocess.TimeoutExpired as error:
+            raise NotKept(f"a second `{what}` was not refused") from error
+        _require(done.returncode == 1, f"a second `{what}` ended with exit code {done.returncode}, not 1")
+        _require(done.stderr.count("\n") == 1, f"a second `{what}` said {len(done.stderr.splitlines())} lines")
+    return "a second site and a second acquisition were refused in one line each"
+
+
+def _recording_deleted(site: ScratchSite) -> str:
+    for path in site.run_folder.glob("*.active"):
+        path.unlink()
+    took_s = site.seconds_until(lambda: list(site.run_folder.glob("*.active")), 20.0)
+    _require(took_s is not None, "the recorder did not begin another file within 20 s")
+    return f"noticed, and another file begun, after {took_s:.1f} s"
+
+
+def _full_disk(site: ScratchSite) -> str:
+    ballast = site.run_folder / "ballast"
+    with ballast.open("wb", buffering=0) as file:
+        try:
+            while True:
+                file.write(bytes(1 << 16))
+        except OSError:  # full
+            pass
+    took_s = site.seconds_until(lambda: site.problem("recorder"), REPLACED_LIMIT_S)
+    _require(took_s, "the recorder did not report the full disk")
+    reported = site.problem("recorder")
+    _require(site.seconds_until_judged(), "nothing was judged while the disk was full")
+    ballast.unlink()
+    again_s = site.seconds_until(lambda: not site.problem("recorder"), REPLACED_LIMIT_S)
+    _require(again_s, f"not recorded again after room was made: {site.problem('recorder')}")
+    return f"reported after {took_s:.1f} s ({reported}); recorded again {again_s:.1f} s after room was made"
+
+
+def _strangers(site: ScratchSite) -> str:
+    before = {label: site.memory_bytes(label) for label in STAGES}
+    publisher = site.bus.publisher(tray_key(SITE, TRAY, "raw"), BY_NAME["raw"], type_name(Raw), "stranger")
+    for number in range(STRANGERS):
+        publisher.put(encode(replace(_forged(0), header=Header(f"stranger-{number}", 0, TRAY))))
+    judged_s = site.seconds_until_judged()
+    _require(judged_s, "nothing was judged in the half minute after")
+    grown = max(site.memory_bytes(label) - before[label] for label in STAGES) / 1e6
+    _require(grown < STRANGERS_LIMIT_MB, f"a stage grew by {grown:.0f} MB")
+    return f"judged again {judged_s:.1f} s after {STRANGERS:,} messages; no stage grew by more than {grown:.0f} MB"
+
+
+def _clock_back(site: ScratchSite) -> str:
+    site.set_clock(-FAR_AHEAD_S)
+    judged_s = site.seconds_until_judged(60.0)
+    _require(judged_s, "nothing was judged in the minute after")
+    return f"judged again after {judged_s:.1f} s"
+
+
+def _clock_forward(site: ScratchSite) -> str:
+    site.set_clock(FAR_AHEAD_S)
+    judged_s = site.seconds_until_judged(60.0)
+    _require(judged_s, "nothing was judged in the minute after")
+    return f"judged again after {judged_s:.1f} s"
+
+
+SCENARIOS = (
+    Scenario("kill", "each stage that is killed comes back, and nothing it had received is lost", _kills),
+    Scenario("hang", "a stage that hangs is killed and replaced", _hang),
+    Scenario("silence", "a silent line is reported", _silence),
+    Scenario("backlog", f"a line that stalls {STALL_S:.0f} s and delivers its backlog raises no alarm", _backlog),
+    Scenario("noise", "noise on the line is skipped", _noise),
+    Scenario("garbage", "messages of strangers that nobody can decode are not our loss", _garbage),
+    Scenario("far-ahead", "a forged message an hour ahead changes nothing", _far_ahead),
+    Scenario("strangers", "messages under ten thousand names neither delay the site nor fill its memory", _strangers),
+    Scenario("second-owner", "a second owner of a site or a tray is refused", _second_owner),
+    Scenario("deleted", "a recording that is deleted is noticed", _recording_deleted, needs_own_site=True),
+    Scenario(
+        "full-disk",
+        "a full disk is reported, delays no judgement, and is recorded on again once there is room",
+        _full_disk,
+        needs_own_site=True,
+        needs_small_disk=True,
+        settings=("recorder.min_free_bytes=8000000",),
+    ),
+    Scenario("clock-back", "a host clock set back an hour stops nothing", _clock_back, needs_own_site=True),
+    Scenario("clock-forward", "a host clock set forward an hour stops nothing", _clock_forward, needs_own_site=True),
+)

@@ -1,0 +1,223 @@
+"""A site of its own for a self-test: a simulated tray behind a relay, `fantwin up`, and a watcher of both."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from pipeline.bus.session import Bus
+from pipeline.config.loading import load_config
+from pipeline.errors import UserError
+from pipeline.launch.site_watcher import SiteWatcher, StageView
+from pipeline.selftest.line_relay import LineRelay
+from pipeline.selftest.stepped_clock import VARIABLE, set_offset_ns
+from schemas.codec import decode
+from schemas.messages import Alarm, Score, Transition
+from schemas.topics import tray_key
+
+FANTWIN = (sys.executable, "-P", "-m", "pipeline")
+CONFIGURATION = Path(__file__).parents[1] / "demo" / "demo.toml"
+SITE, TRAY, FANS = "demo", "tray1", 8
+STAGES = (f"acquisition/{TRAY}", "resampler", "twin_integrator", "scorer", "recorder")
+START_LIMIT_S = 60.0
+_POLL_S = 0.05
+
+
+class ScratchSite:
+    """Runs from entering to leaving its context; all its processes have ended after that."""
+
+    def __init__(self, folder: Path, *settings: str) -> None:
+        """folder: for its files, empty but for `runs`. settings: further overrides, `key=value`."""
+        self.folder = folder
+        self.run_folder = folder / "runs"
+        """what the stages write"""
+        self.run_folder.mkdir(exist_ok=True)
+        self.endpoint = f"tcp/127.0.0.1:{_free_port()}"
+        self.overrides = (
+            *(f"run_folder={json.dumps(str(self.run_folder))}", f"tray.0.port={json.dumps(str(folder / 'tray'))}"),
+            *(f"bus.endpoint='{self.endpoint}'", "launcher.stages=" + json.dumps([s.split("/")[0] for s in STAGES])),
+            *settings,
+        )
+        self.line = LineRelay(folder / "device", folder / "tray")
+        self._clock_file = folder / "clock"
+        self._processes: list[subprocess.Popen[str]] = []
+        self.raised: list[Alarm] = []
+        """the alarms raised so far"""
+        self.judged = 0
+        """samples so far that were valid, and judged, for all fans"""
+
+    def __enter__(self) -> Self:
+        set_offset_ns(self._clock_file, 0)
+        code = "from pipeline.selftest import stepped_clock\n\nstepped_clock.install()\n"
+        (self.folder / "sitecustomize.py").write_text(code, encoding="utf-8")
+        self._log = (self.folder / "up.log").open("w", encoding="utf-8")
+        self.bus = Bus(load_config(CONFIGURATION, self.overrides).bus, listens=False)
+        try:
+            self.watcher = SiteWatcher(self.bus, SITE)
+            self.bus.subscribe(tray_key(SITE, "*", "alarm"), self._on_alarm)
+            self.bus.subscribe(tray_key(SITE, "*", "score"), self._on_score)
+            self._start()
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        stages = [view.health.process_id for view in self.watcher.stages() if view.alive]
+        for process in self._processes:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+        for process_id in stages:
+            _kill(process_id)
+        self.line.close()
+        self.bus.close()
+        self._log.close()
+
+    def _start(self) -> None:
+        simulate = ("simulate", "--fans", FANS, "--speed-unit", "rpm", "--link", self.folder / "device")
+        self.tray = self.process(*simulate, "--wait-for-reader")
+        self.line.start()
+        self.up = self.process("up", *self.configured(), "--json", stdout=subprocess.PIPE)
+        if self.seconds_until_judged(START_LIMIT_S) is None:
+            raise UserError(f"the site of the self-test did not start within {START_LIMIT_S:.0f} s: {self.last_line()}")
+
+    def configured(self) -> tuple[str, ...]:
+        """The words that give a command this site's configuration."""
+        return ("-c", str(CONFIGURATION), *(word for override in self.overrides for word in ("--set", override)))
+
+    def process(self, *words: object, stdout: int | None = None) -> subprocess.Popen[str]:
+        """Start a `fantwin` command that ends with this site."""
+        process = subprocess.Popen(
+            [*FANTWIN, *map(str, words)],
+            stdin=subprocess.DEVNULL,
+            stdout=stdout or self._log,
+            stderr=self._log,
+            text=True,
+            start_new_session=True,
+            env={**os.environ, VARIABLE: str(self._clock_file), "PYTHONPATH": _path_with(self.folder)},
+        )
+        self._processes.append(process)
+        return process
+
+    def command(self, *words: object, limit_s: float = START_LIMIT_S) -> subprocess.CompletedProcess[str]:
+        """Run a `fantwin` command to its end.
+
+        Raises:
+            subprocess.TimeoutExpired: it did not end within the limit, and was killed.
+        """
+        return subprocess.run(
+            [*FANTWIN, *map(str, words)],
+            capture_output=True,
+            text=True,
+            timeout=limit_s,
+            check=False,
+            stdin=subprocess.DEVNULL,
+        )
+
+    def set_clock(self, offset_s: float) -> None:
+        """Set the wall clock of all processes of this site."""
+        set_offset_ns(self._clock_file, round(offset_s * 1e9))
+
+    def view(self, label: str) -> StageView | None:
+        """The stage as it reports itself; None if it has not."""
+        stage, _, tray = label.partition("/")
+        instance = tray or "all"
+        views = self.watcher.stages()
+        return next((v for v in views if (v.health.stage, v.health.instance) == (stage, instance)), None)
+
+    def process_id(self, label: str) -> int:
+        """The process of a stage that is alive."""
+        view = self.view(label)
+        assert view
+        return view.health.process_id
+
+    def problem(self, label: str) -> str:
+        """What a stage reports as wrong now."""
+        view = self.view(label)
+        return view.health.problem if view else ""
+
+    def memory_bytes(self, label: str) -> int:
+        """The resident memory of a stage."""
+        pages = Path(f"/proc/{self.process_id(label)}/statm").read_text(encoding="ascii").split()[1]
+        return int(pages) * os.sysconf("SC_PAGE_SIZE")
+
+    def seconds_until(self, condition: Callable[[], Any], limit_s: float) -> float | None:
+        """How long it took until the condition held; None if it did not within the limit."""
+        began_s = time.monotonic()
+        while not condition():
+            if time.monotonic() - began_s > limit_s:
+                return None
+            time.sleep(_POLL_S)
+        return time.monotonic() - began_s
+
+    def seconds_until_judged(self, limit_s: float = 30.0) -> float | None:
+        """Seconds until another hundred samples of all fans have been judged; None if they were not in time."""
+        before = self.judged
+        return self.seconds_until(lambda: self.judged >= before + 100, limit_s)
+
+    def replaced(self, label: str, old_process_id: int, limit_s: float) -> float | None:
+        """Seconds until another process has taken the place of a stage."""
+
+        def is_new() -> bool:
+            view = self.view(label)
+            return view is not None and view.alive and view.health.process_id != old_process_id
+
+        return self.seconds_until(is_new, limit_s)
+
+    def last_line(self) -> str:
+        """The last line of what the processes have printed."""
+        lines = self.log().strip().splitlines()
+        return lines[-1] if lines else "no output"
+
+    def log(self) -> str:
+        """All lines that the processes have printed."""
+        return (self.folder / "up.log").read_text(encoding="utf-8", errors="replace")
+
+    def stop(self) -> tuple[int, dict[str, Any]]:
+        """Stop the site as Ctrl-C does; returns its exit code and outcome."""
+        self.up.send_signal(signal.SIGINT)
+        output, _ = self.up.communicate(timeout=START_LIMIT_S)
+        self.tray.send_signal(signal.SIGINT)
+        self.tray.wait(START_LIMIT_S)
+        return self.up.returncode, json.loads(output)
+
+    def recordings(self) -> list[Path]:
+        """All parts of the recording."""
+        return sorted(self.run_folder.glob("recording*.mcap*"), key=lambda path: (len(path.name), path.name))
+
+    def _on_alarm(self, _key: str, payload: bytes) -> None:
+        alarm = decode(Alarm, payload)
+        if alarm.transition == Transition.RAISED:
+            self.raised.append(alarm)
+
+    def _on_score(self, _key: str, payload: bytes) -> None:
+        self.judged += int(decode(Score, payload).valid.all(axis=1).sum())
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def _path_with(folder: Path) -> str:
+    return os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH", ""))))
+
+
+def _kill(process_id: int) -> None:
+    try:
+        os.kill(process_id, signal.SIGKILL)
+    except ProcessLookupError:
+        return

@@ -1,0 +1,94 @@
+"""Runs the scenarios of a self-test on scratch sites, and takes the account of each site at its end."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.selftest.scenarios import SMALL_DISK_BYTES, NotKept, Scenario
+from pipeline.selftest.scratch_site import ScratchSite
+
+BACK_LIMIT_S = 30.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the result; `kept` is None where the scenario cannot run here."""
+
+    name: str
+    promise: str
+    seen: str
+    kept: bool | None
+
+
+def run_scenarios(folder: Path, scenarios: Sequence[Scenario], report: Callable[[Row], None]) -> list[Row]:
+    """Run them in order; `report` is called with each row when it is known."""
+    rows: list[Row] = []
+
+    def add(row: Row) -> None:
+        rows.append(row)
+        report(row)
+
+    for number, group in enumerate(_by_site(scenarios), start=1):
+        place = folder / f"site-{number}"
+        (place / "runs").mkdir(parents=True)
+        with small_disk(place / "runs", any(scenario.needs_small_disk for scenario in group)) as is_there:
+            if not is_there:
+                add(Row(group[0].name, group[0].promise, "not run: only root may mount a small disk", kept=None))
+                continue
+            with ScratchSite(place, *(each for scenario in group for each in scenario.settings)) as site:
+                for scenario in group:
+                    add(_run(site, scenario))
+                add(_account(site, ", ".join(scenario.name for scenario in group)))
+    return rows
+
+
+@contextmanager
+def small_disk(place: Path, is_needed: bool) -> Iterator[bool]:
+    """A small disk of its own at `place`, if it is needed; yields whether the need is met."""
+    if not is_needed:
+        yield True
+        return
+    words = ["mount", "-t", "tmpfs", "-o", f"size={SMALL_DISK_BYTES}", "tmpfs", str(place)]
+    if shutil.which("mount") is None or subprocess.run(words, capture_output=True, check=False).returncode:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        subprocess.run(["umount", "-l", str(place)], capture_output=True, check=False)
+
+
+def _by_site(scenarios: Sequence[Scenario]) -> list[list[Scenario]]:
+    """The scenarios that share a site, and then each that needs its own."""
+    shared = [scenario for scenario in scenarios if not scenario.needs_own_site]
+    return [*([shared] if shared else []), *([each] for each in scenarios if each.needs_own_site)]
+
+
+def _run(site: ScratchSite, scenario: Scenario) -> Row:
+    alarms = len(site.raised)
+    try:
+        seen = scenario.run(site)
+        if site.seconds_until_judged(BACK_LIMIT_S) is None:
+            raise NotKept(f"{seen}; but not all fans were judged again within {BACK_LIMIT_S:.0f} s")
+        if len(site.raised) > alarms:
+            raise NotKept(f"{seen}; but {len(site.raised) - alarms} healthy fans raised an alarm")
+    except NotKept as result:
+        return Row(scenario.name, scenario.promise, str(result), kept=False)
+    return Row(scenario.name, scenario.promise, seen, kept=True)
+
+
+def _account(site: ScratchSite, names: str) -> Row:
+    """Stop the site and verify its recording."""
+    name, promise = f"account of {names}", "it stops in order, and its recording replays to the same decisions"
+    status, outcome = site.stop()
+    if status not in (0, 3):
+        return Row(name, promise, f"exit code {status}: {site.last_line()}", kept=False)
+    verified = site.command("replay", "--offline", "--verify", *site.recordings())
+    last = (verified.stdout.strip() or verified.stderr.strip()).splitlines()[-1:]
+    lost = sum(outcome["lost"].values())
+    return Row(name, promise, f"{lost} lost; {' '.join(last)}", kept=verified.returncode == 0)

@@ -1,0 +1,148 @@
+"""`fantwin selftest`: a promise that is not kept is a row and exit code 1; a scenario on a real site is kept."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.selftest import selftest
+from pipeline.selftest.scenarios import SCENARIOS, NotKept, Scenario
+from pipeline.selftest.stepped_clock import set_offset_ns
+from tests.support.fantwin_command import error_of, fantwin
+
+
+class HealthySite:
+    """A site that survives everything."""
+
+    raised: list[object]
+    back_s: float | None = 0.1
+    status = 0
+
+    def __init__(self, folder: Path, *settings: str) -> None:
+        self.folder, self.settings, self.raised = folder, settings, []
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        return
+
+    def seconds_until_judged(self, _limit_s: float) -> float | None:
+        return self.back_s
+
+    def stop(self) -> tuple[int, dict[str, Any]]:
+        return self.status, {"lost": {"resampler": 2}}
+
+    def last_line(self) -> str:
+        return "the last line"
+
+    def recordings(self) -> list[Path]:
+        return []
+
+    def command(self, *_words: object):
+        return type("Done", (), {"returncode": 0, "stdout": "equal: 5 samples\n", "stderr": ""})
+
+
+class BlindSite(HealthySite):
+    back_s = None
+
+
+class BadlyEndedSite(HealthySite):
+    status = 1
+
+
+def refuses(_site: object) -> str:
+    raise NotKept("it ended")
+
+
+def alarms(site: HealthySite) -> str:
+    site.raised.append("alarm")
+    return "seen"
+
+
+FINE = Scenario("fine", "nothing happens", lambda _site: "seen")
+
+
+def rows_of(monkeypatch: pytest.MonkeyPatch, folder: Path, site: type, *scenarios: Scenario) -> list[selftest.Row]:
+    monkeypatch.setattr(selftest, "ScratchSite", site)
+    reported: list[selftest.Row] = []
+    rows = selftest.run_scenarios(folder, scenarios, reported.append)
+    assert rows == reported
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("site", "run", "seen"),
+    [
+        (HealthySite, refuses, "it ended"),
+        (HealthySite, alarms, "seen; but 1 healthy fans raised an alarm"),
+        (BlindSite, FINE.run, "seen; but not all fans were judged again within 30 s"),
+    ],
+)
+def test_a_promise_that_is_not_kept_is_a_row_that_says_what_was_seen(monkeypatch, tmp_path, site, run, seen):
+    row, account = rows_of(monkeypatch, tmp_path, site, Scenario("bad", "promised", run))
+    assert (row.kept, row.seen) == (False, seen)
+    assert (account.kept, account.seen) == (True, "2 lost; equal: 5 samples")
+
+
+def test_a_site_that_ends_badly_is_a_row_with_its_last_line(monkeypatch, tmp_path):
+    row, account = rows_of(monkeypatch, tmp_path, BadlyEndedSite, FINE)
+    assert (row.kept, account.kept, account.seen) == (True, False, "exit code 1: the last line")
+
+
+def test_scenarios_share_a_site_unless_they_need_their_own(monkeypatch, tmp_path):
+    alone = Scenario("alone", "promised", FINE.run, needs_own_site=True)
+    rows = rows_of(monkeypatch, tmp_path, HealthySite, FINE, alone, FINE)
+    assert [row.name for row in rows] == ["fine", "fine", "account of fine, fine", "alone", "account of alone"]
+
+
+def test_without_the_right_to_mount_a_disk_a_scenario_is_not_run_and_nothing_fails(monkeypatch, tmp_path):
+    monkeypatch.setattr(selftest.shutil, "which", lambda _name: None)
+    (row,) = rows_of(monkeypatch, tmp_path, HealthySite, Scenario("disk", "promised", refuses, needs_small_disk=True))
+    assert (row.kept, row.seen) == (None, "not run: only root may mount a small disk")
+
+
+def test_the_exit_code_says_whether_all_promises_were_kept(monkeypatch, tmp_path):
+    monkeypatch.setattr(selftest, "ScratchSite", HealthySite)
+    codes = {}
+    for name, scenario in (("kept", FINE), ("not-kept", Scenario("bad", "promised", refuses))):
+        monkeypatch.setattr("pipeline.cli.watch.selftest.SCENARIOS", [scenario])
+        done = fantwin("selftest", "--json", "-o", tmp_path / name)
+        codes[name] = (done.exit_code, json.loads(done.stdout)["kept"])
+    assert codes == {"kept": (0, True), "not-kept": (1, False)}
+
+
+def test_a_scenario_that_is_unknown_or_a_folder_in_use_is_one_line(tmp_path):
+    assert error_of("selftest", "hangs") == "no scenario 'hangs'; did you mean 'hang'?"
+    (tmp_path / "file").touch()
+    assert "is not empty; name a new folder with -o" in error_of("selftest", "-o", tmp_path)
+
+
+def test_every_scenario_is_listed_with_its_promise():
+    listed = fantwin("selftest", "--list").output
+    assert all(scenario.name in listed and scenario.promise in listed for scenario in SCENARIOS)
+
+
+def test_the_clock_of_a_process_follows_the_file(tmp_path):
+    clock = tmp_path / "clock"
+    set_offset_ns(clock, -3600 * 10**9)
+    code = "from pipeline.selftest import stepped_clock; stepped_clock.install(); import time; print(time.time_ns())"
+    environment = {**os.environ, "FANTWIN_SELFTEST_CLOCK": str(clock)}
+    before_ns = time.time_ns()
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert before_ns <= int(done.stdout) + 3600 * 10**9 <= time.time_ns()
+
+
+@pytest.mark.real_time
+def test_on_a_real_site_noise_is_skipped_and_its_recording_verifies():
+    done = fantwin("selftest", "noise", "--json")
+    assert done.exit_code == 0, done.output
+    rows = json.loads(done.stdout)["rows"]
+    assert [row["name"] for row in rows] == ["noise", "account of noise"]
