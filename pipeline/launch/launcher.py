@@ -17,6 +17,7 @@ from pipeline.launch.event_log import without_figures
 from pipeline.launch.loss_accounting import label
 from pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, process_list
 from pipeline.launch.site_watcher import SiteWatcher
+from pipeline.launch.watchdog import Watchdog
 from schemas.topics import alive_key
 
 _POLL_S = 0.05
@@ -36,6 +37,8 @@ class _Slot:
     start_at_s: float = 0.0
     delay_s: float = 0.0
     was_ready: bool = False
+    hung: str = ""
+    """why it was killed, for people"""
 
 
 @dataclass
@@ -67,6 +70,7 @@ class Launcher:
         self._say = say
         self._reported: dict[str, str] = {}
         self._slots = [_Slot(row, delay_s=config.launcher.restart_delay_s) for row in process_list(config)]
+        self._watchdog = Watchdog(config.launcher.watchdog_s)
         self.outcome = Outcome(run_folder=str(config.run_folder))
 
     def run(self, stop: threading.Event) -> Outcome:
@@ -134,6 +138,7 @@ class Launcher:
 
     def _start(self, slot: _Slot) -> None:
         slot.child = Child(slot.row, self._path, self._overrides, lambda row, line: self._say(f"{row.label} | {line}"))
+        self._watchdog.started(slot.row.label, time.monotonic())
         self._say(f"{slot.row.label}: started, process {slot.child.process_id}")
 
     def _check_processes(self) -> None:
@@ -147,11 +152,22 @@ class Launcher:
             status = slot.child.exit_status()
             if status is None:
                 slot.was_ready = slot.was_ready or self._watcher.is_ready(slot.child.process_id)
+                if slot.child.notices.read():
+                    self._watchdog.heard(slot.row.label, now, is_ready=slot.child.notices.is_ready)
                 continue
             if status == EXIT_CANNOT_START and not slot.was_ready:
                 slot.child.stop(0.1)
                 raise UserError(slot.child.last_line or f"{slot.row.label} cannot start as configured")
             self._plan_restart(slot, status, now)
+        self._kill_what_hangs(now)
+
+    def _kill_what_hangs(self, now: float) -> None:
+        hung = self._watchdog.hung(now)
+        for slot in self._slots:
+            if hung and slot.child and slot.row.label == hung[0]:
+                doing = f" ({slot.child.notices.status})" if slot.child.notices.status else ""
+                slot.hung = f"hangs: has not gone round its loop for {hung[1]:.0f} s{doing}; killed"
+                slot.child.kill()
 
     def _report_changes(self) -> None:
         """Report what has changed: problems of stages, and alarms."""
@@ -175,7 +191,10 @@ class Launcher:
         if now - slot.child.started_s > _STABLE_S:
             slot.delay_s = limits.restart_delay_s
         how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
-        self._say(f"{slot.row.label}: {how}, restarting in {slot.delay_s:.1f} s")
+        self._say(f"{slot.row.label}: {slot.hung or how}, restarting in {slot.delay_s:.1f} s")
+        slot.hung = ""
+        self._watchdog.ended(slot.row.label)
+        slot.child.notices.close()
         self.outcome.restarts[slot.row.label] = self.outcome.restarts.get(slot.row.label, 0) + 1
         slot.child, slot.start_at_s = None, now + slot.delay_s
         slot.delay_s = min(2 * slot.delay_s, limits.restart_delay_max_s)

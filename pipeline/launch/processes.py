@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -13,6 +14,8 @@ from pathlib import Path
 
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
+from pipeline.launch.notices import Notices
+from pipeline.runtime.notifier import VARIABLE as NOTIFY_VARIABLE
 
 EXIT_CANNOT_START = 78  # the stage cannot run as configured; one line on stderr says why (EX_CONFIG of sysexits.h)
 
@@ -60,6 +63,7 @@ class Child:
         self.row = row
         self.started_s = time.monotonic()
         self.last_line = ""
+        self.notices = Notices()
         # a process group of its own, so that Ctrl-C in the terminal reaches only the launcher, which stops all;
         # the launcher holds standard input open: when the launcher ends, however it ends, the child stops too
         self._process = subprocess.Popen(
@@ -70,6 +74,7 @@ class Child:
             text=True,
             errors="replace",
             start_new_session=True,
+            env={**os.environ, NOTIFY_VARIABLE: self.notices.address},
         )
         self._on_line = on_line
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -83,6 +88,10 @@ class Child:
     def exit_status(self) -> int | None:
         """None while it runs; negative: ended by that signal."""
         return self._process.poll()
+
+    def kill(self) -> None:
+        """End it at once: it hangs, and catches no other signal."""
+        self._process.kill()
 
     def stop(self, timeout_s: float) -> int | None:
         """Terminate it and wait; returns its exit status, None when it had to be killed.
@@ -100,6 +109,7 @@ class Child:
         if status == -signal.SIGTERM:
             status = 0
         self._reader.join(timeout=1.0)
+        self.notices.close()
         return status
 
     def _read(self) -> None:

@@ -23,6 +23,8 @@ class HealthBuilder:
         self._instance = instance
         self._started_t_ns = started_t_ns
         self._may_drop = may_drop
+        self.summary = "starting"
+        """the status of the last health in one line"""
         self._latencies_ms: deque[float] = deque(maxlen=_MAX_LATENCIES)
 
     def add_output(self, message: Message, now_ns: int) -> None:
@@ -46,6 +48,7 @@ class HealthBuilder:
         if problem and status == StageStatus.OK:
             status = StageStatus.DEGRADED
         p50, p99 = np.percentile(self._latencies_ms, (50, 99)) if self._latencies_ms else (0.0, 0.0)
+        self.summary = f"{status.words}: {problem}" if problem else status.words
         return Health(
             stage=self._stage,
             instance=self._instance,

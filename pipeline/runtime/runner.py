@@ -23,6 +23,7 @@ from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
 from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness
+from pipeline.runtime.notifier import Notifier
 from pipeline.runtime.outputs import Outputs
 from pipeline.runtime.peers import Peers
 from pipeline.runtime.sequence_tracker import SequenceTracker
@@ -97,6 +98,7 @@ class Runner:
             tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
         }
         self._peers = Peers(self._read_keys)
+        self._notifier = Notifier.from_environment()
         self._ending = Ending(stage.name, config.launcher.stop_timeout_s)
         self._active_core: str | None = None
         """the core whose method is being called, or has raised"""
@@ -144,8 +146,10 @@ class Runner:
 
     def _work(self) -> None:
         self._start()
+        self._notifier.ready()
         self._loop(until=self._should_end)
         self._ending.begin()
+        self._notifier.stopping()
         self._drain()
 
     def _start(self) -> None:
@@ -187,6 +191,7 @@ class Runner:
                 if now >= next_health or (now >= next_loss and self._lost() > reported_lost):
                     next_health, next_loss = now + HEALTH_PERIOD_S, now + LOSS_REPORT_S
                     reported_lost = self._publish_health(StageStatus.OK).lost
+                self._notifier.at_work(self._health.summary)
 
     def _should_end(self) -> bool:
         if self.stop.is_set() or not self.launcher_gone.is_set():
@@ -341,7 +346,11 @@ class Runner:
         self._active_core = None
 
     def _recover(self, key: str, producer: str, first: int, last: int) -> Iterator[Envelope]:
-        found = self._bus.recover(key, producer, first, last, self._inbox.set_aside)
+        def while_waiting() -> None:
+            self._notifier.at_work(f"asks for {key} again")
+            self._inbox.set_aside()
+
+        found = self._bus.recover(key, producer, first, last, while_waiting)
         envelopes = (self._decode(its_key, payload, time.time_ns()) for its_key, payload in found)
         return (envelope for envelope in envelopes if envelope is not None)
 

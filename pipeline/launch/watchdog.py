@@ -1,0 +1,59 @@
+"""Finds the stage that hangs: the one that has not gone round its loop for too long.
+
+A stage that publishes to one that hangs is soon blocked itself. So only the stage that has been silent longest is
+named, and all others are given a new period: they go on once it is gone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+START_LIMIT_S = 60.0
+"""silence while a stage starts: it may load large libraries and ask others for what it missed"""
+_OWN_PAUSE_S = 1.0  # the launcher itself did not run: the machine was suspended or very busy
+
+
+@dataclass(slots=True)
+class _Heard:
+    at_s: float
+    is_ready: bool = False
+
+
+class Watchdog:
+    """When each stage was last at work. Times are those of a monotonic clock, in seconds."""
+
+    def __init__(self, limit_s: float) -> None:
+        """limit_s: how long a stage may be silent."""
+        self._limit_s = limit_s
+        self._heard: dict[str, _Heard] = {}
+        self._checked_s: float | None = None
+
+    def started(self, name: str, now_s: float) -> None:
+        """A stage has been started."""
+        self._heard[name] = _Heard(now_s)
+
+    def heard(self, name: str, now_s: float, *, is_ready: bool) -> None:
+        """A stage has gone round its loop."""
+        self._heard[name] = _Heard(now_s, is_ready)
+
+    def ended(self, name: str) -> None:
+        """A stage has ended."""
+        self._heard.pop(name, None)
+
+    def hung(self, now_s: float) -> tuple[str, float] | None:
+        """The stage that hangs, and for how many seconds; None if none does. To be called all the time."""
+        pause_s = 0.0 if self._checked_s is None else now_s - self._checked_s
+        self._checked_s = now_s
+        if pause_s > _OWN_PAUSE_S:
+            for heard in self._heard.values():
+                heard.at_s = min(now_s, heard.at_s + pause_s)
+        silent = {name: now_s - heard.at_s for name, heard in self._heard.items() if self._is_overdue(heard, now_s)}
+        if not silent:
+            return None
+        name = max(silent, key=lambda each: silent[each])
+        for heard in self._heard.values():
+            heard.at_s = now_s
+        return name, silent[name]
+
+    def _is_overdue(self, heard: _Heard, now_s: float) -> bool:
+        return now_s - heard.at_s > (self._limit_s if heard.is_ready else max(self._limit_s, START_LIMIT_S))

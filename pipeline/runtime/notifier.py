@@ -1,0 +1,59 @@
+"""Says that this process is ready and at work, to whoever started it: the launcher, or systemd.
+
+The protocol is systemd's (man sd_notify): a datagram of lines to the Unix socket that the environment names. A stage
+sends one while it goes round its loop, so that silence means that it hangs.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+
+VARIABLE = "NOTIFY_SOCKET"
+PERIOD_S = 0.25
+
+
+class Notifier:
+    """Sends the notices of one process; does nothing where nobody asked for them. Never blocks, never raises."""
+
+    def __init__(self, address: str | None) -> None:
+        """address: a path, or a name that begins with `@` for Linux's abstract sockets; None: nobody asked."""
+        self._address = f"\0{address[1:]}" if address and address.startswith("@") else address
+        self._socket: socket.socket | None = None
+        self._next_s = 0.0
+        self._is_ready = False
+        if self._address:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            self._socket.setblocking(False)
+
+    @classmethod
+    def from_environment(cls) -> Notifier:
+        """The notifier that the environment asks for."""
+        return cls(os.environ.get(VARIABLE))
+
+    def ready(self) -> None:
+        """The process has started: from now on every notice says so, since one may be lost."""
+        self._is_ready = True
+        self._next_s = 0.0
+
+    def at_work(self, status: str) -> None:
+        """The loop has gone round; sent every `PERIOD_S` at most. status: one line for people."""
+        now_s = time.monotonic()
+        if self._socket is None or now_s < self._next_s:
+            return
+        self._next_s = now_s + PERIOD_S
+        lines = [*(["READY=1"] if self._is_ready else []), "WATCHDOG=1", f"STATUS={' '.join(status.split())}"]
+        self._send("\n".join(lines))
+
+    def stopping(self) -> None:
+        """The process ends in order."""
+        self._send("STOPPING=1")
+
+    def _send(self, text: str) -> None:
+        if self._socket is None:
+            return
+        try:
+            self._socket.sendto(text.encode(), self._address or "")
+        except OSError:  # nobody listens any more, or is behind
+            return
