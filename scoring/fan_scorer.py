@@ -224,7 +224,7 @@ class FanScorer:
                 Observation(ratios=ratios, persistent=persistent, expected=expected, transient_rad_s=transient_rad_s)
             )
         largest = ratios.argmax(axis=0)
-        score = np.take_along_axis(ratios, largest[np.newaxis], axis=0)[0]
+        score = ratios.max(axis=0)
         highest = score.max(axis=0)
         self._below_half_limit &= highest <= HALF_LIMIT
         self._within_limit &= highest <= 1.0

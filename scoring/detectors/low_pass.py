@@ -30,19 +30,23 @@ class LowPass(ColumnState):
     def update(self, x: Array, valid: Array, period_s: float) -> Array:
         """Take a block, (n, columns) each, and return the output after each sample."""
         keep = self.keep(period_s)
-        whole = valid.all(axis=0)
         if len(x) == 1:
             y = np.where(valid, (1.0 - keep) * x + keep * self.value, self.value)
-        elif whole.all():
+        elif valid.all():
             y, _ = filter_rows(keep, x, keep * self.value[np.newaxis])
         else:
-            y = np.empty_like(x)
-            if whole.any():
-                y[:, whole], _ = filter_rows(keep, x[:, whole], keep * self.value[np.newaxis, whole])
-            y[:, ~whole] = self.value[~whole]
-            for column in np.flatnonzero(~whole & valid.any(axis=0)).tolist():
-                y[:, column] = self._held(x[:, column], valid[:, column], keep, self.value[column])
+            y = self._partly_valid(x, valid, keep)
         self.value = y[-1].copy()
+        return y
+
+    def _partly_valid(self, x: Array, valid: Array, keep: float) -> Array:
+        y = np.empty_like(x)
+        whole = valid.all(axis=0)
+        if whole.any():
+            y[:, whole], _ = filter_rows(keep, x[:, whole], keep * self.value[np.newaxis, whole])
+        y[:, ~whole] = self.value[~whole]
+        for column in np.flatnonzero(~whole & valid.any(axis=0)).tolist():
+            y[:, column] = self._held(x[:, column], valid[:, column], keep, self.value[column])
         return y
 
     def columns(self) -> dict[str, Array]:
