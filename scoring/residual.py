@@ -98,6 +98,11 @@ class Residual:
         persistent = standardised / self._persistent_std(scaling, speed_rad_s, transient_rad_s, valid)
         return standardised.clip(-clip, clip), persistent.clip(-clip, clip)
 
+    @property
+    def memory_s(self) -> float:
+        """How long samples affect the smoothed residual."""
+        return self._low_pass.memory_s
+
     def reset(self, fans: Array) -> None:
         """Start the low-pass again for some fans, (fans,) of bool; baselines stay."""
         self._low_pass.reset(fans)

@@ -10,6 +10,8 @@ from schemas.messages import Array
 from scoring.detectors.state import ColumnState
 from scoring.torque_balance import filter_rows
 
+MEMORY_TIME_CONSTANTS = 5.0  # after these, less than one percent of an output is left
+
 
 class LowPass(ColumnState):
     """y[k] = keep y[k-1] + (1 - keep) x[k] with keep = exp(-step / time constant), exact for a held input."""
@@ -18,6 +20,11 @@ class LowPass(ColumnState):
         self._time_constant_s = time_constant_s
         self.value = np.full(columns, start)
         """(columns,) the last output"""
+
+    @property
+    def memory_s(self) -> float:
+        """How long samples affect the output."""
+        return MEMORY_TIME_CONSTANTS * self._time_constant_s
 
     def keep(self, period_s: float) -> float:
         """Weight of the previous output after one step."""
