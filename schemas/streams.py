@@ -18,7 +18,8 @@ from schemas.messages import Health, Input
 
 LOSS_PREFIX = "lost_"
 """start of the names of counters that count losses"""
-
+MOST_PUBLISHED = 1 << 53
+"""no producer has ever published more messages on one key: 100,000 a second for 2,800 years"""
 
 StreamId: TypeAlias = tuple[str, str]
 """(key, producer)"""

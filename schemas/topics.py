@@ -23,6 +23,7 @@ from schemas.messages import (
 )
 
 ON_CHANGE = "on change"
+KIB, MIB = 1 << 10, 1 << 20
 ROOT = "fantwin"
 HEALTH_CHUNK = "health"
 ALIVE_CHUNK = "alive"
@@ -31,13 +32,20 @@ RESERVED_TRAY_NAMES = (HEALTH_CHUNK, ALIVE_CHUNK)
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic. A producer keeps its last `history` messages for consumers that missed them."""
+    """One topic.
+
+    Attributes:
+        history: a producer keeps this many of its last messages for consumers that missed them.
+        largest_bytes: a longer message is refused before it is decoded. The largest that any configuration makes is
+            half of it or less (blocks of 4096 samples of 64 fans).
+    """
 
     name: str
     message: type[Message]
     rate: str
     recorded: bool
     history: int
+    largest_bytes: int
     about: str
 
     @property
@@ -47,17 +55,19 @@ class Topic:
 
 
 TOPICS: tuple[Topic, ...] = (
-    Topic("raw", Raw, "as the device sends, often 100 Hz", True, 1024, "samples as the device sent them"),
-    Topic("grid", Grid, "the grid's rate over the block size", True, 1024, "samples on a uniform grid"),
-    Topic("prediction", Prediction, "as grid", True, 1024, "the healthy twin beside the measurement"),
-    Topic("score", Score, "as prediction", True, 1024, "scored samples, ready to draw"),
-    Topic("alarm", Alarm, ON_CHANGE, True, 1024, "transitions of alarms"),
-    Topic("request", Request, ON_CHANGE, True, 64, "requests of operators about alarms"),
-    Topic("snapshot", ScorerSnapshot, "on change, and each minute", True, 4, "state of a scorer for a restart"),
-    Topic("command", Command, ON_CHANGE, True, 64, "commands and set-points for the fans"),
-    Topic("twin", ModelCard, ON_CHANGE, True, 8, "the twin in force"),
-    Topic("clock", Clock, "20 Hz", False, 1, "position of a replay"),
-    Topic("health", Health, "1 Hz for each stage", True, 8, "status and losses of a stage"),
+    Topic("raw", Raw, "as the device sends, often 100 Hz", True, 1024, 16 * MIB, "samples as the device sent them"),
+    Topic("grid", Grid, "the grid's rate over the block size", True, 1024, 16 * MIB, "samples on a uniform grid"),
+    Topic("prediction", Prediction, "as grid", True, 1024, 32 * MIB, "the healthy twin beside the measurement"),
+    Topic("score", Score, "as prediction", True, 1024, 64 * MIB, "scored samples, ready to draw"),
+    Topic("alarm", Alarm, ON_CHANGE, True, 1024, MIB, "transitions of alarms"),
+    Topic("request", Request, ON_CHANGE, True, 64, 64 * KIB, "requests of operators about alarms"),
+    Topic(
+        "snapshot", ScorerSnapshot, "on change, and each minute", True, 4, 16 * MIB, "a scorer's state for a restart"
+    ),
+    Topic("command", Command, ON_CHANGE, True, 64, 64 * KIB, "commands and set-points for the fans"),
+    Topic("twin", ModelCard, ON_CHANGE, True, 8, 4 * MIB, "the twin in force"),
+    Topic("clock", Clock, "20 Hz", False, 1, 4 * KIB, "position of a replay"),
+    Topic("health", Health, "1 Hz for each stage", True, 8, 2 * MIB, "status and losses of a stage"),
 )
 BY_NAME = {topic.name: topic for topic in TOPICS}
 FORMER_NAMES = {"memory": "snapshot"}
@@ -67,6 +77,14 @@ FORMER_NAMES = {"memory": "snapshot"}
 def current_name(topic: str) -> str:
     """The name of a topic today, given a name that it has or had."""
     return FORMER_NAMES.get(topic, topic)
+
+
+def largest_bytes(key: str) -> int:
+    """The length of the longest message that is accepted on a key or key expression, in bytes."""
+    try:
+        return topic_of(key).largest_bytes
+    except KeyError:
+        return max(topic.largest_bytes for topic in TOPICS)
 
 
 def tray_key(site: str, tray: str, topic: str) -> str:

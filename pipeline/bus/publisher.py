@@ -7,11 +7,11 @@ from collections import deque
 
 import zenoh
 
+from pipeline.bus.recovery import LAST_SEQUENCE, recovery_key
 from schemas.topics import Topic
 
 KEPT_BYTES = 16 << 20
 """the most a publisher keeps, whatever its history: large messages of a large fleet would fill the memory"""
-_RECOVER = "/recover/"
 
 
 class Publisher:
@@ -41,24 +41,18 @@ class Publisher:
             while len(self._kept) > self._history or self._kept_bytes > KEPT_BYTES:
                 _, discarded = self._kept.popleft()
                 self._kept_bytes -= len(discarded)
-        self.published += 1
+            self.published += 1
         self._publisher.put(payload)
 
     def _answer(self, query: zenoh.Query) -> None:
+        """Answer with what is kept of a range, and at the end with the number of published messages."""
         first = int(query.parameters.get("first") or 0)
-        last = int(query.parameters.get("last") or 2**63)
+        last = int(query.parameters.get("last") or LAST_SEQUENCE)
         with self._lock:
-            wanted = [(sequence, payload) for sequence, payload in self._kept if first <= sequence <= last]
+            wanted = [payload for sequence, payload in self._kept if first <= sequence <= last]
+            published = self.published
         with query:
-            for _, payload in wanted:
+            for payload in wanted:
                 query.reply(self._recovery_key, payload)
-
-
-def recovery_key(key: str, producer: str) -> str:
-    """Where a producer answers requests for what it published on `key`; `producer` may be `*`."""
-    return f"{key}{_RECOVER}{producer}"
-
-
-def published_key(recovery_key: str) -> str:
-    """The key whose messages are recovered at a recovery key."""
-    return recovery_key.partition(_RECOVER)[0]
+            if query.parameters.get("count"):  # earlier versions do not ask, and would take it for a message
+                query.reply(self._recovery_key, b"", attachment=str(published).encode())

@@ -13,18 +13,20 @@ yet connected, or was restarted, can request what it missed.
 from __future__ import annotations
 
 import json
+import queue
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
 import zenoh
 
 from pipeline.bus.errors import BusError, reason
-from pipeline.bus.publisher import Publisher, published_key, recovery_key
+from pipeline.bus.publisher import Publisher
+from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
 from pipeline.config.models import BusConfig
-from schemas.topics import Topic
+from schemas.topics import Topic, largest_bytes
 
 _RETRY = '{"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}'
 _ROUTER_TIMEOUT_MS = "1000"
@@ -47,6 +49,7 @@ class Bus:
         self.came_second = _somebody_listens(config.endpoint)
         """Whether another process listened before: discovering the others takes a moment."""
         self._session = _open(config, stop, listens)
+        self.refused_too_large = 0
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
 
     def __enter__(self) -> Self:
@@ -64,10 +67,15 @@ class Bus:
     def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> None:
         """Call `on_message(key, payload)` for what other sessions publish, from a thread of the bus.
 
-        While it blocks, publishers wait. Messages of one session arrive in the order of publishing, over all keys.
+        While it blocks, publishers wait. Messages of one session arrive in the order of publishing, over all keys. A
+        message that is larger than any of its topic is refused, and counted in `refused_too_large`.
         """
+        limit = largest_bytes(key_expression)
 
         def receive(sample: zenoh.Sample) -> None:
+            if len(sample.payload) > limit:
+                self.refused_too_large += 1
+                return
             on_message(str(sample.key_expr), sample.payload.to_bytes())
 
         # not indirect: with a thread and a queue for each subscriber, keys lose their order and publishers never wait
@@ -94,30 +102,23 @@ class Bus:
         replies = self._session.liveliness().get(key_expression, timeout=self._config.recovery_timeout_s)
         return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
-    def recover(
-        self, key: str, producer: str, first: int, last: int, while_waiting: Callable[[], None]
-    ) -> Iterator[tuple[str, bytes]]:
-        """Request messages `first..last` on `key` from `producer` (`*`: all); yields (key, payload) of those kept.
+    def request_missed(
+        self, key: str, producer: str, first: int, last: int, timeout_s: float, on_answer: OnAnswer
+    ) -> RecoveryRequest:
+        """Request messages `first..last` on `key` from `producer` (`*`: all) without waiting for the answer.
 
-        `while_waiting` is called repeatedly, so that the caller can keep its inbox from filling up: replies arrive
-        through the same threads that fill it.
+        `on_answer` is called once, from a thread of the bus: it must not block.
         """
-        replies = self._session.get(
-            f"{recovery_key(key, producer)}?first={first};last={last}",
-            target=zenoh.QueryTarget.ALL,
-            timeout=self._config.recovery_timeout_s,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-        )
-        while True:
-            try:
-                reply = replies.try_recv()
-            except zenoh.ZError:  # after the last reply
-                return
-            if reply is None:
-                while_waiting()
-            elif reply.ok is not None:
-                yield published_key(str(reply.ok.key_expr)), reply.ok.payload.to_bytes()
+        return RecoveryRequest(self._session, key, producer, first, last, timeout_s, on_answer)
+
+    def recover(self, key: str, producer: str = ALL_PRODUCERS) -> list[tuple[str, bytes]]:
+        """All messages on `key` that `producer` still keeps, as (key, payload). Waits for the answer: not for a stage,
+        whose inbox would fill up meanwhile."""
+        answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
+        request = self.request_missed(key, producer, 0, LAST_SEQUENCE, self._config.recovery_timeout_s, answers.put)
+        answer = answers.get()
+        request.cancel()
+        return answer.messages
 
     def close(self) -> None:
         """Leave the bus. What was published before has left this process."""

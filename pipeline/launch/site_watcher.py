@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -60,7 +59,7 @@ class SiteWatcher:
     def ask_for_past_alarms(self) -> None:
         """Fetch the alarms that were raised before this watcher started."""
         key = tray_key(self._site, "*", "alarm")
-        for its_key, payload in self._bus.recover(key, "*", 0, 2**63, lambda: time.sleep(0.005)):
+        for its_key, payload in self._bus.recover(key):
             self._on_alarm(its_key, payload)
 
     def stages(self) -> list[StageView]:

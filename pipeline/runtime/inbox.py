@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import queue
+import threading
 from collections import deque
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from pipeline.bus.recovery import Answer
+from pipeline.runtime.tracked_streams import Request
+
 INBOX_SIZE = 4096
+INBOX_BYTES = 128 << 20
+"""the inbox is full when it holds as many messages or as many bytes"""
 _BLOCKED_CHECK_S = 0.05
-_SET_ASIDE_TIMEOUT_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,57 +41,85 @@ class Liveness:
     alive: bool
 
 
-Item: TypeAlias = FromBus | FromSource | Liveness
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """The answer to a request for missed messages."""
+
+    request: Request
+    answer: Answer
+
+
+Item: TypeAlias = FromBus | FromSource | Liveness | Recovered
 
 
 class Inbox:
-    """A bounded queue. When it is full, `put` blocks, or drops the oldest item and counts it."""
+    """A bounded queue. When it is full, `put` blocks, or drops the oldest message of the bus and counts it."""
 
     def __init__(self, drops_oldest: bool) -> None:
-        self._queue: queue.Queue[Item] = queue.Queue(INBOX_SIZE)
+        self._items: deque[Item] = deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
         self._drops_oldest = drops_oldest
-        self._aside: deque[Item] = deque()
         self._closed = False
         self.dropped = 0
 
     def put(self, item: Item) -> bool:
         """Add an item; False, and nothing is added, once the inbox is closed."""
-        while not self._closed:
-            try:
-                self._queue.put(item, block=not self._drops_oldest, timeout=_BLOCKED_CHECK_S)
-                return True
-            except queue.Full:
-                if self._drops_oldest:
-                    self._drop_one()
-        return False
+        with self._changed:
+            while self._drops_oldest and self._is_full() and self._drop_oldest():
+                self.dropped += 1
+            while self._is_full() and not self._closed:
+                self._changed.wait(_BLOCKED_CHECK_S)
+            return self._add(item)
+
+    def put_at_once(self, item: Item) -> None:
+        """Add an item even if the inbox is full: for the few whose number is bounded elsewhere."""
+        with self._changed:
+            self._add(item)
 
     def get(self, timeout_s: float) -> Item | None:
         """The next item; None when there is none in time."""
-        if self._aside:
-            return self._aside.popleft()
-        try:
-            return self._queue.get(timeout=timeout_s)
-        except queue.Empty:
-            return None
-
-    def set_aside(self) -> None:
-        """Move an item out of the queue and keep it for later, in order: makes room while the stage waits."""
-        try:
-            self._aside.append(self._queue.get(timeout=_SET_ASIDE_TIMEOUT_S))
-        except queue.Empty:
-            return
+        with self._changed:
+            if not self._items:
+                self._changed.wait(timeout_s)
+            return self._take_first() if self._items else None
 
     def waiting(self) -> int:
         """How many items wait now."""
-        return self._queue.qsize() + len(self._aside)
+        return len(self._items)
 
     def close(self) -> None:
         """Release any thread blocked in `put`: the bus cannot close while one of its threads is blocked."""
-        self._closed = True
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
 
-    def _drop_one(self) -> None:
-        try:
-            self._queue.get_nowait()
-        except queue.Empty:
-            return
-        self.dropped += 1
+    def _is_full(self) -> bool:
+        return len(self._items) >= INBOX_SIZE or self._bytes >= INBOX_BYTES
+
+    def _add(self, item: Item) -> bool:
+        if self._closed:
+            return False
+        self._items.append(item)
+        self._bytes += _size(item)
+        self._changed.notify_all()
+        return True
+
+    def _drop_oldest(self) -> bool:
+        """Drop the oldest message of the bus; False if there is none. What else waits must not be missed."""
+        for place, item in enumerate(self._items):
+            if isinstance(item, FromBus):
+                del self._items[place]
+                self._bytes -= _size(item)
+                return True
+        return False
+
+    def _take_first(self) -> Item:
+        item = self._items.popleft()
+        self._bytes -= _size(item)
+        self._changed.notify_all()
+        return item
+
+
+def _size(item: Item) -> int:
+    return len(item.payload) if isinstance(item, FromBus) else 0

@@ -4,12 +4,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Set
+from dataclasses import dataclass
+from typing import TypeVar
 
 from pipeline.runtime.inbox import Liveness
 from schemas.messages import Health, StageStatus
 
+MOST_PEERS = 4096
+"""are remembered; of more, those heard last"""
 LAST_HEALTH_TIMEOUT_S = 1.0
 """how long a stopping stage waits for the last health of a producer that has just left"""
+
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, slots=True)
+class _Reported:
+    """What matters here of the last health of a session."""
+
+    is_producer: bool
+    has_stopped: bool
 
 
 class Peers:
@@ -18,36 +32,41 @@ class Peers:
     def __init__(self, read_keys: Set[str]) -> None:
         """read_keys: the keys that this stage reads."""
         self._read_keys = read_keys
-        self._alive: set[str] = set()
+        self._alive: dict[str, None] = {}
         self._left_s: dict[str, float] = {}
-        self._last_health: dict[str, Health] = {}
+        self._reported: dict[str, _Reported] = {}
 
     def update(self, change: Liveness) -> None:
         """A session has appeared or left."""
         if change.alive:
-            self._alive.add(change.key)
             self._left_s.pop(change.key, None)
+            _remember(self._alive, change.key, None)
         else:
-            self._alive.discard(change.key)
-            self._left_s[change.key] = time.monotonic()
+            self._alive.pop(change.key, None)
+            _remember(self._left_s, change.key, time.monotonic())
 
     def add_health(self, key: str, health: Health) -> None:
         """The session with the liveliness key `key` has published a health."""
-        self._last_health[key] = health
+        is_producer = any(output.key in self._read_keys for output in health.outputs)
+        _remember(self._reported, key, _Reported(is_producer, health.status == StageStatus.STOPPED))
 
     def has_producer(self) -> bool:
         """Whether a stage that writes what this one reads is alive."""
-        return any(self._is_producer(key) for key in self._alive)
+        return any(key in self._alive for key, reported in self._reported.items() if reported.is_producer)
 
     def awaits_last_health(self) -> bool:
         """Whether a session has just left whose last health, and so its last messages, may still be on the way."""
         now = time.monotonic()
         return any(
-            now - left_s < LAST_HEALTH_TIMEOUT_S and self._last_health[key].status != StageStatus.STOPPED
+            now - left_s < LAST_HEALTH_TIMEOUT_S and not self._reported[key].has_stopped
             for key, left_s in self._left_s.items()
-            if key in self._last_health
+            if key in self._reported
         )
 
-    def _is_producer(self, key: str) -> bool:
-        health = self._last_health.get(key)
-        return health is not None and any(output.key in self._read_keys for output in health.outputs)
+
+def _remember(by_key: dict[str, Value], key: str, value: Value) -> None:
+    """Put a value last, and forget the first beyond MOST_PEERS."""
+    by_key.pop(key, None)
+    by_key[key] = value
+    if len(by_key) > MOST_PEERS:
+        del by_key[next(iter(by_key))]

@@ -12,7 +12,7 @@ import secrets
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from pipeline.bus.session import Bus
@@ -22,11 +22,12 @@ from pipeline.errors import UserError
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
-from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness
+from pipeline.runtime.inbox import FromBus, FromSource, Inbox, Item, Liveness, Recovered
 from pipeline.runtime.notifier import Notifier
 from pipeline.runtime.outputs import Outputs
 from pipeline.runtime.peers import Peers
-from pipeline.runtime.sequence_tracker import SequenceTracker
+from pipeline.runtime.recovery import Recovery
+from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.stage import BuiltStage, Context, Source, Stage
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.envelope import Envelope
@@ -89,7 +90,8 @@ class Runner:
         """those that have been started"""
         self._clock = StageClock()
         self._bus = Bus(config.bus, stop)
-        self._tracker = SequenceTracker(self._recover_rare if stage.may_drop else self._recover)
+        self._recovery = Recovery(self._bus, self._inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
+        self._tracker = SequenceTracker(self._recovery.ask)
         self._outputs = Outputs(self._bus, config.site, stage, [t.name for t in trays], self.producer)
         self._health_publisher = self._bus.publisher(
             health_key(config.site, stage.name, self._instance), BY_NAME["health"], type_name(Health), self.producer
@@ -147,7 +149,7 @@ class Runner:
     def _work(self) -> None:
         self._start()
         self._notifier.ready()
-        self._loop(until=self._should_end)
+        self._loop(self._should_end, StageStatus.OK)
         self._ending.begin()
         self._notifier.stopping()
         self._drain()
@@ -163,6 +165,7 @@ class Runner:
         self._publish_health(StageStatus.STARTING)
         if not self.stage.may_drop:
             self._catch_up()
+            self._loop(lambda: not self._recovery.is_catching_up, StageStatus.STARTING)
         self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
         for name, parts in self._parts.items():
             if parts.source:
@@ -175,7 +178,7 @@ class Runner:
     def _on_liveness(self, key: str, alive: bool) -> None:
         self._inbox.put(Liveness(key, alive))
 
-    def _loop(self, until: Callable[[], bool]) -> None:
+    def _loop(self, until: Callable[[], bool], status: StageStatus) -> None:
         next_tick = next_health = next_loss = time.monotonic()
         reported_lost = 0
         while not until():
@@ -190,7 +193,7 @@ class Runner:
                     self._call(name, lambda core=parts.core, now_ns=now_ns: core.tick(now_ns), from_timer=True)
                 if now >= next_health or (now >= next_loss and self._lost() > reported_lost):
                     next_health, next_loss = now + HEALTH_PERIOD_S, now + LOSS_REPORT_S
-                    reported_lost = self._publish_health(StageStatus.OK).lost
+                    reported_lost = self._publish_health(status).lost
                 self._notifier.at_work(self._health.summary)
 
     def _should_end(self) -> bool:
@@ -211,7 +214,8 @@ class Runner:
             if self._ending.left_s(DRAINED) < 0:
                 self._discard_waiting()
                 return
-            if left is None and sources.wait(0) and not self._peers.awaits_last_health():
+            awaits_more = self._peers.awaits_last_health() or self._tracker.is_waiting
+            if left is None and sources.wait(0) and not awaits_more:
                 left = self._inbox.waiting()
                 continue
             item = self._inbox.get(TICK_S)
@@ -282,6 +286,8 @@ class Runner:
         if isinstance(item, FromSource):
             core = self._parts[item.core].core
             self._call(item.core, lambda: core.step(item.item))
+        elif isinstance(item, Recovered):
+            self._handle_recovered(item)
         elif isinstance(item, Liveness):
             self._peers.update(item)
             if not item.alive and item.key == alive_key(self._site, REPLAY, "all"):
@@ -298,7 +304,20 @@ class Runner:
                 for due in self._tracker.accept(envelope):
                     self._step(due)
 
+    def _handle_recovered(self, item: Recovered) -> None:
+        decoded = (self._decode(key, payload, time.time_ns()) for key, payload in item.answer.messages)
+        envelopes = [e for e in decoded if e is not None and e.message.header.producer != self.producer]
+        if self._recovery.is_catch_up(item.request):
+            due = self._tracker.accept_kept(envelopes)
+        else:
+            due = self._tracker.answer(item.request, Found(envelopes, item.answer.published))
+        for envelope in due:
+            self._step(envelope)
+        self._recovery.finish(item)
+
     def _handle_health(self, envelope: Envelope, health: Health) -> None:
+        if not self._tracker.believes(health):
+            return
         self._peers.add_health(alive_key(self._site, health.stage, health.instance), health)
         if health.stage == REPLAY and health.status == StageStatus.STOPPED:
             self._clock.clear()
@@ -345,32 +364,17 @@ class Runner:
                 self._health.add_output(stamped, now_ns)
         self._active_core = None
 
-    def _recover(self, key: str, producer: str, first: int, last: int) -> Iterator[Envelope]:
-        def while_waiting() -> None:
-            self._notifier.at_work(f"asks for {key} again")
-            self._inbox.set_aside()
-
-        found = self._bus.recover(key, producer, first, last, while_waiting)
-        envelopes = (self._decode(its_key, payload, time.time_ns()) for its_key, payload in found)
-        return (envelope for envelope in envelopes if envelope is not None)
-
-    def _recover_rare(self, key: str, producer: str, first: int, last: int) -> Iterator[Envelope]:
-        """For a stage that may drop: recovers no data, only what is published on change, such as the twin in force."""
-        return self._recover(key, producer, first, last) if topic_of(key).is_rare else iter(())
-
     def _catch_up(self) -> None:
-        """Process what producers still keep from before this stage started: only then is it ready."""
+        """Request what producers still keep from before this stage started: only then is it ready."""
         keys = sorted(self._read_keys)
         if "health" in self.stage.reads:
             keys.append(health_key(self._site, "*", "*"))
-        for key in keys:
-            kept = (e for e in self._recover(key, "*", 0, 2**63) if e.message.header.producer != self.producer)
-            for envelope in sorted(kept, key=lambda e: (e.message.header.producer, e.message.header.sequence)):
-                for due in self._tracker.accept(envelope):
-                    self._step(due)
+        self._recovery.catch_up(keys)
 
     def _counters(self) -> Counter[str]:
-        counters: Counter[str] = Counter(self._counts)
+        counters = self._counts + Counter(self._tracker.counters())
+        if self._bus.refused_too_large:
+            counters["refused_too_large"] = self._bus.refused_too_large
         for parts in self._parts.values():
             counters.update(parts.core.counters())
         if self._inbox.dropped:
@@ -384,7 +388,7 @@ class Runner:
         cores = [parts.core for parts in self._parts.values()] if with_counts else []
         health = self._health.build(
             status=status,
-            problems=[self._ending.problem, *(core.problem() for core in cores)],
+            problems=[self._ending.problem, self._tracker.problem(), *(core.problem() for core in cores)],
             inputs=self._tracker.inputs() if with_counts else (),
             outputs=self._outputs.counts() if with_counts else (),
             counters=self._counters() if with_counts else {},

@@ -1,81 +1,200 @@
-"""Puts arriving messages in sequence: missing messages are requested, duplicates dropped, and messages that remain
-missing counted."""
+"""Puts arriving messages in sequence: missing messages are requested, duplicates dropped, messages that remain missing
+counted, and sequence numbers that are not possible refused.
+
+Nothing here waits. While the missing messages of a stream are on their way, its later messages are held; all other
+streams go on. What is held and remembered is bounded: docs/reference/bounds.md.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
+from pipeline.runtime.tracked_streams import Request, Stream, TrackedStreams, Waiting
 from schemas.envelope import Envelope
 from schemas.messages import Health, Input
-from schemas.streams import StreamId, StreamState, output_streams
-from schemas.topics import topic_of
+from schemas.streams import MOST_PUBLISHED, output_streams
 
-MAX_NAMED_PRODUCERS = 64
-"""of one key, in health: the latest are listed by name. Every `fantwin alarms ack` is a producer of its own."""
-Recover: TypeAlias = Callable[[str, str, int, int], Iterable[Envelope]]
+MOST_HELD_MESSAGES = 4096
+"""of one stream"""
+MOST_HELD_BYTES = 64 << 20
+"""of one stream. Beyond either limit it goes on without the messages that were requested."""
+MOST_PER_S = 100_000
+"""no producer publishes more messages a second on one key"""
+REFUSAL_SHOWN_S = 60.0
+"""how long health names what was refused"""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The answer to a request: the messages still kept, and how many their producer says it has published (None: it did
+    not answer)."""
+
+    envelopes: Sequence[Envelope] = ()
+    published: int | None = None
+
+
+Ask: TypeAlias = Callable[[Request], Found | None]
 
 
 class SequenceTracker:
     """Tracks every stream a stage reads.
 
-    `recover(key, producer, first, last)` asks a producer for messages that it still keeps. Without it, gaps are only
-    counted.
+    `ask` requests messages that a producer still keeps. It returns the answer, or None if the answer comes later: then
+    it is passed to `answer`.
 
     The first message seen of a stream need not be its first. Earlier messages that the producer still keeps are asked
     for; those it no longer keeps are history, not a loss. From then on every gap is either recovered or counted.
+
+    A number beyond the next is believed if the producer confirms that it has published so many, or, where it does not
+    answer, if it can have published so many since it was last heard. Otherwise the message is refused, and the stream
+    goes on as if it had not come.
     """
 
-    def __init__(self, recover: Recover | None) -> None:
-        self._recover = recover
-        self._streams: dict[str, dict[str, StreamState]] = {}
-        """by key, then by producer; the producer heard last is at the end"""
+    def __init__(self, ask: Ask, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._ask = ask
+        self._now_s = now_s
+        self._streams = TrackedStreams(now_s)
+        self._refused: Counter[str] = Counter()
+        self._refusal = ""
+        self._refused_s = 0.0
 
-    def accept(self, envelope: Envelope) -> Iterator[Envelope]:
-        """The messages to process now that this one has arrived: recovered ones first; none if it is a duplicate."""
-        header = envelope.message.header
-        state = self._state(envelope.key, header.producer)
-        if not state.is_duplicate(header.sequence):
-            yield from self._fill((envelope.key, header.producer), state, header.sequence)
-        if state.accept(header.sequence):
-            yield envelope
+    def accept(self, envelope: Envelope) -> list[Envelope]:
+        """The messages to process now that this one has arrived: none if it is held, a duplicate, or refused."""
+        stream = self._streams.heard(envelope.key, envelope.message.header.producer)
+        if stream is None:
+            self._refuse("refused_producers", f"{envelope.key}: too many producers at a time")
+            return []
+        waiting = stream.waiting
+        if waiting is None:
+            return self._take(stream, envelope)
+        waiting.hold(envelope)
+        if len(waiting.held) > MOST_HELD_MESSAGES or waiting.held_bytes > MOST_HELD_BYTES:
+            return self._go_on(stream, waiting, Found())
+        return []
 
-    def reconcile(self, health: Health, keys: Iterable[str]) -> Iterator[Envelope]:
-        """The recovered messages on `keys` that a producer reports as published and that never arrived. On a topic with
-        few messages no next message would show the gap."""
-        wanted = set(keys)
-        for stream, published in output_streams(health).items():
-            if stream[0] in wanted:
-                yield from self._fill(stream, self._state(*stream), published)
+    def accept_kept(self, envelopes: Iterable[Envelope]) -> list[Envelope]:
+        """The messages to process of those that producers keep from before this consumer started, in sequence."""
+        due: list[Envelope] = []
+        for envelope in sorted(envelopes, key=lambda e: (e.message.header.producer, e.message.header.sequence)):
+            header = envelope.message.header
+            stream = self._streams.heard(envelope.key, header.producer)
+            if stream and not stream.waiting and stream.next_sequence is None and header.sequence < MOST_PUBLISHED:
+                stream.skip_to(header.sequence)
+            due += self.accept(envelope)
+        return due
+
+    def reconcile(self, health: Health, keys: Iterable[str]) -> list[Envelope]:
+        """Request messages on `keys` that a producer reports as published and that never arrived. On a topic with few
+        messages no next message would show the gap."""
+        wanted, due = set(keys), []
+        for (key, producer), published in output_streams(health).items():
+            stream = self._streams.heard(key, producer) if key in wanted else None
+            if stream is None or stream.waiting:
+                continue
+            if published and (stream.next_sequence is None or published > stream.next_sequence):
+                due += self._request(stream, published, None)
+            else:
+                stream.skip_to(published)
+                stream.heard_s = self._now_s()
+        return due
+
+    def answer(self, request: Request, found: Found) -> list[Envelope]:
+        """The messages to process now that a request has been answered."""
+        stream = self._streams.get(request.key, request.producer)
+        if stream is None or stream.waiting is None or stream.waiting.request is not request:
+            return []  # it went on without
+        return self._go_on(stream, stream.waiting, found)
+
+    def believes(self, health: Health) -> bool:
+        """Whether its producer can have published what a health says. If not, the health is counted as refused."""
+        for (key, producer), published in output_streams(health).items():
+            stream = self._streams.get(key, producer)
+            if published > MOST_PUBLISHED or (stream is not None and not self._is_possible(stream, published)):
+                self._refuse_number(key, producer, published, stream.next_sequence if stream else None)
+                return False
+        return True
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether an answer is due."""
+        return any(stream.waiting for stream in self._streams)
 
     def inputs(self) -> tuple[Input, ...]:
-        """The counts for health. The oldest producers of a key with many are summed up under an empty name."""
-        found: list[Input] = []
-        for key, by_producer in self._streams.items():
-            states = [(producer, state) for producer, state in by_producer.items() if state.next_sequence is not None]
-            others, named = states[:-MAX_NAMED_PRODUCERS], states[-MAX_NAMED_PRODUCERS:]
-            found += [state.as_input((key, producer)) for producer, state in named]
-            if others:
-                total = StreamState()
-                for _, state in others:
-                    total.add(state)
-                found.append(total.as_input((key, "")))
-        return tuple(found)
+        """The counts for health. Forgotten producers of a key are summed up under an empty name."""
+        return self._streams.inputs()
 
-    def _state(self, key: str, producer: str) -> StreamState:
-        by_producer = self._streams.setdefault(key, {})
-        state = by_producer[producer] = by_producer.pop(producer, None) or StreamState()
-        return state
+    def counters(self) -> Mapping[str, int]:
+        """What was refused; docs/reference/messages.md explains it."""
+        return self._refused
 
-    def _fill(self, stream: StreamId, state: StreamState, until: int) -> Iterator[Envelope]:
-        """Recover what is due before sequence number `until`, and count the rest as missing."""
-        (key, producer), due = stream, state.next_sequence
-        first = max(0, until - topic_of(key).history) if due is None else due
-        if first < until and self._recover:
-            recovered = self._recover(key, producer, first, until - 1)
-            for envelope in sorted(recovered, key=lambda envelope: envelope.message.header.sequence):
-                sequence = envelope.message.header.sequence
-                if first <= sequence < until and not state.is_duplicate(sequence):
-                    state.accept(sequence)
-                    yield envelope
-        state.skip_to(until)
+    def problem(self) -> str:
+        """What was refused last, while it is recent; empty if nothing."""
+        return self._refusal if self._refusal and self._now_s() - self._refused_s < REFUSAL_SHOWN_S else ""
+
+    def _take(self, stream: Stream, envelope: Envelope) -> list[Envelope]:
+        sequence, expected = envelope.message.header.sequence, stream.next_sequence
+        if sequence != expected and not stream.is_duplicate(sequence):
+            if sequence >= MOST_PUBLISHED:
+                self._refuse_number(stream.key, stream.producer, sequence + 1, expected)
+                return []
+            if expected is not None or sequence > 0:
+                return self._request(stream, sequence, envelope)
+        stream.heard_s = self._now_s()
+        return [envelope] if stream.accept(sequence) else []
+
+    def _request(self, stream: Stream, until: int, shown_by: Envelope | None) -> list[Envelope]:
+        """Request what is missing before `until`."""
+        first = stream.next_sequence if stream.next_sequence is not None else max(0, until - stream.history)
+        request = Request(stream.key, stream.producer, first, until - 1)
+        stream.waiting = waiting = Waiting(request, until, shown_by)
+        found = self._ask(request)
+        return [] if found is None else self._go_on(stream, waiting, found)
+
+    def _go_on(self, stream: Stream, waiting: Waiting, found: Found) -> list[Envelope]:
+        """Process what was found, then what was held."""
+        stream.waiting = None
+        due: list[Envelope] = []
+        for envelope in sorted(found.envelopes, key=lambda each: each.message.header.sequence):
+            header = envelope.message.header
+            if (envelope.key, header.producer) != (stream.key, stream.producer) or header.sequence >= waiting.until:
+                continue
+            if header.sequence >= waiting.request.first and not stream.is_duplicate(header.sequence):
+                stream.accept(header.sequence)
+                due.append(envelope)
+        if self._is_believed(stream, waiting, found.published):
+            stream.skip_to(waiting.until)
+            stream.heard_s = self._now_s()
+            arrived = [waiting.shown_by] if waiting.shown_by else []
+        else:
+            self._refuse_number(stream.key, stream.producer, waiting.published, found.published or stream.next_sequence)
+            arrived = []
+        for envelope in (*arrived, *waiting.held):
+            if stream.waiting is None:
+                due += self._take(stream, envelope)
+            else:
+                stream.waiting.hold(envelope)
+        return due
+
+    def _is_believed(self, stream: Stream, waiting: Waiting, published: int | None) -> bool:
+        if published is not None:
+            return waiting.published <= published
+        return self._is_possible(stream, waiting.published)
+
+    def _is_possible(self, stream: Stream, published: int) -> bool:
+        """Whether a producer that does not answer can have published so many messages since it was last heard."""
+        if stream.next_sequence is None:
+            return True
+        silent_s = self._now_s() - stream.heard_s
+        return published - stream.next_sequence <= stream.history + MOST_PER_S * silent_s
+
+    def _refuse_number(self, key: str, producer: str, claimed: int, known: int | None) -> None:
+        line = f"{key}: {claimed} messages in the name of {producer} are not possible after {known or 0}: ignored"
+        self._refuse("refused_numbers", line)
+
+    def _refuse(self, counter: str, line: str) -> None:
+        self._refused[counter] += 1
+        self._refusal, self._refused_s = f"{line}; another program publishes here: stop it", self._now_s()

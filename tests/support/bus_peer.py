@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import queue
 import sys
-import time
-from functools import partial
 
+from pipeline.bus.recovery import Answer
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
-from pipeline.runtime.sequence_tracker import SequenceTracker
+from pipeline.runtime.sequence_tracker import Found, SequenceTracker
+from pipeline.runtime.tracked_streams import Request
 from schemas.codec import decode, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Header, Severity
 from schemas.topics import BY_NAME, tray_key
 
-pause = partial(time.sleep, 0.001)
 KEY = tray_key("site", "tray", "alarm")
 TOPIC = BY_NAME["alarm"]
 
@@ -53,9 +52,13 @@ def collect(bus: Bus, count: int) -> None:
     def packet(payload: bytes) -> Envelope:
         return Envelope(KEY, "alarm", payload, 0, decode(Alarm, payload))
 
-    tracker = SequenceTracker(
-        lambda key, who, first, last: [packet(found) for _, found in bus.recover(key, who, first, last, pause)]
-    )
+    def ask(request: Request) -> Found:
+        answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
+        bus.request_missed(request.key, request.producer, request.first, request.last, 5.0, answers.put)
+        answer = answers.get()
+        return Found([packet(payload) for _, payload in answer.messages], answer.published)
+
+    tracker = SequenceTracker(ask)
     bus.subscribe(KEY, lambda _key, payload: inbox.put(payload))
     print("ready", flush=True)
     got: list[int] = []

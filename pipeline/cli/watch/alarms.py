@@ -120,7 +120,7 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
     bus.subscribe(key, lambda _key, payload: _decoded(payload, news.put))
     wait_for_stages(bus, SiteWatcher(bus, config.site), config, stop)
     known: list[Alarm] = []
-    for _, payload in bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_POLL_S)):
+    for _, payload in bus.recover(key):
         _decoded(payload, known.append)
     found = [each for each in current_alarms(sorted(known, key=newest_t_ns)) if show_all or is_listed(each.newest)]
     console = Console(soft_wrap=True, highlight=False)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
@@ -32,7 +31,6 @@ from schemas.units import NS_PER_S
 from scoring.former_snapshot_keys import FORMER_PARAMETER_KEYS, current_keys
 from scoring.wear.trend import NS_PER_DAY
 
-_POLL_S = 0.02
 _NEEDED = "a fan has its first point some time after commissioning (score below 0.5, no alarm, not too slow)"
 _SHOWN = ("unit", "change", "per_day", "days", "limit", "reached_t_ns", "unknown_reason")
 
@@ -65,7 +63,7 @@ def wear(
         with Bus(settings.bus, stop, listens=False) as bus:
             wait_for_stages(bus, SiteWatcher(bus, settings.site), settings, stop, what="wear")
             key = tray_key(settings.site, "*", "snapshot")
-            replies = bus.recover(key, "*", 0, 2**63, lambda: time.sleep(_POLL_S))
+            replies = bus.recover(key)
             snapshots = [snapshot for _, payload in replies for snapshot in _decoded(payload)]
         nothing = "no scorer has recorded wear so far: it does so every minute; try again later"
     found = [

@@ -14,7 +14,7 @@ from pipeline.bus.errors import BusError
 from pipeline.bus.publisher import KEPT_BYTES
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
-from schemas.topics import alive_key
+from schemas.topics import BY_NAME, alive_key, tray_key
 from tests.support.bus_peer import KEY, TOPIC
 from tests.support.running_chain import eventually
 
@@ -116,33 +116,28 @@ def test_a_session_that_does_not_listen_leaves_the_endpoint_to_others(endpoint):
 
 
 def test_a_publisher_keeps_the_newest_messages_that_fit_its_memory(endpoint):
-    size, count = KEPT_BYTES // 4, 6
+    key, size, count = tray_key("site", "tray", "score"), KEPT_BYTES // 4, 6
     patient = BusConfig(endpoint=endpoint, recovery_timeout_s=30)
-    pause = threading.Event()
-
-    def wait() -> None:
-        pause.wait(0.002)
-
     met = threading.Event()
     with Bus(patient) as bus, Bus(patient) as asker:
         bus.declare_alive(alive_key("site", "big", "all"))
         asker.watch_alive(alive_key("site", "*", "*"), lambda _key, _alive: met.set())
         assert met.wait(20)
-        publisher = bus.publisher(KEY, TOPIC, "", "big")
+        publisher = bus.publisher(key, BY_NAME["score"], "", "big")
         for number in range(count):
             publisher.put(bytes([number]) * size)
         # the asker must have discovered the publisher
-        eventually(lambda: list(asker.recover(KEY, "big", count - 1, count - 1, wait)), "somebody answers")
-        kept = [payload[0] for _, payload in asker.recover(KEY, "big", 0, count, wait)]
+        eventually(lambda: asker.recover(key, "big"), "somebody answers")
+        kept = [payload[0] for _, payload in asker.recover(key, "big")]
         assert kept == [2, 3, 4, 5]
         for _ in range(TOPIC.history + 1):
             publisher.put(b"small")
-        assert len(list(asker.recover(KEY, "big", 0, 2**63, wait))) == TOPIC.history
+        assert len(asker.recover(key, "big")) == TOPIC.history
 
 
 def test_an_unanswered_recovery_request_returns_nothing(endpoint):
     with Bus(BusConfig(endpoint=endpoint)) as bus:
-        assert list(bus.recover(KEY, "nobody", 0, 5, lambda: None)) == []
+        assert bus.recover(KEY, "nobody") == []
 
 
 def test_a_wrong_endpoint_is_one_line():

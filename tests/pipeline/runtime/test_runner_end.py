@@ -16,8 +16,8 @@ from pipeline.config.models import LauncherConfig
 from pipeline.errors import UserError
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Context, Stage
-from schemas.codec import decode, encode
-from schemas.messages import Header, Health, Message, StageStatus
+from schemas.codec import decode
+from schemas.messages import Health, Message, StageStatus
 from schemas.topics import health_key
 from tests.pipeline.runtime.test_runner import TRAY_A, TRAY_B, Bench, Burst, Passer, config, raw, toy
 from tests.support.running_chain import eventually
@@ -159,8 +159,12 @@ def test_row_04_a_loop_that_hangs_is_left_behind_in_time(config):
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_row_04_counts_that_no_health_can_hold_do_not_keep_the_stage_on_the_bus(config):
-    bench = Bench(toy(), config)
-    bench.publisher[TRAY_A].put(encode(replace(raw(1), header=Header("feeder", 2**64 - 1, TRAY_A))))
+    class CountsTooMuch(Passer):
+        def counters(self):
+            return {"seen": 2**64 if self.fans else 0}
+
+    bench = Bench(toy(lambda _context: BuiltStage(CountsTooMuch())), config)
+    bench.feed(TRAY_A, 1)
     last = bench.health_with(lambda health: "crashed" in health.problem)
     bench.thread.join(20)
     bench.bus.close()

@@ -5,7 +5,8 @@ from collections.abc import Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.runtime.sequence_tracker import SequenceTracker
+from pipeline.runtime.sequence_tracker import Found, SequenceTracker
+from pipeline.runtime.tracked_streams import Request
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Header, Health, Output, Severity, StageStatus
 from schemas.topics import BY_NAME, tray_key
@@ -36,9 +37,10 @@ class Producer:
         self.keeps = set(keeps)
         self.asked: list[tuple[int, int]] = []
 
-    def recover(self, _key: str, producer: str, first: int, last: int) -> list[Envelope]:
-        self.asked.append((first, last))
-        return [packet(s, producer) for s in sorted(self.keeps, reverse=True) if first <= s <= last]
+    def ask(self, request: Request) -> Found:
+        self.asked.append((request.first, request.last))
+        kept = sorted(self.keeps, reverse=True)
+        return Found([packet(s, request.producer) for s in kept if request.first <= s <= request.last])
 
 
 def sequences(packets: Iterable[Envelope]) -> list[int]:
@@ -59,7 +61,7 @@ def health(published: int, producer: str = "p") -> Health:
 
 def test_a_gap_is_filled_in_order_from_what_the_producer_keeps():
     producer = Producer(range(10))
-    tracker = SequenceTracker(producer.recover)
+    tracker = SequenceTracker(producer.ask)
     assert sequences(tracker.accept(packet(0))) == [0]
     assert sequences(tracker.accept(packet(4))) == [1, 2, 3, 4]
     assert producer.asked == [(1, 3)]
@@ -68,7 +70,7 @@ def test_a_gap_is_filled_in_order_from_what_the_producer_keeps():
 
 
 def test_messages_that_the_producer_no_longer_keeps_are_counted_as_missing():
-    tracker = SequenceTracker(Producer([2]).recover)
+    tracker = SequenceTracker(Producer([2]).ask)
     list(tracker.accept(packet(0)))
     assert sequences(tracker.accept(packet(5))) == [2, 5]
     (line,) = tracker.inputs()
@@ -76,7 +78,7 @@ def test_messages_that_the_producer_no_longer_keeps_are_counted_as_missing():
 
 
 def test_a_message_that_comes_again_is_dropped_and_counted():
-    tracker = SequenceTracker(Producer([]).recover)
+    tracker = SequenceTracker(Producer([]).ask)
     list(tracker.accept(packet(0)))
     assert sequences(tracker.accept(packet(0))) == []
     assert tracker.inputs()[0].duplicated == 1
@@ -84,27 +86,27 @@ def test_a_message_that_comes_again_is_dropped_and_counted():
 
 def test_a_late_consumer_gets_the_messages_still_kept_and_counts_earlier_ones_as_history():
     producer = Producer([98, 99])
-    tracker = SequenceTracker(producer.recover)
+    tracker = SequenceTracker(producer.ask)
     assert sequences(tracker.accept(packet(100))) == [98, 99, 100]
     assert tracker.inputs()[0].missing == 0
 
 
 def test_a_late_consumer_requests_no_more_than_a_producer_keeps():
     producer = Producer([])
-    list(SequenceTracker(producer.recover).accept(packet(10**6)))
+    list(SequenceTracker(producer.ask).accept(packet(10**6)))
     history = BY_NAME["alarm"].history
     assert producer.asked == [(10**6 - history, 10**6 - 1)]
 
 
 def test_a_new_session_of_a_producer_starts_its_own_sequence():
-    tracker = SequenceTracker(Producer([]).recover)
+    tracker = SequenceTracker(Producer([]).ask)
     list(tracker.accept(packet(7, "old")))
     assert sequences(tracker.accept(packet(0, "new"))) == [0]
     assert all(line.duplicated == 0 for line in tracker.inputs())
 
 
 def test_the_latest_of_many_producers_are_listed_by_name_and_the_others_summed_up():
-    tracker = SequenceTracker(Producer([]).recover)
+    tracker = SequenceTracker(Producer([]).ask)
     list(tracker.accept(packet(0, "controller")))
     for number in range(100):
         list(tracker.accept(packet(0, f"operator-{number}")))
@@ -120,19 +122,19 @@ def test_the_latest_of_many_producers_are_listed_by_name_and_the_others_summed_u
 
 def test_health_reveals_a_last_message_that_never_arrived():
     producer = Producer(range(3))
-    tracker = SequenceTracker(producer.recover)
+    tracker = SequenceTracker(producer.ask)
     list(tracker.accept(packet(0)))
     assert sequences(tracker.reconcile(health(3), [KEY])) == [1, 2]
     assert sequences(tracker.reconcile(health(3), [KEY])) == []
 
 
 def test_health_reveals_a_first_message_that_never_arrived():
-    tracker = SequenceTracker(Producer([0]).recover)
+    tracker = SequenceTracker(Producer([0]).ask)
     assert sequences(tracker.reconcile(health(1), [KEY])) == [0]
 
 
 def test_all_messages_are_counted_of_a_producer_known_before_its_first_message():
-    tracker = SequenceTracker(Producer([]).recover)
+    tracker = SequenceTracker(Producer([]).ask)
     assert sequences(tracker.reconcile(health(0), [KEY])) == []
     assert sequences(tracker.accept(packet(3))) == [3]
     (line,) = tracker.inputs()
@@ -141,12 +143,12 @@ def test_all_messages_are_counted_of_a_producer_known_before_its_first_message()
 
 def test_health_about_keys_that_are_not_read_is_ignored():
     producer = Producer(range(3))
-    assert list(SequenceTracker(producer.recover).reconcile(health(3), ["another/key"])) == []
+    assert list(SequenceTracker(producer.ask).reconcile(health(3), ["another/key"])) == []
     assert producer.asked == []
 
 
 def test_without_recovery_gaps_are_only_counted():
-    tracker = SequenceTracker(None)
+    tracker = SequenceTracker(lambda _request: Found())
     list(tracker.accept(packet(0)))
     assert sequences(tracker.accept(packet(5))) == [5]
     assert tracker.inputs()[0].missing == 4
@@ -157,7 +159,7 @@ def test_without_recovery_gaps_are_only_counted():
     kept=st.sets(st.integers(0, 60)),
 )
 def test_each_message_comes_once_and_in_order_and_the_counts_add_up(arriving, kept):
-    tracker = SequenceTracker(Producer(kept).recover)
+    tracker = SequenceTracker(Producer(kept).ask)
     out = [s for sequence in arriving for s in sequences(tracker.accept(packet(sequence)))]
     assert out == sorted(set(out))
     if arriving:

@@ -1,0 +1,130 @@
+"""The streams that a stage remembers: a bounded number, whoever publishes how much under however many names."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+
+from schemas.envelope import Envelope
+from schemas.messages import Input
+from schemas.streams import StreamId, StreamState
+from schemas.topics import HEALTH_CHUNK, health_key, topic_of
+
+MOST_PRODUCERS = 64
+"""of one key are remembered. Every `fantwin alarms ack` is a producer of its own."""
+MOST_HEALTH_PRODUCERS = 1024
+"""of all health keys of a site together"""
+SILENT_S = 60.0
+"""a producer that has not been heard for so long makes room for another first"""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Request:
+    """Messages `first..last` of a producer on a key are missing; producer `*`: those of all producers."""
+
+    key: str
+    producer: str
+    first: int
+    last: int
+
+
+@dataclass(slots=True)
+class Waiting:
+    """A stream waits for the missing messages before number `until`.
+
+    Attributes:
+        shown_by: the message that showed the gap; None: a health did.
+        held: what has arrived since.
+    """
+
+    request: Request
+    until: int
+    shown_by: Envelope | None
+    held: deque[Envelope] = field(default_factory=deque)
+    held_bytes: int = 0
+
+    def hold(self, envelope: Envelope) -> None:
+        """Keep a message until the missing ones have come."""
+        self.held.append(envelope)
+        self.held_bytes += len(envelope.payload)
+
+    @property
+    def published(self) -> int:
+        """At least so many messages have been published if what showed the gap is true."""
+        return self.until if self.shown_by is None else self.until + 1
+
+
+@dataclass(slots=True)
+class Stream(StreamState):
+    """A stream and what the tracker needs to know about it. `heard_s`: when it was last heard, monotonic."""
+
+    key: str = ""
+    producer: str = ""
+    heard_s: float = 0.0
+    waiting: Waiting | None = None
+
+    @property
+    def history(self) -> int:
+        """How many messages its producer keeps at most."""
+        return topic_of(self.key).history
+
+
+class TrackedStreams:
+    """Streams by key and producer. Where one too many appears, another is forgotten, and its counts are summed up under
+    an empty name: one that has been silent for long, or else the one that has sent least. One that waits for missing
+    messages is not forgotten; if all wait, the new one is refused.
+    """
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        self._now_s = now_s
+        self._groups: dict[str, dict[StreamId, Stream]] = {}
+        """by key, one for all keys of health; the stream heard last is at the end"""
+        self._forgotten: dict[str, StreamState] = {}
+
+    def __iter__(self) -> Iterator[Stream]:
+        """All streams that are remembered."""
+        return (stream for group in self._groups.values() for stream in group.values())
+
+    def get(self, key: str, producer: str) -> Stream | None:
+        """A stream that is remembered; None if it is not."""
+        return self._groups.get(_group(key), {}).get((key, producer))
+
+    def heard(self, key: str, producer: str) -> Stream | None:
+        """The stream, which is heard now; a new one if it is not remembered. None: there is no room for a new one."""
+        name = _group(key)
+        group = self._groups.setdefault(name, {})
+        stream = group.pop((key, producer), None)
+        if stream is None:
+            if len(group) >= (MOST_PRODUCERS if name == key else MOST_HEALTH_PRODUCERS) and not self._forget_one(name):
+                return None
+            stream = Stream(key=key, producer=producer, heard_s=self._now_s())
+        group[key, producer] = stream
+        return stream
+
+    def inputs(self) -> tuple[Input, ...]:
+        """The counts for health; those of forgotten streams are the last of their key, without a producer."""
+        found: list[Input] = []
+        for name, group in self._groups.items():
+            found += [stream.as_input(id) for id, stream in group.items() if stream.next_sequence is not None]
+            if name in self._forgotten:
+                found.append(self._forgotten[name].as_input((name, "")))
+        return tuple(found)
+
+    def _forget_one(self, name: str) -> bool:
+        group = self._groups[name]
+        candidates = [(id, each) for id, each in islice(group.items(), MOST_PRODUCERS) if each.waiting is None]
+        if not candidates:
+            return False
+        before_s = self._now_s() - SILENT_S
+        id, stream = min(candidates, key=lambda pair: pair[1].heard_s > before_s and pair[1].received + 1)
+        del group[id]
+        self._forgotten.setdefault(name, StreamState()).add(stream)
+        return True
+
+
+def _group(key: str) -> str:
+    """The key, or the pattern of all health keys of its site."""
+    parts = key.split("/", 3)
+    return health_key(parts[1], "*", "*") if len(parts) == 4 and parts[2] == HEALTH_CHUNK else key

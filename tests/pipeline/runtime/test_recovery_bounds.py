@@ -1,0 +1,289 @@
+"""Recovery is bounded in time, bytes and messages, and live data does not wait for it."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from pipeline.bus import recovery as bus_recovery
+from pipeline.bus.recovery import LAST_SEQUENCE, Answer, recovery_key
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+from pipeline.runtime.inbox import INBOX_BYTES, FromBus, Inbox, Liveness, Recovered
+from pipeline.runtime.peers import MOST_PEERS, Peers
+from pipeline.runtime.recovery import BACK_OFF_S, MOST_AT_A_TIME, Recovery
+from pipeline.runtime.sequence_tracker import MOST_HELD_MESSAGES, Found, SequenceTracker
+from pipeline.runtime.tracked_streams import MOST_HEALTH_PRODUCERS, MOST_PRODUCERS, SILENT_S, Request
+from schemas.codec import encode, type_name
+from schemas.messages import Grid, Header, Raw
+from schemas.topics import BY_NAME, health_key, tray_key
+from tests.pipeline.runtime.test_runner import TRAY_A, Bench, config, raw, toy
+from tests.pipeline.runtime.test_sequence_tracker import KEY, health, packet, sequences
+from tests.support.running_chain import eventually
+
+__all__ = ["config"]  # a fixture
+
+
+def test_row_11_live_data_does_not_wait_for_a_producer_that_never_answers(config):
+    """A stranger makes the stage ask, and does not answer; the time limit is far beyond the test's."""
+    patient = replace(config, bus=BusConfig(endpoint=config.bus.endpoint, recovery_timeout_s=300))
+    bench = Bench(toy(), patient)
+    asked = threading.Event()
+    queries: list[Any] = []
+
+    def never_answer(query: Any) -> None:
+        queries.append(query)
+        asked.set()
+
+    key = tray_key("s", TRAY_A, "raw")
+    silent = bench.bus._session.declare_queryable(recovery_key(key, "stranger"), never_answer)
+    stranger = bench.bus.publisher(key, BY_NAME["raw"], type_name(Raw), "another name")
+    stranger.put(encode(replace(raw(1), header=Header("stranger", 5, TRAY_A))))
+    assert asked.wait(20)
+    for t_ns in (2, 3):
+        bench.feed(TRAY_A, t_ns)
+    assert [bench.next(Grid).t_ns.tolist() for _ in range(2)] == [[2], [3]]
+    for query in queries:
+        query.drop()
+    assert bench.next(Grid).t_ns.tolist() == [1], "without an answer the stream goes on"
+    silent.undeclare()
+    bench.end()
+
+
+def late(_request: Request) -> Found | None:
+    return None
+
+
+def test_row_11_messages_of_a_stream_wait_in_order_for_those_that_were_missed_and_others_go_on():
+    requests: list[Request] = []
+    tracker = SequenceTracker(requests.append)
+    tracker.accept(packet(0))
+    tracker.accept(packet(3))
+    tracker.accept(packet(4))
+    assert tracker.is_waiting
+    assert sequences(tracker.accept(packet(0, "other"))) == [0]
+    assert sequences(tracker.answer(requests[0], Found([packet(2), packet(1)], 5))) == [1, 2, 3, 4]
+    assert not tracker.is_waiting
+    assert tracker.answer(requests[0], Found([packet(1)])) == [], "a second answer changes nothing"
+
+
+def test_row_11_a_stream_that_has_waited_for_too_much_goes_on_without():
+    tracker = SequenceTracker(late)
+    tracker.accept(packet(0))
+    due = [s for number in range(2, MOST_HELD_MESSAGES + 4) for s in sequences(tracker.accept(packet(number)))]
+    assert due == list(range(2, MOST_HELD_MESSAGES + 4))
+    assert tracker.inputs()[0].missing == 1
+
+
+def test_row_11_a_stream_that_waits_is_bounded_in_bytes(monkeypatch):
+    monkeypatch.setattr("pipeline.runtime.sequence_tracker.MOST_HELD_BYTES", 100)
+    tracker = SequenceTracker(late)
+    tracker.accept(packet(0))
+    large = [replace(packet(number), payload=bytes(40)) for number in range(2, 6)]
+    assert [len(tracker.accept(each)) for each in large] == [0, 0, 0, 4]
+
+
+def test_row_11_a_flood_of_producers_leaves_the_real_one_in_sequence_and_few_others():
+    tracker = SequenceTracker(lambda _request: Found())
+    for number in range(2_000):
+        assert sequences(tracker.accept(packet(number, "real"))) == [number]
+        tracker.accept(packet(1, f"false-{number}"))
+    assert len(list(tracker._streams)) == MOST_PRODUCERS
+    assert len(tracker.inputs()) == MOST_PRODUCERS + 1
+    assert sum(line.received for line in tracker.inputs()) == 4_000
+    real = next(line for line in tracker.inputs() if line.producer == "real")
+    assert (real.received, real.missing, real.duplicated) == (2_000, 0, 0)
+
+
+def test_row_11_a_flood_of_healths_is_remembered_in_part():
+    tracker = SequenceTracker(lambda _request: Found())
+    for number in range(MOST_HEALTH_PRODUCERS + 100):
+        key = health_key("site", "stage", f"false-{number}")
+        tracker.accept(replace(packet(0, f"p{number}"), key=key, topic="health"))
+        tracker.reconcile(health(5, f"p{number}"), [KEY])
+    assert len(list(tracker._streams)) == MOST_HEALTH_PRODUCERS + MOST_PRODUCERS
+
+
+def test_row_11_a_producer_that_was_silent_for_long_makes_room_first():
+    now_s = [0.0]
+    tracker = SequenceTracker(lambda _request: Found(), lambda: now_s[0])
+    for number in range(10):
+        tracker.accept(packet(number, "stopped long ago"))
+    now_s[0] = SILENT_S
+    for number in range(MOST_PRODUCERS):
+        tracker.accept(packet(0, f"new-{number}"))
+    assert {line.producer for line in tracker.inputs()} == {"", *(f"new-{n}" for n in range(MOST_PRODUCERS))}
+
+
+def test_row_11_while_all_remembered_producers_wait_others_are_refused_and_named():
+    tracker = SequenceTracker(late)
+    for number in range(MOST_PRODUCERS + 1):
+        tracker.accept(packet(1, f"p{number}"))
+    assert tracker.counters() == {"refused_producers": 1}
+    assert f"{KEY}: too many producers at a time" in tracker.problem()
+
+
+class FakeBus:
+    """Keeps the requests, and how each is answered."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, str, float]] = []
+        self.answer: list[Any] = []
+
+    def request_missed(self, key: str, producer: str, first: int, last: int, timeout_s: float, on_answer: Any) -> Any:
+        self.asked.append((key, producer, timeout_s))
+        self.answer.append(on_answer)
+        return self
+
+    def cancel(self) -> None:
+        """Nothing is running."""
+
+
+class Asker:
+    """A `Recovery` with a bus and a clock of its own."""
+
+    def __init__(self, *, only_rare: bool = False) -> None:
+        self.now_s = 0.0
+        self.bus: Any = FakeBus()
+        self.inbox = Inbox(drops_oldest=False)
+        self.recovery = Recovery(self.bus, self.inbox, 5.0, only_rare=only_rare, now_s=lambda: self.now_s)
+
+    def finish(self) -> Recovered:
+        item = self.inbox.get(0.0)
+        assert isinstance(item, Recovered)
+        self.recovery.finish(item)
+        return item
+
+
+def request(producer: str = "p", key: str = KEY) -> Request:
+    return Request(key, producer, 0, 5)
+
+
+def test_row_11_a_producer_that_did_not_answer_is_left_alone_for_a_while():
+    asker = Asker()
+    assert asker.recovery.ask(request()) is None
+    asker.bus.answer[0](Answer(timed_out=True))
+    asker.finish()
+    assert asker.recovery.ask(request()) == Found()
+    assert asker.recovery.ask(request("another")) is None
+    asker.now_s = BACK_OFF_S
+    assert asker.recovery.ask(request()) is None
+
+
+def test_row_11_few_requests_run_at_a_time_and_one_that_waited_too_long_is_not_sent():
+    asker = Asker()
+    requests = [request(f"p{number}") for number in range(MOST_AT_A_TIME + 2)]
+    assert [asker.recovery.ask(each) for each in requests] == [None] * len(requests)
+    assert len(asker.bus.asked) == MOST_AT_A_TIME
+    asker.bus.answer[0](Answer())
+    asker.finish()
+    assert asker.bus.asked[-1][1] == f"p{MOST_AT_A_TIME}"
+    asker.now_s = 5.0
+    asker.bus.answer[1](Answer())
+    asker.finish()
+    assert len(asker.bus.asked) == MOST_AT_A_TIME + 1
+    assert asker.finish() == Recovered(requests[-1], Answer())
+
+
+def test_row_11_after_one_catch_up_without_an_answer_the_next_ones_wait_for_less():
+    asker = Asker()
+    asker.recovery.catch_up(["a/1", "a/2"])
+    asker.bus.answer[0](Answer(timed_out=True))
+    asker.finish()
+    assert [each[2] for each in asker.bus.asked] == [5.0, 0.5]
+    assert asker.recovery.is_catching_up
+    asker.bus.answer[1](Answer())
+    asker.finish()
+    assert not asker.recovery.is_catching_up
+
+
+@pytest.fixture
+def endless(endpoint):
+    """A bus on which somebody answers requests for KEY of "endless" without end, and whoever asks it."""
+    config = BusConfig(endpoint=endpoint, recovery_timeout_s=60)
+    has_ended = threading.Event()
+
+    def answer(query: Any) -> None:
+        with query:
+            while not has_ended.is_set():
+                query.reply(recovery_key(KEY, "endless"), bytes(1000))
+
+    with Bus(config) as bus, Bus(config) as asker:
+        queryable = bus._session.declare_queryable(recovery_key(KEY, "endless"), answer)
+        bus.declare_alive("fantwin/s/alive/endless/all")
+        eventually(lambda: asker.alive("fantwin/s/alive/*/*"), "they have met")
+        yield asker
+        has_ended.set()
+        queryable.undeclare()
+
+
+@pytest.mark.parametrize(("last", "most_bytes", "expected"), [(9, 1 << 30, 10), (LAST_SEQUENCE, 50_500, 50)])
+def test_row_11_an_endless_answer_ends_at_its_bound(endless, monkeypatch, last, most_bytes, expected):
+    monkeypatch.setattr(bus_recovery, "MOST_RECOVERED_BYTES", most_bytes)
+    answered = threading.Event()
+    answers: list[Answer] = []
+
+    def receive(answer: Answer) -> None:
+        answers.append(answer)
+        answered.set()
+
+    request = endless.request_missed(KEY, "endless", 0, last, 60, receive)
+    assert answered.wait(20)
+    request.cancel()
+    assert len(answers[0].messages) == expected
+    assert len(answers) == 1
+
+
+def test_row_11_a_message_larger_than_any_of_its_topic_is_refused(endpoint):
+    key, arrived = tray_key("s", "a", "clock"), threading.Event()
+    config, got = BusConfig(endpoint=endpoint), []
+
+    def receive(_key: str, payload: bytes) -> None:
+        got.append(len(payload))
+        arrived.set()
+
+    with Bus(config) as bus, Bus(config) as other:
+        bus.subscribe(key, receive)
+        publisher = other.publisher(key, BY_NAME["clock"], "", "p")
+
+        def small_arrives() -> bool:
+            publisher.put(bytes(10))
+            return arrived.is_set()
+
+        eventually(small_arrives, "they have met")
+        publisher.put(bytes(BY_NAME["clock"].largest_bytes + 1))
+        publisher.put(bytes(11))
+        eventually(lambda: 11 in got, "the next arrived")
+    assert set(got) == {10, 11}
+    assert bus.refused_too_large == 1
+
+
+def test_row_11_the_inbox_is_bounded_in_bytes():
+    inbox = Inbox(drops_oldest=True)
+    payload = bytes(INBOX_BYTES // 2)
+    for number in range(5):
+        inbox.put(FromBus("k", payload, number))
+    assert inbox.waiting() == 2
+    assert inbox.dropped == 3
+
+
+def test_row_11_what_must_not_be_missed_is_not_dropped_from_a_full_inbox():
+    inbox = Inbox(drops_oldest=True)
+    answer = Recovered(request(), Answer())
+    inbox.put(answer)
+    for number in range(5):
+        inbox.put(FromBus("k", bytes(INBOX_BYTES), number))
+    assert inbox.get(0.0) is answer
+    assert inbox.get(0.0) == FromBus("k", bytes(INBOX_BYTES), 4)
+
+
+def test_row_11_the_healths_of_few_peers_are_remembered():
+    peers = Peers(frozenset())
+    for number in range(MOST_PEERS + 10):
+        peers.add_health(f"key {number}", health(0))
+        peers.update(Liveness(f"key {number}", alive=True))
+        peers.update(Liveness(f"other key {number}", alive=False))
+    assert [len(each) for each in (peers._reported, peers._alive, peers._left_s)] == [MOST_PEERS] * 3
