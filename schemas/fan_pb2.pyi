@@ -57,6 +57,8 @@ class Transition(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     TRANSITION_COMMISSIONING: _ClassVar[Transition]
     TRANSITION_REPUBLISHED: _ClassVar[Transition]
     TRANSITION_REFUSED: _ClassVar[Transition]
+    TRANSITION_DATA_LOST: _ClassVar[Transition]
+    TRANSITION_DATA_RESTORED: _ClassVar[Transition]
 
 class Action(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -123,6 +125,8 @@ TRANSITION_IN_SERVICE: Transition
 TRANSITION_COMMISSIONING: Transition
 TRANSITION_REPUBLISHED: Transition
 TRANSITION_REFUSED: Transition
+TRANSITION_DATA_LOST: Transition
+TRANSITION_DATA_RESTORED: Transition
 ACTION_NONE: Action
 ACTION_ACKNOWLEDGE: Action
 ACTION_CONFIRM: Action
@@ -305,7 +309,7 @@ class Diagnosis(_message.Message):
     def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ..., parameter: _Optional[str] = ..., change: _Optional[float] = ..., change_low: _Optional[float] = ..., change_high: _Optional[float] = ..., unit: _Optional[str] = ..., evidence: _Optional[str] = ...) -> None: ...
 
 class Alarm(_message.Message):
-    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "limit_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_limit_command", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed", "out_of_service", "causes", "request", "operator_name", "comment")
+    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "limit_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_limit_command", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed", "out_of_service", "causes", "request", "operator_name", "comment", "stale")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FAN_FIELD_NUMBER: _ClassVar[int]
     ACTIVE_FIELD_NUMBER: _ClassVar[int]
@@ -330,6 +334,7 @@ class Alarm(_message.Message):
     REQUEST_FIELD_NUMBER: _ClassVar[int]
     OPERATOR_NAME_FIELD_NUMBER: _ClassVar[int]
     COMMENT_FIELD_NUMBER: _ClassVar[int]
+    STALE_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fan: int
     active: bool
@@ -354,7 +359,8 @@ class Alarm(_message.Message):
     request: str
     operator_name: str
     comment: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., limit_rad_s: _Optional[float] = ..., message: _Optional[str] = ..., transition: _Optional[_Union[Transition, str]] = ..., statistic: _Optional[_Union[Statistic, str]] = ..., score: _Optional[float] = ..., torque_balance_command: _Optional[float] = ..., torque_balance_limit_command: _Optional[float] = ..., acknowledged: _Optional[bool] = ..., confirmed: _Optional[bool] = ..., latched: _Optional[bool] = ..., shelved_until_t_ns: _Optional[int] = ..., suppressed: _Optional[bool] = ..., out_of_service: _Optional[bool] = ..., causes: _Optional[_Iterable[_Union[Diagnosis, _Mapping]]] = ..., request: _Optional[str] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ...) -> None: ...
+    stale: bool
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., limit_rad_s: _Optional[float] = ..., message: _Optional[str] = ..., transition: _Optional[_Union[Transition, str]] = ..., statistic: _Optional[_Union[Statistic, str]] = ..., score: _Optional[float] = ..., torque_balance_command: _Optional[float] = ..., torque_balance_limit_command: _Optional[float] = ..., acknowledged: _Optional[bool] = ..., confirmed: _Optional[bool] = ..., latched: _Optional[bool] = ..., shelved_until_t_ns: _Optional[int] = ..., suppressed: _Optional[bool] = ..., out_of_service: _Optional[bool] = ..., causes: _Optional[_Iterable[_Union[Diagnosis, _Mapping]]] = ..., request: _Optional[str] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ..., stale: _Optional[bool] = ...) -> None: ...
 
 class Request(_message.Message):
     __slots__ = ("header", "t_ns", "action", "fan", "duration_s", "operator_name", "comment")

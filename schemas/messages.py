@@ -76,6 +76,8 @@ class Transition(OpenEnum):
     COMMISSIONING = 14
     REPUBLISHED = 15
     REFUSED = 16
+    DATA_LOST = 17
+    DATA_RESTORED = 18
 
 
 class Action(OpenEnum):
@@ -267,6 +269,7 @@ class Alarm:
     request: str = ""
     operator_name: str = ""
     comment: str = ""
+    stale: bool = False
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

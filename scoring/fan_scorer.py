@@ -2,11 +2,14 @@
 
 The score of a fan is the largest ratio of a statistic to its limit. Above 1 the fan deviates from its healthy
 behaviour. scoring.alarms decides whether that raises an alarm.
+
+After a gap longer than its memory a statistic starts again: what a fan did before the gap says nothing about it now.
+Baselines stay.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -21,12 +24,14 @@ from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.state import restore_column
 from scoring.detectors.table import rows
 from scoring.former_snapshot_keys import current_fan_scorer
+from scoring.gaps import Gaps
 from scoring.limits import Limits
 from scoring.residual import Residual
 from scoring.samples import Samples
 
 HALF_LIMIT = 0.5  # once a fan is commissioned, baselines learn only below this score
 RESIDUALS: tuple[Signal, ...] = ("speed", "balance")
+INPUTS: tuple[Signal, ...] = (*RESIDUALS, "tacho")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -84,8 +89,13 @@ class _ScoredResidual:
 class FanScorer:
     """Scores one tray's fans. The result does not depend on how samples are cut into blocks."""
 
-    def __init__(self, fans: int, limits: Limits, *, for_calibration: bool = False) -> None:
-        """observing: keep what calibration needs, for `observed`; statistics then grow beyond their limits."""
+    def __init__(
+        self, fans: int, limits: Limits, *, for_calibration: bool = False, forgets_over_gaps: bool = True
+    ) -> None:
+        """for_calibration: keep what calibration needs, for `observed`; statistics then grow beyond their limits.
+
+        forgets_over_gaps: False only to decide as for recordings made before statistics started again after gaps.
+        """
         self.limits = limits
         self.residuals = {source: Residual(fans, source, limits) for source in RESIDUALS}
         contexts = {
@@ -105,6 +115,9 @@ class FanScorer:
         }
         self._statistics = np.array([row.statistic for row in self._rows])
         self._motion = Motion(fans)
+        self._gaps = Gaps(len(INPUTS), fans) if forgets_over_gaps else None
+        self._memories = self._memories_ns()
+        self._shortest_memory_ns = min(memory_ns for _, _, memory_ns in self._memories)
         self._below_half_limit = np.ones(fans, np.bool_)
         """(fans,) whether every statistic stayed below half of its limit in the present interval so far"""
         self._within_limit = np.ones(fans, np.bool_)
@@ -125,14 +138,19 @@ class FanScorer:
         if self.origin_t_ns is None:
             self.origin_t_ns = int(block.t_ns[0])
         intervals = (block.t_ns - self.origin_t_ns) // self._interval_ns
-        cuts = np.flatnonzero(np.diff(intervals)) + 1
-        edges = [0, *cuts.tolist(), len(intervals)]
+        begins = np.diff(intervals, prepend=intervals[0]) != 0
+        missing_ns = self._missing_ns(block)
+        after_gap = np.any(missing_ns > self._shortest_memory_ns, axis=(1, 2))
+        starts = np.flatnonzero(begins | after_gap)
+        edges = [0, *starts[starts > 0].tolist(), len(intervals)]
         scored = []
         for first, last in pairwise(edges):
             number = int(intervals[first])
             if number != self._interval:
                 self._end_interval(block.period_ns)
                 self._interval = number
+            if after_gap[first]:
+                self._forget(missing_ns[first])
             scored.append(self._score(block, slice(first, last)))
         if len(scored) == 1:
             return scored[0]
@@ -152,6 +170,11 @@ class FanScorer:
         for detector in self.detectors.values():
             detector.reset(fans)
         self._below_half_limit[fans] = self._within_limit[fans] = True
+
+    @property
+    def longest_memory_ns(self) -> int:
+        """The longest memory of a detector in use, ns: after so many samples all statistics are of the present."""
+        return max((round(detector.memory_s * NS_PER_S) for detector in self.detectors.values()), default=0)
 
     def limit_sigmas(self, source: Signal, period_s: float) -> float:
         """How far the smoothed residual may be from its baseline, sigma; infinite without that limit."""
@@ -184,6 +207,31 @@ class FanScorer:
                 if row.source == source and row.name in self.detectors:
                     self.detectors[row.name].reset(first)
         self._below_half_limit[:] = self._within_limit[:] = True
+
+    def _memories_ns(self) -> list[tuple[int, Callable[[Array], None], int]]:
+        """What is forgotten over a gap: the number of its input, how to start it again, and its memory, ns."""
+        forgotten: list[tuple[Signal, Callable[[Array], None], float]] = [
+            (row.source, self.detectors[row.name].reset, self.detectors[row.name].memory_s)
+            for row in self._rows
+            if row.name in self.detectors
+        ]
+        forgotten.extend((name, residual.reset, residual.memory_s) for name, residual in self.residuals.items())
+        forgotten.append(("tacho", self._motion.reset, self._motion.memory_s))
+        return [(INPUTS.index(source), reset, round(memory_s * NS_PER_S)) for source, reset, memory_s in forgotten]
+
+    def _missing_ns(self, block: Samples) -> Array:
+        """(n, inputs, fans) how long each input was missing before each of its samples, ns."""
+        if self._gaps is None:
+            return np.zeros((len(block.t_ns), 1, 1))
+        valid = np.stack((block.speed_valid, block.balance_valid, block.alive), axis=1)
+        return self._gaps.update(block.t_ns, block.period_ns, valid)
+
+    def _forget(self, missing_ns: Array) -> None:
+        """Start again what remembers less than the gap before this sample, (inputs, fans) ns."""
+        for number, reset, memory_ns in self._memories:
+            fans = missing_ns[number] > memory_ns
+            if fans.any():
+                reset(fans)
 
     def _score(self, block: Samples, stretch: slice) -> ScoredBlock:
         """Score samples of one interval."""
@@ -224,7 +272,7 @@ class FanScorer:
                 Observation(ratios=ratios, persistent=persistent, expected=expected, transient_rad_s=transient_rad_s)
             )
         largest = ratios.argmax(axis=0)
-        score = np.take_along_axis(ratios, largest[np.newaxis], axis=0)[0]
+        score = ratios.max(axis=0)
         highest = score.max(axis=0)
         self._below_half_limit &= highest <= HALF_LIMIT
         self._within_limit &= highest <= 1.0
@@ -280,6 +328,7 @@ class FanScorer:
             "below_half_limit": self._below_half_limit.tolist(),
             "within_limit": self._within_limit.tolist(),
             "motion": self._motion.snapshot(),
+            **({"gaps": self._gaps.snapshot()} if self._gaps else {}),
             "detectors": {name: detector.snapshot() for name, detector in self.detectors.items()},
             **{source: residual.snapshot() for source, residual in self.residuals.items()},
         }
@@ -303,6 +352,8 @@ class FanScorer:
         for flags, name in ((self._below_half_limit, "below_half_limit"), (self._within_limit, "within_limit")):
             restore_column(flags, name, state[name])
         self._motion.restore(state["motion"])
+        if self._gaps and "gaps" in state:
+            self._gaps.restore(state["gaps"])
         for source, residual in self.residuals.items():
             residual.restore(state[source])
         for name, detector in self.detectors.items():

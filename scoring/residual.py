@@ -54,7 +54,7 @@ class Residual:
 
     def expected(self, speed_rad_s: Array) -> Array:
         """(n, fans) the mean healthy residual at these speeds (n, fans), in sigma of each fan."""
-        healthy, speed = self._healthy, np.abs(np.nan_to_num(speed_rad_s))
+        healthy, speed = self._healthy, np.where(np.isnan(speed_rad_s), 0.0, np.abs(speed_rad_s))
         expected = np.interp(speed, healthy.speeds_rad_s, healthy.expected_residual_sigmas)
         return expected if healthy.fan_offsets is None else expected + self._fan_offset(healthy.fan_offsets, speed)
 
@@ -79,7 +79,7 @@ class Residual:
         limit = self._healthy.baseline.commissioning_limit_sigmas
         reach = limit * scaling + self._clip(period_s) * self._residual_std(speed_rad_s, valid)
         centre = self.baseline.value * scaling
-        clipped = np.clip(np.where(valid, residual, centre), centre - reach, centre + reach)
+        clipped = np.where(valid, residual, centre).clip(centre - reach, centre + reach)
         self.baseline.add(clipped, valid, scaling)
 
     def smooth(self, shift: Array, valid: Array, period_s: float) -> Array:
@@ -96,7 +96,12 @@ class Residual:
         clip = self._clip(period_s)
         standardised = _finite(shift, valid) / self._residual_std(speed_rad_s, valid)
         persistent = standardised / self._persistent_std(scaling, speed_rad_s, transient_rad_s, valid)
-        return np.clip(standardised, -clip, clip), np.clip(persistent, -clip, clip)
+        return standardised.clip(-clip, clip), persistent.clip(-clip, clip)
+
+    @property
+    def memory_s(self) -> float:
+        """How long samples affect the smoothed residual."""
+        return self._low_pass.memory_s
 
     def reset(self, fans: Array) -> None:
         """Start the low-pass again for some fans, (fans,) of bool; baselines stay."""
@@ -140,4 +145,4 @@ class Residual:
 
 
 def _finite(shift: Array, valid: Array) -> Array:
-    return np.clip(np.where(valid, shift, 0.0), -LARGEST_SIGMAS, LARGEST_SIGMAS)
+    return np.where(valid, shift, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)

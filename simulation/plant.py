@@ -141,11 +141,13 @@ def advance(
     rise = parameters.breakaway_v - parameters.coulomb_v
     inverse_stribeck = 1.0 / np.asarray(parameters.stribeck_rad_s)
     per_inertia_s = step_s / np.asarray(parameters.J)
+    half_per_inertia_s = 0.5 * per_inertia_s
     speed, current = state.speed_rad_s, state.current_v
     for _ in range(substeps):
-        torque = parameters.gain * (target_v + (current - target_v) * mean_share)
-        current = target_v + (current - target_v) * decay
-        half = speed + 0.5 * per_inertia_s * (torque - (parameters.alpha + drag * np.abs(speed)) * speed)
+        excess_v = current - target_v
+        torque = parameters.gain * (target_v + excess_v * mean_share)
+        current = target_v + excess_v * decay
+        half = speed + half_per_inertia_s * (torque - (parameters.alpha + drag * np.abs(speed)) * speed)
         free = speed + per_inertia_s * (torque - (parameters.alpha + drag * np.abs(half)) * half)
         impulse = per_inertia_s * (coulomb + rise * np.exp(-np.square(speed * inverse_stribeck)))
         speed = np.sign(free) * np.maximum(np.abs(free) - impulse, 0.0)

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field, ValidationError
 
+from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.snapshot_store import SnapshotStore
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
@@ -59,6 +60,7 @@ ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
 READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_KEPT}"
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
 RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
+DATA_LOST_AFTER_NS = 2 * NS_PER_S  # an active alarm is not confirmed by data after so long without a score
 BACK_IN_TIME_NS = 120 * NS_PER_S  # a restarted producer catches up with less; older samples are of another recording
 
 
@@ -113,12 +115,15 @@ class ScorerCore(Core):
         config: ScorerConfig,
         twin: HealthyTwin,
         snapshot_store: SnapshotStore | None = None,
+        decision_rules: DecisionRules = CURRENT_RULES,
     ) -> None:
         """snapshot_store: where snapshots are kept; None: nowhere, as in a replay."""
         self._fans = fans
         self._twin = twin
         self._config = config
         self._text = AlarmText(speed_unit, twin.command_unit)
+        self._forgets_over_gaps = decision_rules >= DecisionRules.TIME_AND_GAPS
+        self._scorer = self._new_scorer()
         self._settings = ConditionSettings(
             on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),
             off_delay_ns=round(config.off_delay_s * NS_PER_S),
@@ -126,6 +131,8 @@ class ScorerCore(Core):
             alarm_ratio=config.alarm_ratio,
             latching=config.latching,
             confirming=config.confirming,
+            data_lost_after_ns=DATA_LOST_AFTER_NS if self._forgets_over_gaps else None,
+            settling_ns=self._scorer.longest_memory_ns,
         )
         self._unscored = UnscoredMonitor(fans, max(1, round(config.not_judged_s * NS_PER_S)))
         self._snapshot_store = snapshot_store
@@ -139,7 +146,7 @@ class ScorerCore(Core):
         """messages to be emitted first"""
 
     def _start_new(self) -> None:
-        self._scorer = FanScorer(self._fans, self._twin.limits)
+        self._scorer = self._new_scorer()
         self._diagnoser = Diagnoser(self._twin.balances)
         self._wear = WearMonitor(
             self._twin.balances, self._diagnoser, self._config.wear_every_s, self._twin.command_unit
@@ -150,6 +157,9 @@ class ScorerCore(Core):
         """who made the last prediction"""
         self._is_restored = False
         """from a snapshot that was not yet compared with the first prediction"""
+
+    def _new_scorer(self) -> FanScorer:
+        return FanScorer(self._fans, self._twin.limits, forgets_over_gaps=self._forgets_over_gaps)
 
     def restore(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
         """Continue from a snapshot. Returns the messages that report it.
@@ -344,8 +354,9 @@ def build(context: Context) -> BuiltStage:
     tray = context.tray
     path = context.snapshot_folder / f"scorer-{tray.name}.snapshot" if context.snapshot_folder else None
     twin = _healthy_twin(context, load_tray_twin(twin_path(context), tray.fans))
+    store = SnapshotStore(path) if path else None
     return BuiltStage(
-        ScorerCore(tray.fans, tray.speed_unit, context.config, twin, SnapshotStore(path) if path else None)
+        ScorerCore(tray.fans, tray.speed_unit, context.config, twin, store, decision_rules=context.decision_rules)
     )
 
 

@@ -14,28 +14,27 @@ import difflib
 import math
 import re
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from itertools import islice
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
+from pipeline.devices.table_columns import DATE_UNIT, NS_PER_UNIT, NumberColumn, TimeColumn
 from pipeline.errors import UserError
-from schemas.messages import FURTHEST_T_NS, Array
+from schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Array
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
-NS_PER_UNIT = {"s": NS_PER_S, "ms": 1_000_000, "us": 1_000, "ns": 1}
 RAD_S_PER_TABLE_UNIT = {**RAD_S_PER_UNIT, "hz": 2 * math.pi, "deg/s": math.pi / 180}
-DATE_UNIT = "iso"
 GAP_IN_MEDIAN_PERIODS = 5.0
 OUT_OF_ORDER_NS = NS_PER_S  # rows further back than this mean that the clock was set
 
 _DELIMITERS = ",;\t"
-_UNIX_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_DATE_AND_FRACTION = re.compile(r"(\d\d:\d\d:\d\d)[:,](\d+)")  # some loggers write 17:14:08:947, or 17:14:08,947
-_FINER_UNIT = {"s": "ms", "ms": "us", "us": "ns"}
-_NOT_MEASURED = {"", "nan", "na", "n/a", "null", "none", "-"}
+LONGEST_LINE = 1 << 20
+"""characters"""
+_ROWS_IN_PIECE = 4096
 
 
 @dataclass(frozen=True)
@@ -131,21 +130,39 @@ def read_table(
             f"{len(command)} command and {len(speed)} speed columns: give --speed once per fan, and --command "
             "once for all fans or once per fan"
         )
-    rows = _rows(path)
-    names = _names(path, next(rows, []))
-    cells = [row + [""] * (len(names) - len(row)) for row in rows if any(row)]
-    times, time_without_unit = _times(path, names, cells, time) if time else (_counted_times(len(cells), period), "")
     if time and period:
         raise UserError("--period is for tables without a time column: leave out --time or --period")
-    commands = [_numbers(path, names, cells, _column(path, given, names, ())[0]) for given in command]
-    speed_columns, units = zip(*(_column(path, given, names, RAD_S_PER_TABLE_UNIT) for given in speed), strict=True)
-    if len(set(units)) > 1:
-        raise UserError(f"speeds in {', '.join(unit or 'no unit' for unit in units)}: give all in one unit")
-    unit = units[0] or "rad/s"
-    speeds = [_numbers(path, names, cells, column) * RAD_S_PER_TABLE_UNIT[unit] for column in speed_columns]
-    fans_per_command = len(speeds) // len(commands)
-    table = _clean(path, times, np.column_stack(commands * fans_per_command), np.column_stack(speeds), unit)
-    return replace(table, assumed=_assumed(time_without_unit, "" if units[0] else names[speed_columns[0]]))
+    if not (time or period):
+        raise UserError("a table needs --time COLUMN[:UNIT], or --period 10ms if it has no time column")
+    rows = _rows(path)
+    names = _names(path, next(rows, []))
+    times = TimeColumn(path, *_column(path, time, names, (*NS_PER_UNIT, DATE_UNIT))) if time else None
+    commands = [NumberColumn(path, *_column(path, given, names, ())[:2]) for given in command]
+    found = [_column(path, given, names, RAD_S_PER_TABLE_UNIT) for given in speed]
+    units = {unit for _, _, unit in found}
+    if len(units) > 1:
+        raise UserError(f"speeds in {', '.join(unit or 'no unit' for _, _, unit in found)}: give all in one unit")
+    unit = found[0][2] or "rad/s"
+    speeds = [NumberColumn(path, name, index) for name, index, _ in found]
+    count = 0
+    for piece in _pieces(rows, len(names)):
+        for column in (*filter(None, [times]), *commands, *speeds):
+            column.add(piece)
+        count += len(piece)
+    t_ns, has_time = times.values() if times else _counted_times(count, period or "")
+    command_values = np.column_stack([column.values() for column in commands] * (len(speeds) // len(commands)))
+    speed_rad_s = np.column_stack([column.values() for column in speeds])
+    speed_rad_s *= RAD_S_PER_TABLE_UNIT[unit]
+    assumed = _assumed(times.name if times and times.is_assumed else "", "" if found[0][2] else found[0][0])
+    table = _clean(path, t_ns, has_time, command_values, speed_rad_s, unit)
+    return replace(table, assumed=assumed)
+
+
+def _pieces(rows: Iterator[list[str]], width: int) -> Iterator[list[list[str]]]:
+    """The rows that are not empty, some thousand at a time, each at least `width` cells wide."""
+    filled = (row + [""] * (width - len(row)) for row in rows if any(row))
+    while piece := list(islice(filled, _ROWS_IN_PIECE)):
+        yield piece
 
 
 def _rows(path: Path) -> Iterator[list[str]]:
@@ -157,14 +174,21 @@ def _rows(path: Path) -> Iterator[list[str]]:
         if not is_utf_16 and b"\0" in start:
             raise UserError(f"{path}: not a text file with columns; export it as CSV")
         with path.open(encoding="utf-16" if is_utf_16 else "utf-8-sig", errors="replace", newline="") as file:
-            header = file.readline()
+            header = file.readline(LONGEST_LINE)
             file.seek(0)
             delimiter = max(_DELIMITERS, key=header.count)
-            yield from ([cell.strip() for cell in row] for row in csv.reader(file, delimiter=delimiter))
+            yield from ([cell.strip() for cell in row] for row in csv.reader(_lines(path, file), delimiter=delimiter))
     except OSError as error:
         raise UserError(f"{path}: cannot read the table: {error.strerror}") from error
     except csv.Error as error:
         raise UserError(f"{path}: not a text file with columns: {error}") from error
+
+
+def _lines(path: Path, file: TextIO) -> Iterator[str]:
+    while line := file.readline(LONGEST_LINE):
+        if len(line) == LONGEST_LINE:
+            raise UserError(f"{path}: not a text file with columns: a line is longer than {LONGEST_LINE:,} characters")
+        yield line
 
 
 def _names(path: Path, header: list[str]) -> list[str]:
@@ -174,8 +198,8 @@ def _names(path: Path, header: list[str]) -> list[str]:
     return names
 
 
-def _column(path: Path, given: str, names: list[str], units: Iterable[str]) -> tuple[int, str]:
-    """Index of a column and its unit, empty if none is given; `given` is NAME or NAME:UNIT."""
+def _column(path: Path, given: str, names: list[str], units: Iterable[str]) -> tuple[str, int, str]:
+    """Name and index of a column and its unit, empty if none is given; `given` is NAME or NAME:UNIT."""
     name, colon, unit = given.rpartition(":")
     if given in names or not colon:
         name, unit = given, ""
@@ -190,51 +214,7 @@ def _column(path: Path, given: str, names: list[str], units: Iterable[str]) -> t
     if unit and unit not in units:
         known = f"known: {', '.join(units)}" if units else "a command has no unit"
         raise UserError(f"{given!r}: unknown unit {unit!r}; {known}")
-    return names.index(name), unit
-
-
-def _numbers(path: Path, names: list[str], cells: list[list[str]], column: int) -> Array:
-    """A column as float64, NaN where a cell is not a finite number."""
-    values = np.array([_number(row[column]) for row in cells], dtype=np.float64)
-    values[np.isinf(values)] = np.nan
-    if not np.any(np.isfinite(values)):
-        example = next((row[column] for row in cells if row[column]), "")
-        raise UserError(f"{path}: column {names[column]!r} has no numbers, but for example {example!r}")
-    return values
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        if cell.lower() in _NOT_MEASURED:
-            return math.nan
-    try:
-        return float(cell.replace(",", "."))  # decimal comma; possible only where columns are not separated by commas
-    except ValueError:
-        return math.nan
-
-
-def _times(path: Path, names: list[str], cells: list[list[str]], given: str) -> tuple[list[int | None], str]:
-    """Time of each row in ns, None where it cannot be read; and the column's name if its unit was assumed."""
-    column, unit = _column(path, given, names, (*NS_PER_UNIT, DATE_UNIT))
-    first = next((row[column] for row in cells if row[column]), "")
-    assumed = ""
-    if not unit:
-        unit = DATE_UNIT if math.isnan(_number(first)) else "s"
-        assumed = "" if unit == DATE_UNIT else names[column]
-    parse = _date_ns if unit == DATE_UNIT else _count_ns(NS_PER_UNIT[unit])
-    times = [parse(row[column]) for row in cells]
-    if not any(time is not None for time in times):
-        raise UserError(
-            f"{path}: column {names[column]!r} has no times in {unit}, but for example {first!r}; "
-            "use numbers in s, ms, us or ns, or dates such as 2026-01-31 13:45:00.250"
-        )
-    if any(time is not None and abs(time) >= FURTHEST_T_NS for time in times):
-        name, finer = names[column], _FINER_UNIT.get(unit)
-        hint = f"is it in ms, us or ns? use --time {name}:{finer}" if finer else "choose another time column"
-        raise UserError(f"{path}: column {name!r} in {unit} gives times beyond the year 2116: {hint}")
-    return times, assumed
+    return name, names.index(name), unit
 
 
 def _assumed(time: str, speed: str) -> str:
@@ -253,68 +233,62 @@ def _assumed(time: str, speed: str) -> str:
     return f"no unit given, {assumed} assumed; if that is wrong, use for example {options}"
 
 
-def _counted_times(rows: int, period: str | None) -> list[int | None]:
-    """Times of a table without a time column: rows `period` apart, from 0."""
-    if period is None:
-        raise UserError("a table needs --time COLUMN[:UNIT], or --period 10ms if it has no time column")
-    match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(s|ms|us|ns)", period.strip())
+def _counted_times(rows: int, period: str) -> tuple[Array, Array]:
+    """Times of a table without a time column: rows `period` apart, from 0; all are known."""
+    match = re.fullmatch(r"(\d{1,9}\.?\d*|\.\d+)\s*(s|ms|us|ns)", period.strip())
     period_ns = round(float(match[1]) * NS_PER_UNIT[match[2]]) if match else 0
-    if period_ns <= 0:
+    if not 0 < period_ns <= LARGEST_PERIOD_NS:
         raise UserError(f"--period {period}: give the time between samples with its unit, for example 10ms")
-    return [row * period_ns for row in range(rows)]
+    if rows * period_ns >= FURTHEST_T_NS:
+        raise UserError(f"--period {period}: the table would end beyond the year 2116; give a shorter period")
+    return np.arange(rows, dtype=np.int64) * period_ns, np.ones(rows, dtype=np.bool_)
 
 
-def _count_ns(scale: int) -> Callable[[str], int | None]:
-    def parse(cell: str) -> int | None:
-        try:
-            return int(cell) * scale  # exact: a float cannot hold ns since 1970
-        except ValueError:
-            value = _number(cell) * scale
-            return round(value) if math.isfinite(value) else None
+def _clean(path: Path, t_ns: Array, has_time: Array, command: Array, speed_rad_s: Array, unit: str) -> Table:
+    """Sort rows by time, hold commands, merge rows of the same time, and count all of it.
 
-    return parse
-
-
-def _date_ns(cell: str) -> int | None:
-    try:
-        date = datetime.fromisoformat(_DATE_AND_FRACTION.sub(r"\1.\2", cell))
-    except ValueError:
-        return None
-    since = (date if date.tzinfo else date.replace(tzinfo=UTC)) - _UNIX_EPOCH
-    return since // timedelta(microseconds=1) * 1000
-
-
-def _clean(path: Path, times: list[int | None], command: Array, speed_rad_s: Array, unit: str) -> Table:
-    """Sort rows by time, hold commands, merge rows of the same time, and count all of it."""
-    rows = len(times)
-    timed = [row for row, time in enumerate(times) if time is not None]
-    t_ns = np.array([times[row] for row in timed], dtype=np.int64)
+    A step that changes nothing copies nothing: most tables are in order and may be large.
+    """
+    rows = len(t_ns)
+    if not has_time.all():
+        t_ns, command, speed_rad_s = t_ns[has_time], command[has_time], speed_rad_s[has_time]
     behind_ns = np.maximum.accumulate(t_ns) - t_ns
     if np.any(behind_ns > OUT_OF_ORDER_NS):
         first = int(np.argmax(behind_ns > OUT_OF_ORDER_NS))
+        row = int(np.flatnonzero(has_time)[first])
         raise UserError(
-            f"{path}: time goes back by {behind_ns[first] / NS_PER_S:.3f} s at row {timed[first] + 1}, as if the "
+            f"{path}: time goes back by {behind_ns[first] / NS_PER_S:.3f} s at row {row + 1}, as if the "
             "clock had been set: choose another time column, or cut the file there"
         )
-    order = np.argsort(t_ns, kind="stable")
-    t_ns, command, speed_rad_s = t_ns[order], command[timed][order], speed_rad_s[timed][order]
-    held_command = hold_last(command)
-    known = ~np.any(np.isnan(held_command), axis=1)
-    t_ns, command, held_command, speed_rad_s = t_ns[known], command[known], held_command[known], speed_rad_s[known]
+    out_of_order = int(np.count_nonzero(behind_ns))
+    del behind_ns
+    if out_of_order:
+        order = np.argsort(t_ns, kind="stable")
+        t_ns, command, speed_rad_s = t_ns[order], command[order], speed_rad_s[order]
+    commands_held = int(np.count_nonzero(np.isnan(command)))
+    held = hold_last(command) if commands_held else command
+    known = ~np.any(np.isnan(held), axis=1)
+    before_command = int(np.count_nonzero(~known))
+    if before_command:
+        commands_held = int(np.count_nonzero(np.isnan(command[known])))
+        t_ns, held, speed_rad_s = t_ns[known], held[known], speed_rad_s[known]
     first = np.flatnonzero(np.diff(t_ns, prepend=t_ns[:1] - 1))
     if len(first) < 2:
         raise UserError(f"{path}: fewer than two rows with a time and a command")
-    last = np.append(first[1:], len(t_ns)) - 1
+    speeds_missing, repeated = int(np.count_nonzero(np.isnan(speed_rad_s))), len(t_ns) - len(first)
+    if repeated:
+        last = np.append(first[1:], len(t_ns)) - 1
+        t_ns, held, speed_rad_s = t_ns[first], held[last], _means(speed_rad_s, first)
     repairs = Repairs(
         rows=rows,
-        without_time=rows - len(timed),
-        out_of_order=int(np.count_nonzero(behind_ns)),
-        repeated=len(t_ns) - len(first),
-        before_command=int(np.count_nonzero(~known)),
-        commands_held=int(np.count_nonzero(np.isnan(command))),
-        speeds_missing=int(np.count_nonzero(np.isnan(speed_rad_s))),
+        without_time=rows - int(np.count_nonzero(has_time)),
+        out_of_order=out_of_order,
+        repeated=repeated,
+        before_command=before_command,
+        commands_held=commands_held,
+        speeds_missing=speeds_missing,
     )
-    return Table(path, t_ns[first], held_command[last], _means(speed_rad_s, first), unit, repairs)
+    return Table(path, t_ns, held, speed_rad_s, unit, repairs)
 
 
 def hold_last(command: Array) -> Array:

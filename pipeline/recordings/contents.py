@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import Chunk
 from mcap.summary import Summary
 
 from pipeline.recordings.disk import not_being_written
 from pipeline.recordings.reading import METADATA_NAME
-from pipeline.recordings.records import CORRUPT_DATA_ERRORS, MESSAGE, RECORD, chunk_data, parse, records_in
+from pipeline.recordings.records import CORRUPT_DATA_ERRORS, MESSAGE, chunk_at, indexed_reader, records_in
 from pipeline.recordings.scan import Scan, scan
 from pipeline.recordings.sequence_ledger import (
     BEFORE_NAME,
@@ -183,7 +181,7 @@ def _by_scan(found: Scan) -> Contents:
 
 
 def _by_index(path: Path, file: BinaryIO) -> Contents | None:
-    reader = make_reader(file)
+    reader = indexed_reader(file)
     summary = reader.get_summary()
     if summary is None or summary.statistics is None:
         return None
@@ -228,8 +226,7 @@ def _last_message(file: BinaryIO, summary: Summary, number: int) -> tuple[str, M
     """The key of a channel and its last message; None if that cannot be decoded."""
     key = summary.channels[number].topic
     chunk = next(chunk for chunk in reversed(summary.chunk_indexes) if number in chunk.message_index_offsets)
-    file.seek(chunk.chunk_start_offset + RECORD.size)
-    data = chunk_data(parse(Chunk, file.read(chunk.chunk_length - RECORD.size)))
+    data = chunk_at(file, chunk.chunk_start_offset, chunk.chunk_length)
     payloads = [
         data[start + MESSAGE.size : end]
         for _, opcode, start, end in records_in(data)

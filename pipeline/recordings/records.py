@@ -14,17 +14,23 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
+from zlib import crc32
 
+import lz4.frame
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
+from mcap.reader import McapReader, SeekingReader
 from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
-from zstandard import ZstdError
+from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 from pipeline.errors import UserError
 
+LARGEST_CHUNK_BYTES = 64 << 20
+"""of a chunk without compression; a larger one is treated as damaged"""
+LARGEST_RECORD_BYTES = 256 << 20
+"""a longer record is treated as damaged: one record at a time is in memory"""
 RECORD = struct.Struct("<BQ")
 """before each record's content: opcode, length of the content"""
 MESSAGE = struct.Struct("<HIQQ")
@@ -148,7 +154,7 @@ class RecordReader:
     def _is_plausible(self, header: bytes, offset: int) -> bool:
         """Whether these bytes can be the opcode and length of a record at `offset`."""
         is_whole = len(header) == RECORD.size and header[0] != 0
-        return is_whole and RECORD.unpack(header)[1] <= self.size - offset - RECORD.size
+        return is_whole and RECORD.unpack(header)[1] <= min(self.size - offset - RECORD.size, LARGEST_RECORD_BYTES)
 
     def _next_chunk(self, file: BinaryIO, start: int) -> int | None:
         """Offset of the next intact zstd chunk at or after `start`; None if there is none."""
@@ -171,7 +177,7 @@ class RecordReader:
     def _is_chunk(self, file: BinaryIO, offset: int) -> bool:
         file.seek(offset)
         opcode, length = RECORD.unpack(file.read(RECORD.size))
-        if opcode != Opcode.CHUNK or length > self.size - offset - RECORD.size:
+        if opcode != Opcode.CHUNK or length > min(self.size - offset - RECORD.size, LARGEST_RECORD_BYTES):
             return False
         try:
             chunk_data(parse(Chunk, file.read(length)))
@@ -199,19 +205,51 @@ def _parse_known(opcode: int, content: bytes) -> McapRecord | None:
 
 
 def chunk_data(chunk: Chunk) -> bytes:
-    """The uncompressed records of a chunk. Raises one of CORRUPT_DATA_ERRORS where it is damaged."""
-    if chunk.compression not in ("", "zstd", "lz4"):
-        raise ValueError(f"unknown compression {chunk.compression!r}")
-    try:
-        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-    except RuntimeError as error:  # lz4 raises nothing more specific
-        raise ValueError(str(error)) from error
-    if size != chunk.uncompressed_size:
-        raise ValueError(f"a chunk of {size} bytes instead of {chunk.uncompressed_size}")
-    data = stream.read(size)
+    """The uncompressed records of a chunk, at most LARGEST_CHUNK_BYTES.
+
+    Raises one of CORRUPT_DATA_ERRORS where it is damaged or larger.
+    """
+    size = chunk.uncompressed_size
+    if size > LARGEST_CHUNK_BYTES:
+        raise ValueError(f"a chunk of {size} bytes; at most {LARGEST_CHUNK_BYTES}")
+    data = _decompressed(chunk)
+    if len(data) != size:
+        raise ValueError(f"a chunk of {len(data)} bytes instead of {size}")
+    if chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
+        raise ValueError("a chunk whose checksum is wrong")
     if not chunk.uncompressed_crc:
         deque(records_in(data), 0)  # without a checksum, at least the lengths must be right
     return data
+
+
+def _decompressed(chunk: Chunk) -> bytes:
+    """Never takes much more memory than the size that the chunk states: a few bytes can stand for gigabytes."""
+    size = chunk.uncompressed_size
+    if chunk.compression == "":
+        return chunk.data
+    if chunk.compression == "zstd":
+        if frame_content_size(chunk.data) > size:  # -1 if the frame does not state it
+            raise ValueError("a chunk whose compressed data state another size")
+        return ZstdDecompressor().decompress(chunk.data, max_output_size=size)
+    if chunk.compression == "lz4":
+        try:
+            return lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        except RuntimeError as error:  # lz4 raises nothing more specific
+            raise ValueError(str(error)) from error
+    raise ValueError(f"unknown compression {chunk.compression!r}")
+
+
+def indexed_reader(file: BinaryIO) -> McapReader:
+    """The library's reader of the index, for files from anywhere. It raises one of CORRUPT_DATA_ERRORS."""
+    return SeekingReader(file, record_size_limit=LARGEST_RECORD_BYTES)
+
+
+def chunk_at(file: BinaryIO, offset: int, length: int) -> bytes:
+    """`chunk_data` of the chunk that an index places there; `length` is that of the whole record."""
+    if not RECORD.size <= length <= LARGEST_RECORD_BYTES:
+        raise ValueError(f"an index with a chunk of {length} bytes")
+    file.seek(offset + RECORD.size)
+    return chunk_data(parse(Chunk, file.read(length - RECORD.size)))
 
 
 def records_in(data: bytes) -> Iterator[tuple[int, int, int, int]]:
@@ -223,8 +261,8 @@ def records_in(data: bytes) -> Iterator[tuple[int, int, int, int]]:
     while at < size:
         opcode, length = RECORD.unpack_from(data, at)
         start = at + RECORD.size
-        if start + length > size:
-            raise ValueError("a record that is longer than its chunk")
+        if not opcode or start + length > size:
+            raise ValueError("a record without an opcode, or longer than its chunk")
         yield at, opcode, start, start + length
         at = start + length
 

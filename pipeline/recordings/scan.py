@@ -8,7 +8,6 @@ from pathlib import Path
 from zlib import crc32
 
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Header, Metadata, Schema
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
@@ -22,6 +21,7 @@ from pipeline.recordings.records import (
     Record,
     RecordReader,
     chunk_data,
+    indexed_reader,
     parse,
     records_in,
 )
@@ -262,6 +262,6 @@ def summary_of(path: Path) -> Summary:
     """The summary section of a file; an empty one if it has none that can be read."""
     with path.open("rb") as file:
         try:
-            return make_reader(file).get_summary() or Summary()
+            return indexed_reader(file).get_summary() or Summary()
         except CORRUPT_DATA_ERRORS:
             return Summary()

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from pipeline.config.models import Section, TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
+from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from schemas.messages import Message
 from schemas.topics import BY_NAME
 
@@ -94,6 +95,8 @@ class Context:
     configuration_text: str = field(default="", repr=False)
     overrides: tuple[str, ...] = ()
     """the keys set on the command line, `key=value`"""
+    decision_rules: DecisionRules = CURRENT_RULES
+    """an older version only while an older recording is replayed"""
 
     @property
     def tray(self) -> TrayConfig:

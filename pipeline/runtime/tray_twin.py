@@ -17,6 +17,8 @@ from schemas.twin_card import CARD_PROPERTY, BalanceCard, CardError, TwinCard
 if TYPE_CHECKING:
     from scoring.diagnosis.regression_window import HealthyBalance
 
+LARGEST_TWIN_BYTES = 64 << 20
+"""of a twin's file; the demo's has 28 kB"""
 DEAD_ZONE = 0.25
 """of the command range; a larger friction is not taken for a dead zone"""
 
@@ -120,12 +122,16 @@ def read_file(path: Path) -> bytes:
     """The content of a twin's file.
 
     Raises:
-        StageError: it cannot be read.
+        StageError: it cannot be read, or is too large.
     """
     try:
-        return path.read_bytes()
+        with path.open("rb") as file:
+            content = file.read(LARGEST_TWIN_BYTES + 1)
     except OSError as error:
         raise StageError(f"{path}: cannot read the twin: {error.strerror}; correct [[tray]] twin") from error
+    if len(content) > LARGEST_TWIN_BYTES:
+        raise StageError(f"{path}: larger than {LARGEST_TWIN_BYTES:,} bytes, so not a twin; correct [[tray]] twin")
+    return content
 
 
 def tray_twin(path: Path, content: bytes, fans: int | None) -> TrayTwin:

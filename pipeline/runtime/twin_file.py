@@ -7,7 +7,9 @@ when the stage starts, not while fans run.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -21,6 +23,8 @@ from schemas.twin_card import GRAPH_INPUTS, GRAPH_OUTPUTS, TwinCard
 
 Advance: TypeAlias = Callable[[Array, Array, Array], tuple[Array, Array]]
 """(state (fans, n_state), command (n, fans), step_s (n,)) -> (speed_rad_s (n, fans), state (fans, n_state))."""
+FIRST_RUN_LIMIT_S = 10.0
+"""how long the two samples that are run at load may take; they take about a millisecond"""
 
 
 @dataclass(frozen=True)
@@ -44,9 +48,10 @@ class TwinFile(TrayTwin):
         session = _session(path, content)
         known = tray_twin(path, content, fans)
         _check_graph(path, session, known.card)
-        twin = cls(**vars(known), advance=_advance(session, for_fans(known.card.parameters, known.fans)))
-        _check_run(path, twin)
-        return twin
+        parameters = for_fans(known.card.parameters, known.fans)
+        with _time_limit(FIRST_RUN_LIMIT_S) as options:
+            _check_run(path, cls(**vars(known), advance=_advance(session, parameters, options)), options)
+        return cls(**vars(known), advance=_advance(session, parameters))
 
 
 def load_twin(context: Context) -> TwinFile:
@@ -96,13 +101,32 @@ def _check_graph(path: Path, session: Any, card: TwinCard) -> None:
             )
 
 
-def _check_run(path: Path, twin: TwinFile) -> None:
+@contextmanager
+def _time_limit(limit_s: float) -> Iterator[Any]:
+    """Options of a run that onnxruntime ends after `limit_s`, even inside a loop of the graph."""
+    import onnxruntime  # noqa: PLC0415  as in _session
+
+    options = onnxruntime.RunOptions()
+    timer = threading.Timer(limit_s, setattr, (options, "terminate", True))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield options
+    finally:
+        timer.cancel()
+
+
+def _check_run(path: Path, twin: TwinFile, options: Any) -> None:
     """Run two samples at rest: this finds what neither the card nor the names and types of the graph show."""
     command = np.full((2, twin.fans), twin.card.command_range[0])
     state = twin.initial_state(np.zeros(twin.fans), command[0])
     try:
         speed_rad_s, state_out = twin.advance(state, command, np.full(2, 1.0 / twin.card.rate_hz))
     except Exception as error:  # as in _session
+        if options.terminate:
+            raise StageError(
+                f"{path}: the twin takes more than {FIRST_RUN_LIMIT_S:g} s for two samples; export it again"
+            ) from error
         raise StageError(f"{path}: the twin does not run: {_first_line(error)}; export it again") from error
     if speed_rad_s.shape != command.shape or state_out.shape != state.shape:
         raise StageError(
@@ -111,10 +135,10 @@ def _check_run(path: Path, twin: TwinFile) -> None:
         )
 
 
-def _advance(session: Any, parameters: Array) -> Advance:
+def _advance(session: Any, parameters: Array, options: Any = None) -> Advance:
     def advance(state: Array, command: Array, period_s: Array) -> tuple[Array, Array]:
         feed = {"state": state, "command": command, "step_s": period_s, "parameters": parameters}
-        speed_rad_s, state_out = session.run(list(GRAPH_OUTPUTS), feed)
+        speed_rad_s, state_out = session.run(list(GRAPH_OUTPUTS), feed, options)
         return speed_rad_s, state_out
 
     return advance

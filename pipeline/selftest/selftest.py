@@ -42,8 +42,8 @@ def run_scenarios(folder: Path, scenarios: Sequence[Scenario], report: Callable[
                 continue
             with ScratchSite(place, *(each for scenario in group for each in scenario.settings)) as site:
                 for scenario in group:
-                    add(_run(site, scenario))
-                add(_account(site, ", ".join(scenario.name for scenario in group)))
+                    add(run_scenario(site, scenario))
+                add(account(site, ", ".join(scenario.name for scenario in group)))
     return rows
 
 
@@ -69,7 +69,8 @@ def _by_site(scenarios: Sequence[Scenario]) -> list[list[Scenario]]:
     return [*([shared] if shared else []), *([each] for each in scenarios if each.needs_own_site)]
 
 
-def _run(site: ScratchSite, scenario: Scenario) -> Row:
+def run_scenario(site: ScratchSite, scenario: Scenario) -> Row:
+    """Run one scenario on a running site; afterwards all fans must be judged again, without a new alarm."""
     alarms = len(site.raised)
     try:
         seen = scenario.run(site)
@@ -82,8 +83,8 @@ def _run(site: ScratchSite, scenario: Scenario) -> Row:
     return Row(scenario.name, scenario.promise, seen, kept=True)
 
 
-def _account(site: ScratchSite, names: str) -> Row:
-    """Stop the site and verify its recording."""
+def account(site: ScratchSite, names: str) -> Row:
+    """Stop the site and verify its recording. `names`: of what was done to it."""
     name, promise = f"account of {names}", "it stops in order, and its recording replays to the same decisions"
     status, outcome = site.stop()
     if status not in (0, 3):

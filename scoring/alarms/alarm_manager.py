@@ -71,7 +71,8 @@ class AlarmManager:
         alarms: list[Alarm] = []
 
         def emit(row: int, fan: int, transition: Transition, **changed: Any) -> None:
-            measured = _measured(row, fan, score, context)
+            lost = transition == Transition.DATA_LOST
+            measured = {"t_ns": int(score.t_ns[row])} if lost else _measured(row, fan, score, context)
             alarms.append(self._emit(replace(self._next_message(fan), **measured, transition=transition, **changed)))
 
         def diagnose_due(t_ns: Array) -> None:
@@ -90,6 +91,8 @@ class AlarmManager:
             elif event.transition == Transition.CLEARED:
                 self.cleared += 1
                 self._diagnoser.cleared(fan)
+            elif event.transition == Transition.DATA_LOST:
+                self._diagnoser.cleared(fan)  # samples from after a gap may be of another state
             emit(event.row, fan, event.transition, **changed)
         diagnose_due(score.t_ns)
         return alarms
@@ -244,6 +247,7 @@ def _state_fields(state: AlarmState) -> dict[str, Any]:
         "shelved_until_t_ns": state.shelved_until_t_ns,
         "suppressed": state.suppressed,
         "out_of_service": state.out_of_service,
+        "stale": state.stale,
     }
 
 

@@ -36,6 +36,8 @@ TRANSITIONS = {
     Transition.OUT_OF_SERVICE: "out of service",
     Transition.IN_SERVICE: "in service",
     Transition.COMMISSIONING: "a new baseline is being taken",
+    Transition.DATA_LOST: "not confirmed by data: there are no samples to judge",
+    Transition.DATA_RESTORED: "judged again, on new samples",
 }
 """transitions whose line depends on nothing else"""
 

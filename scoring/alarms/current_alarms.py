@@ -49,6 +49,7 @@ class CurrentAlarm:
         alarm, raised = self.newest, self.newest.severity != Severity.NONE
         states = {
             "active": alarm.active,
+            "not confirmed by data": alarm.stale,
             "cleared": raised and not alarm.active,
             "never raised": not raised,
             "unacknowledged": not alarm.acknowledged,
@@ -75,6 +76,7 @@ class CurrentAlarm:
             "shelved_until_t_ns": alarm.shelved_until_t_ns,
             "suppressed": alarm.suppressed,
             "out_of_service": alarm.out_of_service,
+            "stale": alarm.stale,
             "retained": is_retained(alarm),
             "presented": is_presented(alarm),
             "onset_t_ns": alarm.onset_t_ns,

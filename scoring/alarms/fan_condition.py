@@ -36,6 +36,11 @@ class ConditionSettings:
     """a cleared alarm stays until it is reset"""
     confirming: bool = False
     """an acknowledged alarm must also be confirmed"""
+    data_lost_after_ns: int | None = None
+    """after a longer time without a valid sample an active alarm is stale; None: never, as in recordings of former
+    versions"""
+    settling_ns: int = 0
+    """time of valid samples after a gap, from which on low ratios count: statistics have started again"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +60,8 @@ class AlarmState:
     """0: not shelved"""
     suppressed: bool = False
     out_of_service: bool = False
+    stale: bool = False
+    """the state is that of before a gap: no sample has confirmed it since"""
     acknowledged_by: str = ""
     comment: str = ""
     """of the last granted request that had one"""
@@ -69,6 +76,7 @@ class FanCondition:
         self.alarm_state = AlarmState()
         self._excursion_t_ns = 0  # first sample of the excursion; meaningless when NORMAL
         self._held_ns = 0  # time since SUSPECT or RETURNING began
+        self._settled_ns = 0  # time of valid samples since the gap, while the alarm is stale
 
     def update(self, t_ns: int, period_ns: int, ratio: float) -> Sequence[tuple[Transition, AlarmState]]:
         """Process one valid sample and return the transitions, in order.
@@ -95,9 +103,22 @@ class FanCondition:
             acknowledged=False,
             confirmed=True,  # nothing to confirm before it is acknowledged, see table B.1
             latched=self._settings.latching,
+            stale=False,
             acknowledged_by="",
         )
         return ((Transition.RAISED, self.alarm_state),)
+
+    def lose_data(self) -> Sequence[tuple[Transition, AlarmState]]:
+        """The time without valid samples has become too long: delays end, and an active alarm becomes stale."""
+        self._held_ns = self._settled_ns = 0
+        if not self.alarm_state.active:
+            self.fan_state = NORMAL
+            return ()
+        self.fan_state = ALARM
+        if self.alarm_state.stale:
+            return ()
+        self.alarm_state = replace(self.alarm_state, stale=True)
+        return ((Transition.DATA_LOST, self.alarm_state),)
 
     def discard(self, *, keep_silenced: bool) -> None:
         """Return to an alarm that was never raised. keep_silenced: shelved, suppressed, out of service stay as set."""
@@ -149,7 +170,13 @@ class FanCondition:
         alarm = asdict(self.alarm_state)
         del alarm["active"]  # follows from the fan state
         alarm["severity"] = int(self.alarm_state.severity)
-        return {"state": self.fan_state, "excursion_t_ns": self._excursion_t_ns, "held_ns": self._held_ns, **alarm}
+        return {
+            "state": self.fan_state,
+            "excursion_t_ns": self._excursion_t_ns,
+            "held_ns": self._held_ns,
+            "settled_ns": self._settled_ns,
+            **alarm,
+        }
 
     @classmethod
     def restore(cls, settings: ConditionSettings, snapshot: Mapping[str, Any]) -> Self:
@@ -165,6 +192,7 @@ class FanCondition:
             raise ValueError(stored["state"])
         condition._excursion_t_ns = _time(stored["excursion_t_ns"])
         condition._held_ns = _time(stored["held_ns"])
+        condition._settled_ns = _time(stored.get("settled_ns", 0))
         condition.alarm_state = AlarmState(
             active=condition.fan_state in (ALARM, RETURNING),
             severity=Severity.known(stored["severity"]),
@@ -175,12 +203,23 @@ class FanCondition:
             latched=bool(stored["latched"]),
             suppressed=bool(stored["suppressed"]),
             out_of_service=bool(stored["out_of_service"]),
+            stale=bool(stored.get("stale", False)),
             acknowledged_by=str(stored["acknowledged_by"]),
             comment=str(stored["comment"]),
         )
         return condition
 
     def _update_active(self, period_ns: int, ratio: float) -> Sequence[tuple[Transition, AlarmState]]:
+        if not self.alarm_state.stale:
+            return self._update_judged(period_ns, ratio)
+        self._settled_ns += period_ns
+        if ratio < self._settings.return_ratio and self._settled_ns < self._settings.settling_ns:
+            return ()
+        self.alarm_state = replace(self.alarm_state, stale=False)
+        restored = (Transition.DATA_RESTORED, self.alarm_state)
+        return (restored, *self._update_judged(period_ns, ratio))
+
+    def _update_judged(self, period_ns: int, ratio: float) -> Sequence[tuple[Transition, AlarmState]]:
         if not ratio < self._settings.return_ratio:
             self.fan_state = ALARM
             severity = self._severity(ratio)

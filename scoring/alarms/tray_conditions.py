@@ -1,7 +1,8 @@
 """The alarm conditions of a tray's fans, updated with blocks of samples.
 
 The result does not depend on how samples are cut into blocks: delays count the time of valid samples, and every event
-carries the alarm's state at its own row. An invalid sample changes no state and no timer; only shelving times run on.
+carries the alarm's state at its own row. An invalid sample changes no state and no timer; only shelving times run on,
+and after some time without a valid sample the delays end and an active alarm becomes stale.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from scoring.alarms.fan_condition import (
 )
 
 UNKNOWN = int(FanState.UNKNOWN)
+NEVER_NS = -(1 << 62)
+_DATA_LOST, _UNSHELVE, _SAMPLE = range(3)  # what may happen at a row, in this order
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,7 @@ class TrayConditions:
     def __init__(self, fans: int, settings: ConditionSettings) -> None:
         self._settings = settings
         self._conditions = [FanCondition(settings) for _ in range(fans)]
+        self._last_valid_t_ns = np.full(fans, NEVER_NS, np.int64)
         self._refresh_all()
 
     def update(self, t_ns: Array, period_ns: int, ratio: Array, valid: Array) -> BlockResult:
@@ -62,23 +66,38 @@ class TrayConditions:
         busy = self._not_normal | ((ratio > 1) & valid).any(axis=0)
         for fan in np.flatnonzero(busy | (self._shelved_until_t_ns <= t_ns[-1])).tolist():
             condition = self._conditions[fan]
-            unshelve_row = int(np.searchsorted(t_ns, self._shelved_until_t_ns[fan]))
             rows = np.flatnonzero(valid[:, fan]) if busy[fan] else np.zeros(0, np.intp)
-            samples = zip(rows.tolist(), t_ns[rows].tolist(), ratio[rows, fan].tolist(), strict=True)
-            for row, sample_t_ns, sample_ratio in samples:
-                if row >= unshelve_row:
-                    events.append(AlarmEvent(unshelve_row, fan, *condition.unshelve()))
-                    unshelve_row = len(t_ns)
+            steps = [(row, _SAMPLE) for row in rows.tolist()]
+            if busy[fan]:
+                steps += [(row, _DATA_LOST) for row in self._data_lost_rows(fan, t_ns, rows)]
+            steps.append((int(np.searchsorted(t_ns, self._shelved_until_t_ns[fan])), _UNSHELVE))
+            for row, step in sorted(steps):
+                if row == len(t_ns):
+                    break
                 before = condition.fan_state
-                transitions = condition.update(sample_t_ns, period_ns, sample_ratio)
+                if step == _DATA_LOST:
+                    transitions = condition.lose_data()
+                elif step == _UNSHELVE:
+                    transitions = (condition.unshelve(),)
+                else:
+                    transitions = condition.update(int(t_ns[row]), period_ns, float(ratio[row, fan]))
+                    state[row, fan] = condition.fan_state
                 events += [AlarmEvent(row, fan, *transition) for transition in transitions]
-                state[row, fan] = condition.fan_state
                 too_short += before == SUSPECT and condition.fan_state == NORMAL
-            if unshelve_row < len(t_ns):
-                events.append(AlarmEvent(unshelve_row, fan, *condition.unshelve()))
             self._refresh(fan)
+        last_rows = np.where(valid.any(axis=0), len(t_ns) - 1 - valid[::-1].argmax(axis=0), -1)
+        self._last_valid_t_ns = np.where(last_rows >= 0, t_ns[last_rows], self._last_valid_t_ns)
         events.sort(key=lambda event: (event.row, event.fan))
         return BlockResult(state, events, too_short)
+
+    def _data_lost_rows(self, fan: int, t_ns: Array, rows: Array) -> list[int]:
+        """At which rows a fan has been without a valid sample for too long; rows: those with one."""
+        limit_ns = self._settings.data_lost_after_ns
+        if limit_ns is None or self._last_valid_t_ns[fan] == NEVER_NS:
+            return []
+        since_t_ns = np.concatenate((self._last_valid_t_ns[fan : fan + 1], t_ns[rows]))
+        lost = np.searchsorted(t_ns, since_t_ns + limit_ns, side="right")
+        return lost[lost <= np.append(rows, len(t_ns) - 1)].tolist()
 
     def request(
         self,
@@ -115,7 +134,10 @@ class TrayConditions:
 
     def snapshot(self) -> dict[str, Any]:
         """The whole state, as JSON values."""
-        return {"fans": [condition.snapshot() for condition in self._conditions]}
+        return {
+            "fans": [condition.snapshot() for condition in self._conditions],
+            "last_valid_t_ns": self._last_valid_t_ns.tolist(),
+        }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a snapshot. Nothing has changed if this raises.
@@ -125,11 +147,12 @@ class TrayConditions:
         """
         try:
             conditions = [FanCondition.restore(self._settings, each) for each in snapshot["fans"]]
+            last_valid_t_ns = np.array(snapshot.get("last_valid_t_ns", [NEVER_NS] * len(conditions)), np.int64)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise ValueError(f"not a snapshot of alarm conditions: {error!r}") from error
-        if len(conditions) != len(self._conditions):
+        if not len(conditions) == len(last_valid_t_ns) == len(self._conditions):
             raise ValueError(f"a snapshot of {len(conditions)} fans, here are {len(self._conditions)}")
-        self._conditions = conditions
+        self._conditions, self._last_valid_t_ns = conditions, last_valid_t_ns
         self._refresh_all()
 
     def _refresh_all(self) -> None:

@@ -108,7 +108,7 @@ class Baseline(ColumnState):
 
     def add(self, residual: Array, valid: Array, scaling: Array | float = 1.0) -> None:
         """Take samples of the present interval, (n, fans) each; residual in sigma, scaling finite."""
-        known = np.clip(np.where(valid, residual, 0.0), -LARGEST_SIGMAS, LARGEST_SIGMAS)
+        known = np.where(valid, residual, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
         self._sums += np.rint(known * scaling * FIXED_POINT_ONE).astype(np.int64).sum(axis=0)
         squares = np.rint(np.where(valid, scaling * scaling, 0.0) * FIXED_POINT_ONE)
         self._scaling_squares += squares.astype(np.int64).sum(axis=0)

@@ -32,19 +32,27 @@ class Cusum:
 
     def update(self, z: Array, valid: Array, period_s: float) -> Array:
         """Take a block, (n, fans) each; invalid samples leave the sums as they are. Returns max(C+, C-)."""
-        shift = np.clip(np.where(valid, z, 0.0), -LARGEST_SIGMAS, LARGEST_SIGMAS)
-        gains = np.stack((shift - self._reference, -shift - self._reference)) * (period_s * ONE)
+        shift = np.where(valid, z, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
+        gains = np.array((shift - self._reference, -shift - self._reference)) * (period_s * ONE)
         gains = np.where(valid, np.rint(gains), 0.0).astype(np.int64)  # (2, n, fans)
         totals = self.sums[:, np.newaxis] + np.cumsum(gains, axis=1)
         sums = totals - np.minimum(np.minimum.accumulate(totals, axis=1), 0)
         if self._cap is not None:
-            for side, fan in np.argwhere((sums > self._cap).any(axis=1)).tolist():
-                self._sum_with_cap(sums[side, :, fan], gains[side, :, fan], int(self.sums[side, fan]))
+            above = (sums > self._cap).any(axis=1)
+            if above.any():
+                for side, fan in np.argwhere(above).tolist():
+                    sums[side, :, fan] = self._with_cap(gains[side, :, fan], int(self.sums[side, fan]), self._cap)
         self.sums = sums[:, -1].copy()
         return sums.max(axis=0) / ONE
 
-    def _sum_with_cap(self, sums: Array, gains: Array, total: int) -> None:
-        assert self._cap is not None
-        for row, gain in enumerate(gains.tolist()):
-            total = min(max(total + gain, 0), self._cap)
-            sums[row] = total
+    @staticmethod
+    def _with_cap(gains: Array, total: int, cap: int) -> list[int]:
+        sums = []
+        for gain in gains.tolist():
+            total += gain
+            if total < 0:
+                total = 0
+            elif total > cap:
+                total = cap
+            sums.append(total)
+        return sums

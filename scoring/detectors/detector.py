@@ -156,6 +156,11 @@ class Detector(ColumnState):
     def reset(self, fans: Array) -> None:
         """Start again for some fans, (fans,) of bool."""
 
+    @property
+    @abstractmethod
+    def memory_s(self) -> float:
+        """How long samples affect the statistic. After a longer gap it starts again: nothing before it counts."""
+
     @abstractmethod
     def limit_sigmas(self, period_s: float) -> float:
         """The smallest constant shift of the residual that the statistic ends up reporting, sigma; inf: it reports

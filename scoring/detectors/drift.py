@@ -77,6 +77,11 @@ class Drift(Detector):
         """See Detector."""
         self._cusum.reset(fans)
 
+    @property
+    def memory_s(self) -> float:
+        """The time in which a residual of zero takes a sum at its cap back to zero."""
+        return CAP_LIMITS * self._limit_sigma_s / self._settings.reference_sigmas
+
     def limit_sigmas(self, period_s: float) -> float:
         """The reference value: any larger shift adds up until it reaches the limit."""
         return self._settings.reference_sigmas * self._mean_residual_std

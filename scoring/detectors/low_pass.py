@@ -10,6 +10,8 @@ from schemas.messages import Array
 from scoring.detectors.state import ColumnState
 from scoring.torque_balance import filter_rows
 
+MEMORY_TIME_CONSTANTS = 5.0  # after these, less than one percent of an output is left
+
 
 class LowPass(ColumnState):
     """y[k] = keep y[k-1] + (1 - keep) x[k] with keep = exp(-step / time constant), exact for a held input."""
@@ -18,6 +20,11 @@ class LowPass(ColumnState):
         self._time_constant_s = time_constant_s
         self.value = np.full(columns, start)
         """(columns,) the last output"""
+
+    @property
+    def memory_s(self) -> float:
+        """How long samples affect the output."""
+        return MEMORY_TIME_CONSTANTS * self._time_constant_s
 
     def keep(self, period_s: float) -> float:
         """Weight of the previous output after one step."""
@@ -30,19 +37,23 @@ class LowPass(ColumnState):
     def update(self, x: Array, valid: Array, period_s: float) -> Array:
         """Take a block, (n, columns) each, and return the output after each sample."""
         keep = self.keep(period_s)
-        whole = valid.all(axis=0)
         if len(x) == 1:
             y = np.where(valid, (1.0 - keep) * x + keep * self.value, self.value)
-        elif whole.all():
+        elif valid.all():
             y, _ = filter_rows(keep, x, keep * self.value[np.newaxis])
         else:
-            y = np.empty_like(x)
-            if whole.any():
-                y[:, whole], _ = filter_rows(keep, x[:, whole], keep * self.value[np.newaxis, whole])
-            y[:, ~whole] = self.value[~whole]
-            for column in np.flatnonzero(~whole & valid.any(axis=0)).tolist():
-                y[:, column] = self._held(x[:, column], valid[:, column], keep, self.value[column])
+            y = self._partly_valid(x, valid, keep)
         self.value = y[-1].copy()
+        return y
+
+    def _partly_valid(self, x: Array, valid: Array, keep: float) -> Array:
+        y = np.empty_like(x)
+        whole = valid.all(axis=0)
+        if whole.any():
+            y[:, whole], _ = filter_rows(keep, x[:, whole], keep * self.value[np.newaxis, whole])
+        y[:, ~whole] = self.value[~whole]
+        for column in np.flatnonzero(~whole & valid.any(axis=0)).tolist():
+            y[:, column] = self._held(x[:, column], valid[:, column], keep, self.value[column])
         return y
 
     def columns(self) -> dict[str, Array]:

@@ -33,6 +33,15 @@ class Motion(ColumnState):
         speed = np.where(valid, speed_rad_s, 0.0)
         return np.where(valid, np.abs(speed - self.past.update(speed, valid, period_s)), 0.0)
 
+    @property
+    def memory_s(self) -> float:
+        """How long readings affect the measure."""
+        return self.past.memory_s
+
+    def reset(self, fans: Array) -> None:
+        """Start again for some fans, (fans,) of bool."""
+        self.past.reset(fans, np.nan)
+
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
         return {"past": self.past.value}

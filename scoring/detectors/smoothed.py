@@ -60,6 +60,11 @@ class Smoothed(Detector):
         """See Detector."""
         self._low_pass.reset(fans)
 
+    @property
+    def memory_s(self) -> float:
+        """See Detector."""
+        return self._low_pass.memory_s
+
     def limit_sigmas(self, period_s: float) -> float:
         """The mean over speeds; at one speed, or in motion, it is more or less as the healthy residual varies."""
         return self._deviation(period_s) * self._settings.limit * self._context.mean_residual_std

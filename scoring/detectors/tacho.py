@@ -96,6 +96,11 @@ class Tacho(Detector):
         self._repeated_ns[fans] = 0
         self._missing.reset(fans)
 
+    @property
+    def memory_s(self) -> float:
+        """Of the share of missing readings. A repetition ends at the first sample without a reading."""
+        return self._missing.memory_s
+
     def limit_sigmas(self, period_s: float) -> float:
         """It does not watch a residual."""
         return math.inf

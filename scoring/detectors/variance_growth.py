@@ -81,6 +81,11 @@ class VarianceGrowth(Detector):
         self._mean.reset(fans)
         self._square.reset(fans)
 
+    @property
+    def memory_s(self) -> float:
+        """See Detector."""
+        return max(self._mean.memory_s, self._square.memory_s)
+
     def limit_sigmas(self, period_s: float) -> float:
         """A constant shift does not raise the variance."""
         return math.inf

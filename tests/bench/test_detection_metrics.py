@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -230,6 +231,11 @@ def _at_level(
     return command, np.concatenate([block.speed_rad_s for block in blocks])[2000:].mean(axis=0)
 
 
+@cache
+def _healthy_at_level(level: float, *, is_looped: bool) -> tuple[Array, Array]:
+    return _at_level(level, is_looped=is_looped)
+
+
 def _tray() -> FanParameters:
     return tray_of_fans(TRAY_FANS, 7)
 
@@ -239,7 +245,7 @@ def test_a_fault_in_open_loop_moves_the_speed_by_the_requested_amount(kind: str)
     fans, nothing = _tray(), np.zeros(TRAY_FANS)
     healthy = severities.held_speed_rad_s(severities.given_v(np.full(TRAY_FANS, 0.6), fans), fans)
     size = severities.size(kind, healthy, fans, np.full(TRAY_FANS, 20.0), nothing)
-    _, before = _at_level(0.6, is_looped=False)
+    _, before = _healthy_at_level(0.6, is_looped=False)
     _, after = _at_level(0.6, is_looped=False, kind=kind, size=size)
     assert before == pytest.approx(healthy, abs=1.0)
     assert after - before == pytest.approx(np.full(TRAY_FANS, 20.0 if kind == "blade" else -20.0), abs=1.0)
@@ -250,7 +256,7 @@ def test_a_fault_in_closed_loop_moves_the_command_by_the_requested_amount(kind: 
     fans, nothing = _tray(), np.zeros(TRAY_FANS)
     speed = np.full(TRAY_FANS, 450.0)
     size = severities.size(kind, speed, fans, nothing, np.full(TRAY_FANS, 0.04))
-    before, _ = _at_level(450.0, is_looped=True)
+    before, _ = _healthy_at_level(450.0, is_looped=True)
     after, reading = _at_level(450.0, is_looped=True, kind=kind, size=size)
     assert reading == pytest.approx(speed, abs=1.0)
     assert after - before == pytest.approx(np.full(TRAY_FANS, -0.04 if kind == "blade" else 0.04), abs=0.004)

@@ -115,7 +115,7 @@ def test_the_scorer_survives_any_message(session: list[Message], calibration: An
     survives(core, [all_valid_prediction(message) for message in session] if all_valid else session)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     st.sampled_from([1, 1000, 10_000_000, 1_000_000_000]),
     st.lists(st.tuples(st.floats(allow_nan=True), st.floats(allow_nan=True)), min_size=1, max_size=20),

@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.recordings.writing import RecordingWriter
+from pipeline.runtime.decision_rules import CURRENT_RULES
 from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
 from schemas.messages import Action, Header, InputPosition, Message, Raw, Request
@@ -76,6 +77,7 @@ class Stages:
         self.tray = tray.name
         self.now_ns = started_t_ns
         metadata = {
+            "decision_rules": str(int(CURRENT_RULES)),
             "site": config.site,
             "trays": tray.name,
             "started_t_ns": str(started_t_ns),

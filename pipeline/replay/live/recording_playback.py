@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 
 from pipeline.recordings.order import Seen, in_order
 from pipeline.recordings.reading import RecordingError, read_recording
+from pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
 from schemas.envelope import Envelope
 from schemas.messages import Array, Grid, Message, Prediction, Raw, Score
 from schemas.units import NS_PER_S
@@ -154,8 +153,8 @@ def _later(t_ns: Any, by_ns: int) -> Any:
 
 def _last_received_t_ns(file: Path) -> int:
     """Receipt of the last message according to the file's index; 0 where it has none."""
-    with suppress(McapError, OSError, ValueError), file.open("rb") as opened:
-        summary = make_reader(opened).get_summary()
+    with suppress(OSError, *CORRUPT_DATA_ERRORS), file.open("rb") as opened:
+        summary = indexed_reader(opened).get_summary()
         if summary and summary.statistics:
             return summary.statistics.message_end_time
     return 0

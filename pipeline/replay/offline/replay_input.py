@@ -19,6 +19,7 @@ from pipeline.replay.offline.plan import PlanReader, TrayPlan, undisturbed_plan
 from pipeline.replay.offline.raw_blocks import RawBlocks
 from pipeline.replay.resolve_config import attached_config
 from pipeline.replay.stage_chain import StageChain, decision_chain
+from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Message, Raw
@@ -40,6 +41,8 @@ class ReplayInput:
     started_t_ns: int
     """when the recording began"""
     stages: StageChain
+    decision_rules: DecisionRules
+    """those of the recording; with another configuration or twin those of today"""
     start_s: float = 0.0
     end_s: float = math.inf
     """the part that is replayed, in seconds since the tray's first raw sample"""
@@ -101,6 +104,7 @@ class ReplayInput:
                 started_t_ns=self.started_t_ns,
                 configuration_text=self.config.text,
                 overrides=self.config.overrides,
+                decision_rules=self.decision_rules,
             )
             for stage in self.stages.stages
         ]
@@ -147,15 +151,17 @@ def open_replay_input(
                 raise RecordingError(f"{ordered[0]}: no twin in this recording: name one with --twin FILE.onnx")
             base = default_config(ordered[0], metadata, first, any_twin, overrides, stages.names)
         trays = tuple(base.tray(name) for name in first)
+        is_as_recorded = attached is not None and config is None and not overrides and twin is None
         yield ReplayInput(
             paths=ordered,
             metadata=metadata,
             config=replace(base, trays=trays),
             twins={tray.name: _twin_of(tray, base, attached, recorded, twin, ordered[0]) for tray in trays},
             started_t_ns=_started_t_ns(ordered[0], metadata, first),
-            is_as_recorded=attached is not None and config is None and not overrides and twin is None,
+            is_as_recorded=is_as_recorded,
             is_same_grid=attached is not None and base.sections["resampler"] == attached.sections["resampler"],
             stages=stages,
+            decision_rules=_decision_rules(ordered[0], metadata) if is_as_recorded else CURRENT_RULES,
             start_s=start_s,
             end_s=end_s,
         )
@@ -164,7 +170,8 @@ def open_replay_input(
 def _refuse_another_run(first: Path, metadata: RecordingMetadata, path: Path) -> None:
     """The parts of one recording have one site, one configuration and one twin."""
     other = read_metadata(path)
-    for what, key in (("site", "site"), ("keys set on the command line", "overrides")):
+    keys = ("site", "site"), ("keys set on the command line", "overrides"), ("version of the rules", "decision_rules")
+    for what, key in keys:
         if metadata.metadata.get(key) != other.metadata.get(key):
             raise RecordingError(
                 f"{first} and {path} belong to two runs: they differ in {what}; replay them one by one"
@@ -198,6 +205,21 @@ def _twin_of(
     if tray.name in recorded:
         return recorded[tray.name]
     raise RecordingError(f"{path}: no twin of {tray.name} in this recording: name one with --twin FILE.onnx")
+
+
+def _decision_rules(path: Path, metadata: RecordingMetadata) -> DecisionRules:
+    """The version of the rules that the recorded decisions were made by.
+
+    Raises:
+        RecordingError: it is of a newer version of fantwin.
+    """
+    version = metadata.metadata.get("decision_rules", str(int(DecisionRules.FIRST)))
+    try:
+        return DecisionRules(int(version))
+    except ValueError as error:
+        raise RecordingError(
+            f"{path}: its decisions were made by rules {version!r}, which this version does not know: update fantwin"
+        ) from error
 
 
 def _started_t_ns(path: Path, metadata: RecordingMetadata, first: Mapping[str, Sequence[Raw]]) -> int:

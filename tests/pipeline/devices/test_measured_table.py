@@ -1,11 +1,13 @@
 """Measured tables: the rows of real files are read, repaired and counted."""
 
 import csv
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.devices import measured_table
 from pipeline.devices.measured_table import Table, read_table
 from pipeline.errors import UserError
 
@@ -240,3 +242,47 @@ def test_times_read_in_too_large_a_unit_are_an_error_that_names_the_unit_to_try(
 
 def test_a_time_too_large_for_a_float_is_not_a_time(tmp_path):
     assert table(tmp_path, "t,u,y\n0,1,10\n1e305,1,10\n1,2,20\n").repairs.without_time == 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t,u,y\n,1,5\n0,,10\nx,1,5\n0.01,2,20\n\n0.03,,30\n0.03,3,\n0.02,4,40\n",
+        "t,u,y\n,1,5\n2024-05-01 10:00:00,1,10\n2024-05-01 10:00:01,2,20\n",
+    ],
+)
+def test_row_17_a_table_read_in_pieces_is_the_same(tmp_path, monkeypatch, text):
+    whole = table(tmp_path, text)
+    monkeypatch.setattr(measured_table, "_ROWS_IN_PIECE", 1)
+    pieces = table(tmp_path, text)
+    for name in ("t_ns", "command", "speed_rad_s"):
+        np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
+    assert (pieces.repairs, pieces.assumed) == (whole.repairs, whole.assumed)
+
+
+def test_row_17_a_table_needs_little_more_memory_than_its_file(tmp_path):
+    path = tmp_path / "long.csv"
+    path.write_text(
+        "t,u,y,text\n" + "".join(f"{k * 0.01:.2f},{k % 40},{k % 777:.3f},not needed\n" for k in range(60_000))
+    )
+    tracemalloc.start()
+    try:
+        read_table(path, "t:s", ["u"], ["y:rpm"])
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < 5 * path.stat().st_size
+
+
+def test_row_17_a_line_without_end_is_refused(tmp_path):
+    path = tmp_path / "endless.csv"
+    path.write_text("t,u,y\n" + 1_100_000 * "1")
+    with pytest.raises(UserError, match=r"endless\.csv: not a text file with columns: a line is longer than 1,048,576"):
+        read_table(path, "t", ["u"], ["y"])
+
+
+@pytest.mark.parametrize("period", ["2d", "90000s", "99999999999999999999s", "86400s"])
+def test_row_15_a_period_without_measure_is_refused(tmp_path, monkeypatch, period):
+    monkeypatch.setattr(measured_table, "FURTHEST_T_NS", 100_000 * 10**9)
+    with pytest.raises(UserError, match=f"--period {period}: "):
+        table(tmp_path, "u,y\n" + 5 * "1,2\n", time=None, period=period)

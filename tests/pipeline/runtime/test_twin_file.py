@@ -13,6 +13,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
+from pipeline.runtime import twin_file
 from pipeline.runtime.stage import StageError
 from pipeline.runtime.twin_file import TwinFile
 from schemas.twin_card import CARD_PROPERTY
@@ -242,3 +243,37 @@ def test_a_graph_that_only_looks_like_a_twin_is_refused(
         helper.make_node(second[0], second[1], ["state_out"]),
     ]
     assert named in _refusal(_of_the_right_names(tmp_path / "other.onnx", dtype, nodes, card), fans=3)
+
+
+def test_row_17_a_twin_with_an_endless_loop_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(twin_file, "FIRST_RUN_LIMIT_S", 0.2)
+    card = TwinFile.load(write_twin(tmp_path / "twin.onnx", fans=3), 3).card_json
+    scalar, state = (
+        helper.make_tensor_value_info("", *of) for of in ((TensorProto.BOOL, []), (TensorProto.DOUBLE, None))
+    )
+    values = {}
+    for name, like in {"count": scalar, "go": scalar, "goes": scalar, "x": state, "y": state}.items():
+        values[name] = onnx.ValueInfoProto()
+        values[name].CopyFrom(like)
+        values[name].name = name
+    values["count"].type.tensor_type.elem_type = TensorProto.INT64
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["go"], ["goes"]), helper.make_node("Identity", ["x"], ["y"])],
+        "body",
+        [values["count"], values["go"], values["x"]],
+        [values["goes"], values["y"]],
+    )
+    nodes = [
+        helper.make_node("Identity", ["command"], ["speed_rad_s"]),
+        helper.make_node("Constant", [], ["start"], value=helper.make_tensor("start", TensorProto.BOOL, [], [True])),
+        helper.make_node("Loop", ["", "start", "state"], ["state_out"], body=body),
+    ]
+    path = _of_the_right_names(tmp_path / "endless.onnx", TensorProto.DOUBLE, nodes, card)
+    assert "the twin takes more than 0.2 s for two samples; export it again" in _refusal(path, fans=3)
+
+
+def test_row_17_a_file_that_is_too_large_for_a_twin_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "twin.onnx"
+    with path.open("wb") as file:
+        file.truncate(1 << 40)
+    assert "larger than 67,108,864 bytes, so not a twin" in _refusal(path)

@@ -59,6 +59,11 @@ class Peak(Detector):
         """See Detector."""
         self._peak[fans] = 0.0
 
+    @property
+    def memory_s(self) -> float:
+        """See Detector."""
+        return 10.0
+
     def limit_sigmas(self, period_s: float) -> float:
         """See Detector."""
         return self._limit

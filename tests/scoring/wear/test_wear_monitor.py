@@ -84,7 +84,7 @@ def core() -> ScorerCore:
 
 def core_for_days() -> ScorerCore:
     """With longer intervals of the baseline: over days they make no difference, and most of the time goes into them."""
-    return core_of(2, calibration=CALIBRATION, baseline_s=1.0)
+    return core_of(2, calibration=CALIBRATION, baseline_s=3.0)
 
 
 def live_through(

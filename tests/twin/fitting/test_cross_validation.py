@@ -18,8 +18,8 @@ def untrained(runs: list[Run]) -> Hybrid:
 
 @pytest.mark.slow
 def test_a_fan_that_the_physics_describe_gets_no_network_and_a_rough_one_does() -> None:
-    plain = [fan_data.published_run(seed, 8.0) for seed in (1, 2, 3)]
-    rough = [fan_data.rough_run(seed, 15.0) for seed in (1, 2, 3)]
+    plain = [fan_data.published_run(seed, 5.0) for seed in (1, 2, 3)]
+    rough = [fan_data.rough_run(seed, 8.0) for seed in (1, 2, 3)]
     assert choose_prior_std(untrained(plain), plain, seed=0, physics="refined") == 0.0
     assert choose_prior_std(untrained(rough), rough, seed=0, physics="refined") > 0.0
 

@@ -30,7 +30,7 @@ def test_the_published_fan_is_recovered_within_its_confidence_intervals(publishe
 
 @pytest.mark.slow
 def test_95_percent_intervals_hold_the_truth_in_95_percent_of_recordings() -> None:
-    runs = [fan_data.published_run(seed, duration_s=10.0, fans=20) for seed in range(100, 108)]
+    runs = [fan_data.published_run(seed, duration_s=5.0, fans=20) for seed in range(100, 108)]
     found = [identify([run]) for run in runs]
     low, high = (np.concatenate([one.interval_95[:, :3, side] for one in found]) for side in (0, 1))
     inside = (low <= fan_data.PUBLISHED_PARAMETERS) & (high >= fan_data.PUBLISHED_PARAMETERS)

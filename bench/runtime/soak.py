@@ -1,0 +1,62 @@
+"""A site in wall time with one fault after another: does anything hang, get lost without a count, or alarm falsely?
+
+The faults are those of `fantwin selftest` that can share a site, in random order. After each, all fans must be judged
+again and no alarm may have been raised. At the end the site stops in order, and its recording is verified.
+
+    python -m bench.runtime.soak --minutes 30 --seeds 1 2 3
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import tempfile
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+from pipeline.selftest.scenarios import SCENARIOS
+from pipeline.selftest.scratch_site import STAGES, ScratchSite
+from pipeline.selftest.selftest import Row, account, run_scenario
+
+SHARED = [scenario for scenario in SCENARIOS if not scenario.needs_own_site]
+
+
+def soak(minutes: float, seed: int, folder: Path) -> tuple[list[Row], dict[str, tuple[float, float]]]:
+    """The rows of all faults, and the memory of each stage after the first fault and after the last, MB."""
+    rng = random.Random(seed)
+    rows: list[Row] = []
+    memory: list[dict[str, float]] = []
+    with ScratchSite(folder) as site:
+        until_s = time.monotonic() + 60.0 * minutes
+        while time.monotonic() < until_s:
+            row = run_scenario(site, rng.choice(SHARED))
+            rows.append(row)
+            memory.append({label: site.memory_bytes(label) / 1e6 for label in STAGES})
+            if not row.kept:
+                print(f"seed {seed}: {row.name}: {row.seen}", flush=True)
+        rows.append(account(site, "all faults"))
+    return rows, {label: (memory[0][label], memory[-1][label]) for label in STAGES}
+
+
+def main() -> None:
+    """Print a line for each seed, or JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=30.0, help="wall time of each seed (default 30)")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3], help="of the order of faults")
+    parser.add_argument("--json", action="store_true", help="print all rows as JSON")
+    options = parser.parse_args()
+    for seed in options.seeds:
+        with tempfile.TemporaryDirectory(prefix="fantwin-soak-") as folder:
+            rows, memory = soak(options.minutes, seed, Path(folder))
+        if options.json:
+            print(json.dumps({"seed": seed, "rows": [asdict(row) for row in rows], "memory_mb": memory}))
+            continue
+        kept = sum(bool(row.kept) for row in rows)
+        grown = ", ".join(f"{label} {first:.0f} to {last:.0f}" for label, (first, last) in memory.items())
+        print(f"seed {seed}: {kept} of {len(rows)} kept; {rows[-1].seen}; memory, MB: {grown}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

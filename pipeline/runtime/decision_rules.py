@@ -1,0 +1,23 @@
+"""The version of the rules by which the stages decide.
+
+A recording names its version (`decision_rules` in its metadata), so that a replay of an older one decides as the stages
+did then. A change of the rules that changes decisions on recorded samples gets a new number here; the stages ask for
+the rule by `Context.decision_rules`.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class DecisionRules(IntEnum):
+    """Each version, and what it changed."""
+
+    FIRST = 1
+    """of recordings without the entry: statistics kept their state over gaps of any length"""
+    TIME_AND_GAPS = 2
+    """Statistics start again after a gap longer than their memory, and alarms are not confirmed until they are judged
+    again. A backlog, a step of the host's clock and samples of another time are told apart."""
+
+
+CURRENT_RULES = max(DecisionRules)
