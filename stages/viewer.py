@@ -70,11 +70,15 @@ class ViewSink(Protocol):
         ...
 
     def flush(self) -> None:
-        """Write what has been sent, so that it survives a crash of this process."""
+        """Write what has been sent, so that it survives a crash of this process. Returns within seconds."""
+        ...
+
+    def problem(self) -> str:
+        """Why the view is not complete; empty if all is well."""
         ...
 
     def close(self) -> None:
-        """Write everything and close."""
+        """Write everything and close, within seconds."""
         ...
 
 
@@ -159,13 +163,13 @@ class ViewerCore(Core):
         return {"samples_drawn": self._samples_drawn, "wrong_fan_count": 0, **self._counts}
 
     def problem(self) -> str:
-        """Scores with another number of fans than configured; empty if there are none."""
+        """Scores with another number of fans than configured, or what the sink reports; empty if there is nothing."""
         for name, view in self._views.items():
             if view.wrong_fans:
                 return (
                     f"scores have {view.wrong_fans} fans, [[tray]] {name} has fans = {view.config.fans}: correct `fans`"
                 )
-        return ""
+        return self._sink.problem()
 
     def _add_score(self, view: _TrayView, score: Score) -> None:
         if score.fans != view.config.fans:

@@ -10,6 +10,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -32,9 +33,12 @@ from pipeline.viewing.rerun_layout import (
     state_path,
 )
 from pipeline.viewing.trace import Trace
+from pipeline.viewing.view_file import ViewFile
 from schemas.messages import Array
 
 APPLICATION = "fantwin"
+FLUSH_LIMIT_S = 2.0
+"""how long a flush may take; it is called twice a second and usually takes milliseconds"""
 ZONE_HEIGHT = 2.0  # of an alarm zone, in half heights of the band
 # Rerun's page server runs in a shell that ends with this process, even when it is killed: the pipe to its input closes.
 _PAGE_SCRIPT = '"$@" >/dev/null 2>&1 & cat >/dev/null; kill $!'
@@ -46,6 +50,14 @@ def rerun_program() -> Path:
     assert spec is not None and spec.origin is not None, "rerun-sdk contains rerun_cli"
     folder = Path(spec.origin).parent
     return folder / "Rerun.app/Contents/MacOS/Rerun" if sys.platform == "darwin" else folder / "rerun"
+
+
+def _open_view(file: Path) -> ViewFile:
+    path = unused_path(file)
+    try:
+        return ViewFile(path)
+    except OSError as error:
+        raise StageError(f"{path}: cannot write the view: {error.strerror}; change viewer.file") from error
 
 
 def unused_path(path: Path) -> Path:
@@ -92,18 +104,22 @@ class RerunSink:
         layouts = [TrayLayout(tray.name, range(tray.fans), tray.speed_unit) for tray in trays]
         self._recording = rr.RecordingStream(APPLICATION)
         self._open_paths: set[str] = set()
+        self._late = False
+        self._file = _open_view(file) if file is not None else None
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
-        if file is not None:
+        if self._file is not None:
             # Without a footer, memory does not grow with the file, and the file can be opened after a crash.
-            sinks.append(rr.FileSink(unused_path(file), write_footer=False))
+            sinks.append(rr.FileSink(self._file.pipe, write_footer=False))
         if grpc_port is not None:
             server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=memory_limit)
             sinks.append(server)
         self._recording.set_sinks(*sinks, default_blueprint=blueprint(layouts, window_s))
+        if self._file is not None:
+            self._file.release_pipe()
         self._recording.send_recording_name(f"{name} {np.datetime64(started_t_ns, 'ns').astype('datetime64[s]')} UTC")
         for layout in layouts:
             log_styles(self._recording, layout)
-        self._recording.flush()  # the styles reach the file first, so that the file of a killed viewer has them
+        self.flush()  # the styles reach the file first, so that the file of a killed viewer has them
         self._page = _serve_page(web_port, grpc_port) if web_port is not None and grpc_port is not None else None
 
     def draw(self, trace: Trace) -> None:
@@ -126,17 +142,36 @@ class RerunSink:
         self._recording.log(STAGES_PATH, rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN), static=True)
 
     def flush(self) -> None:
-        """Pass everything to the operating system, so that it survives a crash of this process."""
-        self._recording.flush()
+        """Pass everything on, so that it survives a crash of this process. Waits some seconds at most."""
+        try:
+            self._recording.flush(timeout_sec=FLUSH_LIMIT_S)
+        except RuntimeError:  # the only error it raises
+            self._late = True
+        else:
+            self._late = False
+        if self._file is not None:
+            self._file.flush()
+
+    def problem(self) -> str:
+        """Why the view is not complete; empty if all is well."""
+        late = f"live viewers take more than {FLUSH_LIMIT_S:g} s for the newest data; close slow viewers"
+        return "; ".join(filter(None, [self._file.problem if self._file else "", late if self._late else ""]))
 
     def close(self) -> None:
-        """Write everything and stop serving."""
-        self._recording.flush()
-        self._recording.disconnect()
+        """Write everything and stop serving, within some seconds."""
+        self.flush()
+        ending = threading.Thread(target=self._recording.disconnect, daemon=True)
+        ending.start()
+        ending.join(FLUSH_LIMIT_S)
+        if self._file is not None:
+            self._file.close()
         if self._page is not None:
             assert self._page.stdin is not None
             self._page.stdin.close()
-            self._page.wait()
+            try:
+                self._page.wait(FLUSH_LIMIT_S)
+            except subprocess.TimeoutExpired:
+                self._page.kill()
 
     def _draw_fan(self, trace: Trace, fan: int) -> None:
         measured, predicted, half_width = trace.measured[:, fan], trace.predicted[:, fan], trace.half_width[:, fan]

@@ -57,6 +57,7 @@ class FakeSink:
     pages: list[str] = field(default_factory=list)
     flushed: int = 0
     closed: bool = False
+    trouble: str = ""
 
     def draw(self, trace: Trace) -> None:
         self.traces.append(trace)
@@ -72,6 +73,9 @@ class FakeSink:
 
     def flush(self) -> None:
         self.flushed = len(self.traces)
+
+    def problem(self) -> str:
+        return self.trouble
 
     def close(self) -> None:
         self.closed = True
