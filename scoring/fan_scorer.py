@@ -210,12 +210,13 @@ class FanScorer:
 
     def _memories_ns(self) -> list[tuple[int, Callable[[Array], None], int]]:
         """What is forgotten over a gap: the number of its input, how to start it again, and its memory, ns."""
-        forgotten: list[tuple[Signal, Callable[[Array], None], float]] = [
-            (row.source, self.detectors[row.name].reset, self.detectors[row.name].memory_s)
-            for row in self._rows
-            if row.name in self.detectors
-        ]
-        forgotten.extend((name, residual.reset, residual.memory_s) for name, residual in self.residuals.items())
+        forgotten: list[tuple[Signal, Callable[[Array], None], float]] = []
+        for row in self._rows:
+            if row.name in self.detectors:
+                detector = self.detectors[row.name]
+                forgotten.append((row.source, detector.reset, detector.memory_s))
+        for source in RESIDUALS:
+            forgotten.append((source, self.residuals[source].reset, self.residuals[source].memory_s))
         forgotten.append(("tacho", self._motion.reset, self._motion.memory_s))
         return [(INPUTS.index(source), reset, round(memory_s * NS_PER_S)) for source, reset, memory_s in forgotten]
 

@@ -24,13 +24,17 @@ from pydantic import Field, model_validator
 from pipeline.devices.device_clock import UINT32, DeviceClock
 from pipeline.devices.device_sequence import LARGEST_GAP
 from pipeline.devices.interpolation import NEVER_NS, LastReadings, Samples, all_true, interpolate_samples
+from pipeline.devices.line_guard import LineGuard
+from pipeline.runtime.clock import is_of_replay
+from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
 from schemas.blocks import cut, join
 from schemas.messages import Array, Grid, InvalidReason, Raw
 from schemas.units import NS_PER_S
 
 LONGEST_TICK_NS = NS_PER_S // 10  # a longer pause between ticks is a host that stalled, not a silent source
-SET_BACK_NS = NS_PER_S  # a new sample this much older than the newest: the host clock was set back
+SET_BACK_NS = NS_PER_S  # a new sample this much older than the newest: a replay was restarted
+MAX_ENDED_PRODUCERS = 64
 GAP, STALE, NO_SPEED = (np.uint8(reason) for reason in (InvalidReason.GAP, InvalidReason.STALE, InvalidReason.NO_SPEED))
 
 
@@ -58,19 +62,22 @@ def first_grid_time(t_ns: int, period_ns: int) -> int:
 class ResamplerCore(Core):
     """The grid of one tray. Samples that are dropped and gaps are counted."""
 
-    def __init__(self, fans: int, config: ResamplerConfig) -> None:
+    def __init__(self, fans: int, config: ResamplerConfig, *, decision_rules: DecisionRules = CURRENT_RULES) -> None:
         self._fans = fans
         self._block_size = config.block_size
         self._period_ns = round(NS_PER_S / config.rate_hz)
         self._gap_limit_ns = round(config.gap_limit_s * NS_PER_S)
         self._watermark_ns = round(config.watermark_s * NS_PER_S)
         self._stale_for_ns = round(config.stale_for_s * NS_PER_S)
-        self._clock = DeviceClock()
+        knows_time = decision_rules >= DecisionRules.TIME_AND_GAPS
+        self._clock = DeviceClock(knows_backlogs=knows_time)
+        self._guard = LineGuard(self._clock, self._period_ns) if knows_time else None
         self._last_readings = LastReadings(fans, self._gap_limit_ns)
         # The last raw sample at or before the next grid time, and all later ones.
         self._held = Samples(np.zeros(0, np.int64), np.zeros((0, fans)), np.zeros((0, fans)))
         self._newest_t_ns = NEVER_NS
         self._next_t_ns = NEVER_NS
+        self._not_before_t_ns = NEVER_NS  # earlier samples are not accepted: the clock has restarted
         self._pending: list[Grid] = []  # not yet published
         self._pending_rows = 0
         self._in_gap = False
@@ -80,7 +87,7 @@ class ResamplerCore(Core):
         self._set_back_ns = 0  # by how much the host clock was set back, until it has caught up
         self._producer = ""
         self._sequence = -1  # of the newest message of this producer
-        self._ended_producers: set[str] = set()  # another one has followed them
+        self._ended_producers: dict[str, None] = {}  # the latest that another one has followed
         self._device_sequence: int | None = None  # of the newest raw sample
         self._counts: Counter[str] = Counter()
 
@@ -91,17 +98,12 @@ class ResamplerCore(Core):
             self._counts["lost_wrong_fan_count"] += len(item.host_receive_t_ns)
             return []
         self._wrong_fans = 0
-        self._silence_ns = 0
-        is_new = self._is_new(item)
-        times = self._times(item, is_new)
-        self._counts["samples_in"] += len(times)
-        accepted = [k for k, t_ns in enumerate(times) if self._is_accepted(t_ns, is_new)]
-        if accepted:
-            t_ns, command, speed = np.array(times, np.int64), item.command, item.speed_rad_s
-            if len(accepted) < len(times):
-                t_ns, command, speed = t_ns[accepted], command[accepted], speed[accepted]
-            self._held = self._held.extended(t_ns, command, speed)
-            self._fill(self._newest_t_ns, final=False)
+        self._counts["samples_in"] += len(item.host_receive_t_ns)
+        if self._guard is None or is_of_replay(item.header.producer) or self._is_repeated(item):
+            self._add(item, self._is_new(item))
+            return self._blocks()
+        for message in self._guard.admit(item, is_of_ended=item.header.producer in self._ended_producers):
+            self._add(message, is_new=message.header.producer == self._guard.producer)
         return self._blocks()
 
     def tick(self, now_ns: int) -> list[Grid]:
@@ -120,11 +122,14 @@ class ResamplerCore(Core):
 
     def close(self) -> list[Grid]:
         """Publish the grid up to the newest raw sample."""
+        for message in self._guard.close() if self._guard else ():
+            self._add(message, is_new=True)
         return self.publish_until(self._newest_t_ns)
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/time.md explains each counter."""
-        return {**self._counts, "clock_restarts": max(0, self._clock.segments - 1)}
+        of_guard = self._guard.counts if self._guard else {}
+        return {**self._counts, **of_guard, "clock_restarts": max(0, self._clock.segments - 1)}
 
     def problem(self) -> str:
         """No samples, samples of another number of fans, or a host clock that was set back."""
@@ -137,24 +142,48 @@ class ResamplerCore(Core):
                 f"the host clock was set back by {self._set_back_ns / NS_PER_S:.0f} s, or a replay was restarted: "
                 "samples are refused until it has caught up; restart the stages"
             )
-        return ""
+        return self._guard.problem() if self._guard else ""
+
+    def _add(self, item: Raw, is_new: bool) -> None:
+        """Add the samples of a message of the line; is_new: neither repeated nor one of an ended session."""
+        self._silence_ns = 0
+        times, restarts = self._times(item, is_new)
+        accepted = [k for k, t_ns in enumerate(times) if self._is_accepted(t_ns, is_new, after_restart=k in restarts)]
+        if accepted:
+            t_ns, command, speed = np.array(times, np.int64), item.command, item.speed_rad_s
+            if len(accepted) < len(times):
+                t_ns, command, speed = t_ns[accepted], command[accepted], speed[accepted]
+            self._held = self._held.extended(t_ns, command, speed)
+            self._fill(self._newest_t_ns, final=False)
+
+    def _is_repeated(self, item: Raw) -> bool:
+        """Whether the bus has delivered a message of the present producer again."""
+        return item.header.producer == self._producer and item.header.sequence <= self._sequence
 
     def _is_new(self, item: Raw) -> bool:
-        """Whether a message is newer than all before; the bus may repeat one, or deliver one of an ended session."""
-        producer, sequence = item.header.producer, item.header.sequence
-        if producer in self._ended_producers:
-            return False
-        return producer != self._producer or sequence > self._sequence
+        """Whether a message is newer than all before: neither repeated nor one of an ended session."""
+        return item.header.producer not in self._ended_producers and not self._is_repeated(item)
 
-    def _times(self, item: Raw, is_new: bool) -> list[int]:
-        """Host time of each sample, ns."""
-        times, clock_us = item.host_receive_t_ns.tolist(), item.device_clock_us.tolist()
-        segments = self._clock.segments
-        if clock_us:
-            times[0] = self._clock.to_host_ns(clock_us[0], times[0])
-        if times and is_new:
-            self._follow_device(item, same_device_run=self._clock.segments == segments)
-        return [*times[:1], *map(self._clock.to_host_ns, clock_us[1:], times[1:])] if clock_us else times
+    def _times(self, item: Raw, is_new: bool) -> tuple[list[int], set[int]]:
+        """Host time of each sample, ns, and the rows at which the clock of the device has restarted."""
+        times, clock_us, restarts = item.host_receive_t_ns.tolist(), item.device_clock_us.tolist(), set[int]()
+        for row, us in enumerate(clock_us):
+            segments = self._clock.segments
+            times[row] = self._clock.to_host_ns(us, times[row], follows=row > 0 or self._follows(item))
+            if self._clock.segments != segments:
+                restarts.add(row)
+            if row == 0 and is_new:
+                self._follow_device(item, same_device_run=not restarts)
+        if times and not clock_us and is_new:
+            self._follow_device(item, same_device_run=True)
+        return times, restarts
+
+    def _follows(self, item: Raw) -> bool:
+        """Whether the device has not restarted since the newest sample, by its own numbers."""
+        sequence = item.device_sequence
+        if not len(sequence) or self._device_sequence is None:
+            return False
+        return 0 < (int(sequence[0]) - self._device_sequence) % UINT32 < LARGEST_GAP
 
     def _follow_device(self, item: Raw, same_device_run: bool) -> None:
         """Count what the device sent while acquisition was down, from the first sample of its next session."""
@@ -164,13 +193,22 @@ class ResamplerCore(Core):
             if same_device_run and 0 < missing < LARGEST_GAP:
                 self._counts["lost_between_sessions"] += missing
         if item.header.producer != self._producer:
-            self._ended_producers.add(self._producer)
+            self._ended_producers[self._producer] = None
+            self._ended_producers.pop(item.header.producer, None)
+            if len(self._ended_producers) > MAX_ENDED_PRODUCERS:
+                del self._ended_producers[next(iter(self._ended_producers))]
         self._producer, self._sequence = item.header.producer, item.header.sequence
         self._device_sequence = int(sequence[-1]) if len(sequence) else None
 
-    def _is_accepted(self, t_ns: int, is_new: bool) -> bool:
+    def _is_accepted(self, t_ns: int, is_new: bool, *, after_restart: bool) -> bool:
         """Whether a sample is newer than all before; counts the reason if not."""
         behind_ns = self._newest_t_ns - t_ns
+        if after_restart and self._guard and self._newest_t_ns != NEVER_NS:
+            # Two segments of the device clock are not compared: a gap lies between, and nothing is interpolated.
+            self._not_before_t_ns = self._newest_t_ns + self._gap_limit_ns + 1
+        if behind_ns < 0 and t_ns < self._not_before_t_ns:
+            self._counts["lost_after_clock_restart"] += 1
+            return False
         if is_new and behind_ns > SET_BACK_NS:
             self._counts["lost_clock_set_back"] += 1
             self._set_back_ns = self._set_back_ns or behind_ns
@@ -288,7 +326,7 @@ class ResamplerCore(Core):
 
 def build(context: Context) -> BuiltStage:
     """The core of one tray."""
-    return BuiltStage(ResamplerCore(context.tray.fans, context.config))
+    return BuiltStage(ResamplerCore(context.tray.fans, context.config, decision_rules=context.decision_rules))
 
 
 STAGE = Stage(

@@ -28,10 +28,11 @@ MAX_DRIFT = 0.02  # a ceramic resonator is within 0.5 %, an RC oscillator within
 SLEW_TIME_NS = 20 * NS_PER_S  # time constant with which times approach the line
 MAX_SLEW = 0.01  # largest relative correction
 JUMP_NS = NS_PER_S  # a larger disagreement means a clock that was set or restarted, not a delay
-LATE_BUCKETS = 5  # if every sample is late for so many buckets, the host clock was set forward
-LONGEST_SILENCE_NS = (
-    600 * NS_PER_S
-)  # after this the 32-bit clock may have wrapped unnoticed (it wraps every 71 minutes)
+LATE_BUCKETS = 5  # if every sample is equally late for so many buckets, the host clock was set forward
+LATENESS_JITTER_NS = NS_PER_S // 10  # by which samples may be less late than before, beside a drift
+LONGEST_SILENCE_NS = 600 * NS_PER_S  # after this the 32-bit clock may have wrapped unnoticed
+WRAP_NS = UINT32 * NS_PER_US  # 71.6 minutes
+WRAP_TOLERANCE_NS = 5 * NS_PER_S  # of a sample that is on time after the clock has wrapped
 
 Point = tuple[int, int]
 """Device time and offset (receipt - device time), both ns."""
@@ -42,9 +43,14 @@ class DeviceClock:
 
     A *segment* is a period of uninterrupted device time; within it, times are continuous. It ends when the device
     restarts, when either clock is set by more than a second, or after ten minutes without samples.
+
+    A *backlog* is what a line delivers late, after it has stalled: the device clock continues, and the samples are less
+    late from one to the next. It belongs to the segment before the stall, however long that was.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, knows_backlogs: bool = True) -> None:
+        """knows_backlogs: False only for times as in recordings of former versions."""
+        self._knows_backlogs = knows_backlogs
         self.segments = 0
         """Number of segments so far; 1 if nothing was interrupted."""
         self.drift = 0.0
@@ -55,21 +61,28 @@ class DeviceClock:
         self._points: deque[Point] = deque(maxlen=WINDOW_BUCKETS)
         self._lowest: Point = (0, 0)  # of the bucket being filled
         self._late_buckets = 0
+        self._first_lateness: Point = (0, 0)  # device time and lateness of the first of them
         self._from_device_ns = 0  # start of the current piece of the mapping
         self._from_t_ns = 0
         self._slew = 0.0
 
-    def to_host_ns(self, device_clock_us: int, receive_t_ns: int) -> int:
+    def to_host_ns(self, device_clock_us: int, receive_t_ns: int, *, follows: bool = False) -> int:
         """Host time (ns since the epoch) at which the sample was measured, plus the smallest delay.
 
-        device_clock_us: modulo 2^32. A sample that is not newer than the newest one gets its time from the current
-        mapping and does not change it.
+        device_clock_us: modulo 2^32. follows: the device's own numbers say that it has not restarted since the newest
+        sample. A sample that is not newer than the newest one gets its time from the current mapping and does not
+        change it.
         """
-        if self.segments == 0 or receive_t_ns - self._receive_t_ns > LONGEST_SILENCE_NS:
+        if self.segments == 0:
             return self._begin(device_clock_us, receive_t_ns)
-        step_us = (device_clock_us - self._last_us + UINT32 // 2) % UINT32 - UINT32 // 2
+        step_us = self._step_us(device_clock_us)
         device_ns = self._device_ns + step_us * NS_PER_US
         t_ns = self._map(device_ns)
+        if receive_t_ns - self._receive_t_ns > LONGEST_SILENCE_NS:
+            late_ns = (receive_t_ns - t_ns + WRAP_TOLERANCE_NS) % WRAP_NS - WRAP_TOLERANCE_NS
+            is_backlog = step_us > 0 and (follows or step_us * NS_PER_US <= JUMP_NS) and late_ns > WRAP_TOLERANCE_NS
+            if not (is_backlog and self._knows_backlogs):
+                return self._begin(device_clock_us, receive_t_ns)
         if step_us <= 0:
             is_old = -step_us * NS_PER_US < JUMP_NS or receive_t_ns < self._receive_t_ns
             return t_ns if is_old else self._begin(device_clock_us, receive_t_ns)
@@ -84,6 +97,16 @@ class DeviceClock:
         elif receive_t_ns - device_ns < self._lowest[1]:
             self._lowest = (device_ns, receive_t_ns - device_ns)
         return t_ns
+
+    def expected_host_ns(self, device_clock_us: int) -> int | None:
+        """The host time of a sample if the device has not restarted; None if its clock shows that it has."""
+        step_us = self._step_us(device_clock_us)
+        if self.segments == 0 or not 0 < step_us * NS_PER_US <= LONGEST_SILENCE_NS:
+            return None
+        return self._map(self._device_ns + step_us * NS_PER_US)
+
+    def _step_us(self, device_clock_us: int) -> int:
+        return (device_clock_us - self._last_us + UINT32 // 2) % UINT32 - UINT32 // 2
 
     def _begin(self, device_clock_us: int, receive_t_ns: int) -> int:
         self.segments += 1
@@ -103,8 +126,12 @@ class DeviceClock:
     def _end_bucket(self, device_ns: int, t_ns: int) -> None:
         """Start a new piece of the mapping at this sample, without a jump, with the slope of the new line."""
         lowest_device_ns, lowest_offset_ns = self._lowest
-        late = lowest_offset_ns + lowest_device_ns - self._map(lowest_device_ns) > JUMP_NS
-        self._late_buckets = self._late_buckets + 1 if late else 0
+        lateness_ns = lowest_offset_ns + lowest_device_ns - self._map(lowest_device_ns)
+        late = lateness_ns > JUMP_NS
+        if late and (self._late_buckets == 0 or self._is_shrinking(lowest_device_ns, lateness_ns)):
+            self._late_buckets, self._first_lateness = 1, (lowest_device_ns, lateness_ns)
+        else:
+            self._late_buckets = self._late_buckets + 1 if late else 0
         self._slew = 0.0
         if not late:
             self._points.append(self._lowest)
@@ -114,6 +141,11 @@ class DeviceClock:
             error_ns = line_offset_ns - (t_ns - device_ns)
             self._slew = _clamp(error_ns / SLEW_TIME_NS, MAX_SLEW)
         self._from_device_ns, self._from_t_ns = device_ns, t_ns
+
+    def _is_shrinking(self, device_ns: int, lateness_ns: int) -> bool:
+        """Whether late samples become less late, as those of a backlog do and those after a set clock do not."""
+        since_ns, first_ns = device_ns - self._first_lateness[0], self._first_lateness[1]
+        return self._knows_backlogs and lateness_ns < first_ns - LATENESS_JITTER_NS - MAX_DRIFT * since_ns
 
 
 def line_below(points: Sequence[Point], at_ns: int, drift: float) -> tuple[float, float]:

@@ -17,7 +17,7 @@ class DecisionRules(IntEnum):
     """of recordings without the entry: statistics kept their state over gaps of any length"""
     TIME_AND_GAPS = 2
     """Statistics start again after a gap longer than their memory, and alarms are not confirmed until they are judged
-    again. A backlog, a step of the host's clock and samples of another time are told apart."""
+    again. A backlog, a step of the host's clock and samples of another time are distinguished."""
 
 
 CURRENT_RULES = max(DecisionRules)

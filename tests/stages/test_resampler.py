@@ -398,11 +398,11 @@ def moved(message: Raw, by_s: float) -> Raw:
     return replace(message, host_receive_t_ns=message.host_receive_t_ns + round(by_s * NS_PER_S))
 
 
-@pytest.mark.parametrize("producer", ["a", "b"], ids=["running on", "acquisition restarted"])
-def test_samples_of_a_clock_set_back_are_counted_and_reported_until_it_has_caught_up(producer: str) -> None:
+@pytest.mark.parametrize("producer", ["replay-a", "replay-b"], ids=["running on", "another"])
+def test_samples_of_a_replay_that_goes_back_are_counted_and_reported_until_it_has_caught_up(producer: str) -> None:
     message = raw(at(0.0, 0.01), np.zeros(2))
     core = ResamplerCore(1, ResamplerConfig())
-    core.step(stamped(message, "a", 0))
+    core.step(stamped(message, "replay-a", 0))
     assert core.problem() == ""
     core.step(stamped(moved(message, -3600), producer, 1))
     core.step(stamped(moved(message, -3599), producer, 2))
@@ -416,22 +416,14 @@ def test_samples_of_a_clock_set_back_are_counted_and_reported_until_it_has_caugh
     assert core.problem() == ""
 
 
-def test_one_time_far_in_the_future_is_reported_as_a_clock_set_back() -> None:
-    message = raw(at(0.0, 0.01), np.zeros(2))
-    core = ResamplerCore(1, ResamplerConfig())
-    for sequence, by_s in enumerate((0, 1e8, 1)):
-        core.step(stamped(moved(message, by_s), "a", sequence))
-    assert "set back by 99999999 s" in core.problem()
-
-
 def test_messages_repeated_or_late_from_an_ended_session_are_not_a_clock_set_back() -> None:
     message = raw(at(0.0, 0.01), np.zeros(2))
     core = ResamplerCore(1, ResamplerConfig())
     core.step(stamped(message, "a", 0))
     core.step(stamped(moved(message, 5), "a", 2))
     core.step(stamped(message, "a", 0))
-    core.step(stamped(moved(message, 10), "b", 0))
-    core.step(stamped(moved(message, 6), "a", 3))
+    core.step(stamped(moved(message, 5.5), "b", 0))
+    core.step(stamped(moved(message, 5.2), "a", 3))
     assert core.problem() == ""
     assert core.counters()["out_of_order"] == 4
     assert "lost_clock_set_back" not in core.counters()
@@ -440,7 +432,7 @@ def test_messages_repeated_or_late_from_an_ended_session_are_not_a_clock_set_bac
 def test_a_late_message_of_an_ended_session_counts_no_loss_between_sessions() -> None:
     message = raw(at(0.0, 0.01), np.zeros(2))
     core = ResamplerCore(1, ResamplerConfig())
-    for producer, sequence, by_s, first in (("a", 0, 0, 0), ("b", 0, 10, 10), ("a", 1, 1, 2), ("b", 1, 11, 12)):
+    for producer, sequence, by_s, first in (("a", 0, 0, 0), ("b", 0, 0.9, 10), ("a", 1, 0.1, 2), ("b", 1, 1, 12)):
         numbered = replace(moved(message, by_s), device_sequence=np.array([first, first + 1], np.uint32))
         core.step(stamped(numbered, producer, sequence))
     assert core.counters()["lost_between_sessions"] == 8

@@ -20,7 +20,17 @@ from tests.stages.test_resampler import NAN, at, raw
 WHAT_HAPPENS = (
     *("regular", "jitter", "dense", "sparse", "losses"),
     *("missing readings", "dead tacho", "no number", "gap", "silence"),
-    *("again", "earlier", "set back", "device restarts", "acquisition restarts", "late session", "ticks", "given up"),
+    *(
+        "another time",
+        "again",
+        "earlier",
+        "set back",
+        "device restarts",
+        "acquisition restarts",
+        "late session",
+        "ticks",
+        "given up",
+    ),
 )
 
 
@@ -46,6 +56,11 @@ class ScriptedLink:
             items += [self._sample(self._rng.uniform(0.6, 8.0))]
         elif what == "gap":
             items += [self._sample(self._rng.uniform(0.101, 0.6))]
+        elif what == "another time":
+            newest, now_s, self._producer = self._producer, self._now_s, "z"
+            items += [self._sample(self._rng.choice([-60.0, 60.0]))]
+            items += [self._sample(0.2) for _ in range(count)]
+            self._producer, self._now_s = newest, now_s
         elif what == "set back":
             items += [self._sample(-self._rng.uniform(1.1, 3.0))]
         elif what == "device restarts":

@@ -1,0 +1,212 @@
+"""stages.resampler: samples of another time, backlogs, and host clocks that are set, on one line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.runtime.decision_rules import DecisionRules
+from schemas.blocks import join
+from schemas.messages import Grid, Header, Raw
+from schemas.units import NS_PER_S
+from stages.resampler import ResamplerConfig, ResamplerCore
+
+EPOCH_NS = 1_700_000_000_000_000_000
+HZ = 100
+PERIOD_NS = NS_PER_S // HZ
+RAD_S_PER_S = 10.0
+"""the speed rises this fast, so that an error of time shows as an error of slope"""
+
+
+def sample(number: int, *, delay_s: float = 0.001, producer: str = "acquisition-a", clock: bool = True) -> Raw:
+    """Sample `number` of the device, measured at number / HZ seconds."""
+    t_ns = EPOCH_NS + number * PERIOD_NS
+    return Raw(
+        header=Header(producer, number, "tray1"),
+        fans=1,
+        host_receive_t_ns=np.array([t_ns + round(delay_s * NS_PER_S)], np.int64),
+        device_clock_us=np.array([number * 10_000 % 2**32] if clock else [], np.uint32),
+        device_sequence=np.array([number % 2**32] if clock else [], np.uint32),
+        command=np.full((1, 1), 50.0),
+        speed_rad_s=np.full((1, 1), number / HZ * RAD_S_PER_S),
+    )
+
+
+def line(first_s: float, last_s: float, **more: object) -> Iterator[Raw]:
+    return (sample(number, **more) for number in range(round(first_s * HZ), round(last_s * HZ)))  # type: ignore[arg-type]
+
+
+def shifted(messages: Iterator[Raw], by_s: float) -> Iterator[Raw]:
+    for message in messages:
+        yield replace(message, host_receive_t_ns=message.host_receive_t_ns + round(by_s * NS_PER_S))
+
+
+def after_stall(from_s: float, until_s: float) -> Iterator[Raw]:
+    """What was measured in a stall, all received at its end."""
+    for message in line(from_s, until_s):
+        yield replace(message, host_receive_t_ns=np.array([EPOCH_NS + round((until_s + 0.002) * NS_PER_S)], np.int64))
+
+
+def core_of(rules: DecisionRules = max(DecisionRules)) -> ResamplerCore:
+    return ResamplerCore(1, ResamplerConfig(), decision_rules=rules)
+
+
+def grid_of(core: ResamplerCore, *parts: Iterator[Raw] | Sequence[Raw]) -> Grid:
+    grids = [grid for part in parts for message in part for grid in core.step(message)]
+    return join([*grids, *core.close()])
+
+
+def slopes(grid: Grid) -> np.ndarray:
+    """Of the speed between neighbouring valid samples of the grid, rad/s per second."""
+    both = grid.valid[1:, 0] & grid.valid[:-1, 0]
+    return (np.diff(grid.speed_rad_s[:, 0]) / np.diff(grid.t_ns) * NS_PER_S)[both]
+
+
+def valid_after(grid: Grid, t_s: float) -> int:
+    return int(grid.valid[grid.t_ns > EPOCH_NS + t_s * NS_PER_S, 0].sum())
+
+
+# row 2
+
+
+@pytest.mark.parametrize("ahead_s", [3600.0, 60.0, -3600.0])
+@pytest.mark.parametrize("clock", [True, False], ids=["device clock", "no device clock"])
+def test_row_02_a_message_of_another_time_from_another_producer_moves_nothing(ahead_s: float, clock: bool) -> None:
+    (forged,) = shifted(iter([sample(1, producer="acquisition-forged", clock=clock)]), 20.0 + ahead_s)
+    core, undisturbed = core_of(), core_of()
+    grid = grid_of(core, line(0, 20, clock=clock), [forged], line(20, 40, clock=clock))
+    expected = grid_of(undisturbed, line(0, 40, clock=clock))
+    assert grid.t_ns.tolist() == expected.t_ns.tolist()
+    assert grid.speed_rad_s.tobytes() == expected.speed_rad_s.tobytes()
+    assert core.counters()["refused_other_time"] == 1
+    assert core.counters().get("out_of_order", 0) == 0
+    assert not [name for name in core.counters() if name.startswith("lost_")]
+    side = "ahead of" if ahead_s > 0 else "behind"
+    assert core.problem().startswith(f"raw samples of acquisition-forged are {abs(ahead_s):.0f} s {side} those of")
+
+
+def test_row_02_a_second_acquisition_with_a_fast_clock_moves_nothing() -> None:
+    core = core_of()
+    second = shifted(line(20, 40, producer="acquisition-fast"), 60.0)
+    both = [message for pair in zip(line(20, 40), second, strict=True) for message in pair]
+    grid = grid_of(core, line(0, 20), both)
+    assert grid.valid.all()
+    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=1e-3)
+    assert core.counters()["refused_other_time"] + 50 >= 2000
+    assert "acquisition-fast" in core.problem()
+
+
+def test_row_02_a_report_ends_a_minute_later() -> None:
+    core = core_of()
+    (forged,) = shifted(iter([sample(1, producer="acquisition-forged")]), 3600.0)
+    grid_of(core, line(0, 5), [forged], line(5, 70))
+    assert core.problem() == ""
+
+
+@pytest.mark.parametrize("away_s", [5.0, 3600.0])
+def test_row_02_acquisition_that_returns_after_some_time_is_the_line_again(away_s: float) -> None:
+    core = core_of()
+    grid = grid_of(core, line(0, 20), line(20 + away_s, 40 + away_s, producer="acquisition-b"))
+    assert valid_after(grid, 20 + away_s) >= 19.9 * HZ, "all of its samples, also the first"
+    assert core.counters().get("refused_other_time", 0) == 0
+    assert core.problem() == ""
+
+
+# row 5
+
+
+@pytest.mark.parametrize("stall_s", [3.0, 6.0, 8.0, 30.0, 300.0, 900.0])
+def test_row_05_a_backlog_after_a_stall_of_any_length_keeps_its_times(stall_s: float) -> None:
+    core = core_of()
+    end_s = 20 + stall_s
+    grid = grid_of(core, line(0, 20), after_stall(20, end_s), line(end_s, end_s + 30))
+    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
+    assert grid.valid.all(), "nothing is missing: the samples were only late"
+    assert core.counters()["clock_restarts"] == 0
+
+
+def test_row_05_a_backlog_that_comes_after_the_grid_has_ended_continues_it() -> None:
+    core = core_of()
+    ticks = [grid for tenths in range(200, 300) for grid in core.tick(EPOCH_NS + tenths * NS_PER_S // 10)]
+    assert not ticks, "nothing before the first sample"
+    before = [grid for message in line(0, 20) for grid in core.step(message)]
+    before += [grid for tenths in range(200, 300) for grid in core.tick(EPOCH_NS + tenths * NS_PER_S // 10)]
+    grid = grid_of(core, after_stall(20, 30), line(30, 50))
+    assert grid.t_ns[0] == join(before).t_ns[-1] + PERIOD_NS, (
+        "five seconds were given up, and those that follow are not"
+    )
+    assert (grid.t_ns[0] - EPOCH_NS) / NS_PER_S == pytest.approx(25.0, abs=0.1)
+    assert grid.valid.all()
+    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
+
+
+def test_row_05_a_backlog_of_which_the_first_part_is_lost_gives_no_false_slope() -> None:
+    core = core_of()
+    grid = grid_of(core, line(0, 20), after_stall(900, 1200), line(1200, 1230))
+    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
+    assert valid_after(grid, 1201) > 28 * HZ
+
+
+@pytest.mark.parametrize("speed_up", [1.2, 2.0, 10.0])
+def test_row_05_a_backlog_that_drains_slowly_is_no_clock_that_was_set(speed_up: float) -> None:
+    def draining() -> Iterator[Raw]:
+        for message, number in zip(line(20, 100), range(8000), strict=True):
+            at_s = max(20 + number / HZ, 28 + number / HZ / speed_up)
+            yield replace(message, host_receive_t_ns=np.array([EPOCH_NS + round(at_s * NS_PER_S)], np.int64))
+
+    core = core_of()
+    grid = grid_of(core, line(0, 20), draining())
+    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
+    assert core.counters()["clock_restarts"] == 0
+
+
+def test_row_05_a_host_clock_set_forward_is_followed_within_seconds_without_a_false_slope() -> None:
+    core = core_of()
+    grid = grid_of(core, line(0, 20), shifted(line(20, 40), 3600.0))
+    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
+    assert core.counters()["clock_restarts"] == 1
+    assert valid_after(grid, 3600) > 13 * HZ
+
+
+def test_row_05_a_restarted_device_gives_no_false_slope() -> None:
+    core = core_of()
+    restarted = (
+        replace(
+            sample(number),
+            device_clock_us=np.array([(number - 2050) * 10_000], np.uint32),
+            device_sequence=np.array([number - 2050], np.uint32),
+        )
+        for number in range(2050, 4000)
+    )
+    grid = grid_of(core, line(0, 20), restarted)
+    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
+    assert core.counters()["clock_restarts"] == 1
+
+
+# row 13
+
+
+@pytest.mark.parametrize("clock", [True, False], ids=["device clock", "no device clock"])
+@pytest.mark.parametrize("producer", ["acquisition-a", "acquisition-b"], ids=["running on", "restarted"])
+def test_row_13_after_the_host_clock_was_set_back_an_hour_judging_continues(clock: bool, producer: str) -> None:
+    core = core_of()
+    grid = grid_of(core, line(0, 20, clock=clock), shifted(line(20, 40, clock=clock, producer=producer), -3600.0))
+    assert (np.diff(grid.t_ns) > 0).all()
+    assert valid_after(grid, 20) >= 19.9 * HZ
+    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.05)
+    assert core.counters()["host_clock_set_back"] == 1
+    assert core.problem() == (
+        "the host clock was set back by 3600 s: times continue from before, 3600 s ahead of it, until the site is "
+        "restarted"
+    )
+
+
+def test_row_13_a_host_clock_that_is_put_right_again_ends_the_shift() -> None:
+    core = core_of()
+    grid = grid_of(core, line(0, 20), shifted(line(20, 40), -3600.0), line(40, 60))
+    assert valid_after(grid, 0) >= 59.9 * HZ
+    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
+    assert grid.t_ns[-1] < EPOCH_NS + 60 * NS_PER_S
