@@ -27,6 +27,7 @@ KIB, MIB = 1 << 10, 1 << 20
 ROOT = "fantwin"
 HEALTH_CHUNK = "health"
 ALIVE_CHUNK = "alive"
+SESSION_CHUNK = "session"
 RESERVED_TRAY_NAMES = (HEALTH_CHUNK, ALIVE_CHUNK)
 
 
@@ -100,6 +101,11 @@ def health_key(site: str, stage: str, instance: str) -> str:
 def alive_key(site: str, stage: str, instance: str) -> str:
     """Key of a stage's liveliness token; `*` may stand for any part."""
     return f"{ROOT}/{site}/{ALIVE_CHUNK}/{stage}/{instance}"
+
+
+def sessions_key(site: str, stage: str = "*", instance: str = "*") -> str:
+    """Pattern of the keys of the tokens that say which process runs a stage; `pipeline.runtime.sessions` makes them."""
+    return f"{ROOT}/{site}/{SESSION_CHUNK}/{stage}/{instance}/**"
 
 
 def topic_of(key: str) -> Topic:

@@ -247,7 +247,14 @@ class ScorerCore(Core):
 
     def close(self) -> list[ScorerSnapshot]:
         """The snapshot that the next session continues from."""
-        return self._take_snapshot(at_once=True) if self._last_t_ns > np.iinfo(np.int64).min else []
+        snapshots = self._take_snapshot(at_once=True) if self._last_t_ns > np.iinfo(np.int64).min else []
+        self.abort()
+        return snapshots
+
+    def abort(self) -> None:
+        """Save nothing; another process may use the snapshot."""
+        if self._snapshot_store:
+            self._snapshot_store.unlock()
 
     def _discard_if_of_other_times(self, item: Prediction) -> list[Alarm]:
         """Discard a restored snapshot if it is of later times than the first prediction, as when another recording is
@@ -349,12 +356,15 @@ def build(context: Context) -> BuiltStage:
     """The core of one tray.
 
     Raises:
-        StageError: the tray names no twin, or one that cannot be used; the snapshot file cannot be read.
+        StageError: the tray names no twin, or one that cannot be used; the snapshot file cannot be read, or another
+            process uses it.
     """
     tray = context.tray
     path = context.snapshot_folder / f"scorer-{tray.name}.snapshot" if context.snapshot_folder else None
     twin = _healthy_twin(context, load_tray_twin(twin_path(context), tray.fans))
     store = SnapshotStore(path) if path else None
+    if store:
+        store.lock(f"site {context.site}")
     return BuiltStage(
         ScorerCore(tray.fans, tray.speed_unit, context.config, twin, store, decision_rules=context.decision_rules)
     )

@@ -16,6 +16,7 @@ import json
 import queue
 import socket
 import threading
+import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import Self
@@ -31,6 +32,7 @@ from schemas.topics import Topic, largest_bytes
 _RETRY = '{"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}'
 _ROUTER_TIMEOUT_MS = "1000"
 _ROUTER_RETRY_S = 0.2
+_MEETING_POLL_S = 0.01
 
 
 class Bus:
@@ -96,6 +98,16 @@ class Bus:
 
         handler = zenoh.handlers.Callback(receive, indirect=False)
         self._declared.append(self._session.liveliness().declare_subscriber(key_expression, handler, history=True))
+
+    def wait_for_others(self, limit_s: float, stop: threading.Event) -> None:
+        """Wait until another process is connected; return at once where none listened at the endpoint before.
+
+        Before that, no token and no message of another process can be seen.
+        """
+        until_s = time.monotonic() + limit_s
+        while self.came_second and not (self._session.info.peers_zid() or self._session.info.routers_zid()):
+            if time.monotonic() > until_s or stop.wait(_MEETING_POLL_S):
+                return
 
     def alive(self, key_expression: str) -> set[str]:
         """The keys of the tokens that exist now."""

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pipeline.bus.session import Bus
 from pipeline.config.models import NAME_PATTERN
 from pipeline.launch.loss_accounting import losses
+from pipeline.runtime.sessions import Sessions
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Health
-from schemas.topics import alive_key, health_key, tray_key
+from schemas.topics import alive_key, health_key, sessions_key, tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence
 
@@ -50,9 +51,11 @@ class SiteWatcher:
         self._lock = threading.Lock()
         self._healths: dict[str, tuple[Health, Health | None]] = {}
         self._alive: set[str] = set()
+        self._sessions = Sessions()
         self._alarms: dict[tuple[str, int], dict[tuple[str, int], Alarm]] = {}
         """by fan: the messages about its last occurrence, by producer and sequence number"""
         bus.watch_alive(alive_key(site, "*", "*"), self._on_liveness)
+        bus.watch_alive(sessions_key(site), self._on_session)
         bus.subscribe(health_key(site, "*", "*"), self._on_health)
         bus.subscribe(tray_key(site, "*", "alarm"), self._on_alarm)
 
@@ -67,6 +70,8 @@ class SiteWatcher:
         with self._lock:
             latest: dict[tuple[str, str], StageView] = {}
             for health, previous in sorted(self._healths.values(), key=lambda pair: pair[0].t_ns):
+                if self._sessions.is_ignored(health.header.producer):
+                    continue
                 alive = alive_key(self._site, health.stage, health.instance) in self._alive
                 latest[health.stage, health.instance] = StageView(health, previous, alive)
             return [latest[name] for name in sorted(latest)]
@@ -93,6 +98,10 @@ class SiteWatcher:
         with self._lock:
             (self._alive.add if alive else self._alive.discard)(key)
 
+    def _on_session(self, key: str, alive: bool) -> None:
+        with self._lock:
+            self._sessions.update(key, alive)
+
     def _on_health(self, _key: str, payload: bytes) -> None:
         health = _decoded(Health, payload)
         if isinstance(health, Health):
@@ -105,6 +114,8 @@ class SiteWatcher:
         alarm = _decoded(Alarm, payload)
         if isinstance(alarm, Alarm) and alarm.header.producer and key == _alarm_key(self._site, alarm.header.tray):
             with self._lock:
+                if self._sessions.is_ignored(alarm.header.producer):
+                    return
                 messages = self._alarms.setdefault((alarm.header.tray, alarm.fan), {})
                 messages[alarm.header.producer, alarm.header.sequence] = alarm
                 newest = in_sequence(messages.values())[-1]

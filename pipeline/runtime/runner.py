@@ -28,12 +28,13 @@ from pipeline.runtime.outputs import Outputs
 from pipeline.runtime.peers import Peers
 from pipeline.runtime.recovery import Recovery
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
-from pipeline.runtime.stage import BuiltStage, Context, Source, Stage
+from pipeline.runtime.sessions import Session, Sessions, refuse_second
+from pipeline.runtime.stage import BuiltStage, Context, Source, Stage, StageError
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, StageStatus
 from schemas.streams import stage_losses
-from schemas.topics import BY_NAME, alive_key, health_key, topic_of, tray_key
+from schemas.topics import BY_NAME, alive_key, health_key, sessions_key, topic_of, tray_key
 
 TICK_S = 0.05
 HEALTH_PERIOD_S = 1.0
@@ -89,7 +90,16 @@ class Runner:
         self._sources: list[Source] = []
         """those that have been started"""
         self._clock = StageClock()
+        self._sessions = Sessions()
+        self._session = Session.of_this_process(stage.name, self._instance, started_t_ns, self.producer)
         self._bus = Bus(config.bus, stop)
+        try:
+            refuse_second(self._bus, config.site, self._session, stop)
+        except StageError:
+            for parts in self._parts.values():
+                parts.core.abort()
+            self._bus.close()
+            raise
         self._recovery = Recovery(self._bus, self._inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
         self._tracker = SequenceTracker(self._recovery.ask)
         self._outputs = Outputs(self._bus, config.site, stage, [t.name for t in trays], self.producer)
@@ -162,6 +172,9 @@ class Runner:
                 self._bus.subscribe(tray_key(self._site, tray, "clock"), self._on_bus)
         self._bus.subscribe(health_key(self._site, "*", "*"), self._on_bus)
         self._bus.watch_alive(alive_key(self._site, "*", "*"), self._on_liveness)
+        self._bus.watch_alive(sessions_key(self._site), self._on_liveness)
+        self._bus.declare_alive(self._session.key(self._site))  # before the first message
+        self._sessions.update(self._session.key(self._site), alive=True)
         self._publish_health(StageStatus.STARTING)
         if not self.stage.may_drop:
             self._catch_up()
@@ -290,6 +303,7 @@ class Runner:
             self._handle_recovered(item)
         elif isinstance(item, Liveness):
             self._peers.update(item)
+            self._sessions.update(item.key, item.alive)
             if not item.alive and item.key == alive_key(self._site, REPLAY, "all"):
                 self._clock.clear()
         else:
@@ -344,6 +358,9 @@ class Runner:
         if self._has_source and is_of_replay(header.producer):  # a recorded command must not drive today's fan
             self._counts["refused_of_replay"] += 1
             return
+        if self._sessions.is_ignored(header.producer) and envelope.topic != "health":
+            self._counts["refused_of_second"] += 1
+            return
         if envelope.topic == self.stage.reads[0] and not self._has_source:  # what a device sends follows from no input
             self._outputs.advance(header.tray, envelope.topic, header)
         core, item = self._parts[name].core, envelope if self.stage.wants_envelopes else envelope.message
@@ -388,7 +405,12 @@ class Runner:
         cores = [parts.core for parts in self._parts.values()] if with_counts else []
         health = self._health.build(
             status=status,
-            problems=[self._ending.problem, self._tracker.problem(), *(core.problem() for core in cores)],
+            problems=[
+                self._ending.problem,
+                self._sessions.problem(),
+                self._tracker.problem(),
+                *(core.problem() for core in cores),
+            ],
             inputs=self._tracker.inputs() if with_counts else (),
             outputs=self._outputs.counts() if with_counts else (),
             counters=self._counters() if with_counts else {},

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from pipeline.runtime.stage import StageError
@@ -23,8 +25,43 @@ class SnapshotStore:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._former = path.with_suffix(FORMER_SUFFIX)
+        self._lock: int | None = None
         self.problem = ""
         """one line, while the last snapshot could not be saved"""
+
+    def lock(self, user: str) -> None:
+        """Keep other processes from using the snapshot until `unlock`, or until this process ends, however it ends.
+
+        user: who this is, for whoever is refused. Where no file can be written, nothing is locked: nothing can be saved
+        there either, which `save` reports.
+
+        Raises:
+            StageError: another process uses it.
+        """
+        path = self.path.with_suffix(".lock")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError:
+            return
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            other = os.read(descriptor, 200).decode(errors="replace")
+            os.close(descriptor)
+            raise StageError(
+                f"{self.path}: in use by another scorer ({other}); stop that, or give this site another run_folder"
+            ) from error
+        self._lock = descriptor
+        with suppress(OSError):  # a full disk: locked all the same
+            os.truncate(descriptor, 0)
+            os.write(descriptor, f"process {os.getpid()}, {user}".encode())
+
+    def unlock(self) -> None:
+        """Let other processes use the snapshot."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def load(self) -> ScorerSnapshot | None:
         """The last snapshot; None when there is none.

@@ -103,25 +103,23 @@ def a_second_up_is_refused(chain: Chain) -> None:
     assert "started, process" not in second.stderr
 
 
-def a_stage_of_its_own_comes_and_goes(chain: Chain) -> None:
-    """Ctrl-C ends a stage that was started by itself, while the others go on."""
-    alone = RunningCommand([*chain.words("run"), "scorer"])
-    try:
-        with chain.watcher() as watcher:
-            eventually(
-                lambda: any(v.health.process_id == alone.process.pid for v in watcher.stages()),
-                "the second scorer is seen",
-            )
-        assert alone.end(signal.SIGINT) == 0, alone.lines
-    finally:
-        alone.kill()
+def row_07_a_second_process_of_a_stage_is_refused(chain: Chain) -> None:
+    running = chain.process_ids()
+    for stage, line in (
+        ("scorer", f"scorer-{TRAY}.snapshot: in use by another scorer (process {running['scorer']}, site {SITE})"),
+        ("resampler", f"resampler of site {SITE!r} already runs: process {running['resampler']} on "),
+    ):
+        second = fantwin(*chain.words("run"), stage)
+        assert second.returncode == 1
+        assert line in second.stderr
+        assert len(second.stderr.strip().splitlines()) == 1
 
 
 def test_visitors_change_nothing_and_ctrl_c_stops_in_order_with_everything_recorded_and_scored(chain):
     up = start(chain)
     command_reaches_the_fan(chain)
     a_second_up_is_refused(chain)
-    a_stage_of_its_own_comes_and_goes(chain)
+    row_07_a_second_process_of_a_stage_is_refused(chain)
     status = up.end(signal.SIGINT)  # while the tray is sending
     assert chain.tray and chain.tray.end() == 0
     assert status == 0, up.lines

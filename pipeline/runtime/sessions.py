@@ -1,0 +1,148 @@
+"""One owner of each stage: which process runs it, and whose messages count where two do.
+
+Each stage session shows a liveliness token from before its first message until it ends, however it ends. A stage whose
+token another process already shows is refused at its start. Where two were started at once, or a network has healed,
+all see both tokens: the session that started later owns the stage, and what the other publishes is ignored until one of
+them ends. Ownership follows from the tokens that exist now, so no clock that was wrong once decides it for ever.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import threading
+import time
+from dataclasses import dataclass
+
+from pipeline.bus.session import Bus
+from pipeline.runtime.stage import StageError
+from schemas.topics import SESSION_CHUNK, sessions_key
+
+MEETING_LIMIT_S = 2.0
+"""how long a starting stage waits for the first other process, where one listens at the endpoint"""
+GOSSIP_S = 0.2
+"""how long after that it waits for further processes, of which the first one tells it: they took 6 ms"""
+LEAVING_LIMIT_S = 2.0
+"""how long it waits for a predecessor that is about to leave"""
+MOST_SESSIONS = 4096
+_POLL_S = 0.02
+
+
+@dataclass(frozen=True)
+class Session:
+    """A process that runs a stage. `started_t_ns`: when it began, host time; `producer`: how it signs messages."""
+
+    stage: str
+    instance: str
+    started_t_ns: int
+    producer: str
+    host: str
+    process_id: int
+
+    @classmethod
+    def of_this_process(cls, stage: str, instance: str, started_t_ns: int, producer: str) -> Session:
+        """The session of a stage that runs in this process."""
+        host = re.sub(r"[^A-Za-z0-9_.-]", "_", socket.gethostname()) or "unknown"
+        return cls(stage, instance, started_t_ns, producer, host, os.getpid())
+
+    @classmethod
+    def of_key(cls, key: str) -> Session | None:
+        """The session that shows the token `key`; None if it is no such token."""
+        parts = key.split("/")
+        if len(parts) != 9 or parts[2] != SESSION_CHUNK:
+            return None
+        stage, instance, started, producer, host, process_id = parts[3:]
+        if not (_is_number(started) and _is_number(process_id)):
+            return None
+        return cls(stage, instance, int(started), producer, host, int(process_id))
+
+    def key(self, site: str) -> str:
+        """The key of its token."""
+        prefix = sessions_key(site, self.stage, self.instance).removesuffix("/**")
+        return f"{prefix}/{self.started_t_ns}/{self.producer}/{self.host}/{self.process_id}"
+
+    @property
+    def name(self) -> str:
+        """The stage and its tray, for people."""
+        return self.stage if self.instance == "all" else f"{self.stage}/{self.instance}"
+
+    @property
+    def process(self) -> str:
+        """The process, for people."""
+        return f"process {self.process_id} on {self.host}"
+
+    def may_live(self, here: str) -> bool:
+        """Whether its process may still run. A token outlives a process whose host was cut off; `here`: this host."""
+        if self.host != here:
+            return True
+        try:
+            os.kill(self.process_id, 0)
+        except ProcessLookupError:
+            return False
+        except OSError:
+            pass
+        return True
+
+
+class Sessions:
+    """The sessions on the bus, and which of them are ignored."""
+
+    def __init__(self) -> None:
+        self._alive: dict[str, Session] = {}
+        self._ignored: dict[str, tuple[Session, Session]] = {}
+        """by producer: the session that is ignored, and the one that owns its stage"""
+
+    def update(self, key: str, alive: bool) -> None:
+        """A token has appeared, or gone."""
+        session = Session.of_key(key)
+        if session is None or (alive and len(self._alive) >= MOST_SESSIONS):
+            return
+        if alive:
+            self._alive[key] = session
+        else:
+            self._alive.pop(key, None)
+        owners: dict[tuple[str, str], Session] = {}
+        for each in sorted(self._alive.values(), key=lambda each: (each.started_t_ns, each.producer)):
+            owners[each.stage, each.instance] = each
+        found = ((each, owners[each.stage, each.instance]) for each in self._alive.values())
+        self._ignored = {each.producer: (each, owner) for each, owner in found if each is not owner}
+
+    def is_ignored(self, producer: str) -> bool:
+        """Whether another process owns the stage of this producer."""
+        return producer in self._ignored
+
+    def problem(self) -> str:
+        """The stages that run twice; empty if none does."""
+        return "; ".join(
+            f"{ignored.name} runs twice: {ignored.process} is ignored, because {owner.process} started later; "
+            "stop one of them"
+            for ignored, owner in self._ignored.values()
+        )
+
+
+def refuse_second(bus: Bus, site: str, session: Session, stop: threading.Event) -> None:
+    """Return if no other process runs this stage; wait a moment for one that is about to leave.
+
+    Raises:
+        StageError: one does.
+    """
+    bus.wait_for_others(MEETING_LIMIT_S, stop)
+    met_s = time.monotonic()
+    while time.monotonic() - met_s < (LEAVING_LIMIT_S if (others := _others(bus, site, session)) else GOSSIP_S):
+        if not bus.came_second or stop.wait(_POLL_S):
+            break
+    if others:
+        raise StageError(
+            f"{session.name} of site {site!r} already runs: {others[0].process}; stop that, or give this one another "
+            "site, tray or bus.endpoint"
+        )
+
+
+def _others(bus: Bus, site: str, session: Session) -> list[Session]:
+    found = (Session.of_key(key) for key in bus.alive(sessions_key(site, session.stage, session.instance)))
+    return [each for each in found if each is not None and each != session and each.may_live(session.host)]
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) < 20

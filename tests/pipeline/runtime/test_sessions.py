@@ -1,0 +1,162 @@
+"""One owner of each stage: a second is refused at its start, and ignored where both run."""
+
+from __future__ import annotations
+
+import os
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline.bus.session import Bus
+from pipeline.launch.site_watcher import SiteWatcher
+from pipeline.runtime.runner import Runner
+from pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
+from pipeline.runtime.snapshot_store import SnapshotStore
+from pipeline.runtime.stage import BuiltStage, StageError
+from schemas.codec import encode, type_name
+from schemas.messages import Alarm, Grid, Header, Raw, Severity
+from schemas.topics import BY_NAME, sessions_key, tray_key
+from tests.pipeline.runtime.test_runner import TRAY_A, Bench, Passer, config, raw, toy
+from tests.support.running_chain import eventually
+
+__all__ = ["config"]  # a fixture
+
+FIRST = Session("acquisition", TRAY_A, 100, "acquisition-a-1111", "board", 4711)
+SECOND = Session("acquisition", TRAY_A, 200, "acquisition-a-2222", "rack", 4712)
+ONE_LINE = (
+    "acquisition/a runs twice: process 4711 on board is ignored, because process 4712 on rack started later; "
+    "stop one of them"
+)
+
+
+def test_row_07_a_session_is_read_from_the_key_of_its_token():
+    assert Session.of_key(FIRST.key("s")) == FIRST
+    assert Session.of_key(sessions_key("s")) is None
+    assert Session.of_key(FIRST.key("s").replace("4711", "x")) is None
+
+
+@pytest.mark.parametrize("order", [(FIRST, SECOND), (SECOND, FIRST)])
+def test_row_07_of_two_sessions_the_later_owns_the_stage_until_it_ends(order):
+    sessions = Sessions()
+    for session in order:
+        sessions.update(session.key("s"), alive=True)
+    assert sessions.is_ignored(FIRST.producer)
+    assert not sessions.is_ignored(SECOND.producer)
+    assert sessions.problem() == ONE_LINE
+    sessions.update(SECOND.key("s"), alive=False)
+    assert not sessions.is_ignored(FIRST.producer)
+    assert not sessions.problem()
+
+
+def test_row_07_sessions_of_different_trays_and_stages_do_not_conflict():
+    sessions = Sessions()
+    for session in (FIRST, replace(SECOND, instance="b"), replace(SECOND, stage="scorer")):
+        sessions.update(session.key("s"), alive=True)
+    assert not sessions.problem()
+
+
+def test_row_07_the_sessions_remembered_are_bounded():
+    sessions = Sessions()
+    for number in range(MOST_SESSIONS + 5):
+        sessions._alive[f"key {number}"] = FIRST
+    sessions.update(SECOND.key("s"), alive=True)
+    assert SECOND.key("s") not in sessions._alive
+
+
+def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_the_first(config, monkeypatch):
+    monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
+    aborted: list[bool] = []
+
+    class Aborts(Passer):
+        def abort(self) -> None:
+            aborted.append(True)
+
+    bench = Bench(toy(), config)
+    with pytest.raises(
+        StageError, match=f"^resampler of site 's' already runs: process {os.getpid()} on [^;]*; stop that, or give"
+    ):
+        Runner(toy(lambda _context: BuiltStage(Aborts()), core_per_tray=False), config, None, threading.Event())
+    bench.feed(TRAY_A, 1)
+    assert bench.next(Grid).t_ns.tolist() == [1], "the first is not disturbed"
+    bench.end()
+    assert aborted == [True]
+
+
+def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobody(config, monkeypatch):
+    monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
+    ours = Session.of_this_process("resampler", "all", 1, "p")
+    with Bus(config.bus) as bus:
+        bus.declare_alive(replace(ours, process_id=2**22 + 1).key("s"))
+        stop = threading.Event()
+        stop.set()
+        Runner(toy(), config, None, stop).run()
+
+
+def test_row_07_where_two_run_the_samples_of_one_are_ignored_and_both_are_named(config):
+    bench = Bench(toy(), config)
+    with Bus(config.bus) as other:
+        for bus, session in ((bench.bus, FIRST), (other, SECOND)):
+            bus.declare_alive(session.key("s"))
+        bench.health_with(lambda health: health.problem == ONE_LINE)
+        key = tray_key("s", TRAY_A, "raw")
+        publishers = {s: bench.bus.publisher(key, BY_NAME["raw"], type_name(Raw), s.producer) for s in (FIRST, SECOND)}
+
+        def feed(session: Session, t_ns: int) -> None:
+            header = Header(session.producer, publishers[session].published, TRAY_A)
+            publishers[session].put(encode(replace(raw(t_ns), header=header)))
+
+        feed(FIRST, 1)
+        feed(SECOND, 2)
+        assert bench.next(Grid).t_ns.tolist() == [2]
+        refused = bench.health_with(lambda health: any(c.name == "refused_of_second" for c in health.counters))
+    bench.health_with(lambda health: not health.problem)
+    feed(FIRST, 3)
+    assert bench.next(Grid).t_ns.tolist() == [3], "the other has ended"
+    bench.end()
+    assert {c.name: c.value for c in refused.counters}["refused_of_second"] == 1
+
+
+def test_row_07_alarms_of_a_second_scorer_are_not_shown(config):
+    first, second = (replace(s, stage="scorer", instance="all") for s in (FIRST, SECOND))
+    with Bus(config.bus) as site, Bus(config.bus) as ours:
+        watcher = SiteWatcher(ours, "s")
+        for session in (first, second):
+            site.declare_alive(session.key("s"))
+        eventually(watcher._sessions.problem, "both are known")
+        key = tray_key("s", TRAY_A, "alarm")
+        for session, fan in ((first, 1), (second, 2)):
+            alarm = Alarm(
+                header=Header(session.producer, 0, TRAY_A),
+                fan=fan,
+                active=True,
+                severity=Severity.ALARM,
+                t_ns=1,
+                onset_t_ns=1,
+                residual_rad_s=0,
+                limit_rad_s=0,
+                message="",
+            )
+            site.publisher(key, BY_NAME["alarm"], type_name(Alarm), session.producer).put(encode(alarm))
+        eventually(watcher.alarms, "an alarm is shown")
+        assert [alarm.fan for alarm in watcher.alarms()] == [2]
+
+
+def test_row_07_a_snapshot_that_another_process_uses_is_refused_in_one_line(tmp_path: Path):
+    path = tmp_path / "scorer-tray1.snapshot"
+    first = SnapshotStore(path)
+    first.lock("site one")
+    with pytest.raises(StageError) as refused:
+        SnapshotStore(path).lock("site two")
+    assert str(refused.value) == (
+        f"{path}: in use by another scorer (process {os.getpid()}, site one); stop that, or give this site another "
+        "run_folder"
+    )
+    first.unlock()
+    SnapshotStore(path).lock("site two")
+
+
+def test_row_07_a_snapshot_in_a_folder_that_cannot_be_written_is_not_locked(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    SnapshotStore(tmp_path / "file" / "scorer-tray1.snapshot").lock("site one")
