@@ -313,10 +313,10 @@ def test_a_run_alarms_if_it_starts_with_an_offset_beyond_healthy_ones(white_limi
     assert max(alarm.t_s for alarm in alarms[:4]) < 2.0
 
 
-def test_slow_wear_is_followed_to_the_adaptation_limit_and_then_alarms(white_limits: Limits) -> None:
+def test_slow_wear_is_followed_for_a_while_and_then_alarms(white_limits: Limits) -> None:
     per_s = 3e-4
     farthest = white_limits.speed.baseline.adaptation_limit_sigmas
-    seconds = 1.2 * farthest / per_s
+    seconds = farthest / per_s
     samples, fans = round(seconds * 100), 2
     wear = per_s * np.arange(samples)[:, np.newaxis] / 100
     speed = autoregressive(samples, fans, 0.0, 60) + wear
@@ -325,9 +325,11 @@ def test_slow_wear_is_followed_to_the_adaptation_limit_and_then_alarms(white_lim
     alarms = alarms_of(white_limits, blocks, fans, scorer)
     assert {alarm.fan for alarm in alarms} == {0, 1}
     first_s = [min(alarm.t_s for alarm in alarms if alarm.fan == fan) for fan in range(fans)]
-    assert min(first_s) > 0.15 * farthest / per_s  # not at once: the baseline follows, and lags
+    assert min(first_s) > 0.5 * farthest / per_s  # not at once: the baseline follows, and lags
     baseline = scorer.residuals["speed"].baseline
-    assert np.abs(baseline.value - baseline.commissioned).max() <= farthest * (1 + 1e-9)
+    followed = np.abs(baseline.value - baseline.commissioned)
+    assert 0.4 * farthest < followed.min()
+    assert followed.max() <= farthest
 
 
 # The parts
