@@ -24,6 +24,7 @@ from pydantic import Field
 from pipeline.config.models import TrayConfig
 from pipeline.devices.device_clock import UINT32
 from pipeline.devices.device_sequence import DeviceSequence
+from pipeline.devices.host_clock import HOST_CLOCK, HostClock
 from pipeline.devices.sample_source import (
     LinkDown,
     LinkUp,
@@ -39,6 +40,7 @@ from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
 from schemas.messages import Array, Command, Raw
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
+STEP_SHOWN_NS = 60 * NS_PER_S  # how long health says that the host clock was set
 QUALITY_WINDOW = 100  # readings from which the quality of the connection is computed
 FLOAT32_TOLERANCE = 1e-6
 
@@ -96,8 +98,18 @@ Item: TypeAlias = ReadingBatch | LinkUp | LinkDown | Command
 class AcquisitionCore(Core):
     """One tray. Everything that arrives is either published or counted by kind; no input raises an exception."""
 
-    def __init__(self, tray: TrayConfig, config: AcquisitionConfig, source: SampleSource, started_t_ns: int) -> None:
+    def __init__(
+        self,
+        tray: TrayConfig,
+        config: AcquisitionConfig,
+        source: SampleSource,
+        started_t_ns: int,
+        host_clock: HostClock = HOST_CLOCK,
+    ) -> None:
+        """host_clock: gives the times of receipt and of ticks; its steps are reported."""
         self._tray = tray
+        self._host_clock = host_clock
+        self._seen_step = host_clock.last_step
         self._config = config
         self._source = source
         self._sequence = DeviceSequence()
@@ -129,6 +141,7 @@ class AcquisitionCore(Core):
 
     def tick(self, now_ns: int) -> list[Raw]:
         """Publish a block that has waited long enough."""
+        self._follow_host_clock()
         self._now_ns = now_ns
         if self._block and now_ns - self._block[0].t_ns >= self._config.block_wait_s * NS_PER_S:
             return self._flush()
@@ -140,14 +153,29 @@ class AcquisitionCore(Core):
 
     def counters(self) -> Mapping[str, int]:
         """Input by kind; docs/reference/wire-protocol.md explains each counter."""
-        return dict(self._counts)
+        steps = {"host_clock_steps": self._host_clock.steps} if self._host_clock.steps else {}
+        return {**self._counts, **steps}
 
     def samples_in(self, item: Item) -> int:
         """The readings in a batch."""
         return sum(isinstance(each, Reading) for each in item.items) if isinstance(item, ReadingBatch) else 0
 
     def problem(self) -> str:
-        """What is wrong with the connection now."""
+        """What is wrong with the connection now, and for a minute that the host clock was set."""
+        return "; ".join(filter(None, (self._problem_of_line(), self._problem_of_host_clock())))
+
+    def _problem_of_host_clock(self) -> str:
+        step = self._host_clock.last_step
+        if step is None or self._now_ns - step.at_ns > STEP_SHOWN_NS:
+            return ""
+        way = "back" if step.step_ns < 0 else "forward"
+        was_set = f"the host clock was set {way} by {abs(step.step_ns) / NS_PER_S:.0f} s"
+        if step.ahead_ns:
+            ahead = f"{step.ahead_ns / NS_PER_S:.0f} s ahead of it"
+            return f"{was_set}: times continue from before, {ahead}, until the site is restarted"
+        return f"{was_set}, or the host was suspended: times follow it"
+
+    def _problem_of_line(self) -> str:
         name, silence_s = self._source.name, self._config.silence_s
         if self._down_reason is not None:
             return f"{name}: {self._down_reason}"
@@ -160,6 +188,15 @@ class AcquisitionCore(Core):
         if len(self._recent_valid) >= QUALITY_WINDOW // 5 and 2 * sum(self._recent_valid) < len(self._recent_valid):
             return f"{name}: most input is faulty{fault}; check the wiring, and {settings} of the [[tray]]"
         return ""
+
+    def _follow_host_clock(self) -> None:
+        """A clock that was set forward is no silence."""
+        step = self._host_clock.last_step
+        if step is not self._seen_step:
+            self._seen_step = step
+            if step and not step.ahead_ns:
+                self._last_valid_t_ns = max(self._last_valid_t_ns, step.at_ns)
+                self._last_input_t_ns = max(self._last_input_t_ns, step.at_ns)
 
     def _receive(self, batch: ReadingBatch) -> list[Raw]:
         if batch.byte_count:

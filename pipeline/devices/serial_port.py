@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import serial
 
+from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.devices.sample_source import LinkDown, LinkUp
 
 READ_TIMEOUT_S = 0.1
@@ -116,7 +117,7 @@ class SerialPort:
                 drain_until_s = drain_until_s or time.monotonic() + DRAIN_LIMIT_S
             try:
                 data = port.read(1)
-                received_t_ns = time.time_ns()
+                received_t_ns = HOST_CLOCK.now_ns()
                 data += port.read(port.in_waiting)
             except _PORT_ERRORS:
                 return any_received

@@ -3,6 +3,10 @@
 Stages with an input use the time of their samples; only sources use the host clock. A replay may be slow, paused or
 faster than real time, and a tray must not look silent because of its pace. So ticks carry the time that the replay has
 reached. Stages with a source, and stages that serve all trays at once, keep the host's time.
+
+The time of a replay is only taken from the session that owns the site: the one whose health the replayer publishes,
+while its liveliness token is there. A replay renews its time 20 times a second, also while it is paused. A time that is
+not renewed expires: a silent line is reported, whoever has stopped the time.
 """
 
 from __future__ import annotations
@@ -10,11 +14,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
+from pipeline.devices.host_clock import HOST_CLOCK
 from schemas.messages import Clock
 
 REPLAY = "replay"
 """name of the replayer, used like a stage name in health, liveliness token and producer"""
+EXPIRES_S = 5.0
+"""a replay's time that is not renewed for so long no longer applies"""
 
 
 def is_of_replay(producer: str) -> bool:
@@ -22,34 +30,70 @@ def is_of_replay(producer: str) -> bool:
     return producer.startswith(f"{REPLAY}-")
 
 
+@dataclass(frozen=True, slots=True)
+class _ReplayTime:
+    """A clock message, and when it was received: by the host's time and by the monotonic clock."""
+
+    clock: Clock
+    host_ns: int
+    received_s: float
+
+
 class StageClock:
     """The time of each tray that a stage serves."""
 
-    def __init__(self, host_ns: Callable[[], int] = time.time_ns) -> None:
+    def __init__(
+        self, host_ns: Callable[[], int] = HOST_CLOCK.now_ns, monotonic_s: Callable[[], float] = time.monotonic
+    ) -> None:
         self._host_ns = host_ns
-        self._replay: dict[str, tuple[Clock, int]] = {}
-        """by tray: the last clock message of a replay, and the host time at which it was received"""
+        self._monotonic_s = monotonic_s
+        self._is_replay_alive = False
+        self._owner = ""
+        """the producer of the replay"""
+        self._times: dict[str, _ReplayTime] = {}
+        """by tray: the last clock message of the replay"""
 
-    def update(self, clock: Clock, received_t_ns: int) -> None:
-        """A replay has published its time, which from now on applies to that tray."""
-        self._replay[clock.header.tray] = (clock, received_t_ns)
+    def set_replay_alive(self, alive: bool) -> None:
+        """The replayer's liveliness token has appeared or gone."""
+        self._is_replay_alive = alive
+        if not alive:
+            self._clear()
 
-    def clear(self) -> None:
-        """The replay has left: the host's time applies again."""
-        self._replay.clear()
+    def add_replay_health(self, producer: str, *, has_stopped: bool) -> None:
+        """A replayer has published health: its session owns the site, unless another one does and is going on."""
+        if has_stopped:
+            if producer == self._owner:
+                self._clear()
+        elif not any(self._time_of(tray) for tray in self._times):
+            self._owner = producer
+
+    def update(self, clock: Clock) -> bool:
+        """A replay has published its time, which from now on applies to that tray; False if it does not own the
+        site."""
+        if not self._is_replay_alive or clock.header.producer != self._owner:
+            return False
+        self._times[clock.header.tray] = _ReplayTime(clock, self._host_ns(), self._monotonic_s())
+        return True
 
     def tick_ns(self, tray: str) -> int:
         """The time for `tick`: exactly the last time of the replay, never beyond it; otherwise the host's."""
-        last = self._replay.get(tray)
-        return last[0].t_ns if last else self._host_ns()
+        last = self._time_of(tray)
+        return last.clock.t_ns if last else self._host_ns()
 
     def now_ns(self, tray: str) -> int | None:
         """The time against which the age of a sample is measured. None in a replay that is paused or runs as fast as it
         can: an age has no meaning there."""
-        last = self._replay.get(tray)
+        last = self._time_of(tray)
         if last is None:
             return self._host_ns()
-        clock, received_ns = last
-        if clock.rate == 0.0 or math.isinf(clock.rate):
+        if last.clock.rate == 0.0 or math.isinf(last.clock.rate):
             return None
-        return clock.t_ns + round((self._host_ns() - received_ns) * clock.rate)
+        return last.clock.t_ns + round((self._host_ns() - last.host_ns) * last.clock.rate)
+
+    def _time_of(self, tray: str) -> _ReplayTime | None:
+        last = self._times.get(tray)
+        return last if last and self._monotonic_s() - last.received_s <= EXPIRES_S else None
+
+    def _clear(self) -> None:
+        self._times.clear()
+        self._owner = ""

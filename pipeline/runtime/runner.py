@@ -304,8 +304,8 @@ class Runner:
         elif isinstance(item, Liveness):
             self._peers.update(item)
             self._sessions.update(item.key, item.alive)
-            if not item.alive and item.key == alive_key(self._site, REPLAY, "all"):
-                self._clock.clear()
+            if item.key == alive_key(self._site, REPLAY, "all"):
+                self._clock.set_replay_alive(item.alive)
         else:
             envelope = self._decode(item.key, item.payload, item.received_t_ns)
             if envelope is None:
@@ -313,7 +313,8 @@ class Runner:
             if isinstance(envelope.message, Health):
                 self._handle_health(envelope, envelope.message)
             elif isinstance(envelope.message, Clock):
-                self._clock.update(envelope.message, envelope.received_t_ns)
+                if not self._clock.update(envelope.message):
+                    self._counts["refused_clocks"] += 1
             else:
                 for due in self._tracker.accept(envelope):
                     self._step(due)
@@ -333,8 +334,8 @@ class Runner:
         if not self._tracker.believes(health):
             return
         self._peers.add_health(alive_key(self._site, health.stage, health.instance), health)
-        if health.stage == REPLAY and health.status == StageStatus.STOPPED:
-            self._clock.clear()
+        if health.stage == REPLAY:
+            self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
         for due in self._tracker.reconcile(health, self._read_keys):
             self._step(due)
         if "health" in self.stage.reads:

@@ -11,6 +11,7 @@ import pytest
 
 from pipeline.config.models import TrayConfig
 from pipeline.config.registry import STAGES
+from pipeline.devices.host_clock import HostClock
 from pipeline.devices.sample_source import LinkDown, LinkUp
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.serial_port import ReceivedBytes
@@ -334,3 +335,44 @@ def test_the_stage_is_built_with_the_serial_line_as_its_source() -> None:
     assert isinstance(parts.core, AcquisitionCore)
     assert isinstance(parts.source, SerialSource)
     assert STAGES[STAGE.name].scope == "tray"
+
+
+class SetClock:
+    """A host whose wall clock is set."""
+
+    def __init__(self) -> None:
+        self.wall_ns = self.monotonic_ns = 0
+        self.clock = HostClock(lambda: self.wall_ns, lambda: self.monotonic_ns)
+
+    def passes(self, seconds: float, set_by_s: int = 0) -> int:
+        self.monotonic_ns += round(seconds * S)
+        self.wall_ns += round(seconds * S) + set_by_s * S
+        return self.clock.now_ns()
+
+
+@pytest.mark.parametrize(
+    ("set_by_s", "report"),
+    [
+        (-3600, "set back by 3600 s: times continue from before, 3600 s ahead of it, until the site is restarted"),
+        (3600, "set forward by 3600 s, or the host was suspended: times follow it"),
+    ],
+)
+def test_row_13_a_host_clock_that_is_set_is_reported_once_and_silence_still_counts(set_by_s: int, report: str) -> None:
+    host = SetClock()
+    host.passes(1.0)
+    tray = TrayConfig.model_validate({"name": "bench", "fans": 2, "port": "/dev/ttyTEST"})
+    core = SerialCore(tray, AcquisitionConfig(), FakeLink(), host.clock.now_ns(), host.clock)
+    core.step(LinkUp())
+    feed(core, [sample(0)], t_ns=host.passes(0.01))
+    core.tick(host.passes(0.05, set_by_s))
+    assert core.problem() == f"the host clock was {report}"
+    assert core.counters()["host_clock_steps"] == 1
+    (raw,) = feed(core, [sample(1)], t_ns=host.passes(0.01))
+    assert raw.host_receive_t_ns[0] > 0
+    core.tick(host.passes(1.9))
+    assert "nothing received" not in core.problem()
+    core.tick(host.passes(0.2))
+    assert "nothing received for 2 s" in core.problem(), "a silent line is reported after two seconds, not an hour"
+    feed(core, [sample(2)], t_ns=host.passes(60.0))
+    core.tick(host.passes(0.05))
+    assert core.problem() == ""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.config.models import TrayConfig
+from pipeline.devices.host_clock import HOST_CLOCK, HostClock
 from pipeline.devices.sample_source import LinkDown, LinkUp, SourceContext
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.serial_port import ReceivedBytes
@@ -35,10 +36,17 @@ class FakeLink:
 class SerialCore(AcquisitionCore):
     """Decodes bytes as the serial source does before it hands them to the core."""
 
-    def __init__(self, tray: TrayConfig, config: AcquisitionConfig, link: ByteLink, started_t_ns: int = 0) -> None:
+    def __init__(
+        self,
+        tray: TrayConfig,
+        config: AcquisitionConfig,
+        link: ByteLink,
+        started_t_ns: int = 0,
+        host_clock: HostClock = HOST_CLOCK,
+    ) -> None:
         assert isinstance(tray.source, SerialConfig)
         self.source = SerialSource(tray.source, SourceContext(tray.fans, tray.speed_unit, Path()), link)
-        super().__init__(tray, config, self.source, started_t_ns)
+        super().__init__(tray, config, self.source, started_t_ns, host_clock)
 
     def step(self, item: Item | ReceivedBytes) -> list[Raw]:
         if isinstance(item, ReceivedBytes | LinkUp | LinkDown):

@@ -17,9 +17,20 @@ class Host:
     def __call__(self) -> int:
         return self.ns
 
+    def monotonic_s(self) -> float:
+        return self.ns / 1e9
 
-def clock_message(t_ns: int, rate: float, tray: str = "a") -> Clock:
-    return Clock(header=Header("replay-all-1", 0, tray), t_ns=t_ns, rate=rate)
+
+def clock_of(host: Host, *, owner: str = "replay-all-1") -> StageClock:
+    """The clock of a stage while a replay owns the site."""
+    clock = StageClock(host, host.monotonic_s)
+    clock.set_replay_alive(True)
+    clock.add_replay_health(owner, has_stopped=False)
+    return clock
+
+
+def clock_message(t_ns: int, rate: float, tray: str = "a", producer: str = "replay-all-1") -> Clock:
+    return Clock(header=Header(producer, 0, tray), t_ns=t_ns, rate=rate)
 
 
 def test_without_a_replay_the_time_is_the_hosts():
@@ -29,8 +40,8 @@ def test_without_a_replay_the_time_is_the_hosts():
 
 def test_a_tick_stays_at_the_last_time_of_the_replay_and_ages_advance_at_its_rate():
     host = Host()
-    clock = StageClock(host)
-    clock.update(clock_message(1000, 2.0), HOST_NS)
+    clock = clock_of(host)
+    assert clock.update(clock_message(1000, 2.0))
     host.ns += 50
     assert clock.tick_ns("a") == 1000
     assert clock.now_ns("a") == 1100
@@ -38,18 +49,53 @@ def test_a_tick_stays_at_the_last_time_of_the_replay_and_ages_advance_at_its_rat
 
 
 def test_there_is_no_age_while_a_replay_is_paused_or_runs_as_fast_as_it_can():
-    clock = StageClock(Host())
+    clock = clock_of(Host())
     for rate in (0.0, math.inf):
-        clock.update(clock_message(1000, rate), HOST_NS)
+        clock.update(clock_message(1000, rate))
         assert clock.now_ns("a") is None
         assert clock.tick_ns("a") == 1000
 
 
 def test_the_hosts_time_applies_again_once_the_replay_has_left():
-    clock = StageClock(Host())
-    clock.update(clock_message(1000, 1.0), HOST_NS)
-    clock.clear()
-    assert clock.tick_ns("a") == HOST_NS
+    for leave in (
+        lambda clock: clock.set_replay_alive(False),
+        lambda clock: clock.add_replay_health("replay-all-1", has_stopped=True),
+    ):
+        clock = clock_of(Host())
+        clock.update(clock_message(1000, 1.0))
+        leave(clock)
+        assert clock.tick_ns("a") == HOST_NS
+        assert not clock.update(clock_message(2000, 1.0)), "what is still on the way no longer applies"
+
+
+def test_row_12_a_clock_is_taken_from_the_replay_that_owns_the_site_only():
+    host = Host()
+    nobody = StageClock(host, host.monotonic_s)
+    assert not nobody.update(clock_message(1000, 0.0))
+    announced = StageClock(host, host.monotonic_s)
+    announced.add_replay_health("replay-all-1", has_stopped=False)
+    assert not announced.update(clock_message(1000, 0.0)), "without the liveliness token"
+    for clock in (nobody, announced):
+        host.ns += 10**9
+        assert clock.tick_ns("a") == host.ns, "a silent line is still reported"
+    owned = clock_of(host)
+    owned.update(clock_message(1000, 1.0))
+    owned.add_replay_health("replay-forged", has_stopped=False)
+    assert not owned.update(clock_message(5000, 0.0, producer="replay-forged"))
+    assert owned.tick_ns("a") == 1000
+
+
+def test_row_12_a_clock_that_is_not_renewed_expires_and_another_replay_may_follow():
+    host = Host()
+    clock = clock_of(host)
+    clock.update(clock_message(1000, 0.0))
+    host.ns += round(4.9e9)
+    assert clock.tick_ns("a") == 1000, "a paused replay renews it 20 times a second"
+    host.ns += round(0.2e9)
+    assert clock.tick_ns("a") == clock.now_ns("a") == host.ns
+    clock.add_replay_health("replay-all-2", has_stopped=False)
+    assert clock.update(clock_message(3000, 1.0, producer="replay-all-2"))
+    assert clock.tick_ns("a") == 3000
 
 
 def test_only_the_replayers_sessions_count_as_a_replay():

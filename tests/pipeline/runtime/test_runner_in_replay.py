@@ -42,13 +42,17 @@ class Replay:
         )
 
     def publish_time(self, t_ns: int, rate: float = 1.0) -> None:
+        self._publish_health(StageStatus.OK)
         header = Header("replay-1", self.clock.published, TRAY_A)
         self.clock.put(encode(Clock(header=header, t_ns=t_ns, rate=rate)))
 
     def stop(self) -> None:
+        self._publish_health(StageStatus.STOPPED)
+
+    def _publish_health(self, status: StageStatus) -> None:
         header = Header("replay-1", self.health.published, "")
-        last = Health(header=header, stage="replay", instance="all", status=StageStatus.STOPPED, t_ns=0, uptime_s=0.0)
-        self.health.put(encode(last))
+        health = Health(header=header, stage="replay", instance="all", status=status, t_ns=0, uptime_s=0.0)
+        self.health.put(encode(health))
 
 
 @pytest.fixture
@@ -82,6 +86,16 @@ def test_ticks_carry_the_time_of_a_replay_until_it_leaves_in_any_way(config, tic
         eventually(lambda: core.ticks[-1] > 1e18, "the host's time applies again")
     finally:
         replay.bus.close()
+
+
+def test_row_12_a_clock_from_anybody_but_the_replay_is_refused_and_time_goes_on(config, tickers):
+    bench, core, _ = tickers
+    key = tray_key("s", TRAY_A, "clock")
+    stranger = bench.bus.publisher(key, BY_NAME["clock"], type_name(Clock), "replay-forged")
+    stranger.put(encode(Clock(header=Header("replay-forged", 0, TRAY_A), t_ns=1000, rate=0.0)))
+    health = bench.health_with(lambda h: any(c.name == "refused_clocks" for c in h.counters))
+    assert {c.name: c.value for c in health.counters}["refused_clocks"] == 1
+    assert min(core.ticks) > 1e18, "the host's time never stopped"
 
 
 def test_latency_is_measured_in_the_time_of_the_replay_and_not_while_it_is_paused(config, tickers):

@@ -1,0 +1,68 @@
+"""The host's time, which passes evenly: steps of its wall clock are noticed, and never make it go back.
+
+Durations are of the monotonic clock; the wall clock labels them. The time follows the wall clock while that is
+corrected by less than a second, and when it is set forward. When the wall clock is set back, the time goes on, ahead of
+it, until the wall clock is put right.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from schemas.units import NS_PER_S
+
+STEP_NS = NS_PER_S  # a larger difference is a clock that was set, not one that was corrected
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStep:
+    """The wall clock was set. step_ns: by how much, negative if it was set back. at_ns: when, in the time of HostClock.
+    ahead_ns: by how much that time is now ahead of the wall clock."""
+
+    step_ns: int
+    at_ns: int
+    ahead_ns: int
+
+
+class HostClock:
+    """One time for all threads of a process."""
+
+    def __init__(
+        self, wall_ns: Callable[[], int] = time.time_ns, monotonic_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._wall_ns = wall_ns
+        self._monotonic_ns = monotonic_ns
+        self._lock = threading.Lock()
+        self._offset_ns = wall_ns() - monotonic_ns()
+        self._ahead_ns = 0
+        self.steps = 0
+        """how often the wall clock was set"""
+        self.last_step: ClockStep | None = None
+
+    def now_ns(self) -> int:
+        """Nanoseconds since the epoch, as the wall clock said before it was set back, if it was."""
+        with self._lock:
+            monotonic_ns = self._monotonic_ns()
+            now_ns = monotonic_ns + self._offset_ns
+            wall_ns = self._wall_ns()
+            ahead_ns = now_ns - wall_ns
+            step_ns = self._ahead_ns - ahead_ns
+            if abs(step_ns) > STEP_NS:
+                self._ahead_ns = ahead_ns = ahead_ns if ahead_ns > STEP_NS else 0
+                if not ahead_ns:
+                    now_ns = wall_ns
+                self.steps += 1
+                self.last_step = ClockStep(step_ns, now_ns, ahead_ns)
+            if not self._ahead_ns:
+                now_ns = wall_ns
+            else:
+                self._ahead_ns = ahead_ns  # the wall clock may be corrected while it is behind
+            self._offset_ns = now_ns - monotonic_ns
+            return now_ns
+
+
+HOST_CLOCK = HostClock()
+"""of this process"""

@@ -1,0 +1,61 @@
+"""pipeline.devices.host_clock: a time that passes evenly, whatever happens to the wall clock."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from pipeline.devices.host_clock import ClockStep, HostClock
+from schemas.units import NS_PER_S
+
+EPOCH_NS = 1_700_000_000_000_000_000
+HOUR_NS = 3600 * NS_PER_S
+
+
+class Host:
+    def __init__(self) -> None:
+        self.wall_ns, self.monotonic_ns = EPOCH_NS, 5 * NS_PER_S
+        self.clock = HostClock(lambda: self.wall_ns, lambda: self.monotonic_ns)
+
+    def passes(self, seconds: float, *, set_by_ns: int = 0) -> int:
+        self.monotonic_ns += round(seconds * NS_PER_S)
+        self.wall_ns += round(seconds * NS_PER_S) + set_by_ns
+        return self.clock.now_ns()
+
+
+def test_without_a_step_it_is_the_wall_clock() -> None:
+    host = Host()
+    times = [host.passes(0.05, set_by_ns=correction) for correction in (0, 300_000_000, -2_000_000, 0)]
+    assert times[-1] == host.wall_ns
+    assert host.clock.steps == 0
+
+
+def test_row_13_a_wall_clock_set_back_does_not_take_the_time_back() -> None:
+    host = Host()
+    before = host.passes(1.0)
+    assert host.passes(0.05, set_by_ns=-HOUR_NS) == before + 50_000_000
+    assert host.clock.last_step == ClockStep(-HOUR_NS, before + 50_000_000, HOUR_NS)
+    assert host.passes(600.0) == before + 50_000_000 + 600 * NS_PER_S
+    assert host.clock.steps == 1, "it is one step, however long ago"
+
+
+def test_a_wall_clock_set_forward_is_followed() -> None:
+    host = Host()
+    before = host.passes(1.0)
+    assert host.passes(0.05, set_by_ns=HOUR_NS) == before + 50_000_000 + HOUR_NS == host.wall_ns
+    assert host.clock.last_step == ClockStep(HOUR_NS, host.wall_ns, 0)
+
+
+@pytest.mark.parametrize("more_ns", [0, HOUR_NS])
+def test_a_wall_clock_that_is_put_right_is_followed_again(more_ns: int) -> None:
+    host = Host()
+    host.passes(1.0, set_by_ns=-HOUR_NS)
+    assert host.passes(1.0, set_by_ns=HOUR_NS + more_ns) == host.wall_ns
+    assert (host.clock.steps, host.clock.last_step.ahead_ns) == (2, 0) if host.clock.last_step else False
+
+
+def test_the_time_never_goes_back_by_more_than_a_second() -> None:
+    host = Host()
+    times = [host.passes(0.05, set_by_ns=by_s * NS_PER_S) for by_s in (0, -5, 3, -7200, 100, 7300, -1, -2, 50)]
+    assert all(later > earlier - NS_PER_S for earlier, later in pairwise(times))
