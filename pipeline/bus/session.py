@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import json
 import queue
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from typing import Self
 
 import zenoh
 
+from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program, somebody_listens
 from pipeline.bus.errors import BusError, reason
 from pipeline.bus.publisher import Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
@@ -32,6 +32,8 @@ from schemas.topics import Topic, largest_bytes
 _RETRY = '{"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}'
 _ROUTER_TIMEOUT_MS = "1000"
 _ROUTER_RETRY_S = 0.2
+MEETING_LIMIT_S = 10.0
+"""by then a process that listens at the endpoint has answered, however busy the machine"""
 _MEETING_POLL_S = 0.01
 
 
@@ -48,8 +50,12 @@ class Bus:
             BusError: the endpoint cannot be used, or a client's router is not there.
         """
         self._config = config
-        self.came_second = _somebody_listens(config.endpoint)
+        problem = endpoint_problem(config.endpoint) if config.mode == "peer" else ""
+        if problem:
+            raise BusError(problem)
+        self.came_second = somebody_listens(config.endpoint)
         """Whether another process listened before: discovering the others takes a moment."""
+        self._has_answered = config.mode == "client" or (self.came_second and _answers(config.endpoint, stop))
         self._session = _open(config, stop, listens)
         self.refused_too_large = 0
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
@@ -99,13 +105,13 @@ class Bus:
         handler = zenoh.handlers.Callback(receive, indirect=False)
         self._declared.append(self._session.liveliness().declare_subscriber(key_expression, handler, history=True))
 
-    def wait_for_others(self, limit_s: float, stop: threading.Event) -> None:
-        """Wait until another process is connected; return at once where none listened at the endpoint before.
+    def wait_for_others(self, stop: threading.Event) -> None:
+        """Wait until another process is connected, or `stop` is set; not at all where none listened before.
 
         Before that, no token and no message of another process can be seen.
         """
-        until_s = time.monotonic() + limit_s
-        while self.came_second and not (self._session.info.peers_zid() or self._session.info.routers_zid()):
+        until_s = time.monotonic() + MEETING_LIMIT_S
+        while self._has_answered and not (self._session.info.peers_zid() or self._session.info.routers_zid()):
             if time.monotonic() > until_s or stop.wait(_MEETING_POLL_S):
                 return
 
@@ -137,18 +143,34 @@ class Bus:
         self._session.close()
 
 
-def _somebody_listens(endpoint: str) -> bool:
-    protocol, _, address = endpoint.partition("/")
-    host, _, port = address.rpartition(":")
-    if protocol != "tcp" or not port.isdecimal():
+def _answers(endpoint: str, stop: threading.Event | None) -> bool:
+    """Whether a process of fantwin listens at the endpoint of a peer; False if nobody does, or `stop` is set.
+
+    Raises:
+        BusError: a program listens there and does not answer.
+    """
+    if not accepts_connections(endpoint):
         return False
-    with socket.socket() as probe:  # bind, not connect: the other end would take a connection for a peer
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    conf = _client_config(endpoint)
+    until_s = time.monotonic() + MEETING_LIMIT_S
+    while True:
         try:
-            probe.bind((host, int(port)))
-        except OSError:
+            zenoh.open(conf).close()  # a peer would try again for ever, and takes ten seconds to close
             return True
-    return False
+        except zenoh.ZError as error:
+            if time.monotonic() > until_s:
+                raise BusError(foreign_program(endpoint)) from error
+            if stop is not None and stop.is_set():
+                return False
+
+
+def _client_config(endpoint: str) -> zenoh.Config:
+    conf = zenoh.Config()
+    conf.insert_json5("mode", '"client"')
+    conf.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    conf.insert_json5("connect/timeout_ms", _ROUTER_TIMEOUT_MS)
+    conf.insert_json5("scouting/multicast/enabled", "false")
+    return conf
 
 
 def _open(config: BusConfig, stop: threading.Event | None, listens: bool) -> zenoh.Session:
@@ -158,10 +180,13 @@ def _open(config: BusConfig, stop: threading.Event | None, listens: bool) -> zen
             return zenoh.open(conf)
     except zenoh.ZError as error:
         raise BusError(f"bus.endpoint = {config.endpoint!r} cannot be used: {reason(error)}") from error
+    until_s = time.monotonic() + (MEETING_LIMIT_S if stop else 0.0)
     while True:  # Zenoh can wait for the router itself, but then ignores Ctrl-C
         try:
             return zenoh.open(conf)
         except zenoh.ZError as error:
+            if time.monotonic() > until_s and accepts_connections(config.endpoint):
+                raise BusError(foreign_program(config.endpoint)) from error
             if stop is None or stop.wait(_ROUTER_RETRY_S):
                 raise BusError(
                     f"bus.endpoint = {config.endpoint!r}: no router answers: {reason(error)}; start `fantwin router`"

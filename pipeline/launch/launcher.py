@@ -80,6 +80,7 @@ class Launcher:
             UserError: a stage cannot run as configured; the others have been stopped.
         """
         with Bus(self._config.bus, stop) as bus:
+            bus.wait_for_others(stop)
             self._refuse_second_launcher(bus, stop)
             self._watcher = SiteWatcher(bus, self._config.site)
             try:

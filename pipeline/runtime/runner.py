@@ -29,7 +29,7 @@ from pipeline.runtime.peers import Peers
 from pipeline.runtime.recovery import Recovery
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.sessions import Session, Sessions, refuse_second
-from pipeline.runtime.stage import BuiltStage, Context, Source, Stage, StageError
+from pipeline.runtime.stage import BuiltStage, Context, Source, Stage
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, StageStatus
@@ -95,7 +95,7 @@ class Runner:
         self._bus = Bus(config.bus, stop)
         try:
             refuse_second(self._bus, config.site, self._session, stop)
-        except StageError:
+        except UserError:
             for parts in self._parts.values():
                 parts.core.abort()
             self._bus.close()

@@ -19,10 +19,8 @@ from pipeline.bus.session import Bus
 from pipeline.runtime.stage import StageError
 from schemas.topics import SESSION_CHUNK, sessions_key
 
-MEETING_LIMIT_S = 2.0
-"""how long a starting stage waits for the first other process, where one listens at the endpoint"""
 GOSSIP_S = 0.2
-"""how long after that it waits for further processes, of which the first one tells it: they took 6 ms"""
+"""how long a starting stage waits for further processes after it has met the first: they took 6 ms"""
 LEAVING_LIMIT_S = 2.0
 """how long it waits for a predecessor that is about to leave"""
 MOST_SESSIONS = 4096
@@ -126,8 +124,9 @@ def refuse_second(bus: Bus, site: str, session: Session, stop: threading.Event) 
 
     Raises:
         StageError: one does.
+        BusError: a program that is not fantwin listens at the endpoint.
     """
-    bus.wait_for_others(MEETING_LIMIT_S, stop)
+    bus.wait_for_others(stop)
     met_s = time.monotonic()
     while time.monotonic() - met_s < (LEAVING_LIMIT_S if (others := _others(bus, site, session)) else GOSSIP_S):
         if not bus.came_second or stop.wait(_POLL_S):

@@ -16,9 +16,12 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program
+from pipeline.bus.errors import BusError
+from pipeline.bus.session import Bus
 from pipeline.cli.options import JsonOption, SetOption
 from pipeline.config.loading import load_config
-from pipeline.config.models import Config, ConfigError
+from pipeline.config.models import BusConfig, Config, ConfigError
 from pipeline.launch.processes import process_list
 from pipeline.optional_dependencies import how_to_install
 from pipeline.runtime.stage import Context, load_stage
@@ -66,6 +69,7 @@ def _findings(config: Path | None, overrides: list[str] | None) -> Iterator[tupl
         return
     yield True, f"{config}: site {settings.site!r}, trays {', '.join(tray.name for tray in settings.trays)}"
     yield from _check_run_folder(settings.run_folder)
+    yield from _check_bus(settings.bus)
     yield from _check_stages(settings)
 
 
@@ -104,6 +108,24 @@ def _check_run_folder(folder: Path) -> Iterator[tuple[bool, str]]:
     enough = free > _MIN_FREE_BYTES
     advice = "" if enough else "; make room or name another folder"
     yield enough, f"run_folder {folder}: {free / 1e9:.1f} GB free{advice}"
+
+
+def _check_bus(config: BusConfig) -> Iterator[tuple[bool, str]]:
+    """Whether processes can meet at the endpoint."""
+    endpoint = config.endpoint
+    if problem := endpoint_problem(endpoint):
+        yield False, problem
+    elif not accepts_connections(endpoint):
+        yield (
+            True,
+            f"bus.endpoint {endpoint}: free" if config.mode == "peer" else f"bus.endpoint {endpoint}: no router yet",
+        )
+    else:
+        try:
+            Bus(config, listens=False).close()
+            yield True, f"bus.endpoint {endpoint}: fantwin answers there"
+        except BusError:
+            yield False, foreign_program(endpoint)
 
 
 def _check_stages(config: Config) -> Iterator[tuple[bool, str]]:

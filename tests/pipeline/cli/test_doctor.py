@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import socket
 import tomllib
 import tty
 from collections.abc import Iterator
@@ -60,6 +61,8 @@ def test_a_configuration_in_order_can_start(capsys, tmp_path, port):
         ("tray.0.twin='demo.toml'", ["twin_integrator", "not an ONNX file"]),
         ("tray.0.fans=3", ["twin_integrator", "a twin of 8 fans", "choose a twin that fits"]),
         ("run_folder='/etc/hostname/x'", ["run_folder /etc/hostname/x", "not a folder this user may write to"]),
+        ("bus.endpoint='tcp/127.0.0.1:99999'", ["bus.endpoint", "port 99999 is out of range"]),
+        ("bus.endpoint='tcp/no-such-host.invalid:7447'", ["bus.endpoint", "'no-such-host.invalid' cannot be found"]),
         ("scorer.on_dealy_s=1", ["scorer.on_dealy_s", "did you mean 'on_delay_s'"]),
     ],
 )
@@ -71,6 +74,19 @@ def test_each_problem_is_one_line_that_says_what_to_do(capsys, tmp_path, port, s
     assert not again or setting.startswith("run_folder")  # the recorder, too, says that it cannot write there
     for word in words:
         assert word in line
+
+
+def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(capsys, tmp_path, port, monkeypatch):
+    monkeypatch.setattr("pipeline.bus.session.MEETING_LIMIT_S", 0.0)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+        settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", f"bus.endpoint='{endpoint}'"]
+        code, found = examine(capsys, DEMO / "demo.toml", *settings)
+    assert code == 1
+    assert found["problems"] == [
+        f"bus.endpoint = '{endpoint}': the program that listens there is not fantwin, or hangs, so no stage would "
+        "meet another: stop it, or choose another port"
+    ]
 
 
 def test_a_missing_configuration_is_a_problem_and_no_crash(capsys, tmp_path):

@@ -1,0 +1,74 @@
+"""What can be wrong with an endpoint before anybody meets there."""
+
+from __future__ import annotations
+
+import re
+import socket
+
+_ADDRESS = re.compile(r"(tcp|tls|ws|udp|quic)/(\[[^\]]*\]|[^:/?#]*):(\d+)(?:[?#].*)?")
+_CONNECTING = ("tcp", "tls", "ws")
+_CONNECT_TIMEOUT_S = 1.0
+
+
+def endpoint_problem(endpoint: str) -> str:
+    """What is wrong with an endpoint in itself: one line, or empty. Zenoh judges endpoints that are no host and port.
+
+    A host that does not resolve now may do so later, as that of a container that has not started yet.
+    """
+    match = _ADDRESS.fullmatch(endpoint)
+    if match is None:
+        return ""
+    if not (match[3].isascii() and 1 <= int(match[3][:6]) <= 65535):
+        return f"bus.endpoint = {endpoint!r}: port {match[3][:20]} is out of range, 1 to 65535"
+    try:
+        socket.getaddrinfo(match[2].strip("[]"), int(match[3]))
+    except (OSError, UnicodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a host name"
+        return f"bus.endpoint = {endpoint!r}: the host {match[2]!r} cannot be found ({reason}): correct it"
+    return ""
+
+
+def somebody_listens(endpoint: str) -> bool:
+    """Whether the port is taken on this host; also true for an address of another host.
+
+    It binds and does not connect: the other end would take a connection for a peer.
+    """
+    match = _ADDRESS.fullmatch(endpoint)
+    if match is None or match[1] not in _CONNECTING:
+        return False
+    for family, kind, protocol, _, address in _resolved(match):
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(address)
+            except OSError:
+                return True
+    return False
+
+
+def accepts_connections(endpoint: str) -> bool:
+    """Whether a program accepts connections there, whatever it is."""
+    match = _ADDRESS.fullmatch(endpoint)
+    if match is None or match[1] not in _CONNECTING:
+        return False
+    try:
+        with socket.create_connection((match[2].strip("[]"), int(match[3])), _CONNECT_TIMEOUT_S):
+            return True
+    except OSError:
+        return False
+
+
+def foreign_program(endpoint: str) -> str:
+    """One line about an endpoint that accepts connections and does not answer as fantwin."""
+    return (
+        f"bus.endpoint = {endpoint!r}: the program that listens there is not fantwin, or hangs, so no stage would meet "
+        "another: stop it, or choose another port"
+    )
+
+
+def _resolved(match: re.Match[str]) -> list[tuple[int, int, int, str, tuple[object, ...]]]:
+    try:
+        found = socket.getaddrinfo(match[2].strip("[]"), int(match[3]), type=socket.SOCK_STREAM)
+    except OSError:
+        return []
+    return [(int(family), int(kind), protocol, name, address) for family, kind, protocol, name, address in found]

@@ -1,0 +1,71 @@
+"""An endpoint at which nobody would ever meet is one line."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from pipeline.bus.endpoint import accepts_connections, endpoint_problem, somebody_listens
+from pipeline.bus.errors import BusError
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+
+NOBODY = "no-such-host.invalid"
+
+
+@pytest.fixture
+def foreign() -> Iterator[str]:
+    """The endpoint of a program that accepts connections and never answers."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        yield f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "line"),
+    [
+        ("tcp/127.0.0.1:99999", "port 99999 is out of range, 1 to 65535"),
+        ("tcp/127.0.0.1:0", "port 0 is out of range"),
+        ("tls/[::1]:7447777777777", "port 7447777777777 is out of range"),
+        (f"tcp/{NOBODY}:7447", f"the host '{NOBODY}' cannot be found"),
+        (f"tcp/{'x' * 70}.invalid:7447", "cannot be found"),
+    ],
+)
+def test_row_15_an_endpoint_that_cannot_be_is_one_line(endpoint, line):
+    with pytest.raises(BusError) as refused:
+        Bus(BusConfig(endpoint=endpoint))
+    assert str(refused.value).startswith(f"bus.endpoint = {endpoint!r}: ")
+    assert line in str(refused.value)
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "udp/localhost:1", "unixsock-stream/x"])
+def test_row_15_other_endpoints_are_left_to_zenoh(endpoint):
+    assert endpoint_problem(endpoint) == ""
+
+
+@pytest.mark.parametrize("mode", ["peer", "client"])
+@pytest.mark.parametrize("stop", [None, threading.Event()])
+def test_row_15_a_foreign_program_at_the_endpoint_is_one_line(foreign, monkeypatch, mode, stop):
+    monkeypatch.setattr("pipeline.bus.session.MEETING_LIMIT_S", 0.0)
+    with pytest.raises(BusError) as refused:
+        Bus(BusConfig(mode=mode, endpoint=foreign), stop)
+    assert str(refused.value) == (
+        f"bus.endpoint = {foreign!r}: the program that listens there is not fantwin, or hangs, so no stage would meet "
+        "another: stop it, or choose another port"
+    )
+
+
+def test_row_15_where_nobody_listens_nobody_is_waited_for(endpoint):
+    assert not somebody_listens(endpoint)
+    assert not accepts_connections(endpoint)
+    with Bus(BusConfig(endpoint=endpoint)) as bus:
+        bus.wait_for_others(threading.Event())
+
+
+def test_row_15_a_process_that_answers_is_no_foreign_program(endpoint):
+    with Bus(BusConfig(endpoint=endpoint)), Bus(BusConfig(endpoint=endpoint)) as second:
+        assert somebody_listens(endpoint)
+        assert accepts_connections(endpoint)
+        second.wait_for_others(threading.Event())
