@@ -468,8 +468,16 @@ class Output(_message.Message):
     published: int
     def __init__(self, key: _Optional[str] = ..., published: _Optional[int] = ...) -> None: ...
 
+class AwaitedInput(_message.Message):
+    __slots__ = ("key", "since_t_ns")
+    KEY_FIELD_NUMBER: _ClassVar[int]
+    SINCE_T_NS_FIELD_NUMBER: _ClassVar[int]
+    key: str
+    since_t_ns: int
+    def __init__(self, key: _Optional[str] = ..., since_t_ns: _Optional[int] = ...) -> None: ...
+
 class Health(_message.Message):
-    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id")
+    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STAGE_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
@@ -484,6 +492,9 @@ class Health(_message.Message):
     LATENCY_P99_MS_FIELD_NUMBER: _ClassVar[int]
     LOST_FIELD_NUMBER: _ClassVar[int]
     PROCESS_ID_FIELD_NUMBER: _ClassVar[int]
+    WAITING_FOR_FIELD_NUMBER: _ClassVar[int]
+    NEWEST_INPUT_T_NS_FIELD_NUMBER: _ClassVar[int]
+    NEWEST_OUTPUT_T_NS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     stage: str
     instance: str
@@ -498,4 +509,7 @@ class Health(_message.Message):
     latency_p99_ms: float
     lost: int
     process_id: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ...) -> None: ...
+    waiting_for: _containers.RepeatedCompositeFieldContainer[AwaitedInput]
+    newest_input_t_ns: int
+    newest_output_t_ns: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ...) -> None: ...

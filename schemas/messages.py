@@ -357,6 +357,14 @@ class Output:
     published: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class AwaitedInput:
+    """An input that a stage waits for, and since when, host time."""
+
+    key: str
+    since_t_ns: int
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Health:
     """Status of a stage, and what it has received, sent and lost."""
@@ -375,6 +383,9 @@ class Health:
     latency_p99_ms: float = 0.0
     lost: int = 0
     process_id: int = 0
+    waiting_for: tuple[AwaitedInput, ...] = ()
+    newest_input_t_ns: int = 0
+    newest_output_t_ns: int = 0
 
 
 Message: TypeAlias = (

@@ -108,6 +108,12 @@ def sessions_key(site: str, stage: str = "*", instance: str = "*") -> str:
     return f"{ROOT}/{site}/{SESSION_CHUNK}/{stage}/{instance}/**"
 
 
+def key_in_words(key: str) -> str:
+    """A tray's topic for people: `grid of tray1`."""
+    tray, topic = key.split("/")[-2:]
+    return f"{topic} of {tray}"
+
+
 def topic_of(key: str) -> Topic:
     """The topic of a key.
 

@@ -13,9 +13,9 @@ from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
-from pipeline.launch.event_log import without_figures
-from pipeline.launch.loss_accounting import label
 from pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, process_list
+from pipeline.launch.site_report import RunningProcess, SiteReport
+from pipeline.launch.site_state import site_states
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.launch.watchdog import Watchdog
 from schemas.topics import alive_key
@@ -37,6 +37,8 @@ class _Slot:
     start_at_s: float = 0.0
     delay_s: float = 0.0
     was_ready: bool = False
+    was_seen: bool = False
+    """whether the process that runs now has been on the bus"""
     hung: str = ""
     """why it was killed, for people"""
 
@@ -68,7 +70,7 @@ class Launcher:
         self._path: Path = config.path
         self._overrides = tuple(overrides)
         self._say = say
-        self._reported: dict[str, str] = {}
+        self._report = SiteReport(config.bus.endpoint, say)
         self._slots = [_Slot(row, delay_s=config.launcher.restart_delay_s) for row in process_list(config)]
         self._watchdog = Watchdog(config.launcher.watchdog_s)
         self.outcome = Outcome(run_folder=str(config.run_folder))
@@ -139,6 +141,7 @@ class Launcher:
 
     def _start(self, slot: _Slot) -> None:
         slot.child = Child(slot.row, self._path, self._overrides, lambda row, line: self._say(f"{row.label} | {line}"))
+        slot.was_seen = False
         self._watchdog.started(slot.row.label, time.monotonic())
         self._say(f"{slot.row.label}: started, process {slot.child.process_id}")
 
@@ -152,7 +155,8 @@ class Launcher:
                 continue
             status = slot.child.exit_status()
             if status is None:
-                slot.was_ready = slot.was_ready or self._watcher.is_ready(slot.child.process_id)
+                slot.was_seen = slot.was_seen or self._watcher.is_ready(slot.child.process_id)
+                slot.was_ready = slot.was_ready or slot.was_seen
                 if slot.child.notices.read():
                     self._watchdog.heard(slot.row.label, now, is_ready=slot.child.notices.is_ready)
                 continue
@@ -171,20 +175,14 @@ class Launcher:
                 slot.child.kill()
 
     def _report_changes(self) -> None:
-        """Report what has changed: problems of stages, and alarms."""
-        for view in self._watcher.stages():
-            name, problem = label(view.health), view.health.problem
-            meaning = without_figures(problem)
-            if view.alive and meaning != self._reported.get(name, ""):
-                self._reported[name] = meaning
-                self._say(f"{name}: {problem or 'the problem is resolved'}")
-        for current in self._watcher.current_alarms():
-            alarm = current.newest
-            fan = f"{alarm.header.tray} fan {alarm.fan}"
-            now = current.line()
-            if now != self._reported.get(fan):
-                self._reported[fan] = now
-                self._say(now)
+        now = time.monotonic()
+        processes = {
+            slot.row.label: RunningProcess(slot.child.process_id, self._watchdog.is_at_work(slot.row.label, now))
+            for slot in self._slots
+            if slot.child and slot.was_seen
+        }
+        self._report.stages(site_states(self._watcher, [slot.row for slot in self._slots]), processes)
+        self._report.alarms(self._watcher.current_alarms())
 
     def _plan_restart(self, slot: _Slot, status: int, now: float) -> None:
         assert slot.child is not None

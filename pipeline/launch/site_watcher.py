@@ -17,6 +17,9 @@ from schemas.topics import alive_key, health_key, sessions_key, tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence
 
+MAX_SESSIONS = 1000
+"""sessions whose last health is kept; each `fantwin alarms ack` is none, it sends no health"""
+
 
 @dataclass(frozen=True)
 class StageView:
@@ -25,6 +28,8 @@ class StageView:
     health: Health
     previous: Health | None
     alive: bool
+    age_s: float = 0.0
+    """since the health was heard here: clocks of other hosts may differ"""
 
     @property
     def rate_in_hz(self) -> float:
@@ -49,7 +54,8 @@ class SiteWatcher:
         self._bus = bus
         self._site = site
         self._lock = threading.Lock()
-        self._healths: dict[str, tuple[Health, Health | None]] = {}
+        self._healths: dict[str, tuple[Health, Health | None, float]] = {}
+        """by producer: the last health and the one before, and when the last was heard, of a monotonic clock in s"""
         self._alive: set[str] = set()
         self._sessions = Sessions()
         self._alarms: dict[tuple[str, int], dict[tuple[str, int], Alarm]] = {}
@@ -69,12 +75,18 @@ class SiteWatcher:
         """The latest session of every stage instance, by name."""
         with self._lock:
             latest: dict[tuple[str, str], StageView] = {}
-            for health, previous in sorted(self._healths.values(), key=lambda pair: pair[0].t_ns):
+            for health, previous, heard_s in sorted(self._healths.values(), key=lambda found: found[0].t_ns):
                 if self._sessions.is_ignored(health.header.producer):
                     continue
                 alive = alive_key(self._site, health.stage, health.instance) in self._alive
-                latest[health.stage, health.instance] = StageView(health, previous, alive)
+                age_s = time.monotonic() - heard_s
+                latest[health.stage, health.instance] = StageView(health, previous, alive, age_s)
             return [latest[name] for name in sorted(latest)]
+
+    def alive(self) -> set[tuple[str, str]]:
+        """Stage and instance of each session that is on the bus now."""
+        with self._lock:
+            return {(stage, instance) for *_, stage, instance in (key.split("/") for key in self._alive)}
 
     def is_ready(self, process_id: int) -> bool:
         """Whether the session of this process is alive and at work."""
@@ -92,7 +104,7 @@ class SiteWatcher:
     def losses(self) -> dict[str, int]:
         """What every stage has lost, over all its sessions; see `pipeline.launch.loss_accounting`."""
         with self._lock:
-            return losses(health for health, _ in self._healths.values())
+            return losses(health for health, _, _ in self._healths.values())
 
     def _on_liveness(self, key: str, alive: bool) -> None:
         with self._lock:
@@ -102,12 +114,14 @@ class SiteWatcher:
         with self._lock:
             self._sessions.update(key, alive)
 
-    def _on_health(self, _key: str, payload: bytes) -> None:
+    def _on_health(self, key: str, payload: bytes) -> None:
         health = _decoded(Health, payload)
-        if isinstance(health, Health):
+        if isinstance(health, Health) and key == health_key(self._site, health.stage, health.instance):
             with self._lock:
-                before = self._healths.get(health.header.producer)
-                self._healths[health.header.producer] = (health, before[0] if before else None)
+                before = self._healths.pop(health.header.producer, None)
+                self._healths[health.header.producer] = (health, before[0] if before else None, time.monotonic())
+                if len(self._healths) > MAX_SESSIONS:
+                    del self._healths[next(iter(self._healths))]
 
     def _on_alarm(self, key: str, payload: bytes) -> None:
         """A message without a producer, or of another tray than its key says, is no alarm: no bytes decode as one."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 START_LIMIT_S = 60.0
 """silence while a stage starts: it may load large libraries and ask others for what it missed"""
+_AT_WORK_S = 2.0
 _OWN_PAUSE_S = 1.0  # the launcher itself did not run: the machine was suspended or very busy
 
 
@@ -35,6 +36,10 @@ class Watchdog:
     def heard(self, name: str, now_s: float, *, is_ready: bool) -> None:
         """A stage has gone round its loop."""
         self._heard[name] = _Heard(now_s, is_ready)
+
+    def is_at_work(self, name: str, now_s: float) -> bool:
+        """Whether a stage has gone round its loop a moment ago."""
+        return name in self._heard and now_s - self._heard[name].at_s < _AT_WORK_S
 
     def ended(self, name: str) -> None:
         """A stage has ended."""

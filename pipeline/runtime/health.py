@@ -3,35 +3,54 @@
 from __future__ import annotations
 
 import os
+import time
 from collections import deque
 from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from schemas.messages import Counter, Health, Input, Message, Output, StageStatus, newest_t_ns
+from schemas.messages import AwaitedInput, Counter, Health, Input, Message, Output, StageStatus, newest_t_ns
 from schemas.streams import stage_losses
 from schemas.units import NS_PER_S
 
 _MAX_LATENCIES = 2000
+LATENCY_WINDOW_S = 10.0
+"""latencies are those of the outputs of this long"""
+AWAITED_AFTER_NS = 2 * NS_PER_S
+"""a stage waits for a main input when nothing of it has arrived for this long"""
 
 
 class HealthBuilder:
-    """Collects the latencies of a stage's outputs and builds its `Health` messages."""
+    """Collects what a stage receives and sends, and builds its `Health` messages."""
 
-    def __init__(self, stage: str, instance: str, started_t_ns: int, *, may_drop: bool) -> None:
+    def __init__(
+        self, stage: str, instance: str, started_t_ns: int, *, may_drop: bool, main_keys: Iterable[str] = ()
+    ) -> None:
+        """main_keys: the keys of the stage's main input."""
         self._stage = stage
         self._instance = instance
         self._started_t_ns = started_t_ns
         self._may_drop = may_drop
         self.summary = "starting"
         """the status of the last health in one line"""
-        self._latencies_ms: deque[float] = deque(maxlen=_MAX_LATENCIES)
+        self._latencies_ms: deque[tuple[float, float]] = deque(maxlen=_MAX_LATENCIES)
+        """with the time at which each was measured, of a monotonic clock in s"""
+        self._main_input_t_ns = dict.fromkeys(main_keys, started_t_ns)
+        """by key: when its last message was received"""
+        self._newest_input_t_ns = self._newest_output_t_ns = 0
 
-    def add_output(self, message: Message, now_ns: int) -> None:
-        """Add the latency of an output: the age of its newest sample when it was published."""
+    def add_input(self, key: str, received_t_ns: int) -> None:
+        """A message or an item of the source has been received; key: empty for a source."""
+        self._newest_input_t_ns = received_t_ns
+        if key in self._main_input_t_ns:
+            self._main_input_t_ns[key] = received_t_ns
+
+    def add_output(self, message: Message, sent_t_ns: int, now_ns: int | None) -> None:
+        """An output has been sent. Its latency is the age of its newest sample at `now_ns`, if the time is known."""
+        self._newest_output_t_ns = sent_t_ns
         t_ns = newest_t_ns(message)
-        if t_ns:
-            self._latencies_ms.append((now_ns - t_ns) / 1e6)
+        if t_ns and now_ns is not None:
+            self._latencies_ms.append((time.monotonic(), (now_ns - t_ns) / 1e6))
 
     def build(
         self,
@@ -47,7 +66,9 @@ class HealthBuilder:
         problem = "; ".join(filter(None, problems))
         if problem and status == StageStatus.OK:
             status = StageStatus.DEGRADED
-        p50, p99 = np.percentile(self._latencies_ms, (50, 99)) if self._latencies_ms else (0.0, 0.0)
+        since_s = time.monotonic() - LATENCY_WINDOW_S
+        latencies_ms = [latency_ms for at_s, latency_ms in self._latencies_ms if at_s >= since_s]
+        p50, p99 = np.percentile(latencies_ms, (50, 99)) if latencies_ms else (0.0, 0.0)
         self.summary = f"{status.words}: {problem}" if problem else status.words
         return Health(
             stage=self._stage,
@@ -63,4 +84,11 @@ class HealthBuilder:
             latency_p99_ms=float(p99),
             lost=stage_losses(inputs, counters, may_drop=self._may_drop),
             process_id=os.getpid(),
+            waiting_for=tuple(
+                AwaitedInput(key=key, since_t_ns=since_t_ns)
+                for key, since_t_ns in self._main_input_t_ns.items()
+                if now_ns - since_t_ns > AWAITED_AFTER_NS
+            ),
+            newest_input_t_ns=self._newest_input_t_ns,
+            newest_output_t_ns=self._newest_output_t_ns,
         )

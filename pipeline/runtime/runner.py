@@ -29,7 +29,8 @@ from pipeline.runtime.peers import Peers
 from pipeline.runtime.recovery import Recovery
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.sessions import Session, Sessions, refuse_second
-from pipeline.runtime.stage import BuiltStage, Context, Source, Stage
+from pipeline.runtime.sources import Sources
+from pipeline.runtime.stage import BuiltStage, Context, Stage
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, StageStatus
@@ -68,7 +69,6 @@ class Runner:
         self._inbox = Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
         started_t_ns = time.time_ns()
-        self._health = HealthBuilder(stage.name, self._instance, started_t_ns, may_drop=stage.may_drop)
         context = Context(
             site=config.site,
             trays=trays,
@@ -87,8 +87,7 @@ class Runner:
         )
         """by the tray that a core serves; an empty name: all"""
         self._has_source = any(parts.source for parts in self._parts.values())
-        self._sources: list[Source] = []
-        """those that have been started"""
+        self._sources = Sources()
         self._clock = StageClock()
         self._sessions = Sessions()
         self._session = Session.of_this_process(stage.name, self._instance, started_t_ns, self.producer)
@@ -110,12 +109,19 @@ class Runner:
             tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
         }
         self._peers = Peers(self._read_keys)
+        main = stage.reads[0] if stage.reads and not self._has_source else ""  # what feeds a source is seen there
+        self._health = HealthBuilder(
+            stage.name,
+            self._instance,
+            started_t_ns,
+            may_drop=stage.may_drop,
+            main_keys=self._read_keys & {tray_key(config.site, t.name, main) for t in trays},
+        )
         self._notifier = Notifier.from_environment()
         self._ending = Ending(stage.name, config.launcher.stop_timeout_s)
         self._active_core: str | None = None
         """the core whose method is being called, or has raised"""
         self._producers_end_limit_s = 0.0
-        self._sources_stop: Step | None = None
         self._count_lock = threading.Lock()
         """sources count from their own threads"""
 
@@ -141,7 +147,7 @@ class Runner:
             if work.error is not None:
                 ending.fail(work.error, f"crashed: {type(work.error).__name__}: {work.error}")
         self._inbox.close()
-        ending.finish("stopping the source", self._stop_sources(), SOURCES_STOPPED)
+        ending.finish("stopping the source", self._sources.stop(), SOURCES_STOPPED)
         failed = self._active_core
         for name, parts in self._parts.items():
             self._close_core(name, parts, failed)
@@ -182,8 +188,7 @@ class Runner:
         self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
         for name, parts in self._parts.items():
             if parts.source:
-                self._sources.append(parts.source)
-                parts.source.start(lambda item, name=name: self._deliver(FromSource(name, item)))
+                self._sources.start(parts.source, lambda item, name=name: self._deliver(FromSource(name, item)))
 
     def _on_bus(self, key: str, payload: bytes) -> None:
         self._inbox.put(FromBus(key, payload, time.time_ns()))
@@ -221,7 +226,7 @@ class Runner:
 
         What there is no time for is counted as lost.
         """
-        sources = self._stop_sources()
+        sources = self._sources.stop()
         left: int | None = None  # items still to be processed, known once everything expected has arrived
         while left != 0:
             if self._ending.left_s(DRAINED) < 0:
@@ -252,22 +257,6 @@ class Runner:
         with self._count_lock:
             self._counts["lost_at_stop"] += self._parts[item.core].core.samples_in(item.item)
 
-    def _stop_sources(self) -> Step:
-        """Stop all sources, once, in a thread: each delivers the rest of what it has while it is being stopped."""
-        if self._sources_stop is None:
-            self._sources_stop = Step(self._stop_each_source)
-        return self._sources_stop
-
-    def _stop_each_source(self) -> None:
-        errors: list[Exception] = []
-        for source in self._sources:
-            try:
-                source.stop()
-            except Exception as error:  # noqa: BLE001  the others are stopped as well
-                errors.append(error)
-        if errors:
-            raise errors[0]
-
     def _close_core(self, name: str, parts: BuiltStage, failed: str | None) -> None:
         what = name or "the core"
         if name == failed:
@@ -297,6 +286,7 @@ class Runner:
 
     def _handle(self, item: Item) -> None:
         if isinstance(item, FromSource):
+            self._health.add_input("", time.time_ns())
             core = self._parts[item.core].core
             self._call(item.core, lambda: core.step(item.item))
         elif isinstance(item, Recovered):
@@ -316,6 +306,7 @@ class Runner:
                 if not self._clock.update(envelope.message):
                     self._counts["refused_clocks"] += 1
             else:
+                self._health.add_input(envelope.key, envelope.received_t_ns)
                 for due in self._tracker.accept(envelope):
                     self._step(due)
 
@@ -378,8 +369,7 @@ class Runner:
         for message in produce():
             tray = name or message.header.tray or input_tray
             stamped = self._outputs.publish(tray, message, from_timer=from_timer)
-            if (now_ns := self._clock.now_ns(tray)) is not None:
-                self._health.add_output(stamped, now_ns)
+            self._health.add_output(stamped, time.time_ns(), self._clock.now_ns(tray))
         self._active_core = None
 
     def _catch_up(self) -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.messages import Health, ModelCard, StageStatus
+from schemas.topics import key_in_words
 
 CHANGES_SHOWN = 20
 PROBLEM_LENGTH = 200
@@ -80,6 +81,9 @@ class StagesPage:
             rows.append(f"| {literal} | {_bold(state, 'ok')} | {_bold(lost, '0')} |")
             if latest.health.problem and state != "stopped":
                 problems.append(f"- **{literal}**: {_problem(latest.health)}")
+            if latest.health.waiting_for and state == StageStatus.OK.words:
+                awaited = ", ".join(key_in_words(each.key) for each in latest.health.waiting_for)
+                problems.append(f"- **{literal}**: waits for {markdown_literal(awaited)}")
         twins = [
             f"- {markdown_literal(tray)}: {markdown_literal(card.twin)} ({markdown_literal(card.kind)}), "
             f"since {_time(card.t_ns)}"

@@ -10,6 +10,7 @@ from schemas.fields import LARGEST_ENUM_VALUE, Column, OpenEnum, columns, other_
 from schemas.messages import (
     FURTHEST_T_NS,
     LARGEST_PERIOD_NS,
+    AwaitedInput,
     Counter,
     Diagnosis,
     Header,
@@ -28,8 +29,9 @@ TEXT = st.text(max_size=20)
 FLOAT = st.floats(width=64)
 POSITION = st.builds(InputPosition, TEXT, TEXT, UINT64, UINT64, UINT64, st.booleans())
 HEADER = st.builds(Header, TEXT, UINT64, TEXT, st.none() | POSITION)
+_TIMES = ("t_ns", "onset_t_ns", "shelved_until_t_ns", "since_t_ns", "newest_input_t_ns", "newest_output_t_ns")
 SCALARS: dict[str, st.SearchStrategy[Any]] = {
-    **dict.fromkeys(("t_ns", "onset_t_ns", "shelved_until_t_ns"), INT64),
+    **dict.fromkeys(_TIMES, INT64),
     "period_ns": PERIOD_NS,
     "process_id": UINT32,
     "lost": UINT64,
@@ -45,9 +47,9 @@ def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
         return SCALARS[name]
     if isinstance(hint, type) and issubclass(hint, OpenEnum):
         return st.integers(0, LARGEST_ENUM_VALUE).map(hint)
-    for record in (Counter, Input, Output, Diagnosis):
+    for record in (Counter, Input, Output, Diagnosis, AwaitedInput):
         if hint == tuple[record, ...]:
-            values = {name: OF_TYPE[hint] for name, hint in other_fields(record).items()}
+            values = {name: SCALARS.get(name, OF_TYPE[hint]) for name, hint in other_fields(record).items()}
             return st.lists(st.builds(record, **values), max_size=3).map(tuple)
     return OF_TYPE[hint]
 

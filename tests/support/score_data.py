@@ -96,3 +96,23 @@ def _alarm(tray: str, fan: int, at_s: float, onset_s: float, active: bool) -> Al
         torque_balance_command=0.3 if active else 0.01,
         confirmed=True,
     )
+
+
+def one_sample(fans: int, *reasons: InvalidReason) -> Score:
+    """A score of one sample. reasons: why the fans are not judged, beginning with fan 0; the rest are judged."""
+    invalid = np.array([[*reasons, *[InvalidReason.NONE] * (fans - len(reasons))]], np.uint8)
+    valid, column = invalid == InvalidReason.NONE, np.zeros(invalid.shape)
+    measured = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "lower_bound_rad_s", "upper_bound_rad_s")
+    derived = ("band_variance", "residual_rad_s", "smoothed_residual_rad_s", "torque_balance_command", "score")
+    baselines = ("speed_baseline_rad_s", "balance_baseline_command")
+    return Score(
+        fans=fans,
+        period_ns=STEP_NS,
+        t_ns=np.array([START_NS]),
+        outside=column != 0,
+        state=invalid * 0,
+        statistic=invalid * 0,
+        valid=valid,
+        invalid_reason=invalid,
+        **dict.fromkeys((*measured, *derived, *baselines), column),
+    )

@@ -23,6 +23,9 @@ from pipeline.cli.watch.request import ask
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.errors import UserError
+from pipeline.launch.judged_fans import JudgedFans, Unjudged
+from pipeline.launch.processes import process_list
+from pipeline.launch.site_state import site_states
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
@@ -34,6 +37,7 @@ from scoring.alarms.alarm_text import CANNOT_TELL, CAUSES
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, until
 
 _DISCOVERY_S = 5.0  # every stage sends several health messages in this time
+_SCORES_S = 3.0  # a score of every tray arrives in this time
 _POLL_S = 0.02
 _MIN_PROBABILITY = 0.05  # less probable causes are not listed
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
@@ -80,7 +84,7 @@ def alarms(
 ) -> None:
     """List the current alarms, or acknowledge, shelve ... the alarm of a fan (docs/reference/alarms.md).
 
-    Exit code 0: listed, or granted; 1: refused, or no answer.
+    Exit code 0: listed, and every fan is judged now, or granted; 1: a fan is not judged, refused, or no answer.
 
     Example: fantwin alarms
 
@@ -118,18 +122,23 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
     key = tray_key(config.site, "*", "alarm")
     news: queue.Queue[Alarm] = queue.Queue()
     bus.subscribe(key, lambda _key, payload: _decoded(payload, news.put))
-    wait_for_stages(bus, SiteWatcher(bus, config.site), config, stop)
+    watcher, judged = SiteWatcher(bus, config.site), JudgedFans(bus, config.site, config.trays)
+    wait_for_stages(bus, watcher, config, stop)
     known: list[Alarm] = []
     for _, payload in bus.recover(key):
         _decoded(payload, known.append)
     found = [each for each in current_alarms(sorted(known, key=newest_t_ns)) if show_all or is_listed(each.newest)]
     console = Console(soft_wrap=True, highlight=False)
+    unjudged = _wait_until_judged(watcher, judged, config, stop)
     if json_output:
-        typer.echo(json.dumps({"alarms": [each.as_json() for each in found]}))
+        shown = {"alarms": [each.as_json() for each in found], "not_judged": [each.as_json() for each in unjudged]}
+        typer.echo(json.dumps(shown))
     else:
         for each in found:
             console.print(alarm_lines(each))
-        if not found:
+        for each in unjudged:
+            console.print(Text(each.line(), style="red"))
+        if not found and not unjudged:
             console.print(Text("no alarms", style="green"))
     names = {(alarm.header.producer, alarm.header.sequence, alarm.header.tray) for alarm in known}
     while watch and not stop.is_set():
@@ -143,6 +152,19 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
             typer.echo(json.dumps({"transition": _word(alarm), **_alone(alarm).as_json()}))
         else:
             console.print(_transition_line(alarm))
+    if unjudged and not watch:
+        raise typer.Exit(1)
+
+
+def _wait_until_judged(
+    watcher: SiteWatcher, judged: JudgedFans, config: Config, stop: threading.Event
+) -> list[Unjudged]:
+    """The fans that are not judged now; waits for scores, which come in blocks."""
+    until_s = time.monotonic() + _SCORES_S
+    while True:
+        unjudged = judged.unjudged(site_states(watcher, process_list(config)))
+        if not unjudged or time.monotonic() > until_s or stop.wait(_POLL_S):
+            return unjudged
 
 
 def wait_for_stages(

@@ -10,6 +10,7 @@ from rich.text import Text
 from pipeline.bus.session import Bus
 from pipeline.cli.watch.status import stage_table
 from pipeline.config.models import Config
+from pipeline.launch.judged_fans import JudgedFans
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import decode
 from schemas.messages import FanState, InvalidReason, Score
@@ -26,6 +27,7 @@ class DemoScreen:
         self._config = config
         self._tray = config.trays[0]
         self._watcher = SiteWatcher(bus, config.site)
+        self._judged = JudgedFans(bus, config.site, config.trays)
         self._score: Score | None = None
         bus.subscribe(tray_key(config.site, self._tray.name, "score"), self._on_score)
 
@@ -42,7 +44,7 @@ class DemoScreen:
     def render(self) -> Group:
         """Stages, alarms and fans, for a terminal."""
         starting = Text("starting the stages", style="dim")
-        stages = stage_table(self._watcher, self._config) if self._watcher.stages() else starting
+        stages = stage_table(self._watcher, self._config, self._judged) if self._watcher.stages() else starting
         return Group(stages, self._fan_table())
 
     def line(self) -> str:

@@ -20,16 +20,20 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.errors import UserError
+from pipeline.launch.judged_fans import JudgedFans
+from pipeline.launch.processes import process_list
+from pipeline.launch.site_state import StageState, Word, site_states
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.runtime.signals import stop_on_signals
-from schemas.messages import Severity, StageStatus
+from schemas.messages import Severity
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.current_alarms import CurrentAlarm, clock
 
 _STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 _LISTEN_S = 2.5  # two health messages of every stage, which give rates
-_SILENT_AFTER_S = 5.0
+_LISTEN_MAX_S = 6.0
+_STATE_STYLES = {Word.OK: "green", Word.DEGRADED: "red"}
 
 
 def status(
@@ -40,8 +44,11 @@ def status(
 ) -> None:
     """Show stages, rates, latency, losses and alarms of a running site.
 
-    Stays live on a terminal, until Ctrl-C. Into a pipe or a file it prints once and exits.
-    Exit code 1 if no stage answers, 3 if a stage has lost something.
+    Each stage that the configuration asks for has a row. Stays live on a terminal, until Ctrl-C. Into a pipe or a file
+    it prints once and exits.
+
+    Exit code 1 if a stage is missing, gone, silent, starved or late, or if a fan is not judged; 3 if a stage has lost
+    something.
 
     Example: fantwin status -c fantwin.toml --once
     """
@@ -50,22 +57,36 @@ def status(
     stop_on_signals(stop)
     with Bus(settings.bus, listens=False) as bus:
         watcher = SiteWatcher(bus, settings.site)
+        judged = JudgedFans(bus, settings.site, settings.trays)
         if once or json_output or not sys.stdout.isatty():
-            stop.wait(_LISTEN_S)
+            _listen(watcher, settings, judged, stop)
             watcher.ask_for_past_alarms()
             _require_a_stage(watcher, settings)
             if json_output:
-                typer.echo(json.dumps(as_json(watcher)))
+                typer.echo(json.dumps(as_json(watcher, settings, judged)))
             else:
-                Console().print(stage_table(watcher, settings))
+                Console().print(stage_table(watcher, settings, judged))
         else:
             watcher.ask_for_past_alarms()
             with Live(console=Console(), refresh_per_second=4) as live:
                 while not stop.wait(0.25):
-                    live.update(stage_table(watcher, settings))
+                    live.update(stage_table(watcher, settings, judged))
             _require_a_stage(watcher, settings)
+        states = site_states(watcher, process_list(settings))
+        if any(state.is_fault for state in states) or judged.unjudged(states):
+            raise typer.Exit(1)
         if any(watcher.losses().values()):
             raise typer.Exit(3)
+
+
+def _listen(watcher: SiteWatcher, config: Config, judged: JudgedFans, stop: threading.Event) -> None:
+    """Long enough for rates; longer as long as something seems to be missing, which may not be discovered yet."""
+    began_s = time.monotonic()
+    while not stop.wait(0.1) and time.monotonic() < began_s + _LISTEN_MAX_S:
+        states = site_states(watcher, process_list(config))
+        is_complete = not any(state.is_fault for state in states) and not judged.unjudged(states)
+        if is_complete and time.monotonic() > began_s + _LISTEN_S:
+            return
 
 
 def _require_a_stage(watcher: SiteWatcher, config: Config) -> None:
@@ -77,37 +98,38 @@ def _no_stage(config: Config) -> str:
     return f"no stage of site {config.site!r} answers at {config.bus.endpoint}"
 
 
-def stage_table(watcher: SiteWatcher, config: Config) -> Group:
-    """The page for people: a row for each stage, then problems, then alarms."""
+def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Group:
+    """The page for people: a row for each stage, then problems, then alarms, then the fans that are not judged."""
     table = Table("stage", "state", title="stages", title_justify="left", box=SIMPLE_HEAD)
     for column in ("in /s", "out /s", "p50 ms", "p99 ms", "lost"):
         table.add_column(column, justify="right")
-    views = watcher.stages()
-    problems = [] if any(view.alive for view in views) else [Text(_no_stage(config), style="red")]
-    for view in views:
-        health = view.health
-        name = health.stage if health.instance == "all" else f"{health.stage}/{health.instance}"
-        lost = Text(str(health.lost), style="red" if health.lost else "")
-        latency = (
-            (f"{health.latency_p50_ms:.1f}", f"{health.latency_p99_ms:.1f}") if health.latency_p99_ms else ("", "")
-        )
-        table.add_row(name, _state(view), f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}", *latency, lost)
-        if health.problem and view.alive:
-            problems.append(Text(f"{name}: {health.problem}", style="red"))
+    states = site_states(watcher, process_list(config))
+    is_anyone_there = any(state.view and state.view.alive for state in states)
+    problems = [] if is_anyone_there else [Text(_no_stage(config), style="red")]
+    for state in states:
+        style = "red" if state.is_fault else _STATE_STYLES.get(state.word, "yellow")
+        table.add_row(state.label, Text(state.word, style=style), *_figures(state.view))
+        if state.detail and (state.is_fault or state.word == Word.WAITING):
+            problems.append(Text(f"{state.label}: {state.detail}", style=style))
+        if state.view and state.view.health.problem and state.view.alive:
+            problems.append(Text(f"{state.label}: {state.view.health.problem}", style="red"))
     alarms = [_alarm_line(each) for each in watcher.current_alarms() if is_listed(each.newest)]
-    if not any(view.alive and view.health.stage == "scorer" for view in views):
-        alarms.append(Text("alarms unknown: no scorer is alive", style="red"))
-    return Group(*([table] if views else []), *problems, *(alarms or [Text("no alarms", style="green")]))
+    if not any(state.view and state.view.alive and state.view.health.stage == "scorer" for state in states):
+        unjudged = [Text("alarms unknown: no scorer is alive", style="red")]
+    else:
+        unjudged = [Text(each.line(), style="red") for each in judged.unjudged(states)]
+    no_alarms = [] if alarms or unjudged else [Text("no alarms", style="green")]
+    return Group(*([table] if watcher.stages() else []), *problems, *alarms, *unjudged, *no_alarms)
 
 
-def _state(view: StageView) -> Text:
-    if not view.alive:
-        stopped = view.health.status == StageStatus.STOPPED
-        return Text("stopped" if stopped else "gone", style="yellow" if stopped else "red")
-    if time.time_ns() - view.health.t_ns > _SILENT_AFTER_S * NS_PER_S:
-        return Text("silent", style="red")
-    styles = {StageStatus.STARTING: "yellow", StageStatus.OK: "green", StageStatus.DEGRADED: "red"}
-    return Text(view.health.status.name.lower(), style=styles.get(view.health.status, "yellow"))
+def _figures(view: StageView | None) -> list[str | Text]:
+    """Rates, latencies and losses; empty for a stage that was not heard."""
+    if view is None:
+        return []
+    health = view.health
+    latency = (f"{health.latency_p50_ms:.1f}", f"{health.latency_p99_ms:.1f}") if health.latency_p99_ms else ("", "")
+    lost = Text(str(health.lost), style="red" if health.lost else "")
+    return [f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}", *latency, lost]
 
 
 def _alarm_line(current: CurrentAlarm) -> Text:
@@ -124,24 +146,35 @@ def _alarm_line(current: CurrentAlarm) -> Text:
     return text.append(f"; {about}") if about else text
 
 
-def as_json(watcher: SiteWatcher) -> dict[str, object]:
+def as_json(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> dict[str, object]:
     """The same for machines (`--json`)."""
+    states = site_states(watcher, process_list(config))
     return {
-        "stages": [
-            {
-                "stage": view.health.stage,
-                "instance": view.health.instance,
-                "alive": view.alive,
-                "status": view.health.status.name.lower(),
-                "problem": view.health.problem,
-                "process_id": view.health.process_id,
-                "rate_in_hz": round(view.rate_in_hz, 1),
-                "rate_out_hz": round(view.rate_out_hz, 1),
-                "latency_ms": {"p50": view.health.latency_p50_ms, "p99": view.health.latency_p99_ms},
-                "lost": view.health.lost,
-                "counters": {counter.name: counter.value for counter in view.health.counters},
-            }
-            for view in watcher.stages()
-        ],
+        "stages": [_state_as_json(state) for state in states],
         "alarms": [current.as_json() for current in watcher.current_alarms()],
+        "not_judged": [each.as_json() for each in judged.unjudged(states)],
+    }
+
+
+def _state_as_json(state: StageState) -> dict[str, object]:
+    stage, _, tray = state.label.partition("/")
+    about = {"stage": stage, "instance": tray or "all", "state": str(state.word), "detail": state.detail}
+    view = state.view
+    if view is None:
+        return {**about, "alive": False}
+    health = view.health
+    ages_s = {"input_age_s": health.newest_input_t_ns, "output_age_s": health.newest_output_t_ns}
+    return {
+        **about,
+        "alive": view.alive,
+        "status": health.status.name.lower(),
+        "problem": health.problem,
+        "process_id": health.process_id,
+        "rate_in_hz": round(view.rate_in_hz, 1),
+        "rate_out_hz": round(view.rate_out_hz, 1),
+        "latency_ms": {"p50": health.latency_p50_ms, "p99": health.latency_p99_ms},
+        "waiting_for": [each.key for each in health.waiting_for],
+        **{name: round((health.t_ns - t_ns) / NS_PER_S, 3) if t_ns else None for name, t_ns in ages_s.items()},
+        "lost": health.lost,
+        "counters": {counter.name: counter.value for counter in health.counters},
     }

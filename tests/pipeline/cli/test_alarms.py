@@ -18,13 +18,25 @@ from pipeline.cli.watch.alarms import OperatorAction, alarm_lines
 from pipeline.config.loading import load_config
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Core, Stage
-from schemas.messages import Action, Alarm, Diagnosis, Header, Message, Request, Severity, StageStatus, Transition
+from schemas.messages import (
+    Action,
+    Alarm,
+    Diagnosis,
+    Header,
+    InvalidReason,
+    Message,
+    Request,
+    Severity,
+    StageStatus,
+    Transition,
+)
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from scoring.alarms.tray_conditions import TrayConditions
 from stages.scorer import ScorerConfig
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
+from tests.support.score_data import one_sample
 
 FANS = 8
 CAUSES = (
@@ -40,13 +52,15 @@ class AlarmOnRequestScorer(Core):
         self.conditions = TrayConditions(FANS, ConditionSettings(0, 0))
         self.ratio: dict[int, float] = {}
         self.deaf = False
+        self.not_judged: tuple[InvalidReason, ...] = ()
         self._now_ns = 0
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         self._now_ns = now_ns
         ratio = np.array([[self.ratio.get(fan, 0.0) for fan in range(FANS)]])
         result = self.conditions.update(np.array([now_ns]), 1, ratio, ratio >= 0)
-        return [self._alarm(c.fan, c.transition, c.alarm_state, "too slow") for c in result.events]
+        alarms = [self._alarm(c.fan, c.transition, c.alarm_state, "too slow") for c in result.events]
+        return [one_sample(FANS, *self.not_judged), *alarms]
 
     def step(self, item: Any) -> Sequence[Message]:
         if self.deaf or not isinstance(item, Request):
@@ -100,7 +114,7 @@ class Site:
             name="scorer",
             about="",
             reads=("prediction", "request"),
-            writes=("alarm",),
+            writes=("alarm", "score"),
             config=ScorerConfig,
             build=lambda _context: BuiltStage(self.core),
         )
@@ -170,6 +184,15 @@ def test_the_list_shows_current_alarms_and_with_all_also_those_that_are_over(sit
     first, cause, message = site.ask().splitlines()
     assert first.startswith(f"{TRAY} fan 3  ALARM    active, unacknowledged  since ")
     assert (cause.strip(), message.strip()) == ("drag_up 83 %, friction_up 10 %: drag +50 %", "too slow")
+
+
+def test_row_01_no_alarms_is_not_said_while_a_fan_is_not_judged(site):
+    site.core.not_judged = (InvalidReason.NO_SPEED, InvalidReason.NONE, InvalidReason.STALE)
+    done = fantwin("alarms", *site.words)
+    assert done.stdout == f"{TRAY}: fan 2 not judged: the line is silent\n{TRAY}: fan 0 not judged: no speed\n"
+    assert done.exit_code == 1
+    document = json.loads(fantwin("alarms", "--json", *site.words).stdout)
+    assert document["not_judged"][1] == {"tray": TRAY, "fans": [0], "why": "no speed"}
 
 
 def test_an_alarm_of_a_newer_scorer_is_listed_with_its_number():

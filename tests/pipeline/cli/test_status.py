@@ -21,6 +21,7 @@ from pipeline.bus.session import Bus
 from pipeline.cli.watch.status import as_json, stage_table
 from pipeline.config.loading import load_config
 from pipeline.config.models import BusConfig
+from pipeline.launch.judged_fans import JudgedFans
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from schemas.codec import encode, type_name
 from schemas.messages import (
@@ -30,6 +31,7 @@ from schemas.messages import (
     Header,
     Health,
     Input,
+    InvalidReason,
     Output,
     Severity,
     StageStatus,
@@ -37,7 +39,8 @@ from schemas.messages import (
 )
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from schemas.units import NS_PER_S
-from tests.support.running_chain import DEMO, SITE, TRAY, RunningCommand, eventually, fantwin
+from tests.support.running_chain import DEMO, FANS, SITE, TRAY, RunningCommand, eventually, fantwin
+from tests.support.score_data import one_sample
 
 HEALTH = Health(
     header=Header("scorer-all-1", 0, ""),
@@ -75,12 +78,25 @@ class Site:
         stage, outside = self.buses
         self.health = self._publisher(stage, health_key(SITE, "scorer", "all"), "health", HEALTH.header.producer)
         self.alarm = self._publisher(stage, tray_key(SITE, TRAY, "alarm"), "alarm", ALARM.header.producer)
+        self.score = self._publisher(stage, tray_key(SITE, TRAY, "score"), "score", HEALTH.header.producer)
         stage.declare_alive(alive_key(SITE, "scorer", "all"))
         self.outside = outside
 
     @staticmethod
     def _publisher(bus: Bus, key: str, topic: str, producer: str) -> Publisher:
         return bus.publisher(key, BY_NAME[topic], type_name(BY_NAME[topic].message), producer)
+
+    def judged(self, *reasons: InvalidReason) -> JudgedFans:
+        """What a listener knows after a score; reasons: why fans are not judged, beginning with fan 0."""
+        config = load_config(DEMO / "demo.toml")
+        listener = JudgedFans(self.outside, SITE, config.trays)
+
+        def heard() -> bool:
+            self.score.put(encode(one_sample(FANS, *reasons)))
+            return bool(listener._seen_s)
+
+        eventually(heard, "the listener hears it")
+        return listener
 
     def close(self) -> None:
         for bus in self.buses:
@@ -108,10 +124,23 @@ def view(site: Site, watcher: SiteWatcher, *healths: Health) -> StageView:
     return last
 
 
-def shown(watcher: SiteWatcher) -> str:
+ONLY_THE_SCORER = 'launcher.stages=["scorer"]'
+
+
+def shown(watcher: SiteWatcher, judged: JudgedFans, *settings: str) -> str:
     console = Console(width=120, file=io.StringIO(), record=True)
-    console.print(stage_table(watcher, load_config(DEMO / "demo.toml")))
+    console.print(stage_table(watcher, load_config(DEMO / "demo.toml", [ONLY_THE_SCORER, *settings]), judged))
     return console.export_text()
+
+
+def document(watcher: SiteWatcher, judged: JudgedFans) -> Any:
+    """What a machine reads."""
+    return json.loads(json.dumps(as_json(watcher, load_config(DEMO / "demo.toml", [ONLY_THE_SCORER]), judged)))
+
+
+def status_words(site: Site) -> list[object]:
+    endpoint = f"bus.endpoint='{site.buses[0]._config.endpoint}'"
+    return ["status", "-c", DEMO / "demo.toml", "--set", endpoint, "--set", ONLY_THE_SCORER]
 
 
 def later(health: Health, seconds: float, received: int, published: int) -> Health:
@@ -152,10 +181,10 @@ def test_json_has_stages_rates_losses_and_alarms(site):
     site.alarm.put(encode(ALARM))
     view(site, watcher, HEALTH)
     watcher.ask_for_past_alarms()
-    reported = json.loads(json.dumps(as_json(watcher)))
+    reported = document(watcher, site.judged())
     (stage,), (alarm,) = reported["stages"], reported["alarms"]
     assert (stage["stage"], stage["alive"], stage["status"], stage["process_id"]) == ("scorer", True, "ok", 4711)
-    assert stage["lost"] == 7
+    assert (stage["state"], stage["lost"], reported["not_judged"]) == ("ok", 7, [])
     assert stage["counters"] == {"lost_on_purpose": 4}
     assert stage["latency_ms"] == {"p50": 1.5, "p99": 2.5}
     assert (alarm["tray"], alarm["fan"], alarm["active"]) == (TRAY, 2, True)
@@ -179,28 +208,39 @@ def test_alarms_are_shown_with_their_states_and_probable_causes(site):
     watcher = SiteWatcher(site.outside, SITE)
     view(site, watcher, HEALTH)
     watcher.ask_for_past_alarms()
-    text = shown(watcher)
+    text = shown(watcher, site.judged())
     assert "fan 2: active, acknowledged, drag_up 87 %; more drag" in " ".join(text.split())
     assert "fan 3" not in text, "it is over, and everybody knows"
     assert "fan 4: never raised, shelved until it clears" in text
-    reported = {alarm["fan"]: alarm for alarm in as_json(watcher)["alarms"]}  # type: ignore[attr-defined]
+    reported = {alarm["fan"]: alarm for alarm in document(watcher, site.judged())["alarms"]}
     assert (reported[2]["acknowledged"], reported[2]["causes"][0]["cause"]) == (True, "drag_up")
     assert (reported[3]["retained"], reported[4]["presented"]) == (False, False)
 
 
-@pytest.mark.parametrize(
-    ("health", "word"),
-    [
-        (replace(HEALTH, problem="the line is silent"), "scorer: the line is silent"),
-        (HEALTH, "silent"),  # its last word is years old
-    ],
-)
-def test_problems_of_stages_are_shown(site, health, word):
+def test_problems_of_stages_are_shown(site):
     watcher = SiteWatcher(site.outside, SITE)
-    view(site, watcher, health)
-    text = shown(watcher)
-    assert word in text
+    view(site, watcher, replace(HEALTH, problem="the line is silent"))
+    text = shown(watcher, site.judged())
+    assert "scorer: the line is silent" in text
     assert "no alarms" in text
+
+
+def test_row_01_every_stage_that_the_configuration_asks_for_has_a_row(site):
+    watcher = SiteWatcher(site.outside, SITE)
+    view(site, watcher, HEALTH)
+    text = shown(watcher, site.judged(), 'launcher.stages=["resampler", "scorer"]')
+    assert re.search(r"resampler +missing", text)
+    assert "resampler: not seen on the bus" in text
+
+
+def test_row_01_no_alarms_is_not_said_while_a_fan_is_not_judged(site):
+    watcher = SiteWatcher(site.outside, SITE)
+    view(site, watcher, HEALTH)
+    judged = site.judged(InvalidReason.NO_SPEED)
+    text = shown(watcher, judged)
+    assert "tray1: fan 0 not judged: no speed" in text
+    assert "no alarms" not in text
+    assert document(watcher, judged)["not_judged"] == [{"tray": TRAY, "fans": [0], "why": "no speed"}]
 
 
 def test_a_stage_that_vanished_is_shown_as_gone(site):
@@ -208,7 +248,7 @@ def test_a_stage_that_vanished_is_shown_as_gone(site):
     view(site, watcher, HEALTH)
     site.buses[0].close()
     eventually(lambda: not watcher.stages()[0].alive, "the watcher sees it go")
-    text = shown(watcher)
+    text = shown(watcher, JudgedFans(site.outside, SITE, load_config(DEMO / "demo.toml").trays))
     assert "gone" in text
     assert "no stage of site 'demo' answers at tcp/" in text
     assert "alarms unknown: no scorer is alive" in text
@@ -217,7 +257,8 @@ def test_a_stage_that_vanished_is_shown_as_gone(site):
 
 def test_without_running_stages_no_table_is_shown_and_alarms_are_unknown(endpoint):
     with Bus(BusConfig(endpoint=endpoint)) as bus:
-        text = shown(SiteWatcher(bus, SITE))
+        trays = load_config(DEMO / "demo.toml").trays
+        text = shown(SiteWatcher(bus, SITE), JudgedFans(bus, SITE, trays))
     assert "no stage of site 'demo' answers at tcp/" in text
     assert "alarms unknown: no scorer is alive" in text
     assert "stages" not in text
@@ -246,13 +287,12 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Callable[[], str
 
 def test_on_a_terminal_the_view_stays_live_until_it_is_stopped(site, terminal):
     written, slave = terminal
-    live = RunningCommand(
-        ["status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{site.buses[0]._config.endpoint}'"], stdout=slave
-    )
+    live = RunningCommand(status_words(site), stdout=slave)
 
     def shows(lost: int) -> bool:
         now = time.time_ns()
         site.health.put(encode(replace(HEALTH, t_ns=now, lost=lost, header=Header("scorer-all-1", now, ""))))
+        site.score.put(encode(one_sample(FANS)))
         return f" {lost} " in written()
 
     try:
@@ -275,7 +315,7 @@ def test_on_a_terminal_a_live_view_that_found_no_stage_says_so_at_the_end(endpoi
 
 def test_into_a_pipe_a_running_site_is_shown_once_and_a_loss_is_exit_code_3(site):
     done: list = []
-    words = ("status", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{site.buses[0]._config.endpoint}'")
+    words = status_words(site)
     threads = [
         threading.Thread(target=lambda w=w: done.append(fantwin(*words, *w))) for w in (("--json",), ("--once",), ())
     ]
@@ -285,6 +325,7 @@ def test_into_a_pipe_a_running_site_is_shown_once_and_a_loss_is_exit_code_3(site
         if not any(thread.is_alive() for thread in threads):
             break
         site.health.put(encode(replace(HEALTH, t_ns=HEALTH.t_ns + number)))
+        site.score.put(encode(one_sample(FANS)))
         threads[0].join(0.05)
         threads[1].join(0.05)
     assert [answer.returncode for answer in done] == [3, 3, 3], done

@@ -1,0 +1,107 @@
+"""Which fans are being judged now. Only where all are does "no alarms" mean that none has a fault."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import TrayConfig
+from pipeline.config.registry import STAGES
+from pipeline.launch.site_state import StageState, Word
+from schemas.codec import CodecError, decode
+from schemas.messages import InvalidReason, Score
+from schemas.topics import tray_key
+from scoring.alarms.unscored_monitor import REASONS
+
+JUDGED_WITHIN_S = 5.0
+"""a fan is judged now if it had a valid score this recently"""
+_SAMPLED_S = 0.1  # scores of a tray are looked at this often: a fast line sends hundreds a second
+_LAST_JUDGE = "scorer"
+
+
+@dataclass(frozen=True)
+class Unjudged:
+    """Fans of one tray that are not judged, for one reason; no fans: none of the tray is."""
+
+    tray: str
+    fans: tuple[int, ...]
+    why: str
+
+    def line(self) -> str:
+        """For people."""
+        if not self.fans:
+            return f"{self.tray}: no fan is judged: {self.why}"
+        names = ", ".join(map(str, self.fans))
+        return f"{self.tray}: {'fan' if len(self.fans) == 1 else 'fans'} {names} not judged: {self.why}"
+
+    def as_json(self) -> dict[str, object]:
+        """For machines; no fans: all of the tray."""
+        return {"tray": self.tray, "fans": list(self.fans), "why": self.why}
+
+
+class JudgedFans:
+    """Listens to the scores of a site. Thread-safe."""
+
+    def __init__(
+        self, bus: Bus, site: str, trays: Sequence[TrayConfig], now_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._trays = trays
+        self._now_s = now_s
+        self._lock = threading.Lock()
+        self._seen_s: dict[str, float] = {}
+        """by tray: when a score was looked at"""
+        self._judged_s = {tray.name: np.full(tray.fans, -np.inf) for tray in trays}
+        self._reasons = {tray.name: np.zeros(tray.fans, np.uint8) for tray in trays}
+        for tray in trays:
+            bus.subscribe(tray_key(site, tray.name, "score"), lambda _key, data, name=tray.name: self.add(name, data))
+
+    def add(self, tray: str, payload: bytes) -> None:
+        """A score of a tray has arrived."""
+        now_s = self._now_s()
+        if now_s - self._seen_s.get(tray, -np.inf) < _SAMPLED_S:
+            return
+        try:
+            score = decode(Score, payload)
+        except CodecError:
+            return
+        judged_s = self._judged_s[tray]
+        if not isinstance(score, Score) or score.fans != len(judged_s) or not len(score.valid):
+            return
+        with self._lock:
+            self._seen_s[tray] = now_s
+            judged_s[score.valid.any(axis=0)] = now_s
+            self._reasons[tray] = score.invalid_reason[-1]
+
+    def unjudged(self, states: Sequence[StageState]) -> list[Unjudged]:
+        """The fans that are not judged now, and why. states: of the site's stages; one may be the reason."""
+        oldest_s = self._now_s() - JUDGED_WITHIN_S
+        found: list[Unjudged] = []
+        with self._lock:
+            for tray in self._trays:
+                fans = np.flatnonzero(self._judged_s[tray.name] < oldest_s)
+                if len(fans) and self._seen_s.get(tray.name, -np.inf) < oldest_s:
+                    found.append(Unjudged(tray.name, (), _why_no_scores(tray.name, states)))
+                    continue
+                reasons = self._reasons[tray.name][fans]
+                for reason in np.unique(reasons).tolist():
+                    of_reason = tuple(fans[reasons == reason].tolist())
+                    why = REASONS.get(InvalidReason(reason), InvalidReason(reason).words)
+                    found.append(Unjudged(tray.name, () if len(of_reason) == tray.fans else of_reason, why))
+        return found
+
+
+def _why_no_scores(tray: str, states: Sequence[StageState]) -> str:
+    """The first stage on the way from the device to the scores that does not work."""
+    on_the_way = list(STAGES)[: list(STAGES).index(_LAST_JUDGE) + 1]
+    for state in states:
+        stage, _, of_tray = state.label.partition("/")
+        if state.is_expected and stage in on_the_way and of_tray in ("", tray):
+            problem = state.view.health.problem if state.view and state.word == Word.DEGRADED else ""
+            if state.is_fault or state.word == Word.WAITING or problem:
+                return f"{state.label}: {problem or state.detail}"
+    return "no score arrives"

@@ -1,0 +1,71 @@
+"""What `fantwin up` says of a running site: stages that lose their connection or their input, problems and alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from pipeline.launch.event_log import without_figures
+from pipeline.launch.site_state import OFF_THE_BUS, StageState, Word
+from scoring.alarms.current_alarms import CurrentAlarm
+
+_ALL = "all stages"
+_UNHEARD = OFF_THE_BUS | {Word.SILENT}
+
+
+@dataclass(frozen=True)
+class RunningProcess:
+    """The process of a stage, as its launcher knows it. is_at_work: it has gone round its loop a moment ago."""
+
+    process_id: int
+    is_at_work: bool
+
+
+class SiteReport:
+    """Says each change once."""
+
+    def __init__(self, endpoint: str, say: Callable[[str], None]) -> None:
+        self._endpoint = endpoint
+        self._say = say
+        self._said: dict[str, str] = {}
+        """by subject: what was said of it last, without its figures; empty: that all is well"""
+
+    def stages(self, states: Sequence[StageState], processes: Mapping[str, RunningProcess]) -> None:
+        """Say how the stages have changed. processes: those that run and have been on the bus, by label; what becomes
+        of the others is said when they end and start."""
+        running = [(state, processes[state.label]) for state in states if state.label in processes]
+        off = [state.label for state, process in running if state.word in _UNHEARD and process.is_at_work]
+        all_off = len(running) > 1 and len(off) == len(running)
+        lost = f"the connection to the bus is lost: they work, but none of them is heard at {self._endpoint}"
+        self._change(_ALL, lost if all_off else "", "heard on the bus again")
+        for state, process in running:
+            if not (all_off and state.label in off):
+                self._change(state.label, self._fault(state, process), "at work again")
+        for state in states:
+            if state.view and state.view.alive:
+                subject = f"{state.label}: problem"
+                self._change(subject, state.view.health.problem, "the problem is resolved", name=state.label)
+
+    def _fault(self, state: StageState, process: RunningProcess) -> str:
+        """What is wrong with a stage whose process runs; empty if nothing is."""
+        if state.word not in _UNHEARD:
+            return f"{state.word}: {state.detail}" if state.is_fault else ""
+        if process.is_at_work:
+            where = f"process {process.process_id} works, but is not heard at {self._endpoint}"
+            return f"the connection to the bus is lost: {where}"
+        return "silent: it hangs or is blocked"
+
+    def alarms(self, alarms: Iterable[CurrentAlarm]) -> None:
+        """Say how the alarms have changed."""
+        for current in alarms:
+            alarm, line = current.newest, current.line()
+            subject = f"{alarm.header.tray} fan {alarm.fan}"
+            if line != self._said.get(subject):
+                self._said[subject] = line
+                self._say(line)
+
+    def _change(self, subject: str, fault: str, when_over: str, name: str = "") -> None:
+        meaning = without_figures(fault)
+        if meaning != self._said.get(subject, ""):
+            self._said[subject] = meaning
+            self._say(f"{name or subject}: {fault or when_over}")

@@ -1,0 +1,153 @@
+"""The state of every stage that a site should have: a stage that is missing, silent, starved or late is a state too.
+
+What a stage says of itself is not enough: a stage that hangs says nothing, and one that receives nothing finds nothing
+wrong. So each stage is also judged by when it was heard, by what its producers say they have sent, and by the age of
+what it sends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from pipeline.config.registry import STAGES
+from pipeline.launch.loss_accounting import label
+from pipeline.launch.processes import StageProcess
+from pipeline.launch.site_watcher import SiteWatcher, StageView
+from pipeline.launch.watchdog import START_LIMIT_S
+from pipeline.runtime.clock import REPLAY
+from schemas.messages import Health, StageStatus
+from schemas.streams import input_streams, output_streams
+from schemas.topics import key_in_words
+from schemas.units import NS_PER_S
+
+SILENT_AFTER_S = 5.0
+"""without a health, which every stage sends once a second"""
+STARVED_AFTER_S = 5.0
+LATE_MS = 5000.0
+
+
+class Word(StrEnum):
+    """The state of a stage in one word."""
+
+    OK = "ok"
+    STARTING = "starting"
+    DEGRADED = "degraded"
+    WAITING = "waiting"
+    LATE = "late"
+    STARVED = "starved"
+    SILENT = "silent"
+    STOPPED = "stopped"
+    GONE = "gone"
+    MISSING = "missing"
+
+
+OFF_THE_BUS = {Word.GONE, Word.MISSING}
+AT_WORK = {Word.OK, Word.STARTING, Word.DEGRADED, Word.WAITING}
+"""in any other state a stage does not do what the configuration asks for"""
+
+
+@dataclass(frozen=True)
+class StageState:
+    """The state of one stage.
+
+    Attributes:
+        label: its name for people.
+        word: the state in one word.
+        detail: what is wrong, in one line; empty if nothing is, or if the stage says it itself as its problem.
+        view: its last session; None if it has not been heard.
+        is_expected: whether the configuration asks for it.
+    """
+
+    label: str
+    word: Word
+    detail: str
+    view: StageView | None
+    is_expected: bool
+
+    @property
+    def is_fault(self) -> bool:
+        """Whether the site lacks a stage that the configuration asks for, or its work."""
+        return self.is_expected and self.word not in AT_WORK
+
+
+def site_states(watcher: SiteWatcher, expected: Iterable[StageProcess]) -> list[StageState]:
+    """The states as a watcher sees them now."""
+    return stage_states(watcher.stages(), watcher.alive(), expected)
+
+
+def stage_states(
+    views: Sequence[StageView], alive: Iterable[tuple[str, str]], expected: Iterable[StageProcess]
+) -> list[StageState]:
+    """A state for each stage that is expected, in the order of the data flow, and for each other that was heard.
+
+    views: the latest session of each stage; alive: stage and instance of the sessions that are on the bus now.
+    """
+    alive = set(alive)
+    by_name = {(view.health.stage, view.health.instance): view for view in views}
+    is_replayed = (REPLAY, "all") in alive
+    states: list[StageState] = []
+    for row in expected:
+        name = (row.stage, row.instance)
+        view = by_name.pop(name, None)
+        if view is not None:
+            states.append(_state_of(view, views, is_expected=True))
+        elif name in alive:
+            why = "alive on the bus, but sends no health: it starts, hangs or is blocked"
+            states.append(StageState(row.label, Word.SILENT, why, None, is_expected=True))
+        elif not (is_replayed and STAGES[row.stage].scope == "tray"):  # the replay plays what it would send
+            states.append(StageState(row.label, Word.MISSING, "not seen on the bus", None, is_expected=True))
+    return states + [_state_of(view, views, is_expected=False) for _, view in sorted(by_name.items())]
+
+
+def _state_of(view: StageView, views: Sequence[StageView], *, is_expected: bool) -> StageState:
+    word, detail = _judged(view, views)
+    return StageState(label(view.health), word, detail, view, is_expected)
+
+
+def _judged(view: StageView, views: Sequence[StageView]) -> tuple[Word, str]:
+    health = view.health
+    is_starting = health.status == StageStatus.STARTING  # it is alive, and sends more, when it has caught up
+    if health.status == StageStatus.STOPPED:
+        return Word.STOPPED, "stopped in order"
+    if not view.alive and not is_starting:
+        return Word.GONE, f"left the bus without stopping; last heard {view.age_s:.0f} s ago"
+    if view.age_s > (START_LIMIT_S if is_starting else SILENT_AFTER_S):
+        return Word.SILENT, f"no health for {view.age_s:.0f} s: it hangs or is blocked"
+    return _state_of_work(health, views)
+
+
+def _state_of_work(health: Health, views: Sequence[StageView]) -> tuple[Word, str]:
+    """The state of a stage that is heard."""
+    if starving := _starving(health, views):
+        return Word.STARVED, starving
+    if health.latency_p50_ms > LATE_MS:
+        return Word.LATE, f"its outputs are {health.latency_p50_ms / 1e3:.0f} s old when they are sent"
+    if health.waiting_for and health.status == StageStatus.OK:
+        return Word.WAITING, waiting_text(health)
+    words = {StageStatus.STARTING: Word.STARTING, StageStatus.OK: Word.OK, StageStatus.DEGRADED: Word.DEGRADED}
+    return words.get(health.status, Word.DEGRADED), ""
+
+
+def waiting_text(health: Health) -> str:
+    """Which inputs a stage waits for, and for how long."""
+    waits = [(health.t_ns - each.since_t_ns, key_in_words(each.key)) for each in health.waiting_for]
+    return f"waits for {', '.join(name for _, name in waits)}, for {min(waits)[0] / NS_PER_S:.0f} s" if waits else ""
+
+
+def _starving(health: Health, views: Sequence[StageView]) -> str:
+    """Which input a stage does not receive although its producer has sent it for a while; empty if none."""
+    received = {stream: state.next_sequence or 0 for stream, state in input_streams(health).items()}
+    awaited = {each.key: (health.t_ns - each.since_t_ns) / NS_PER_S for each in health.waiting_for}
+    for view in views:
+        before = view.previous
+        if before is None or not view.alive:
+            continue
+        for stream, count in output_streams(before).items():  # sent a second ago or earlier
+            seconds = awaited.get(stream[0], 0.0)
+            if seconds > STARVED_AFTER_S and count > received.get(stream, 0):
+                return (
+                    f"nothing of {key_in_words(stream[0])} for {seconds:.0f} s, although {label(view.health)} sends it"
+                )
+    return ""

@@ -1,0 +1,86 @@
+"""Which fans are judged now, and why others are not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from pipeline.config.models import TrayConfig
+from pipeline.launch.judged_fans import JUDGED_WITHIN_S, JudgedFans
+from pipeline.launch.site_state import StageState, Word
+from schemas.codec import encode
+from schemas.messages import InvalidReason
+from tests.pipeline.launch.test_site_watcher import StubBus
+from tests.support.score_data import one_sample
+
+FANS = 4
+TRAYS = [TrayConfig(name="a", fans=FANS), TrayConfig(name="b", fans=FANS)]
+
+
+class Listener:
+    """Fans of two trays, and a clock that the test sets."""
+
+    def __init__(self) -> None:
+        bus: Any = StubBus()
+        self.now_s = 100.0
+        self.judged = JudgedFans(bus, "s", TRAYS, lambda: self.now_s)
+
+    def score(self, tray: str, *reasons: InvalidReason) -> None:
+        self.now_s += 1.0
+        self.judged.add(tray, encode(one_sample(FANS, *reasons)))
+
+    def lines(self, *states: StageState) -> list[str]:
+        return [each.line() for each in self.judged.unjudged(states)]
+
+
+@pytest.fixture
+def listener() -> Listener:
+    return Listener()
+
+
+def state(label: str, word: Word, detail: str = "") -> StageState:
+    return StageState(label, word, detail, None, is_expected=True)
+
+
+def test_row_01_every_fan_with_a_valid_score_is_judged(listener):
+    listener.score("a")
+    listener.score("b")
+    assert listener.lines() == []
+
+
+def test_row_01_fans_are_named_with_the_reason(listener):
+    listener.score("a", InvalidReason.STALE, InvalidReason.NONE, InvalidReason.STALE, InvalidReason.NO_SPEED)
+    listener.score("b", *[InvalidReason.WARMING_UP] * FANS)
+    assert listener.lines() == [
+        "a: fans 0, 2 not judged: the line is silent",
+        "a: fan 3 not judged: no speed",
+        "b: no fan is judged: the twin is warming up",
+    ]
+
+
+def test_a_fan_with_one_invalid_sample_is_still_judged(listener):
+    listener.score("a")
+    listener.score("b")
+    listener.score("a", InvalidReason.GAP)
+    assert listener.lines() == []
+
+
+def test_row_01_without_scores_the_first_stage_that_does_not_work_is_the_reason(listener):
+    listener.score("a")
+    listener.score("b")
+    listener.now_s += JUDGED_WITHIN_S
+    listener.score("b")
+    twin = state("twin_integrator", Word.SILENT, "no health for 6 s: it hangs or is blocked")
+    others = [state("acquisition/a", Word.OK), state("acquisition/b", Word.SILENT, "of another tray")]
+    after = [state("scorer", Word.STARVED, "later"), state("recorder", Word.SILENT, "not on the way")]
+    assert listener.lines(*others, twin, *after) == [
+        "a: no fan is judged: twin_integrator: no health for 6 s: it hangs or is blocked"
+    ]
+    assert listener.lines(after[1]) == ["a: no fan is judged: no score arrives"]
+
+
+@pytest.mark.parametrize("payload", [b"\xff", b"", encode(one_sample(FANS + 1))])
+def test_bytes_that_are_no_score_of_the_tray_judge_nothing(listener, payload):
+    listener.judged.add("a", payload)
+    assert len(listener.lines()) == 2

@@ -1,0 +1,76 @@
+"""What `fantwin up` says of a running site."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from pipeline.launch.site_report import RunningProcess, SiteReport
+from pipeline.launch.site_state import StageState, Word
+from tests.pipeline.launch.test_site_state import CONSUMER, view
+
+IDS = {"resampler": RunningProcess(11, is_at_work=True), "scorer": RunningProcess(12, is_at_work=True)}
+
+
+@pytest.fixture
+def lines() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def report(lines: list[str]) -> SiteReport:
+    return SiteReport("tcp/x:1", lines.append)
+
+
+def state(label: str, word: Word = Word.OK, detail: str = "") -> StageState:
+    return StageState(label, word, detail, None, is_expected=True)
+
+
+def test_row_16_a_lost_connection_is_said_once_and_that_it_is_back(report, lines):
+    for seconds in range(3):
+        report.stages([state("resampler", Word.GONE, f"last heard {seconds} s ago"), state("scorer")], IDS)
+    report.stages([state("resampler"), state("scorer")], IDS)
+    assert lines == [
+        "resampler: the connection to the bus is lost: process 11 works, but is not heard at tcp/x:1",
+        "resampler: at work again",
+    ]
+
+
+def test_row_16_a_router_that_is_gone_is_one_line(report, lines):
+    report.stages([state("resampler", Word.GONE), state("scorer", Word.MISSING)], IDS)
+    report.stages([state("resampler"), state("scorer")], IDS)
+    assert lines == [
+        "all stages: the connection to the bus is lost: they work, but none of them is heard at tcp/x:1",
+        "all stages: heard on the bus again",
+    ]
+
+
+def test_row_01_a_stage_that_hangs_is_said_once_and_that_it_works_again(report, lines):
+    hangs = {"resampler": RunningProcess(11, is_at_work=False), "scorer": IDS["scorer"]}
+    for word in (Word.SILENT, Word.SILENT, Word.GONE, Word.MISSING):
+        report.stages([state("resampler", word), state("scorer")], hangs)
+    report.stages([state("resampler"), state("scorer")], IDS)
+    assert lines == ["resampler: silent: it hangs or is blocked", "resampler: at work again"]
+
+
+def test_row_01_a_stage_that_starves_is_said_until_it_works_again(report, lines):
+    for word, detail in ((Word.STARVED, "nothing for 6 s"), (Word.STARVED, "nothing for 7 s"), (Word.OK, "")):
+        report.stages([state("resampler", word, detail), state("scorer")], IDS)
+    assert lines == ["resampler: starved: nothing for 6 s", "resampler: at work again"]
+
+
+def test_of_a_stage_whose_process_does_not_run_nothing_more_is_said(report, lines):
+    report.stages([state("resampler", Word.GONE), state("scorer")], {"scorer": IDS["scorer"]})
+    assert lines == []
+
+
+def test_row_18_a_problem_whose_figures_change_is_said_once(report, lines):
+    for free in ("12.3", "11.9", "11.5"):
+        health = replace(CONSUMER, problem=f"{free} MB are free on the disk, but 100.0 MB are required")
+        report.stages([replace(state("recorder"), view=view(health))], {})
+    report.stages([replace(state("recorder"), view=view(CONSUMER))], {})
+    assert lines == [
+        "recorder: 12.3 MB are free on the disk, but 100.0 MB are required",
+        "recorder: the problem is resolved",
+    ]
