@@ -46,7 +46,10 @@ class Watchdog:
         self._heard.pop(name, None)
 
     def hung(self, now_s: float) -> tuple[str, float] | None:
-        """The stage that hangs, and for how many seconds; None if none does. To be called all the time."""
+        """The stage that hangs, and for how many seconds; None if none does. To be called all the time.
+
+        It is forgotten: it is up to the caller to kill it.
+        """
         pause_s = 0.0 if self._checked_s is None else now_s - self._checked_s
         self._checked_s = now_s
         if pause_s > _OWN_PAUSE_S:
@@ -56,6 +59,7 @@ class Watchdog:
         if not silent:
             return None
         name = max(silent, key=lambda each: silent[each])
+        del self._heard[name]
         for heard in self._heard.values():
             heard.at_s = now_s
         return name, silent[name]

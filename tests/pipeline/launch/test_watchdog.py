@@ -57,7 +57,7 @@ def test_row_01_a_stage_blocked_by_one_that_hangs_is_not_named_in_its_place():
     hung = site.hung_within(20.0)
     assert hung
     assert hung[0] == "scorer"
-    site.watchdog.ended("scorer")
+    site.names = ("acquisition", "resampler")
     assert site.hung_within(9.0) is None, "the others are given a new period"
     site.hangs.clear()
     assert site.hung_within(20.0) is None
