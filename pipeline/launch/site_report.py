@@ -35,7 +35,8 @@ class SiteReport:
         of the others is said when they end and start."""
         running = [(state, processes[state.label]) for state in states if state.label in processes]
         off = [state.label for state, process in running if state.word in _UNHEARD and process.is_at_work]
-        all_off = len(running) > 1 and len(off) == len(running)
+        is_of_all = len(running) > 1 and len(off) == len(running)
+        all_off = is_of_all or bool(off and self._said.get(_ALL))  # they come back one after the other
         lost = f"the connection to the bus is lost: they work, but none of them is heard at {self._endpoint}"
         self._change(_ALL, lost if all_off else "", "heard on the bus again")
         for state, process in running:

@@ -25,9 +25,9 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
 
     Example: fantwin up -c fantwin.toml
     """
-    settings = load_config(config, overrides or ())
     stop = threading.Event()
-    stop_on_signals(stop)
+    stop_on_signals(stop)  # first: what follows takes a second or two
+    settings = load_config(config, overrides or ())
     log = EventLog(sys.stderr.fileno())
     try:
         outcome = Launcher(settings, overrides or (), log.say).run(stop)

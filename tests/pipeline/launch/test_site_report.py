@@ -39,6 +39,7 @@ def test_row_16_a_lost_connection_is_said_once_and_that_it_is_back(report, lines
 
 def test_row_16_a_router_that_is_gone_is_one_line(report, lines):
     report.stages([state("resampler", Word.GONE), state("scorer", Word.MISSING)], IDS)
+    report.stages([state("resampler"), state("scorer", Word.GONE)], IDS)  # they come back one after the other
     report.stages([state("resampler"), state("scorer")], IDS)
     assert lines == [
         "all stages: the connection to the bus is lost: they work, but none of them is heard at tcp/x:1",
