@@ -87,7 +87,7 @@ class Runner:
         )
         """by the tray that a core serves; an empty name: all"""
         self._has_source = any(parts.source for parts in self._parts.values())
-        self._sources = Sources()
+        self._sources = Sources(self._inbox)
         self._clock = StageClock()
         self._sessions = Sessions()
         self._session = Session.of_this_process(stage.name, self._instance, started_t_ns, self.producer)
@@ -122,8 +122,6 @@ class Runner:
         self._active_core: str | None = None
         """the core whose method is being called, or has raised"""
         self._producers_end_limit_s = 0.0
-        self._count_lock = threading.Lock()
-        """sources count from their own threads"""
 
     def run(self) -> Health:
         """Run to the end and return the last health, which is published whatever happens.
@@ -187,8 +185,7 @@ class Runner:
             self._loop(lambda: not self._recovery.is_catching_up, StageStatus.STARTING)
         self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
         for name, parts in self._parts.items():
-            if parts.source:
-                self._sources.start(parts.source, lambda item, name=name: self._deliver(FromSource(name, item)))
+            self._sources.start(name, parts)
 
     def _on_bus(self, key: str, payload: bytes) -> None:
         self._inbox.put(FromBus(key, payload, time.time_ns()))
@@ -242,20 +239,12 @@ class Runner:
                 left = None if left is None else left - 1
 
     def _discard_waiting(self) -> None:
-        self._inbox.close()  # from now on `_deliver` counts what it refuses
+        self._inbox.close()  # from now on it takes nothing, and the sources count what they deliver
         while (item := self._inbox.get(0)) is not None:
             if isinstance(item, FromSource):
-                self._count_lost(item)
+                self._sources.discard(item)
             elif isinstance(item, FromBus) and item.key in self._read_keys and not self.stage.may_drop:
                 self._counts["lost_at_stop"] += 1
-
-    def _deliver(self, item: FromSource) -> None:
-        if not self._inbox.put(item):
-            self._count_lost(item)
-
-    def _count_lost(self, item: FromSource) -> None:
-        with self._count_lock:
-            self._counts["lost_at_stop"] += self._parts[item.core].core.samples_in(item.item)
 
     def _close_core(self, name: str, parts: BuiltStage, failed: str | None) -> None:
         what = name or "the core"
@@ -380,7 +369,7 @@ class Runner:
         self._recovery.catch_up(keys)
 
     def _counters(self) -> Counter[str]:
-        counters = self._counts + Counter(self._tracker.counters())
+        counters = self._counts + Counter(self._tracker.counters()) + Counter(lost_at_stop=self._sources.lost)
         if self._bus.refused_too_large:
             counters["refused_too_large"] = self._bus.refused_too_large
         for parts in self._parts.values():

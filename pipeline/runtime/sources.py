@@ -2,24 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
 from typing import Any
 
 from pipeline.runtime.ending import Step
-from pipeline.runtime.stage import Source
+from pipeline.runtime.inbox import FromSource, Inbox
+from pipeline.runtime.stage import BuiltStage, Core, Source
 
 
 class Sources:
-    """Those that have been started."""
+    """Those that have been started. What they deliver goes to the inbox, or is counted as lost."""
 
-    def __init__(self) -> None:
+    def __init__(self, inbox: Inbox) -> None:
+        self.lost = 0
+        """samples that were delivered and for which there was no time any more"""
+        self._inbox = inbox
         self._started: list[Source] = []
+        self._cores: dict[str, Core] = {}
+        self._lock = threading.Lock()
         self._stopping: Step | None = None
 
-    def start(self, source: Source, deliver: Callable[[Any], None]) -> None:
-        """Start one."""
-        self._started.append(source)
-        source.start(deliver)
+    def start(self, name: str, parts: BuiltStage) -> None:
+        """Start the source of the core called `name`, if it has one."""
+        if parts.source is None:
+            return
+
+        def deliver(item: Any) -> None:
+            if not self._inbox.put(FromSource(name, item)):
+                self.discard(FromSource(name, item))
+
+        self._cores[name] = parts.core
+        self._started.append(parts.source)
+        parts.source.start(deliver)
+
+    def discard(self, item: FromSource) -> None:
+        """Count what is not processed any more."""
+        with self._lock:
+            self.lost += self._cores[item.core].samples_in(item.item)
 
     def stop(self) -> Step:
         """Stop all, each of which delivers the rest of what it has meanwhile. Further calls return the same step."""
