@@ -117,6 +117,9 @@ class Stages:
 
     def kill(self, stage: str) -> None:
         """kill -9: the state of the core is lost; its successor takes the messages still kept again, topic by topic."""
+        store = getattr(self._core(stage), "_snapshot_store", None)
+        if store:
+            store.unlock()  # as the system does for a killed process
         self.stages[stage] = self._begin(stage)
         feeding = self.source if stage == "resampler" else self.stages[CHAIN[CHAIN.index(stage) - 1]]
         kept = (*feeding.kept, *self.operator.kept)

@@ -43,7 +43,7 @@ def run_offline(
     json_output: bool,
 ) -> None:
     """Score, print, and exit with 0: success, 1: failed, 3: data were lost. With `verify`: 0 equal, 1 different,
-    2 not comparable.
+    2 nothing is comparable, 3 equal as far as it is comparable.
 
     Raises:
         UserError: it failed.
@@ -72,7 +72,8 @@ def run_offline(
     if problems and not verify and not any(tray.scored for tray in trays):
         raise UserError(f"{files[0]}: {'; '.join(problems)}")
     if verify:
-        raise typer.Exit(0 if result["verified"]["equal"] else EXIT_DIFFERS)
+        found = result["verified"]
+        raise typer.Exit(EXIT_DIFFERS if not found["equal"] else EXIT_LOST if found["not_comparable"] else 0)
     if result["lost"] or result["damage"]:
         raise typer.Exit(EXIT_LOST)
 
@@ -117,6 +118,9 @@ def _result(replay_input: ReplayInput, trays: Sequence[RescoredTray], took_s: fl
             "alarms_equal": sum(one.alarms_equal for one in compared),
             "alarms_different": sum(one.alarms_different for one in compared),
             "alarms_not_recorded": sum(one.alarms_not_recorded for one in compared),
+            "samples_not_comparable": sum(one.not_comparable for one in compared),
+            "alarms_not_comparable": sum(one.alarms_not_comparable for one in compared),
+            "not_comparable": [reason for one in compared for reason in one.reasons],
             "differences": [line for one in compared for line in one.named],
         }
     elif not replay_input.is_as_recorded and any(tray.recorded_alarms for tray in trays):
@@ -180,6 +184,13 @@ def _print_verified(found: dict[str, Any], console: Console) -> None:
         )
         for line in found["differences"]:
             console.print(f"  {line}", markup=False)
+    if found["not_comparable"]:
+        console.print(
+            f"[bold yellow]not comparable:[/bold yellow] {found['samples_not_comparable']} samples and "
+            f"{found['alarms_not_comparable']} alarms:"
+        )
+        for reason in found["not_comparable"]:
+            console.print(f"  {reason}", markup=False)
     if found["samples_not_recorded"]:
         console.print(f"{found['samples_not_recorded']} replayed samples are not in the recording")
 

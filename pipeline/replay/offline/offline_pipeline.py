@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.replay.offline.plan import Session, TrayPlan
+from pipeline.replay.offline.plan import BEGINNING, RAW_MISSING, Limit, Session, TrayPlan, limit_through
 from pipeline.replay.offline.raw_blocks import BLOCK_SIZE, RawBlocks
 from pipeline.replay.offline.sample_stream import SampleStream
 from pipeline.replay.stage_chain import StageChain
 from pipeline.runtime.stage import Context, Core, Stage
 from schemas.blocks import cut
 from schemas.messages import Message, Prediction, ScorerSnapshot
+from schemas.messages import newest_t_ns as message_t_ns
 from schemas.topics import BY_NAME
 
 
@@ -52,6 +53,8 @@ class OfflinePipeline:
         self._observe = observe
         self.counts: Counter[str] = Counter()
         """counters of all cores, of all sessions"""
+        self._limited: set[str] = set()
+        """sessions of the first stage that consumed raw messages which the recording lacks"""
         self._last = stages.stages[-1]
         streams: dict[str, SampleStream[Any]] = {}
         for stage, output in zip(stages.stages[:-1], stages.outputs, strict=False):
@@ -65,6 +68,13 @@ class OfflinePipeline:
     def raw_missing(self) -> int:
         """Raw messages that the recording lacks, up to where the pipeline has run."""
         return self._raw.missing
+
+    def limit_of(self, producer: str) -> Limit | None:
+        """Up to where the outputs of a session of the last stage can be reproduced; exact for what has been run."""
+        limits: dict[str, Limit | None] = {}
+        for sessions in self._plan.sessions.values():
+            limits = {session.producer: limit_through(session, limits) for session in sessions}
+        return limits.get(producer)
 
     def run(self) -> Iterator[ReplayedMessage]:
         """What the last stage makes, in order.
@@ -101,10 +111,13 @@ class OfflinePipeline:
         """The blocks of a stage's main output in one session. inputs: by producer; none for the first stage."""
         core: Any = self._core(stage)
         kind = BY_NAME[output].message
+        newest_t_ns = BEGINNING
 
         def main_output(messages: Iterable[Message]) -> Iterator[Message]:
+            nonlocal newest_t_ns
             for message in messages:
                 if isinstance(message, kind):
+                    newest_t_ns = max(newest_t_ns, message_t_ns(message))
                     yield message
                 else:
                     self._observe(message)
@@ -114,10 +127,24 @@ class OfflinePipeline:
                 yield from main_output(core.step(block))
         else:
             for block, until_t_ns in self._raw.of(session):
+                if self._begins_to_lack(session):
+                    yield from main_output(core.publish_until(BEGINNING))  # what it has made already
+                    self._limit_by_gap(session, newest_t_ns)
                 yield from main_output(core.step(block))
                 if until_t_ns is not None:
                     yield from main_output(core.publish_until(until_t_ns))
+            if self._begins_to_lack(session):
+                yield from main_output(core.publish_until(BEGINNING))
+                self._limit_by_gap(session, newest_t_ns)
         yield from main_output(self._close(core))
+
+    def _begins_to_lack(self, session: Session) -> bool:
+        """Whether the recording lacks raw messages that this session of the first stage consumed next."""
+        return session.producer in self._raw.has_gap and session.producer not in self._limited
+
+    def _limit_by_gap(self, session: Session, newest_t_ns: int) -> None:
+        self._limited.add(session.producer)
+        session.set_limit(newest_t_ns, f"the recording lacks {RAW_MISSING} raw messages that were scored")
 
     def _run_last(self, core: Core, session: Session) -> Iterator[Message]:
         """What the last stage makes of its samples, and of the requests between them."""

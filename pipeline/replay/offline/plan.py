@@ -8,6 +8,7 @@ sequence number; samples of grids, predictions and scores by their time.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from pipeline.replay.stage_chain import StageChain
 from schemas import fan_pb2
@@ -17,6 +18,17 @@ from schemas.fast_decode import decode_header
 from schemas.messages import Alarm, Grid, Message, Prediction, Request, Score, ScorerSnapshot
 
 BEGINNING = -(2**63)
+RAW_MISSING = "{raw_missing}"
+"""in a reason: their number, which is known only at the end"""
+
+
+class Limit(NamedTuple):
+    """Up to where the outputs of a session can be reproduced."""
+
+    t_ns: int
+    """time of the last such sample; BEGINNING: none"""
+    reason: str
+    """why not those after it"""
 
 
 @dataclass
@@ -40,13 +52,15 @@ class Session:
     """One run of a stage's process, and what it consumed."""
 
     producer: str
-    spans: list[Span] = field(default_factory=list)
     began_before: bool = False
     """it had consumed input before its first recorded output"""
+    lacks_outputs: bool = False
+    """it consumes samples, and had made output before its first recorded output"""
+    spans: list[Span] = field(default_factory=list)
     timer_outputs: dict[tuple[str, int], int] = field(default_factory=dict)
     """of the first stage: after which raw message (producer, sequence) a timer made it emit samples, and until when"""
-    is_guessed: bool = False
-    """some raw messages never reached it, and the recording does not say which"""
+    limit: Limit | None = None
+    """None: the recording holds all that the session consumed, as far as is known"""
     snapshot: ScorerSnapshot | None = None
     """what it was restored from"""
     requests: list[tuple[int, Request]] = field(default_factory=list)
@@ -57,10 +71,10 @@ class Session:
     position: fan_pb2.InputPosition | None = None
     """of its newest recorded output"""
 
-    @property
-    def can_be_repeated(self) -> bool:
-        """Whether the recording holds the state that it began with."""
-        return self.snapshot is not None or not self.began_before
+    def set_limit(self, t_ns: int, reason: str) -> None:
+        """Its outputs after `t_ns` cannot be reproduced. The earliest limit holds."""
+        if self.limit is None or t_ns < self.limit.t_ns:
+            self.limit = Limit(t_ns, reason)
 
 
 @dataclass
@@ -91,12 +105,24 @@ class TrayPlan:
 def undisturbed_plan(chain: StageChain) -> TrayPlan:
     """One session of each stage, which consumes everything there is."""
     first, *others = (stage.name for stage in chain.stages)
-    raw = Session("", [Span("", 0, None)])
-    return TrayPlan({first: [raw]} | {name: [Session("", [Span("", BEGINNING, None)])] for name in others})
+    raw = Session("", spans=[Span("", 0, None)])
+    return TrayPlan({first: [raw]} | {name: [Session("", spans=[Span("", BEGINNING, None)])] for name in others})
 
 
 class NoInputPositionError(Exception):
     """An output does not say which input it was made from."""
+
+
+def limit_through(session: Session, upstream: dict[str, Limit | None]) -> Limit | None:
+    """The limit of a session that consumes samples of others, whose limits are `upstream` by producer."""
+    for span in session.spans:
+        limit = upstream.get(span.producer)
+        if limit is not None and (span.last is None or span.last > limit.t_ns):
+            until_t_ns = max(limit.t_ns, span.first - 1 if span.first > BEGINNING else BEGINNING)
+            if session.limit is None or until_t_ns < session.limit.t_ns:
+                return Limit(until_t_ns, limit.reason)
+            break
+    return session.limit
 
 
 class PlanReader:
@@ -127,22 +153,30 @@ class PlanReader:
             self.undecodable += 1
 
     def plan(self) -> TrayPlan | None:
-        """The sessions; None where the recording does not say what all of them consumed."""
+        """The sessions; None where the recording says of none what it consumed (`no_plan_reason`)."""
         plan = TrayPlan({stage: list(sessions.values()) for stage, sessions in self._sessions.items()})
-        producing, *consuming = plan.sessions.values()
-        for sessions in consuming:
-            producers = {session.producer for session in producing}
-            if not sessions or not all(session.spans for session in sessions):
-                return None
-            if not all(span.producer in producers for session in sessions for span in session.spans):
-                return None
-            producing = sessions
         if not self._has_positions:
+            return None
+        producing, *consuming = plan.sessions.values()
+        for stage, sessions in zip(list(plan.sessions)[1:], consuming, strict=True):
+            _drop_unknown_producers(sessions, {session.producer for session in producing})
+            plan.sessions[stage] = producing = [session for session in sessions if session.spans]
+        if not all(plan.sessions.values()):
             return None
         _open_ends(plan)
         _find_repeats(plan)
         self._add_sides(plan)
+        _limit_unknown_beginnings(plan)
         return plan
+
+    @property
+    def no_plan_reason(self) -> str:
+        """Why there is no plan."""
+        if not self._has_positions:
+            return "the scores have no input positions: nothing to compare with"
+        empty = [topic for topic, stage in self._stages.items() if not self._sessions[stage]]
+        lacking = f"it has no messages of topic {empty[0]}" if empty else "it does not say what the scorer consumed"
+        return f"{lacking}: nothing to compare with"
 
     def _add_output(self, envelope: Envelope) -> None:
         header = decode_header(envelope)
@@ -154,13 +188,14 @@ class PlanReader:
         if session is None:
             # the first stage consumes messages without making output; the others answer the first message at once
             began_before = stage != self._first and position.consumed_count > 1
-            session = sessions[header.producer] = Session(header.producer, began_before=began_before)
+            lacks_outputs = stage != self._first and header.sequence > 0
+            session = sessions[header.producer] = Session(header.producer, began_before, lacks_outputs)
         elif header.sequence < session.next_sequence:
             return  # this part of the recording overlaps the one before
         if stage == self._first:
             _extend_by_messages(session, position, envelope)
         else:
-            _extend_by_samples(session, position, envelope)
+            _extend_by_samples(session, position, envelope, lacks_outputs=header.sequence > session.next_sequence)
         session.position = position
         session.next_sequence, session.last_t_ns = header.sequence + 1, envelope.newest_t_ns
 
@@ -196,7 +231,11 @@ def _extend_by_messages(session: Session, position: fan_pb2.InputPosition, envel
         # `contiguous_from` were those right after the last known one, unless there was more than one gap.
         newly_contiguous = position.sequence - position.contiguous_from + 1
         earlier = position.consumed_count - before.consumed_count - newly_contiguous
-        session.is_guessed |= earlier != 0
+        if earlier != 0:
+            session.set_limit(
+                session.last_t_ns,
+                f"raw messages never reached {session.producer}, and the recording does not say which",
+            )
         session.spans[-1].last = before.sequence + max(earlier, 0)
         session.spans.append(Span(position.producer, position.contiguous_from, position.sequence))
     session.spans[-1].last_known = position.sequence
@@ -204,11 +243,16 @@ def _extend_by_messages(session: Session, position: fan_pb2.InputPosition, envel
         session.timer_outputs[position.producer, position.sequence] = envelope.newest_t_ns
 
 
-def _extend_by_samples(session: Session, position: fan_pb2.InputPosition, envelope: Envelope) -> None:
+def _extend_by_samples(
+    session: Session, position: fan_pb2.InputPosition, envelope: Envelope, *, lacks_outputs: bool
+) -> None:
+    """lacks_outputs: the recording lacks outputs of the session right before this one."""
     before = session.position
     if before and _continues(before, position):
         session.spans[-1].last = envelope.newest_t_ns
     else:
+        if before and lacks_outputs:  # it may have consumed samples of any producer in between
+            session.set_limit(session.last_t_ns, f"what {session.producer} consumed next was not recorded")
         message = envelope.message
         assert isinstance(message, Grid | Prediction | Score)
         session.spans.append(Span(position.producer, int(message.t_ns[0]), envelope.newest_t_ns))
@@ -217,6 +261,31 @@ def _extend_by_samples(session: Session, position: fan_pb2.InputPosition, envelo
 def _continues(before: fan_pb2.InputPosition, position: fan_pb2.InputPosition) -> bool:
     """Whether nothing is missing between two positions."""
     return position.producer == before.producer and position.contiguous_from <= before.sequence + 1
+
+
+def _drop_unknown_producers(sessions: list[Session], known: set[str]) -> None:
+    for session in sessions:
+        unknown = next((span for span in session.spans if span.producer not in known), None)
+        if unknown:
+            before = session.spans[: session.spans.index(unknown)]
+            last = before[-1].last if before else None
+            session.set_limit(
+                BEGINNING if last is None else last,
+                f"{session.producer} consumed what {unknown.producer} made, and nothing of that was recorded",
+            )
+            session.spans = [span for span in session.spans if span.producer in known]
+
+
+def _limit_unknown_beginnings(plan: TrayPlan) -> None:
+    for sessions in plan.sessions.values():
+        for number, session in enumerate(sessions):
+            if session.lacks_outputs or (session.began_before and session.snapshot is None):
+                reason = (
+                    f"the first messages of {session.producer} were not recorded"
+                    if number
+                    else f"the recording begins in the middle of {session.producer}: name the parts before it as well"
+                )
+                session.set_limit(BEGINNING, reason)
 
 
 def _open_ends(plan: TrayPlan) -> None:

@@ -37,6 +37,8 @@ class RawBlocks:
         """of each producer: the first sequence number that no session has consumed yet"""
         self._gaps: dict[tuple[str, int], int] = {}
         """missing messages, by producer and first sequence number"""
+        self.has_gap: set[str] = set()
+        """sessions that consumed messages, before the next block they are given, that are missing"""
 
     @property
     def missing(self) -> int:
@@ -47,7 +49,13 @@ class RawBlocks:
         """The blocks of a session. A block ends where a timer made the session emit samples; then until which time."""
         waiting: list[bytes] = []
         kind: tuple[str, bool] | None = None  # of the waiting messages: their producer, and whether they are new
-        for producer, sequence, payload in self._messages(session.spans):
+        for producer, sequence, payload, after_gap in self._messages(session.spans):
+            if after_gap:
+                yield from self._decoded(waiting, kind)
+                waiting = []
+                self.has_gap.add(session.producer)
+            if not payload:
+                break
             is_new = sequence >= self._next_new.get(producer, 0)
             if (producer, is_new) != kind or len(waiting) >= BLOCK_SIZE:
                 yield from self._decoded(waiting, kind)
@@ -80,11 +88,13 @@ class RawBlocks:
         inside = np.flatnonzero((since_s >= self._stretch_s[0]) & (since_s < self._stretch_s[1]))
         return cut(block, int(inside[0]), int(inside[-1]) + 1) if len(inside) else cut(block, 0, 0)
 
-    def _messages(self, spans: Sequence[Span]) -> Iterator[tuple[str, int, bytes]]:
-        """Producer, sequence number and bytes of the raw messages of spans, each once.
+    def _messages(self, spans: Sequence[Span]) -> Iterator[tuple[str, int, bytes, bool]]:
+        """Producer, sequence number and bytes of the raw messages of spans, each once, and whether messages before it
+        are missing. The last has no bytes and stands for the end.
 
         Spans only go forward. An open span continues with whichever producer follows. Gaps are counted.
         """
+        after_gap = False
         next_sequence: dict[str, int] = {}
         number, has_begun = 0, not spans[0].producer
         due: dict[str, int] = {spans[0].producer: spans[0].first} if spans[0].producer else {}
@@ -95,7 +105,7 @@ class RawBlocks:
                 continue  # this part of the recording overlaps the one before
             next_sequence[producer] = sequence + 1
             while not _contains(spans[number], producer, sequence) and _is_later(spans, number, producer, sequence):
-                self._count_gap(spans[number].producer, due, spans[number].last_known + 1)
+                after_gap |= self._count_gap(spans[number].producer, due, spans[number].last_known + 1)
                 number += 1
                 has_begun = False
                 due[spans[number].producer] = spans[number].first
@@ -104,19 +114,23 @@ class RawBlocks:
                 has_begun = True
             elif producer == span.producer or not has_begun or span.last is not None:
                 continue
-            self._count_gap(producer, due, sequence)
+            after_gap |= self._count_gap(producer, due, sequence)
             due[producer] = sequence + 1
-            yield producer, sequence, envelope.payload
+            yield producer, sequence, envelope.payload, after_gap
+            after_gap = False
         for span in spans[number:]:
             if span.producer:
                 due[span.producer] = max(due.get(span.producer, 0), span.first)
-                self._count_gap(span.producer, due, span.last_known + 1)
+                after_gap |= self._count_gap(span.producer, due, span.last_known + 1)
+        yield "", 0, b"", after_gap
 
-    def _count_gap(self, producer: str, due: dict[str, int], end: int) -> None:
-        """Count the producer's messages from the one that is due up to `end`, which is not one of them."""
+    def _count_gap(self, producer: str, due: dict[str, int], end: int) -> bool:
+        """Count the producer's messages from the one that is due up to `end`, which is not one of them. Returns whether
+        there are any."""
         first = due.get(producer, end)
         if end > first:
             self._gaps[producer, first] = max(self._gaps.get((producer, first), 0), end - first)
+        return end > first
 
 
 def _contains(span: Span, producer: str, sequence: int) -> bool:

@@ -67,8 +67,8 @@ class ReplayInput:
             if reading.damage:
                 self.damage[path] = reading.damage
 
-    def read_plan(self, tray: str) -> tuple[TrayPlan | None, list[Alarm]]:
-        """What each session of a tray's stages consumed, and the recorded alarms, each once.
+    def read_plan(self, tray: str) -> tuple[TrayPlan | None, list[Alarm], str]:
+        """What each session of a tray's stages consumed; the recorded alarms, each once; why there is no plan.
 
         The plan is None if the recording does not contain it, or if another grid or only a part is replayed.
         """
@@ -81,7 +81,7 @@ class ReplayInput:
         plan = reader.plan() if self.is_same_grid and not self.is_part else None
         if plan:
             plan.uses_recorded_snapshots = self.is_as_recorded
-        return plan, list(reader.alarms.values())
+        return plan, list(reader.alarms.values()), reader.no_plan_reason
 
     def pipeline(
         self, tray: str, plan: TrayPlan | None = None, observe: Callable[[Message], None] = lambda _message: None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,9 +13,9 @@ import numpy as np
 from pipeline.errors import UserError
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.offline.output_recording import TrayOutput, output_writer
-from pipeline.replay.offline.plan import TrayPlan, undisturbed_plan
+from pipeline.replay.offline.plan import RAW_MISSING, TrayPlan, undisturbed_plan
 from pipeline.replay.offline.replay_input import ReplayInput
-from pipeline.replay.offline.verify import CannotCompareError, Comparison, TrayVerifier, refuse_unverifiable
+from pipeline.replay.offline.verify import CannotCompareError, Comparison, TrayVerifier
 from schemas.codec import CodecError
 from schemas.messages import Alarm, Header, InvalidReason, Message, Score
 from schemas.streams import LOSS_PREFIX
@@ -96,23 +97,31 @@ def rescore(
         RecordingError: the output cannot be written.
         UserError: the output exists.
     """
-    if output is None:
-        return [_rescore_tray(replay_input, tray.name, verify, None, progress) for tray in replay_input.trays]
-    with output_writer(replay_input, output) as writer:
-        return [_rescore_tray(replay_input, tray.name, verify, writer, progress) for tray in replay_input.trays]
+    if verify and replay_input.is_part:
+        raise CannotCompareError(
+            f"{replay_input.paths[0]}: a part of a run cannot be compared: leave out --start and --end"
+        )
+    with output_writer(replay_input, output) if output else nullcontext() as writer:
+        trays = [_rescore_tray(replay_input, tray.name, verify, writer, progress) for tray in replay_input.trays]
+    compared = [tray.comparison for tray in trays if tray.comparison]
+    if verify and not any(found.has_content for found in compared):
+        reasons = "; ".join(reason for found in compared for reason in found.reasons)
+        raise CannotCompareError(f"{replay_input.paths[0]}: {reasons}")
+    return trays
 
 
 def _rescore_tray(
     replay_input: ReplayInput, tray: str, verify: bool, writer: RecordingWriter | None, progress: Progress
 ) -> RescoredTray:
-    plan, recorded_alarms = replay_input.read_plan(tray)
-    where = f"{replay_input.paths[0]}: {tray}"
-    if verify:
-        refuse_unverifiable(where, plan, is_part=replay_input.is_part)
+    plan, recorded_alarms, no_plan_reason = replay_input.read_plan(tray)
     rescored = RescoredTray(tray, plan or undisturbed_plan(replay_input.stages), recorded_alarms=recorded_alarms)
     output = TrayOutput(writer, replay_input.config.site, tray) if writer else None
     pipeline = replay_input.pipeline(tray, rescored.plan, output.add if output else _ignore)
-    verifier = TrayVerifier(tray, lambda: replay_input.envelopes(tray, ("score",))) if verify else None
+    verifier = (
+        TrayVerifier(tray, lambda: replay_input.envelopes(tray, ("score",)), pipeline.limit_of)
+        if verify and plan
+        else None
+    )
     try:
         for replayed in pipeline.run():
             message = replayed.message
@@ -127,23 +136,13 @@ def _rescore_tray(
         raise UserError(f"{replay_input.paths[0]}: a message cannot be decoded: {error}; see `fantwin info`") from error
     rescored.counts, rescored.raw_missing = pipeline.counts, pipeline.raw_missing
     if verifier:
-        rescored.comparison = verifier.finish(rescored.plan.last, rescored.alarms, recorded_alarms)
-        _refuse_meaningless(where, rescored.comparison, rescored)
+        rescored.comparison = found = verifier.finish(rescored.plan.last, rescored.alarms, recorded_alarms)
+        found.reasons = [reason.replace(RAW_MISSING, str(rescored.raw_missing)) for reason in found.reasons]
+        if not (found.has_content or found.reasons):
+            found.reasons.append(f"{tray}: no scores in the recording: nothing to compare with")
+    elif verify:
+        rescored.comparison = Comparison(tray, reasons=[f"{tray}: {no_plan_reason}"])
     return rescored
-
-
-def _refuse_meaningless(where: str, found: Comparison, rescored: RescoredTray) -> None:
-    """Raises CannotCompareError if a difference would not be a difference of the code."""
-    if not (found.equal or found.different or found.not_made):
-        raise CannotCompareError(f"{where}: no scores in the recording: nothing to compare with")
-    if found.is_equal:
-        return
-    if rescored.raw_missing:
-        raise CannotCompareError(f"{where}: the recording lacks {rescored.raw_missing} raw messages that were scored")
-    if any(session.is_guessed for session in rescored.plan.first):
-        raise CannotCompareError(
-            f"{where}: some raw messages never reached the first stage, and the recording does not say which"
-        )
 
 
 def _ignore(_message: Message) -> None:

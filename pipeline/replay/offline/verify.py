@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
-from pipeline.replay.offline.plan import Session, TrayPlan
+from pipeline.replay.offline.plan import BEGINNING, Limit, Session
 from schemas.blocks import cut
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header, decode_together
@@ -44,6 +44,11 @@ class Comparison:
     alarms_different: int = 0
     alarms_not_recorded: int = 0
     """replayed, and later than the last recorded score of their session"""
+    not_comparable: int = 0
+    """not equal or not replayed, where the recording lacks what they were computed from"""
+    alarms_not_comparable: int = 0
+    reasons: list[str] = field(default_factory=list)
+    """why something is not comparable, a line each"""
     named: list[str] = field(default_factory=list)
     """the first differences, a line each"""
 
@@ -52,37 +57,42 @@ class Comparison:
         """Whether nothing differs."""
         return not (self.different or self.not_made or self.alarms_different)
 
+    @property
+    def has_content(self) -> bool:
+        """Whether anything could be compared."""
+        return bool(self.equal or self.different or self.not_made)
+
+    def add_not_comparable(self, samples: int, limit: Limit) -> None:
+        """Count samples beyond the limit of their session."""
+        self.not_comparable += samples
+        since = "" if limit.t_ns == BEGINNING else f"after {format_utc(limit.t_ns)}: "
+        reason = f"{self.tray}: {since}{limit.reason}"
+        if samples and reason not in self.reasons:
+            self.reasons.append(reason)
+
     def name(self, difference: str) -> None:
         """Describe a difference, if it is one of the first."""
         if len(self.named) < MAX_NAMED:
             self.named.append(difference)
 
 
-def refuse_unverifiable(where: str, plan: TrayPlan | None, *, is_part: bool) -> None:
-    """Check, before the replay, that the decisions can be repeated.
-
-    Raises:
-        CannotCompareError: they cannot.
-    """
-    if is_part:
-        raise CannotCompareError(f"{where}: a part of a run cannot be compared: leave out --start and --end")
-    if plan is None:
-        raise CannotCompareError(f"{where}: the scores have no input positions: nothing to compare with")
-    sessions = [session for sessions in plan.sessions.values() for session in sessions]
-    began_before = sorted(session.producer for session in sessions if not session.can_be_repeated)
-    if began_before:
-        raise CannotCompareError(
-            f"{where}: the recording begins in the middle of {', '.join(began_before)}: "
-            "name the parts before it as well"
-        )
-
-
 class TrayVerifier:
-    """Compares what a replay of one tray makes with the recording, session by session."""
+    """Compares what a replay of one tray makes with the recording, session by session.
 
-    def __init__(self, tray: str, read_scores: Callable[[], Iterable[Envelope]]) -> None:
-        """read_scores: the recorded scores of the tray, from the beginning at each call."""
+    What differs beyond the limit of its session is not a difference of the code: the recording lacks what it was
+    computed from.
+    """
+
+    def __init__(
+        self,
+        tray: str,
+        read_scores: Callable[[], Iterable[Envelope]],
+        limit_of: Callable[[str], Limit | None],
+    ) -> None:
+        """read_scores: the recorded scores of the tray, from the beginning at each call. limit_of: the limit of a
+        session of the scorer, as known when its last scores were made."""
         self._read_scores = read_scores
+        self._limit_of = limit_of
         self._producer: str | None = None
         self._recorded: RecordedSession | None = None
         self._visited: set[str] = set()
@@ -93,7 +103,7 @@ class TrayVerifier:
         if self._recorded is None or producer != self._producer:
             self._end_session()
             self._recorded = self._begin_session(producer)
-        compare_scores(score, self._recorded, self._found)
+        compare_scores(score, self._recorded, self._found, self._limit_of(producer))
 
     def finish(self, sessions: Sequence[Session], alarms: Sequence[Alarm], recorded: Sequence[Alarm]) -> Comparison:
         """Compare what is left, and the alarms; the result."""
@@ -106,7 +116,7 @@ class TrayVerifier:
                 [alarm for alarm in listed if alarm.header.producer == session.producer]
                 for listed in (alarms, recorded)
             )
-            compare_alarms(replayed, known, session.last_t_ns, self._found)
+            compare_alarms(replayed, known, session.last_t_ns, self._found, self._limit_of(session.producer))
         return self._found
 
     def _begin_session(self, producer: str) -> RecordedSession:
@@ -115,9 +125,10 @@ class TrayVerifier:
         return RecordedSession(self._read_scores(), producer)
 
     def _end_session(self) -> None:
-        if self._recorded:
+        if self._recorded and self._producer is not None:
+            limit = self._limit_of(self._producer)
             for block in self._recorded.until(None):
-                count_not_made(block.t_ns, self._found)
+                count_not_made(block.t_ns, self._found, limit)
         self._recorded = None
 
 
@@ -141,38 +152,56 @@ class RecordedSession:
             self._rest = next(self._blocks, None)
 
 
-def compare_scores(made: Score, recorded: RecordedSession, found: Comparison) -> None:
+def compare_scores(made: Score, recorded: RecordedSession, found: Comparison, limit: Limit | None = None) -> None:
     """Compare a block of scores with the recorded ones up to its last sample."""
     taken = 0
     for block in recorded.until(int(made.t_ns[-1])):
         at = np.searchsorted(made.t_ns, block.t_ns)
         is_made = (at < len(made.t_ns)) & (made.t_ns[np.minimum(at, len(made.t_ns) - 1)] == block.t_ns)
-        count_not_made(block.t_ns[~is_made], found)
+        count_not_made(block.t_ns[~is_made], found, limit)
         rows = at[is_made]
         taken += len(rows)
         different = np.zeros(len(rows), np.bool_)
+        within = _within(block.t_ns[is_made], limit)
         if block.fans != made.fans:
             different[:] = True
             found.name(f"{found.tray}: {made.fans} fans replayed, {block.fans} recorded")
         else:
             for name in _SAMPLE_COLUMNS:
                 differs = _differ(getattr(made, name)[rows], getattr(block, name)[is_made])
+                different |= differs.any(axis=1)
+                differs &= within[:, np.newaxis]
                 if differs.any():
                     _name_first(found, name, block.t_ns[is_made], differs, made, block, rows, is_made)
-                    different |= differs.any(axis=1)
-        found.different += int(different.sum())
+        if limit is not None:
+            found.add_not_comparable(int((different & ~within).sum()), limit)
+        found.different += int((different & within).sum())
         found.equal += int((~different).sum())
     found.not_recorded += len(made.t_ns) - taken
 
 
-def count_not_made(t_ns: Array, found: Comparison) -> None:
+def _within(t_ns: Array, limit: Limit | None) -> Array:
+    return np.ones(len(t_ns), np.bool_) if limit is None else t_ns <= limit.t_ns
+
+
+def count_not_made(t_ns: Array, found: Comparison, limit: Limit | None = None) -> None:
     """Count samples that were recorded and not replayed."""
+    if limit is not None:
+        within = _within(t_ns, limit)
+        found.add_not_comparable(int((~within).sum()), limit)
+        t_ns = t_ns[within]
     if len(t_ns):
         found.not_made += len(t_ns)
         found.name(f"{found.tray}: {format_utc(int(t_ns[0]))}: recorded and not replayed, {len(t_ns)} samples")
 
 
-def compare_alarms(made: Iterable[Alarm], recorded: Iterable[Alarm], last_scored_t_ns: int, found: Comparison) -> None:
+def compare_alarms(
+    made: Iterable[Alarm],
+    recorded: Iterable[Alarm],
+    last_scored_t_ns: int,
+    found: Comparison,
+    limit: Limit | None = None,
+) -> None:
     """Compare the alarms of one session with the recorded ones, matched by fan, time, transition and request.
 
     An alarm is published right after its score, so those of the last recorded score may be missing in the recording.
@@ -182,6 +211,8 @@ def compare_alarms(made: Iterable[Alarm], recorded: Iterable[Alarm], last_scored
         other = left.pop((alarm.fan, alarm.t_ns, alarm.transition, alarm.request), None)
         if other is not None and _without_header(alarm) == _without_header(other):
             found.alarms_equal += 1
+        elif limit is not None and alarm.t_ns > limit.t_ns:
+            found.alarms_not_comparable += 1
         elif other is not None:
             found.alarms_different += 1
             found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, {other.message!r} recorded")
@@ -191,6 +222,9 @@ def compare_alarms(made: Iterable[Alarm], recorded: Iterable[Alarm], last_scored
             found.alarms_different += 1
             found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, none recorded")
     for alarm in left.values():
+        if limit is not None and alarm.t_ns > limit.t_ns:
+            found.alarms_not_comparable += 1
+            continue
         found.alarms_different += 1
         found.name(f"{found.tray}: alarm {_describe(alarm)} recorded, none replayed")
 

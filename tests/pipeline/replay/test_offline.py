@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.offline.alarm_episodes import episodes
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import RescoredTray, rescore
-from pipeline.replay.offline.verify import CannotCompareError
+from pipeline.replay.offline.verify import CannotCompareError, Comparison
 from schemas import fan_pb2
 from schemas.messages import Action, Alarm, Score, Transition
 from tests.support.killed_site import CHAIN, Site
@@ -38,6 +39,13 @@ def made_equal(tray: RescoredTray) -> int:
     found = tray.comparison
     assert found and found.is_equal, found
     return found.equal
+
+
+def verified_in_part(*paths: Path) -> Comparison:
+    """The comparison of a recording that lacks something: what can be compared is equal."""
+    found = verified(*paths).comparison
+    assert found and found.is_equal and found.equal and found.not_comparable, found
+    return found
 
 
 def recorded(path: Path, topic: str) -> list[Any]:
@@ -196,17 +204,19 @@ def test_a_restarted_scorer_continues_from_its_snapshot_and_so_does_a_replay(tmp
     assert len(raised) == 1 and raised[0].t_ns == first.raised_ns, "one alarm, over the restart"
 
 
-def test_a_session_cannot_be_reproduced_without_the_snapshot_it_began_with(scorer_killed, tmp_path):
+def test_row_14_a_session_cannot_be_reproduced_without_the_snapshot_it_began_with(scorer_killed, tmp_path):
 
     def forgotten(entry):
         return None if entry.topic == "snapshot" else entry.message
 
     path = changed(scorer_killed, tmp_path / "forgotten.mcap", forgotten)
-    with pytest.raises(CannotCompareError, match="begins in the middle of scorer"):
-        verified(path)
+    found = verified_in_part(path)
+    assert found.equal >= 214
+    (reason,) = found.reasons
+    assert re.fullmatch("tray1: the first messages of scorer-.* were not recorded", reason)
 
 
-def test_a_part_that_begins_with_a_restarted_scorer_still_needs_its_earlier_input(tmp_path):
+def test_row_14_a_scorer_restarted_in_a_pause_of_the_recorder_still_needs_its_earlier_input(tmp_path):
     site = Site(tmp_path, 1, calibrated=True)
     site.run(210)
     site.records = False
@@ -214,8 +224,9 @@ def test_a_part_that_begins_with_a_restarted_scorer_still_needs_its_earlier_inpu
     site.records = True
     site.kill("scorer")
     site.run(100)
-    with pytest.raises(CannotCompareError, match="lacks .* raw messages"):
-        verified(site.finished())
+    found = verified_in_part(site.finished())
+    assert found.equal >= 209
+    assert any("lacks 20 raw messages that were scored" in reason for reason in found.reasons)
 
 
 def test_with_other_limits_a_session_continues_from_the_replayed_state_of_the_one_before(scorer_killed):
@@ -240,7 +251,7 @@ def test_a_recording_of_another_version_is_judged_from_its_raw_samples(short, la
         envelopes = list(replay_input.envelopes("tray1", ("grid", "prediction", "score", "raw")))
         old = [p if p.topic != "prediction" else replace(p, payload=_without(lacks, p.payload)) for p in envelopes]
         replay_input.envelopes = lambda tray, topics: (p for p in old if p.topic in topics)  # type: ignore[method-assign]
-        plan, _ = replay_input.read_plan("tray1")
+        plan, _, _ = replay_input.read_plan("tray1")
         (tray,) = rescore(replay_input, None, verify=False)
     assert (plan is not None) == is_planned
     assert tray.scored > 200
@@ -252,26 +263,73 @@ def _without(column: str, payload: bytes) -> bytes:
     return prediction.SerializeToString()
 
 
-def test_raw_messages_that_the_recorder_never_got_are_missed(tmp_path):
+def test_row_14_scores_before_raw_messages_that_the_recorder_never_got_are_compared(tmp_path):
     site = Site(tmp_path, seed=3)
     site.run(150)
     site.records = False
     site.run(3)
     site.records = True
     site.run(150)
-    path = site.finished()
-    with pytest.raises(CannotCompareError, match="lacks 3 raw messages"):
-        verified(path)
+    found = verified_in_part(site.finished())
+    assert found.equal >= 149
+    (reason,) = found.reasons
+    assert re.fullmatch("tray1: after .*Z: the recording lacks 3 raw messages that were scored", reason)
 
 
-@pytest.mark.parametrize(("first", "last"), [(10, 10**9), (0, 280)], ids=["head", "tail"])
-def test_raw_messages_that_are_missing_at_the_ends_are_missed(short, tmp_path, first, last):
+def without_raw(path: Path, out: Path, first: int, last: int) -> Path:
+    """A copy that holds only the raw messages from `first` to before `last`."""
 
     def without(entry):
         return entry.message if entry.topic != "raw" or first <= entry.message.header.sequence < last else None
 
-    with pytest.raises(CannotCompareError, match="lacks .* raw messages"):
-        verified(changed(short, tmp_path / "without.mcap", without))
+    return changed(path, out, without)
+
+
+def test_row_14_without_the_first_raw_messages_nothing_is_compared(short, tmp_path):
+    with pytest.raises(CannotCompareError, match="lacks 10 raw messages"):
+        verified(without_raw(short, tmp_path / "without.mcap", 10, 10**9))
+
+
+def test_row_14_scores_before_raw_messages_that_are_missing_at_the_end_are_compared(short, tmp_path):
+    found = verified_in_part(without_raw(short, tmp_path / "without.mcap", 0, 280))
+    assert found.equal >= 275
+    assert "lacks 20 raw messages" in found.reasons[0]
+
+
+@pytest.mark.parametrize("stage", ["resampler", "twin_integrator", "scorer"])
+def test_row_14_a_session_that_fell_into_a_pause_of_the_recorder_leaves_the_rest_comparable(tmp_path, stage):
+    site = Site(tmp_path, seed=4)
+    site.run(150)
+    site.records = False
+    site.run(20)
+    site.kill(stage)  # the session that follows is recorded nowhere
+    site.run(20)
+    site.kill(stage)
+    site.run(5)
+    site.records = True
+    site.run(100)
+    found = verified_in_part(site.finished())
+    assert found.equal >= 149
+    assert found.not_comparable >= 90
+    assert found.reasons
+
+
+@pytest.mark.parametrize("stage", ["resampler", "twin_integrator", "scorer"])
+def test_row_14_a_session_without_any_recorded_output_leaves_the_rest_comparable(tmp_path, stage):
+    site = Site(tmp_path, seed=4)
+    site.run(150)
+    site.kill(stage)
+    producer = site.stages[stage].producer
+    site.run(20)
+    site.kill(stage)
+    site.run(100)
+
+    def without(entry):
+        return None if entry.message.header.producer == producer else entry.message
+
+    found = verified(changed(site.finished(), tmp_path / "without.mcap", without)).comparison
+    assert found and found.is_equal and found.equal >= 149, found
+    assert bool(found.not_comparable) == bool(found.reasons)
 
 
 def test_a_recording_without_raw_samples_is_never_equal(short, tmp_path):
@@ -334,7 +392,7 @@ def test_an_undecodable_alarm_costs_that_alarm_only(undisturbed):
         first = next(n for n, envelope in enumerate(envelopes) if envelope.topic == "alarm")
         envelopes[first] = replace(envelopes[first], payload=b"\xff\xff")
         replay_input.envelopes = lambda tray, topics: iter(envelopes)  # type: ignore[method-assign]
-        plan, found = replay_input.read_plan("tray1")
+        plan, found, _ = replay_input.read_plan("tray1")
     assert plan and len(found) == len(alarms) - 1
     assert "cannot be decoded: 1" in next(iter(replay_input.damage.values()))
 
@@ -490,3 +548,12 @@ def test_a_snapshot_in_an_older_recording_is_restored_and_its_replay_is_equal():
     }
     assert operators == {0: (True, False, False), 1: (False, True, False), 2: (True, False, True)}
     assert not tray.counts["snapshots_of_another_twin"] and not tray.counts["snapshots_not_understood"]
+
+
+@pytest.mark.parametrize("recording", ["integrator_killed", "scorer_killed", "undisturbed"])
+def test_a_recording_that_lacks_nothing_is_compared_to_its_end(recording, request):
+    with open_replay_input([request.getfixturevalue(recording)], None, (), None) as replay_input:
+        plan, _, _ = replay_input.read_plan("tray1")
+    assert (
+        plan and [session.limit for sessions in plan.sessions.values() for session in sessions if session.limit] == []
+    )
