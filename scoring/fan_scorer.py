@@ -138,11 +138,10 @@ class FanScorer:
         if self.origin_t_ns is None:
             self.origin_t_ns = int(block.t_ns[0])
         intervals = (block.t_ns - self.origin_t_ns) // self._interval_ns
-        begins = np.diff(intervals, prepend=intervals[0]) != 0
         missing_ns = self._missing_ns(block)
-        after_gap = np.any(missing_ns > self._shortest_memory_ns, axis=(1, 2))
-        starts = np.flatnonzero(begins | after_gap)
-        edges = [0, *starts[starts > 0].tolist(), len(intervals)]
+        after_gap: Array = np.any(missing_ns > self._shortest_memory_ns, axis=(1, 2))
+        cuts = np.flatnonzero((np.diff(intervals) != 0) | after_gap[1:]) + 1
+        edges = [0, *cuts.tolist(), len(intervals)]
         scored = []
         for first, last in pairwise(edges):
             number = int(intervals[first])
@@ -224,7 +223,7 @@ class FanScorer:
         """(n, inputs, fans) how long each input was missing before each of its samples, ns."""
         if self._gaps is None:
             return np.zeros((len(block.t_ns), 1, 1))
-        valid = np.stack((block.speed_valid, block.balance_valid, block.alive), axis=1)
+        valid = np.array((block.speed_valid, block.balance_valid, block.alive)).swapaxes(0, 1)
         return self._gaps.update(block.t_ns, block.period_ns, valid)
 
     def _forget(self, missing_ns: Array) -> None:

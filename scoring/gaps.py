@@ -21,6 +21,10 @@ class Gaps(ColumnState):
 
         Returns (n, inputs, fans): the time without a valid sample before each valid one, ns; 0 for the first of all.
         """
+        if len(t_ns) == 1:
+            missing_ns = np.where(valid[0] & (self._last_t_ns != NEVER_NS), t_ns[0] - self._last_t_ns - period_ns, 0)
+            np.copyto(self._last_t_ns, t_ns[0], where=valid[0])
+            return missing_ns[np.newaxis]
         seen = np.where(valid, t_ns[:, np.newaxis, np.newaxis], NEVER_NS)
         last = np.maximum.accumulate(np.concatenate((self._last_t_ns[np.newaxis], seen)))
         self._last_t_ns = last[-1].copy()

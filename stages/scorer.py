@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
+from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.snapshot_store import SnapshotStore
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
@@ -137,6 +138,7 @@ class ScorerCore(Core):
         self._unscored = UnscoredMonitor(fans, max(1, round(config.not_judged_s * NS_PER_S)))
         self._snapshot_store = snapshot_store
         self._wrong_fans = 0
+        self._old_samples = OldSamples()
         self._counts: Counter[str] = Counter()
         self._not_restored = ""
         """why the snapshot was not used as a whole, for people"""
@@ -214,7 +216,10 @@ class ScorerCore(Core):
         new = item.t_ns > before
         self._counts["repeated"] += int((~new).sum())
         if not new.any():
+            if len(item.t_ns):
+                self._old_samples.add(item.t_ns, item.period_ns, self._last_t_ns)
             return [*self.tick(0), *discarded]
+        self._old_samples.clear()
         self._last_t_ns, self._input_producer = int(item.t_ns[new][-1]), item.header.producer
         score, alarms = self._score(item if new.all() else select(item, new))
         return [*self.tick(0), *discarded, score, *alarms, *self._take_snapshot(at_once=bool(alarms))]
@@ -234,7 +239,11 @@ class ScorerCore(Core):
             return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
         origin_t_ns = self._scorer.origin_t_ns
         is_new = origin_t_ns is None or self._last_t_ns < origin_t_ns + SHOWN_NS
-        problems = [self._not_restored if is_new else "", self._unscored.problem()]
+        problems = [
+            self._not_restored if is_new else "",
+            self._unscored.problem(),
+            self._old_samples.problem("predictions", "scorer"),
+        ]
         problems += [self._snapshot_store.problem] if self._snapshot_store else []
         held = np.flatnonzero(self._scorer.held_baselines)
         if len(held):

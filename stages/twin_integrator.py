@@ -27,6 +27,7 @@ import scipy.signal  # noqa: F401  the torque balance loads it on first use: not
 from pydantic import Field
 
 from pipeline.runtime.free_run import FreeRun, FreeRunInputs
+from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from pipeline.runtime.twin_file import TwinFile, load_twin
 from schemas.blocks import select
@@ -77,6 +78,7 @@ class TwinIntegratorCore(Core):
         self._period_ns = 0
         self._in_announced_gap = False  # the last sample had the reason GAP or STALE for all fans
         self._problem = ""
+        self._old_samples = OldSamples()
         self._counts: Counter[str] = Counter()
 
     def step(self, item: Grid) -> list[ModelCard | Prediction]:
@@ -89,7 +91,10 @@ class TwinIntegratorCore(Core):
         self._problem = ""
         grid = self._only_new(item)
         if not len(grid.t_ns):
+            if len(item.t_ns) and self._last_t_ns is not None:
+                self._old_samples.add(item.t_ns, item.period_ns, self._last_t_ns)
             return messages
+        self._old_samples.clear()
         if grid.period_ns != self._period_ns:
             self._run.stop(np.ones_like(self._run.running))
             self._balance.reset()
@@ -116,8 +121,8 @@ class TwinIntegratorCore(Core):
         return dict(self._counts)
 
     def problem(self) -> str:
-        """A twin that does not fit the grid it receives."""
-        return self._problem
+        """A twin that does not fit the grid it receives, or a grid whose times have gone back."""
+        return self._problem or self._old_samples.problem("grid samples", "twin_integrator and scorer")
 
     def _only_new(self, grid: Grid) -> Grid:
         """The block without the samples that are not newer than those before them."""

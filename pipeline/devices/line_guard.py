@@ -64,6 +64,8 @@ class LineGuard:
             return [message]
         if self.producer is None:
             self._newest_t_ns = int(t_ns[0])
+        if len(t_ns) == 1:
+            return self._admit_sample(message, is_of_ended)
         own = self.producer in (None, message.header.producer)
         steps_ns = np.diff(t_ns, prepend=self._newest_t_ns)
         apart = steps_ns < -APART_NS if own and not self._shift_ns else np.abs(steps_ns) > APART_NS

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import chain, groupby, islice
 
 import numpy as np
 import pytest
@@ -44,18 +45,23 @@ def shifted(messages: Iterator[Raw], by_s: float) -> Iterator[Raw]:
         yield replace(message, host_receive_t_ns=message.host_receive_t_ns + round(by_s * NS_PER_S))
 
 
-def after_stall(from_s: float, until_s: float) -> Iterator[Raw]:
+def after_stall(from_s: float, until_s: float, received_s: float | None = None) -> Iterator[Raw]:
     """What was measured in a stall, all received at its end."""
+    received_t_ns = EPOCH_NS + round(((until_s if received_s is None else received_s) + 0.002) * NS_PER_S)
     for message in line(from_s, until_s):
-        yield replace(message, host_receive_t_ns=np.array([EPOCH_NS + round((until_s + 0.002) * NS_PER_S)], np.int64))
+        yield replace(message, host_receive_t_ns=np.array([received_t_ns], np.int64))
 
 
 def core_of(rules: DecisionRules = max(DecisionRules)) -> ResamplerCore:
-    return ResamplerCore(1, ResamplerConfig(), decision_rules=rules)
+    return ResamplerCore(1, ResamplerConfig(block_size=512), decision_rules=rules)
 
 
-def grid_of(core: ResamplerCore, *parts: Iterator[Raw] | Sequence[Raw]) -> Grid:
-    grids = [grid for part in parts for message in part for grid in core.step(message)]
+def grid_of(core: ResamplerCore, *parts: Iterable[Raw]) -> Grid:
+    """The grid of these messages; those of one producer that follow one another are joined, which changes nothing."""
+    grids: list[Grid] = []
+    for _, of_one in groupby(chain(*parts), key=lambda message: message.header.producer):
+        while block := list(islice(of_one, 64)):
+            grids += core.step(join(block))
     return join([*grids, *core.close()])
 
 
@@ -118,11 +124,11 @@ def test_row_02_acquisition_that_returns_after_some_time_is_the_line_again(away_
 # row 5
 
 
-@pytest.mark.parametrize("stall_s", [3.0, 6.0, 8.0, 30.0, 300.0, 900.0])
+@pytest.mark.parametrize("stall_s", [6.0, 8.0, 60.0])
 def test_row_05_a_backlog_after_a_stall_of_any_length_keeps_its_times(stall_s: float) -> None:
     core = core_of()
     end_s = 20 + stall_s
-    grid = grid_of(core, line(0, 20), after_stall(20, end_s), line(end_s, end_s + 30))
+    grid = grid_of(core, line(0, 20), after_stall(20, end_s), line(end_s, end_s + 15))
     np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
     assert grid.valid.all(), "nothing is missing: the samples were only late"
     assert core.counters()["clock_restarts"] == 0
@@ -143,17 +149,25 @@ def test_row_05_a_backlog_that_comes_after_the_grid_has_ended_continues_it() -> 
     np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
 
 
+def test_row_05_a_backlog_of_the_first_part_of_a_stall_of_half_an_hour_keeps_its_times() -> None:
+    core = core_of()
+    grid = grid_of(core, line(0, 20), after_stall(20, 30, received_s=2000), line(2000, 2015))
+    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
+    assert int(grid.valid.sum()) >= 44.9 * HZ
+    assert core.counters()["clock_restarts"] == 0
+
+
 def test_row_05_a_backlog_of_which_the_first_part_is_lost_gives_no_false_slope() -> None:
     core = core_of()
-    grid = grid_of(core, line(0, 20), after_stall(900, 1200), line(1200, 1230))
+    grid = grid_of(core, line(0, 20), after_stall(1180, 1200), line(1200, 1215))
     np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
-    assert valid_after(grid, 1201) > 28 * HZ
+    assert valid_after(grid, 1201) > 13 * HZ
 
 
-@pytest.mark.parametrize("speed_up", [1.2, 2.0, 10.0])
+@pytest.mark.parametrize("speed_up", [1.3, 10.0])
 def test_row_05_a_backlog_that_drains_slowly_is_no_clock_that_was_set(speed_up: float) -> None:
     def draining() -> Iterator[Raw]:
-        for message, number in zip(line(20, 100), range(8000), strict=True):
+        for message, number in zip(line(20, 80), range(6000), strict=True):
             at_s = max(20 + number / HZ, 28 + number / HZ / speed_up)
             yield replace(message, host_receive_t_ns=np.array([EPOCH_NS + round(at_s * NS_PER_S)], np.int64))
 

@@ -482,6 +482,16 @@ def test_repeated_samples_are_dropped_and_counted() -> None:
     assert core.counters()["repeated"] == 24
 
 
+def test_row_13_predictions_that_have_gone_back_for_good_are_reported_until_there_are_new_ones() -> None:
+    core = commissioned(core_of())
+    feed(core, [prediction_of(np.zeros(500), first=-360_000)])
+    assert core.problem() == "", "a producer that was restarted catches up"
+    feed(core, [prediction_of(np.zeros(500), first=-359_500)])
+    assert core.problem().startswith("predictions are 3590 s older than those before and not judged")
+    feed(core, [prediction_of(np.zeros(10))])
+    assert core.problem() == ""
+
+
 def test_a_prediction_that_is_no_number_has_no_score() -> None:
     prediction = prediction_of(np.zeros(3))
     prediction.predicted_speed_rad_s[1] = np.nan

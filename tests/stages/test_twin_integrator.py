@@ -251,6 +251,18 @@ def test_repeated_samples_are_dropped_and_counted() -> None:
     np.testing.assert_allclose(again.predicted_speed_rad_s, whole.predicted_speed_rad_s, rtol=1e-12)
 
 
+def test_row_13_a_grid_that_has_gone_back_for_good_is_reported_until_there_are_new_samples() -> None:
+    core = core_of()
+    hour = 3600 * 100
+    feed(core, [grid_of(stairs(300), first=hour)])
+    core.step(grid_of(stairs(500)))
+    assert core.problem() == "", "a producer that was restarted catches up"
+    core.step(grid_of(stairs(500), first=500))
+    assert core.problem().startswith("grid samples are 3593 s older than those before and not judged")
+    feed(core, [grid_of(stairs(10), first=hour + 300)])
+    assert core.problem() == ""
+
+
 def test_a_command_outside_the_training_range_is_not_valid() -> None:
     core = core_of()
     prediction = feed(core, [grid_of(np.array([40.0, 104.9, 105.1, -5.1, -4.9]))])
