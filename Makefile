@@ -1,6 +1,7 @@
 # make demo   install what the demo needs into .venv and run it
 # make test   install what the tests need, check, and run all tests; those in real time come last, two at a time
 # make check  format, lint, types, direction of imports, generated code
+# make selftest  the faults of practice on a simulated site, as a table of promised and seen
 # make bench  measurements, as ratios
 # make schema regenerate the code of schemas/fan.proto
 # make twin   train the demo's twin again
@@ -17,7 +18,7 @@ BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_t
 	$(addprefix bench.runtime.,restart recorder_throughput recorder_kills replay_bus replay_speed stage_memory)
 SOURCES := schemas scoring pipeline simulation stages twin tests bench
 
-.PHONY: demo test check bench schema twin lock clean
+.PHONY: demo test check selftest bench schema twin lock clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.runtime
@@ -32,6 +33,9 @@ check: $(VENV)/.development
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+selftest: $(VENV)/.runtime
+	$(BIN)/fantwin selftest
 
 bench: $(VENV)/.benches
 	for bench in $(BENCHES); do $(BIN)/python -m $$bench || exit 1; done

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.selftest.scratch_site import FANS, SITE, STAGES, TRAY, ScratchSite
+from pipeline.selftest.scratch_site import FANS, SITE, STAGES, TRAY, NotKept, ScratchSite
 from schemas.codec import encode, type_name
 from schemas.messages import Header, Raw
 from schemas.topics import BY_NAME, tray_key
@@ -28,10 +28,6 @@ GARBAGE_MESSAGES = 2_000
 STRANGERS = 10_000
 STRANGERS_LIMIT_MB = 20.0
 SMALL_DISK_BYTES = 64 << 20
-
-
-class NotKept(Exception):  # noqa: N818  a result, not an error
-    """A promise that was not kept; the text says what was seen instead."""
 
 
 @dataclass(frozen=True)

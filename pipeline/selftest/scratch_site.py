@@ -32,6 +32,10 @@ START_LIMIT_S = 60.0
 _POLL_S = 0.05
 
 
+class NotKept(Exception):  # noqa: N818  a result, not an error
+    """A promise that was not kept; the text says what was seen instead."""
+
+
 class ScratchSite:
     """Runs from entering to leaving its context; all its processes have ended after that."""
 
@@ -138,9 +142,14 @@ class ScratchSite:
         return next((v for v in views if (v.health.stage, v.health.instance) == (stage, instance)), None)
 
     def process_id(self, label: str) -> int:
-        """The process of a stage that is alive."""
+        """The process of a stage.
+
+        Raises:
+            NotKept: the stage is not on the bus.
+        """
         view = self.view(label)
-        assert view
+        if view is None or not view.alive:
+            raise NotKept(f"{label} is not on the bus: {self.last_line()}")
         return view.health.process_id
 
     def problem(self, label: str) -> str:
@@ -186,12 +195,19 @@ class ScratchSite:
         return (self.folder / "up.log").read_text(encoding="utf-8", errors="replace")
 
     def stop(self) -> tuple[int, dict[str, Any]]:
-        """Stop the site as Ctrl-C does; returns its exit code and outcome."""
+        """Stop the site as Ctrl-C does; returns its exit code and outcome.
+
+        Raises:
+            NotKept: it does not stop.
+        """
         self.up.send_signal(signal.SIGINT)
-        output, _ = self.up.communicate(timeout=START_LIMIT_S)
+        try:
+            output, _ = self.up.communicate(timeout=START_LIMIT_S)
+        except subprocess.TimeoutExpired as error:
+            raise NotKept(f"it did not stop within {START_LIMIT_S:.0f} s: {self.last_line()}") from error
         self.tray.send_signal(signal.SIGINT)
         self.tray.wait(START_LIMIT_S)
-        return self.up.returncode, json.loads(output)
+        return self.up.returncode, json.loads(output or "{}")
 
     def recordings(self) -> list[Path]:
         """All parts of the recording."""

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 from pipeline.selftest import selftest
-from pipeline.selftest.scenarios import SCENARIOS, NotKept, Scenario
+from pipeline.selftest.scenarios import SCENARIOS, Scenario
+from pipeline.selftest.scratch_site import NotKept
 from pipeline.selftest.stepped_clock import set_offset_ns
 from tests.support.fantwin_command import error_of, fantwin
 
@@ -58,6 +59,11 @@ class BadlyEndedSite(HealthySite):
     status = 1
 
 
+class EndlessSite(HealthySite):
+    def stop(self) -> tuple[int, dict[str, Any]]:
+        raise NotKept("it did not stop")
+
+
 def refuses(_site: object) -> str:
     raise NotKept("it ended")
 
@@ -89,12 +95,15 @@ def rows_of(monkeypatch: pytest.MonkeyPatch, folder: Path, site: type, *scenario
 def test_a_promise_that_is_not_kept_is_a_row_that_says_what_was_seen(monkeypatch, tmp_path, site, run, seen):
     row, account = rows_of(monkeypatch, tmp_path, site, Scenario("bad", "promised", run))
     assert (row.kept, row.seen) == (False, seen)
-    assert (account.kept, account.seen) == (True, "2 lost; equal: 5 samples")
+    assert (account.kept, account.seen) == (True, "lost: resampler 2; equal: 5 samples")
 
 
-def test_a_site_that_ends_badly_is_a_row_with_its_last_line(monkeypatch, tmp_path):
-    row, account = rows_of(monkeypatch, tmp_path, BadlyEndedSite, FINE)
-    assert (row.kept, account.kept, account.seen) == (True, False, "exit code 1: the last line")
+@pytest.mark.parametrize(
+    ("site", "seen"), [(BadlyEndedSite, "exit code 1: the last line"), (EndlessSite, "it did not stop")]
+)
+def test_a_site_that_ends_badly_is_a_row_that_says_how(monkeypatch, tmp_path, site, seen):
+    row, account = rows_of(monkeypatch, tmp_path, site, FINE)
+    assert (row.kept, account.kept, account.seen) == (True, False, seen)
 
 
 def test_scenarios_share_a_site_unless_they_need_their_own(monkeypatch, tmp_path):
