@@ -42,7 +42,7 @@ HEALTH_PERIOD_S = 1.0
 LOSS_REPORT_S = 0.2  # losses are reported this soon, so that a stage that is killed leaves few unreported
 PRODUCERS_END_LIMIT_S = 10.0  # how long a stage whose launcher has gone waits for its producers to end
 # When each part of the end must be over, as shares of launcher.stop_timeout_s: the rest is for the process itself.
-DRAINED, WORK_ENDED, SOURCES_STOPPED, CORES_CLOSED, HEALTH_SENT, BUS_LEFT = 0.5, 0.6, 0.65, 0.8, 0.85, 0.95
+DRAINED, WORK_ENDED, SOURCES_STOPPED, CORES_CLOSED, HEALTH_SENT, BUS_LEFT = 0.7, 0.75, 0.78, 0.88, 0.9, 0.95
 
 
 class Runner:
