@@ -36,7 +36,8 @@ class Topic:
     """One topic.
 
     Attributes:
-        history: a producer keeps this many of its last messages for consumers that missed them.
+        history: a producer keeps this many of its last messages for consumers that missed them, 80 s at 100 Hz, as far
+            as its memory allows (`pipeline.bus.publisher`).
         largest_bytes: a longer message is refused before it is decoded. The largest that any configuration makes is
             half of it or less (blocks of 4096 samples of 64 fans).
     """
@@ -55,11 +56,14 @@ class Topic:
         return self.rate == ON_CHANGE
 
 
+CATCH_UP_MESSAGES = 1024
+"""a consumer that begins asks for no more of each stream"""
+
 TOPICS: tuple[Topic, ...] = (
-    Topic("raw", Raw, "as the device sends, often 100 Hz", True, 1024, 16 * MIB, "samples as the device sent them"),
-    Topic("grid", Grid, "the grid's rate over the block size", True, 1024, 16 * MIB, "samples on a uniform grid"),
-    Topic("prediction", Prediction, "as grid", True, 1024, 32 * MIB, "the healthy twin beside the measurement"),
-    Topic("score", Score, "as prediction", True, 1024, 64 * MIB, "scored samples, ready to draw"),
+    Topic("raw", Raw, "as the device sends, often 100 Hz", True, 8192, 16 * MIB, "samples as the device sent them"),
+    Topic("grid", Grid, "the grid's rate over the block size", True, 8192, 16 * MIB, "samples on a uniform grid"),
+    Topic("prediction", Prediction, "as grid", True, 8192, 32 * MIB, "the healthy twin beside the measurement"),
+    Topic("score", Score, "as prediction", True, 8192, 64 * MIB, "scored samples, ready to draw"),
     Topic("alarm", Alarm, ON_CHANGE, True, 1024, MIB, "transitions of alarms"),
     Topic("request", Request, ON_CHANGE, True, 64, 64 * KIB, "requests of operators about alarms"),
     Topic(

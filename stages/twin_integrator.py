@@ -183,7 +183,7 @@ class TwinIntegratorCore(Core):
         for row in np.flatnonzero(since_ns > self._longest_step_ns).tolist():
             missing[row] = round(int(since_ns[row]) / period_ns) - 1
             if not (in_gap[row - 1] if row else self._in_announced_gap):
-                self._counts["lost_grid_samples"] += int(missing[row])
+                self._counts["missing_grid_samples"] += int(missing[row])
         self._in_announced_gap = bool(in_gap[-1])
         return missing
 

@@ -12,18 +12,30 @@ from schemas.topics import Topic
 
 KEPT_BYTES = 16 << 20
 """the most a publisher keeps, whatever its history: large messages of a large fleet would fill the memory"""
+KEPT_BYTES_OF_ALL = 256 << 20
+"""the most that all publishers of a process keep together; what is published only on change is kept beyond that"""
+
+
+class KeptBytes:
+    """How much the publishers of a session keep together."""
+
+    def __init__(self) -> None:
+        self.total = 0
+        self.lock = threading.Lock()
 
 
 class Publisher:
     """One output: publishes bytes on a key, and keeps the last ones for consumers that missed them."""
 
-    def __init__(self, session: zenoh.Session, key: str, topic: Topic, encoding: str, producer: str) -> None:
+    def __init__(
+        self, session: zenoh.Session, key: str, topic: Topic, encoding: str, producer: str, kept_bytes: KeptBytes
+    ) -> None:
         self.key = key
         self.published = 0
-        self._history = topic.history
+        self._topic = topic
         self._kept: deque[tuple[int, bytes]] = deque()
         self._kept_bytes = 0
-        self._lock = threading.Lock()
+        self._of_all = kept_bytes
         self._publisher = session.declare_publisher(
             key,
             encoding=f"application/protobuf;{encoding}",
@@ -35,21 +47,31 @@ class Publisher:
 
     def put(self, payload: bytes) -> None:
         """Publish the message whose sequence number is `published`."""
-        with self._lock:
+        with self._of_all.lock:
             self._kept.append((self.published, payload))
-            self._kept_bytes += len(payload)
-            while len(self._kept) > self._history or self._kept_bytes > KEPT_BYTES:
-                _, discarded = self._kept.popleft()
-                self._kept_bytes -= len(discarded)
+            self._add(len(payload))
+            while self._kept and self._keeps_too_much():
+                self._add(-len(self._kept.popleft()[1]))
             self.published += 1
         self._publisher.put(payload)
+
+    def _add(self, size: int) -> None:
+        self._kept_bytes += size
+        if not self._topic.is_rare:
+            self._of_all.total += size
+
+    def _keeps_too_much(self) -> bool:
+        if len(self._kept) > self._topic.history or self._kept_bytes > KEPT_BYTES:
+            return True
+        return self._of_all.total > KEPT_BYTES_OF_ALL and not self._topic.is_rare and len(self._kept) > 1
 
     def _answer(self, query: zenoh.Query) -> None:
         """Answer with what is kept of a range, and at the end with the number of published messages."""
         first = int(query.parameters.get("first") or 0)
         last = int(query.parameters.get("last") or LAST_SEQUENCE)
-        with self._lock:
-            wanted = [payload for sequence, payload in self._kept if first <= sequence <= last]
+        newest = int(query.parameters.get("newest") or self._topic.history)
+        with self._of_all.lock:
+            wanted = [payload for sequence, payload in self._kept if first <= sequence <= last][-newest:]
             published = self.published
         with query:
             for payload in wanted:

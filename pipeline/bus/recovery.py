@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 import zenoh
 
-from schemas.topics import largest_bytes
+from schemas.topics import CATCH_UP_MESSAGES, largest_bytes
 
 MOST_RECOVERED_MESSAGES = 16_384
 MOST_RECOVERED_BYTES = 64 << 20
@@ -76,8 +76,9 @@ class RecoveryRequest:
         self._lock = threading.Lock()
         self._has_ended = False
         self._cancellation = zenoh.CancellationToken()
+        newest = "" if self._is_of_one else f";newest={CATCH_UP_MESSAGES}"
         session.get(
-            f"{recovery_key(key, producer)}?first={first};last={last};count=1",
+            f"{recovery_key(key, producer)}?first={first};last={last};count=1{newest}",
             zenoh.handlers.Callback(self._receive, lambda: self._end(None), indirect=False),
             target=zenoh.QueryTarget.ALL,
             timeout=timeout_s,

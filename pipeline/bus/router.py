@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import zenoh
 
 from pipeline.bus.errors import BusError, reason
+from pipeline.bus.link import LEASE_MS
 
 
 @contextmanager
@@ -22,6 +23,7 @@ def open_router(endpoint: str) -> Iterator[None]:
     try:
         conf.insert_json5("mode", '"router"')
         conf.insert_json5("listen/endpoints", json.dumps([endpoint]))
+        conf.insert_json5("transport/link/tx/lease", LEASE_MS)
         conf.insert_json5("scouting/multicast/enabled", "false")
         session = zenoh.open(conf)
     except zenoh.ZError as error:

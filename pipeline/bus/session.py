@@ -24,7 +24,8 @@ import zenoh
 
 from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program, somebody_listens
 from pipeline.bus.errors import BusError, reason
-from pipeline.bus.publisher import Publisher
+from pipeline.bus.link import LEASE_MS
+from pipeline.bus.publisher import KeptBytes, Publisher
 from pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest
 from pipeline.config.models import BusConfig
 from schemas.topics import Topic, largest_bytes
@@ -58,6 +59,7 @@ class Bus:
         self._has_answered = config.mode == "client" or (self.came_second and _answers(config.endpoint, stop))
         self._session = _open(config, stop, listens)
         self.refused_too_large = 0
+        self._kept_bytes = KeptBytes()
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
 
     def __enter__(self) -> Self:
@@ -70,7 +72,7 @@ class Bus:
 
     def publisher(self, key: str, topic: Topic, encoding: str, producer: str) -> Publisher:
         """Declare an output; `encoding` is the full protobuf name of its messages."""
-        return Publisher(self._session, key, topic, encoding, producer)
+        return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes)
 
     def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> None:
         """Call `on_message(key, payload)` for what other sessions publish, from a thread of the bus.
@@ -200,6 +202,8 @@ def _zenoh_config(config: BusConfig, listens: bool) -> zenoh.Config:
     conf.insert_json5("connect/timeout_ms", "-1" if config.mode == "peer" else _ROUTER_TIMEOUT_MS)
     conf.insert_json5("connect/exit_on_failure", "false")
     conf.insert_json5("connect/retry", _RETRY)
+    if config.mode == "client":
+        conf.insert_json5("transport/link/tx/lease", LEASE_MS)
     conf.insert_json5("scouting/multicast/enabled", "false")
     if config.mode == "peer":
         host = config.endpoint.rsplit(":", 1)[0]

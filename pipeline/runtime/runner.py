@@ -11,7 +11,7 @@ import functools
 import secrets
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -86,6 +86,8 @@ class Runner:
             else {"": stage.build(context)}
         )
         """by the tray that a core serves; an empty name: all"""
+        self._due: deque[Envelope] = deque()
+        """messages in sequence, to be processed before anything else: recovered ones are many at a time"""
         self._has_source = any(parts.source for parts in self._parts.values())
         self._sources = Sources(self._inbox)
         self._clock = StageClock()
@@ -182,7 +184,7 @@ class Runner:
         self._publish_health(StageStatus.STARTING)
         if not self.stage.may_drop:
             self._catch_up()
-            self._loop(lambda: not self._recovery.is_catching_up, StageStatus.STARTING)
+            self._loop(lambda: not (self._recovery.is_catching_up or self._due), StageStatus.STARTING)
         self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
         for name, parts in self._parts.items():
             self._sources.start(name, parts)
@@ -197,8 +199,9 @@ class Runner:
         next_tick = next_health = next_loss = time.monotonic()
         reported_lost = 0
         while not until():
-            item = self._inbox.get(max(0.0, next_tick - time.monotonic()))
-            if item is not None:
+            if self._due:
+                self._step(self._due.popleft())
+            elif (item := self._inbox.get(max(0.0, next_tick - time.monotonic()))) is not None:
                 self._handle(item)
             now = time.monotonic()
             if now >= next_tick:
@@ -225,10 +228,13 @@ class Runner:
         """
         sources = self._sources.stop()
         left: int | None = None  # items still to be processed, known once everything expected has arrived
-        while left != 0:
+        while left != 0 or self._due:
             if self._ending.left_s(DRAINED) < 0:
                 self._discard_waiting()
                 return
+            if self._due:
+                self._step(self._due.popleft())
+                continue
             awaits_more = self._peers.awaits_last_health() or self._tracker.is_waiting
             if left is None and sources.wait(0) and not awaits_more:
                 left = self._inbox.waiting()
@@ -236,10 +242,13 @@ class Runner:
             item = self._inbox.get(TICK_S)
             if item is not None:
                 self._handle(item)
-                left = None if left is None else left - 1
+                left = None if left is None else max(0, left - 1)
 
     def _discard_waiting(self) -> None:
         self._inbox.close()  # from now on it takes nothing, and the sources count what they deliver
+        if not self.stage.may_drop:
+            self._counts["lost_at_stop"] += len(self._due) + self._tracker.held
+        self._due.clear()
         while (item := self._inbox.get(0)) is not None:
             if isinstance(item, FromSource):
                 self._sources.discard(item)
@@ -296,8 +305,7 @@ class Runner:
                     self._counts["refused_clocks"] += 1
             else:
                 self._health.add_input(envelope.key, envelope.received_t_ns)
-                for due in self._tracker.accept(envelope):
-                    self._step(due)
+                self._due += self._tracker.accept(envelope)
 
     def _handle_recovered(self, item: Recovered) -> None:
         decoded = (self._decode(key, payload, time.time_ns()) for key, payload in item.answer.messages)
@@ -306,8 +314,7 @@ class Runner:
             due = self._tracker.accept_kept(envelopes)
         else:
             due = self._tracker.answer(item.request, Found(envelopes, item.answer.published))
-        for envelope in due:
-            self._step(envelope)
+        self._due += due
         self._recovery.finish(item)
 
     def _handle_health(self, envelope: Envelope, health: Health) -> None:
@@ -316,11 +323,9 @@ class Runner:
         self._peers.add_health(alive_key(self._site, health.stage, health.instance), health)
         if health.stage == REPLAY:
             self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
-        for due in self._tracker.reconcile(health, self._read_keys):
-            self._step(due)
+        self._due += self._tracker.reconcile(health, self._read_keys)
         if "health" in self.stage.reads:
-            for due in self._tracker.accept(envelope):
-                self._step(due)
+            self._due += self._tracker.accept(envelope)
 
     def _decode(self, key: str, payload: bytes, received_t_ns: int) -> Envelope | None:
         try:

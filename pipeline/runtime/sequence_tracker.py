@@ -17,6 +17,7 @@ from pipeline.runtime.tracked_streams import Request, Stream, TrackedStreams, Wa
 from schemas.envelope import Envelope
 from schemas.messages import Health, Input
 from schemas.streams import MOST_PUBLISHED, output_streams
+from schemas.topics import CATCH_UP_MESSAGES
 
 MOST_HELD_MESSAGES = 4096
 """of one stream"""
@@ -123,6 +124,12 @@ class SequenceTracker:
         """Whether an answer is due."""
         return any(stream.waiting for stream in self._streams)
 
+    @property
+    def held(self) -> int:
+        """How many messages are held until an answer comes."""
+        waiting = [stream.waiting for stream in self._streams if stream.waiting]
+        return sum(len(each.held) + (each.shown_by is not None) for each in waiting)
+
     def inputs(self) -> tuple[Input, ...]:
         """The counts for health. Forgotten producers of a key are summed up under an empty name."""
         return self._streams.inputs()
@@ -148,7 +155,7 @@ class SequenceTracker:
 
     def _request(self, stream: Stream, until: int, shown_by: Envelope | None) -> list[Envelope]:
         """Request what is missing before `until`."""
-        first = stream.next_sequence if stream.next_sequence is not None else max(0, until - stream.history)
+        first = stream.next_sequence if stream.next_sequence is not None else max(0, until - CATCH_UP_MESSAGES)
         request = Request(stream.key, stream.producer, first, until - 1)
         stream.waiting = waiting = Waiting(request, until, shown_by)
         found = self._ask(request)
@@ -189,7 +196,7 @@ class SequenceTracker:
         if stream.next_sequence is None:
             return True
         silent_s = self._now_s() - stream.heard_s
-        return published - stream.next_sequence <= stream.history + MOST_PER_S * silent_s
+        return published - stream.next_sequence <= CATCH_UP_MESSAGES + MOST_PER_S * silent_s
 
     def _refuse_number(self, key: str, producer: str, claimed: int, known: int | None) -> None:
         line = f"{key}: {claimed} messages in the name of {producer} are not possible after {known or 0}: ignored"

@@ -10,7 +10,7 @@ from itertools import islice
 from schemas.envelope import Envelope
 from schemas.messages import Input
 from schemas.streams import StreamId, StreamState
-from schemas.topics import HEALTH_CHUNK, health_key, topic_of
+from schemas.topics import HEALTH_CHUNK, health_key
 
 MOST_PRODUCERS = 64
 """of one key are remembered. Every `fantwin alarms ack` is a producer of its own."""
@@ -64,11 +64,6 @@ class Stream(StreamState):
     producer: str = ""
     heard_s: float = 0.0
     waiting: Waiting | None = None
-
-    @property
-    def history(self) -> int:
-        """How many messages its producer keeps at most."""
-        return topic_of(self.key).history
 
 
 class TrackedStreams:

@@ -15,7 +15,7 @@ from pipeline.bus.publisher import KEPT_BYTES
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from schemas.topics import BY_NAME, alive_key, tray_key
-from tests.support.bus_peer import KEY, TOPIC
+from tests.support.bus_peer import KEY
 from tests.support.running_chain import eventually
 
 COUNT = 400
@@ -130,9 +130,10 @@ def test_a_publisher_keeps_the_newest_messages_that_fit_its_memory(endpoint):
         eventually(lambda: asker.recover(key, "big"), "somebody answers")
         kept = [payload[0] for _, payload in asker.recover(key, "big")]
         assert kept == [2, 3, 4, 5]
-        for _ in range(TOPIC.history + 1):
+        history = BY_NAME["score"].history
+        for _ in range(history + 1):
             publisher.put(b"small")
-        assert len(asker.recover(key, "big")) == TOPIC.history
+        assert len(asker.recover(key, "big")) == history
 
 
 def test_an_unanswered_recovery_request_returns_nothing(endpoint):

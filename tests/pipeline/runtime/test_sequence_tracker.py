@@ -9,7 +9,7 @@ from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.tracked_streams import Request
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Header, Health, Output, Severity, StageStatus
-from schemas.topics import BY_NAME, tray_key
+from schemas.topics import CATCH_UP_MESSAGES, tray_key
 
 KEY = tray_key("site", "tray", "alarm")
 
@@ -94,7 +94,7 @@ def test_a_late_consumer_gets_the_messages_still_kept_and_counts_earlier_ones_as
 def test_a_late_consumer_requests_no_more_than_a_producer_keeps():
     producer = Producer([])
     list(SequenceTracker(producer.ask).accept(packet(10**6)))
-    history = BY_NAME["alarm"].history
+    history = CATCH_UP_MESSAGES
     assert producer.asked == [(10**6 - history, 10**6 - 1)]
 
 

@@ -1,0 +1,37 @@
+"""What publishers keep for consumers that missed it: enough for a lost link, and bounded in memory."""
+
+from __future__ import annotations
+
+from pipeline.bus import publisher as publisher_module
+from pipeline.bus.session import Bus
+from pipeline.config.models import BusConfig
+from schemas.topics import BY_NAME, CATCH_UP_MESSAGES, tray_key
+from tests.support.running_chain import eventually
+
+LOST_S, RATE_HZ = 30, 100
+
+
+def test_row_16_what_is_sent_while_a_link_is_lost_for_30_s_is_kept(endpoint):
+    """Samples of 8 fans at 100 Hz; a consumer that begins asks for fewer."""
+    key, topic = tray_key("s", "a", "raw"), BY_NAME["raw"]
+    config = BusConfig(endpoint=endpoint)
+    with Bus(config) as bus, Bus(config) as asker:
+        publisher = bus.publisher(key, topic, "", "p")
+        for _ in range(LOST_S * RATE_HZ + 500):
+            publisher.put(bytes(300))
+        eventually(lambda: asker.recover(key, "p"), "they have met")
+        assert len(asker.recover(key, "p")) == LOST_S * RATE_HZ + 500
+        assert len(asker.recover(key)) == CATCH_UP_MESSAGES
+
+
+def test_row_16_publishers_of_a_process_keep_a_bounded_number_of_bytes_together(endpoint, monkeypatch):
+    monkeypatch.setattr(publisher_module, "KEPT_BYTES_OF_ALL", 10_000)
+    with Bus(BusConfig(endpoint=endpoint)) as bus:
+        first, second = (bus.publisher(tray_key("s", tray, "raw"), BY_NAME["raw"], "", "p") for tray in "ab")
+        rare = bus.publisher(tray_key("s", "a", "alarm"), BY_NAME["alarm"], "", "p")
+        for _ in range(100):
+            rare.put(bytes(100))
+            for publisher in (first, second):
+                publisher.put(bytes(100))
+        assert sum(len(each._kept) for each in (first, second)) == 100
+        assert len(rare._kept) == 100, "what is published only on change is kept all the same"
