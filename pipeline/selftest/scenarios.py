@@ -21,6 +21,7 @@ from schemas.messages import Header, Raw
 from schemas.topics import BY_NAME, tray_key
 
 REPLACED_LIMIT_S = 30.0
+SILENCE = "no raw samples"
 STALL_S = 8.0
 FAR_AHEAD_S = 3600.0
 NOISE_BYTES = 200_000
@@ -99,10 +100,10 @@ def _hang(site: ScratchSite) -> str:
 
 def _silence(site: ScratchSite) -> str:
     site.line.cut(True)
-    took_s = site.seconds_until(lambda: site.problem("resampler"), 20.0)
+    took_s = site.seconds_until(lambda: SILENCE in site.problem("resampler"), 20.0)
     site.line.cut(False)
-    _require(took_s, "no stage reported the silence within 20 s")
-    return f"reported after {took_s:.1f} s: {site.problem('resampler') or 'resolved'}"
+    _require(took_s is not None, f"the resampler did not report {SILENCE!r} within 20 s")
+    return f"reported by the resampler after {took_s:.1f} s"
 
 
 def _backlog(site: ScratchSite) -> str:

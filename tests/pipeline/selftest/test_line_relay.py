@@ -16,7 +16,7 @@ from pipeline.selftest.line_relay import LineRelay
 LIMIT_S = 20.0
 
 
-class Line:
+class RelayedDevice:
     """A device, the relay, and a reader."""
 
     def __init__(self, folder: Path) -> None:
@@ -46,20 +46,20 @@ class Line:
 
 
 @pytest.fixture
-def line(tmp_path: Path) -> Iterator[Line]:
-    line = Line(tmp_path)
+def line(tmp_path: Path) -> Iterator[RelayedDevice]:
+    line = RelayedDevice(tmp_path)
     yield line
     line.close()
 
 
-def test_bytes_pass_in_both_directions(line: Line) -> None:
+def test_bytes_pass_in_both_directions(line: RelayedDevice) -> None:
     line.send(b"sample")
     assert line.receive(6) == b"sample"
     os.write(line.reader, b"command")
     assert line.device.wait(LIMIT_S) == b"command"
 
 
-def test_what_is_held_is_delivered_in_order_on_release(line: Line) -> None:
+def test_what_is_held_is_delivered_in_order_on_release(line: RelayedDevice) -> None:
     line.relay.hold()
     for number in range(5):
         line.send(bytes([number]) * 700)
@@ -68,7 +68,7 @@ def test_what_is_held_is_delivered_in_order_on_release(line: Line) -> None:
     assert line.receive(3500) == b"".join(bytes([number]) * 700 for number in range(5))
 
 
-def test_what_is_sent_while_the_line_is_cut_is_lost(line: Line) -> None:
+def test_what_is_sent_while_the_line_is_cut_is_lost(line: RelayedDevice) -> None:
     line.relay.cut(True)
     line.send(b"lost")
     line.relay.cut(False)
@@ -76,7 +76,7 @@ def test_what_is_sent_while_the_line_is_cut_is_lost(line: Line) -> None:
     assert line.receive(4) == b"kept"
 
 
-def test_what_is_injected_arrives_whole(line: Line) -> None:
+def test_what_is_injected_arrives_whole(line: RelayedDevice) -> None:
     noise = bytes(range(256)) * 100
     line.relay.inject(noise)
     assert line.receive(len(noise)) == noise
