@@ -69,6 +69,11 @@ class OfflinePipeline:
         """Raw messages that the recording lacks, up to where the pipeline has run."""
         return self._raw.missing
 
+    @property
+    def longest_repeat(self) -> float:
+        """At most so many samples can a restarted stage consume again."""
+        return 2 * BY_NAME["raw"].history * self._raw.samples_in_message
+
     def limit_of(self, producer: str) -> Limit | None:
         """Up to where the outputs of a session of the last stage can be reproduced; exact for what has been run."""
         limits: dict[str, Limit | None] = {}
@@ -112,6 +117,8 @@ class OfflinePipeline:
         core: Any = self._core(stage)
         kind = BY_NAME[output].message
         newest_t_ns = BEGINNING
+        counters: Mapping[str, int] | None = None
+        """what it counted up to the newest message that it certainly consumed"""
 
         def main_output(messages: Iterable[Message]) -> Iterator[Message]:
             nonlocal newest_t_ns
@@ -127,6 +134,8 @@ class OfflinePipeline:
                 yield from main_output(core.step(block))
         else:
             for block, until_t_ns in self._raw.of(session):
+                if counters is None and session.producer in self._raw.is_past_known:
+                    counters = dict(core.counters())
                 if self._begins_to_lack(session):
                     yield from main_output(core.publish_until(BEGINNING))  # what it has made already
                     self._limit_by_gap(session, newest_t_ns)
@@ -136,7 +145,8 @@ class OfflinePipeline:
             if self._begins_to_lack(session):
                 yield from main_output(core.publish_until(BEGINNING))
                 self._limit_by_gap(session, newest_t_ns)
-        yield from main_output(self._close(core))
+        is_last = session is self._plan.first[-1]  # another one consumes what this one is given beyond that
+        yield from main_output(self._close(core, None if is_last else counters))
 
     def _begins_to_lack(self, session: Session) -> bool:
         """Whether the recording lacks raw messages that this session of the first stage consumed next."""
@@ -174,9 +184,10 @@ class OfflinePipeline:
     def _core(self, stage: Stage) -> Core:
         return stage.build(self._contexts[stage.name]).core
 
-    def _close(self, core: Core) -> list[Message]:
+    def _close(self, core: Core, counters: Mapping[str, int] | None = None) -> list[Message]:
+        """Close a core and add its counters, or those given instead."""
         closing = list(core.close())
-        self.counts.update(core.counters())
+        self.counts.update(core.counters() if counters is None else counters)
         return closing
 
 

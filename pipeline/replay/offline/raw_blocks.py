@@ -40,6 +40,11 @@ class RawBlocks:
         self.has_gap: set[str] = set()
         """sessions that consumed messages, before the next block they are given, that are missing"""
 
+        self.is_past_known: set[str] = set()
+        """sessions whose next block begins after the newest message that they certainly consumed"""
+        self.samples_in_message = 1.0
+        """on average, of the messages read first"""
+
     @property
     def missing(self) -> int:
         """Raw messages that a stage consumed, or that lie between recorded ones, and that are not in the recording."""
@@ -63,16 +68,24 @@ class RawBlocks:
             if is_new:
                 self._next_new[producer] = sequence + 1
             waiting.append(payload)
+            is_last_known = (producer, sequence) == (session.spans[-1].producer, session.spans[-1].last_known)
             until_t_ns = session.timer_outputs.get((producer, sequence))
             if until_t_ns is not None:
                 *blocks, (last, _) = self._decoded(waiting, kind)
                 yield from blocks
                 yield last, until_t_ns
                 waiting = []
+            if is_last_known:
+                yield from self._decoded(waiting, kind)
+                waiting = []
+                self.is_past_known.add(session.producer)
         yield from self._decoded(waiting, kind)
 
     def _decoded(self, payloads: Sequence[bytes], kind: tuple[str, bool] | None) -> Iterator[tuple[Raw, None]]:
         for block in decode_together(Raw, payloads):
+            if self._first_t_ns is None and len(block.host_receive_t_ns):
+                self._first_t_ns = int(block.host_receive_t_ns[0])
+                self.samples_in_message = len(block.host_receive_t_ns) / len(payloads)
             wanted = self._in_stretch(block)
             if kind and kind[1]:
                 self._observe(wanted)
@@ -82,8 +95,7 @@ class RawBlocks:
     def _in_stretch(self, block: Raw) -> Raw:
         if self._stretch_s == (0.0, math.inf) or not len(block.host_receive_t_ns):
             return block
-        if self._first_t_ns is None:
-            self._first_t_ns = int(block.host_receive_t_ns[0])
+        assert self._first_t_ns is not None
         since_s = (block.host_receive_t_ns - self._first_t_ns) / NS_PER_S
         inside = np.flatnonzero((since_s >= self._stretch_s[0]) & (since_s < self._stretch_s[1]))
         return cut(block, int(inside[0]), int(inside[-1]) + 1) if len(inside) else cut(block, 0, 0)

@@ -69,13 +69,20 @@ class RescoredTray:
         """Messages that the recording lacks, and samples that the stages counted as lost."""
         return self.raw_missing + sum(n for name, n in self.counts.items() if name.startswith(LOSS_PREFIX))
 
-    def add(self, score: Score) -> None:
-        """Count the samples of a block; those that an earlier session has scored already do not count again."""
+    def add(self, score: Score, longest_repeat: float) -> None:
+        """Count the samples of a block; those that an earlier session has scored already do not count again.
+
+        longest_repeat: at most so many samples does a restarted stage repeat. Samples from further back are not
+        repeated: the clock was set back.
+        """
+        if int(score.t_ns[0]) < self._newest_t_ns - longest_repeat * score.period_ns:
+            self._newest_t_ns = int(score.t_ns[0]) - 1
         self.period_ns = score.period_ns
-        self.start_ns = self.start_ns or int(score.t_ns[0])
-        self.end_ns = int(score.t_ns[-1])
+        first_ns, last_ns = int(score.t_ns[0]), int(score.t_ns[-1])
+        self.start_ns = min(self.start_ns or first_ns, first_ns)
+        self.end_ns = max(self.end_ns, last_ns)
         new = score.t_ns > self._newest_t_ns
-        self._newest_t_ns = max(self._newest_t_ns, self.end_ns)
+        self._newest_t_ns = max(self._newest_t_ns, last_ns)
         valid = score.valid[new]
         self.samples += int(new.sum())
         self.scored += int(valid.any(axis=1).sum())
@@ -128,7 +135,7 @@ def _rescore_tray(
             if isinstance(message, Alarm):
                 rescored.alarms.append(replace(message, header=Header(replayed.producer, 0, tray)))
             elif isinstance(message, Score):
-                rescored.add(message)
+                rescored.add(message, pipeline.longest_repeat)
                 progress(tray, rescored.end_ns)
                 if verifier:
                     verifier.add(replayed.producer, message)

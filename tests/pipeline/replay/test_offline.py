@@ -557,3 +557,18 @@ def test_a_recording_that_lacks_nothing_is_compared_to_its_end(recording, reques
     assert (
         plan and [session.limit for sessions in plan.sessions.values() for session in sessions if session.limit] == []
     )
+
+
+def test_row_13_after_a_step_of_the_clock_the_samples_that_are_counted_are_those_that_are_compared(tmp_path):
+    site = Site(tmp_path, seed=3)
+    site.run(100)
+    site.now_ns -= 3600 * 10**9
+    site.run(220)  # more than are kept and consumed again: all of these are of the new time
+    for stage in CHAIN:
+        site.kill(stage)
+    site.run(100)
+    tray = verified(site.finished())
+    found = tray.comparison
+    assert found and found.different == found.not_made == 0
+    assert tray.samples == found.equal == sum(len(score.t_ns) for score in recorded(site.path, "score"))
+    assert tray.lost == 0
