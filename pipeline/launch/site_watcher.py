@@ -18,8 +18,8 @@ from schemas.topics import alive_key, health_key, sessions_key, tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence
 
-MAX_SESSIONS = 1000
-"""sessions whose last health is kept; each `fantwin alarms ack` is none, it sends no health"""
+MOST_WATCHED_SESSIONS = 1000
+"""sessions whose last health is kept; those heard longest ago are forgotten first"""
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class SiteWatcher:
             with self._lock:
                 before = self._healths.pop(health.header.producer, None)
                 self._healths[health.header.producer] = (health, before[0] if before else None, time.monotonic())
-                if len(self._healths) > MAX_SESSIONS:
+                if len(self._healths) > MOST_WATCHED_SESSIONS:
                     del self._healths[next(iter(self._healths))]
 
     def _on_alarm(self, key: str, payload: bytes) -> None:
