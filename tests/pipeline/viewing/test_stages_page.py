@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 from pipeline.viewing.stages_page import CHANGES_SHOWN, SILENT_AFTER_NS, StagesPage, rounded
-from schemas.messages import Header, Health, ModelCard, StageStatus
+from schemas.messages import AwaitedInput, Header, Health, ModelCard, StageStatus
 
 NOW_NS = 1_760_000_000_000_000_000  # 2025-10-09 08:53:20
 
@@ -109,3 +111,9 @@ def test_the_twin_in_force_is_shown_for_every_tray() -> None:
             "tray1", ModelCard(header=Header("x", 0, "tray1"), t_ns=NOW_NS, twin=twin, kind="hybrid", sha256="")
         )
     assert section(page.text(NOW_NS), "Twins in force")[0] == "- tray1: new (hybrid), since 2025-10-09 08:53:20"
+
+
+def test_row_01_a_stage_that_waits_for_its_input_is_named() -> None:
+    awaited = AwaitedInput(key="fantwin/s/tray1/grid", since_t_ns=0)
+    page = page_of(replace(health("scorer"), waiting_for=(awaited,)))
+    assert section(page.text(NOW_NS), "What is wrong")[0] == "- **scorer**: waits for grid of tray1"

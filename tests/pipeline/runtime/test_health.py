@@ -1,0 +1,51 @@
+"""What a stage says of itself besides its counts: what it waits for, and how old what it sends is."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.runtime.health import AWAITED_AFTER_NS, LATENCY_WINDOW_S, HealthBuilder
+from schemas.messages import AwaitedInput, Clock, Health, StageStatus
+
+KEY = "fantwin/s/tray1/grid"
+START_NS = 1_800_000_000_000_000_000
+
+
+@pytest.fixture
+def builder() -> HealthBuilder:
+    return HealthBuilder("scorer", "all", START_NS, may_drop=False, main_keys=[KEY])
+
+
+def health(builder: HealthBuilder, now_ns: int) -> Health:
+    return builder.build(status=StageStatus.OK, problems=(), inputs=(), outputs=(), counters={}, now_ns=now_ns)
+
+
+def test_row_01_a_main_input_without_a_message_for_two_seconds_is_waited_for(builder):
+    assert health(builder, START_NS + AWAITED_AFTER_NS).waiting_for == ()
+    late_ns = START_NS + AWAITED_AFTER_NS + 1
+    assert health(builder, late_ns).waiting_for == (AwaitedInput(key=KEY, since_t_ns=START_NS),)
+    builder.add_input("fantwin/s/tray1/request", late_ns)  # not the main input
+    assert health(builder, late_ns).waiting_for != ()
+    builder.add_input(KEY, late_ns)
+    assert health(builder, late_ns).waiting_for == ()
+
+
+def test_row_01_the_times_of_the_newest_input_and_output_are_given(builder):
+    empty = health(builder, START_NS)
+    assert (empty.newest_input_t_ns, empty.newest_output_t_ns) == (0, 0)
+    builder.add_input(KEY, START_NS + 5)
+    builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS + 7, None)
+    found = health(builder, START_NS + 9)
+    assert (found.newest_input_t_ns, found.newest_output_t_ns) == (START_NS + 5, START_NS + 7)
+    assert found.latency_p50_ms == 0.0, "the time of a paused replay is not known"
+
+
+def test_latencies_are_of_the_last_ten_seconds(builder, monkeypatch):
+    now_s = [100.0]
+    monkeypatch.setattr("pipeline.runtime.health.time.monotonic", lambda: now_s[0])
+    builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS, START_NS + 47_000_000_000)
+    assert health(builder, START_NS).latency_p50_ms == 47_000.0
+    now_s[0] += LATENCY_WINDOW_S / 2
+    builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS, START_NS + 1_000_000)
+    now_s[0] += LATENCY_WINDOW_S / 2 + 0.1
+    assert health(builder, START_NS).latency_p50_ms == 1.0
