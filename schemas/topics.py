@@ -56,8 +56,8 @@ class Topic:
         return self.rate == ON_CHANGE
 
 
-CATCH_UP_MESSAGES = 1024
-"""a consumer that begins asks for no more of each stream"""
+CATCH_UP_MESSAGES = 4096
+"""a consumer that begins asks for no more of each stream: 40 s at 100 Hz, enough to replace one that hung"""
 
 TOPICS: tuple[Topic, ...] = (
     Topic("raw", Raw, "as the device sends, often 100 Hz", True, 8192, 16 * MIB, "samples as the device sent them"),
