@@ -102,7 +102,7 @@ class Runner:
             self._bus.close()
             raise
         self._recovery = Recovery(self._bus, self._inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
-        self._tracker = SequenceTracker(self._recovery.ask)
+        self._tracker = SequenceTracker(self._recovery.ask, is_session=self._sessions.is_alive)
         self._outputs = Outputs(self._bus, config.site, stage, [t.name for t in trays], self.producer)
         self._health_publisher = self._bus.publisher(
             health_key(config.site, stage.name, self._instance), BY_NAME["health"], type_name(Health), self.producer

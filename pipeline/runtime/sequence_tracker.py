@@ -55,10 +55,16 @@ class SequenceTracker:
     goes on as if it had not come.
     """
 
-    def __init__(self, ask: Ask, now_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        ask: Ask,
+        now_s: Callable[[], float] = time.monotonic,
+        is_session: Callable[[str], bool] = lambda _producer: False,
+    ) -> None:
+        """is_session: whether a producer is a session of a stage that is alive; it is never one too many."""
         self._ask = ask
         self._now_s = now_s
-        self._streams = TrackedStreams(now_s)
+        self._streams = TrackedStreams(now_s, is_session)
         self._refused: Counter[str] = Counter()
         self._refusal = ""
         self._refused_s = 0.0

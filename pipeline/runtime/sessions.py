@@ -106,6 +106,10 @@ class Sessions:
         found = ((each, owners[each.stage, each.instance]) for each in self._alive.values())
         self._ignored = {each.producer: (each, owner) for each, owner in found if each is not owner}
 
+    def is_alive(self, producer: str) -> bool:
+        """Whether this producer is a session that is alive."""
+        return any(each.producer == producer for each in self._alive.values())
+
     def is_ignored(self, producer: str) -> bool:
         """Whether another process owns the stage of this producer."""
         return producer in self._ignored

@@ -69,11 +69,16 @@ class Stream(StreamState):
 class TrackedStreams:
     """Streams by key and producer. Where one too many appears, another is forgotten, and its counts are summed up under
     an empty name: one that has been silent for long, or else the one that has sent least. One that waits for missing
-    messages is not forgotten; if all wait, the new one is refused.
+    messages is not forgotten; if all wait, the new one is refused. So are more new ones in SILENT_S than are
+    remembered, unless they are sessions of a stage.
     """
 
-    def __init__(self, now_s: Callable[[], float]) -> None:
+    def __init__(self, now_s: Callable[[], float], is_session: Callable[[str], bool]) -> None:
+        """is_session: whether a producer is a session of a stage that is alive."""
         self._now_s = now_s
+        self._is_session = is_session
+        self._newcomers_s: dict[str, deque[float]] = {}
+        """by group: when the last new producers were first heard"""
         self._groups: dict[str, dict[StreamId, Stream]] = {}
         """by key, one for all keys of health; the stream heard last is at the end"""
         self._forgotten: dict[str, StreamState] = {}
@@ -92,9 +97,13 @@ class TrackedStreams:
         group = self._groups.setdefault(name, {})
         stream = group.pop((key, producer), None)
         if stream is None:
-            if len(group) >= (MOST_PRODUCERS if name == key else MOST_HEALTH_PRODUCERS) and not self._forget_one(name):
+            most = MOST_PRODUCERS if name == key else MOST_HEALTH_PRODUCERS
+            newcomers_s, now_s = self._newcomers_s.setdefault(name, deque(maxlen=most)), self._now_s()
+            is_flood = len(newcomers_s) == most and now_s - newcomers_s[0] < SILENT_S
+            if (is_flood and not self._is_session(producer)) or (len(group) >= most and not self._forget_one(name)):
                 return None
-            stream = Stream(key=key, producer=producer, heard_s=self._now_s())
+            newcomers_s.append(now_s)
+            stream = Stream(key=key, producer=producer, heard_s=now_s)
         group[key, producer] = stream
         return stream
 

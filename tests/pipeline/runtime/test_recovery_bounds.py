@@ -92,10 +92,18 @@ def test_row_11_a_flood_of_producers_leaves_the_real_one_in_sequence_and_few_oth
         assert sequences(tracker.accept(packet(number, "real"))) == [number]
         tracker.accept(packet(1, f"false-{number}"))
     assert len(list(tracker._streams)) == MOST_PRODUCERS
-    assert len(tracker.inputs()) == MOST_PRODUCERS + 1
-    assert sum(line.received for line in tracker.inputs()) == 4_000
+    assert sum(line.received for line in tracker.inputs()) == 2_000 + MOST_PRODUCERS - 1
+    assert tracker.counters() == {"refused_producers": 2_000 - MOST_PRODUCERS + 1}
     real = next(line for line in tracker.inputs() if line.producer == "real")
     assert (real.received, real.missing, real.duplicated) == (2_000, 0, 0)
+
+
+def test_row_11_in_a_flood_of_producers_a_session_of_a_stage_is_admitted():
+    tracker = SequenceTracker(lambda _request: Found(), is_session=lambda producer: producer == "restarted")
+    for number in range(2 * MOST_PRODUCERS):
+        tracker.accept(packet(1, f"false-{number}"))
+    assert sequences(tracker.accept(packet(0, "restarted"))) == [0]
+    assert sequences(tracker.accept(packet(0, "stranger"))) == []
 
 
 def test_row_11_a_flood_of_healths_is_remembered_in_part():

@@ -106,9 +106,11 @@ def test_a_new_session_of_a_producer_starts_its_own_sequence():
 
 
 def test_the_latest_of_many_producers_are_listed_by_name_and_the_others_summed_up():
-    tracker = SequenceTracker(Producer([]).ask)
+    now_s = [0.0]
+    tracker = SequenceTracker(Producer([]).ask, lambda: now_s[0])
     list(tracker.accept(packet(0, "controller")))
     for number in range(100):
+        now_s[0] += 1.0
         list(tracker.accept(packet(0, f"operator-{number}")))
         list(tracker.accept(packet(3, f"operator-{number}")))
         assert sequences(tracker.accept(packet(number + 1, "controller"))) == [number + 1], (
