@@ -207,7 +207,7 @@ class ResamplerCore(Core):
             # Two segments of the device clock are not compared: a gap lies between, and nothing is interpolated.
             self._not_before_t_ns = self._newest_t_ns + self._gap_limit_ns + 1
         if behind_ns < 0 and t_ns < self._not_before_t_ns:
-            self._counts["lost_after_clock_restart"] += 1
+            self._counts["dropped_after_clock_restart"] += 1
             return False
         if is_new and behind_ns > SET_BACK_NS:
             self._counts["lost_clock_set_back"] += 1
