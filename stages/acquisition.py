@@ -104,7 +104,7 @@ class AcquisitionCore(Core):
         config: AcquisitionConfig,
         source: SampleSource,
         started_t_ns: int,
-        host_clock: HostClock = HOST_CLOCK,
+        host_clock: HostClock,
     ) -> None:
         """host_clock: gives the times of receipt and of ticks; its steps are reported."""
         self._tray = tray
@@ -290,7 +290,8 @@ def build(context: Context) -> BuiltStage:
         StageError: a setting of the source is missing.
     """
     source = build_tray_source(context)
-    return BuiltStage(AcquisitionCore(context.tray, context.config, source, context.started_t_ns), source)
+    core = AcquisitionCore(context.tray, context.config, source, context.started_t_ns, HOST_CLOCK)
+    return BuiltStage(core, source)
 
 
 def check(context: Context) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -21,8 +20,7 @@ from pipeline.launch.watchdog import Watchdog
 from schemas.topics import alive_key
 
 _POLL_S = 0.05
-_DISCOVERY_S = 10.0  # by then a process that was there before has been discovered, however busy the machine
-_OTHERS_S = 2.0  # after the first, by then all of them have been
+_SEARCH_S = 2.0  # so long after it has met one process, a launcher has discovered all others
 _ORDERLY = (0, 3)  # exit status of a stage that stopped in order: without losses, or with losses
 _READY_TIMEOUT_S = 30.0
 _STABLE_S = 10.0  # a stage that ran this long starts again at the shortest delay
@@ -82,7 +80,6 @@ class Launcher:
             UserError: a stage cannot run as configured; the others have been stopped.
         """
         with Bus(self._config.bus, stop) as bus:
-            bus.wait_for_others(stop)
             self._refuse_second_launcher(bus, stop)
             self._watcher = SiteWatcher(bus, self._config.site)
             try:
@@ -99,23 +96,19 @@ class Launcher:
     def _refuse_second_launcher(self, bus: Bus, stop: threading.Event) -> None:
         """Refuse to start when stages of this site already run.
 
-        A process at the endpoint may belong to this site, to another site, or be no stage at all. On a busy machine it
-        takes seconds to discover the first; a router has been discovered as soon as the session is open.
+        The process at the endpoint, if there is one, may belong to this site, to another, or be no stage at all.
         """
         ours = {alive_key(self._config.site, slot.row.stage, slot.row.instance): slot.row.label for slot in self._slots}
-        began_s, discovered_s = time.monotonic(), math.inf if self._config.bus.mode == "peer" else time.monotonic()
+        bus.wait_for_others(stop)
+        until_s = time.monotonic() + _SEARCH_S
         while True:
-            alive = bus.alive(alive_key("*", "*", "*"))
+            alive = bus.alive(alive_key(self._config.site, "*", "*"))
             if running := [label for key, label in ours.items() if key in alive]:
                 raise UserError(
                     f"site {self._config.site!r} already runs at {self._config.bus.endpoint} ({', '.join(running)}): "
                     "stop that, or give this one another site or bus.endpoint"
                 )
-            now_s = time.monotonic()
-            discovered_s = min(discovered_s, now_s if alive else math.inf)
-            if not bus.came_second or now_s >= min(began_s + _DISCOVERY_S, discovered_s + _OTHERS_S):
-                return
-            if stop.wait(_POLL_S):
+            if not bus.came_second or time.monotonic() >= until_s or stop.wait(_POLL_S):
                 return
 
     def _start_all(self, stop: threading.Event) -> None:

@@ -45,7 +45,7 @@ class ScratchSite:
         self.run_folder = folder / "runs"
         """what the stages write"""
         self.run_folder.mkdir(exist_ok=True)
-        self.endpoint = f"tcp/127.0.0.1:{_free_port()}"
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.overrides = (
             *(f"run_folder={json.dumps(str(self.run_folder))}", f"tray.0.port={json.dumps(str(folder / 'tray'))}"),
             *(f"bus.endpoint='{self.endpoint}'", "launcher.stages=" + json.dumps([s.split("/")[0] for s in STAGES])),
@@ -63,10 +63,10 @@ class ScratchSite:
         set_offset_ns(self._clock_file, 0)
         code = "from pipeline.selftest import stepped_clock\n\nstepped_clock.install()\n"
         (self.folder / "sitecustomize.py").write_text(code, encoding="utf-8")
-        self._log = (self.folder / "up.log").open("w", encoding="utf-8")
         self.bus = Bus(load_config(CONFIGURATION, self.overrides).bus, listens=False)
+        self.watcher = SiteWatcher(self.bus, SITE)
+        self._log = (self.folder / "up.log").open("w", encoding="utf-8")
         try:
-            self.watcher = SiteWatcher(self.bus, SITE)
             self.bus.subscribe(tray_key(SITE, "*", "alarm"), self._on_alarm)
             self.bus.subscribe(tray_key(SITE, "*", "score"), self._on_score)
             self._start()
@@ -222,7 +222,8 @@ class ScratchSite:
         self.judged += int(decode(Score, payload).valid.all(axis=1).sum())
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port on loopback that nothing uses."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]

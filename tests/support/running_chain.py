@@ -8,7 +8,6 @@ import queue
 import re
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -19,10 +18,10 @@ from typing import Any
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
 from pipeline.launch.site_watcher import SiteWatcher, StageView
+from pipeline.selftest.scratch_site import FANTWIN
 
 DEMO = Path(__file__).parents[2] / "pipeline" / "demo"
 SITE, TRAY, FANS = "demo", "tray1", 8
-FANTWIN = (sys.executable, "-P", "-m", "pipeline")
 DEADLINE_S = 60.0  # far beyond what anything takes, so that a slow machine fails no test
 
 

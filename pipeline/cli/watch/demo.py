@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -30,10 +29,10 @@ from pipeline.config.models import Config
 from pipeline.errors import UserError
 from pipeline.runtime.signals import stop_on_signals
 from pipeline.runtime.snapshot_store import FORMER_SUFFIX
+from pipeline.selftest.scratch_site import FANTWIN, free_port
 from schemas.units import NS_PER_S
 
 DEMO_FOLDER = Path(__file__).parents[2] / "demo"
-FANTWIN = (sys.executable, "-P", "-m", "pipeline")
 DURATION_S = 34.0
 FAULTS = (
     ("inlet", "fan=2,start=8,stop=14,size=1.8"),
@@ -65,7 +64,7 @@ def demo(
         "viewer.serve=false",
         f"run_folder={json.dumps(str(out))}",
         f"tray.0.port={json.dumps(str(out / 'tray'))}",
-        f"bus.endpoint='tcp/127.0.0.1:{_free_port()}'",
+        f"bus.endpoint='tcp/127.0.0.1:{free_port()}'",
     ]
     config = load_config(DEMO_FOLDER / "demo.toml", overrides)
     started_s = time.monotonic()
@@ -91,12 +90,6 @@ def _clear(out: Path) -> None:
         raise UserError(
             f"{out}: cannot be used for the demo's files: {error.strerror}; name another with -o"
         ) from error
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def _run(config: Config, overrides: list[str], out: Path, seed: int, console: Console) -> dict[str, int]:
