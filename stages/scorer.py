@@ -198,7 +198,7 @@ class ScorerCore(Core):
         return [replace(snapshot, restored=True), *self._alarms.republish()]
 
     def tick(self, now_ns: int) -> list[Alarm | ScorerSnapshot]:
-        """Emit once what was restored."""
+        """Emit once what was restored, also if it is then discarded: a replay restores it, too."""
         at_start, self._at_start = self._at_start, []
         return at_start
 
@@ -211,18 +211,18 @@ class ScorerCore(Core):
             self._counts["lost_wrong_fan_count"] += len(item.t_ns)
             return []
         self._wrong_fans = 0
-        discarded = self._discard_if_of_other_times(item)
+        before_score = [*self.tick(0), *self._discard_if_of_other_times(item)]
         before = np.maximum.accumulate(np.concatenate(([self._last_t_ns], item.t_ns)))[:-1]
         new = item.t_ns > before
         self._counts["repeated"] += int((~new).sum())
         if not new.any():
             if len(item.t_ns):
                 self._old_samples.add(item.t_ns, item.period_ns, self._last_t_ns)
-            return [*self.tick(0), *discarded]
+            return before_score
         self._old_samples.clear()
         self._last_t_ns, self._input_producer = int(item.t_ns[new][-1]), item.header.producer
         score, alarms = self._score(item if new.all() else select(item, new))
-        return [*self.tick(0), *discarded, score, *alarms, *self._take_snapshot(at_once=bool(alarms))]
+        return [*before_score, score, *alarms, *self._take_snapshot(at_once=bool(alarms))]
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/deciding.md says what each counts."""
@@ -280,7 +280,6 @@ class ScorerCore(Core):
             return []
         discarded, self._not_restored = self._alarms.discard_all(first_t_ns, keep_silenced=False), ""
         self._start_new()
-        self._at_start = []
         self._counts["snapshots_of_other_times"] += 1
         return discarded
 

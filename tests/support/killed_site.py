@@ -21,6 +21,7 @@ from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
 from schemas.messages import Action, Header, InputPosition, Message, Raw, Request
 from schemas.topics import TOPICS, tray_key
+from schemas.units import NS_PER_S
 from tests.support.twin_files import small_hybrid, write_twin
 
 SITE, TRAY, FANS = "plant", "tray1", 3
@@ -127,6 +128,11 @@ class Stages:
             for topic, message in kept:
                 if topic == read:
                     self._step(stage, topic, message)
+
+    def set_clock_back(self, by_s: float) -> None:
+        """Set the host clock back."""
+        self.now_ns -= round(by_s * NS_PER_S)
+        self._ticked_ns -= round(by_s * NS_PER_S)
 
     def loses(self, messages: int) -> None:
         """The next raw messages never reach the resampler."""

@@ -23,6 +23,7 @@ from pipeline.replay.offline.rescoring import RescoredTray, rescore
 from pipeline.replay.offline.verify import CannotCompareError, Comparison
 from schemas import fan_pb2
 from schemas.messages import Action, Alarm, Score, Transition
+from schemas.units import NS_PER_S
 from tests.support.killed_site import CHAIN, Site
 from tests.support.twin_files import write_twin
 
@@ -572,3 +573,23 @@ def test_row_13_after_a_step_of_the_clock_the_samples_that_are_counted_are_those
     assert found and found.different == found.not_made == 0
     assert tray.samples == found.equal == sum(len(score.t_ns) for score in recorded(site.path, "score"))
     assert tray.lost == 0
+
+
+@pytest.mark.parametrize("restored_s_before_data", [0.0, 0.1])
+def test_row_13_alarms_that_end_because_the_clock_was_set_back_and_the_site_restarted_end_in_a_replay(
+    tmp_path, restored_s_before_data
+):
+    site = Site(tmp_path, seed=1, calibrated=True)
+    site.run(120)
+    site.set_clock_back(3600)
+    site.restart_source()
+    for stage in CHAIN:
+        site.kill(stage)
+    site.now_ns += round(restored_s_before_data * NS_PER_S)
+    site.tick()
+    site.run(50)
+    found = verified(site.finished()).comparison
+    alarms = alarms_of(site.path)
+    assert "fan 0: stands no longer" in [alarm.message for alarm in alarms]
+    assert found and found.is_equal, found
+    assert found.alarms_equal == len(alarms)
