@@ -3,17 +3,23 @@
 Durations are of the monotonic clock; the wall clock labels them. The time follows the wall clock while that is
 corrected by less than a second, and when it is set forward. When the wall clock is set back, the time goes on, ahead of
 it, until the wall clock is put right.
+
+A site has one time: its launcher hands its own on to each stage that it starts. A stage that is started again after the
+wall clock was set back goes on as the others do.
 """
 
 from __future__ import annotations
 
+import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from schemas.units import NS_PER_S
 
+VARIABLE = "FANTWIN_HOST_CLOCK"
+"""environment variable with the offset of the time to go on with"""
 STEP_NS = NS_PER_S  # a larger difference is a clock that was set, not one that was corrected
 
 
@@ -31,12 +37,17 @@ class HostClock:
     """One time for all threads of a process."""
 
     def __init__(
-        self, wall_ns: Callable[[], int] = time.time_ns, monotonic_ns: Callable[[], int] = time.monotonic_ns
+        self,
+        wall_ns: Callable[[], int] = time.time_ns,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+        offset_ns: int | None = None,
     ) -> None:
+        """offset_ns: `offset_ns` of the clock of another process on this host, to go on with its time; None: begin with
+        the wall clock."""
         self._wall_ns = wall_ns
         self._monotonic_ns = monotonic_ns
         self._lock = threading.Lock()
-        self._offset_ns = wall_ns() - monotonic_ns()
+        self._offset_ns = wall_ns() - monotonic_ns() if offset_ns is None else offset_ns
         self._ahead_ns = 0
         self.steps = 0
         """how often the wall clock was set"""
@@ -63,6 +74,20 @@ class HostClock:
             self._offset_ns = now_ns - monotonic_ns
             return now_ns
 
+    @property
+    def offset_ns(self) -> int:
+        """The time now less the monotonic clock, which all processes of a host share."""
+        self.now_ns()
+        return self._offset_ns
 
-HOST_CLOCK = HostClock()
+
+def handed_on(environment: Mapping[str, str]) -> int | None:
+    """The offset of the time that whoever started this process has handed on; None if nobody has."""
+    try:
+        return int(environment[VARIABLE])
+    except (KeyError, ValueError):
+        return None
+
+
+HOST_CLOCK = HostClock(offset_ns=handed_on(os.environ))
 """of this process"""

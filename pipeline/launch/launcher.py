@@ -11,6 +11,7 @@ from pathlib import Path
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
+from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.errors import UserError
 from pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, process_list
 from pipeline.launch.site_report import RunningProcess, SiteReport
@@ -133,13 +134,20 @@ class Launcher:
                 return
 
     def _start(self, slot: _Slot) -> None:
-        slot.child = Child(slot.row, self._path, self._overrides, lambda row, line: self._say(f"{row.label} | {line}"))
+        slot.child = Child(
+            slot.row,
+            self._path,
+            self._overrides,
+            lambda row, line: self._say(f"{row.label} | {line}"),
+            HOST_CLOCK.offset_ns,
+        )
         slot.was_seen = False
         self._watchdog.started(slot.row.label, time.monotonic())
         self._say(f"{slot.row.label}: started, process {slot.child.process_id}")
 
     def _check_processes(self) -> None:
         """Notice stages that have died, and restart those that are due."""
+        HOST_CLOCK.now_ns()  # it notices a step when it is read
         now = time.monotonic()
         for slot in self._slots:
             if slot.child is None:

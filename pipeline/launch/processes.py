@@ -14,6 +14,7 @@ from pathlib import Path
 
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
+from pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
 from pipeline.launch.notices import Notices
 from pipeline.runtime.notifier import VARIABLE as NOTIFY_VARIABLE
 
@@ -54,7 +55,9 @@ class Child:
         config_path: Path,
         overrides: Iterable[str],
         on_line: Callable[[StageProcess, str], None],
+        clock_offset_ns: int,
     ) -> None:
+        """clock_offset_ns: of the time that it goes on with."""
         command = [sys.executable, "-P", "-m", "pipeline", "run", row.stage, "-c", str(config_path)]
         if row.tray:
             command += ["--tray", row.tray]
@@ -74,7 +77,11 @@ class Child:
             text=True,
             errors="replace",
             start_new_session=True,
-            env={**os.environ, NOTIFY_VARIABLE: self.notices.address},
+            env={
+                **os.environ,
+                NOTIFY_VARIABLE: self.notices.address,
+                CLOCK_VARIABLE: str(clock_offset_ns),
+            },
         )
         self._on_line = on_line
         self._reader = threading.Thread(target=self._read, daemon=True)

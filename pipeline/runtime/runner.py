@@ -18,6 +18,7 @@ from dataclasses import replace
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
+from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.errors import UserError
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.ending import Ending, Step
@@ -68,7 +69,7 @@ class Runner:
         self.producer = f"{stage.name}-{self._instance}-{secrets.token_hex(4)}"
         self._inbox = Inbox(drops_oldest=stage.may_drop)
         self._counts: Counter[str] = Counter()
-        started_t_ns = time.time_ns()
+        started_t_ns = HOST_CLOCK.now_ns()
         context = Context(
             site=config.site,
             trays=trays,
@@ -190,7 +191,7 @@ class Runner:
             self._sources.start(name, parts)
 
     def _on_bus(self, key: str, payload: bytes) -> None:
-        self._inbox.put(FromBus(key, payload, time.time_ns()))
+        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()))
 
     def _on_liveness(self, key: str, alive: bool) -> None:
         self._inbox.put(Liveness(key, alive))
@@ -284,7 +285,7 @@ class Runner:
 
     def _handle(self, item: Item) -> None:
         if isinstance(item, FromSource):
-            self._health.add_input("", time.time_ns())
+            self._health.add_input("", HOST_CLOCK.now_ns())
             core = self._parts[item.core].core
             self._call(item.core, lambda: core.step(item.item))
         elif isinstance(item, Recovered):
@@ -308,7 +309,7 @@ class Runner:
                 self._due += self._tracker.accept(envelope)
 
     def _handle_recovered(self, item: Recovered) -> None:
-        decoded = (self._decode(key, payload, time.time_ns()) for key, payload in item.answer.messages)
+        decoded = (self._decode(key, payload, HOST_CLOCK.now_ns()) for key, payload in item.answer.messages)
         envelopes = [e for e in decoded if e is not None and e.message.header.producer != self.producer]
         if self._recovery.is_catch_up(item.request):
             due = self._tracker.accept_kept(envelopes)
@@ -363,7 +364,7 @@ class Runner:
         for message in produce():
             tray = name or message.header.tray or input_tray
             stamped = self._outputs.publish(tray, message, from_timer=from_timer)
-            self._health.add_output(stamped, time.time_ns(), self._clock.now_ns(tray))
+            self._health.add_output(stamped, HOST_CLOCK.now_ns(), self._clock.now_ns(tray))
         self._active_core = None
 
     def _catch_up(self) -> None:
@@ -399,7 +400,7 @@ class Runner:
             inputs=self._tracker.inputs() if with_counts else (),
             outputs=self._outputs.counts() if with_counts else (),
             counters=self._counters() if with_counts else {},
-            now_ns=time.time_ns(),
+            now_ns=HOST_CLOCK.now_ns(),
         )
         return replace(health, header=Header(self.producer, self._health_publisher.published, ""))
 
@@ -409,5 +410,5 @@ class Runner:
         self._health_publisher.put(payload)
         if "health" in self.stage.reads:
             # the bus does not return a session's own messages
-            self._step(Envelope(self._health_publisher.key, "health", payload, time.time_ns(), health))
+            self._step(Envelope(self._health_publisher.key, "health", payload, HOST_CLOCK.now_ns(), health))
         return health

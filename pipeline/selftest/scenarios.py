@@ -199,7 +199,14 @@ def _clock_back(site: ScratchSite) -> str:
     site.set_clock(-FAR_AHEAD_S)
     judged_s = site.seconds_until_judged(60.0)
     _require(judged_s, "nothing was judged in the minute after")
-    return f"judged again after {judged_s:.1f} s"
+    old = {label: site.process_id(label) for label in (STAGES[0], "resampler")}
+    for process_id in old.values():
+        os.kill(process_id, signal.SIGKILL)
+    for label, process_id in old.items():
+        _require(site.replaced(label, process_id, REPLACED_LIMIT_S), f"{label} was not replaced")
+    again_s = site.seconds_until_judged(60.0)
+    _require(again_s, "nothing was judged in the minute after acquisition and resampler were replaced")
+    return f"judged again after {judged_s:.1f} s, and {again_s:.1f} s after acquisition and resampler were replaced"
 
 
 def _clock_forward(site: ScratchSite) -> str:
@@ -228,6 +235,11 @@ SCENARIOS = (
         needs_small_disk=True,
         settings=("recorder.min_free_bytes=8000000",),
     ),
-    Scenario("clock-back", "a host clock set back an hour stops nothing", _clock_back, needs_own_site=True),
+    Scenario(
+        "clock-back",
+        "a host clock set back an hour stops nothing, nor does a stage that is killed after that",
+        _clock_back,
+        needs_own_site=True,
+    ),
     Scenario("clock-forward", "a host clock set forward an hour stops nothing", _clock_forward, needs_own_site=True),
 )

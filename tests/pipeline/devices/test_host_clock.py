@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from pipeline.devices.host_clock import ClockStep, HostClock
+from pipeline.devices.host_clock import VARIABLE, ClockStep, HostClock, handed_on
 from schemas.units import NS_PER_S
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -59,3 +59,30 @@ def test_the_time_never_goes_back_by_more_than_a_second() -> None:
     host = Host()
     times = [host.passes(0.05, set_by_ns=by_s * NS_PER_S) for by_s in (0, -5, 3, -7200, 100, 7300, -1, -2, 50)]
     assert all(later > earlier - NS_PER_S for earlier, later in pairwise(times))
+
+
+def test_row_13_a_stage_that_is_started_after_the_wall_clock_was_set_back_goes_on_with_the_time_of_its_launcher() -> (
+    None
+):
+    host = Host()
+    host.passes(1.0)
+    host.passes(1.0, set_by_ns=-HOUR_NS)
+    handed = handed_on({VARIABLE: str(host.clock.offset_ns)})
+    of_stage = HostClock(lambda: host.wall_ns, lambda: host.monotonic_ns, handed)
+    assert of_stage.now_ns() == host.passes(0.0) == host.wall_ns + HOUR_NS
+    assert of_stage.last_step and of_stage.last_step.step_ns == -HOUR_NS, "it reports the step, too"
+
+
+@pytest.mark.parametrize("set_by_s", [-20, -10, -3, -2, 3])
+def test_row_13_a_clock_set_while_a_stage_starts_is_noticed_by_it(set_by_s: int) -> None:
+    host = Host()
+    before, offset_ns = host.passes(1.0), host.clock.offset_ns
+    host.monotonic_ns += NS_PER_S
+    host.wall_ns += NS_PER_S + set_by_s * NS_PER_S
+    of_stage = HostClock(lambda: host.wall_ns, lambda: host.monotonic_ns, offset_ns)
+    assert of_stage.now_ns() == host.clock.now_ns() == before + NS_PER_S + max(set_by_s, 0) * NS_PER_S
+
+
+@pytest.mark.parametrize("environment", [{}, {VARIABLE: "soon"}])
+def test_a_process_that_nobody_hands_a_time_begins_with_the_wall_clock(environment: dict[str, str]) -> None:
+    assert handed_on(environment) is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import Any
 import pytest
 
 from pipeline.config.loading import load_config
+from pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
 from pipeline.errors import UserError
 from pipeline.launch.launcher import Launcher, Outcome
-from pipeline.launch.processes import process_list
+from pipeline.launch.processes import Child, process_list
 from schemas.topics import alive_key
 from tests.support.running_chain import DEMO, SITE, Chain, fantwin
 
@@ -131,3 +133,16 @@ def test_the_search_ends_when_the_launcher_is_stopped(monkeypatch: pytest.Monkey
     stop.set()
     Launcher(load_config(DEMO / "demo.toml"), (), lambda _line: None)._refuse_second_launcher(bus, stop)
     assert bus.now_s == 100.0
+
+
+def test_row_13_a_stage_goes_on_with_the_time_of_its_launcher_when_it_is_started_again(tmp_path, monkeypatch):
+    class StartedError(Exception):
+        """Instead of a process."""
+
+    def start(_command: list[str], *, env: dict[str, str], **_more: object) -> None:
+        raise StartedError(env[CLOCK_VARIABLE])
+
+    config = load_config(DEMO / "demo.toml")
+    monkeypatch.setattr(subprocess, "Popen", start)
+    with pytest.raises(StartedError, match="12345"):
+        Child(process_list(config)[0], config.path, (), lambda _row, _line: None, 12345)
