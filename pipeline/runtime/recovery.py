@@ -64,7 +64,7 @@ class Recovery:
     def ask(self, request: Request) -> Found | None:
         """Request messages. None: the answer will be in the inbox. Otherwise nobody is asked."""
         if self._only_rare and not topic_of(request.key).is_rare:
-            return Found()
+            return Found(was_asked=False)
         if self._now_s() < self._asked_again_s.get((request.key, request.producer), 0.0):
             return Found()
         if len(self._running) < MOST_AT_A_TIME:

@@ -103,7 +103,7 @@ class Runner:
             self._bus.close()
             raise
         self._recovery = Recovery(self._bus, self._inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
-        self._tracker = SequenceTracker(self._recovery.ask, is_session=self._sessions.is_alive)
+        self._tracker = SequenceTracker(self._recovery.ask, sessions=self._sessions)
         self._outputs = Outputs(self._bus, config.site, stage, [t.name for t in trays], self.producer)
         self._health_publisher = self._bus.publisher(
             health_key(config.site, stage.name, self._instance), BY_NAME["health"], type_name(Health), self.producer
@@ -324,6 +324,7 @@ class Runner:
         self._peers.add_health(alive_key(self._site, health.stage, health.instance), health)
         if health.stage == REPLAY:
             self._clock.add_replay_health(health.header.producer, has_stopped=health.status == StageStatus.STOPPED)
+        self._sessions.add_health(health, self._read_keys)
         self._due += self._tracker.reconcile(health, self._read_keys)
         if "health" in self.stage.reads:
             self._due += self._tracker.accept(envelope)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from pipeline.runtime.sessions import Sessions
 from pipeline.runtime.tracked_streams import Request, Stream, TrackedStreams, Waiting
 from schemas.envelope import Envelope
 from schemas.messages import Health, Input
@@ -31,11 +32,17 @@ REFUSAL_SHOWN_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The answer to a request: the messages still kept, and how many their producer says it has published (None: it did
-    not answer)."""
+    """The answer to a request.
+
+    Attributes:
+        envelopes: the messages still kept.
+        published: how many messages their producer says it has published; None: it did not answer.
+        was_asked: whether the producer was asked at all.
+    """
 
     envelopes: Sequence[Envelope] = ()
     published: int | None = None
+    was_asked: bool = True
 
 
 Ask: TypeAlias = Callable[[Request], Found | None]
@@ -48,7 +55,8 @@ class SequenceTracker:
     it is passed to `answer`.
 
     The first message seen of a stream need not be its first. Earlier messages that the producer still keeps are asked
-    for; those it no longer keeps are history, not a loss. From then on every gap is either recovered or counted.
+    for; those it no longer keeps are history, not a loss. If a stage that is alive does not answer, what it may have
+    kept counts as missing. From then on every gap is either recovered or counted.
 
     A number beyond the next is believed if the producer confirms that it has published so many, or, where it does not
     answer, if it can have published so many since it was last heard. Otherwise the message is refused, and the stream
@@ -56,24 +64,25 @@ class SequenceTracker:
     """
 
     def __init__(
-        self,
-        ask: Ask,
-        now_s: Callable[[], float] = time.monotonic,
-        is_session: Callable[[str], bool] = lambda _producer: False,
+        self, ask: Ask, now_s: Callable[[], float] = time.monotonic, sessions: Sessions | None = None
     ) -> None:
-        """is_session: whether a producer is a session of a stage that is alive; it is never one too many."""
+        """sessions: the stages that are alive."""
         self._ask = ask
         self._now_s = now_s
-        self._streams = TrackedStreams(now_s, is_session)
+        self._sessions = sessions or Sessions()
+        self._streams = TrackedStreams(now_s, self._sessions)
         self._refused: Counter[str] = Counter()
         self._refusal = ""
         self._refused_s = 0.0
 
     def accept(self, envelope: Envelope) -> list[Envelope]:
         """The messages to process now that this one has arrived: none if it is held, a duplicate, or refused."""
-        stream = self._streams.heard(envelope.key, envelope.message.header.producer)
+        producer = envelope.message.header.producer
+        stream = self._streams.heard(envelope.key, producer)
         if stream is None:
-            self._refuse("refused_producers", f"{envelope.key}: too many producers at a time")
+            is_stranger = self._sessions.is_stranger(envelope.key, producer)
+            why = f"{producer} is no stage of this site" if is_stranger else "too many producers at a time"
+            self._refuse("refused_producers", f"{envelope.key}: {why}")
             return []
         waiting = stream.waiting
         if waiting is None:
@@ -179,6 +188,8 @@ class SequenceTracker:
                 stream.accept(header.sequence)
                 due.append(envelope)
         if self._is_believed(stream, waiting, found.published):
+            if stream.next_sequence is None and self._owes_answer(stream, found):
+                stream.next_sequence = waiting.request.first
             stream.skip_to(waiting.until)
             stream.heard_s = self._now_s()
             arrived = [waiting.shown_by] if waiting.shown_by else []
@@ -196,6 +207,9 @@ class SequenceTracker:
         if published is not None:
             return waiting.published <= published
         return self._is_possible(stream, waiting.published)
+
+    def _owes_answer(self, stream: Stream, found: Found) -> bool:
+        return found.was_asked and found.published is None and self._sessions.is_alive(stream.producer)
 
     def _is_possible(self, stream: Stream, published: int) -> bool:
         """Whether a producer that does not answer can have published so many messages since it was last heard."""

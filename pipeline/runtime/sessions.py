@@ -13,11 +13,13 @@ import re
 import socket
 import threading
 import time
+from collections.abc import Set
 from dataclasses import dataclass
 
 from pipeline.bus.session import Bus
 from pipeline.runtime.stage import StageError
-from schemas.topics import SESSION_CHUNK, sessions_key
+from schemas.messages import Health
+from schemas.topics import SESSION_CHUNK, health_key, sessions_key
 
 GOSSIP_S = 0.2
 """how long a starting stage waits for further processes after it has met the first: they took 6 ms"""
@@ -90,6 +92,8 @@ class Sessions:
         self._alive: dict[str, Session] = {}
         self._ignored: dict[str, tuple[Session, Session]] = {}
         """by producer: the session that is ignored, and the one that owns its stage"""
+        self._written: dict[str, set[str]] = {}
+        """by producer of a session: the keys on which it publishes"""
 
     def update(self, key: str, alive: bool) -> None:
         """A token has appeared, or gone."""
@@ -98,17 +102,29 @@ class Sessions:
             return
         if alive:
             self._alive[key] = session
+            self._written.setdefault(session.producer, {health_key(key.split("/")[1], session.stage, session.instance)})
         else:
             self._alive.pop(key, None)
+            self._written.pop(session.producer, None)
         owners: dict[tuple[str, str], Session] = {}
         for each in sorted(self._alive.values(), key=lambda each: (each.started_t_ns, each.producer)):
             owners[each.stage, each.instance] = each
         found = ((each, owners[each.stage, each.instance]) for each in self._alive.values())
         self._ignored = {each.producer: (each, owner) for each, owner in found if each is not owner}
 
+    def add_health(self, health: Health, read_keys: Set[str]) -> None:
+        """A stage has said what it publishes; `read_keys`: the keys that matter here."""
+        written = self._written.get(health.header.producer)
+        if written is not None:
+            written.update(output.key for output in health.outputs if output.key in read_keys)
+
     def is_alive(self, producer: str) -> bool:
         """Whether this producer is a session that is alive."""
-        return any(each.producer == producer for each in self._alive.values())
+        return producer in self._written
+
+    def is_stranger(self, key: str, producer: str) -> bool:
+        """Whether a session publishes on this key, and this producer is none."""
+        return producer not in self._written and any(key in keys for keys in self._written.values())
 
     def is_ignored(self, producer: str) -> bool:
         """Whether another process owns the stage of this producer."""

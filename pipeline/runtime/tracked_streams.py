@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 
+from pipeline.runtime.sessions import Sessions
 from schemas.envelope import Envelope
 from schemas.messages import Input
 from schemas.streams import StreamId, StreamState
@@ -70,13 +71,12 @@ class TrackedStreams:
     """Streams by key and producer. Where one too many appears, another is forgotten, and its counts are summed up under
     an empty name: one that has been silent for long, or else the one that has sent least. One that waits for missing
     messages is not forgotten; if all wait, the new one is refused. So are more new ones in SILENT_S than are
-    remembered, unless they are sessions of a stage.
+    remembered, unless they are sessions of a stage, and strangers where a session publishes.
     """
 
-    def __init__(self, now_s: Callable[[], float], is_session: Callable[[str], bool]) -> None:
-        """is_session: whether a producer is a session of a stage that is alive."""
+    def __init__(self, now_s: Callable[[], float], sessions: Sessions) -> None:
         self._now_s = now_s
-        self._is_session = is_session
+        self._sessions = sessions
         self._newcomers_s: dict[str, deque[float]] = {}
         """by group: when the last new producers were first heard"""
         self._groups: dict[str, dict[StreamId, Stream]] = {}
@@ -100,7 +100,9 @@ class TrackedStreams:
             most = MOST_PRODUCERS if name == key else MOST_HEALTH_PRODUCERS
             newcomers_s, now_s = self._newcomers_s.setdefault(name, deque(maxlen=most)), self._now_s()
             is_flood = len(newcomers_s) == most and now_s - newcomers_s[0] < SILENT_S
-            if (is_flood and not self._is_session(producer)) or (len(group) >= most and not self._forget_one(name)):
+            if is_flood and not self._sessions.is_alive(producer):
+                return None
+            if self._sessions.is_stranger(key, producer) or (len(group) >= most and not self._forget_one(name)):
                 return None
             newcomers_s.append(now_s)
             stream = Stream(key=key, producer=producer, heard_s=now_s)

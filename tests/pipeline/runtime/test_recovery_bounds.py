@@ -16,6 +16,7 @@ from pipeline.runtime.inbox import INBOX_BYTES, FromBus, Inbox, Liveness, Recove
 from pipeline.runtime.peers import MOST_PEERS, Peers
 from pipeline.runtime.recovery import BACK_OFF_S, MOST_AT_A_TIME, Recovery
 from pipeline.runtime.sequence_tracker import MOST_HELD_MESSAGES, Found, SequenceTracker
+from pipeline.runtime.sessions import Session, Sessions
 from pipeline.runtime.tracked_streams import MOST_HEALTH_PRODUCERS, MOST_PRODUCERS, SILENT_S, Request
 from schemas.codec import encode, type_name
 from schemas.messages import Grid, Header, Raw
@@ -99,11 +100,34 @@ def test_row_11_a_flood_of_producers_leaves_the_real_one_in_sequence_and_few_oth
 
 
 def test_row_11_in_a_flood_of_producers_a_session_of_a_stage_is_admitted():
-    tracker = SequenceTracker(lambda _request: Found(), is_session=lambda producer: producer == "restarted")
+    sessions = Sessions()
+    sessions.update(Session("acquisition", "tray", 1, "restarted", "host", 1).key("site"), alive=True)
+    tracker = SequenceTracker(lambda _request: Found(), sessions=sessions)
     for number in range(2 * MOST_PRODUCERS):
         tracker.accept(packet(1, f"false-{number}"))
     assert sequences(tracker.accept(packet(0, "restarted"))) == [0]
     assert sequences(tracker.accept(packet(0, "stranger"))) == []
+
+
+def test_row_11_where_a_stage_publishes_others_are_refused_without_asking():
+    sessions, requests = Sessions(), []
+    acquisition = Session("acquisition", "tray", 1, "real", "host", 1)
+    sessions.update(acquisition.key("site"), alive=True)
+    tracker = SequenceTracker(requests.append, sessions=sessions)
+    tracker.accept(packet(3, "before it said what it publishes"))
+    sessions.add_health(health(0, "real"), {KEY})
+    requests.clear()
+    tracker.accept(packet(3, "stranger"))
+    tracker.reconcile(health(3, "stranger"), [KEY])
+    own_health = health_key("site", "acquisition", "tray")
+    tracker.accept(replace(packet(3, "stranger"), key=own_health, topic="health"))
+    assert not requests
+    assert tracker.counters() == {"refused_producers": 2}
+    assert f"{own_health}: stranger is no stage of this site" in tracker.problem()
+    assert sequences(tracker.accept(packet(0, "real"))) == [0]
+    sessions.update(acquisition.key("site"), alive=False)
+    tracker.accept(packet(3, "a replay"))
+    assert [request.producer for request in requests] == ["a replay"]
 
 
 def test_row_11_a_flood_of_healths_is_remembered_in_part():

@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
+from pipeline.runtime.sessions import Session, Sessions
 from pipeline.runtime.tracked_streams import Request
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Header, Health, Output, Severity, StageStatus
@@ -89,6 +91,15 @@ def test_a_late_consumer_gets_the_messages_still_kept_and_counts_earlier_ones_as
     tracker = SequenceTracker(producer.ask)
     assert sequences(tracker.accept(packet(100))) == [98, 99, 100]
     assert tracker.inputs()[0].missing == 0
+
+
+@pytest.mark.parametrize(("found", "missing"), [(Found(), 8), (Found(published=9), 0), (Found(was_asked=False), 0)])
+def test_first_messages_of_a_stage_that_does_not_answer_are_missing_and_not_history(found, missing):
+    sessions = Sessions()
+    sessions.update(Session("scorer", "all", 1, "p", "host", 1).key("site"), alive=True)
+    tracker = SequenceTracker(lambda _request: found, sessions=sessions)
+    assert sequences(tracker.accept(packet(8))) == [8]
+    assert tracker.inputs()[0].missing == missing
 
 
 def test_a_late_consumer_requests_no_more_than_a_producer_keeps():
