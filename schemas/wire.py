@@ -21,6 +21,8 @@ from cobs import cobs
 
 Protocol: TypeAlias = Literal["binary", "text"]
 End: TypeAlias = Literal["host", "device"]
+DELIMITERS: dict[Protocol, bytes] = {"binary": b"\0", "text": b"\n"}
+"""between frames; one more is no frame and no fault"""
 
 VERSION = 1
 MAX_FANS = 64
@@ -258,7 +260,7 @@ class Decoder:
     def __init__(self, protocol: Protocol, fans: int, end: End = "host") -> None:
         """Every frame must have `fans` fans. The end `host` accepts samples, `device` commands and set-points."""
         self._text = protocol == "text"
-        self._delimiter = b"\n" if self._text else b"\0"
+        self._delimiter = DELIMITERS[protocol]
         self._fans = fans
         self._accepts = (Sample,) if end == "host" else (CommandFrame, SetPointFrame)
         self.reset()

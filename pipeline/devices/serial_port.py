@@ -115,15 +115,18 @@ class SerialPort:
         while True:
             if self._stopping.is_set():
                 drain_until_s = drain_until_s or time.monotonic() + DRAIN_LIMIT_S
+            data, received_t_ns, is_connected = b"", 0, True
             try:
                 data = port.read(1)
                 received_t_ns = HOST_CLOCK.now_ns()
                 data += port.read(port.in_waiting)
             except _PORT_ERRORS:
-                return any_received
+                is_connected = False  # a byte that came before counts
             if data:
                 any_received = True
                 deliver(ReceivedBytes(data, received_t_ns))
+            if not is_connected:
+                return any_received
             if drain_until_s and (not data or time.monotonic() > drain_until_s):
                 return any_received
 

@@ -31,8 +31,7 @@ LATE_S = 0.02
 DRAIN_LIMIT_S = 3.0
 _DRAINED_FOR_S = 0.1
 _POLL_S = 0.01
-# Serial libraries discard what arrived before a port was opened.
-_READER_DELAY_S = 0.25
+_TAKEN_LIMIT_S = 0.5
 _READ_BYTES = 4096
 
 
@@ -206,12 +205,16 @@ class PlaybackCounts:
     """sent, but unread when the line was closed"""
 
 
-def wait_for_reader(line: PseudoTerminal, stop: threading.Event) -> None:
-    """Return when a reader has opened the line and kept it open, or when `stop` is set."""
+def wait_for_reader(line: PseudoTerminal, protocol: wire.Protocol, stop: threading.Event) -> None:
+    """Return when a reader takes what is sent, or when `stop` is set.
+
+    Serial libraries discard what has arrived when they have set up a port, which may be long after they opened it. So a
+    delimiter, which is no frame, is sent until one has been taken.
+    """
     while not stop.is_set():
-        if line.has_reader():
-            stop.wait(_READER_DELAY_S)
-            if line.has_reader():
+        if line.has_reader() and line.write(wire.DELIMITERS[protocol]):
+            is_taken = line.drain(_TAKEN_LIMIT_S) == 0
+            if is_taken and line.has_reader():
                 return
         stop.wait(_POLL_S)
 

@@ -63,9 +63,7 @@ class SequenceTracker:
     goes on as if it had not come.
     """
 
-    def __init__(
-        self, ask: Ask, now_s: Callable[[], float] = time.monotonic, sessions: Sessions | None = None
-    ) -> None:
+    def __init__(self, ask: Ask, now_s: Callable[[], float] = time.monotonic, sessions: Sessions | None = None) -> None:
         """sessions: the stages that are alive."""
         self._ask = ask
         self._now_s = now_s

@@ -90,6 +90,7 @@ def check(rig: Rig, folder: Path, messages: list[Message]) -> None:
     raws = [message for message in messages if isinstance(message, Raw)]
     scores = [message for message in messages if isinstance(message, Score)]
     truth = json.loads((folder / f"{rig.tray}.json").read_text())
+    assert truth["bytes_unread"] == 0
     assert sum(len(raw.host_receive_t_ns) for raw in raws) == truth["samples_sent"] > 0
     valid, command, measured, residual = (
         np.concatenate([getattr(score, column) for score in scores])

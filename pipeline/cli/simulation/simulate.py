@@ -178,7 +178,7 @@ def simulate(
             fans_on = "1 fan on" if device.fans == 1 else f"{device.fans} fans on"
             typer.echo(f"{fans_on} {link or line.port}: {protocol}, speeds in {speed_unit}", err=json_output)
             if wait:
-                wait_for_reader(line, stop)
+                wait_for_reader(line, protocol, stop)
             on_start = partial(_save_start, truth, summary_of)
             played = play(device, line, protocol, RAD_S_PER_UNIT[speed_unit], stop, on_start)
             summary = summary_of(played, complete=True)

@@ -3,6 +3,7 @@ import os
 import signal
 import subprocess
 import sys
+import termios
 import threading
 import time
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ from pipeline.errors import UserError
 from pipeline.recordings.reading import read_recording
 from schemas import wire
 from schemas.messages import Raw
+from tests.support.running_chain import eventually
 
 FANTWIN = (
     sys.executable,
@@ -281,26 +283,30 @@ def test_garbage_from_the_host_is_counted_and_harmless(line: PseudoTerminal) -> 
     assert device.commands[0][0] == 0.5
 
 
-def test_waiting_for_a_reader_ends_when_there_is_one_or_when_stopped(line: PseudoTerminal) -> None:
+def test_waiting_for_a_reader_ends_when_one_takes_what_is_sent_or_when_stopped(line: PseudoTerminal) -> None:
+    """Opening is not enough: a serial library discards what arrives before it has set up the port."""
     assert not line.has_reader()
     stop = threading.Event()
-    waiting = threading.Thread(target=wait_for_reader, args=(line, stop))
+    waiting = threading.Thread(target=wait_for_reader, args=(line, "binary", stop))
     waiting.start()
     port = os.open(line.port, os.O_RDONLY | os.O_NOCTTY)
+    eventually(lambda: simulated_line._readable_bytes(port), "a delimiter has been sent")
+    assert waiting.is_alive()
+    termios.tcflush(port, termios.TCIFLUSH)
     waiting.join(10.0)
     assert not waiting.is_alive()
     assert not stop.is_set()
     os.close(port)
     assert not line.has_reader()
     stop.set()
-    wait_for_reader(line, stop)
+    wait_for_reader(line, "binary", stop)
 
 
 def test_a_program_that_opens_the_line_only_for_a_moment_is_not_a_reader(line: PseudoTerminal) -> None:
     ports = [os.open(line.port, os.O_RDONLY | os.O_NOCTTY)]
 
     class LeavesAtOnce(threading.Event):
-        """In the first wait, the settling time, the visitor leaves. The second, for the next reader, ends the test."""
+        """In the first wait the visitor leaves. The second ends the test."""
 
         def wait(self, timeout: float | None = None) -> bool:
             if ports:
@@ -310,7 +316,7 @@ def test_a_program_that_opens_the_line_only_for_a_moment_is_not_a_reader(line: P
             return self.is_set()
 
     stop = LeavesAtOnce()
-    wait_for_reader(line, stop)
+    wait_for_reader(line, "text", stop)
     assert stop.is_set()
 
 

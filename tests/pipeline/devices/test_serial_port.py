@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import queue
 import threading
@@ -9,9 +10,10 @@ import time
 import tty
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import pytest
+import serial
 
 from pipeline.config.models import TrayConfig
 from pipeline.devices.sample_source import LinkDown, LinkUp
@@ -119,6 +121,23 @@ def test_every_byte_value_passes_unchanged_in_both_directions(device: Device, li
     assert items.bytes(512) == everything
     assert line.write(everything)
     assert device.receive(512) == everything
+
+
+def test_a_byte_that_came_just_before_the_device_was_disconnected_is_delivered():
+    class Unplugged:
+        """Disconnected between the two reads."""
+
+        def read(self, _size: int) -> bytes:
+            return b"x"
+
+        @property
+        def in_waiting(self) -> int:
+            raise OSError(errno.EIO, "gone")
+
+    delivered: list[ReceivedBytes] = []
+    port = cast("serial.Serial", Unplugged())
+    assert SerialPort("unused", 115200)._read_until_disconnected(port, delivered.append)
+    assert [each.data for each in delivered] == [b"x"]
 
 
 def test_a_port_that_does_not_exist_yet_is_reported_once_and_waited_for(device: Device, line: SerialPort) -> None:
