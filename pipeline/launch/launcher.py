@@ -13,17 +13,20 @@ from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.errors import UserError
+from pipeline.launch.loss_accounting import Launched
 from pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, process_list
 from pipeline.launch.site_report import RunningProcess, SiteReport
 from pipeline.launch.site_state import site_states
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.launch.watchdog import Watchdog
+from schemas.messages import StageStatus
 from schemas.topics import alive_key
 
 _POLL_S = 0.05
 _SEARCH_S = 2.0  # so long after it has met one process, a launcher has discovered all others
 _ORDERLY = (0, 3)  # exit status of a stage that stopped in order: without losses, or with losses
 _READY_TIMEOUT_S = 30.0
+_LAST_HEALTH_S = 2.0  # after the end of a process, for what it sent last
 _STABLE_S = 10.0  # a stage that ran this long starts again at the shortest delay
 
 
@@ -38,6 +41,8 @@ class _Slot:
     was_ready: bool = False
     was_seen: bool = False
     """whether the process that runs now has been on the bus"""
+    sessions: list[Launched] = field(default_factory=list)
+    """all that were started"""
     hung: str = ""
     """why it was killed, for people"""
 
@@ -72,6 +77,8 @@ class Launcher:
         self._report = SiteReport(config.bus.endpoint, say)
         self._slots = [_Slot(row, delay_s=config.launcher.restart_delay_s) for row in process_list(config)]
         self._watchdog = Watchdog(config.launcher.watchdog_s)
+        self._is_started = False
+        """all stages have been started and waited for"""
         self.outcome = Outcome(run_folder=str(config.run_folder))
 
     def run(self, stop: threading.Event) -> Outcome:
@@ -91,7 +98,8 @@ class Launcher:
                 self._restart_those_down()
             finally:
                 self._stop_all()
-                self.outcome.lost = self._watcher.losses()
+                ready = [slot for slot in self._slots if slot.was_ready]  # before, a stage is due nothing
+                self.outcome.lost = self._watcher.losses({each for slot in ready for each in slot.sessions})
         return self.outcome
 
     def _refuse_second_launcher(self, bus: Bus, stop: threading.Event) -> None:
@@ -122,6 +130,7 @@ class Launcher:
             for slot in reversed(group):
                 self._start(slot)
             self._wait_until_ready(group, stop)
+        self._is_started = not stop.is_set()
 
     def _wait_until_ready(self, slots: list[_Slot], stop: threading.Event) -> None:
         deadline = time.monotonic() + _READY_TIMEOUT_S
@@ -142,6 +151,8 @@ class Launcher:
             HOST_CLOCK.offset_ns,
         )
         slot.was_seen = False
+        slot.sessions.append((slot.row.label, slot.child.process_id))
+        self._watcher.add_launched(slot.sessions[-1])
         self._watchdog.started(slot.row.label, time.monotonic())
         self._say(f"{slot.row.label}: started, process {slot.child.process_id}")
 
@@ -225,7 +236,25 @@ class Launcher:
             elif status not in _ORDERLY:
                 self.outcome.failed.append(slot.row.label)
                 self._say(f"{slot.row.label}: ended with status {status}: {slot.child.last_line}")
+            elif not self._has_reported(slot):
+                self.outcome.failed.append(slot.row.label)
+                self._say(f"{slot.row.label}: its last health was not heard: what it has lost is not known")
+            elif self._is_started and not slot.was_ready:
+                self.outcome.failed.append(slot.row.label)
+                self._say(f"{slot.row.label}: was never ready: it has received nothing")
             slot.child = None
+
+    def _has_reported(self, slot: _Slot) -> bool:
+        """Whether the last health of a stage has arrived, which has its counts; it may be behind the process's end.
+        A stage that was never heard has nothing to report if it was still starting for the first time."""
+        until_s = time.monotonic() + _LAST_HEALTH_S
+        while True:
+            last = self._watcher.last_health(slot.sessions[-1])
+            if not slot.was_ready if last is None else last.status == StageStatus.STOPPED:
+                return True
+            if time.monotonic() >= until_s:
+                return False
+            time.sleep(_POLL_S)
 
 
 def _listens_only(row: StageProcess) -> bool:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import NAME_PATTERN
-from pipeline.launch.loss_accounting import losses
+from pipeline.launch.loss_accounting import Launched, label, losses
 from pipeline.runtime.sessions import Sessions
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Health
@@ -19,7 +19,7 @@ from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence
 
 MOST_WATCHED_SESSIONS = 1000
-"""sessions whose last health is kept; those heard longest ago are forgotten first"""
+"""sessions whose last health is kept; of the others, those heard longest ago are forgotten first, then launched ones"""
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,7 @@ class SiteWatcher:
         self._lock = threading.Lock()
         self._healths: dict[str, tuple[Health, Health | None, float]] = {}
         """by producer: the last health and the one before, and when the last was heard, of a monotonic clock in s"""
+        self._launched: set[Launched] = set()
         self._alive: set[str] = set()
         self._sessions = Sessions()
         self._alarms: dict[tuple[str, int], dict[tuple[str, int], Alarm]] = {}
@@ -102,10 +103,21 @@ class SiteWatcher:
         with self._lock:
             return current_alarms(alarm for messages in self._alarms.values() for alarm in messages.values())
 
-    def losses(self) -> dict[str, int]:
+    def add_launched(self, session: Launched) -> None:
+        """A session that this process has started: what it lost is not forgotten in a flood of others."""
+        with self._lock:
+            self._launched.add(session)
+
+    def last_health(self, session: Launched) -> Health | None:
+        """The last health of a session; None if none has been heard."""
+        with self._lock:
+            found = (health for health, _, _ in self._healths.values() if _session(health) == session)
+            return next(found, None)
+
+    def losses(self, launched: Collection[Launched] = ()) -> dict[str, int]:
         """What every stage has lost, over all its sessions; see `pipeline.launch.loss_accounting`."""
         with self._lock:
-            return losses(health for health, _, _ in self._healths.values())
+            return losses((health for health, _, _ in self._healths.values()), launched)
 
     def _on_liveness(self, key: str, alive: bool) -> None:
         with self._lock:
@@ -122,7 +134,8 @@ class SiteWatcher:
                 before = self._healths.pop(health.header.producer, None)
                 self._healths[health.header.producer] = (health, before[0] if before else None, time.monotonic())
                 if len(self._healths) > MOST_WATCHED_SESSIONS:
-                    del self._healths[next(iter(self._healths))]
+                    others = (name for name, each in self._healths.items() if _session(each[0]) not in self._launched)
+                    del self._healths[next(others, next(iter(self._healths)))]
 
     def _on_alarm(self, key: str, payload: bytes) -> None:
         """A message without a producer, or of another tray than its key says, is no alarm: no bytes decode as one."""
@@ -136,6 +149,10 @@ class SiteWatcher:
                 newest = in_sequence(messages.values())[-1]
                 for name in [name for name, each in messages.items() if each.onset_t_ns != newest.onset_t_ns]:
                     del messages[name]
+
+
+def _session(health: Health) -> Launched:
+    return label(health), health.process_id
 
 
 def _alarm_key(site: str, tray: str) -> str:

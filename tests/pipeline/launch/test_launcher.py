@@ -5,8 +5,9 @@ from __future__ import annotations
 import subprocess
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -15,8 +16,19 @@ from pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
 from pipeline.errors import UserError
 from pipeline.launch.launcher import Launcher, Outcome
 from pipeline.launch.processes import Child, process_list
+from schemas.messages import Header, Health, StageStatus
 from schemas.topics import alive_key
 from tests.support.running_chain import DEMO, SITE, Chain, fantwin
+
+HEALTH = Health(
+    header=Header("recorder-all-1", 0, ""),
+    stage="recorder",
+    instance="all",
+    status=StageStatus.OK,
+    t_ns=1,
+    uptime_s=1.0,
+    process_id=7,
+)
 
 
 @pytest.fixture
@@ -111,6 +123,66 @@ def test_a_second_launcher_searches_for_stages_of_its_site_for_two_seconds(monke
 
 def test_the_first_launcher_does_not_search(monkeypatch):
     assert search_time_s(LateBus(SITE, after_s=1.0, came_second=False), monkeypatch) == 0.0
+
+
+class EndedChild:
+    """The process of a stage that ends in order."""
+
+    process_id = 7
+    last_line = ""
+
+    def stop(self, _timeout_s: float) -> int:
+        return 0
+
+
+class Heard:
+    """A watcher that hears these healths of one session, one after the other."""
+
+    def __init__(self, *statuses: StageStatus) -> None:
+        self.statuses = list(statuses)
+
+    def last_health(self, _session: object) -> Any:
+        if len(self.statuses) > 1:
+            del self.statuses[0]
+        return replace(HEALTH, status=self.statuses[0]) if self.statuses else None
+
+
+def stopped(watcher: Any, monkeypatch: pytest.MonkeyPatch, *, was_ready: bool = True) -> tuple[Outcome, list[str]]:
+    """How a run ends whose only stage was the recorder."""
+    bus: Any = LateBus(SITE, 0.0)
+    bus.sleep = bus.wait
+    monkeypatch.setattr("pipeline.launch.launcher.time", bus)
+    lines: list[str] = []
+    launcher = Launcher(load_config(DEMO / "demo.toml", ["launcher.stages=['recorder']"]), (), lines.append)
+    (slot,) = launcher._slots
+    slot.child, slot.was_ready, slot.sessions = cast("Any", EndedChild()), was_ready, [("recorder", 7)]
+    launcher._watcher, launcher._is_started = watcher, True
+    launcher._stop_all()
+    return launcher.outcome, lines
+
+
+def test_row_18_a_stage_whose_last_health_is_not_heard_has_not_ended_in_order(monkeypatch):
+    outcome, lines = stopped(Heard(StageStatus.OK), monkeypatch)
+    assert outcome.exit_code == 1
+    assert lines == ["recorder: its last health was not heard: what it has lost is not known"]
+
+
+def test_a_stage_that_was_restarted_at_the_end_and_is_not_heard_has_failed(monkeypatch):
+    outcome, lines = stopped(Heard(), monkeypatch)
+    assert outcome.exit_code == 1
+    assert lines == ["recorder: its last health was not heard: what it has lost is not known"]
+
+
+def test_the_last_health_of_a_stage_may_arrive_after_its_end(monkeypatch):
+    watcher = Heard(StageStatus.OK, StageStatus.OK, StageStatus.OK, StageStatus.STOPPED)
+    outcome, lines = stopped(watcher, monkeypatch)
+    assert (outcome.exit_code, lines) == (0, [])
+
+
+def test_a_stage_that_was_never_ready_has_failed(monkeypatch):
+    outcome, lines = stopped(Heard(), monkeypatch, was_ready=False)
+    assert outcome.exit_code == 1
+    assert lines == ["recorder: was never ready: it has received nothing"]
 
 
 @pytest.mark.parametrize(

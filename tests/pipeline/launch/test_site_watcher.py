@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.launch.site_watcher import SiteWatcher
+from pipeline.launch.site_watcher import MOST_WATCHED_SESSIONS, SiteWatcher
 from schemas.codec import encode
-from schemas.messages import Alarm, Header
-from schemas.topics import tray_key
+from schemas.messages import Alarm, Header, Health, StageStatus
+from schemas.topics import health_key, tray_key
 from tests.support.bus_peer import alarm
 
 
@@ -50,3 +50,24 @@ def test_an_alarm_that_is_recovered_is_known():
     bus.kept = [("fantwin/s/tray/alarm", encode(alarm(3)))]
     watcher.ask_for_past_alarms()
     assert [type(each) for each in watcher.alarms()] == [Alarm]
+
+
+def test_row_11_what_a_launched_session_has_lost_is_not_forgotten_in_a_flood_of_others():
+    bus: Any = StubBus()
+    watcher = SiteWatcher(bus, "s")
+    watcher.add_launched(("recorder", 1))
+    for number in range(1, MOST_WATCHED_SESSIONS + 3):
+        health = Health(
+            header=Header(f"recorder-all-{number}", 0, ""),
+            stage="recorder",
+            instance="all",
+            status=StageStatus.OK,
+            t_ns=number,
+            uptime_s=0.0,
+            lost=int(number == 1),
+            process_id=number,
+        )
+        bus.subscribers[health_key("s", "*", "*")]("fantwin/s/health/recorder/all", encode(health))
+    assert watcher.losses() == {"recorder": 1}
+    assert watcher.last_health(("recorder", 1)) is not None
+    assert watcher.last_health(("recorder", 2)) is None
