@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
 from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
 from mcap.summary import Summary
 
 from pipeline.recordings.disk import not_being_written
@@ -53,8 +55,8 @@ class Contents:
     first_ns: int | None
     last_ns: int | None
     messages: int
-    healths: Mapping[str, Health]
-    """the last of each key"""
+    sessions: tuple[Health, ...]
+    """the last health of each session, in the order of the file"""
     cards: Mapping[str, ModelCard]
     has_ended: bool
     """the recorder was stopped in order with this file"""
@@ -62,6 +64,11 @@ class Contents:
     """what an earlier repair reported as lost, one line each"""
     damage: tuple[str, ...] = ()
     """what is wrong with the file, one line each"""
+
+    @property
+    def healths(self) -> list[Health]:
+        """The last health of each stage and tray."""
+        return list({(health.stage, health.instance): health for health in self.sessions}.values())
 
     @property
     def next(self) -> dict[StreamId, int]:
@@ -172,7 +179,7 @@ def _by_scan(found: Scan) -> Contents:
         first_ns=found.index.first_ns,
         last_ns=found.index.last_ns if found.messages else None,
         messages=found.messages,
-        healths=found.counts.healths,
+        sessions=tuple(found.counts.sessions.values()),
         cards=found.counts.cards,
         has_ended=found.has_ended,
         recovered=found.recovered,
@@ -189,13 +196,14 @@ def _by_index(path: Path, file: BinaryIO) -> Contents | None:
     if LEDGER_NAME not in records:
         return None
     statistics, ledger = summary.statistics, records[LEDGER_NAME]
-    status = [_last_message(file, summary, number) for number in _status_channels(summary)]
+    streams = counts_from_metadata(ledger)
+    cards = [_last_card(file, summary, number) for number in _channels(summary, ModelCard)]
     return Contents(
         path=path,
         size_bytes=path.stat().st_size,
         metadata=records.get(METADATA_NAME, {}),
         attachments=tuple(index.name for index in summary.attachment_indexes),
-        streams=counts_from_metadata(ledger),
+        streams=streams,
         others={
             channel.topic: statistics.channel_message_counts.get(number, 0)
             for number, channel in summary.channels.items()
@@ -205,39 +213,73 @@ def _by_index(path: Path, file: BinaryIO) -> Contents | None:
         first_ns=statistics.message_start_time if statistics.message_count else None,
         last_ns=statistics.message_end_time if statistics.message_count else None,
         messages=statistics.message_count,
-        healths={key: message for key, message in status if isinstance(message, Health)},
-        cards={key: message for key, message in status if isinstance(message, ModelCard)},
+        sessions=_sessions(file, summary, streams),
+        cards={key: card for key, card in cards if card is not None},
         has_ended=ENDED in ledger,
         recovered=recovered_from_metadata(ledger),
     )
 
 
-def _status_channels(summary: Summary) -> list[int]:
-    """The channels whose last message is shown: health and twin cards."""
+def _channels(summary: Summary, kind: type[Message]) -> list[int]:
+    """The channels of this kind of message that have one in a chunk."""
     return [
         number
         for number, channel in summary.channels.items()
-        if _message_type(channel.topic) in (Health, ModelCard)
+        if _message_type(channel.topic) is kind
         and any(number in chunk.message_index_offsets for chunk in summary.chunk_indexes)
     ]
 
 
-def _last_message(file: BinaryIO, summary: Summary, number: int) -> tuple[str, Message | None]:
-    """The key of a channel and its last message; None if that cannot be decoded."""
-    key = summary.channels[number].topic
+def _last_card(file: BinaryIO, summary: Summary, number: int) -> tuple[str, ModelCard | None]:
+    """The key of a channel and its last card; None if that cannot be decoded."""
     chunk = next(chunk for chunk in reversed(summary.chunk_indexes) if number in chunk.message_index_offsets)
-    data = chunk_at(file, chunk.chunk_start_offset, chunk.chunk_length)
-    payloads = [
-        data[start + MESSAGE.size : end]
-        for _, opcode, start, end in records_in(data)
-        if opcode == Opcode.MESSAGE and MESSAGE.unpack_from(data, start)[0] == number
-    ]
-    message_type = _message_type(key)
-    assert message_type is not None
+    *_, (_, payload) = _messages_in(file, chunk, {number})
     try:
-        return key, decode(message_type, payloads[-1])
+        return summary.channels[number].topic, decode(ModelCard, payload)
     except CodecError:
-        return key, None
+        return summary.channels[number].topic, None
+
+
+def _sessions(file: BinaryIO, summary: Summary, streams: Mapping[StreamId, StreamCounts]) -> tuple[Health, ...]:
+    """The last health of each session, in the order of the file. The ledger says when each was received, and so which
+    chunk has it; only where the host's clock was set back others are read as well."""
+    numbers = set(_channels(summary, Health))
+    keys = {summary.channels[number].topic for number in numbers}
+    wanted = {
+        (producer, counts.last_sequence): counts.last_ns
+        for (key, producer), counts in streams.items()
+        if key in keys and counts.last_sequence is not None and counts.last_ns is not None
+    }
+    found: dict[tuple[int, int], Health] = {}
+
+    def look_in(chunk: ChunkIndex, these: Collection[tuple[str, int]]) -> None:
+        sequences = {sequence & 0xFFFFFFFF for _, sequence in these}
+        for place, (sequence, payload) in enumerate(_messages_in(file, chunk, numbers)):
+            if sequence in sequences:
+                with suppress(CodecError):
+                    health = decode(Health, payload)
+                    if wanted.pop((health.header.producer, health.header.sequence), None) is not None:
+                        found[chunk.chunk_start_offset, place] = health
+
+    chunks = [chunk for chunk in summary.chunk_indexes if not numbers.isdisjoint(chunk.message_index_offsets)]
+    for chunk in chunks:
+        within = range(chunk.message_start_time, chunk.message_end_time + 1)
+        if these := [name for name, last_ns in wanted.items() if last_ns in within]:
+            look_in(chunk, these)
+    for chunk in reversed(chunks):
+        if wanted:
+            look_in(chunk, list(wanted))
+    return tuple(found[place] for place in sorted(found))
+
+
+def _messages_in(file: BinaryIO, chunk: ChunkIndex, numbers: Collection[int]) -> Iterator[tuple[int, bytes]]:
+    """MCAP's sequence number and the payload of each message of these channels in a chunk."""
+    data = chunk_at(file, chunk.chunk_start_offset, chunk.chunk_length)
+    for _, opcode, start, end in records_in(data):
+        if opcode == Opcode.MESSAGE:
+            channel, sequence, *_ = MESSAGE.unpack_from(data, start)
+            if channel in numbers:
+                yield sequence, data[start + MESSAGE.size : end]
 
 
 def _message_type(topic: str) -> type[Message] | None:

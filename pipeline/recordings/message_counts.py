@@ -1,4 +1,4 @@
-"""Counts the messages of a file: its sequence ledger, and the last health of each stage and card of each twin."""
+"""Counts the messages of a file: its sequence ledger, and the last health of each session and card of each twin."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class MessageCounts:
         self.ledger = SequenceLedger()
         self.others: dict[str, StreamCounts] = {}
         """messages on channels that are not fantwin's, by topic"""
-        self.healths: dict[str, Health] = {}
-        """the last of each key"""
+        self.sessions: dict[str, Health] = {}
+        """the last health of each session, by its producer; the session heard last is at the end"""
         self.cards: dict[str, ModelCard] = {}
         self.undecodable = 0
         """messages that do not have the type of their channel"""
@@ -89,7 +89,8 @@ class MessageCounts:
             return
         self.ledger.add(state.key, header.producer, header.sequence, envelope.received_t_ns)
         if isinstance(message, Health):
-            self.healths[state.key] = message
+            self.sessions.pop(header.producer, None)
+            self.sessions[header.producer] = message
             self.ledger.add_health(message)
         elif isinstance(message, ModelCard):
             self.cards[state.key] = message

@@ -19,7 +19,6 @@ from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.reading import RecordingError, read_recording
 from pipeline.recordings.scan import scan
 from schemas.messages import StageStatus
-from schemas.topics import health_key
 from tests.support.recorder_feed import PRODUCER, SITE
 from tests.support.running_chain import DEADLINE_S, FANTWIN, eventually
 
@@ -139,8 +138,8 @@ class Kills:
             found = scan(active)
             ledger = found.counts.ledger
             due = {key: ledger.next[key, producer] for key, producer in ledger.counts if producer == PRODUCER}
-            recorder_health = found.counts.healths.get(health_key(SITE, "recorder", "all"))
-            has_caught_up = recorder_health is not None and recorder_health.status == StageStatus.OK
+            recorders = [health for health in found.counts.sessions.values() if health.stage == "recorder"]
+            has_caught_up = bool(recorders) and recorders[-1].status == StageStatus.OK
             if has_caught_up and found.index.first_ns is not None:
                 self._killed.append(_Killed(found.index.first_ns, at_ns, due, found.index.last_ns))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime
@@ -18,6 +18,7 @@ from rich.table import Table
 
 from pipeline.cli.options import JsonOption
 from pipeline.cli.progress import working
+from pipeline.launch.loss_accounting import label, losses
 from pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
@@ -38,26 +39,37 @@ def info(
     """
     with working(f"reading {', '.join(str(file) for file in files)}"):
         parts = sorted((contents_of(file) for file in dict.fromkeys(files)), key=lambda part: part.first_ns or 0)
-    breaks = continuity(parts)
+    breaks, lost = continuity(parts), _losses(parts)
     if json_output:
-        typer.echo(json.dumps(as_json(parts, breaks)))
+        typer.echo(json.dumps(as_json(parts, breaks, lost)))
     else:
-        _show(parts, breaks)
+        _show(parts, breaks, lost)
     if breaks or any(_has_lost(part) for part in parts):
         raise typer.Exit(3)
 
 
-def as_json(parts: Sequence[Contents], breaks: Sequence[str]) -> dict[str, Any]:
+def _losses(parts: Iterable[Contents]) -> dict[str, int]:
+    """What each stage has lost, over all its sessions in all parts, as `fantwin up` counts it."""
+    sessions: dict[str, Health] = {}
+    for health in (health for part in parts for health in part.sessions):
+        sessions.pop(health.header.producer, None)
+        sessions[health.header.producer] = health
+    return dict(sorted(losses(sessions.values()).items()))
+
+
+def as_json(parts: Sequence[Contents], breaks: Sequence[str], lost: Mapping[str, int]) -> dict[str, Any]:
     """The output of --json: each file, and the topics of all files together."""
     together = sum_by_key(item for part in parts for item in part.streams.items())
     return {
         "files": [_part_as_json(part) for part in parts],
         "topics": {key: _counts_as_json(counts) for key, counts in together.items()},
         "continuity": list(breaks),
+        "lost": dict(lost),
     }
 
 
 def _part_as_json(part: Contents) -> dict[str, Any]:
+    lost = _losses([part])
     return {
         "file": str(part.path),
         "size_bytes": part.size_bytes,
@@ -73,13 +85,13 @@ def _part_as_json(part: Contents) -> dict[str, Any]:
         "producers": [{"key": key, "producer": producer, **asdict(a)} for (key, producer), a in part.streams.items()],
         "other_topics": dict(part.others),
         "stages": {
-            _stage(health): {
+            label(health): {
                 "status": health.status.name.lower(),
                 "problem": health.problem,
-                "lost": health.lost,
+                "lost": lost[label(health)],
                 "counters": {counter.name: counter.value for counter in health.counters},
             }
-            for health in part.healths.values()
+            for health in part.healths
         },
         "recovered": list(part.recovered),
         "damage": list(part.damage),
@@ -97,19 +109,16 @@ def _counts_as_json(counts: StreamCounts) -> dict[str, Any]:
     }
 
 
-def _show(parts: Iterable[Contents], breaks: Iterable[str]) -> None:
+def _show(parts: Iterable[Contents], breaks: Iterable[str], lost: Mapping[str, int]) -> None:
     console = Console(soft_wrap=True, highlight=False)
     for part in parts:
         for line in _about(part):
             console.print(line)
         if part.streams or part.others:
             console.print(_table(part))
-        for health in sorted(part.healths.values(), key=_stage):
-            if health.problem or health.lost:
-                lost = f"; {health.lost} lost" if health.lost else ""
-                console.print(
-                    f"[red]{escape(_stage(health))}: {escape(health.problem or 'no problem now')}{lost}[/red]"
-                )
+        for health in sorted(part.healths, key=label):
+            if health.problem:
+                console.print(f"[red]{escape(label(health))}: {escape(health.problem)}[/red]")
         for line in part.recovered:
             console.print(f"[red]repaired earlier: {escape(line)}[/red]")
         for line in part.damage:
@@ -117,6 +126,9 @@ def _show(parts: Iterable[Contents], breaks: Iterable[str]) -> None:
             console.print(f"[red]{escape(line)}{advice}[/red]")
     for line in breaks:
         console.print(f"[red]{escape(line)}[/red]")
+    if any(lost.values()):
+        by_stage = ", ".join(f"{name} {count}" for name, count in lost.items() if count)
+        console.print(f"[red]lost, over all sessions of each stage: {escape(by_stage)}[/red]")
 
 
 def _about(part: Contents) -> list[str]:
@@ -193,10 +205,6 @@ def _has_configuration(part: Contents) -> bool:
 
 def _tray(key: str) -> str:
     return key.split("/")[2]
-
-
-def _stage(health: Health) -> str:
-    return health.stage if health.instance == "all" else f"{health.stage}/{health.instance}"
 
 
 def _time(t_ns: int | None) -> str:

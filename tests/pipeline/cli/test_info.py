@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from pipeline.recordings import contents
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Counter, Header, Health, ModelCard, StageStatus
+from schemas.messages import Counter, Header, Health, Input, ModelCard, StageStatus
 from schemas.topics import health_key, tray_key
 from tests.pipeline.recordings.test_parts import part, parts_in
 from tests.pipeline.recordings.test_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
@@ -91,11 +92,68 @@ def test_the_text_shows_the_same(tmp_path):
         "tray tray1, 2 fans, speeds in rpm",
         "twin of tray1: demo, hybrid, sha256 abababababab",
         "attached: configuration.toml, tray1.onnx",
-        "acquisition/tray1: the line is silent: look at the cable; 3 lost",
+        "acquisition/tray1: the line is silent: look at the cable\n",
+        "lost, over all sessions of each stage: acquisition/tray1 3",
     ):
         assert words in output
     (line,) = (line for line in output.splitlines() if "tray1/raw" in line)
     assert line.split()[1:4] == ["5", "2", "1"]
+
+
+def healths_of(*sessions: tuple[str, int, tuple[Input, ...]], at_s: int = 0) -> Iterator[tuple[Health, int]]:
+    """Two healths of each session of the resampler (its name, what it lost, what it received), and their times."""
+    for name, lost, inputs in sessions:
+        for number in range(2):
+            health = Health(
+                header=Header(name, number, ""),
+                stage="resampler",
+                instance="all",
+                status=StageStatus.OK,
+                t_ns=1,
+                uptime_s=1.0,
+                inputs=inputs,
+                lost=lost * number,
+            )
+            yield health, (at_s := at_s + 1) * SECOND_NS
+
+
+def received(first: int, until: int) -> tuple[Input, ...]:
+    line = Input(key=RAW_KEY, producer="a", received=until - first, missing=0, duplicated=0, next_sequence=until)
+    return (line,)
+
+
+def with_healths(path: Path, healths: Iterable[tuple[Health, int]], ledger: SequenceLedger | None = None) -> Path:
+    """A recording with each health in a chunk of its own."""
+    with RecordingWriter(path, METADATA, ledger=ledger) as writer:
+        for health, t_ns in healths:
+            writer.add_message(health_key("plant", "resampler", "all"), health, t_ns)
+            writer.flush()
+    return path
+
+
+SESSIONS = (("r-1", 2, received(0, 40)), ("r-2", 3, received(45, 90)))
+
+
+def test_row_18_losses_of_all_sessions_of_a_stage_are_shown_and_what_was_lost_between_them(tmp_path):
+    path = with_healths(tmp_path / "r.mcap", healths_of(*SESSIONS))
+    assert shown(path)["lost"] == {"resampler": 2 + 3 + 5}
+    assert shown(path)["files"][0]["stages"]["resampler"]["lost"] == 2 + 3 + 5
+    assert "lost, over all sessions of each stage: resampler 10" in fantwin("info", path).stdout
+    path.write_bytes(path.read_bytes()[:-50])
+    assert shown(path)["lost"] == {"resampler": 2 + 3 + 5}, "a file without an index shows the same"
+
+
+def test_a_session_in_two_parts_counts_once(tmp_path):
+    first, second, third, fourth = healths_of(*SESSIONS)
+    one = with_healths(tmp_path / "r.mcap", (first, second, third))
+    other = with_healths(tmp_path / "r-2.mcap", (fourth,), SequenceLedger())
+    assert shown(one, other)["lost"] == {"resampler": 2 + 3 + 5}
+
+
+def test_row_13_the_last_health_of_a_session_is_found_after_the_host_clock_was_set_back(tmp_path):
+    (first, t_ns), (last, _) = healths_of(SESSIONS[0], at_s=3600)
+    path = with_healths(tmp_path / "r.mcap", ((first, t_ns), (last, t_ns - 3600 * SECOND_NS)))
+    assert shown(path)["lost"] == {"resampler": 2}
 
 
 def test_a_file_without_an_index_is_read_in_full_with_the_same_result(tmp_path):
