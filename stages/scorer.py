@@ -51,6 +51,7 @@ from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
 from scoring.limits import Limits, Timing, uncalibrated
 from scoring.samples import samples_of
 from scoring.score_message import score_of
+from scoring.snapshot_times import with_times_moved
 from scoring.wear.wear_monitor import WearMonitor
 
 SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
@@ -62,6 +63,7 @@ READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
 RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 DATA_LOST_AFTER_NS = 2 * NS_PER_S  # an active alarm is not confirmed by data after so long without a score
+SET_BACK_NS = NS_PER_S  # a snapshot further ahead of the present is of a clock that was set back since
 BACK_IN_TIME_NS = 120 * NS_PER_S  # a restarted producer catches up with less; older samples are of another recording
 
 
@@ -117,8 +119,9 @@ class ScorerCore(Core):
         twin: HealthyTwin,
         snapshot_store: SnapshotStore | None = None,
         decision_rules: DecisionRules = CURRENT_RULES,
+        started_t_ns: int | None = None,
     ) -> None:
-        """snapshot_store: where snapshots are kept; None: nowhere, as in a replay."""
+        """snapshot_store: where snapshots are kept; None: nowhere, as in a replay. started_t_ns: the present time."""
         self._fans = fans
         self._twin = twin
         self._config = config
@@ -142,10 +145,15 @@ class ScorerCore(Core):
         self._counts: Counter[str] = Counter()
         self._not_restored = ""
         """why the snapshot was not used as a whole, for people"""
+        self._set_back, self._set_back_until_t_ns = "", 0
+        """that the snapshot was set back, for people"""
         self._start_new()
         snapshot = snapshot_store.load() if snapshot_store else None
         self._at_start = self.restore(snapshot) if snapshot else []
         """messages to be emitted first"""
+        is_ahead = started_t_ns is not None and self._last_t_ns > started_t_ns + SET_BACK_NS
+        self._may_be_set_back = is_ahead and self._is_restored and not self._not_restored
+        """the snapshot is of later times than now: the first prediction shows whether all times have gone back"""
 
     def _start_new(self) -> None:
         self._scorer = self._new_scorer()
@@ -199,18 +207,22 @@ class ScorerCore(Core):
 
     def tick(self, now_ns: int) -> list[Alarm | ScorerSnapshot]:
         """Emit once what was restored, also if it is then discarded: a replay restores it, too."""
+        if self._may_be_set_back:
+            return []
         at_start, self._at_start = self._at_start, []
         return at_start
 
     def step(self, item: Prediction | Request) -> list[Score | Alarm | ScorerSnapshot]:
         """Score a block and return its score and alarm transitions; or answer a request."""
         if isinstance(item, Request):
+            self._may_be_set_back = False
             return [*self.tick(0), *self._answer(item)]
         if item.fans != self._fans:
             self._wrong_fans = item.fans
             self._counts["lost_wrong_fan_count"] += len(item.t_ns)
             return []
         self._wrong_fans = 0
+        self._set_snapshot_back(item)
         before_score = [*self.tick(0), *self._discard_if_of_other_times(item)]
         before = np.maximum.accumulate(np.concatenate(([self._last_t_ns], item.t_ns)))[:-1]
         new = item.t_ns > before
@@ -241,6 +253,7 @@ class ScorerCore(Core):
         is_new = origin_t_ns is None or self._last_t_ns < origin_t_ns + SHOWN_NS
         problems = [
             self._not_restored if is_new else "",
+            self._set_back if self._last_t_ns < self._set_back_until_t_ns else "",
             self._unscored.problem(),
             self._old_samples.problem("predictions", "scorer"),
         ]
@@ -264,6 +277,30 @@ class ScorerCore(Core):
         """Save nothing; another process may use the snapshot."""
         if self._snapshot_store:
             self._snapshot_store.unlock()
+
+    def _set_snapshot_back(self, item: Prediction) -> None:
+        """Move the restored snapshot to before the first prediction, if the host clock was set back after it.
+
+        How long nothing was judged is not known: longer than the statistics remember. Only a snapshot that is also
+        ahead of the host's time is moved. Otherwise a producer repeats what it has kept, or a recording is played.
+        """
+        if not self._may_be_set_back or not len(item.t_ns):
+            return
+        self._may_be_set_back = False
+        first_t_ns, ahead_ns = int(item.t_ns[0]), self._last_t_ns - int(item.t_ns[0])
+        if item.header.producer == self._input_producer or ahead_ns < 0:
+            return
+        t_ns = first_t_ns - item.period_ns - max(self._scorer.longest_memory_ns, DATA_LOST_AFTER_NS)
+        state = with_times_moved(self._state(), t_ns - self._last_t_ns)
+        self._start_new()
+        self._at_start = self.restore(ScorerSnapshot(t_ns=t_ns, twin_sha256=self._twin.sha256, state_json=_json(state)))
+        self._snapshot_t_ns = 0  # saved at once: a restart must not set back the same one again
+        self._counts["snapshots_set_back"] += 1
+        self._set_back_until_t_ns = first_t_ns + SHOWN_NS
+        self._set_back = (
+            f"the snapshot is {ahead_ns / NS_PER_S:.0f} s ahead of the samples, because the host clock was set back: "
+            "baselines, alarms and wear continue, with their times set back as well"
+        )
 
     def _discard_if_of_other_times(self, item: Prediction) -> list[Alarm]:
         """Discard a restored snapshot if it is of later times than the first prediction, as when another recording is
@@ -344,20 +381,24 @@ class ScorerCore(Core):
         if not at_once and self._last_t_ns - self._snapshot_t_ns < SNAPSHOT_PERIOD_NS:
             return []
         self._snapshot_t_ns = self._last_t_ns
-        state = {
+        snapshot = ScorerSnapshot(
+            t_ns=max(self._last_t_ns, 0), twin_sha256=self._twin.sha256, state_json=_json(self._state())
+        )
+        if self._snapshot_store:
+            self._snapshot_store.save(snapshot)
+        return [snapshot]
+
+    def _state(self) -> dict[str, Any]:
+        return {
             "scorer": self._scorer.snapshot(),
             "alarms": self._alarms.snapshot(),
             "wear": self._wear.snapshot(),
             "input_producer": self._input_producer,
         }
-        snapshot = ScorerSnapshot(
-            t_ns=max(self._last_t_ns, 0),
-            twin_sha256=self._twin.sha256,
-            state_json=json.dumps(state, allow_nan=False),
-        )
-        if self._snapshot_store:
-            self._snapshot_store.save(snapshot)
-        return [snapshot]
+
+
+def _json(state: Mapping[str, Any]) -> str:
+    return json.dumps(state, allow_nan=False)
 
 
 def build(context: Context) -> BuiltStage:
@@ -374,7 +415,15 @@ def build(context: Context) -> BuiltStage:
     if store:
         store.lock(f"site {context.site}")
     return BuiltStage(
-        ScorerCore(tray.fans, tray.speed_unit, context.config, twin, store, decision_rules=context.decision_rules)
+        ScorerCore(
+            tray.fans,
+            tray.speed_unit,
+            context.config,
+            twin,
+            store,
+            decision_rules=context.decision_rules,
+            started_t_ns=context.started_t_ns,
+        )
     )
 
 

@@ -22,7 +22,7 @@ from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import RescoredTray, rescore
 from pipeline.replay.offline.verify import CannotCompareError, Comparison
 from schemas import fan_pb2
-from schemas.messages import Action, Alarm, Score, Transition
+from schemas.messages import Action, Alarm, FanState, Score, Transition
 from schemas.units import NS_PER_S
 from tests.support.killed_site import CHAIN, Site
 from tests.support.twin_files import write_twin
@@ -576,15 +576,15 @@ def test_row_13_after_a_step_of_the_clock_the_samples_that_are_counted_are_those
 
 
 @pytest.mark.parametrize("restored_s_before_data", [0.0, 0.1])
-def test_row_13_alarms_that_end_because_the_clock_was_set_back_and_the_site_restarted_end_in_a_replay(
+def test_row_13_alarms_that_end_because_the_clock_of_the_stages_before_was_set_back_end_in_a_replay(
     tmp_path, restored_s_before_data
 ):
     site = Site(tmp_path, seed=1, calibrated=True)
     site.run(120)
-    site.set_clock_back(3600)
     site.restart_source()
     for stage in CHAIN:
         site.kill(stage)
+    site.set_clock_back(3600)  # after the scorer has started, on another host
     site.now_ns += round(restored_s_before_data * NS_PER_S)
     site.tick()
     site.run(50)
@@ -593,3 +593,32 @@ def test_row_13_alarms_that_end_because_the_clock_was_set_back_and_the_site_rest
     assert "fan 0: stands no longer" in [alarm.message for alarm in alarms]
     assert found and found.is_equal, found
     assert found.alarms_equal == len(alarms)
+
+
+@pytest.mark.parametrize("set_back_s", [2, 20, 60, 3600])
+def test_row_13_a_site_restarted_after_its_clock_was_set_back_goes_on_with_its_baselines_and_alarms(
+    tmp_path, set_back_s
+):
+    site = Site(tmp_path, seed=1, calibrated=True)
+    site.run(120)
+    site.set_clock_back(set_back_s)
+    site.restart_source()
+    for stage in CHAIN:
+        site.kill(stage)
+    core = site.stages["scorer"].core
+    assert core
+    site.tick()
+    site.run(20)
+    assert f"the snapshot is {set_back_s - 1} s ahead of the samples" in core.problem()
+    site.run(80)
+    tray = verified(site.finished())
+    before, after = [
+        [s for s in recorded(site.path, "score") if s.header.producer == p.producer] for p in tray.plan.last
+    ]
+    assert after[0].t_ns[0] < before[-1].t_ns[-1], "it is judged at once"
+    states = np.concatenate([score.state for score in after])
+    assert not (states == FanState.COMMISSIONING).any()
+    assert [a.transition for a in alarms_of(site.path)][3:6] == [Transition.REPUBLISHED] * 3
+    assert all(a.active and a.onset_t_ns < site.now_ns for a in alarms_of(site.path)[3:6])
+    assert made_equal(tray) == sum(len(score.t_ns) for score in recorded(site.path, "score"))
+    assert tray.comparison and tray.comparison.alarms_equal == len(alarms_of(site.path))
