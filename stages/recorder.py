@@ -239,6 +239,14 @@ class Recorder(Core):
                     f"{self._part.path}: another program deleted or cut the file while it was written; messages "
                 )
                 self._news += f"lost with it: {self._part.lost}; keep other programs away from it"
+            if self._part.absent:
+                self._counts["lost_absent"] += self._part.absent
+                self._news_ns = self._now_ns
+                self._news = (
+                    f"{self._part.path}: messages that were written and are not in the finished file: "
+                    f"{self._part.absent}; check the disk, and keep other programs away from it"
+                )
+                _LOG.error("%s", self._news)
             self._ledger = self._ledger.as_lost() if self._part.lost else self._ledger.for_next_part()
             unwritten, self._part, self._unflushed_ns = self._part.pending, None, None
             self._hold(unwritten)

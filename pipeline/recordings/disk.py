@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from pipeline.recordings.records import RecordingError
 
@@ -70,6 +71,11 @@ class AtomicAppendFile:
         if not self._is_synced:
             os.fdatasync(self._descriptor)
             self._is_synced = True
+
+    def reader(self) -> BinaryIO:
+        """What it holds now, wherever it is. Nothing may be written any more: reading moves the place of writing."""
+        os.lseek(self._descriptor, 0, os.SEEK_SET)
+        return os.fdopen(os.dup(self._descriptor), "rb")
 
     def is_at(self, path: Path) -> bool:
         """Whether `path` is still this file: not deleted, moved or replaced. OSError if the system cannot say."""

@@ -19,6 +19,7 @@ class OpenPart(Protocol):
     written: Counter[str]
     restored: int
     lost: int
+    absent: int
 
     @property
     def pending(self) -> Sequence[Envelope]: ...  # noqa: D102

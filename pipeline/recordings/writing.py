@@ -25,7 +25,7 @@ from pipeline.recordings.chunk import FillingChunk
 from pipeline.recordings.disk import AtomicAppendFile, Disk, refused, sync_folder
 from pipeline.recordings.index import SHORT_ENDING, Index
 from pipeline.recordings.reading import METADATA_NAME
-from pipeline.recordings.records import RecordingError, record_bytes
+from pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, indexed_reader, record_bytes
 from pipeline.recordings.sequence_ledger import BEFORE_NAME, LEDGER_NAME, SequenceLedger, ledger_metadata
 from schemas.codec import proto_type, type_name
 from schemas.envelope import Envelope
@@ -80,6 +80,10 @@ class RecordingWriter:
         """how often another program had deleted, moved or replaced the file, and its content was written again"""
         self.lost = 0
         """messages that were flushed and are lost with the file, because it could not be restored"""
+        self.absent = 0
+        """messages that were added and are not in the finished file, by its own count"""
+        self._added: Counter[str] = Counter()
+        """messages by key"""
         self._filling: list[Envelope] = []
         """the messages of the chunk that is not written yet"""
         self._unsynced: list[_WrittenChunk] = []
@@ -137,6 +141,7 @@ class RecordingWriter:
             channel, message.header.sequence, envelope.received_t_ns, newest_t_ns(message), envelope.payload
         )
         self._filling.append(envelope)  # counted as recorded only if it is in the chunk
+        self._added[key] += 1
         if self._chunk.size > CHUNK_BYTES:
             self._finish_chunk()
             if self._unsynced_bytes > UNSYNCED_BYTES:
@@ -188,6 +193,9 @@ class RecordingWriter:
             write_ending(self._file, self._index, ledger_metadata(self.ledger.counts, has_ended=has_ended))
         except OSError as error:
             raise self._end_early(error) from error
+        for key, lacking in (self._added - self._counted_in_file()).items():
+            self.absent += lacking
+            self.written[self._channels[key][1]] -= lacking
         self._rename()
 
     def discard(self) -> None:
@@ -207,6 +215,15 @@ class RecordingWriter:
             self.finish()
         else:
             self.discard()
+
+    def _counted_in_file(self) -> Counter[str]:
+        """The messages of each key by the statistics that are in the file; none if these cannot be read."""
+        with self._file.reader() as file, suppress(OSError, *CORRUPT_DATA_ERRORS):
+            summary = indexed_reader(file).get_summary()
+            if summary and summary.statistics:
+                counts = summary.statistics.channel_message_counts
+                return Counter({channel.topic: counts.get(id, 0) for id, channel in summary.channels.items()})
+        return Counter()
 
     def _register_channel(self, key: str, message_type: type[Message]) -> tuple[int, str]:
         name = type_name(message_type)

@@ -73,7 +73,7 @@ class Part:
         self.written: Counter[str] = Counter()
         self.pending: list[Envelope] = []
         self.content: list[Envelope] = []
-        self.flushes = self.restored = self.lost = 0
+        self.flushes = self.restored = self.lost = self.absent = 0
         self.closed = ""
         self.size = 0
 

@@ -7,10 +7,13 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from pipeline.recordings.chunk import FillingChunk
 from pipeline.recordings.contents import contents_of
+from pipeline.recordings.index import Index
 from pipeline.recordings.reading import read_metadata, read_recording
 from stages.recorder import STAGE, Recorder
 from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, envelope, raw
@@ -134,3 +137,27 @@ def test_row_03_a_recording_cut_by_another_program_is_lost_and_counted(tmp_path)
     assert run.recorded() == list(range(20, 60))
     assert run.core.counters()["lost_deleted"] == 20
     assert contents_of(run.folder / "recording-2.mcap").streams[STREAM].missing == 20
+
+
+def test_row_05_a_message_that_is_not_in_the_finished_file_is_lost(tmp_path, monkeypatch):
+    add = FillingChunk.add
+
+    def lose_number_13(chunk: FillingChunk, channel: int, sequence: int, *others: Any) -> None:
+        if sequence != 13:
+            add(chunk, channel, sequence, *others)
+
+    monkeypatch.setattr(FillingChunk, "add", lose_number_13)
+    run = Run(tmp_path)
+    run.seconds(3)
+    run.core.close()
+    assert run.recorded() == [sequence for sequence in range(30) if sequence != 13]
+    assert run.core.counters() == {"recorded_raw": 29, "lost_unwritten": 0, "lost_absent": 1, "parts": 1}
+    assert "recording.mcap: messages that were written and are not in the finished file: 1;" in run.core.problem()
+
+
+def test_row_05_a_file_whose_end_cannot_be_read_again_has_lost_all(tmp_path, monkeypatch):
+    monkeypatch.setattr(Index, "ending", lambda _index, _offset: b"\xff" * 100)
+    run = Run(tmp_path)
+    run.seconds(3)
+    run.core.close()
+    assert run.core.counters()["lost_absent"] == 30
