@@ -77,7 +77,7 @@ class SiteWatcher:
         """The latest session of every stage instance, by name."""
         with self._lock:
             latest: dict[tuple[str, str], StageView] = {}
-            for health, previous, heard_s in sorted(self._healths.values(), key=lambda found: found[0].t_ns):
+            for health, previous, heard_s in self._healths.values():  # as heard: a host's clock may be set back
                 if self._sessions.is_ignored(health.header.producer):
                     continue
                 alive = alive_key(self._site, health.stage, health.instance) in self._alive

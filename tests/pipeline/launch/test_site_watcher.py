@@ -71,3 +71,20 @@ def test_row_11_what_a_launched_session_has_lost_is_not_forgotten_in_a_flood_of_
     assert watcher.losses() == {"recorder": 1}
     assert watcher.last_health(("recorder", 1)) is not None
     assert watcher.last_health(("recorder", 2)) is None
+
+
+def test_row_13_a_stage_that_is_restarted_after_its_clock_was_set_back_is_the_latest_session():
+    bus: Any = StubBus()
+    watcher = SiteWatcher(bus, "s")
+    for producer, t_ns, process_id in (("recorder-all-a", 7200, 1), ("recorder-all-b", 3600, 2)):
+        health = Health(
+            header=Header(producer, 0, ""),
+            stage="recorder",
+            instance="all",
+            status=StageStatus.OK,
+            t_ns=t_ns,
+            uptime_s=0.0,
+            process_id=process_id,
+        )
+        bus.subscribers[health_key("s", "*", "*")]("fantwin/s/health/recorder/all", encode(health))
+    assert [view.health.process_id for view in watcher.stages()] == [2]
