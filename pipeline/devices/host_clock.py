@@ -1,8 +1,8 @@
 """The host's time, which passes evenly: steps of its wall clock are noticed, and never make it go back.
 
-Durations are of the monotonic clock; the wall clock labels them. The time follows the wall clock while that is
-corrected by less than a second, and when it is set forward. When the wall clock is set back, the time goes on, ahead of
-it, until the wall clock is put right.
+Durations are of the monotonic clock; the wall clock labels them. The time follows the wall clock when that is set
+forward. When it is set back by less than a second, the time passes more slowly until the wall clock has caught up. When
+it is set back further, the time goes on, ahead of it, until the wall clock is put right.
 
 A site has one time: its launcher hands its own on to each stage that it starts. A stage that is started again after the
 wall clock was set back goes on as the others do.
@@ -21,6 +21,10 @@ from schemas.units import NS_PER_S
 VARIABLE = "FANTWIN_HOST_CLOCK"
 """environment variable with the offset of the time to go on with"""
 STEP_NS = NS_PER_S  # a larger difference is a clock that was set, not one that was corrected
+SLOWER = 100  # by this part of it the time is slower while the wall clock catches up
+
+ONE_MOMENT_NS = NS_PER_S // 1000
+READ_ATTEMPTS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +51,8 @@ class HostClock:
         self._wall_ns = wall_ns
         self._monotonic_ns = monotonic_ns
         self._lock = threading.Lock()
-        self._offset_ns = wall_ns() - monotonic_ns() if offset_ns is None else offset_ns
+        self._monotonic_last_ns = monotonic_ns()
+        self._offset_ns = wall_ns() - self._monotonic_last_ns if offset_ns is None else offset_ns
         self._ahead_ns = 0
         self.steps = 0
         """how often the wall clock was set"""
@@ -56,23 +61,32 @@ class HostClock:
     def now_ns(self) -> int:
         """Nanoseconds since the epoch, as the wall clock said before it was set back, if it was."""
         with self._lock:
-            monotonic_ns = self._monotonic_ns()
+            wall_ns, monotonic_ns = self._read()
             now_ns = monotonic_ns + self._offset_ns
-            wall_ns = self._wall_ns()
             ahead_ns = now_ns - wall_ns
             step_ns = self._ahead_ns - ahead_ns
-            if abs(step_ns) > STEP_NS:
-                self._ahead_ns = ahead_ns = ahead_ns if ahead_ns > STEP_NS else 0
-                if not ahead_ns:
-                    now_ns = wall_ns
-                self.steps += 1
-                self.last_step = ClockStep(step_ns, now_ns, ahead_ns)
-            if not self._ahead_ns:
-                now_ns = wall_ns
-            else:
+            is_set = abs(step_ns) > STEP_NS
+            if is_set:
+                self._ahead_ns = ahead_ns if ahead_ns > STEP_NS else 0
+            if self._ahead_ns:
                 self._ahead_ns = ahead_ns  # the wall clock may be corrected while it is behind
-            self._offset_ns = now_ns - monotonic_ns
+            else:
+                now_ns = max(wall_ns, now_ns - (monotonic_ns - self._monotonic_last_ns) // SLOWER)
+            if is_set:
+                self.steps += 1
+                self.last_step = ClockStep(step_ns, now_ns, self._ahead_ns)
+            self._monotonic_last_ns, self._offset_ns = monotonic_ns, now_ns - monotonic_ns
             return now_ns
+
+    def _read(self) -> tuple[int, int]:
+        """Both clocks at one moment: read again if this process was held up in between, which would be taken for a
+        step."""
+        attempt = 0
+        while True:
+            attempt += 1
+            before_ns, wall_ns, monotonic_ns = self._monotonic_ns(), self._wall_ns(), self._monotonic_ns()
+            if monotonic_ns - before_ns <= ONE_MOMENT_NS or attempt == READ_ATTEMPTS:
+                return wall_ns, monotonic_ns
 
     @property
     def offset_ns(self) -> int:

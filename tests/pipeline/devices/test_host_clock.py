@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from pipeline.devices.host_clock import VARIABLE, ClockStep, HostClock, handed_on
@@ -26,9 +27,36 @@ class Host:
 
 def test_without_a_step_it_is_the_wall_clock() -> None:
     host = Host()
-    times = [host.passes(0.05, set_by_ns=correction) for correction in (0, 300_000_000, -2_000_000, 0)]
+    times = [host.passes(0.05, set_by_ns=correction) for correction in (0, 300_000_000, -400_000, 0)]
     assert times[-1] == host.wall_ns
     assert host.clock.steps == 0
+
+
+def test_row_13_a_wall_clock_set_back_by_less_than_a_second_makes_the_time_slower_until_it_has_caught_up() -> None:
+    host = Host()
+    host.passes(1.0)
+    host.passes(0.0, set_by_ns=-500_000_000)
+    times = [host.passes(0.05) for _ in range(1100)]
+    assert 49_000_000 <= min(np.diff(times)) < max(np.diff(times)) == 50_000_000
+    assert times[-1] == host.wall_ns
+    assert host.clock.steps == 0
+
+
+def test_a_process_that_is_held_up_between_two_readings_takes_it_for_no_step() -> None:
+    host = Host()
+    host.passes(1.0)
+    delays_s = iter([2.0, 0.0])
+
+    def read_wall_ns() -> int:
+        wall_ns = host.wall_ns
+        delay_ns = round(next(delays_s) * NS_PER_S)
+        host.wall_ns += delay_ns
+        host.monotonic_ns += delay_ns
+        return wall_ns
+
+    clock = HostClock(read_wall_ns, lambda: host.monotonic_ns, host.clock.offset_ns)
+    assert clock.now_ns() == host.wall_ns
+    assert clock.steps == 0
 
 
 def test_row_13_a_wall_clock_set_back_does_not_take_the_time_back() -> None:
@@ -55,10 +83,10 @@ def test_a_wall_clock_that_is_put_right_is_followed_again(more_ns: int) -> None:
     assert (host.clock.steps, host.clock.last_step.ahead_ns) == (2, 0) if host.clock.last_step else False
 
 
-def test_the_time_never_goes_back_by_more_than_a_second() -> None:
+def test_row_13_the_time_never_goes_back() -> None:
     host = Host()
     times = [host.passes(0.05, set_by_ns=by_s * NS_PER_S) for by_s in (0, -5, 3, -7200, 100, 7300, -1, -2, 50)]
-    assert all(later > earlier - NS_PER_S for earlier, later in pairwise(times))
+    assert all(later > earlier for earlier, later in pairwise(times))
 
 
 def test_row_13_a_stage_that_is_started_after_the_wall_clock_was_set_back_goes_on_with_the_time_of_its_launcher() -> (
