@@ -17,7 +17,7 @@ from pipeline.runtime.sessions import Sessions
 from pipeline.runtime.tracked_streams import Request, Stream, TrackedStreams, Waiting
 from schemas.envelope import Envelope
 from schemas.messages import Health, Input
-from schemas.streams import MOST_PUBLISHED, output_streams
+from schemas.streams import MOST_PUBLISHED, StreamId, output_streams
 from schemas.topics import CATCH_UP_MESSAGES
 
 MOST_HELD_MESSAGES = 4096
@@ -92,14 +92,10 @@ class SequenceTracker:
 
     def accept_kept(self, envelopes: Iterable[Envelope]) -> list[Envelope]:
         """The messages to process of those that producers keep from before this consumer started, in sequence."""
-        due: list[Envelope] = []
-        for envelope in sorted(envelopes, key=lambda e: (e.message.header.producer, e.message.header.sequence)):
-            header = envelope.message.header
-            stream = self._streams.heard(envelope.key, header.producer)
-            if stream and not stream.waiting and stream.next_sequence is None and header.sequence < MOST_PUBLISHED:
-                stream.skip_to(header.sequence)
-            due += self.accept(envelope)
-        return due
+        streams: dict[StreamId, list[Envelope]] = {}
+        for envelope in sorted(envelopes, key=lambda each: each.message.header.sequence):
+            streams.setdefault((envelope.key, envelope.message.header.producer), []).append(envelope)
+        return [due for id, kept in streams.items() for due in self._take_kept(id, kept)]
 
     def reconcile(self, health: Health, keys: Iterable[str]) -> list[Envelope]:
         """Request messages on `keys` that a producer reports as published and that never arrived. On a topic with few
@@ -165,6 +161,15 @@ class SequenceTracker:
                 return self._request(stream, sequence, envelope)
         stream.heard_s = self._now_s()
         return [envelope] if stream.accept(sequence) else []
+
+    def _take_kept(self, id: StreamId, kept: Sequence[Envelope]) -> list[Envelope]:
+        stream, first = self._streams.heard(*id), kept[0].message.header.sequence
+        if stream and stream.next_sequence is None:
+            if stream.waiting:  # its first message came live before these: they answer what it made this consumer ask
+                return self._go_on(stream, stream.waiting, Found(kept))
+            if first < MOST_PUBLISHED:
+                stream.skip_to(first)
+        return [due for envelope in kept for due in self.accept(envelope)]
 
     def _request(self, stream: Stream, until: int, shown_by: Envelope | None) -> list[Envelope]:
         """Request what is missing before `until`."""

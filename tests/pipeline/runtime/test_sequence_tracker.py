@@ -93,6 +93,20 @@ def test_a_late_consumer_gets_the_messages_still_kept_and_counts_earlier_ones_as
     assert tracker.inputs()[0].missing == 0
 
 
+@pytest.mark.parametrize("kept_until", [5000, 5001, 5003])
+def test_a_consumer_restarted_late_gets_what_is_kept_also_when_a_live_message_comes_first(kept_until):
+    """What is kept is as much as may be held: it must not be taken for live messages that wait for an answer."""
+    requests: list[Request] = []
+    tracker = SequenceTracker(requests.append)
+    live = [due for number in (5000, 5001) for due in tracker.accept(packet(number))]
+    kept = [packet(number) for number in range(kept_until - CATCH_UP_MESSAGES, kept_until)]
+    due = [*live, *tracker.accept_kept(kept), *tracker.accept(packet(5002))]
+    assert sequences(due) == list(range(max(kept_until - CATCH_UP_MESSAGES, 5000 - CATCH_UP_MESSAGES), 5003))
+    assert tracker.answer(requests[0], Found(kept, kept_until)) == []
+    (line,) = tracker.inputs()
+    assert (line.missing, line.duplicated) == (0, 0)
+
+
 @pytest.mark.parametrize(("found", "missing"), [(Found(), 8), (Found(published=9), 0), (Found(was_asked=False), 0)])
 def test_first_messages_of_a_stage_that_does_not_answer_are_missing_and_not_history(found, missing):
     sessions = Sessions()
