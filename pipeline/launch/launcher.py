@@ -55,6 +55,8 @@ class Outcome:
     killed: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     lost: dict[str, int] = field(default_factory=dict)
+    refused: dict[str, dict[str, int]] = field(default_factory=dict)
+    """messages of others, by stage and counter; no loss"""
     run_folder: str = ""
 
     @property
@@ -100,6 +102,7 @@ class Launcher:
                 self._stop_all()
                 ready = [slot for slot in self._slots if slot.was_ready]  # before, a stage is due nothing
                 self.outcome.lost = self._watcher.losses({each for slot in ready for each in slot.sessions})
+                self.outcome.refused = self._watcher.refused()
         return self.outcome
 
     def _refuse_second_launcher(self, bus: Bus, stop: threading.Event) -> None:

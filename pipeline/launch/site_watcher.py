@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pipeline.bus.session import Bus
 from pipeline.config.models import NAME_PATTERN
 from pipeline.launch.loss_accounting import Launched, label, losses
+from pipeline.launch.refused_messages import refused
 from pipeline.runtime.sessions import Sessions
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Health
@@ -118,6 +119,11 @@ class SiteWatcher:
         """What every stage has lost, over all its sessions; see `pipeline.launch.loss_accounting`."""
         with self._lock:
             return losses((health for health, _, _ in self._healths.values()), launched)
+
+    def refused(self) -> dict[str, dict[str, int]]:
+        """What every stage has refused, over all its sessions; see `pipeline.launch.refused_messages`."""
+        with self._lock:
+            return refused(health for health, _, _ in self._healths.values())
 
     def _on_liveness(self, key: str, alive: bool) -> None:
         with self._lock:

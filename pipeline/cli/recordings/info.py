@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime
@@ -19,6 +19,7 @@ from rich.table import Table
 from pipeline.cli.options import JsonOption
 from pipeline.cli.progress import working
 from pipeline.launch.loss_accounting import label, losses
+from pipeline.launch.refused_messages import refused, refused_lines
 from pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
@@ -39,37 +40,38 @@ def info(
     """
     with working(f"reading {', '.join(str(file) for file in files)}"):
         parts = sorted((contents_of(file) for file in dict.fromkeys(files)), key=lambda part: part.first_ns or 0)
-    breaks, lost = continuity(parts), _losses(parts)
+    breaks = continuity(parts)
     if json_output:
-        typer.echo(json.dumps(as_json(parts, breaks, lost)))
+        typer.echo(json.dumps(as_json(parts, breaks)))
     else:
-        _show(parts, breaks, lost)
+        _show(parts, breaks)
     if breaks or any(_has_lost(part) for part in parts):
         raise typer.Exit(3)
 
 
-def _losses(parts: Iterable[Contents]) -> dict[str, int]:
-    """What each stage has lost, over all its sessions in all parts, as `fantwin up` counts it."""
+def _sessions(parts: Iterable[Contents]) -> list[Health]:
+    """The last health of each session in all parts."""
     sessions: dict[str, Health] = {}
     for health in (health for part in parts for health in part.sessions):
         sessions.pop(health.header.producer, None)
         sessions[health.header.producer] = health
-    return dict(sorted(losses(sessions.values()).items()))
+    return list(sessions.values())
 
 
-def as_json(parts: Sequence[Contents], breaks: Sequence[str], lost: Mapping[str, int]) -> dict[str, Any]:
+def as_json(parts: Sequence[Contents], breaks: Sequence[str]) -> dict[str, Any]:
     """The output of --json: each file, and the topics of all files together."""
     together = sum_by_key(item for part in parts for item in part.streams.items())
     return {
         "files": [_part_as_json(part) for part in parts],
         "topics": {key: _counts_as_json(counts) for key, counts in together.items()},
         "continuity": list(breaks),
-        "lost": dict(lost),
+        "lost": losses(_sessions(parts)),
+        "refused": refused(_sessions(parts)),
     }
 
 
 def _part_as_json(part: Contents) -> dict[str, Any]:
-    lost = _losses([part])
+    lost = losses(part.sessions)
     return {
         "file": str(part.path),
         "size_bytes": part.size_bytes,
@@ -109,7 +111,7 @@ def _counts_as_json(counts: StreamCounts) -> dict[str, Any]:
     }
 
 
-def _show(parts: Iterable[Contents], breaks: Iterable[str], lost: Mapping[str, int]) -> None:
+def _show(parts: Sequence[Contents], breaks: Iterable[str]) -> None:
     console = Console(soft_wrap=True, highlight=False)
     for part in parts:
         for line in _about(part):
@@ -126,6 +128,9 @@ def _show(parts: Iterable[Contents], breaks: Iterable[str], lost: Mapping[str, i
             console.print(f"[red]{escape(line)}{advice}[/red]")
     for line in breaks:
         console.print(f"[red]{escape(line)}[/red]")
+    for line in refused_lines(refused(_sessions(parts))):
+        console.print(f"[yellow]{escape(line)}[/yellow]")
+    lost = losses(_sessions(parts))
     if any(lost.values()):
         by_stage = ", ".join(f"{name} {count}" for name, count in lost.items() if count)
         console.print(f"[red]lost, over all sessions of each stage: {escape(by_stage)}[/red]")

@@ -22,6 +22,7 @@ from pipeline.config.models import Config
 from pipeline.errors import UserError
 from pipeline.launch.judged_fans import JudgedFans
 from pipeline.launch.processes import process_list
+from pipeline.launch.refused_messages import refused_lines
 from pipeline.launch.site_state import StageState, Word, site_states
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.runtime.signals import stop_on_signals
@@ -45,7 +46,8 @@ def status(
     """Show stages, rates, latency, losses and alarms of a running site.
 
     Each stage that the configuration asks for has a row. Stays live on a terminal, until Ctrl-C. Into a pipe or a file
-    it prints once and exits.
+    it prints once and exits. Losses count from the start of a stage (column `up`: how long ago), over all sessions
+    heard while this command runs; `fantwin up` at its end and `fantwin info` count all sessions.
 
     Exit code 1 if a stage is missing, gone, silent, starved or late, or if a fan is not judged; 3 if a stage has lost
     something.
@@ -101,18 +103,20 @@ def _no_stage(config: Config) -> str:
 def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Group:
     """The page for people: a row for each stage, then problems, then alarms, then the fans that are not judged."""
     table = Table("stage", "state", title="stages", title_justify="left", box=SIMPLE_HEAD)
-    for column in ("in /s", "out /s", "p50 ms", "p99 ms", "lost"):
+    lost = watcher.losses()
+    for column in ("up", "in /s", "out /s", "p50 ms", "p99 ms", "lost"):
         table.add_column(column, justify="right")
     states = site_states(watcher, process_list(config))
     is_anyone_there = any(state.view and state.view.alive for state in states)
     problems = [] if is_anyone_there else [Text(_no_stage(config), style="red")]
     for state in states:
         style = "red" if state.is_fault else _STATE_STYLES.get(state.word, "yellow")
-        table.add_row(state.label, Text(state.word, style=style), *_figures(state.view))
+        table.add_row(state.label, Text(state.word, style=style), *_figures(state.view, lost.get(state.label, 0)))
         if state.detail and (state.is_fault or state.word == Word.WAITING):
             problems.append(Text(f"{state.label}: {state.detail}", style=style))
         if state.view and state.view.health.problem and state.view.alive:
             problems.append(Text(f"{state.label}: {state.view.health.problem}", style="red"))
+    problems += [Text(line, style="yellow") for line in refused_lines(watcher.refused())]
     alarms = [_alarm_line(each) for each in watcher.current_alarms() if is_listed(each.newest)]
     if not any(state.view and state.view.alive and state.view.health.stage == "scorer" for state in states):
         unjudged = [Text("alarms unknown: no scorer is alive", style="red")]
@@ -122,14 +126,19 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Gro
     return Group(*([table] if watcher.stages() else []), *problems, *alarms, *unjudged, *no_alarms)
 
 
-def _figures(view: StageView | None) -> list[str | Text]:
-    """Rates, latencies and losses; empty for a stage that was not heard."""
+def _figures(view: StageView | None, lost: int) -> list[str | Text]:
+    """How long it has run, rates, latencies and losses; empty for a stage that was not heard."""
     if view is None:
         return []
     health = view.health
     latency = (f"{health.latency_p50_ms:.1f}", f"{health.latency_p99_ms:.1f}") if health.latency_p99_ms else ("", "")
-    lost = Text(str(health.lost), style="red" if health.lost else "")
-    return [f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}", *latency, lost]
+    rates = (f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}")
+    return [_duration(health.uptime_s), *rates, *latency, Text(str(lost), style="red" if lost else "")]
+
+
+def _duration(seconds: float) -> str:
+    units = (("d", 86_400.0), ("h", 3600.0), ("min", 60.0))
+    return next((f"{seconds / size:.0f} {unit}" for unit, size in units if seconds >= 2 * size), f"{seconds:.0f} s")
 
 
 def _alarm_line(current: CurrentAlarm) -> Text:
@@ -148,15 +157,15 @@ def _alarm_line(current: CurrentAlarm) -> Text:
 
 def as_json(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> dict[str, object]:
     """The same for machines (`--json`)."""
-    states = site_states(watcher, process_list(config))
+    states, lost = site_states(watcher, process_list(config)), watcher.losses()
     return {
-        "stages": [_state_as_json(state) for state in states],
+        "stages": [_state_as_json(state, lost.get(state.label, 0)) for state in states],
         "alarms": [current.as_json() for current in watcher.current_alarms()],
         "not_judged": [each.as_json() for each in judged.unjudged(states)],
     }
 
 
-def _state_as_json(state: StageState) -> dict[str, object]:
+def _state_as_json(state: StageState, lost: int) -> dict[str, object]:
     stage, _, tray = state.label.partition("/")
     about = {"stage": stage, "instance": tray or "all", "state": str(state.word), "detail": state.detail}
     view = state.view
@@ -175,6 +184,7 @@ def _state_as_json(state: StageState) -> dict[str, object]:
         "latency_ms": {"p50": health.latency_p50_ms, "p99": health.latency_p99_ms},
         "waiting_for": [each.key for each in health.waiting_for],
         **{name: round((health.t_ns - t_ns) / NS_PER_S, 3) if t_ns else None for name, t_ns in ages_s.items()},
-        "lost": health.lost,
+        "uptime_s": round(health.uptime_s, 3),
+        "lost": lost,
         "counters": {counter.name: counter.value for counter in health.counters},
     }

@@ -14,6 +14,7 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.config.loading import load_config
 from pipeline.launch.event_log import EventLog
 from pipeline.launch.launcher import Launcher, Outcome
+from pipeline.launch.refused_messages import refused_lines
 from pipeline.runtime.signals import stop_on_signals
 
 
@@ -32,6 +33,8 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
     try:
         outcome = Launcher(settings, overrides or (), log.say).run(stop)
         if not json_output:
+            for line in refused_lines(outcome.refused):
+                log.say(line)
             losses = ", ".join(f"{name} {count}" for name, count in outcome.lost.items() if count)
             log.say(f"stopped; lost: {losses or 'nothing'}; files in {outcome.run_folder}")
     finally:
@@ -44,6 +47,7 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
 
 def _print_json(outcome: Outcome) -> None:
     """To standard output, where somebody may read it; the exit code stands whether or not it can be written."""
-    found = {name: getattr(outcome, name) for name in ("run_folder", "restarts", "killed", "failed", "lost")}
+    names = ("run_folder", "restarts", "killed", "failed", "lost", "refused")
+    found = {name: getattr(outcome, name) for name in names}
     with suppress(OSError):
         os.write(sys.stdout.fileno(), f"{json.dumps(found)}\n".encode())

@@ -167,6 +167,27 @@ def test_a_later_session_replaces_the_earlier_one_and_their_losses_add_up(site):
     assert watcher.losses() == {"scorer": 9}
 
 
+def test_row_18_the_loss_of_a_stage_that_was_restarted_while_it_is_watched_does_not_start_at_0_again(site):
+    watcher = SiteWatcher(site.outside, SITE)
+    follower = replace(
+        HEALTH, header=Header("scorer-all-2", 0, ""), t_ns=HEALTH.t_ns + NS_PER_S, uptime_s=180.0, lost=2
+    )
+    view(site, watcher, HEALTH, follower)
+    judged = site.judged()
+    (stage,) = document(watcher, judged)["stages"]
+    assert (stage["lost"], stage["uptime_s"]) == (7 + 2, 180.0)
+    (row,) = (line for line in shown(watcher, judged).splitlines() if line.strip().startswith("scorer"))
+    assert (row.split()[2:4], row.split()[-1]) == (["3", "min"], "9")
+
+
+def test_row_07_what_was_refused_of_a_second_process_is_said_and_is_no_loss(site):
+    watcher = SiteWatcher(site.outside, SITE)
+    refusals = (Counter(name="refused_of_second", value=12),)
+    view(site, watcher, replace(HEALTH, counters=refusals, lost=0))
+    assert "scorer: messages refused: 12 of a second process of a stage\n" in shown(watcher, site.judged())
+    assert watcher.losses() == {"scorer": 0}
+
+
 def test_alarms_raised_before_the_watcher_came_are_fetched_and_the_last_of_a_fan_counts(site):
     site.alarm.put(encode(ALARM))
     site.alarm.put(encode(replace(ALARM, active=False, t_ns=ALARM.t_ns + 1, header=Header("scorer-all-1", 1, TRAY))))
