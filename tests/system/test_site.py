@@ -107,7 +107,7 @@ def check_account(chain: Chain, sent: dict[str, Any], account: dict[str, Any], s
     assert sent["samples_unsent"] > 0
     recorded = recorded_values(chain, "raw", "device_sequence")
     assert len(recorded) + lost >= sent["samples_sent"] + sent["samples_unsent"]
-    assert 0 < lost <= sent["samples_unsent"] + 200, "lost is what fell into the pause, not more"
+    assert 0 < lost <= sent["samples_unsent"] + 200, f"lost is what fell into the pause, not more: {account}"
     assert status == 3
 
 
