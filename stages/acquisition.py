@@ -172,8 +172,8 @@ class AcquisitionCore(Core):
         was_set = f"the host clock was set {way} by {abs(step.step_ns) / NS_PER_S:.0f} s"
         if step.ahead_ns:
             ahead = f"{step.ahead_ns / NS_PER_S:.0f} s ahead of it"
-            return f"{was_set}: times continue from before, {ahead}, until the site is restarted"
-        return f"{was_set}, or the host was suspended: times follow it"
+            return f"{was_set}: sample times continue without a step, {ahead}, until the site is restarted"
+        return f"{was_set}, or the host was suspended: sample times follow it"
 
     def _problem_of_line(self) -> str:
         name, silence_s = self._source.name, self._config.silence_s

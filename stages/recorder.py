@@ -34,7 +34,7 @@ from schemas.topics import TOPICS
 from schemas.units import NS_PER_S
 
 HELD_BYTES = 16 << 20
-"""At most so many bytes of messages are kept in memory while nothing can be recorded."""
+"""the most bytes of messages kept in memory while nothing can be recorded"""
 TICK_NS = 50_000_000
 """about the time between ticks"""
 DISK_CHECK_NS = NS_PER_S

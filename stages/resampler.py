@@ -136,7 +136,9 @@ class ResamplerCore(Core):
         if self._wrong_fans:
             return f"raw samples of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
         if self._silence_ns >= self._watermark_ns:
-            return f"no raw samples for more than {self._watermark_ns / NS_PER_S:g} s: see the health of acquisition"
+            return (
+                f"no raw samples for more than {self._watermark_ns / NS_PER_S:g} s: see acquisition in `fantwin status`"
+            )
         if self._set_back_ns:
             return (
                 f"the host clock was set back by {self._set_back_ns / NS_PER_S:.0f} s, or a replay was restarted: "

@@ -1,4 +1,4 @@
-"""What can be wrong with an endpoint before anybody meets there."""
+"""What can be wrong with an endpoint before any process uses it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _CONNECT_TIMEOUT_S = 1.0
 
 
 def endpoint_problem(endpoint: str) -> str:
-    """What is wrong with an endpoint in itself: one line, or empty. Zenoh judges endpoints that are no host and port.
+    """What is wrong with an endpoint in itself: one line, or empty. Zenoh checks all but host and port.
 
     A host that does not resolve now may do so later, as that of a container that has not started yet.
     """
@@ -61,8 +61,8 @@ def accepts_connections(endpoint: str) -> bool:
 def foreign_program(endpoint: str) -> str:
     """One line about an endpoint that accepts connections and does not answer as fantwin."""
     return (
-        f"bus.endpoint = {endpoint!r}: the program that listens there is not fantwin, or hangs, so no stage would meet "
-        "another: stop it, or choose another port"
+        f"bus.endpoint = {endpoint!r}: the program that listens there is not fantwin, or hangs, so stages cannot "
+        "connect: stop it, or choose another port"
     )
 
 

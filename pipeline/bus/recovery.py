@@ -1,7 +1,7 @@
 """Requests for missed messages: asked without waiting, and bounded in messages, bytes and time.
 
 A producer answers at `<key>/recover/<producer>` with the messages that it still keeps, and then with how many it has
-published at all. That number ends the answer of a named producer, and shows what cannot be: a message with a higher
+published at all. That number ends the answer of a named producer, and exposes forged messages: one with a higher
 sequence number is not from this producer.
 """
 
@@ -42,7 +42,7 @@ class Answer:
         messages: (key, payload) of those that were still kept.
         published: how many messages the producer says it has published; None if it did not answer, or if all were
             asked.
-        timed_out: somebody who was asked did not answer in time.
+        timed_out: a producer that was asked did not answer in time.
     """
 
     messages: list[tuple[str, bytes]] = field(default_factory=list)

@@ -80,7 +80,7 @@ class LauncherConfig(Section):
     restart_delay_s: float = Field(default=0.2, gt=0, description="first delay before a dead stage is restarted")
     restart_delay_max_s: float = Field(default=10.0, gt=0, description="the delay doubles up to this")
     watchdog_s: float = Field(
-        default=10.0, ge=1, description="a stage that has not gone round its loop for this long is killed and restarted"
+        default=10.0, ge=1, description="a stage whose main loop has not run for this long is killed and restarted"
     )
     stop_timeout_s: float = Field(
         default=10.0, gt=0, description="how long a stage may take to stop before it is killed"

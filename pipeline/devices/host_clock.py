@@ -1,8 +1,8 @@
-"""The host's time, which passes evenly: steps of its wall clock are noticed, and never make it go back.
+"""The host's time: a step of the wall clock is noticed, and never makes it go back.
 
-Durations are of the monotonic clock; the wall clock labels them. The time follows the wall clock when that is set
-forward. When it is set back by less than a second, the time passes more slowly until the wall clock has caught up. When
-it is set back further, the time goes on, ahead of it, until the wall clock is put right.
+Durations come from the monotonic clock; the wall clock only labels them. The time follows the wall clock when that is
+set forward. When it is set back by less than a second, the time passes more slowly until the wall clock has caught up.
+When it is set back further, the time goes on, ahead of it, until the wall clock is put right.
 
 A site has one time: its launcher hands its own on to each stage that it starts. A stage that is started again after the
 wall clock was set back goes on as the others do.

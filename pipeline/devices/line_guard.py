@@ -1,10 +1,10 @@
-"""Which raw samples are of the present line: others, of another time, must not move it.
+"""Decides which raw samples belong to the current line: samples of another time must not change its time.
 
-A line has one producer at a time, and its times of receipt go on. Samples of another producer whose times are more than
-a second away are *apart*: a second acquisition whose clock is wrong, or the next session of acquisition after some
-time, or after the host clock was set. So are samples of the line's own producer that go back. They are held until one
-side has gone on for some time while the other was silent: then the line continues with them, or they are refused and
-counted. A line that stalls and goes on is never apart from itself.
+A line has one producer at a time, and its times of receipt advance. Samples of another producer whose times are
+more than a second away are *apart*. They come from a second acquisition whose clock is wrong, or from the next session
+of acquisition, after a pause or after the host clock was set. Samples of the line's own producer that go back are apart
+too. Samples that are apart are held until one side has gone on for some time while the other was silent. Then the line
+continues with them, or they are refused and counted. A line that stalls and goes on is never apart from itself.
 
 Grid times cannot go back. If the line continues with earlier times, because the host clock was set back, a shift is
 added to them: times then continue as the device clock says, ahead of the host clock.
@@ -54,7 +54,7 @@ class LineGuard:
         `host_clock_set_back`: how often it was"""
 
     def admit(self, message: Raw, *, is_of_ended: bool = False) -> list[Raw]:
-        """What is to be processed now: nothing while it is open whether the samples are of the line.
+        """The samples to process now; none while it is undecided whether they belong to the line.
 
         is_of_ended: from a producer that another one has followed. What it still sends near the line does not make it
         the line's producer again.
@@ -148,8 +148,8 @@ class LineGuard:
             self._shift_ns = continued_ns if by_device is None else by_device - _time_of(first)
             self.counts["host_clock_set_back"] += 1
             self._show(
-                f"the host clock was set back by {(self._shift_ns - before_ns) / NS_PER_S:.0f} s: times continue from "
-                f"before, {self._shift_ns / NS_PER_S:.0f} s ahead of it, until the site is restarted"
+                f"the host clock was set back by {(self._shift_ns - before_ns) / NS_PER_S:.0f} s: sample times "
+                f"continue without a step, {self._shift_ns / NS_PER_S:.0f} s ahead of it, until the site is restarted"
             )
         return [self._shifted(sample) for sample in held]
 

@@ -1,9 +1,8 @@
-"""Lines for people, written so that the output can hurt nobody.
+"""Log lines for people, written so that writing them never delays or ends the program.
 
-Whoever reads the output may go away or stop reading, and the disk under it may be full. None of this may delay or end
-the program that writes. So lines are written from a thread of their own; what cannot be written is counted, and said
-when it can be. A line that comes again and again is folded: it is written again after 10 s, then after twice as long
-each time, with the number of repetitions.
+The reader of the output may go away or stop reading, and its disk may be full. So a separate thread writes the lines;
+it counts those that it cannot write, and reports the count when it can write again. A line that keeps repeating is
+folded: it is written again after 10 s, then after twice as long each time, with the number of repetitions.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which fans are being judged now. Only where all are does "no alarms" mean that none has a fault."""
+"""Which fans are being judged now. "No alarms" means that no fan has a fault only if all fans are judged."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LAST_JUDGE = "scorer"
 
 @dataclass(frozen=True)
 class Unjudged:
-    """Fans of one tray that are not judged, for one reason; no fans: none of the tray is."""
+    """Fans of one tray that are not judged, for one reason; empty `fans`: no fan of the tray is judged."""
 
     tray: str
     fans: tuple[int, ...]

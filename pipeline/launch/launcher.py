@@ -23,7 +23,7 @@ from schemas.messages import StageStatus
 from schemas.topics import alive_key
 
 _POLL_S = 0.05
-_SEARCH_S = 2.0  # so long after it has met one process, a launcher has discovered all others
+_SEARCH_S = 2.0  # this long after meeting one process, a launcher has discovered all others
 _ORDERLY = (0, 3)  # exit status of a stage that stopped in order: without losses, or with losses
 _READY_TIMEOUT_S = 30.0
 _LAST_HEALTH_S = 2.0  # after the end of a process, for what it sent last
@@ -100,7 +100,7 @@ class Launcher:
                 self._restart_those_down()
             finally:
                 self._stop_all()
-                ready = [slot for slot in self._slots if slot.was_ready]  # before, a stage is due nothing
+                ready = [slot for slot in self._slots if slot.was_ready]  # one that was never ready has lost nothing
                 self.outcome.lost = self._watcher.losses({each for slot in ready for each in slot.sessions})
                 self.outcome.refused = self._watcher.refused()
         return self.outcome
@@ -186,7 +186,7 @@ class Launcher:
         for slot in self._slots:
             if hung and slot.child and slot.row.label == hung[0]:
                 doing = f" ({slot.child.notices.status})" if slot.child.notices.status else ""
-                slot.hung = f"hangs: has not gone round its loop for {hung[1]:.0f} s{doing}; killed"
+                slot.hung = f"hangs: its main loop has not run for {hung[1]:.0f} s{doing}; killed"
                 slot.child.kill()
 
     def _report_changes(self) -> None:
@@ -241,15 +241,15 @@ class Launcher:
                 self._say(f"{slot.row.label}: ended with status {status}: {slot.child.last_line}")
             elif not self._has_reported(slot):
                 self.outcome.failed.append(slot.row.label)
-                self._say(f"{slot.row.label}: its last health was not heard: what it has lost is not known")
+                self._say(f"{slot.row.label}: its last health message did not arrive: what it lost is unknown")
             elif self._is_started and not slot.was_ready:
                 self.outcome.failed.append(slot.row.label)
                 self._say(f"{slot.row.label}: was never ready: it has received nothing")
             slot.child = None
 
     def _has_reported(self, slot: _Slot) -> bool:
-        """Whether the last health of a stage has arrived, which has its counts; it may be behind the process's end.
-        A stage that was never heard has nothing to report if it was still starting for the first time."""
+        """Whether the last health message of a stage, with its counts, has arrived; it may arrive after the process
+        has ended. A stage that was never heard has nothing to report if it was still starting for the first time."""
         until_s = time.monotonic() + _LAST_HEALTH_S
         while True:
             last = self._watcher.last_health(slot.sessions[-1])

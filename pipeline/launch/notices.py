@@ -1,4 +1,4 @@
-"""Receives what a child process says of itself in systemd's protocol; see `pipeline.runtime.notifier`."""
+"""Receives what a child process reports by systemd's protocol; see `pipeline.runtime.notifier`."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class Notices:
         """value of NOTIFY_SOCKET for the child"""
         self.is_ready = False
         self.status = ""
-        """what it said last of what it does"""
+        """its last status line"""
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._socket.bind(f"\0{self.address[1:]}")
 
     def read(self) -> bool:
-        """Read all that has arrived; returns whether the child has gone round its loop since the last call."""
+        """Read all that has arrived; returns whether the child's main loop has run since the last call."""
         was_at_work = False
         while True:
             try:

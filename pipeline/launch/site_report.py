@@ -1,4 +1,4 @@
-"""What `fantwin up` says of a running site: stages that lose their connection or their input, problems and alarms."""
+"""What `fantwin up` reports about a running site: stages that lose their connection or input, problems and alarms."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ _UNHEARD = OFF_THE_BUS | {Word.SILENT}
 
 @dataclass(frozen=True)
 class RunningProcess:
-    """The process of a stage, as its launcher knows it. is_at_work: it has gone round its loop a moment ago."""
+    """The process of a stage, as its launcher knows it. is_at_work: its main loop ran a moment ago."""
 
     process_id: int
     is_at_work: bool
 
 
 class SiteReport:
-    """Says each change once."""
+    """Reports each change once."""
 
     def __init__(self, endpoint: str, say: Callable[[str], None]) -> None:
         self._endpoint = endpoint
         self._say = say
         self._said: dict[str, str] = {}
-        """by subject: what was said of it last, without its figures; empty: that all is well"""
+        """by subject: the last report, without its figures; empty: all is well"""
 
     def stages(self, states: Sequence[StageState], processes: Mapping[str, RunningProcess]) -> None:
-        """Say how the stages have changed. processes: those that run and have been on the bus, by label; what becomes
-        of the others is said when they end and start."""
+        """Report how the stages have changed. processes: those that run and have been on the bus, by label; the
+        launcher reports the others when they end and start."""
         running = [(state, processes[state.label]) for state in states if state.label in processes]
         off = [state.label for state, process in running if state.word in _UNHEARD and process.is_at_work]
         is_of_all = len(running) > 1 and len(off) == len(running)

@@ -1,8 +1,8 @@
 """The state of every stage that a site should have: a stage that is missing, silent, starved or late is a state too.
 
-What a stage says of itself is not enough: a stage that hangs says nothing, and one that receives nothing finds nothing
-wrong. So each stage is also judged by when it was heard, by what its producers say they have sent, and by the age of
-what it sends.
+A stage's own report is not enough: a stage that hangs reports nothing, and one that receives nothing sees nothing
+wrong. So a stage's state also depends on when it was last heard, on what its producers say they have sent, and on the
+age of its outputs.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def stage_states(
         if view is not None:
             states.append(_state_of(view, views, is_expected=True))
         elif name in alive:
-            why = "alive on the bus, but sends no health: it starts, hangs or is blocked"
+            why = "on the bus, but sends no health: it is still starting, hangs or is blocked"
             states.append(StageState(row.label, Word.SILENT, why, None, is_expected=True))
         elif not (is_replayed and STAGES[row.stage].scope == "tray"):  # the replay plays what it would send
             states.append(StageState(row.label, Word.MISSING, "not seen on the bus", None, is_expected=True))
@@ -108,7 +108,7 @@ def _state_of(view: StageView, views: Sequence[StageView], *, is_expected: bool)
 
 def _judged(view: StageView, views: Sequence[StageView]) -> tuple[Word, str]:
     health = view.health
-    is_starting = health.status == StageStatus.STARTING  # it is alive, and sends more, when it has caught up
+    is_starting = health.status == StageStatus.STARTING  # its liveliness token follows once it has caught up
     if health.status == StageStatus.STOPPED:
         return Word.STOPPED, "stopped in order"
     if not view.alive and not is_starting:
@@ -148,6 +148,6 @@ def _starving(health: Health, views: Sequence[StageView]) -> str:
             seconds = awaited.get(stream[0], 0.0)
             if seconds > STARVED_AFTER_S and count > received.get(stream, 0):
                 return (
-                    f"nothing of {key_in_words(stream[0])} for {seconds:.0f} s, although {label(view.health)} sends it"
+                    f"received no {key_in_words(stream[0])} for {seconds:.0f} s, although {label(view.health)} sends it"
                 )
     return ""

@@ -20,7 +20,7 @@ from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence
 
 MOST_WATCHED_SESSIONS = 1000
-"""sessions whose last health is kept; of the others, those heard longest ago are forgotten first, then launched ones"""
+"""so many last healths are kept; of more, those heard longest ago are forgotten, those of launched sessions last"""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class SiteWatcher:
             return current_alarms(alarm for messages in self._alarms.values() for alarm in messages.values())
 
     def add_launched(self, session: Launched) -> None:
-        """A session that this process has started: what it lost is not forgotten in a flood of others."""
+        """Register a session that this process has started: a flood of others does not displace what it lost."""
         with self._lock:
             self._launched.add(session)
 
@@ -144,7 +144,7 @@ class SiteWatcher:
                     del self._healths[next(others, next(iter(self._healths)))]
 
     def _on_alarm(self, key: str, payload: bytes) -> None:
-        """A message without a producer, or of another tray than its key says, is no alarm: no bytes decode as one."""
+        """A message without a producer (empty bytes decode as one), or of another tray than its key, is ignored."""
         alarm = _decoded(Alarm, payload)
         if isinstance(alarm, Alarm) and alarm.header.producer and key == _alarm_key(self._site, alarm.header.tray):
             with self._lock:

@@ -1,7 +1,7 @@
-"""Finds the stage that hangs: the one that has not gone round its loop for too long.
+"""Finds the stage that hangs: the one whose main loop has not run for too long.
 
-A stage that publishes to one that hangs is soon blocked itself. So only the stage that has been silent longest is
-named, and all others are given a new period: they go on once it is gone.
+A stage that publishes to a hung stage is soon blocked itself. So only the stage that has been silent longest is named.
+All others get a new period, because they go on once it is gone.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Watchdog:
         self._heard[name] = _Heard(now_s)
 
     def heard(self, name: str, now_s: float, *, is_ready: bool) -> None:
-        """A stage has gone round its loop."""
+        """The main loop of a stage has run."""
         self._heard[name] = _Heard(now_s, is_ready)
 
     def is_at_work(self, name: str, now_s: float) -> bool:
-        """Whether a stage has gone round its loop a moment ago."""
+        """Whether the main loop of a stage ran a moment ago."""
         return name in self._heard and now_s - self._heard[name].at_s < _AT_WORK_S
 
     def ended(self, name: str) -> None:
@@ -46,9 +46,10 @@ class Watchdog:
         self._heard.pop(name, None)
 
     def hung(self, now_s: float) -> tuple[str, float] | None:
-        """The stage that hangs, and for how many seconds; None if none does. To be called all the time.
+        """The stage that hangs, and for how many seconds; None if none does.
 
-        It is forgotten: it is up to the caller to kill it.
+        Call it at least once a second: a longer pause is taken to be one of the caller itself, and no stage is blamed
+        for it. The stage that is returned is forgotten; the caller must kill it.
         """
         pause_s = 0.0 if self._checked_s is None else now_s - self._checked_s
         self._checked_s = now_s

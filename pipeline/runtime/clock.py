@@ -4,9 +4,9 @@ Stages with an input use the time of their samples; only sources use the host cl
 faster than real time, and a tray must not look silent because of its pace. So ticks carry the time that the replay has
 reached. Stages with a source, and stages that serve all trays at once, keep the host's time.
 
-The time of a replay is only taken from the session that owns the site: the one whose health the replayer publishes,
-while its liveliness token is there. A replay renews its time 20 times a second, also while it is paused. A time that is
-not renewed expires: a silent line is reported, whoever has stopped the time.
+Only the replay session that owns the site sets the time: the one whose health the replayer publishes, while its
+liveliness token is there. A replay renews its time 20 times a second, also while it is paused. A time that is not
+renewed expires, so nobody can hide a silent line by stopping the clock.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from schemas.messages import Clock
 REPLAY = "replay"
 """name of the replayer, used like a stage name in health, liveliness token and producer"""
 EXPIRES_S = 5.0
-"""a replay's time that is not renewed for so long no longer applies"""
+"""a replay's time no longer applies when it has not been renewed for this long"""
 
 
 def is_of_replay(producer: str) -> bool:
@@ -60,7 +60,7 @@ class StageClock:
             self._clear()
 
     def add_replay_health(self, producer: str, *, has_stopped: bool) -> None:
-        """A replayer has published health: its session owns the site, unless another one does and is going on."""
+        """A replayer has published health: its session owns the site, unless another owner still renews its time."""
         if has_stopped:
             if producer == self._owner:
                 self._clear()

@@ -1,4 +1,4 @@
-"""The end of a stage: every step is run, whatever an earlier one did, and each has to end in time."""
+"""The end of a stage: every step runs, whatever an earlier one did, and each has a time limit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LEAST_S = 0.05  # a step is given this long even when those before it have used
 
 
 class Step:
-    """An action in a thread of its own, so that nobody has to wait for it for ever."""
+    """An action in a thread of its own, so that waiting for it can be given up."""
 
     def __init__(self, action: Callable[[], object]) -> None:
         """Begin `action`."""
@@ -36,8 +36,8 @@ class Step:
 class Ending:
     """The steps that end a stage, and the first error among them.
 
-    The stage as a whole is allowed a time to end. Each step is given a point of it by which it must have ended. A step
-    that has not is left behind in its thread.
+    The whole end of the stage has one time limit. Each step must be over when a given share of that time has passed. A
+    step that is not is left behind in its thread.
     """
 
     def __init__(self, stage: str, limit_s: float) -> None:

@@ -73,7 +73,7 @@ class Inbox:
             return self._add(item)
 
     def put_at_once(self, item: Item) -> None:
-        """Add an item even if the inbox is full: for the few whose number is bounded elsewhere."""
+        """Add an item even if the inbox is full: for items whose number is bounded elsewhere."""
         with self._changed:
             self._add(item)
 
@@ -106,7 +106,7 @@ class Inbox:
         return True
 
     def _drop_oldest(self) -> bool:
-        """Drop the oldest message of the bus; False if there is none. What else waits must not be missed."""
+        """Drop the oldest message of the bus; False if there is none. Other items must not be dropped."""
         for place, item in enumerate(self._items):
             if isinstance(item, FromBus):
                 del self._items[place]

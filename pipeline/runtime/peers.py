@@ -11,7 +11,7 @@ from pipeline.runtime.inbox import Liveness
 from schemas.messages import Health, StageStatus
 
 MOST_PEERS = 4096
-"""are remembered; of more, those heard last"""
+"""so many sessions are remembered: those heard most recently"""
 LAST_HEALTH_TIMEOUT_S = 1.0
 """how long a stopping stage waits for the last health of a producer that has just left"""
 

@@ -23,7 +23,7 @@ BACK_OFF_S = 10.0
 """how long a producer that did not answer in time is not asked again"""
 MOST_BACKED_OFF = 256
 IMPATIENT_S = 0.5
-"""how long each catch-up waits after one that was not answered in time: its answer is as a rule complete long before"""
+"""how long further catch-ups wait once one was not answered in time; a complete answer usually comes much sooner"""
 
 
 class Recovery:
@@ -62,7 +62,7 @@ class Recovery:
         return request is self._catch_up_request
 
     def ask(self, request: Request) -> Found | None:
-        """Request messages. None: the answer will be in the inbox. Otherwise nobody is asked."""
+        """Request messages. None: the answer will be in the inbox. Otherwise no request is sent."""
         if self._only_rare and not topic_of(request.key).is_rare:
             return Found(was_asked=False)
         if self._now_s() < self._asked_again_s.get((request.key, request.producer), 0.0):

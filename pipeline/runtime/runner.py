@@ -112,7 +112,9 @@ class Runner:
             tray_key(config.site, t.name, name) for t in trays for name in stage.reads if name != "health"
         }
         self._peers = Peers(self._read_keys)
-        main = stage.reads[0] if stage.reads and not self._has_source else ""  # what feeds a source is seen there
+        main = (
+            stage.reads[0] if stage.reads and not self._has_source else ""
+        )  # the core of a source reports its silence
         self._health = HealthBuilder(
             stage.name,
             self._instance,
@@ -130,8 +132,8 @@ class Runner:
         """Run to the end and return the last health, which is published whatever happens.
 
         At the end cores are closed. A core that raised is aborted instead: its state may be half updated. The end takes
-        no longer than `launcher.stop_timeout_s`: what hangs, as with a consumer that takes no more messages, is left
-        behind. `is_hung` then says that the process cannot end in order.
+        no longer than `launcher.stop_timeout_s`: a step that hangs, for example because a consumer takes no more
+        messages, is left behind. `is_hung` then says that the process cannot end in order.
 
         Raises:
             UserError: a part of the end did not end in time.
@@ -225,7 +227,7 @@ class Runner:
     def _drain(self) -> None:
         """Process what was sent to this stage before it was asked to stop, however much more is being sent.
 
-        What there is no time for is counted as lost.
+        Whatever there is no time for is counted as lost.
         """
         sources = self._sources.stop()
         left: int | None = None  # items still to be processed, known once everything expected has arrived
@@ -265,7 +267,7 @@ class Runner:
             self._ending.run(f"closing {what}", close, CORES_CLOSED)
 
     def _report_end(self) -> Health:
-        """Build and publish the last health; one without counts if those cannot be had."""
+        """Build and publish the last health; without counts if collecting them fails."""
         reported: list[Health] = []
 
         def report() -> None:
@@ -349,7 +351,9 @@ class Runner:
         if self._sessions.is_ignored(header.producer) and envelope.topic != "health":
             self._counts["refused_of_second"] += 1
             return
-        if envelope.topic == self.stage.reads[0] and not self._has_source:  # what a device sends follows from no input
+        if (
+            envelope.topic == self.stage.reads[0] and not self._has_source
+        ):  # samples of a device do not depend on any input
             self._outputs.advance(header.tray, envelope.topic, header)
         core, item = self._parts[name].core, envelope if self.stage.wants_envelopes else envelope.message
         self._call(name, lambda: core.step(item), input_tray=header.tray)

@@ -1,5 +1,5 @@
-"""Puts arriving messages in sequence: missing messages are requested, duplicates dropped, messages that remain missing
-counted, and sequence numbers that are not possible refused.
+"""Puts arriving messages in sequence: requests missing messages, drops duplicates, counts messages that remain missing,
+and refuses impossible sequence numbers.
 
 Nothing here waits. While the missing messages of a stream are on their way, its later messages are held; all other
 streams go on. What is held and remembered is bounded: docs/reference/bounds.md.
@@ -58,9 +58,9 @@ class SequenceTracker:
     for; those it no longer keeps are history, not a loss. If a stage that is alive does not answer, what it may have
     kept counts as missing. From then on every gap is either recovered or counted.
 
-    A number beyond the next is believed if the producer confirms that it has published so many, or, where it does not
-    answer, if it can have published so many since it was last heard. Otherwise the message is refused, and the stream
-    goes on as if it had not come.
+    A number beyond the next is believed if the producer confirms that it has published so many messages. If it does not
+    answer, the number is believed if it can have published so many since it was last heard. Otherwise the message is
+    refused, and the stream goes on as if it had not arrived.
     """
 
     def __init__(self, ask: Ask, now_s: Callable[[], float] = time.monotonic, sessions: Sessions | None = None) -> None:
@@ -79,7 +79,7 @@ class SequenceTracker:
         stream = self._streams.heard(envelope.key, producer)
         if stream is None:
             is_stranger = self._sessions.is_stranger(envelope.key, producer)
-            why = f"{producer} is no stage of this site" if is_stranger else "too many producers at a time"
+            why = f"{producer} is not a stage of this site" if is_stranger else "too many producers at once"
             self._refuse("refused_producers", f"{envelope.key}: {why}")
             return []
         waiting = stream.waiting
@@ -116,7 +116,7 @@ class SequenceTracker:
         """The messages to process now that a request has been answered."""
         stream = self._streams.get(request.key, request.producer)
         if stream is None or stream.waiting is None or stream.waiting.request is not request:
-            return []  # it went on without
+            return []  # the stream went on without the answer
         return self._go_on(stream, stream.waiting, found)
 
     def believes(self, health: Health) -> bool:
@@ -222,7 +222,7 @@ class SequenceTracker:
         return published - stream.next_sequence <= CATCH_UP_MESSAGES + MOST_PER_S * silent_s
 
     def _refuse_number(self, key: str, producer: str, claimed: int, known: int | None) -> None:
-        line = f"{key}: {claimed} messages in the name of {producer} are not possible after {known or 0}: ignored"
+        line = f"{key}: {producer} cannot have published {claimed} messages after {known or 0}: refused"
         self._refuse("refused_numbers", line)
 
     def _refuse(self, counter: str, line: str) -> None:

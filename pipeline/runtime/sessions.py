@@ -3,7 +3,7 @@
 Each stage session shows a liveliness token from before its first message until it ends, however it ends. A stage whose
 token another process already shows is refused at its start. Where two were started at once, or a network has healed,
 all see both tokens: the session that started later owns the stage, and what the other publishes is ignored until one of
-them ends. Ownership follows from the tokens that exist now, so no clock that was wrong once decides it for ever.
+them ends. Ownership depends only on the tokens that exist now, so a clock that was once wrong has no effect later.
 """
 
 from __future__ import annotations

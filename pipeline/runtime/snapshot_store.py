@@ -18,8 +18,8 @@ FORMER_SUFFIX = ".memory"
 class SnapshotStore:
     """One file. A kill at any moment leaves the old file or the new one, never a part of either.
 
-    Where only a file with the former suffix exists, that one is loaded. Saving replaces it by the new one: whoever
-    removes the new one, to start without, must not get back the state before the upgrade.
+    If only a file with the former suffix exists, it is loaded. Saving writes the new file and deletes the former one: a
+    user who later removes the new file, to start without, must not get back the state from before the upgrade.
     """
 
     def __init__(self, path: Path) -> None:
@@ -78,7 +78,8 @@ class SnapshotStore:
             raise StageError(f"{path}: cannot read the scorer's snapshot: {error.strerror}") from error
         except CodecError as error:
             raise StageError(
-                f"{path}: not a scorer's snapshot ({error}); remove it to start without: fans are commissioned again"
+                f"{path}: not a scorer's snapshot ({error}); remove it to start without one: all fans are then "
+                "commissioned again"
             ) from error
         assert isinstance(message, ScorerSnapshot)
         return message

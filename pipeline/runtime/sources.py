@@ -11,11 +11,11 @@ from pipeline.runtime.stage import BuiltStage, Core, Source
 
 
 class Sources:
-    """Those that have been started. What they deliver goes to the inbox, or is counted as lost."""
+    """The sources that have been started. What they deliver goes to the inbox, or is counted as lost."""
 
     def __init__(self, inbox: Inbox) -> None:
         self.lost = 0
-        """samples that were delivered and for which there was no time any more"""
+        """samples that were delivered too late to be processed"""
         self._inbox = inbox
         self._started: list[Source] = []
         self._cores: dict[str, Core] = {}
@@ -36,12 +36,12 @@ class Sources:
         parts.source.start(deliver)
 
     def discard(self, item: FromSource) -> None:
-        """Count what is not processed any more."""
+        """Count an item that is no longer processed."""
         with self._lock:
             self.lost += self._cores[item.core].samples_in(item.item)
 
     def stop(self) -> Step:
-        """Stop all, each of which delivers the rest of what it has meanwhile. Further calls return the same step."""
+        """Stop all sources; each first delivers what it still has. Further calls return the same step."""
         if self._stopping is None:
             self._stopping = Step(self._stop_each)
         return self._stopping

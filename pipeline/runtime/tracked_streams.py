@@ -1,4 +1,4 @@
-"""The streams that a stage remembers: a bounded number, whoever publishes how much under however many names."""
+"""The streams that a stage remembers: a bounded number, however many producers publish, and however much."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Waiting:
 
     @property
     def published(self) -> int:
-        """At least so many messages have been published if what showed the gap is true."""
+        """How many messages have been published at least, if what showed the gap is true."""
         return self.until if self.shown_by is None else self.until + 1
 
 
@@ -68,10 +68,12 @@ class Stream(StreamState):
 
 
 class TrackedStreams:
-    """Streams by key and producer. Where one too many appears, another is forgotten, and its counts are summed up under
-    an empty name: one that has been silent for long, or else the one that has sent least. One that waits for missing
-    messages is not forgotten; if all wait, the new one is refused. So are more new ones in SILENT_S than are
-    remembered, unless they are sessions of a stage, and strangers where a session publishes.
+    """Streams by key and producer.
+
+    To make room for a new stream, one that has been silent for long is forgotten, or else the one that has sent least.
+    Its counts are added up under an empty name. A stream that waits for missing messages is not forgotten; while all
+    wait, a new one is refused. A new producer that is not a session of a stage is also refused in a flood (as many new
+    ones within SILENT_S as are remembered), and on a key that a session publishes.
     """
 
     def __init__(self, now_s: Callable[[], float], sessions: Sessions) -> None:

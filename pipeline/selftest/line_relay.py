@@ -14,7 +14,7 @@ from pipeline.devices.simulated_device import PseudoTerminal
 _POLL_S = 0.002
 _READ_BYTES = 2048
 _WRITE_BYTES = 1024
-"""at once: a pseudo-terminal takes a write of this size whole, or not at all"""
+"""bytes in one write: a pseudo-terminal accepts a write of this size completely or not at all"""
 
 
 class LineRelay:
@@ -48,7 +48,7 @@ class LineRelay:
         self._held = False
 
     def cut(self, is_cut: bool) -> None:
-        """Lose what the device sends, or no longer."""
+        """Start or stop losing what the device sends."""
         self._cut = is_cut
 
     def inject(self, data: bytes) -> None:

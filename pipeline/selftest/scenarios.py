@@ -1,7 +1,7 @@
-"""The faults of a self-test. Each is a row: what is done to a running site, what is promised, and what was seen.
+"""The faults of a self-test. Each is a row: what it does to a running site, what fantwin promises, and what it saw.
 
-A scenario returns what it saw, or raises `NotKept`. After each, the site has to judge all fans again, and no alarm may
-have been raised: all fans are healthy.
+A scenario returns what it saw, or raises `NotKept`. After each, the site must judge all fans again, and must not have
+raised an alarm, because all fans are healthy.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ def _kills(site: ScratchSite) -> str:
         os.kill(old, signal.SIGKILL)
         took_s = site.replaced(label, old, REPLACED_LIMIT_S)
         if took_s is None:
-            raise NotKept(f"{label} was not replaced within {REPLACED_LIMIT_S:.0f} s")
-        _require(site.seconds_until_judged(REPLACED_LIMIT_S), f"nothing was judged after {label} was replaced")
+            raise NotKept(f"{label} was not restarted within {REPLACED_LIMIT_S:.0f} s")
+        _require(site.seconds_until_judged(REPLACED_LIMIT_S), f"judging did not go on after {label} was restarted")
         seen.append(f"{label} {took_s:.1f} s")
     return "back after " + ", ".join(seen)
 
@@ -95,7 +95,7 @@ def _hang(site: ScratchSite) -> str:
     if took_s is None:
         os.kill(old, signal.SIGCONT)
         raise NotKept(f"{label} still hung after {REPLACED_LIMIT_S:.0f} s")
-    return f"killed and replaced after {took_s:.0f} s"
+    return f"killed and restarted after {took_s:.0f} s"
 
 
 def _silence(site: ScratchSite) -> str:
@@ -112,14 +112,14 @@ def _backlog(site: ScratchSite) -> str:
     _pause(STALL_S)
     site.line.release()
     judged_s = site.seconds_until_judged(60.0)
-    _require(judged_s, "nothing was judged in the minute after")
+    _require(judged_s, "judging did not go on within a minute")
     _require(len(site.raised) == before, f"{len(site.raised) - before} false alarms")
     return f"judged again {judged_s:.1f} s after the line was back"
 
 
 def _noise(site: ScratchSite) -> str:
     site.line.inject(bytes((index * 197 + index // 256 * 31) % 256 for index in range(NOISE_BYTES)))
-    _require(site.seconds_until_judged(60.0), "nothing was judged in the minute after")
+    _require(site.seconds_until_judged(60.0), "judging did not go on within a minute")
     return f"{NOISE_BYTES:,} bytes of noise skipped"
 
 
@@ -128,10 +128,10 @@ def _garbage(site: ScratchSite) -> str:
     lost = sum(site.watcher.losses().values())
     for _ in range(GARBAGE_MESSAGES):
         publisher.put(b"\xff\xfe no message")
-    _require(site.seconds_until_judged(), "nothing was judged in the half minute after")
+    _require(site.seconds_until_judged(), "judging did not go on within half a minute")
     more = sum(site.watcher.losses().values()) - lost
     _require(not more, f"counted as {more} losses of this site")
-    return f"{GARBAGE_MESSAGES:,} undecodable messages counted apart"
+    return f"{GARBAGE_MESSAGES:,} undecodable messages, none counted as a loss"
 
 
 def _far_ahead(site: ScratchSite) -> str:
@@ -141,8 +141,8 @@ def _far_ahead(site: ScratchSite) -> str:
     publisher = site.bus.publisher(tray_key(SITE, TRAY, "raw"), BY_NAME["raw"], type_name(Raw), "stranger")
     publisher.put(encode(_forged(t_ns)))
     judged_s = site.seconds_until_judged()
-    _require(judged_s, "nothing was judged in the half minute after")
-    return f"refused; judging went on ({judged_s:.1f} s for the next hundred samples)"
+    _require(judged_s, "judging did not go on within half a minute")
+    return f"refused; judging went on (the next hundred samples took {judged_s:.1f} s)"
 
 
 def _second_owner(site: ScratchSite) -> str:
@@ -153,7 +153,7 @@ def _second_owner(site: ScratchSite) -> str:
         except subprocess.TimeoutExpired as error:
             raise NotKept(f"a second `{what}` was not refused") from error
         _require(done.returncode == 1, f"a second `{what}` ended with exit code {done.returncode}, not 1")
-        _require(done.stderr.count("\n") == 1, f"a second `{what}` said {len(done.stderr.splitlines())} lines")
+        _require(done.stderr.count("\n") == 1, f"a second `{what}` printed {len(done.stderr.splitlines())} lines")
     return "a second site and a second acquisition were refused in one line each"
 
 
@@ -161,8 +161,8 @@ def _recording_deleted(site: ScratchSite) -> str:
     for path in site.run_folder.glob("*.active"):
         path.unlink()
     took_s = site.seconds_until(lambda: list(site.run_folder.glob("*.active")), 20.0)
-    _require(took_s is not None, "the recorder did not begin another file within 20 s")
-    return f"noticed, and another file begun, after {took_s:.1f} s"
+    _require(took_s is not None, "no recording file was there again within 20 s")
+    return f"a recording file was there again after {took_s:.1f} s"
 
 
 def _full_disk(site: ScratchSite) -> str:
@@ -176,11 +176,11 @@ def _full_disk(site: ScratchSite) -> str:
     took_s = site.seconds_until(lambda: site.problem("recorder"), REPLACED_LIMIT_S)
     _require(took_s, "the recorder did not report the full disk")
     reported = site.problem("recorder")
-    _require(site.seconds_until_judged(), "nothing was judged while the disk was full")
+    _require(site.seconds_until_judged(), "judging did not go on while the disk was full")
     ballast.unlink()
     again_s = site.seconds_until(lambda: not site.problem("recorder"), REPLACED_LIMIT_S)
-    _require(again_s, f"not recorded again after room was made: {site.problem('recorder')}")
-    return f"reported after {took_s:.1f} s ({reported}); recorded again {again_s:.1f} s after room was made"
+    _require(again_s, f"recording did not resume after room was made: {site.problem('recorder')}")
+    return f"reported after {took_s:.1f} s ({reported}); recording resumed {again_s:.1f} s after room was made"
 
 
 def _strangers(site: ScratchSite) -> str:
@@ -189,7 +189,7 @@ def _strangers(site: ScratchSite) -> str:
     for number in range(STRANGERS):
         publisher.put(encode(replace(_forged(0), header=Header(f"stranger-{number}", 0, TRAY))))
     judged_s = site.seconds_until_judged()
-    _require(judged_s, "nothing was judged in the half minute after")
+    _require(judged_s, "judging did not go on within half a minute")
     grown = max(site.memory_bytes(label) - before[label] for label in STAGES) / 1e6
     _require(grown < STRANGERS_LIMIT_MB, f"a stage grew by {grown:.0f} MB")
     return f"judged again {judged_s:.1f} s after {STRANGERS:,} messages; no stage grew by more than {grown:.0f} MB"
@@ -198,38 +198,44 @@ def _strangers(site: ScratchSite) -> str:
 def _clock_back(site: ScratchSite) -> str:
     site.set_clock(-FAR_AHEAD_S)
     judged_s = site.seconds_until_judged(60.0)
-    _require(judged_s, "nothing was judged in the minute after")
+    _require(judged_s, "judging did not go on within a minute")
     old = {label: site.process_id(label) for label in (STAGES[0], "resampler")}
     for process_id in old.values():
         os.kill(process_id, signal.SIGKILL)
     for label, process_id in old.items():
-        _require(site.replaced(label, process_id, REPLACED_LIMIT_S), f"{label} was not replaced")
+        _require(site.replaced(label, process_id, REPLACED_LIMIT_S), f"{label} was not restarted")
     again_s = site.seconds_until_judged(60.0)
-    _require(again_s, "nothing was judged in the minute after acquisition and resampler were replaced")
-    return f"judged again after {judged_s:.1f} s, and {again_s:.1f} s after acquisition and resampler were replaced"
+    _require(again_s, "judging did not go on within a minute after acquisition and resampler were restarted")
+    return f"judged again after {judged_s:.1f} s, and {again_s:.1f} s after acquisition and resampler were restarted"
 
 
 def _clock_forward(site: ScratchSite) -> str:
     site.set_clock(FAR_AHEAD_S)
     judged_s = site.seconds_until_judged(60.0)
-    _require(judged_s, "nothing was judged in the minute after")
+    _require(judged_s, "judging did not go on within a minute")
     return f"judged again after {judged_s:.1f} s"
 
 
 SCENARIOS = (
-    Scenario("kill", "each stage that is killed comes back, and nothing it had received is lost", _kills),
-    Scenario("hang", "a stage that hangs is killed and replaced", _hang),
+    Scenario("kill", "each stage that is killed is restarted, and nothing it had received is lost", _kills),
+    Scenario("hang", "a stage that hangs is killed and restarted", _hang),
     Scenario("silence", "a silent line is reported", _silence),
     Scenario("backlog", f"a line that stalls {STALL_S:.0f} s and delivers its backlog raises no alarm", _backlog),
     Scenario("noise", "noise on the line is skipped", _noise),
-    Scenario("garbage", "messages of strangers that nobody can decode are not our loss", _garbage),
-    Scenario("far-ahead", "a forged message an hour ahead changes nothing", _far_ahead),
-    Scenario("strangers", "messages under ten thousand names neither delay the site nor fill its memory", _strangers),
+    Scenario("garbage", "undecodable messages from other programs are not counted as losses of the site", _garbage),
+    Scenario("far-ahead", "a forged message whose time is an hour ahead changes nothing", _far_ahead),
+    Scenario(
+        "strangers",
+        "messages from ten thousand unknown producers neither delay the site nor fill its memory",
+        _strangers,
+    ),
     Scenario("second-owner", "a second owner of a site or a tray is refused", _second_owner),
-    Scenario("deleted", "a recording that is deleted is noticed", _recording_deleted, needs_own_site=True),
+    Scenario(
+        "deleted", "a deleted recording is restored, or a new one is begun", _recording_deleted, needs_own_site=True
+    ),
     Scenario(
         "full-disk",
-        "a full disk is reported, delays no judgement, and is recorded on again once there is room",
+        "a full disk is reported and does not stop judging; recording resumes once there is room",
         _full_disk,
         needs_own_site=True,
         needs_small_disk=True,
@@ -237,9 +243,14 @@ SCENARIOS = (
     ),
     Scenario(
         "clock-back",
-        "a host clock set back an hour stops nothing, nor does a stage that is killed after that",
+        "judging goes on when the host clock is set back an hour, and when stages are killed after that",
         _clock_back,
         needs_own_site=True,
     ),
-    Scenario("clock-forward", "a host clock set forward an hour stops nothing", _clock_forward, needs_own_site=True),
+    Scenario(
+        "clock-forward",
+        "judging goes on when the host clock is set forward an hour",
+        _clock_forward,
+        needs_own_site=True,
+    ),
 )

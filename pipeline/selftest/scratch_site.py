@@ -57,7 +57,7 @@ class ScratchSite:
         self.raised: list[Alarm] = []
         """the alarms raised so far"""
         self.judged = 0
-        """samples so far that were valid, and judged, for all fans"""
+        """samples so far that were judged for all fans"""
 
     def __enter__(self) -> Self:
         set_offset_ns(self._clock_file, 0)
@@ -172,12 +172,12 @@ class ScratchSite:
         return time.monotonic() - began_s
 
     def seconds_until_judged(self, limit_s: float = 30.0) -> float | None:
-        """Seconds until another hundred samples of all fans have been judged; None if they were not in time."""
+        """Seconds until another hundred samples of all fans have been judged; None if the limit passed first."""
         before = self.judged
         return self.seconds_until(lambda: self.judged >= before + 100, limit_s)
 
     def replaced(self, label: str, old_process_id: int, limit_s: float) -> float | None:
-        """Seconds until another process has taken the place of a stage."""
+        """Seconds until a new process runs the stage; None if none did within the limit."""
 
         def is_new() -> bool:
             view = self.view(label)

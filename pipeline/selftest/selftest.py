@@ -1,4 +1,4 @@
-"""Runs the scenarios of a self-test on scratch sites, and takes the account of each site at its end."""
+"""Runs the scenarios of a self-test on scratch sites, and checks how each site stops and what it has recorded."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def run_scenarios(folder: Path, scenarios: Sequence[Scenario], report: Callable[
 
 @contextmanager
 def small_disk(place: Path, is_needed: bool) -> Iterator[bool]:
-    """A small disk of its own at `place`, if it is needed; yields whether the need is met."""
+    """Mount a small disk at `place` if it is needed; yields False if it is needed and cannot be mounted."""
     if not is_needed:
         yield True
         return
@@ -84,8 +84,8 @@ def run_scenario(site: ScratchSite, scenario: Scenario) -> Row:
 
 
 def account(site: ScratchSite, names: str) -> Row:
-    """Stop the site and verify its recording. `names`: of what was done to it."""
-    name, promise = f"account of {names}", "it stops in order, and its recording replays to the same decisions"
+    """Stop the site and verify its recording. names: of the scenarios that ran on it."""
+    name, promise = f"shutdown after {names}", "it stops in order, and its recording replays to the same decisions"
     try:
         status, outcome = site.stop()
     except NotKept as result:

@@ -353,8 +353,11 @@ class SetClock:
 @pytest.mark.parametrize(
     ("set_by_s", "report"),
     [
-        (-3600, "set back by 3600 s: times continue from before, 3600 s ahead of it, until the site is restarted"),
-        (3600, "set forward by 3600 s, or the host was suspended: times follow it"),
+        (
+            -3600,
+            "set back by 3600 s: sample times continue without a step, 3600 s ahead of it, until the site is restarted",
+        ),
+        (3600, "set forward by 3600 s, or the host was suspended: sample times follow it"),
     ],
 )
 def test_row_13_a_host_clock_that_is_set_is_reported_once_and_silence_still_counts(set_by_s: int, report: str) -> None:

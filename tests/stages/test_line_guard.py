@@ -213,8 +213,8 @@ def test_row_13_after_the_host_clock_was_set_back_an_hour_judging_continues(cloc
     np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.05)
     assert core.counters()["host_clock_set_back"] == 1
     assert core.problem() == (
-        "the host clock was set back by 3600 s: times continue from before, 3600 s ahead of it, until the site is "
-        "restarted"
+        "the host clock was set back by 3600 s: sample times continue without a step, 3600 s ahead of it, until the "
+        "site is restarted"
     )
 
 

@@ -33,8 +33,8 @@ def info(
 ) -> None:
     """Show what a recording contains: time, trays, twins, messages and losses of each topic, problems of stages.
 
-    Several parts are also checked to continue one another. A file without an index is read in full, as far as
-    possible. Exit code 3 if messages are missing or a file is damaged.
+    With several parts, it also checks that each continues the one before. A file without an index is read in full, as
+    far as possible. Exit code 3 if messages are missing or a file is damaged.
 
     Example: fantwin info runs/recording.mcap
     """
@@ -143,7 +143,7 @@ def _about(part: Contents) -> list[str]:
     if part.first_ns is not None and part.last_ns is not None:
         lines.append(f"from {_date(part.first_ns)} to {_date(part.last_ns)}: {_duration_s(part):,.1f} s")
     if not metadata and not part.streams:
-        lines.append("not a recording of fantwin: it has no channel of fantwin")
+        lines.append("not a fantwin recording: it has no fantwin channels")
     if "part" in metadata:
         after = f", continues {metadata['continues']}" if "continues" in metadata else ""
         session, site = metadata.get("session", "?"), metadata.get("site", "?")

@@ -75,16 +75,17 @@ def alarms(
         str | None, typer.Option("--for", metavar="TIME", help="How long to shelve: 90s, 30m, 8h or 2d.")
     ] = None,
     comment: Annotated[str, typer.Option(help="Comment for the record.")] = "",
-    operator: Annotated[str | None, typer.Option(help="Who requests it; default: the login name.")] = None,
+    operator: Annotated[str | None, typer.Option(help="Name of the operator; default: your login name.")] = None,
     show_all: Annotated[bool, typer.Option("--all", help="Also list alarms that are over.")] = False,
     watch: Annotated[bool, typer.Option("--watch", help="Keep running and print every transition.")] = False,
     timeout_s: Annotated[float, typer.Option("--timeout", metavar="S", help="How long to wait for answers.")] = 5.0,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """List the current alarms, or acknowledge, shelve ... the alarm of a fan (docs/reference/alarms.md).
+    """List the current alarms; or acknowledge, shelve or suppress the alarm of a fan (docs/reference/alarms.md).
 
-    Exit code 0: listed, and every fan is judged now, or granted; 1: a fan is not judged, refused, or no answer.
+    Exit code 0: the list was printed and every fan is judged now, or the request was granted; 1: a fan is not judged,
+    or the request was refused or not answered.
 
     Example: fantwin alarms
 

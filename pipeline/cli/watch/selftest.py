@@ -1,4 +1,4 @@
-"""`fantwin selftest`: faults of practice on a site of its own; says what was promised and what was seen."""
+"""`fantwin selftest`: causes common faults on a site of its own; prints each promise and what it saw."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _STYLES = {True: "green", False: "red", None: "yellow"}
 
 def selftest(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[SCENARIO]...", help="Which scenarios; default: all.")
+        list[str] | None, typer.Argument(metavar="[SCENARIO]...", help="Scenarios to run; default: all.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Folder for the files; default: a temporary one.")
@@ -34,9 +34,9 @@ def selftest(
     list_scenarios: Annotated[bool, typer.Option("--list", help="List the scenarios and their promises.")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Kill, hang, flood and disturb a simulated site on this computer, and check that it keeps its promises.
+    """Kill, freeze and flood the stages of a simulated site, and check that fantwin keeps its promises.
 
-    Touches no running site: it uses a port and a folder of its own. Takes about three minutes.
+    It leaves running sites alone: it uses its own port and folder on this computer. It takes about three minutes.
     Exit code 1 if a promise was not kept.
 
     Example: fantwin selftest

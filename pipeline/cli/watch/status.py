@@ -50,7 +50,7 @@ def status(
     heard while this command runs; `fantwin up` at its end and `fantwin info` count all sessions.
 
     Exit code 1 if a stage is missing, gone, silent, starved or late, or if a fan is not judged; 3 if a stage has lost
-    something.
+    data.
 
     Example: fantwin status -c fantwin.toml --once
     """

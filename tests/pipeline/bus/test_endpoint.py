@@ -52,8 +52,8 @@ def test_row_15_a_foreign_program_at_the_endpoint_is_one_line(foreign, monkeypat
     with pytest.raises(BusError) as refused:
         Bus(BusConfig(mode=mode, endpoint=foreign), stop)
     assert str(refused.value) == (
-        f"bus.endpoint = {foreign!r}: the program that listens there is not fantwin, or hangs, so no stage would meet "
-        "another: stop it, or choose another port"
+        f"bus.endpoint = {foreign!r}: the program that listens there is not fantwin, or hangs, so stages cannot "
+        "connect: stop it, or choose another port"
     )
 
 

@@ -271,7 +271,7 @@ def test_a_file_without_fantwin_channels_is_shown_as_such(tmp_path):
     (found,) = shown(path)["files"]
     assert (found["topics"], found["other_topics"]) == ({}, {"/camera": 1})
     output = fantwin("info", path).stdout
-    assert "not a recording of fantwin: it has no channel of fantwin" in output
+    assert "not a fantwin recording: it has no fantwin channels" in output
     assert "/camera" in output
 
 

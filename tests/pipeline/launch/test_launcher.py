@@ -164,13 +164,13 @@ def stopped(watcher: Any, monkeypatch: pytest.MonkeyPatch, *, was_ready: bool = 
 def test_row_18_a_stage_whose_last_health_is_not_heard_has_not_ended_in_order(monkeypatch):
     outcome, lines = stopped(Heard(StageStatus.OK), monkeypatch)
     assert outcome.exit_code == 1
-    assert lines == ["recorder: its last health was not heard: what it has lost is not known"]
+    assert lines == ["recorder: its last health message did not arrive: what it lost is unknown"]
 
 
 def test_a_stage_that_was_restarted_at_the_end_and_is_not_heard_has_failed(monkeypatch):
     outcome, lines = stopped(Heard(), monkeypatch)
     assert outcome.exit_code == 1
-    assert lines == ["recorder: its last health was not heard: what it has lost is not known"]
+    assert lines == ["recorder: its last health message did not arrive: what it lost is unknown"]
 
 
 def test_the_last_health_of_a_stage_may_arrive_after_its_end(monkeypatch):

@@ -73,7 +73,7 @@ def test_row_01_a_stage_that_sends_no_health_any_more_is_silent():
 def test_row_01_a_stage_without_input_while_its_producer_sends_is_starved():
     state = states(view(PRODUCER, published_before=850), view(WAITS))["twin_integrator"]
     assert state.word == Word.STARVED
-    assert state.detail == "nothing of grid of tray1 for 12 s, although resampler sends it"
+    assert state.detail == "received no grid of tray1 for 12 s, although resampler sends it"
     assert state.is_fault
 
 

@@ -124,7 +124,7 @@ def test_row_01_a_stage_that_is_stopped_for_good_is_killed_and_restarted(tmp_pat
 
             first = eventually(at_work, "it is at work")
             os.kill(first.health.process_id, signal.SIGSTOP)
-            line = up.line_with("recorder: hangs: has not gone round its loop for ")
+            line = up.line_with("recorder: hangs: its main loop has not run for ")
 
             def is_back() -> bool:
                 view = view_of(watcher, "recorder")

@@ -123,7 +123,7 @@ def test_row_11_where_a_stage_publishes_others_are_refused_without_asking():
     tracker.accept(replace(packet(3, "stranger"), key=own_health, topic="health"))
     assert not requests
     assert tracker.counters() == {"refused_producers": 2}
-    assert f"{own_health}: stranger is no stage of this site" in tracker.problem()
+    assert f"{own_health}: stranger is not a stage of this site" in tracker.problem()
     assert sequences(tracker.accept(packet(0, "real"))) == [0]
     sessions.update(acquisition.key("site"), alive=False)
     tracker.accept(packet(3, "a replay"))
@@ -155,7 +155,7 @@ def test_row_11_while_all_remembered_producers_wait_others_are_refused_and_named
     for number in range(MOST_PRODUCERS + 1):
         tracker.accept(packet(1, f"p{number}"))
     assert tracker.counters() == {"refused_producers": 1}
-    assert f"{KEY}: too many producers at a time" in tracker.problem()
+    assert f"{KEY}: too many producers at once" in tracker.problem()
 
 
 class FakeBus:

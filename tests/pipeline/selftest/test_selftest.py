@@ -109,7 +109,13 @@ def test_a_site_that_ends_badly_is_a_row_that_says_how(monkeypatch, tmp_path, si
 def test_scenarios_share_a_site_unless_they_need_their_own(monkeypatch, tmp_path):
     alone = Scenario("alone", "promised", FINE.run, needs_own_site=True)
     rows = rows_of(monkeypatch, tmp_path, HealthySite, FINE, alone, FINE)
-    assert [row.name for row in rows] == ["fine", "fine", "account of fine, fine", "alone", "account of alone"]
+    assert [row.name for row in rows] == [
+        "fine",
+        "fine",
+        "shutdown after fine, fine",
+        "alone",
+        "shutdown after alone",
+    ]
 
 
 def test_without_the_right_to_mount_a_disk_a_scenario_is_not_run_and_nothing_fails(monkeypatch, tmp_path):
@@ -154,4 +160,4 @@ def test_on_a_real_site_noise_is_skipped_and_its_recording_verifies():
     done = fantwin("selftest", "noise", "--json")
     assert done.exit_code == 0, done.output
     rows = json.loads(done.stdout)["rows"]
-    assert [row["name"] for row in rows] == ["noise", "account of noise"]
+    assert [row["name"] for row in rows] == ["noise", "shutdown after noise"]
