@@ -11,21 +11,23 @@ from __future__ import annotations
 import argparse
 import json
 import random
+import sys
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
 from pipeline.selftest.scenarios import SCENARIOS
-from pipeline.selftest.scratch_site import STAGES, ScratchSite
+from pipeline.selftest.scratch_site import STAGES, NotKept, ScratchSite
 from pipeline.selftest.selftest import Row, account, run_scenario
 
 LOSING = {"deleted", "full-disk"}
 SHARED = [scenario for scenario in SCENARIOS if scenario.name not in LOSING]
 
 
-def soak(minutes: float, seed: int, folder: Path) -> tuple[list[Row], dict[str, tuple[float, float]]]:
-    """The rows of all faults, and the memory of each stage after the first fault and after the last, MB."""
+def soak(minutes: float, seed: int, folder: Path) -> tuple[list[Row], dict[str, tuple[float, ...]]]:
+    """The rows of all faults, and the largest memory of each stage in the first and in the last third, MB."""
     rng = random.Random(seed)
     rows: list[Row] = []
     memory: list[dict[str, float]] = []
@@ -34,11 +36,14 @@ def soak(minutes: float, seed: int, folder: Path) -> tuple[list[Row], dict[str, 
         while time.monotonic() < until_s:
             row = run_scenario(site, rng.choice(SHARED))
             rows.append(row)
-            memory.append({label: site.memory_bytes(label) / 1e6 for label in STAGES})
-            if not row.kept:
-                print(f"seed {seed}: {row.name}: {row.seen}", flush=True)
+            kept = "kept" if row.kept else "NOT KEPT"
+            print(f"seed {seed}: {kept}: {row.name}: {row.seen}", file=sys.stderr, flush=True)
+            with suppress(NotKept):  # a stage that is not there is reported by its row
+                memory.append({label: site.memory_bytes(label) / 1e6 for label in STAGES})
         rows.append(account(site, "all faults"))
-    return rows, {label: (memory[0][label], memory[-1][label]) for label in STAGES}
+    third = max(1, len(memory) // 3)
+    parts = (memory[:third], memory[-third:])
+    return rows, {label: tuple(max(each[label] for each in part) for part in parts) for label in STAGES}
 
 
 def main() -> None:
@@ -55,8 +60,9 @@ def main() -> None:
             print(json.dumps({"seed": seed, "rows": [asdict(row) for row in rows], "memory_mb": memory}))
             continue
         kept = sum(bool(row.kept) for row in rows)
-        grown = ", ".join(f"{label} {first:.0f} to {last:.0f}" for label, (first, last) in memory.items())
-        print(f"seed {seed}: {kept} of {len(rows)} kept; {rows[-1].seen}; memory, MB: {grown}", flush=True)
+        grown = ", ".join(f"{label} {first:.0f}, {last:.0f}" for label, (first, last) in memory.items())
+        seen = f"{kept} of {len(rows)} kept; {rows[-1].seen}"
+        print(f"seed {seed}: {seen}; memory in the first and last third, MB: {grown}", flush=True)
 
 
 if __name__ == "__main__":

@@ -67,9 +67,9 @@ class Publisher:
 
     def _answer(self, query: zenoh.Query) -> None:
         """Answer with what is kept of a range, and at the end with the number of published messages."""
-        first = int(query.parameters.get("first") or 0)
-        last = int(query.parameters.get("last") or LAST_SEQUENCE)
-        newest = int(query.parameters.get("newest") or self._topic.history)
+        first = _number(query.parameters.get("first"), 0)
+        last = _number(query.parameters.get("last"), LAST_SEQUENCE)
+        newest = max(1, _number(query.parameters.get("newest"), self._topic.history))
         with self._of_all.lock:
             wanted = [payload for sequence, payload in self._kept if first <= sequence <= last][-newest:]
             published = self.published
@@ -78,3 +78,8 @@ class Publisher:
                 query.reply(self._recovery_key, payload)
             if query.parameters.get("count"):  # earlier versions do not ask, and would take it for a message
                 query.reply(self._recovery_key, b"", attachment=str(published).encode())
+
+
+def _number(text: str | None, otherwise: int) -> int:
+    """A number in a query, which anybody may have sent."""
+    return int(text) if text and text.isdecimal() and len(text) <= len(str(LAST_SEQUENCE)) else otherwise

@@ -8,10 +8,15 @@ from __future__ import annotations
 
 import os
 import socket
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 VARIABLE = "NOTIFY_SOCKET"
 PERIOD_S = 0.25
+BUILD_LIMIT_S = 600.0
+"""how long building a stage may take: the repair of a large recording, or a router that is not there yet"""
 
 
 class Notifier:
@@ -57,3 +62,22 @@ class Notifier:
             self._socket.sendto(text.encode(), self._address or "")
         except OSError:  # nobody listens any more, or is behind
             return
+
+
+@contextmanager
+def starting(limit_s: float = BUILD_LIMIT_S) -> Iterator[None]:
+    """While the body builds a stage, a thread says that the process is at work, for limit_s at most."""
+    notifier, built = Notifier.from_environment(), threading.Event()
+
+    def repeat() -> None:
+        until_s = time.monotonic() + limit_s
+        while time.monotonic() < until_s and not built.wait(PERIOD_S):
+            notifier.at_work("starting")
+
+    thread = threading.Thread(target=repeat, name="notices", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        built.set()
+        thread.join()

@@ -43,7 +43,8 @@ HEALTH_PERIOD_S = 1.0
 LOSS_REPORT_S = 0.2  # losses are reported this soon, so that a stage that is killed leaves few unreported
 PRODUCERS_END_LIMIT_S = 10.0  # how long a stage whose launcher has gone waits for its producers to end
 # When each part of the end must be over, as shares of launcher.stop_timeout_s: the rest is for the process itself.
-DRAINED, WORK_ENDED, SOURCES_STOPPED, CORES_CLOSED, HEALTH_SENT, BUS_LEFT = 0.7, 0.75, 0.78, 0.88, 0.9, 0.95
+CAUGHT_UP, DRAINED, WORK_ENDED = 0.4, 0.7, 0.75
+SOURCES_STOPPED, CORES_CLOSED, HEALTH_SENT, BUS_LEFT = 0.78, 0.88, 0.9, 0.95
 
 
 class Runner:
@@ -126,7 +127,6 @@ class Runner:
         self._ending = Ending(stage.name, config.launcher.stop_timeout_s)
         self._active_core: str | None = None
         """the core whose method is being called, or has raised"""
-        self._producers_end_limit_s = 0.0
 
     def run(self) -> Health:
         """Run to the end and return the last health, which is published whatever happens.
@@ -140,7 +140,12 @@ class Runner:
             Exception: the first that the stage raised.
         """
         work, ending = Step(self._work), self._ending
+        alone_until_s = 0.0
         while not work.wait(TICK_S):
+            if self.launcher_gone.is_set():
+                alone_until_s = alone_until_s or time.monotonic() + PRODUCERS_END_LIMIT_S
+                if time.monotonic() > alone_until_s:
+                    self.stop.set()
             if self.stop.is_set():
                 ending.begin()
                 ending.finish("processing what had arrived", work, WORK_ENDED)
@@ -187,7 +192,7 @@ class Runner:
         self._publish_health(StageStatus.STARTING)
         if not self.stage.may_drop:
             self._catch_up()
-            self._loop(lambda: not (self._recovery.is_catching_up or self._due), StageStatus.STARTING)
+            self._loop(self._has_caught_up, StageStatus.STARTING)
         self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
         for name, parts in self._parts.items():
             self._sources.start(name, parts)
@@ -218,11 +223,7 @@ class Runner:
                 self._notifier.at_work(self._health.summary)
 
     def _should_end(self) -> bool:
-        if self.stop.is_set() or not self.launcher_gone.is_set():
-            return self.stop.is_set()
-        now = time.monotonic()
-        self._producers_end_limit_s = self._producers_end_limit_s or now + PRODUCERS_END_LIMIT_S
-        return now > self._producers_end_limit_s or not self._peers.has_producer()
+        return self.stop.is_set() or (self.launcher_gone.is_set() and not self._peers.has_producer())
 
     def _drain(self) -> None:
         """Process what was sent to this stage before it was asked to stop, however much more is being sent.
@@ -378,6 +379,9 @@ class Runner:
         if "health" in self.stage.reads:
             keys.append(health_key(self._site, "*", "*"))
         self._recovery.catch_up(keys)
+
+    def _has_caught_up(self) -> bool:
+        return not (self._recovery.is_catching_up or self._due) or self._ending.left_s(CAUGHT_UP) < 0
 
     def _counters(self) -> Counter[str]:
         counters = self._counts + Counter(self._tracker.counters()) + Counter(lost_at_stop=self._sources.lost)

@@ -76,6 +76,8 @@ class Session:
         """Whether its process may still run. A token outlives a process whose host was cut off; `here`: this host."""
         if self.host != here:
             return True
+        if self.process_id == os.getpid():  # in a container each process has the number of the one before
+            return False
         try:
             os.kill(self.process_id, 0)
         except ProcessLookupError:
@@ -94,6 +96,8 @@ class Sessions:
         """by producer: the session that is ignored, and the one that owns its stage"""
         self._written: dict[str, set[str]] = {}
         """by producer of a session: the keys on which it publishes"""
+        self._ended: dict[str, None] = {}
+        """producers of sessions that have ended, the last ones: their messages may still be on the way"""
 
     def update(self, key: str, alive: bool) -> None:
         """A token has appeared, or gone."""
@@ -105,7 +109,10 @@ class Sessions:
             self._written.setdefault(session.producer, {health_key(key.split("/")[1], session.stage, session.instance)})
         else:
             self._alive.pop(key, None)
-            self._written.pop(session.producer, None)
+            if self._written.pop(session.producer, None) is not None:
+                self._ended[session.producer] = None
+                if len(self._ended) > MOST_SESSIONS:
+                    del self._ended[next(iter(self._ended))]
         owners: dict[tuple[str, str], Session] = {}
         for each in sorted(self._alive.values(), key=lambda each: (each.started_t_ns, each.producer)):
             owners[each.stage, each.instance] = each
@@ -123,8 +130,10 @@ class Sessions:
         return producer in self._written
 
     def is_stranger(self, key: str, producer: str) -> bool:
-        """Whether a session publishes on this key, and this producer is none."""
-        return producer not in self._written and any(key in keys for keys in self._written.values())
+        """Whether a session publishes on this key, and this producer neither is nor was one."""
+        if producer in self._written or producer in self._ended:
+            return False
+        return any(key in keys for keys in self._written.values())
 
     def is_ignored(self, producer: str) -> bool:
         """Whether another process owns the stage of this producer."""

@@ -73,7 +73,7 @@ class TrackedStreams:
     To make room for a new stream, one that has been silent for long is forgotten, or else the one that has sent least.
     Its counts are added up under an empty name. A stream that waits for missing messages is not forgotten; while all
     wait, a new one is refused. A new producer that is not a session of a stage is also refused in a flood (as many new
-    ones within SILENT_S as are remembered), and on a key that a session publishes.
+    ones within SILENT_S as are remembered). On a key that a session publishes, strangers are refused, new or not.
     """
 
     def __init__(self, now_s: Callable[[], float], sessions: Sessions) -> None:
@@ -94,7 +94,9 @@ class TrackedStreams:
         return self._groups.get(_group(key), {}).get((key, producer))
 
     def heard(self, key: str, producer: str) -> Stream | None:
-        """The stream, which is heard now; a new one if it is not remembered. None: there is no room for a new one."""
+        """The stream, which is heard now; a new one if it is not remembered. None: it is refused."""
+        if self._sessions.is_stranger(key, producer):
+            return None
         name = _group(key)
         group = self._groups.setdefault(name, {})
         stream = group.pop((key, producer), None)
@@ -102,9 +104,9 @@ class TrackedStreams:
             most = MOST_PRODUCERS if name == key else MOST_HEALTH_PRODUCERS
             newcomers_s, now_s = self._newcomers_s.setdefault(name, deque(maxlen=most)), self._now_s()
             is_flood = len(newcomers_s) == most and now_s - newcomers_s[0] < SILENT_S
-            if is_flood and not self._sessions.is_alive(producer):
-                return None
-            if self._sessions.is_stranger(key, producer) or (len(group) >= most and not self._forget_one(name)):
+            if (is_flood and not self._sessions.is_alive(producer)) or (
+                len(group) >= most and not self._forget_one(name)
+            ):
                 return None
             newcomers_s.append(now_s)
             stream = Stream(key=key, producer=producer, heard_s=now_s)

@@ -16,6 +16,7 @@ from pipeline.config.loading import load_config
 from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
 from pipeline.launch.processes import EXIT_CANNOT_START
+from pipeline.runtime.notifier import starting
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.signals import stop_on_signals
 from pipeline.runtime.stage import load_stage
@@ -41,7 +42,8 @@ def run(
     stop = threading.Event()
     stop_on_signals(stop)
     try:
-        runner = Runner(load_stage(stage), settings, tray, stop)
+        with starting():
+            runner = Runner(load_stage(stage), settings, tray, stop)
     except UserError as error:
         if not until_stdin_closes:
             raise

@@ -12,10 +12,13 @@ import pytest
 
 from pipeline.bus.errors import BusError
 from pipeline.bus.publisher import KEPT_BYTES
+from pipeline.bus.recovery import recovery_key
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
+from schemas.codec import type_name
+from schemas.messages import Alarm
 from schemas.topics import BY_NAME, alive_key, tray_key
-from tests.support.bus_peer import KEY
+from tests.support.bus_peer import KEY, TOPIC
 from tests.support.running_chain import eventually
 
 COUNT = 400
@@ -134,6 +137,15 @@ def test_a_publisher_keeps_the_newest_messages_that_fit_its_memory(endpoint):
         for _ in range(history + 1):
             publisher.put(b"small")
         assert len(asker.recover(key, "big")) == history
+
+
+@pytest.mark.parametrize("asked", ["first=x", "last=-1", "newest=1e9", "newest=0", f"first={'9' * 5000}"])
+def test_row_11_a_request_that_makes_no_sense_is_answered_as_if_it_had_not_asked_that(endpoint, capfd, asked):
+    with Bus(BusConfig(endpoint=endpoint)) as bus:
+        bus.publisher(KEY, TOPIC, type_name(Alarm), "peer").put(b"kept")
+        replies = list(bus._session.get(f"{recovery_key(KEY, 'peer')}?{asked}", timeout=20.0))
+    assert [reply.ok.payload.to_bytes() for reply in replies if reply.ok] == [b"kept"]
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_an_unanswered_recovery_request_returns_nothing(endpoint):

@@ -10,7 +10,7 @@ import pytest
 from pipeline.launch.notices import Notices
 from pipeline.launch.site_watcher import StageView
 from pipeline.launch.watchdog import START_LIMIT_S, Watchdog
-from pipeline.runtime.notifier import Notifier
+from pipeline.runtime.notifier import Notifier, starting
 from schemas.messages import StageStatus
 from tests.support.running_chain import Chain, eventually, view_of
 
@@ -92,6 +92,19 @@ def test_notices_follow_the_protocol_of_systemd():
     assert (notices.is_ready, notices.status) == (True, "ok: all is well")
     notices.close()
     notifier.stopping()  # nobody listens any more
+
+
+def test_row_01_a_stage_that_is_built_for_long_says_that_it_is_at_work(monkeypatch):
+    """As when the recorder repairs a large recording, or the router is not there yet."""
+    notices = Notices()
+    monkeypatch.setenv("NOTIFY_SOCKET", notices.address)
+    with starting():
+        eventually(notices.read, "a notice while it is built")
+    assert (notices.is_ready, notices.status) == (False, "starting")
+    with starting(limit_s=0.0):
+        pass
+    assert not notices.read(), "what takes too long hangs"
+    notices.close()
 
 
 def test_without_somebody_who_asks_nothing_is_sent(monkeypatch):

@@ -114,20 +114,25 @@ def test_row_11_where_a_stage_publishes_others_are_refused_without_asking():
     acquisition = Session("acquisition", "tray", 1, "real", "host", 1)
     sessions.update(acquisition.key("site"), alive=True)
     tracker = SequenceTracker(requests.append, sessions=sessions)
-    tracker.accept(packet(3, "before it said what it publishes"))
+    tracker.accept(packet(3, "early"))
     sessions.add_health(health(0, "real"), {KEY})
     requests.clear()
+    assert tracker.accept(packet(4, "early")) == [], "it was heard before the stage had said what it publishes"
     tracker.accept(packet(3, "stranger"))
     tracker.reconcile(health(3, "stranger"), [KEY])
     own_health = health_key("site", "acquisition", "tray")
     tracker.accept(replace(packet(3, "stranger"), key=own_health, topic="health"))
     assert not requests
-    assert tracker.counters() == {"refused_producers": 2}
+    assert tracker.counters() == {"refused_producers": 3}
     assert f"{own_health}: stranger is not a stage of this site" in tracker.problem()
     assert sequences(tracker.accept(packet(0, "real"))) == [0]
     sessions.update(acquisition.key("site"), alive=False)
     tracker.accept(packet(3, "a replay"))
     assert [request.producer for request in requests] == ["a replay"]
+    successor = Session("acquisition", "tray", 2, "next", "host", 2)
+    sessions.update(successor.key("site"), alive=True)
+    sessions.add_health(health(0, "next"), {KEY})
+    assert sequences(tracker.accept(packet(1, "real"))) == [1], "it may have been on the way when the session ended"
 
 
 def test_row_11_a_flood_of_healths_is_remembered_in_part():

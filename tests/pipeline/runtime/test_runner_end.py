@@ -11,14 +11,15 @@ from typing import Any
 
 import pytest
 
+from pipeline.bus.recovery import recovery_key
 from pipeline.bus.session import Bus
-from pipeline.config.models import LauncherConfig
+from pipeline.config.models import BusConfig, LauncherConfig
 from pipeline.errors import UserError
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Context, Stage
 from schemas.codec import decode
 from schemas.messages import Health, Message, StageStatus
-from schemas.topics import health_key
+from schemas.topics import health_key, tray_key
 from tests.pipeline.runtime.test_runner import TRAY_A, TRAY_B, Bench, Burst, Passer, config, raw, toy
 from tests.support.running_chain import eventually
 
@@ -128,8 +129,10 @@ def test_row_04_a_core_that_hangs_while_it_is_closed_is_left_behind_in_time(conf
     assert "closing the core did not end in time" in ended.problem
 
 
-def test_row_04_a_loop_that_hangs_is_left_behind_in_time(config):
-    """As when a consumer hangs and takes no more of what is published."""
+@pytest.mark.parametrize("who", ["stop", "launcher_gone"])
+def test_row_04_a_loop_that_hangs_is_left_behind_in_time(config, monkeypatch, who):
+    """As when a consumer hangs and takes no more of what is published; also where nobody is left to kill the stage."""
+    monkeypatch.setattr("pipeline.runtime.runner.PRODUCERS_END_LIMIT_S", 0.1)
     release, hanging = threading.Event(), threading.Event()
 
     class Hangs(Passer):
@@ -151,10 +154,39 @@ def test_row_04_a_loop_that_hangs_is_left_behind_in_time(config):
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     assert hanging.wait(20)
-    stop.set()
+    getattr(runner, who).set()
     thread.join(20)
     release.set()
     assert "processing what had arrived did not end in time" in str(errors[0])
+
+
+def test_row_04_a_stage_that_is_stopped_while_it_waits_for_what_it_missed_ends_in_order(config):
+    """As when a producer hangs."""
+    settings = replace(
+        config,
+        launcher=LauncherConfig(stop_timeout_s=1.0),
+        bus=BusConfig(endpoint=config.bus.endpoint, recovery_timeout_s=300),
+    )
+    stop, asked = threading.Event(), threading.Event()
+    queries: list[Any] = []
+
+    def never_answer(query: Any) -> None:
+        queries.append(query)
+        asked.set()
+
+    with Bus(settings.bus) as bus:
+        silent = bus._session.declare_queryable(recovery_key(tray_key("s", TRAY_A, "raw"), "hangs"), never_answer)
+        runner = Runner(toy(), settings, None, stop)
+        thread = threading.Thread(target=runner.run)
+        thread.start()
+        assert asked.wait(20)
+        stop.set()
+        thread.join(20)
+        for query in queries:
+            query.drop()
+        silent.undeclare()
+    assert not thread.is_alive()
+    assert not runner.is_hung
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")

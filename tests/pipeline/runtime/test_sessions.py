@@ -74,8 +74,10 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
             aborted.append(True)
 
     bench = Bench(toy(), config)
+    first = os.getpid()
+    monkeypatch.setattr("pipeline.runtime.sessions.os.getpid", lambda: first + 1)
     with pytest.raises(
-        StageError, match=f"^resampler of site 's' already runs: process {os.getpid()} on [^;]*; stop that, or give"
+        StageError, match=f"^resampler of site 's' already runs: process {first} on [^;]*; stop that, or give"
     ):
         Runner(toy(lambda _context: BuiltStage(Aborts()), core_per_tray=False), config, None, threading.Event())
     bench.feed(TRAY_A, 1)
@@ -84,11 +86,12 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
     assert aborted == [True]
 
 
-def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobody(config, monkeypatch):
+@pytest.mark.parametrize("process_id", [2**22 + 1, os.getpid()], ids=["ended", "our number, as in a container"])
+def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobody(config, monkeypatch, process_id):
     monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
     ours = Session.of_this_process("resampler", "all", 1, "p")
     with Bus(config.bus) as bus:
-        bus.declare_alive(replace(ours, process_id=2**22 + 1).key("s"))
+        bus.declare_alive(replace(ours, process_id=process_id).key("s"))
         stop = threading.Event()
         stop.set()
         Runner(toy(), config, None, stop).run()
