@@ -1,8 +1,9 @@
 """What a site has lost, over all sessions of its stages, computed from the last health of each session.
 
-A stage counts what it misses while it runs. What it cannot know, the healths of all sessions show together: what was
-published before it first heard a producer, while it was dead, or after it had stopped. One rule: of every stream that a
-stage reads, each message from the first that it is due to the last must have reached one of its sessions.
+A stage counts what it misses while it runs. The health messages of all sessions together show what it cannot know: what
+was published before it first heard a producer, while it was dead, or after it had stopped. There is one rule: of every
+stream that a stage reads, each message from the first that is due to it to the last must have reached one of its
+sessions.
 
 * First: number 0 where one launcher started both producer and consumer. Otherwise the first that the stage had: what
   came before is history, and so is what was published between two sessions of which the earlier stopped in order.

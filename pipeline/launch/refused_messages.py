@@ -1,4 +1,4 @@
-"""What stages have refused, over all their sessions: messages of others. They are no loss, and are shown apart."""
+"""Messages of others that stages have refused, over all their sessions. They are not losses, and are shown apart."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pipeline.launch.loss_accounting import label
 from schemas.messages import Health
 
 WORDS = {
-    "refused_of_second": "of a second process of a stage",
+    "refused_of_second": "from a second process of a stage",
     "refused_of_replay": "commands of a replay",
-    "refused_clocks": "clocks of others than the replay",
-    "refused_numbers": "with numbers that are not possible",
-    "refused_producers": "of too many producers at a time",
+    "refused_clocks": "clock messages from others than the replay",
+    "refused_numbers": "with impossible numbers",
+    "refused_producers": "from unknown or too many producers",
     "refused_too_large": "too large",
 }
 """by the counter of the runner"""

@@ -43,7 +43,7 @@ class Notifier:
         self._next_s = 0.0
 
     def at_work(self, status: str) -> None:
-        """The loop has gone round; sent every `PERIOD_S` at most. status: one line for people."""
+        """The main loop has run; sent every `PERIOD_S` at most. status: one line for people."""
         now_s = time.monotonic()
         if self._socket is None or now_s < self._next_s:
             return

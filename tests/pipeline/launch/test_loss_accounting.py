@@ -206,4 +206,4 @@ def test_row_07_what_sessions_have_refused_is_added_up():
     counted = (Counter(name="refused_of_second", value=5), Counter(name="refused_clocks", value=0))
     sessions = [health(name, "recorder", 1, counters=counted) for name in ("w1", "w2")]
     assert refused([*sessions, FOLLOWER]) == {"recorder": {"refused_of_second": 10}}
-    assert refused_lines(refused(sessions)) == ["recorder: messages refused: 10 of a second process of a stage"]
+    assert refused_lines(refused(sessions)) == ["recorder: messages refused: 10 from a second process of a stage"]
