@@ -339,7 +339,14 @@ class Counter:
 
 @dataclass(frozen=True, kw_only=True)
 class Input:
-    """One input of a stage: messages on one key from one producer."""
+    """One input of a stage: messages on one key from one producer.
+
+    Attributes:
+        missing: gaps in the sequence, never filled.
+        missing_at_start: those of them before the first message that was received.
+        refused: those of the received ones that were ignored, because another process owns the stage of their producer.
+        unsaved: the last of the received ones, so many, that are lost if the stage is killed now.
+    """
 
     key: str
     producer: str
@@ -347,6 +354,9 @@ class Input:
     missing: int
     duplicated: int
     next_sequence: int
+    missing_at_start: int = 0
+    refused: int = 0
+    unsaved: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,6 +34,12 @@ class StreamState:
     received: int = 0
     missing: int = 0
     duplicated: int = 0
+    missing_at_start: int = 0
+    """those of the missing ones before the first that was received"""
+    refused: int = 0
+    """those of the received ones that were ignored as of a second process"""
+    unsaved: int = 0
+    """the last of the received ones, so many, that are lost if the consumer is killed now"""
 
     @property
     def first_sequence(self) -> int:
@@ -60,6 +66,7 @@ class StreamState:
         not known yet they are history: counting starts at `sequence`."""
         skipped = 0 if self.next_sequence is None else max(0, sequence - self.next_sequence)
         self.missing += skipped
+        self.missing_at_start += 0 if self.received else skipped
         self.next_sequence = max(sequence, self.next_sequence or 0)
         return skipped
 
@@ -69,8 +76,8 @@ class StreamState:
         self.missing += other.missing
         self.duplicated += other.duplicated
 
-    def as_input(self, stream: StreamId) -> Input:
-        """These counts as a health message carries them."""
+    def as_input(self, stream: StreamId, unsaved: int = 0) -> Input:
+        """These counts as a health message carries them; unsaved: see `Input`."""
         return Input(
             key=stream[0],
             producer=stream[1],
@@ -78,13 +85,24 @@ class StreamState:
             missing=self.missing,
             duplicated=self.duplicated,
             next_sequence=self.next_sequence or 0,
+            missing_at_start=self.missing_at_start,
+            refused=self.refused,
+            unsaved=unsaved,
         )
 
 
 def input_streams(health: Health) -> dict[StreamId, StreamState]:
     """The streams that a stage reads, as its health reports them."""
     return {
-        (line.key, line.producer): StreamState(line.next_sequence, line.received, line.missing, line.duplicated)
+        (line.key, line.producer): StreamState(
+            next_sequence=line.next_sequence,
+            received=line.received,
+            missing=line.missing,
+            duplicated=line.duplicated,
+            missing_at_start=line.missing_at_start,
+            refused=line.refused,
+            unsaved=line.unsaved,
+        )
         for line in health.inputs
     }
 

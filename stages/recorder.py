@@ -172,6 +172,10 @@ class Recorder(Core):
         recorded = self._recorded + (self._part.written if self._part else Counter())
         return {f"recorded_{topic}": count for topic, count in recorded.items()} | self._counts
 
+    def unsaved(self) -> Sequence[Envelope]:
+        """Messages that are not flushed to the disk yet."""
+        return self._part.pending if self._part else self._held.messages
+
     def problem(self) -> str:
         """Why nothing is recorded now, or what another program did to the file; empty if all is well."""
         is_news = self._now_ns - self._news_ns < NEWS_SHOWN_NS

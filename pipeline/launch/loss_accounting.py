@@ -7,17 +7,20 @@ sessions.
 
 * First: number 0 where one launcher started both producer and consumer. Otherwise the first that the stage had: what
   came before is history, and so is what was published between two sessions of which the earlier stopped in order.
-* Last: once the stage has stopped, the last that is known to be published, if its producer had ended by then: it was
-  replaced, or the launcher stopped it first. Otherwise the last that the stage had: more may be on the way.
+* Last: once the stage has stopped, the last that is known to be published, if its producer had ended by then: the stage
+  has heard the producer's successor, or the launcher stopped the producer first. Otherwise the last that it had.
 
-A killed consumer's last health is up to a second old, so what it had not reported counts as lost: an upper bound.
+Where healths do not say which messages a session lacked, the count is an upper bound: what a killed session received
+after its last health, or had not saved by then, counts as lost unless another had it; so does what a session missed
+after its first message, up to as many as there are numbers that no earlier one covers. Only what arrived at a stage
+that had to end may count too low: it is among what the stage never had, or comes on top, and the larger of the two
+counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
-from itertools import chain
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from pipeline.config.registry import STAGES
@@ -29,24 +32,27 @@ from schemas.topics import HEALTH_CHUNK, current_name
 Launched: TypeAlias = tuple[str, int]
 """label and process id of a session"""
 NOT_PROCESSED = "lost_at_stop"
-"""the counter of a stage of what had arrived when it had to end; a part of it is not among what it received"""
+"""the counter of a stage of what had arrived when it had to end; it is not among what its session had"""
 
 
-def losses(healths: Iterable[Health], launched: Collection[Launched] = ()) -> dict[str, int]:
+def losses(healths: Iterable[Health], launched: Collection[Launched] | None = None) -> dict[str, int]:
     """What each stage has lost, by its label.
 
     Args:
         healths: the last of every session, in the order in which they were heard.
-        launched: the sessions that one launcher has started; `healths` has all of them.
+        launched: the sessions that one launcher has started, and whose losses are wanted. None: those of all sessions,
+            of which none is known to have been due a stream from its first message.
     """
     sessions: dict[str, list[_Session]] = {}
     for health in healths:
-        is_ours = (label(health), health.process_id) in launched
-        sessions.setdefault(label(health), []).append(_Session(health, input_streams(health), is_ours))
-    published = _published(sessions)
-    return {
-        name: sum(each.health.lost for each in own) + _never_received(own, published) for name, own in sessions.items()
-    }
+        sessions.setdefault(label(health), []).append(_Session(health, input_streams(health)))
+    site = _Site()
+    for own in sessions.values():
+        site.add(own, launched or ())
+    if launched is not None:
+        ours = {name: [each for each in own if each.name in site.launched] for name, own in sessions.items()}
+        sessions = {name: own for name, own in ours.items() if own}
+    return {name: _lost(own, site) for name, own in sessions.items()}
 
 
 def label(health: Health) -> str:
@@ -56,65 +62,95 @@ def label(health: Health) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Session:
-    """A session of a stage: its last health, what that says it received, and whether it is one of the launched."""
+    """A session of a stage: its last health, and what that says it received."""
 
     health: Health
     inputs: dict[StreamId, StreamState]
-    is_launched: bool
+
+    @property
+    def name(self) -> str:
+        """As which it signs its messages."""
+        return self.health.header.producer
 
     @property
     def has_stopped(self) -> bool:
         """Whether it ended in order."""
         return self.health.status == StageStatus.STOPPED
 
+    @property
+    def lost_at_stop(self) -> int:
+        """What had arrived when it had to end."""
+        return sum(counter.value for counter in self.health.counters if counter.name == NOT_PROCESSED)
+
+    @property
+    def lost_otherwise(self) -> int:
+        """What it lost apart from that and from the missing messages of the streams that it still knows."""
+        missing = sum(state.missing for (_, name), state in self.inputs.items() if name)
+        return max(0, self.health.lost - missing - self.lost_at_stop)
+
 
 @dataclass(slots=True)
-class _Published:
-    """What is known of a stream.
+class _Site:
+    """What all sessions say together.
 
     Attributes:
-        count: so many messages have been published.
-        is_replaced: its producer was followed by another session of its stage.
-        launched_stage: the stage of its producer, if that is one of the launched sessions.
+        published: how many messages of each stream are known to be published.
+        followers: by producer, the later sessions of its stage.
+        launched: by producer, the stage of those that the launcher has started.
     """
 
-    count: int = 0
-    is_replaced: bool = False
-    launched_stage: str = ""
+    published: dict[StreamId, int] = field(default_factory=dict)
+    followers: dict[str, set[str]] = field(default_factory=dict)
+    launched: dict[str, str] = field(default_factory=dict)
+
+    def add(self, own: Sequence[_Session], launched: Collection[Launched]) -> None:
+        """Add the sessions of a stage."""
+        for number, each in enumerate(own):
+            received = {stream: state.next_sequence or 0 for stream, state in each.inputs.items()}
+            for stream, count in (*output_streams(each.health).items(), *received.items()):
+                if stream[1]:  # without a name: earlier producers, summed up
+                    self.published[stream] = max(count, self.published.get(stream, 0))
+            self.followers[each.name] = {later.name for later in own[number + 1 :]}
+            if (label(each.health), each.health.process_id) in launched:
+                self.launched[each.name] = each.health.stage
+
+    def is_due_from_0(self, stream: StreamId, consumer: _Session) -> bool:
+        """Whether the launcher started producer and consumer: all that is published is due."""
+        key, producer = stream
+        both = producer in self.launched and consumer.name in self.launched
+        return both and not _is_of_health(key) and _reads(consumer.health, key)
+
+    def has_ended(self, stream: StreamId, run: Sequence[_Session]) -> bool:
+        """Whether the producer of a stream had ended when these sessions of a stage had stopped."""
+        key, producer = stream
+        if not run[-1].has_stopped:
+            return False
+        heard = {name for each in run for _, name in each.inputs}
+        stage = "" if _is_of_health(key) else self.launched.get(producer, "")
+        return not heard.isdisjoint(self.followers.get(producer, ())) or _stops_before(stage, run[-1].health.stage)
 
 
-def _published(sessions: dict[str, list[_Session]]) -> dict[StreamId, _Published]:
-    """All streams that have a producer's name, by what producers and consumers say."""
-    replaced = {each.health.header.producer for own in sessions.values() for each in own[:-1]}
-    every = list(chain.from_iterable(sessions.values()))
-    stages = {each.health.header.producer: each.health.stage for each in every if each.is_launched}
-    found: dict[StreamId, _Published] = {}
-    for each in every:
-        received = {stream: state.next_sequence or 0 for stream, state in each.inputs.items()}
-        for stream, count in chain(output_streams(each.health).items(), received.items()):
-            key, producer = stream
-            if producer:  # without a name: earlier producers, summed up
-                known = found.setdefault(stream, _Published())
-                known.count = max(known.count, count)
-                known.is_replaced = producer in replaced
-                known.launched_stage = "" if _is_of_health(key) else stages.get(producer, "")
-    return found
-
-
-def _never_received(own: Sequence[_Session], published: dict[StreamId, _Published]) -> int:
-    """Messages that were due to a stage and are in no count of its sessions `own`."""
-    ours = [each for each in own if each.is_launched]
-    from_ours = {stream for stream, known in published.items() if ours and known.launched_stage}
-    never = sum(
-        _absent(ours, stream, published[stream], first=0) for stream in from_ours if _reads(ours[-1].health, stream[0])
-    )
-    for run in _runs(own):
-        others = {stream for each in run for stream in each.inputs} & published.keys() - from_ours
-        never += sum(_absent(run, stream, published[stream], first=None) for stream in others)
-    counters = chain.from_iterable(each.health.counters for each in own)
-    never = max(0, never - sum(counter.value for counter in counters if counter.name == NOT_PROCESSED))
+def _lost(own: Sequence[_Session], site: _Site) -> int:
+    """What one stage has lost, of which these are the sessions."""
     stage = own[-1].health.stage
-    return 0 if never and stage in STAGES and load_stage(stage).may_drop else never
+    if stage in STAGES and load_stage(stage).may_drop:
+        return sum(each.health.lost for each in own)
+    all_runs = _runs(own)
+    within = after = 0
+    for stream, published in site.published.items():
+        is_due_from_0 = site.is_due_from_0(stream, own[-1])
+        runs = [own] if is_due_from_0 else [run for run in all_runs if any(stream in each.inputs for each in run)]
+        if not runs or (is_due_from_0 and _is_forgotten(stream, own)):
+            continue
+        end = 0
+        for run in runs:
+            states = [each.inputs[stream] for each in run if stream in each.inputs]
+            absent, end = _absent(states, is_due_from_0=is_due_from_0)
+            within += absent
+        if site.has_ended(stream, runs[-1]):
+            after += max(0, published - end)
+    at_stop = sum(each.lost_at_stop for each in own)
+    return sum(each.lost_otherwise for each in own) + within + max(after, at_stop)
 
 
 def _runs(own: Sequence[_Session]) -> list[list[_Session]]:
@@ -127,22 +163,27 @@ def _runs(own: Sequence[_Session]) -> list[list[_Session]]:
     return runs
 
 
-def _absent(run: Sequence[_Session], stream: StreamId, known: _Published, first: int | None) -> int:
-    """How many messages of a stream, from number `first`, reached none of these sessions of a stage. None: from the
-    first that one of them had."""
-    states = [each.inputs[stream] for each in run if stream in each.inputs]
-    if not states and any((stream[0], "") in each.inputs for each in run):
-        return 0  # it may be among the streams that were forgotten in a flood of names
-    had = sorted((state.first_sequence, state.next_sequence or 0) for state in states)
-    due, absent = had[0][0] if first is None else first, 0
-    for begin, end in had:
+def _absent(states: Iterable[StreamState], *, is_due_from_0: bool) -> tuple[int, int]:
+    """How many messages of a stream, from the first that is due, none of these sessions of a stage had, and the number
+    after the last that one had."""
+    had = sorted(states, key=lambda state: state.first_sequence + state.missing_at_start)
+    absent, due = 0, 0 if is_due_from_0 else min(state.first_sequence for state in had)
+    for state in had:
+        begin, end = state.first_sequence + state.missing_at_start, (state.next_sequence or 0) - state.unsaved
+        lacking = state.missing - state.missing_at_start + (state.refused if is_due_from_0 else 0)
         absent += max(0, begin - due)
+        due = max(due, begin)
+        absent += min(lacking, max(0, end - due))
         due = max(due, end)
-    has_ended = known.is_replaced or _is_stopped_before(known.launched_stage, run[-1].health.stage)
-    return absent + (max(0, known.count - due) if has_ended and run[-1].has_stopped else 0)
+    return absent, due
 
 
-def _is_stopped_before(producer: str, consumer: str) -> bool:
+def _is_forgotten(stream: StreamId, own: Iterable[_Session]) -> bool:
+    """Whether it may be among the streams that were forgotten in a flood of names."""
+    return any((stream[0], "") in each.inputs for each in own) and not any(stream in each.inputs for each in own)
+
+
+def _stops_before(producer: str, consumer: str) -> bool:
     """Whether a launcher stops the stage `producer` before `consumer`: in the order of the data flow."""
     order = list(STAGES)
     return producer in STAGES and consumer in STAGES and order.index(producer) < order.index(consumer)

@@ -115,7 +115,7 @@ class SiteWatcher:
             found = (health for health, _, _ in self._healths.values() if _session(health) == session)
             return next(found, None)
 
-    def losses(self, launched: Collection[Launched] = ()) -> dict[str, int]:
+    def losses(self, launched: Collection[Launched] | None = None) -> dict[str, int]:
         """What every stage has lost, over all its sessions; see `pipeline.launch.loss_accounting`."""
         with self._lock:
             return losses((health for health, _, _ in self._healths.values()), launched)

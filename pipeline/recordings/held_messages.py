@@ -23,6 +23,11 @@ class HeldMessages:
         """Time of receipt of the oldest message; None if the queue is empty."""
         return self._queue[0].received_t_ns if self._queue else None
 
+    @property
+    def messages(self) -> tuple[Envelope, ...]:
+        """All of them, oldest first."""
+        return tuple(self._queue)
+
     def add(self, messages: Iterable[Envelope], limit_bytes: int) -> list[Envelope]:
         """Append messages; returns those dropped to stay within the limit."""
         for envelope in messages:

@@ -12,8 +12,9 @@ import secrets
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
@@ -31,7 +32,7 @@ from pipeline.runtime.recovery import Recovery
 from pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from pipeline.runtime.sessions import Session, Sessions, refuse_second
 from pipeline.runtime.sources import Sources
-from pipeline.runtime.stage import BuiltStage, Context, Stage
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Health, Message, StageStatus
@@ -252,7 +253,6 @@ class Runner:
         self._inbox.close()  # from now on it takes nothing, and the sources count what they deliver
         if not self.stage.may_drop:
             self._counts["lost_at_stop"] += len(self._due) + self._tracker.held
-        self._due.clear()
         while (item := self._inbox.get(0)) is not None:
             if isinstance(item, FromSource):
                 self._sources.discard(item)
@@ -351,6 +351,7 @@ class Runner:
             return
         if self._sessions.is_ignored(header.producer) and envelope.topic != "health":
             self._counts["refused_of_second"] += 1
+            self._tracker.refuse_second(envelope)
             return
         if (
             envelope.topic == self.stage.reads[0] and not self._has_source
@@ -393,6 +394,10 @@ class Runner:
             counters["dropped"] = self._inbox.dropped
         return counters
 
+    def _unsaved(self, cores: Sequence[Core]) -> Iterator[Envelope]:
+        """What a kill would lose; at the end, what was received and there was no time to process."""
+        return chain(tuple(self._due), *(core.unsaved() for core in cores))
+
     def _lost(self) -> int:
         return stage_losses(self._tracker.inputs(), self._counters(), may_drop=self.stage.may_drop)
 
@@ -406,7 +411,7 @@ class Runner:
                 self._tracker.problem(),
                 *(core.problem() for core in cores),
             ],
-            inputs=self._tracker.inputs() if with_counts else (),
+            inputs=self._tracker.inputs(self._unsaved(cores)) if with_counts else (),
             outputs=self._outputs.counts() if with_counts else (),
             counters=self._counters() if with_counts else {},
             now_ns=HOST_CLOCK.now_ns(),

@@ -139,9 +139,15 @@ class SequenceTracker:
         waiting = [stream.waiting for stream in self._streams if stream.waiting]
         return sum(len(each.held) + (each.shown_by is not None) for each in waiting)
 
-    def inputs(self) -> tuple[Input, ...]:
-        """The counts for health. Forgotten producers of a key are summed up under an empty name."""
-        return self._streams.inputs()
+    def refuse_second(self, envelope: Envelope) -> None:
+        """An accepted message is ignored: another process owns the stage of its producer."""
+        if stream := self._streams.get(envelope.key, envelope.message.header.producer):
+            stream.refused += 1
+
+    def inputs(self, unsaved: Iterable[Envelope] = ()) -> tuple[Input, ...]:
+        """The counts for health. Forgotten producers of a key are summed up under an empty name. unsaved: the messages
+        that are lost if the stage is killed now."""
+        return self._streams.inputs(unsaved)
 
     def counters(self) -> Mapping[str, int]:
         """What was refused; docs/reference/messages.md explains it."""

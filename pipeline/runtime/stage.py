@@ -6,7 +6,7 @@ publishes what it returns. The runner is the only loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,6 +15,7 @@ from pipeline.config.models import Section, TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
+from schemas.envelope import Envelope
 from schemas.messages import Message
 from schemas.topics import BY_NAME
 
@@ -57,6 +58,11 @@ class Core(Protocol):
     def counters(self) -> Mapping[str, int]:
         """What the core counts. Names that begin with `lost_` are losses and are summed up in health."""
         return {}
+
+    def unsaved(self) -> Iterable[Envelope]:
+        """Messages that a core keeps in memory and that are lost if it is killed now, such as those a recorder has not
+        flushed. The default is for cores that have done their work when `step` returns."""
+        return ()
 
     def samples_in(self, item: Any) -> int:
         """How many samples an item of the source holds: so many are lost if there is no time to process it."""

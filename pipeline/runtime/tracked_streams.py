@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -113,11 +113,17 @@ class TrackedStreams:
         group[key, producer] = stream
         return stream
 
-    def inputs(self) -> tuple[Input, ...]:
-        """The counts for health; those of forgotten streams are the last of their key, without a producer."""
+    def inputs(self, unsaved: Iterable[Envelope] = ()) -> tuple[Input, ...]:
+        """The counts for health; those of forgotten streams are the last of their key, without a producer.
+
+        unsaved: the messages that are lost if the stage is killed now.
+        """
+        at_risk = Counter((envelope.key, envelope.message.header.producer) for envelope in unsaved)
         found: list[Input] = []
         for name, group in self._groups.items():
-            found += [stream.as_input(id) for id, stream in group.items() if stream.next_sequence is not None]
+            found += [
+                stream.as_input(id, at_risk[id]) for id, stream in group.items() if stream.next_sequence is not None
+            ]
             if name in self._forgotten:
                 found.append(self._forgotten[name].as_input((name, "")))
         return tuple(found)

@@ -314,6 +314,22 @@ def test_messages_of_a_failed_flush_are_recorded_again_in_the_next_part(tmp_path
     assert core.counters() == {"recorded_raw": 4, "lost_unwritten": 0, "parts": 2, "pauses": 1}
 
 
+def test_what_is_not_flushed_is_reported_as_unsaved():
+    disk = Disk()
+    core = recorder(disk)
+    record(core, range(3))
+    core.tick(NOW_NS + SECOND_NS)
+    record(core, range(3, 5))
+    assert [each.message.header.sequence for each in core.unsaved()] == [3, 4]
+    disk.refuses = True
+    core.tick(NOW_NS + 3 * SECOND_NS)
+    record(core, [5])
+    assert [each.message.header.sequence for each in core.unsaved()] == [3, 4, 5], "they are kept in memory"
+    disk.refuses = False
+    core.close()
+    assert not core.unsaved()
+
+
 def test_without_messages_there_is_nothing_to_flush():
     disk = Disk()
     core = recorder(disk)

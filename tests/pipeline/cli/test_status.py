@@ -170,7 +170,7 @@ def test_a_later_session_replaces_the_earlier_one_and_their_losses_add_up(site):
 def test_row_18_the_loss_of_a_stage_that_was_restarted_while_it_is_watched_does_not_start_at_0_again(site):
     watcher = SiteWatcher(site.outside, SITE)
     follower = replace(
-        HEALTH, header=Header("scorer-all-2", 0, ""), t_ns=HEALTH.t_ns + NS_PER_S, uptime_s=180.0, lost=2
+        HEALTH, header=Header("scorer-all-2", 0, ""), t_ns=HEALTH.t_ns + NS_PER_S, uptime_s=180.0, inputs=(), lost=2
     )
     view(site, watcher, HEALTH, follower)
     judged = site.judged()
@@ -183,7 +183,7 @@ def test_row_18_the_loss_of_a_stage_that_was_restarted_while_it_is_watched_does_
 def test_row_07_what_was_refused_of_a_second_process_is_said_and_is_no_loss(site):
     watcher = SiteWatcher(site.outside, SITE)
     refusals = (Counter(name="refused_of_second", value=12),)
-    view(site, watcher, replace(HEALTH, counters=refusals, lost=0))
+    view(site, watcher, replace(HEALTH, inputs=(), counters=refusals, lost=0))
     assert "scorer: messages refused: 12 from a second process of a stage\n" in shown(watcher, site.judged())
     assert watcher.losses() == {"scorer": 0}
 

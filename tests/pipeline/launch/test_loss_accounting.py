@@ -37,7 +37,7 @@ def health(
     )
 
 
-def line(producer: str, first: int, until: int, missing: int = 0, key: str = KEY) -> Input:
+def line(producer: str, first: int, until: int, missing: int = 0, key: str = KEY, **counts: int) -> Input:
     return Input(
         key=key,
         producer=producer,
@@ -45,6 +45,7 @@ def line(producer: str, first: int, until: int, missing: int = 0, key: str = KEY
         missing=missing,
         duplicated=0,
         next_sequence=until,
+        **counts,
     )
 
 
@@ -207,3 +208,80 @@ def test_row_07_what_sessions_have_refused_is_added_up():
     sessions = [health(name, "recorder", 1, counters=counted) for name in ("w1", "w2")]
     assert refused([*sessions, FOLLOWER]) == {"recorder": {"refused_of_second": 10}}
     assert refused_lines(refused(sessions)) == ["recorder: messages refused: 10 from a second process of a stage"]
+
+
+def test_row_18_what_a_killed_recorder_had_not_flushed_and_a_killed_producer_cannot_send_again_is_lost():
+    before = health("w1", "recorder", 1, OK, inputs=(line("a1", 0, 90, unsaved=12),))
+    after = health("w2", "recorder", 9, inputs=(line("a2", 0, 50),))
+    assert losses([KILLED, before, FOLLOWER, after], LAUNCHED)["recorder"] == 12
+
+
+def test_what_a_killed_recorder_had_not_flushed_and_its_successor_received_again_is_not_lost():
+    before = health("w1", "recorder", 1, OK, inputs=(line("a1", 0, 80, unsaved=12),))
+    after = health("w2", "recorder", 9, inputs=(line("a1", 60, 90),))
+    assert losses([before, SENT, after], LAUNCHED)["recorder"] == 0
+    assert losses([before, SENT, after])["recorder"] == 0
+
+
+def test_what_is_published_after_a_stage_of_another_launcher_was_stopped_is_not_lost():
+    """As with `fantwin run recorder` beside `up`, which goes on."""
+    recorder = health("w9", "recorder", 5, inputs=(line("a1", 0, 40),))
+    assert losses([recorder, SENT], {("acquisition/t", 1)}) == {"acquisition/t": 0}
+
+
+def test_what_a_successor_took_over_is_not_lost_when_its_producer_is_replaced_later():
+    before = health("w1", "recorder", 5, inputs=(line("a1", 0, 40),))
+    after = health("w2", "recorder", 21, OK, inputs=(line("a1", 40, 90), line("a2", 0, 5)))
+    assert losses([before, SENT, after, FOLLOWER])["recorder"] == 0
+
+
+def test_what_is_published_after_a_stage_was_stopped_is_not_lost_when_its_producer_is_replaced_later():
+    recorder = health("w1", "recorder", 5, inputs=(line("a1", 0, 40),))
+    assert losses([recorder, SENT, FOLLOWER])["recorder"] == 0
+
+
+def test_what_a_stage_never_had_of_a_replaced_producer_stays_lost_when_the_stage_is_started_again():
+    before = health("w1", "recorder", 5, inputs=(line("a1", 0, 85), line("a2", 0, 10)))
+    after = health("w2", "recorder", 21, OK, inputs=(line("a2", 30, 50),))
+    assert losses([KILLED, before, FOLLOWER, after])["recorder"] == 5
+
+
+def test_row_07_messages_of_a_launched_producer_that_a_launched_stage_refused_are_lost():
+    recorder = health("w1", "recorder", 9, inputs=(line("a1", 0, 90, refused=28),))
+    assert losses([SENT, recorder], LAUNCHED)["recorder"] == 28
+    stranger = health("w1", "recorder", 9, inputs=(line("a1", 0, 90), line("x9", 0, 90, refused=90)))
+    assert losses([SENT, stranger], LAUNCHED)["recorder"] == 0
+    assert losses([SENT, recorder])["recorder"] == 0, "whose messages are one's own is not known"
+
+
+def test_messages_that_the_predecessor_of_a_stage_received_are_not_missing():
+    """The producer did not answer the successor, which takes all that it may have kept as missing."""
+    before = health("w1", "recorder", 1, OK, inputs=(line("a1", 0, 5000),))
+    counts = line("a1", 904, 5100, missing=4096, missing_at_start=4096)
+    after = health("w2", "recorder", 9, inputs=(counts,), lost=4096)
+    sent = health("a1", "acquisition", 5, published=5100)
+    assert losses([before, sent, after], LAUNCHED)["recorder"] == 0
+    assert losses([before, sent, after])["recorder"] == 0
+    alone = health("w1", "recorder", 9, inputs=(counts,), lost=4096)
+    assert losses([alone])["recorder"] == 4096, "without a predecessor they are"
+
+
+def test_messages_that_a_session_lacked_beyond_those_of_its_predecessor_are_lost():
+    before = health("w1", "recorder", 1, OK, inputs=(line("a1", 0, 50, missing=3),), lost=3)
+    after = health("w2", "recorder", 9, inputs=(line("a1", 40, 90, missing=7),), lost=7)
+    assert losses([before, SENT, after], LAUNCHED)["recorder"] == 3 + 7
+
+
+def test_what_arrived_at_a_stage_that_had_to_end_does_not_hide_a_gap():
+    at_stop = (Counter(name="lost_at_stop", value=10),)
+    recorder = health("w1", "recorder", 9, inputs=(line("a1", 8, 90, unsaved=10),), lost=10, counters=at_stop)
+    assert losses([SENT, recorder], LAUNCHED)["recorder"] == 8 + 10
+    recorder = health("w1", "recorder", 9, inputs=(line("a1", 0, 85, unsaved=5),), lost=10, counters=at_stop)
+    assert losses([SENT, recorder], LAUNCHED)["recorder"] == 10, "five were received, five were not"
+
+
+def test_the_sessions_of_other_launchers_do_not_count():
+    before = health("w9", "recorder", 0, inputs=(line("a9", 0, 10),), lost=7)
+    recorder = health("w1", "recorder", 9, inputs=(line("a1", 0, 90),))
+    assert losses([before, SENT, recorder], LAUNCHED)["recorder"] == 0
+    assert losses([before, SENT, recorder], ()) == {}, "none of them was ready"

@@ -18,6 +18,7 @@ from pipeline.runtime.inbox import INBOX_SIZE
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from schemas.codec import decode, encode, type_name
+from schemas.envelope import Envelope
 from schemas.messages import Command, Grid, Header, Health, InputPosition, Message, Output, Raw, StageStatus
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from tests.support.running_chain import eventually
@@ -275,6 +276,48 @@ def test_health_accounts_for_inputs_outputs_counters_and_losses(config):
     assert {counter.name: counter.value for counter in health.counters} == {"lost_on_purpose": 4, "seen": 10}
     assert health.lost == 3 + 4  # missing messages, and the counters of two cores
     assert {output.key: output.published for output in health.outputs}[tray_key("s", TRAY_A, "grid")] == 6
+
+
+class Holder(Silent):
+    """Like a recorder: it keeps messages in memory until its end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.held: list[Envelope] = []
+
+    def step(self, item: Any) -> Sequence[Message]:
+        self.held.append(item)
+        return []
+
+    def close(self) -> Sequence[Message]:
+        self.held.clear()
+        return []
+
+    def unsaved(self) -> Sequence[Envelope]:
+        return self.held
+
+
+def test_row_18_what_a_killed_stage_had_received_and_not_saved_is_lost_if_nobody_can_send_it_again(config):
+    bench = Bench(toy(lambda _context: BuiltStage(Holder()), wants_envelopes=True), config)
+    for t_ns in range(5):
+        bench.feed(TRAY_A, t_ns)
+    killed = bench.health_with(lambda health: any(line.received == 5 for line in health.inputs))
+    last = bench.end()
+    assert [line.unsaved for line in (*killed.inputs, *last.inputs)] == [5, 0]
+    sent = Health(
+        header=Header("feeder", 0, ""),
+        stage="acquisition",
+        instance=TRAY_A,
+        status=StageStatus.OK,
+        t_ns=1,
+        uptime_s=0,
+        outputs=(Output(key=tray_key("s", TRAY_A, "raw"), published=5),),
+        process_id=1,
+    )
+    follower = replace(last, header=Header("follower", 0, ""), inputs=(), counters=(), lost=0, process_id=2)
+    killed = replace(killed, counters=(), lost=0)
+    launched = {(f"acquisition/{TRAY_A}", 1), ("resampler", 2), ("resampler", killed.process_id)}
+    assert losses([sent, killed, follower], launched)["resampler"] == 5
 
 
 def test_row_18_undecodable_bytes_of_a_stranger_are_counted_and_are_no_loss_of_the_stage(config):

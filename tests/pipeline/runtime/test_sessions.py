@@ -119,6 +119,7 @@ def test_row_07_where_two_run_the_samples_of_one_are_ignored_and_both_are_named(
     assert bench.next(Grid).t_ns.tolist() == [3], "the other has ended"
     bench.end()
     assert {c.name: c.value for c in refused.counters}["refused_of_second"] == 1
+    assert {line.producer: line.refused for line in refused.inputs} == {FIRST.producer: 1, SECOND.producer: 0}
 
 
 def test_row_07_alarms_of_a_second_scorer_are_not_shown(config):
