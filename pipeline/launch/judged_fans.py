@@ -13,6 +13,7 @@ from pipeline.bus.session import Bus
 from pipeline.config.models import TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.launch.site_state import StageState, Word
+from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import CodecError, decode
 from schemas.messages import InvalidReason, Score
 from schemas.topics import tray_key
@@ -48,8 +49,16 @@ class JudgedFans:
     """Listens to the scores of a site. Thread-safe."""
 
     def __init__(
-        self, bus: Bus, site: str, trays: Sequence[TrayConfig], now_s: Callable[[], float] = time.monotonic
+        self,
+        bus: Bus,
+        site: str,
+        trays: Sequence[TrayConfig],
+        watcher: SiteWatcher,
+        now_s: Callable[[], float] = time.monotonic,
     ) -> None:
+        """watcher: knows whose scores count."""
+        self._site = site
+        self._watcher = watcher
         self._trays = trays
         self._now_s = now_s
         self._lock = threading.Lock()
@@ -71,6 +80,8 @@ class JudgedFans:
             return
         judged_s = self._judged_s[tray]
         if not isinstance(score, Score) or score.fans != len(judged_s) or not len(score.valid):
+            return
+        if not self._watcher.counts(tray_key(self._site, tray, "score"), score.header.producer):
             return
         with self._lock:
             self._seen_s[tray] = now_s

@@ -19,6 +19,7 @@ from pipeline.launch.site_report import RunningProcess, SiteReport
 from pipeline.launch.site_state import site_states
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.launch.watchdog import Watchdog
+from pipeline.runtime.clock import REPLAY
 from schemas.messages import StageStatus
 from schemas.topics import alive_key
 
@@ -106,11 +107,12 @@ class Launcher:
         return self.outcome
 
     def _refuse_second_launcher(self, bus: Bus, stop: threading.Event) -> None:
-        """Refuse to start when stages of this site already run.
+        """Refuse to start when stages of this site already run, or where a replay presents the site and a device would.
 
         The process at the endpoint, if there is one, may belong to this site, to another, or be no stage at all.
         """
         ours = {alive_key(self._config.site, slot.row.stage, slot.row.instance): slot.row.label for slot in self._slots}
+        has_devices = any(not _listens_only(slot.row) for slot in self._slots)
         bus.wait_for_others(stop)
         until_s = time.monotonic() + _SEARCH_S
         while True:
@@ -119,6 +121,11 @@ class Launcher:
                 raise UserError(
                     f"site {self._config.site!r} already runs at {self._config.bus.endpoint} ({', '.join(running)}): "
                     "stop that, or give this one another site or bus.endpoint"
+                )
+            if has_devices and alive_key(self._config.site, REPLAY, "all") in alive:
+                raise UserError(
+                    f"a replay presents site {self._config.site!r} at {self._config.bus.endpoint}: stop it, leave "
+                    "acquisition out of launcher.stages, or give this one another site or bus.endpoint"
                 )
             if not bus.came_second or time.monotonic() >= until_s or stop.wait(_POLL_S):
                 return
@@ -131,7 +138,11 @@ class Launcher:
             if stop.is_set():
                 return
             for slot in reversed(group):
-                self._start(slot)
+                try:
+                    self._start(slot)
+                except OSError as error:
+                    why = f"{slot.row.label}: no process could be started: {_reason(error)}"
+                    raise UserError(f"{why}; free memory, or allow more processes and open files (ulimit)") from error
             self._wait_until_ready(group, stop)
         self._is_started = not stop.is_set()
 
@@ -159,6 +170,18 @@ class Launcher:
         self._watchdog.started(slot.row.label, time.monotonic())
         self._say(f"{slot.row.label}: started, process {slot.child.process_id}")
 
+    def _start_again(self, slot: _Slot, now: float) -> None:
+        try:
+            self._start(slot)
+        except OSError as error:
+            again = f"trying again in {slot.delay_s:.1f} s"
+            self._say(f"{slot.row.label}: no process could be started: {_reason(error)}; {again}")
+            self._delay_start(slot, now)
+
+    def _delay_start(self, slot: _Slot, now: float) -> None:
+        slot.start_at_s = now + slot.delay_s
+        slot.delay_s = min(2 * slot.delay_s, self._config.launcher.restart_delay_max_s)
+
     def _check_processes(self) -> None:
         """Notice stages that have died, and restart those that are due."""
         HOST_CLOCK.now_ns()  # it notices a step when it is read
@@ -166,7 +189,7 @@ class Launcher:
         for slot in self._slots:
             if slot.child is None:
                 if slot.start_at_s and now >= slot.start_at_s:
-                    self._start(slot)
+                    self._start_again(slot, now)
                 continue
             status = slot.child.exit_status()
             if status is None:
@@ -201,31 +224,36 @@ class Launcher:
 
     def _plan_restart(self, slot: _Slot, status: int, now: float) -> None:
         assert slot.child is not None
-        limits = self._config.launcher
         if now - slot.child.started_s > _STABLE_S:
-            slot.delay_s = limits.restart_delay_s
+            slot.delay_s = self._config.launcher.restart_delay_s
         how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
         self._say(f"{slot.row.label}: {slot.hung or how}, restarting in {slot.delay_s:.1f} s")
         slot.hung = ""
         self._watchdog.ended(slot.row.label)
         slot.child.notices.close()
         self.outcome.restarts[slot.row.label] = self.outcome.restarts.get(slot.row.label, 0) + 1
-        slot.child, slot.start_at_s = None, now + slot.delay_s
-        slot.delay_s = min(2 * slot.delay_s, limits.restart_delay_max_s)
+        slot.child = None
+        self._delay_start(slot, now)
 
     def _restart_those_down(self) -> None:
         """Start a stage that is down at the end once more: it requests what it missed, so nothing is lost."""
         started = [slot for slot in self._slots if slot.child or slot.start_at_s]
         down = [slot for slot in started if slot.child is None or slot.child.exit_status() is not None]
         for slot in down:
-            self._start(slot)
+            try:
+                self._start(slot)
+            except OSError as error:
+                slot.child = None
+                self.outcome.failed.append(slot.row.label)
+                why = f"no process could be started: {_reason(error)}"
+                self._say(f"{slot.row.label}: {why}; what it missed while it was down is lost")
         until_s = time.monotonic() + self._config.launcher.stop_timeout_s
         while time.monotonic() < until_s and not all(map(self._is_back, down)):
             time.sleep(_POLL_S)
 
     def _is_back(self, slot: _Slot) -> bool:
-        assert slot.child is not None
-        return slot.child.exit_status() is not None or self._watcher.is_ready(slot.child.process_id)
+        child = slot.child
+        return child is None or child.exit_status() is not None or self._watcher.is_ready(child.process_id)
 
     def _stop_all(self) -> None:
         """Stop in the order of the data flow: each stage ends when it has processed all that was sent to it."""
@@ -258,6 +286,10 @@ class Launcher:
             if time.monotonic() >= until_s:
                 return False
             time.sleep(_POLL_S)
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error)
 
 
 def _listens_only(row: StageProcess) -> bool:

@@ -13,14 +13,23 @@ class Notices:
     """The socket of one child. Only on Linux: its name is an abstract one, which leaves no file behind."""
 
     def __init__(self) -> None:
+        """Open the socket.
+
+        Raises:
+            OSError: the system is out of memory or open files.
+        """
         self.address = f"@fantwin-{os.getpid()}-{secrets.token_hex(8)}"
         """value of NOTIFY_SOCKET for the child"""
         self.is_ready = False
         self.status = ""
         """its last status line"""
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-        self._socket.bind(f"\0{self.address[1:]}")
+        try:
+            self._socket.setblocking(False)
+            self._socket.bind(f"\0{self.address[1:]}")
+        except OSError:
+            self._socket.close()
+            raise
 
     def read(self) -> bool:
         """Read all that has arrived; returns whether the child's main loop has run since the last call."""

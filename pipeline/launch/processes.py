@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -57,7 +58,11 @@ class Child:
         on_line: Callable[[StageProcess, str], None],
         clock_offset_ns: int,
     ) -> None:
-        """clock_offset_ns: of the time that it goes on with."""
+        """clock_offset_ns: of the time that it goes on with.
+
+        Raises:
+            OSError: the system has no room for another process; nothing is left of it.
+        """
         command = [sys.executable, "-P", "-m", "pipeline", "run", row.stage, "-c", str(config_path)]
         if row.tray:
             command += ["--tray", row.tray]
@@ -66,11 +71,27 @@ class Child:
         self.row = row
         self.started_s = time.monotonic()
         self.last_line = ""
+        self._on_line = on_line
         self.notices = Notices()
+        try:
+            self._process = self._started([*command, "--until-stdin-closes"], clock_offset_ns)
+        except OSError:
+            self.notices.close()
+            raise
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        try:
+            self._reader.start()
+        except RuntimeError as error:  # the limit of threads, which is that of processes
+            self._process.kill()
+            self._process.wait()
+            self.notices.close()
+            raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from error
+
+    def _started(self, command: list[str], clock_offset_ns: int) -> subprocess.Popen[str]:
         # a process group of its own, so that Ctrl-C in the terminal reaches only the launcher, which stops all;
         # the launcher holds standard input open: when the launcher ends, however it ends, the child stops too
-        self._process = subprocess.Popen(
-            [*command, "--until-stdin-closes"],
+        return subprocess.Popen(
+            command,
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
@@ -83,9 +104,6 @@ class Child:
                 CLOCK_VARIABLE: str(clock_offset_ns),
             },
         )
-        self._on_line = on_line
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
 
     @property
     def process_id(self) -> int:

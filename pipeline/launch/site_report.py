@@ -29,6 +29,8 @@ class SiteReport:
         self._say = say
         self._said: dict[str, str] = {}
         """by subject: the last report, without its figures; empty: all is well"""
+        self._alarms: dict[tuple[str, int], str] = {}
+        """by tray and fan: what was said of its alarm last"""
 
     def stages(self, states: Sequence[StageState], processes: Mapping[str, RunningProcess]) -> None:
         """Report how the stages have changed. processes: those that run and have been on the bus, by label; the
@@ -57,12 +59,12 @@ class SiteReport:
         return "silent: it hangs or is blocked"
 
     def alarms(self, alarms: Iterable[CurrentAlarm]) -> None:
-        """Say how the alarms have changed."""
+        """Say how the alarms have changed. alarms: the current one of each fan that had one."""
+        before, self._alarms = self._alarms, {}
         for current in alarms:
-            alarm, line = current.newest, current.line()
-            subject = f"{alarm.header.tray} fan {alarm.fan}"
-            if line != self._said.get(subject):
-                self._said[subject] = line
+            fan, line = (current.newest.header.tray, current.newest.fan), current.line()
+            self._alarms[fan] = line
+            if line != before.get(fan):
                 self._say(line)
 
     def _change(self, subject: str, fault: str, when_over: str, name: str = "") -> None:

@@ -7,20 +7,24 @@ import threading
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from itertools import chain
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import NAME_PATTERN
+from pipeline.launch.known_sessions import KnownSessions
 from pipeline.launch.loss_accounting import Launched, label, losses
 from pipeline.launch.refused_messages import refused
-from pipeline.runtime.sessions import Sessions
+from pipeline.launch.watched_alarms import WatchedAlarms
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Health
 from schemas.topics import alive_key, health_key, sessions_key, tray_key
 from schemas.units import NS_PER_S
-from scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence
+from scoring.alarms.current_alarms import CurrentAlarm
 
 MOST_WATCHED_SESSIONS = 1000
 """so many last healths are kept; of more, those heard longest ago are forgotten, those of launched sessions last"""
+MOST_UNKNOWN_SESSIONS = 64
+"""producers without a token of a session whose health is kept; those heard longest ago are forgotten first"""
 
 
 @dataclass(frozen=True)
@@ -49,20 +53,31 @@ class StageView:
         return (now - count(self.previous)) / ((self.health.t_ns - self.previous.t_ns) / NS_PER_S)
 
 
+@dataclass(frozen=True, slots=True)
+class _Heard:
+    """The last health of a session, the one before, and when the last was heard, of a monotonic clock in s."""
+
+    health: Health
+    previous: Health | None
+    heard_s: float
+
+
 class SiteWatcher:
-    """Keeps the last health of each session, and the messages about the last alarm of each fan. Thread-safe."""
+    """Keeps the last health of each session, and the last alarm of each fan. Thread-safe.
+
+    Whoever is no session of the site is not shown and not counted: `pipeline.launch.known_sessions`.
+    """
 
     def __init__(self, bus: Bus, site: str) -> None:
         self._bus = bus
         self._site = site
         self._lock = threading.Lock()
-        self._healths: dict[str, tuple[Health, Health | None, float]] = {}
-        """by producer: the last health and the one before, and when the last was heard, of a monotonic clock in s"""
-        self._launched: set[Launched] = set()
-        self._alive: set[str] = set()
-        self._sessions = Sessions()
-        self._alarms: dict[tuple[str, int], dict[tuple[str, int], Alarm]] = {}
-        """by fan: the messages about its last occurrence, by producer and sequence number"""
+        self._sessions = KnownSessions()
+        self._healths: dict[str, _Heard] = {}
+        """by producer, in the order heard: of the sessions that have shown their token"""
+        self._unknown: dict[str, _Heard] = {}
+        """the same of others: their token may still be on its way"""
+        self._alarms = WatchedAlarms(self._sessions.is_known)
         bus.watch_alive(alive_key(site, "*", "*"), self._on_liveness)
         bus.watch_alive(sessions_key(site), self._on_session)
         bus.subscribe(health_key(site, "*", "*"), self._on_health)
@@ -75,25 +90,32 @@ class SiteWatcher:
             self._on_alarm(its_key, payload)
 
     def stages(self) -> list[StageView]:
-        """The latest session of every stage instance, by name."""
+        """The latest session of every stage instance, by name; one whose token is there, if there is one."""
         with self._lock:
             latest: dict[tuple[str, str], StageView] = {}
-            for health, previous, heard_s in self._healths.values():  # as heard: a host's clock may be set back
-                if self._sessions.is_ignored(health.header.producer):
+            at_work = self._sessions.alive()
+            heard = self._believed()  # as heard: a host's clock may be set back
+            for each in sorted(heard, key=lambda each: self._sessions.is_alive(each.health.header.producer)):
+                if self._sessions.is_ignored(each.health.header.producer):
                     continue
-                alive = alive_key(self._site, health.stage, health.instance) in self._alive
-                age_s = time.monotonic() - heard_s
-                latest[health.stage, health.instance] = StageView(health, previous, alive, age_s)
+                name = (each.health.stage, each.health.instance)
+                age_s = time.monotonic() - each.heard_s
+                latest[name] = StageView(each.health, each.previous, name in at_work, age_s)
             return [latest[name] for name in sorted(latest)]
 
     def alive(self) -> set[tuple[str, str]]:
         """Stage and instance of each session that is on the bus now."""
         with self._lock:
-            return {(stage, instance) for *_, stage, instance in (key.split("/") for key in self._alive)}
+            return self._sessions.alive()
 
     def is_ready(self, process_id: int) -> bool:
         """Whether the session of this process is alive and at work."""
         return any(view.alive and view.health.process_id == process_id for view in self.stages())
+
+    def counts(self, key: str, producer: str) -> bool:
+        """Whether a message of this producer on this key is one of the site."""
+        with self._lock:
+            return self._sessions.counts(key, producer)
 
     def alarms(self) -> list[Alarm]:
         """The last alarm message of every fan that had one, oldest first."""
@@ -102,63 +124,76 @@ class SiteWatcher:
     def current_alarms(self) -> list[CurrentAlarm]:
         """The current alarm of each fan that had one, by tray and fan."""
         with self._lock:
-            return current_alarms(alarm for messages in self._alarms.values() for alarm in messages.values())
+            self._alarms.drop(self._is_of_stranger)  # the session that publishes there may have been heard after it
+            return self._alarms.current()
 
     def add_launched(self, session: Launched) -> None:
         """Register a session that this process has started: a flood of others does not displace what it lost."""
         with self._lock:
-            self._launched.add(session)
+            self._sessions.add_launched(session)
 
     def last_health(self, session: Launched) -> Health | None:
         """The last health of a session; None if none has been heard."""
         with self._lock:
-            found = (health for health, _, _ in self._healths.values() if _session(health) == session)
-            return next(found, None)
+            healths = [each.health for each in self._believed()]
+        return next((health for health in healths if (label(health), health.process_id) == session), None)
 
     def losses(self, launched: Collection[Launched] | None = None) -> dict[str, int]:
         """What every stage has lost, over all its sessions; see `pipeline.launch.loss_accounting`."""
         with self._lock:
-            return losses((health for health, _, _ in self._healths.values()), launched)
+            return losses((each.health for each in self._believed()), launched)
 
     def refused(self) -> dict[str, dict[str, int]]:
         """What every stage has refused, over all its sessions; see `pipeline.launch.refused_messages`."""
         with self._lock:
-            return refused(health for health, _, _ in self._healths.values())
+            return refused(each.health for each in self._believed())
+
+    def _believed(self) -> list[_Heard]:
+        every = chain(self._unknown.values(), self._healths.values())
+        return [each for each in every if self._sessions.is_health_of_stage(each.health)]
+
+    def _is_of_stranger(self, alarm: Alarm) -> bool:
+        return self._sessions.is_stranger(_alarm_key(self._site, alarm.header.tray), alarm.header.producer)
 
     def _on_liveness(self, key: str, alive: bool) -> None:
         with self._lock:
-            (self._alive.add if alive else self._alive.discard)(key)
+            self._sessions.update_stage(key, alive)
 
     def _on_session(self, key: str, alive: bool) -> None:
         with self._lock:
-            self._sessions.update(key, alive)
+            session = self._sessions.update(key, alive)
+            if session and (heard := self._unknown.pop(session.producer, None)):
+                self._keep(heard)
 
     def _on_health(self, key: str, payload: bytes) -> None:
         health = _decoded(Health, payload)
         if isinstance(health, Health) and key == health_key(self._site, health.stage, health.instance):
             with self._lock:
-                before = self._healths.pop(health.header.producer, None)
-                self._healths[health.header.producer] = (health, before[0] if before else None, time.monotonic())
-                if len(self._healths) > MOST_WATCHED_SESSIONS:
-                    others = (name for name, each in self._healths.items() if _session(each[0]) not in self._launched)
-                    del self._healths[next(others, next(iter(self._healths)))]
+                self._sessions.add_health(health)
+                before = self._healths.get(health.header.producer) or self._unknown.get(health.header.producer)
+                self._keep(_Heard(health, before.health if before else None, time.monotonic()))
+
+    def _keep(self, heard: _Heard) -> None:
+        producer = heard.health.header.producer
+        if not self._sessions.is_known(producer):
+            self._unknown.pop(producer, None)
+            self._unknown[producer] = heard
+            if len(self._unknown) > MOST_UNKNOWN_SESSIONS:
+                del self._unknown[next(iter(self._unknown))]
+        elif self._sessions.is_health_of_stage(heard.health):
+            self._healths.pop(producer, None)
+            self._healths[producer] = heard
+            if len(self._healths) > MOST_WATCHED_SESSIONS:
+                others = (of for of, each in self._healths.items() if not self._sessions.is_launched(each.health))
+                del self._healths[next(others, next(iter(self._healths)))]
 
     def _on_alarm(self, key: str, payload: bytes) -> None:
         """A message without a producer (empty bytes decode as one), or of another tray than its key, is ignored."""
         alarm = _decoded(Alarm, payload)
         if isinstance(alarm, Alarm) and alarm.header.producer and key == _alarm_key(self._site, alarm.header.tray):
             with self._lock:
-                if self._sessions.is_ignored(alarm.header.producer):
-                    return
-                messages = self._alarms.setdefault((alarm.header.tray, alarm.fan), {})
-                messages[alarm.header.producer, alarm.header.sequence] = alarm
-                newest = in_sequence(messages.values())[-1]
-                for name in [name for name, each in messages.items() if each.onset_t_ns != newest.onset_t_ns]:
-                    del messages[name]
-
-
-def _session(health: Health) -> Launched:
-    return label(health), health.process_id
+                if self._sessions.counts(key, alarm.header.producer):
+                    self._alarms.add(alarm, len(payload))
 
 
 def _alarm_key(site: str, tray: str) -> str:

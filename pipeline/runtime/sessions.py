@@ -17,9 +17,11 @@ from collections.abc import Set
 from dataclasses import dataclass
 
 from pipeline.bus.session import Bus
+from pipeline.config.registry import STAGES
+from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.stage import StageError
 from schemas.messages import Health
-from schemas.topics import SESSION_CHUNK, health_key, sessions_key
+from schemas.topics import SESSION_CHUNK, alive_key, health_key, sessions_key
 
 GOSSIP_S = 0.2
 """how long a starting stage waits for further processes after it has met the first: they took 6 ms"""
@@ -149,17 +151,25 @@ class Sessions:
 
 
 def refuse_second(bus: Bus, site: str, session: Session, stop: threading.Event) -> None:
-    """Return if no other process runs this stage; wait a moment for one that is about to leave.
+    """Return if no other process runs this stage, and no replay presents the site to a stage with a device; wait a
+    moment for one that is about to leave.
 
     Raises:
         StageError: one does.
         BusError: a program that is not fantwin listens at the endpoint.
     """
+    replay = alive_key(site, REPLAY, "all") if STAGES[session.stage].scope == "tray" else ""
     bus.wait_for_others(stop)
     met_s = time.monotonic()
-    while time.monotonic() - met_s < (LEAVING_LIMIT_S if (others := _others(bus, site, session)) else GOSSIP_S):
-        if not bus.came_second or stop.wait(_POLL_S):
+    while True:
+        others, is_replayed = _others(bus, site, session), bool(replay and bus.alive(replay))
+        limit_s = LEAVING_LIMIT_S if others or is_replayed else GOSSIP_S
+        if time.monotonic() - met_s >= limit_s or not bus.came_second or stop.wait(_POLL_S):
             break
+    if is_replayed:
+        raise StageError(
+            f"a replay presents site {site!r}: stop it, or give {session.name} another site or bus.endpoint"
+        )
     if others:
         raise StageError(
             f"{session.name} of site {site!r} already runs: {others[0].process}; stop that, or give this one another "

@@ -6,7 +6,7 @@ the same occurrence, which tray, fan and onset identify.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -110,20 +110,37 @@ def in_sequence(messages: Iterable[Alarm]) -> list[Alarm]:
     return [of_producer[alarm.header.producer].pop() for alarm in received]
 
 
-def _current(messages: list[Alarm]) -> CurrentAlarm:
-    newest = messages[-1]
-    occurrence = [alarm for alarm in messages if alarm.onset_t_ns == newest.onset_t_ns]
-    describing = [alarm for alarm in occurrence if alarm.transition in _DESCRIBES_THE_FAN]
-    names = [
-        alarm.operator_name
-        for alarm in occurrence
-        if alarm.transition in _NAMES_WHO_ACKNOWLEDGED and alarm.acknowledged
-    ]
+def needed(messages: Sequence[Alarm]) -> list[Alarm]:
+    """Of the messages about a fan, in sequence, the few from which its current alarm follows; the others never matter
+    again, whatever is published next."""
+    parts = _parts(messages)
+    return [alarm for alarm in messages if alarm in parts]
+
+
+def _current(messages: Sequence[Alarm]) -> CurrentAlarm:
+    newest, describing, with_causes, acknowledging = _parts(messages)
     return CurrentAlarm(
         newest,
-        message=describing[-1].message if describing else "",
-        causes=next((alarm.causes for alarm in reversed(occurrence) if alarm.causes), ()),
-        acknowledged_by=names[-1] if names and newest.acknowledged else "",
+        message=describing.message if describing else "",
+        causes=with_causes.causes if with_causes else (),
+        acknowledged_by=acknowledging.operator_name if acknowledging and newest.acknowledged else "",
+    )
+
+
+def _parts(messages: Sequence[Alarm]) -> tuple[Alarm, Alarm | None, Alarm | None, Alarm | None]:
+    """The newest message, and of its occurrence the last that describes the fan, the last with causes, and the last
+    that says who acknowledged it."""
+    newest = messages[-1]
+    occurrence = [alarm for alarm in messages if alarm.onset_t_ns == newest.onset_t_ns]
+
+    def last(applies: Callable[[Alarm], object]) -> Alarm | None:
+        return next((alarm for alarm in reversed(occurrence) if applies(alarm)), None)
+
+    return (
+        newest,
+        last(lambda alarm: alarm.transition in _DESCRIBES_THE_FAN),
+        last(lambda alarm: alarm.causes),
+        last(lambda alarm: alarm.acknowledged and alarm.transition in _NAMES_WHO_ACKNOWLEDGED),
     )
 
 

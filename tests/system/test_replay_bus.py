@@ -282,12 +282,34 @@ def test_replay_beside_a_stage_that_writes_the_same_topic_is_refused_with_the_fr
 
 
 def test_a_stage_that_comes_later_and_writes_the_same_ends_the_replay(site, tmp_path):
-    replay = RunningCommand(site.words(write_raw(tmp_path / "source.mcap", 3000), "--topics", "raw,command"))
+    replay = RunningCommand(site.words(write_raw(tmp_path / "source.mcap", 3000), "--topics", "raw,grid"))
     site.running.append(replay)
     site.next(Clock)
-    site.start(f"acquisition/{TRAY}")
+    site.start("resampler")
     assert replay.process.wait(DEADLINE_S) == 1
-    assert "recorded commands are not for the fans of today" in replay.lines[-1]
+    assert "resampler of site 'demo' is running and writes grid itself" in replay.lines[-1]
+
+
+def test_row_07_beside_a_replay_neither_a_site_nor_an_acquisition_starts_and_the_replay_goes_on(site, tmp_path):
+    words = site.words(write_raw(tmp_path / "source.mcap", 500), "--rate", 0.01)
+    replay = RunningCommand(words)
+    site.running.append(replay)
+    site.next(Clock)
+    up = fantwin(*site.chain.words("up"))
+    acquisition = fantwin("run", "acquisition", *site.chain.words("")[1:])
+    assert (up.returncode, acquisition.returncode) == (1, 1)
+    endpoint = site.chain.endpoint
+    assert up.stderr == (
+        f"fantwin: a replay presents site 'demo' at {endpoint}: stop it, leave acquisition out of launcher.stages, or "
+        "give this one another site or bus.endpoint\n"
+    )
+    assert acquisition.stderr == (
+        "fantwin: a replay presents site 'demo': stop it, or give acquisition/tray1 another site or bus.endpoint\n"
+    )
+    while not site.heard[Clock].empty():
+        site.next(Clock)
+    site.next(Clock)
+    assert replay.end() == 0
 
 
 def test_a_replay_without_listeners_is_reported_with_the_endpoint(tmp_path, endpoint):

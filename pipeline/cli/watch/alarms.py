@@ -122,12 +122,14 @@ def alarms(
 def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, watch: bool, json_output: bool) -> None:
     key = tray_key(config.site, "*", "alarm")
     news: queue.Queue[Alarm] = queue.Queue()
-    bus.subscribe(key, lambda _key, payload: _decoded(payload, news.put))
-    watcher, judged = SiteWatcher(bus, config.site), JudgedFans(bus, config.site, config.trays)
+    bus.subscribe(key, lambda its_key, payload: _decoded(config.site, its_key, payload, news.put))
+    watcher = SiteWatcher(bus, config.site)
+    judged = JudgedFans(bus, config.site, config.trays, watcher)
     wait_for_stages(bus, watcher, config, stop)
     known: list[Alarm] = []
-    for _, payload in bus.recover(key):
-        _decoded(payload, known.append)
+    for its_key, payload in bus.recover(key):
+        _decoded(config.site, its_key, payload, known.append)
+    known = [alarm for alarm in known if _counts(watcher, config.site, alarm)]
     found = [each for each in current_alarms(sorted(known, key=newest_t_ns)) if show_all or is_listed(each.newest)]
     console = Console(soft_wrap=True, highlight=False)
     unjudged = _wait_until_judged(watcher, judged, config, stop)
@@ -147,7 +149,8 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
             alarm = news.get(timeout=0.1)
         except queue.Empty:
             continue
-        if (alarm.header.producer, alarm.header.sequence, alarm.header.tray) in names:
+        is_listed_already = (alarm.header.producer, alarm.header.sequence, alarm.header.tray) in names
+        if is_listed_already or not _counts(watcher, config.site, alarm):
             continue
         if json_output:
             typer.echo(json.dumps({"transition": _word(alarm), **_alone(alarm).as_json()}))
@@ -238,14 +241,20 @@ def _granted(alarm: Alarm) -> str:
     return f"fan {alarm.fan}: shelved {until(alarm)}" if alarm.transition == Transition.SHELVED else alarm.message
 
 
-def _decoded(payload: bytes, then: Callable[[Alarm], None]) -> None:
-    """Unreadable messages are skipped here; the stages count them."""
+def _decoded(site: str, key: str, payload: bytes, then: Callable[[Alarm], None]) -> None:
+    """Unreadable messages, and those of another tray than their key says, are skipped; the stages count them."""
     try:
         alarm = decode(Alarm, payload)
     except CodecError:
         return
     assert isinstance(alarm, Alarm)
-    then(alarm)
+    if key == tray_key(site, alarm.header.tray, "alarm"):
+        then(alarm)
+
+
+def _counts(watcher: SiteWatcher, site: str, alarm: Alarm) -> bool:
+    """Whether an alarm is one of the site, not of a stranger."""
+    return watcher.counts(tray_key(site, alarm.header.tray, "alarm"), alarm.header.producer)
 
 
 def _alone(alarm: Alarm) -> CurrentAlarm:

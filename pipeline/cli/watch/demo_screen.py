@@ -27,7 +27,7 @@ class DemoScreen:
         self._config = config
         self._tray = config.trays[0]
         self._watcher = SiteWatcher(bus, config.site)
-        self._judged = JudgedFans(bus, config.site, config.trays)
+        self._judged = JudgedFans(bus, config.site, config.trays, self._watcher)
         self._score: Score | None = None
         bus.subscribe(tray_key(config.site, self._tray.name, "score"), self._on_score)
 

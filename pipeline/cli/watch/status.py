@@ -59,7 +59,7 @@ def status(
     stop_on_signals(stop)
     with Bus(settings.bus, listens=False) as bus:
         watcher = SiteWatcher(bus, settings.site)
-        judged = JudgedFans(bus, settings.site, settings.trays)
+        judged = JudgedFans(bus, settings.site, settings.trays, watcher)
         if once or json_output or not sys.stdout.isatty():
             _listen(watcher, settings, judged, stop)
             watcher.ask_for_past_alarms()

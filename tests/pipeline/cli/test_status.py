@@ -89,7 +89,7 @@ class Site:
     def judged(self, *reasons: InvalidReason) -> JudgedFans:
         """What a listener knows after a score; reasons: why fans are not judged, beginning with fan 0."""
         config = load_config(DEMO / "demo.toml")
-        listener = JudgedFans(self.outside, SITE, config.trays)
+        listener = JudgedFans(self.outside, SITE, config.trays, SiteWatcher(self.outside, SITE))
 
         def heard() -> bool:
             self.score.put(encode(one_sample(FANS, *reasons)))
@@ -269,7 +269,7 @@ def test_a_stage_that_vanished_is_shown_as_gone(site):
     view(site, watcher, HEALTH)
     site.buses[0].close()
     eventually(lambda: not watcher.stages()[0].alive, "the watcher sees it go")
-    text = shown(watcher, JudgedFans(site.outside, SITE, load_config(DEMO / "demo.toml").trays))
+    text = shown(watcher, JudgedFans(site.outside, SITE, load_config(DEMO / "demo.toml").trays, watcher))
     assert "gone" in text
     assert "no stage of site 'demo' answers at tcp/" in text
     assert "alarms unknown: no scorer is alive" in text
@@ -279,7 +279,8 @@ def test_a_stage_that_vanished_is_shown_as_gone(site):
 def test_without_running_stages_no_table_is_shown_and_alarms_are_unknown(endpoint):
     with Bus(BusConfig(endpoint=endpoint)) as bus:
         trays = load_config(DEMO / "demo.toml").trays
-        text = shown(SiteWatcher(bus, SITE), JudgedFans(bus, SITE, trays))
+        watcher = SiteWatcher(bus, SITE)
+        text = shown(watcher, JudgedFans(bus, SITE, trays, watcher))
     assert "no stage of site 'demo' answers at tcp/" in text
     assert "alarms unknown: no scorer is alive" in text
     assert "stages" not in text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -9,9 +10,11 @@ import pytest
 from pipeline.config.models import TrayConfig
 from pipeline.launch.judged_fans import JUDGED_WITHIN_S, JudgedFans
 from pipeline.launch.site_state import StageState, Word
+from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import encode
-from schemas.messages import InvalidReason
-from tests.pipeline.launch.test_site_watcher import StubBus
+from schemas.messages import Header, InvalidReason, Output
+from schemas.topics import tray_key
+from tests.pipeline.launch.test_site_watcher import SCORER, STRANGER, StubBus, health
 from tests.support.score_data import one_sample
 
 FANS = 4
@@ -22,13 +25,13 @@ class Listener:
     """Fans of two trays, and a clock that the test sets."""
 
     def __init__(self) -> None:
-        bus: Any = StubBus()
+        self.bus: Any = StubBus()
         self.now_s = 100.0
-        self.judged = JudgedFans(bus, "s", TRAYS, lambda: self.now_s)
+        self.judged = JudgedFans(self.bus, "s", TRAYS, SiteWatcher(self.bus, "s"), lambda: self.now_s)
 
-    def score(self, tray: str, *reasons: InvalidReason) -> None:
+    def score(self, tray: str, *reasons: InvalidReason, producer: str = "") -> None:
         self.now_s += 1.0
-        self.judged.add(tray, encode(one_sample(FANS, *reasons)))
+        self.judged.add(tray, encode(replace(one_sample(FANS, *reasons), header=Header(producer, 0, tray))))
 
     def lines(self, *states: StageState) -> list[str]:
         return [each.line() for each in self.judged.unjudged(states)]
@@ -64,6 +67,15 @@ def test_a_fan_with_one_invalid_sample_is_still_judged(listener):
     listener.score("b")
     listener.score("a", InvalidReason.GAP)
     assert listener.lines() == []
+
+
+def test_row_11_a_score_of_a_stranger_judges_no_fan_while_the_scorer_is_alive(listener):
+    listener.bus.show(SCORER)
+    outputs = tuple(Output(key=tray_key("s", tray.name, "score"), published=0) for tray in TRAYS)
+    listener.bus.say(health(SCORER, outputs=outputs))
+    listener.score("a", producer=STRANGER)
+    listener.score("b", producer=SCORER.producer)
+    assert listener.lines() == ["a: no fan is judged: no score arrives"]
 
 
 def test_row_01_without_scores_the_first_stage_that_does_not_work_is_the_reason(listener):

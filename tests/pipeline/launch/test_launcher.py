@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import threading
 from collections.abc import Iterator
@@ -15,9 +17,12 @@ from pipeline.config.loading import load_config
 from pipeline.devices.host_clock import VARIABLE as CLOCK_VARIABLE
 from pipeline.errors import UserError
 from pipeline.launch.launcher import Launcher, Outcome
+from pipeline.launch.notices import Notices
 from pipeline.launch.processes import Child, process_list
+from pipeline.launch.site_watcher import SiteWatcher
 from schemas.messages import Header, Health, StageStatus
 from schemas.topics import alive_key
+from tests.pipeline.launch.test_site_watcher import StubBus
 from tests.support.running_chain import DEMO, SITE, Chain, fantwin
 
 HEALTH = Health(
@@ -83,9 +88,10 @@ def test_row_18_stopped_before_all_are_ready_no_source_is_started_and_no_stage_h
 
 
 class LateBus:
-    """A bus that discovers the sessions of `site` `after_s` seconds late. Its clock advances while it is waited for."""
+    """A bus that discovers a stage of `site` `after_s` seconds late. Its clock advances while it is waited for."""
 
-    def __init__(self, site: str, after_s: float, *, came_second: bool = True) -> None:
+    def __init__(self, site: str, after_s: float, *, came_second: bool = True, stage: str = "scorer") -> None:
+        self._stage = stage
         self.came_second = came_second
         self.now_s = 100.0
         self._discovered_s = 100.0 + after_s
@@ -103,13 +109,13 @@ class LateBus:
         """One has been met."""
 
     def alive(self, _key: str) -> set[str]:
-        return {alive_key(self._site, "scorer", "all")} if self.now_s >= self._discovered_s else set()
+        return {alive_key(self._site, self._stage, "all")} if self.now_s >= self._discovered_s else set()
 
 
-def search_time_s(bus: Any, monkeypatch: pytest.MonkeyPatch, mode: str = "peer") -> float:
+def search_time_s(bus: Any, monkeypatch: pytest.MonkeyPatch, *settings: str) -> float:
     """How long the launcher searched for another one in vain."""
     monkeypatch.setattr("pipeline.launch.launcher.time", bus)
-    config = load_config(DEMO / "demo.toml", [f"bus.mode='{mode}'"])
+    config = load_config(DEMO / "demo.toml", settings)
     Launcher(config, (), lambda _line: None)._refuse_second_launcher(bus, bus)
     return bus.now_s - 100.0
 
@@ -118,11 +124,111 @@ def test_a_second_launcher_searches_for_stages_of_its_site_for_two_seconds(monke
     with pytest.raises(UserError, match=r"site 'demo' already runs at \S+ \(scorer\): stop that"):
         search_time_s(LateBus(SITE, after_s=1.5), monkeypatch)
     assert search_time_s(LateBus(SITE, after_s=99.0), monkeypatch) == pytest.approx(2.0, abs=0.1)
-    assert search_time_s(LateBus("other", after_s=0.0), monkeypatch, mode="client") == pytest.approx(2.0, abs=0.1)
+    assert search_time_s(LateBus("other", after_s=0.0), monkeypatch, "bus.mode='client'") == pytest.approx(2.0, abs=0.1)
 
 
 def test_the_first_launcher_does_not_search(monkeypatch):
     assert search_time_s(LateBus(SITE, after_s=1.0, came_second=False), monkeypatch) == 0.0
+
+
+def test_row_07_a_launcher_is_refused_where_a_replay_presents_its_site_unless_it_starts_no_device(monkeypatch):
+    with pytest.raises(UserError, match=r"^a replay presents site 'demo' at \S+: stop it, leave acquisition out of "):
+        search_time_s(LateBus(SITE, after_s=1.5, stage="replay"), monkeypatch)
+    without_device = "launcher.stages=['scorer', 'viewer']"
+    searched_s = search_time_s(LateBus(SITE, after_s=1.5, stage="replay"), monkeypatch, without_device)
+    assert searched_s == pytest.approx(2.0, abs=0.1)
+
+
+class NoRoom:
+    """A system that can start no process until `has_room`."""
+
+    def __init__(self) -> None:
+        self.has_room = False
+
+    def __call__(self, *_arguments: object) -> Any:
+        if not self.has_room:
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        return EndedChild()
+
+
+@pytest.fixture
+def no_room(monkeypatch: pytest.MonkeyPatch) -> NoRoom:
+    no_room = NoRoom()
+    monkeypatch.setattr("pipeline.launch.launcher.Child", no_room)
+    monkeypatch.setattr(Launcher, "_is_back", lambda *_: True)
+    return no_room
+
+
+def recorder_only(lines: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[Launcher, Any, Any]:
+    """A launcher of one stage, its clock, and its only slot."""
+    bus: Any = LateBus(SITE, 0.0)
+    bus.sleep = bus.wait
+    monkeypatch.setattr("pipeline.launch.launcher.time", bus)
+    settings = ["launcher.stages=['recorder']", "launcher.restart_delay_s=1.0", "launcher.restart_delay_max_s=3.0"]
+    launcher = Launcher(load_config(DEMO / "demo.toml", settings), (), lines.append)
+    launcher._watcher = SiteWatcher(cast("Any", StubBus()), SITE)
+    (slot,) = launcher._slots
+    return launcher, bus, slot
+
+
+def test_a_stage_for_which_there_is_no_process_is_started_later(monkeypatch, no_room):
+    lines: list[str] = []
+    launcher, clock, slot = recorder_only(lines, monkeypatch)
+    slot.start_at_s = clock.now_s
+    for _ in range(5):
+        launcher._check_processes()
+        clock.now_s += 1.0
+    no_room.has_room = True
+    clock.now_s += 3.0
+    launcher._check_processes()
+    failed = "recorder: no process could be started: Resource temporarily unavailable; trying again in"
+    assert lines == [f"{failed} 1.0 s", f"{failed} 2.0 s", f"{failed} 3.0 s", "recorder: started, process 7"]
+    assert slot.sessions == [("recorder", 7)]
+
+
+def test_a_stage_for_which_there_is_no_process_at_the_end_has_failed(monkeypatch, no_room):
+    lines: list[str] = []
+    launcher, clock, slot = recorder_only(lines, monkeypatch)
+    slot.start_at_s = clock.now_s
+    launcher._restart_those_down()
+    launcher._stop_all()
+    why = "no process could be started: Resource temporarily unavailable"
+    assert lines == [f"recorder: {why}; what it missed while it was down is lost"]
+    assert launcher.outcome.failed == ["recorder"]
+
+
+def test_a_site_for_which_there_is_no_process_is_refused_in_one_line(monkeypatch, no_room):
+    launcher, _, _ = recorder_only([], monkeypatch)
+    with pytest.raises(UserError, match="^recorder: no process could be started: Resource .* unavailable; free "):
+        launcher._start_all(threading.Event())
+
+
+@pytest.mark.parametrize("fails", ["Popen", "Thread"])
+def test_of_a_process_that_could_not_be_started_nothing_is_left(monkeypatch, fails):
+    closed, killed = [], []
+
+    class Pipe:
+        def kill(self) -> None:
+            killed.append(True)
+
+        def wait(self) -> None:
+            """It has ended."""
+
+    def start(*_arguments: object, **_more: object) -> Any:
+        if fails == "Popen":
+            raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+        return Pipe()
+
+    def start_thread(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    config = load_config(DEMO / "demo.toml")
+    monkeypatch.setattr(subprocess, "Popen", start)
+    monkeypatch.setattr(threading.Thread, "start", start_thread)
+    monkeypatch.setattr(Notices, "close", lambda _notices: closed.append(True))
+    with pytest.raises(OSError, match="Cannot allocate memory|Resource temporarily unavailable"):
+        Child(process_list(config)[0], config.path, (), lambda _row, _line: None, 0)
+    assert (closed, killed) == ([True], [True] if fails == "Thread" else [])
 
 
 class EndedChild:
@@ -130,6 +236,9 @@ class EndedChild:
 
     process_id = 7
     last_line = ""
+
+    def exit_status(self) -> int:
+        return 0
 
     def stop(self, _timeout_s: float) -> int:
         return 0

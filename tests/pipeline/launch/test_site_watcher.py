@@ -8,11 +8,17 @@ from typing import Any
 
 import pytest
 
-from pipeline.launch.site_watcher import MOST_WATCHED_SESSIONS, SiteWatcher
+from pipeline.launch.site_watcher import MOST_UNKNOWN_SESSIONS, MOST_WATCHED_SESSIONS, SiteWatcher
+from pipeline.launch.watched_alarms import MOST_WATCHED_FANS, WATCHED_BYTES
+from pipeline.runtime.sessions import Session
 from schemas.codec import encode
-from schemas.messages import Alarm, Header, Health, StageStatus
-from schemas.topics import health_key, tray_key
+from schemas.messages import Alarm, Diagnosis, Header, Health, Output, Severity, StageStatus, Transition
+from schemas.topics import alive_key, health_key, sessions_key, tray_key
+from scoring.alarms import current_alarms
 from tests.support.bus_peer import alarm
+
+KEY = tray_key("s", "tray", "alarm")
+STRANGER = "nobody"
 
 
 class StubBus:
@@ -20,16 +26,175 @@ class StubBus:
 
     def __init__(self) -> None:
         self.subscribers: dict[str, Callable[[str, bytes], None]] = {}
+        self.watched: dict[str, Callable[[str, bool], None]] = {}
         self.kept: list[tuple[str, bytes]] = []
 
     def subscribe(self, key: str, on_message: Callable[[str, bytes], None]) -> None:
         self.subscribers[key] = on_message
 
     def watch_alive(self, key: str, on_change: Callable[[str, bool], None]) -> None:
-        self.on_alive = on_change
+        self.watched[key] = on_change
 
     def recover(self, *_args: Any) -> Iterator[tuple[str, bytes]]:
         yield from self.kept
+
+    def say(self, message: Health) -> None:
+        key = health_key("s", message.stage, message.instance)
+        self.subscribers[health_key("s", "*", "*")](key, encode(message))
+
+    def raise_alarm(self, message: Alarm) -> None:
+        self.subscribers[tray_key("s", "*", "alarm")](KEY, encode(message))
+
+    def show(self, session: Session, *, alive: bool = True) -> None:
+        """Show the tokens of a session, or let them go."""
+        self.watched[sessions_key("s")](session.key("s"), alive)
+        self.watched[alive_key("s", "*", "*")](alive_key("s", session.stage, session.instance), alive)
+
+
+def session(stage: str, number: int) -> Session:
+    return Session(stage, "all", number, f"{stage}-all-{number}", "host", number)
+
+
+def health(of: Session, t_ns: int = 1, **more: Any) -> Health:
+    fields: dict[str, Any] = {"status": StageStatus.OK, "t_ns": t_ns, "uptime_s": 0.0, "process_id": of.process_id}
+    return Health(header=Header(of.producer, 0, ""), stage=of.stage, instance=of.instance, **fields | more)
+
+
+def of(producer: str, sequence: int = 0, **more: Any) -> Alarm:
+    return replace(alarm(0), header=Header(producer, sequence, "tray"), **more)
+
+
+SCORER = session("scorer", 1)
+
+
+@pytest.fixture
+def bus() -> Any:
+    return StubBus()
+
+
+@pytest.fixture
+def watcher(bus: Any) -> SiteWatcher:
+    """Of a site on which a scorer is at work."""
+    watcher = SiteWatcher(bus, "s")
+    bus.show(SCORER)
+    bus.say(health(SCORER, outputs=(Output(key=KEY, published=0),)))
+    return watcher
+
+
+def fans(watcher: SiteWatcher) -> list[int]:
+    return [current.newest.fan for current in watcher.current_alarms()]
+
+
+def test_row_11_an_alarm_of_a_stranger_is_not_shown_while_the_scorer_is_alive(bus, watcher):
+    bus.raise_alarm(of(STRANGER))
+    assert fans(watcher) == []
+    bus.raise_alarm(of(SCORER.producer, fan=3))
+    assert fans(watcher) == [3]
+
+
+def test_row_11_an_alarm_of_a_stranger_that_came_before_the_scorer_was_heard_is_not_shown_after_it(bus):
+    watcher = SiteWatcher(bus, "s")
+    bus.raise_alarm(of(STRANGER))
+    assert fans(watcher) == [0], "a replay, say: nobody else publishes there"
+    bus.show(SCORER)
+    bus.say(health(SCORER, outputs=(Output(key=KEY, published=0),)))
+    assert fans(watcher) == []
+
+
+def test_the_alarm_of_a_scorer_that_was_killed_is_shown_beside_its_successor(bus, watcher):
+    bus.raise_alarm(of(SCORER.producer))
+    bus.show(SCORER, alive=False)
+    follower = session("scorer", 2)
+    bus.show(follower)
+    bus.say(health(follower, outputs=(Output(key=KEY, published=0),)))
+    assert fans(watcher) == [0]
+
+
+def test_row_11_the_fans_whose_alarm_is_kept_are_bounded_and_those_of_strangers_are_forgotten_first(bus):
+    watcher = SiteWatcher(bus, "s")
+    bus.show(SCORER)
+    bus.raise_alarm(of(SCORER.producer, fan=1))
+    for number in range(MOST_WATCHED_FANS + 10):
+        bus.raise_alarm(of(STRANGER, number, fan=10 + number))
+    assert (len(fans(watcher)), fans(watcher)[0]) == (MOST_WATCHED_FANS, 1)
+
+
+def test_row_11_the_bytes_of_the_alarms_kept_are_bounded(bus):
+    watcher = SiteWatcher(bus, "s")
+    for number in range(40):
+        bus.raise_alarm(of(STRANGER, number, fan=number, message="x" * (1 << 19)))
+    assert 20 < len(fans(watcher)) <= WATCHED_BYTES >> 19
+
+
+def test_row_11_of_a_long_alarm_only_the_messages_that_are_shown_are_kept(bus, watcher):
+    causes = (Diagnosis(cause="drag_up", probability=0.8),)
+    bus.raise_alarm(of(SCORER.producer, 0, causes=causes))
+    acknowledged: dict[str, Any] = {"acknowledged": True, "operator_name": "Ann", "message": ""}
+    bus.raise_alarm(of(SCORER.producer, 1, transition=Transition.ACKNOWLEDGED, **acknowledged))
+    for number in range(2, 200):
+        severity = (Severity.WARNING, Severity.ALARM)[number % 2]
+        changed = of(SCORER.producer, number, transition=Transition.SEVERITY, severity=severity, message=f"{number}")
+        bus.raise_alarm(replace(changed, acknowledged=True))
+        bus.raise_alarm(replace(changed, acknowledged=True))  # the same again: recovered
+    (current,) = watcher.current_alarms()
+    assert (current.message, current.causes, current.acknowledged_by) == ("199", causes, "Ann")
+    assert [len(each.messages) for each in watcher._alarms._fans.values()] == [3]
+
+
+def test_row_11_polling_the_alarms_reduces_no_messages(bus, watcher, monkeypatch):
+    bus.raise_alarm(of(SCORER.producer))
+    monkeypatch.setattr(current_alarms, "in_sequence", None)
+    assert fans(watcher) == [0]
+
+
+def test_row_11_a_late_health_of_a_stranger_hides_no_stage(bus, watcher):
+    assert watcher.is_ready(SCORER.process_id)
+    bus.say(replace(health(SCORER, 4 * 10**18), header=Header(STRANGER, 0, ""), process_id=77))
+    assert watcher.is_ready(SCORER.process_id)
+    assert [view.health.header.producer for view in watcher.stages()] == [SCORER.producer]
+
+
+@pytest.mark.parametrize("stage", ["scorer", "viewer"])
+def test_row_11_what_a_stranger_says_to_have_lost_is_no_loss_during_the_run_and_after_it(bus, watcher, stage):
+    bus.say(replace(health(session(stage, 9), lost=5), process_id=SCORER.process_id))
+    assert watcher.losses({("scorer", SCORER.process_id)}) == {"scorer": 0}
+    bus.say(health(SCORER, status=StageStatus.STOPPED))
+    bus.show(SCORER, alive=False)
+    assert watcher.losses() == {"scorer": 0}
+
+
+def test_the_health_of_a_session_counts_whether_it_comes_before_its_token_or_after_the_token_has_gone(bus, watcher):
+    early, late = session("recorder", 3), session("resampler", 4)
+    bus.say(health(early, lost=1))
+    bus.show(early)
+    bus.show(late)
+    bus.show(late, alive=False)
+    bus.say(health(late, lost=2, status=StageStatus.STOPPED))
+    assert watcher.losses() == {"recorder": 1, "resampler": 2, "scorer": 0}
+    assert watcher.last_health(("resampler", 4)) is not None
+
+
+def test_the_session_whose_token_is_there_is_shown_also_if_its_predecessor_is_heard_later(bus, watcher):
+    follower = session("scorer", 2)
+    bus.show(SCORER, alive=False)
+    bus.show(follower)
+    bus.say(health(follower))
+    bus.say(health(SCORER, status=StageStatus.STOPPED))
+    assert watcher.is_ready(follower.process_id)
+
+
+def test_what_shows_no_token_of_a_session_such_as_a_replay_is_seen_where_no_session_does(bus, watcher):
+    replay = session("replay", 5)
+    bus.watched[alive_key("s", "*", "*")](alive_key("s", "replay", "all"), True)
+    bus.say(health(replay))
+    assert [view.health.stage for view in watcher.stages()] == ["replay", "scorer"]
+
+
+def test_row_11_the_healths_of_strangers_that_are_kept_are_few(bus, watcher):
+    for number in range(100, 100 + 2 * MOST_UNKNOWN_SESSIONS):
+        bus.say(health(session("scorer", number)))
+    assert len(watcher._unknown) == MOST_UNKNOWN_SESSIONS
+    assert watcher.is_ready(SCORER.process_id)
 
 
 @pytest.mark.parametrize("name", ["", "other", "tray/../x", "*"])
@@ -52,39 +217,22 @@ def test_an_alarm_that_is_recovered_is_known():
     assert [type(each) for each in watcher.alarms()] == [Alarm]
 
 
-def test_row_11_what_a_launched_session_has_lost_is_not_forgotten_in_a_flood_of_others():
-    bus: Any = StubBus()
+def test_row_11_what_a_launched_session_has_lost_is_not_forgotten_in_a_flood_of_others(bus):
     watcher = SiteWatcher(bus, "s")
     watcher.add_launched(("recorder", 1))
     for number in range(1, MOST_WATCHED_SESSIONS + 3):
-        health = Health(
-            header=Header(f"recorder-all-{number}", 0, ""),
-            stage="recorder",
-            instance="all",
-            status=StageStatus.OK,
-            t_ns=number,
-            uptime_s=0.0,
-            lost=int(number == 1),
-            process_id=number,
-        )
-        bus.subscribers[health_key("s", "*", "*")]("fantwin/s/health/recorder/all", encode(health))
+        bus.show(session("recorder", number))
+        bus.say(health(session("recorder", number), number, lost=int(number == 1)))
+        bus.show(session("recorder", number), alive=False)
     assert watcher.losses() == {"recorder": 1}
     assert watcher.last_health(("recorder", 1)) is not None
     assert watcher.last_health(("recorder", 2)) is None
 
 
-def test_row_13_a_stage_that_is_restarted_after_its_clock_was_set_back_is_the_latest_session():
-    bus: Any = StubBus()
+def test_row_13_a_stage_that_is_restarted_after_its_clock_was_set_back_is_the_latest_session(bus):
     watcher = SiteWatcher(bus, "s")
-    for producer, t_ns, process_id in (("recorder-all-a", 7200, 1), ("recorder-all-b", 3600, 2)):
-        health = Health(
-            header=Header(producer, 0, ""),
-            stage="recorder",
-            instance="all",
-            status=StageStatus.OK,
-            t_ns=t_ns,
-            uptime_s=0.0,
-            process_id=process_id,
-        )
-        bus.subscribers[health_key("s", "*", "*")]("fantwin/s/health/recorder/all", encode(health))
+    for each, t_ns in ((session("recorder", 1), 7200), (session("recorder", 2), 3600)):
+        bus.show(each)
+        bus.say(health(each, t_ns))
+        bus.show(each, alive=False)
     assert [view.health.process_id for view in watcher.stages()] == [2]

@@ -17,7 +17,7 @@ from pipeline.runtime.snapshot_store import SnapshotStore
 from pipeline.runtime.stage import BuiltStage, StageError
 from schemas.codec import encode, type_name
 from schemas.messages import Alarm, Grid, Header, Raw, Severity
-from schemas.topics import BY_NAME, sessions_key, tray_key
+from schemas.topics import BY_NAME, alive_key, sessions_key, tray_key
 from tests.pipeline.runtime.test_runner import TRAY_A, Bench, Passer, config, raw, toy
 from tests.support.running_chain import eventually
 
@@ -86,6 +86,22 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
     assert aborted == [True]
 
 
+def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_site_and_others_are_not(
+    config, monkeypatch
+):
+    monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
+    with Bus(config.bus) as replay:
+        replay.declare_alive(alive_key("s", "replay", "all"))
+        with pytest.raises(StageError) as refused:
+            Runner(toy(name="acquisition", reads=(), writes=("raw",)), config, TRAY_A, threading.Event())
+        assert str(refused.value) == (
+            "a replay presents site 's': stop it, or give acquisition/a another site or bus.endpoint"
+        )
+        stop = threading.Event()
+        stop.set()
+        Runner(toy(), config, None, stop).run()
+
+
 @pytest.mark.parametrize("process_id", [2**22 + 1, os.getpid()], ids=["ended", "our number, as in a container"])
 def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobody(config, monkeypatch, process_id):
     monkeypatch.setattr("pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
@@ -128,8 +144,8 @@ def test_row_07_alarms_of_a_second_scorer_are_not_shown(config):
         watcher = SiteWatcher(ours, "s")
         for session in (first, second):
             site.declare_alive(session.key("s"))
-        eventually(watcher._sessions.problem, "both are known")
         key = tray_key("s", TRAY_A, "alarm")
+        eventually(lambda: not watcher.counts(key, first.producer), "both are known")
         for session, fan in ((first, 1), (second, 2)):
             alarm = Alarm(
                 header=Header(session.producer, 0, TRAY_A),
