@@ -26,6 +26,7 @@ import numpy as np
 import scipy.signal  # noqa: F401  the torque balance loads it on first use: not while the first block waits
 from pydantic import Field
 
+from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.free_run import FreeRun, FreeRunInputs
 from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
@@ -54,8 +55,17 @@ class TwinIntegratorConfig(StageConfig):
 class TwinIntegratorCore(Core):
     """The twin of one tray."""
 
-    def __init__(self, twin: TwinFile, config: TwinIntegratorConfig, started_t_ns: int) -> None:
+    def __init__(
+        self,
+        twin: TwinFile,
+        config: TwinIntegratorConfig,
+        started_t_ns: int,
+        *,
+        decision_rules: DecisionRules = CURRENT_RULES,
+    ) -> None:
         self._twin = twin
+        self._knows_sessions = decision_rules >= DecisionRules.GRID_SESSIONS
+        self._producer = ""  # of the newest grid
         self._warm_up_ns = round(config.warm_up_s * NS_PER_S)
         self._hold_limit_ns = round(config.hold_limit_s * NS_PER_S)
         low, high = twin.card.command_range
@@ -95,10 +105,10 @@ class TwinIntegratorCore(Core):
                 self._old_samples.add(item.t_ns, item.period_ns, self._last_t_ns)
             return messages
         self._old_samples.clear()
-        if grid.period_ns != self._period_ns:
+        if grid.period_ns != self._period_ns or self._is_of_another_session(grid):
             self._run.stop(np.ones_like(self._run.running))
             self._balance.reset()
-            self._period_ns = grid.period_ns
+        self._period_ns, self._producer = grid.period_ns, grid.header.producer
         card = self._twin.card
         if card.fixed_rate and abs(grid.period_ns * card.rate_hz / NS_PER_S - 1) > RATE_TOLERANCE:
             self._problem = (
@@ -132,6 +142,14 @@ class TwinIntegratorCore(Core):
             return grid
         self._counts["repeated"] += int((~new).sum())
         return select(grid, new)
+
+    def _is_of_another_session(self, grid: Grid) -> bool:
+        """Whether another session of the resampler continues the grid.
+
+        Each derives times from the clock of the device anew. By tens of milliseconds they may differ, as if the speed
+        had jumped.
+        """
+        return self._knows_sessions and self._last_t_ns is not None and grid.header.producer != self._producer
 
     def _predict(self, grid: Grid) -> Prediction:
         run = self._run
@@ -272,7 +290,8 @@ def build(context: Context) -> BuiltStage:
     Raises:
         StageError: the tray names no twin, or one that cannot be used.
     """
-    return BuiltStage(TwinIntegratorCore(load_twin(context), context.config, context.started_t_ns))
+    twin, rules = load_twin(context), context.decision_rules
+    return BuiltStage(TwinIntegratorCore(twin, context.config, context.started_t_ns, decision_rules=rules))
 
 
 def check(context: Context) -> list[str]:

@@ -12,10 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.config.models import TrayConfig
+from pipeline.runtime.decision_rules import DecisionRules
 from pipeline.runtime.stage import Context, StageError
 from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import cut, join
-from schemas.messages import Grid, InvalidReason, ModelCard, Prediction
+from schemas.messages import Grid, Header, InvalidReason, ModelCard, Prediction
 from stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
 from tests.support.twin_files import PARAMETERS, SIGMA_RAD_S, made_up_card, small_hybrid, still_balance, write_twin
 from twin.models import physics
@@ -65,6 +66,10 @@ def twin_with_friction(friction: float, fans: int = 1) -> TwinFile:
 def core_of(twin: TwinFile | None = None, **config: float) -> TwinIntegratorCore:
     settings = TwinIntegratorConfig.model_validate({"start_samples": 1, "warm_up_s": 0.0, **config})
     return TwinIntegratorCore(twin or physical_twin(), settings, EPOCH_NS)
+
+
+def of_session(grid: Grid, producer: str) -> Grid:
+    return replace(grid, header=Header(producer, 0, "tray1"))
 
 
 def grid_of(command: Floats, speed: Floats | None = None, *, first: int = 0, period_ns: int = STEP_NS) -> Grid:
@@ -440,3 +445,22 @@ def test_a_problem_is_reported_only_until_a_matching_grid_arrives() -> None:
     assert "grid of 2 fans" in core.problem()
     core.step(grid_of(np.zeros(1)))
     assert core.problem() == ""
+
+
+@pytest.mark.parametrize("rules", [DecisionRules.TIME_AND_GAPS, DecisionRules.GRID_SESSIONS])
+def test_another_session_of_the_resampler_starts_the_twin_again(rules: DecisionRules):
+    """Its times may differ by tens of milliseconds: on a ramp, the balance saw a jump, and a healthy fan alarmed."""
+    settings = TwinIntegratorConfig(start_samples=1, warm_up_s=0.05)
+    core = TwinIntegratorCore(physical_twin(), settings, EPOCH_NS, decision_rules=rules)
+    command = np.full(60, 50.0)
+    blocks = [
+        of_session(grid_of(command, command), "resampler-all-1"),
+        of_session(grid_of(command, command, first=50), "resampler-all-1"),
+        of_session(grid_of(command, command, first=100), "resampler-all-2"),
+        of_session(grid_of(command, command, first=160), "resampler-all-2"),
+    ]
+    made = [message for block in blocks for message in core.step(block) if isinstance(message, Prediction)]
+    again = rules >= DecisionRules.GRID_SESSIONS
+    assert [(m.invalid_reason == InvalidReason.WARMING_UP).sum() for m in made] == [5, 0, 5 if again else 0, 0]
+    assert core.counters()["free_runs"] == (2 if again else 1)
+    assert [np.isnan(m.torque_balance_command[0, 0]) for m in made] == [True, False, again, False]

@@ -172,7 +172,10 @@ class Chain:
             view = view_of(watcher, label)
             return view is not None and view.alive and view.health.process_id != old
 
-        eventually(is_back, f"{label} is back")
+        try:
+            eventually(is_back, f"{label} is back")
+        except AssertionError as error:
+            raise AssertionError("\n".join((str(error), *(self.up.lines[-30:] if self.up else ())))) from error
         return time.monotonic() - began_s
 
     def recordings(self) -> list[Path]:

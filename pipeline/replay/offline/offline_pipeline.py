@@ -20,7 +20,7 @@ from pipeline.replay.offline.sample_stream import SampleStream
 from pipeline.replay.stage_chain import StageChain
 from pipeline.runtime.stage import Context, Core, Stage
 from schemas.blocks import cut
-from schemas.messages import Message, Prediction, ScorerSnapshot
+from schemas.messages import Header, Message, Prediction, ScorerSnapshot
 from schemas.messages import newest_t_ns as message_t_ns
 from schemas.topics import BY_NAME
 
@@ -179,7 +179,7 @@ class OfflinePipeline:
         for span in session.spans:
             for block in streams[span.producer].of(span):
                 self._observe(block)
-                yield block
+                yield replace(block, header=Header(span.producer, 0, block.header.tray))
 
     def _core(self, stage: Stage) -> Core:
         return stage.build(self._contexts[stage.name]).core
