@@ -146,7 +146,7 @@ class TwinIntegratorCore(Core):
     def _is_of_another_session(self, grid: Grid) -> bool:
         """Whether another session of the resampler continues the grid.
 
-        Each derives times from the clock of the device anew. By tens of milliseconds they may differ, as if the speed
+        Each derives times from the clock of the device again. By tens of milliseconds they may differ, as if the speed
         had jumped.
         """
         return self._knows_sessions and self._last_t_ns is not None and grid.header.producer != self._producer
