@@ -21,6 +21,7 @@ from pydantic import Field, field_validator
 
 from pipeline.recordings.disk import DiskError
 from pipeline.recordings.held_messages import HeldMessages
+from pipeline.recordings.interference import Interference
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.recordings.open_part import OpenPart, PartsFolder
 from pipeline.recordings.parts import RecordingParts
@@ -41,8 +42,6 @@ DISK_CHECK_NS = NS_PER_S
 """how often the free space is checked"""
 ROOM_TO_RESUME = 1 << 20
 """bytes that must be free beyond the minimum to resume, so that recording does not pause again at once"""
-NEWS_SHOWN_NS = 60 * NS_PER_S
-"""how long health reports what another program did to the file"""
 _LOG = logging.getLogger(__name__)
 
 
@@ -100,10 +99,11 @@ class Recorder(Core):
         self._recorded: Counter[str] = Counter()
         self._counts: Counter[str] = Counter(lost_unwritten=0)
         self._held = HeldMessages()
-        self._lost_in_pause = self._restored_reported = 0
-        self._problem = self._paused_because = self._news = ""
+        self._interference = Interference()
+        self._lost_in_pause = 0
+        self._problem = self._paused_because = ""
         self._now_ns = self._paused_ns = self._began_ns = self._checked_ns = now_ns
-        self._flushed_ns = self._news_ns = 0
+        self._flushed_ns = 0
         self._unflushed_ns: int | None = None
         """time of receipt of the oldest message that may not be on the disk yet"""
         try:
@@ -134,7 +134,7 @@ class Recorder(Core):
         if now_ns < self._now_ns - DISK_CHECK_NS:  # the host's clock was set back: restart all intervals
             self._checked_ns = self._began_ns = now_ns
             self._paused_ns = min(self._paused_ns, now_ns)
-            self._news_ns = min(self._news_ns, now_ns)
+            self._interference.clock_set_back(now_ns)
             self._flushed_ns = now_ns - int(self._config.flush_interval_s * NS_PER_S)
             self._unflushed_ns = None if self._unflushed_ns is None else self._flushed_ns  # due at once
         self._now_ns = now_ns
@@ -170,7 +170,8 @@ class Recorder(Core):
         """Messages of each topic that are on the disk, messages lost because they could not be written or because their
         file was deleted, parts, and files that were restored."""
         recorded = self._recorded + (self._part.written if self._part else Counter())
-        return {f"recorded_{topic}": count for topic, count in recorded.items()} | self._counts
+        written = {f"recorded_{topic}": count for topic, count in recorded.items()}
+        return written | self._counts | self._interference.counts
 
     def unsaved(self) -> Sequence[Envelope]:
         """Messages that are not flushed to the disk yet."""
@@ -178,8 +179,7 @@ class Recorder(Core):
 
     def problem(self) -> str:
         """Why nothing is recorded now, or what another program did to the file; empty if all is well."""
-        is_news = self._now_ns - self._news_ns < NEWS_SHOWN_NS
-        return self._problem or (self._news if is_news else "")
+        return self._problem or self._interference.problem(self._now_ns)
 
     def _record(self, envelope: Envelope) -> None:
         if self._part is None:
@@ -200,7 +200,8 @@ class Recorder(Core):
     def _begin(self, about: Mapping[str, str]) -> None:
         held_since_ns = self._held.first_received_t_ns
         self._began_ns = self._now_ns if held_since_ns is None else min(held_since_ns, self._now_ns)
-        self._part, self._restored_reported = self._parts.begin(self._began_ns, self._ledger, about), 0
+        self._part = self._parts.begin(self._began_ns, self._ledger, about)
+        self._interference.begin_part()
         self._counts["parts"] += 1
         self._problem = ""
         for card in self._cards.values():
@@ -233,24 +234,9 @@ class Recorder(Core):
 
     def _release_part(self) -> None:
         if self._part:
-            self._report_restored(self._part)
+            self._interference.end_part(self._part, self._now_ns)
             self._recorded += self._part.written
-            if self._part.lost:
-                self._counts["lost_deleted"] += self._part.lost
-                self._lost_in_pause += self._part.lost
-                self._news_ns = self._now_ns
-                self._news = (
-                    f"{self._part.path}: another program deleted or cut the file while it was written; messages "
-                )
-                self._news += f"lost with it: {self._part.lost}; keep other programs away from it"
-            if self._part.absent:
-                self._counts["lost_absent"] += self._part.absent
-                self._news_ns = self._now_ns
-                self._news = (
-                    f"{self._part.path}: messages that were written and are not in the finished file: "
-                    f"{self._part.absent}; check the disk, and keep other programs away from it"
-                )
-                _LOG.error("%s", self._news)
+            self._lost_in_pause += self._part.lost
             self._ledger = self._ledger.as_lost() if self._part.lost else self._ledger.for_next_part()
             unwritten, self._part, self._unflushed_ns = self._part.pending, None, None
             self._hold(unwritten)
@@ -293,18 +279,7 @@ class Recorder(Core):
         elif self._part:
             self._attempt(self._part.stay_in_place)
         if self._part:
-            self._report_restored(self._part)
-
-    def _report_restored(self, part: OpenPart) -> None:
-        """Report that the file of a part was restored since it was last asked."""
-        if part.restored > self._restored_reported:
-            self._counts["files_restored"] += part.restored - self._restored_reported
-            self._restored_reported, self._news_ns = part.restored, self._now_ns
-            self._news = (
-                f"{part.path}: another program deleted, moved or replaced the file while it was written; it was "
-                "restored with all messages; keep other programs away from it"
-            )
-            _LOG.warning("%s", self._news)
+            self._interference.check(self._part, self._now_ns)
 
     def _pause(self, reason: str) -> None:
         self._release_part()

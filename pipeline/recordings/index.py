@@ -28,7 +28,9 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+from pipeline.recordings.disk import AtomicAppendFile
 from pipeline.recordings.records import RECORD, record_bytes
+from pipeline.recordings.sequence_ledger import LEDGER_NAME
 
 SHORT_ENDING = record_bytes(DataEnd(0), Footer(0, 0, 0)) + MCAP0_MAGIC
 """The end of a file without a summary: 40 bytes, where a summary may need thousands."""
@@ -142,3 +144,28 @@ def message_indexes(entries: Mapping[int, list[int]], offset: int) -> tuple[byte
         )
         offset += RECORD.size + _INDEX_HEAD.size + size
     return b"".join(parts), offsets
+
+
+def write_ending(
+    file: AtomicAppendFile,
+    index: Index,
+    ledger: Mapping[str, str],
+    *,
+    before: bytes = b"",
+) -> None:
+    """End a file with `before`, the ledger and the index: all of it, or nothing.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    metadata = Metadata(name=LEDGER_NAME, metadata=dict(ledger))
+    record = record_bytes(metadata)
+    size, offset = file.size, file.size + len(before)
+    index.add_metadata(metadata, offset, len(record))
+    try:
+        file.write(before + record + index.ending(offset + len(record)))
+        file.sync()
+    except OSError:
+        index.remove_last_metadata()
+        file.cut(size)
+        raise

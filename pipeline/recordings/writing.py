@@ -23,10 +23,10 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from pipeline.recordings.chunk import FillingChunk
 from pipeline.recordings.disk import AtomicAppendFile, Disk, refused, sync_folder
-from pipeline.recordings.index import SHORT_ENDING, Index
+from pipeline.recordings.index import SHORT_ENDING, Index, write_ending
 from pipeline.recordings.reading import METADATA_NAME
 from pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, indexed_reader, record_bytes
-from pipeline.recordings.sequence_ledger import BEFORE_NAME, LEDGER_NAME, SequenceLedger, ledger_metadata
+from pipeline.recordings.sequence_ledger import BEFORE_NAME, SequenceLedger, ledger_metadata
 from schemas.codec import proto_type, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Health, Message, newest_t_ns
@@ -363,31 +363,6 @@ class _WrittenChunk(NamedTuple):
 @cache
 def _schema(message_type: type[Message]) -> bytes:
     return build_file_descriptor_set(proto_type(message_type)).SerializeToString()
-
-
-def write_ending(
-    file: AtomicAppendFile,
-    index: Index,
-    ledger: Mapping[str, str],
-    *,
-    before: bytes = b"",
-) -> None:
-    """End a file with `before`, the ledger and the index: all of it, or nothing.
-
-    Raises:
-        OSError: the disk refuses.
-    """
-    metadata = Metadata(name=LEDGER_NAME, metadata=dict(ledger))
-    record = record_bytes(metadata)
-    size, offset = file.size, file.size + len(before)
-    index.add_metadata(metadata, offset, len(record))
-    try:
-        file.write(before + record + index.ending(offset + len(record)))
-        file.sync()
-    except OSError:
-        index.remove_last_metadata()
-        file.cut(size)
-        raise
 
 
 def free_name(path: Path) -> Path:

@@ -1,0 +1,66 @@
+"""What other programs did to the files of a recording while they were written: counted, and said for a minute."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+
+from pipeline.recordings.open_part import OpenPart
+from schemas.units import NS_PER_S
+
+NEWS_SHOWN_NS = 60 * NS_PER_S
+"""how long health reports it"""
+_LOG = logging.getLogger(__name__)
+
+
+class Interference:
+    """Watches one part after the other."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        """files that were restored, and messages lost with their file or not in it"""
+        self._restored_reported = 0
+        self._news = ""
+        self._news_ns = 0
+
+    def begin_part(self) -> None:
+        """A new part is written from now on."""
+        self._restored_reported = 0
+
+    def check(self, part: OpenPart, now_ns: int) -> None:
+        """Report that the file of the open part was restored since it was last asked."""
+        if part.restored > self._restored_reported:
+            self.counts["files_restored"] += part.restored - self._restored_reported
+            self._restored_reported, self._news_ns = part.restored, now_ns
+            self._news = (
+                f"{part.path}: another program deleted, moved or replaced the file while it was written; it was "
+                "restored with all messages; keep other programs away from it"
+            )
+            _LOG.warning("%s", self._news)
+
+    def end_part(self, part: OpenPart, now_ns: int) -> None:
+        """Report what the part that has ended has lost."""
+        self.check(part, now_ns)
+        if part.lost:
+            self.counts["lost_deleted"] += part.lost
+            self._news_ns = now_ns
+            self._news = (
+                f"{part.path}: another program deleted or cut the file while it was written; messages lost with it: "
+                f"{part.lost}; keep other programs away from it"
+            )
+        if part.absent:
+            self.counts["lost_absent"] += part.absent
+            self._news_ns = now_ns
+            self._news = (
+                f"{part.path}: messages that were written and are not in the finished file: {part.absent}; check the "
+                "disk, and keep other programs away from it"
+            )
+            _LOG.error("%s", self._news)
+
+    def clock_set_back(self, now_ns: int) -> None:
+        """The host's clock was set back to `now_ns`."""
+        self._news_ns = min(self._news_ns, now_ns)
+
+    def problem(self, now_ns: int) -> str:
+        """What happened last, while it is recent; empty if nothing."""
+        return self._news if now_ns - self._news_ns < NEWS_SHOWN_NS else ""
