@@ -20,7 +20,7 @@ from schemas.codec import encode, type_name
 from schemas.messages import Header, Raw
 from schemas.topics import BY_NAME, tray_key
 
-REPLACED_LIMIT_S = 30.0
+REPLACED_LIMIT_S = 60.0
 SILENCE = "no raw samples"
 STALL_S = 8.0
 FAR_AHEAD_S = 3600.0
@@ -128,7 +128,7 @@ def _garbage(site: ScratchSite) -> str:
     lost = sum(site.watcher.losses().values())
     for _ in range(GARBAGE_MESSAGES):
         publisher.put(b"\xff\xfe no message")
-    _require(site.seconds_until_judged(), "judging did not go on within half a minute")
+    _require(site.seconds_until_judged(60.0), "judging did not go on within a minute")
     more = sum(site.watcher.losses().values()) - lost
     _require(not more, f"counted as {more} losses of this site")
     return f"{GARBAGE_MESSAGES:,} undecodable messages, none counted as a loss"
@@ -140,8 +140,8 @@ def _far_ahead(site: ScratchSite) -> str:
     t_ns = view.health.t_ns + round(FAR_AHEAD_S * 1e9)
     publisher = site.bus.publisher(tray_key(SITE, TRAY, "raw"), BY_NAME["raw"], type_name(Raw), "stranger")
     publisher.put(encode(_forged(t_ns)))
-    judged_s = site.seconds_until_judged()
-    _require(judged_s, "judging did not go on within half a minute")
+    judged_s = site.seconds_until_judged(60.0)
+    _require(judged_s, "judging did not go on within a minute")
     return f"refused; judging went on (the next hundred samples took {judged_s:.1f} s)"
 
 
@@ -176,7 +176,7 @@ def _full_disk(site: ScratchSite) -> str:
     took_s = site.seconds_until(lambda: site.problem("recorder"), REPLACED_LIMIT_S)
     _require(took_s, "the recorder did not report the full disk")
     reported = site.problem("recorder")
-    _require(site.seconds_until_judged(), "judging did not go on while the disk was full")
+    _require(site.seconds_until_judged(60.0), "judging did not go on while the disk was full")
     ballast.unlink()
     again_s = site.seconds_until(lambda: not site.problem("recorder"), REPLACED_LIMIT_S)
     _require(again_s, f"recording did not resume after room was made: {site.problem('recorder')}")
@@ -188,8 +188,8 @@ def _strangers(site: ScratchSite) -> str:
     publisher = site.bus.publisher(tray_key(SITE, TRAY, "raw"), BY_NAME["raw"], type_name(Raw), "stranger")
     for number in range(STRANGERS):
         publisher.put(encode(replace(_forged(0), header=Header(f"stranger-{number}", 0, TRAY))))
-    judged_s = site.seconds_until_judged()
-    _require(judged_s, "judging did not go on within half a minute")
+    judged_s = site.seconds_until_judged(60.0)
+    _require(judged_s, "judging did not go on within a minute")
     grown = max(site.memory_bytes(label) - before[label] for label in STAGES) / 1e6
     _require(grown < STRANGERS_LIMIT_MB, f"a stage grew by {grown:.0f} MB")
     return f"judged again {judged_s:.1f} s after {STRANGERS:,} messages; no stage grew by more than {grown:.0f} MB"

@@ -12,7 +12,7 @@ from pathlib import Path
 from pipeline.selftest.scenarios import SMALL_DISK_BYTES, Scenario
 from pipeline.selftest.scratch_site import NotKept, ScratchSite
 
-BACK_LIMIT_S = 30.0
+BACK_LIMIT_S = 60.0
 
 
 @dataclass(frozen=True)

@@ -89,7 +89,7 @@ def rows_of(monkeypatch: pytest.MonkeyPatch, folder: Path, site: type, *scenario
     [
         (HealthySite, refuses, "it ended"),
         (HealthySite, alarms, "seen; but 1 healthy fans raised an alarm"),
-        (BlindSite, FINE.run, "seen; but not all fans were judged again within 30 s"),
+        (BlindSite, FINE.run, "seen; but not all fans were judged again within 60 s"),
     ],
 )
 def test_a_promise_that_is_not_kept_is_a_row_that_says_what_was_seen(monkeypatch, tmp_path, site, run, seen):
