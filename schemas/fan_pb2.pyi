@@ -17,6 +17,7 @@ class InvalidReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     INVALID_REASON_SATURATED: _ClassVar[InvalidReason]
     INVALID_REASON_NO_SPEED: _ClassVar[InvalidReason]
     INVALID_REASON_NO_TWIN: _ClassVar[InvalidReason]
+    INVALID_REASON_CLOCK_RESTARTED: _ClassVar[InvalidReason]
 
 class FanState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -94,6 +95,7 @@ INVALID_REASON_OUT_OF_RANGE: InvalidReason
 INVALID_REASON_SATURATED: InvalidReason
 INVALID_REASON_NO_SPEED: InvalidReason
 INVALID_REASON_NO_TWIN: InvalidReason
+INVALID_REASON_CLOCK_RESTARTED: InvalidReason
 FAN_STATE_UNKNOWN: FanState
 FAN_STATE_NORMAL: FanState
 FAN_STATE_SUSPECT: FanState

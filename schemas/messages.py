@@ -30,6 +30,7 @@ class InvalidReason(OpenEnum):
     SATURATED = 5
     NO_SPEED = 6
     NO_TWIN = 7
+    CLOCK_RESTARTED = 8
 
 
 class FanState(OpenEnum):

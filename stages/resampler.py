@@ -35,7 +35,10 @@ from schemas.units import NS_PER_S
 LONGEST_TICK_NS = NS_PER_S // 10  # a longer pause between ticks is a host that stalled, not a silent source
 SET_BACK_NS = NS_PER_S  # a new sample this much older than the newest: a replay was restarted
 MAX_ENDED_PRODUCERS = 64
-GAP, STALE, NO_SPEED = (np.uint8(reason) for reason in (InvalidReason.GAP, InvalidReason.STALE, InvalidReason.NO_SPEED))
+GAP, STALE, NO_SPEED, CLOCK_RESTARTED = (
+    np.uint8(reason)
+    for reason in (InvalidReason.GAP, InvalidReason.STALE, InvalidReason.NO_SPEED, InvalidReason.CLOCK_RESTARTED)
+)
 
 
 class ResamplerConfig(StageConfig):
@@ -70,6 +73,8 @@ class ResamplerCore(Core):
         self._watermark_ns = round(config.watermark_s * NS_PER_S)
         self._stale_for_ns = round(config.stale_for_s * NS_PER_S)
         knows_time = decision_rules >= DecisionRules.TIME_AND_GAPS
+        self._marks_restarts = decision_rules >= DecisionRules.BREAKS
+        self._restart_t_ns: int | None = None  # of the first sample after a restart, until its grid sample is marked
         self._clock = DeviceClock(knows_backlogs=knows_time)
         self._guard = LineGuard(self._clock, self._period_ns) if knows_time else None
         self._last_readings = LastReadings(fans, self._gap_limit_ns)
@@ -208,6 +213,7 @@ class ResamplerCore(Core):
         if after_restart and self._guard and self._newest_t_ns != NEVER_NS:
             # Two segments of the device clock are not compared: a gap lies between, and nothing is interpolated.
             self._not_before_t_ns = self._newest_t_ns + self._gap_limit_ns + 1
+            self._restart_t_ns = max(t_ns, self._not_before_t_ns) if self._marks_restarts else None
         if behind_ns < 0 and t_ns < self._not_before_t_ns:
             self._counts["dropped_after_clock_restart"] += 1
             return False
@@ -302,6 +308,10 @@ class ResamplerCore(Core):
         invalid_reason = np.zeros(speed.shape, np.uint8)
         if not all_true(valid):
             np.copyto(invalid_reason, reason, where=~valid)
+        if self._restart_t_ns is not None and t_ns[-1] >= self._restart_t_ns:
+            first = t_ns.searchsorted(self._restart_t_ns)
+            valid[first], invalid_reason[first] = False, CLOCK_RESTARTED
+            self._restart_t_ns = None
         grid = Grid(
             fans=self._fans,
             period_ns=self._period_ns,

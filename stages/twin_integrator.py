@@ -40,6 +40,7 @@ RANGE_MARGIN = 0.05  # of the width of the training range: a twin is used this f
 LONGEST_BRIDGE = (
     1 << 16
 )  # grid samples; above half a second at 100 kHz a new start is faster than running through the loss
+LARGEST_MOVE_S = 0.01  # times the width of the training range: a move of the command times the gap in which it was held
 HIGHEST_SPEED = 1.5  # times the top training speed: the balance is used up to there
 RATE_TOLERANCE = 0.01  # a card holds the measured rate
 
@@ -64,12 +65,13 @@ class TwinIntegratorCore(Core):
         decision_rules: DecisionRules = CURRENT_RULES,
     ) -> None:
         self._twin = twin
-        self._knows_sessions = decision_rules >= DecisionRules.GRID_SESSIONS
+        self._knows_breaks = decision_rules >= DecisionRules.BREAKS
         self._producer = ""  # of the newest grid
         self._warm_up_ns = round(config.warm_up_s * NS_PER_S)
         self._hold_limit_ns = round(config.hold_limit_s * NS_PER_S)
         low, high = twin.card.command_range
         margin = RANGE_MARGIN * (high - low)
+        self._largest_move = LARGEST_MOVE_S * (high - low)
         self._lowest_command, self._highest_command = low - margin, high + margin
         self._off_below = twin.off_below
         self._run = FreeRun(twin, config.start_samples)
@@ -149,7 +151,7 @@ class TwinIntegratorCore(Core):
         Each derives times from the clock of the device again. By tens of milliseconds they may differ, as if the speed
         had jumped.
         """
-        return self._knows_sessions and self._last_t_ns is not None and grid.header.producer != self._producer
+        return self._knows_breaks and self._last_t_ns is not None and grid.header.producer != self._producer
 
     def _predict(self, grid: Grid) -> Prediction:
         run = self._run
@@ -181,13 +183,20 @@ class TwinIntegratorCore(Core):
         return self._prediction(grid, predicted, invalid_reason)
 
     def _inputs(self, grid: Grid) -> FreeRunInputs:
+        held_before = self._run.held_command
         silent = (grid.invalid_reason == int(InvalidReason.GAP)) | (grid.invalid_reason == int(InvalidReason.STALE))
         known = ~silent & np.isfinite(grid.command)
         command, known_before_t_ns = self._run.hold(grid.t_ns, grid.command, known)
+        gap_ns = grid.t_ns[:, np.newaxis] - known_before_t_ns - grid.period_ns
+        overdue = gap_ns > self._hold_limit_ns
+        if self._knows_breaks:
+            moved = np.diff(command, axis=0, prepend=held_before[np.newaxis])
+            overdue |= known & (np.abs(moved) * gap_ns > self._largest_move * NS_PER_S)
+            overdue |= grid.invalid_reason == int(InvalidReason.CLOCK_RESTARTED)
         return FreeRunInputs(
             command=command,
             unknown=~known,
-            overdue=grid.t_ns[:, np.newaxis] - known_before_t_ns - grid.period_ns > self._hold_limit_ns,
+            overdue=overdue,
             usable=known & grid.valid & np.isfinite(grid.speed_rad_s),
             missing=self._missing(grid.t_ns, np.all(silent, axis=1)),
         )
@@ -233,7 +242,10 @@ class TwinIntegratorCore(Core):
         known = grid.valid & np.isfinite(grid.speed_rad_s) & np.isfinite(grid.command)
         if self._last_t_ns is not None and grid.t_ns[0] - self._last_t_ns > self._longest_step_ns:
             self._balance.reset()
-        breaks = (np.flatnonzero(np.diff(grid.t_ns) > self._longest_step_ns) + 1).tolist()
+        restarted = (grid.invalid_reason == int(InvalidReason.CLOCK_RESTARTED)).any(axis=1)
+        if restarted[0]:
+            self._balance.reset()
+        breaks = (np.flatnonzero((np.diff(grid.t_ns) > self._longest_step_ns) | restarted[1:]) + 1).tolist()
         parts = []
         for first, last in pairwise((0, *breaks, len(grid.t_ns))):
             if first:

@@ -18,8 +18,9 @@ class DecisionRules(IntEnum):
     TIME_AND_GAPS = 2
     """Statistics start again after a gap longer than their memory, and alarms are not confirmed until they are judged
     again. A backlog, a step of the host's clock and samples of another time are distinguished."""
-    GRID_SESSIONS = 3
-    """The twin starts again when another session of the resampler continues the grid."""
+    BREAKS = 3
+    """The twin starts again where the grid does not continue: with another session of the resampler, another segment of
+    the clock of the device, or a gap in which the command has moved."""
 
 
 CURRENT_RULES = max(DecisionRules)

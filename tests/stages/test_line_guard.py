@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import join
-from schemas.messages import Grid, Header, Raw
+from schemas.messages import Grid, Header, InvalidReason, Raw
 from schemas.units import NS_PER_S
 from stages.resampler import ResamplerConfig, ResamplerCore
 
@@ -69,6 +69,17 @@ def slopes(grid: Grid) -> np.ndarray:
     """Of the speed between neighbouring valid samples of the grid, rad/s per second."""
     both = grid.valid[1:, 0] & grid.valid[:-1, 0]
     return (np.diff(grid.speed_rad_s[:, 0]) / np.diff(grid.t_ns) * NS_PER_S)[both]
+
+
+def assert_restarts_are_marked(grid: Grid) -> None:
+    """Where times do not continue, as the speed shows that grows by RAD_S_PER_S, a sample says so."""
+    valid = np.flatnonzero(grid.valid[:, 0])
+    offsets_s = grid.speed_rad_s[valid, 0] / RAD_S_PER_S - (grid.t_ns[valid] - EPOCH_NS) / NS_PER_S
+    breaks = np.flatnonzero(np.abs(np.diff(offsets_s)) > 0.02)
+    marks = np.flatnonzero(grid.invalid_reason[:, 0] == InvalidReason.CLOCK_RESTARTED)
+    assert len(marks)
+    for last, first in zip(valid[breaks], valid[breaks + 1], strict=True):
+        assert ((last < marks) & (marks < first)).any()
 
 
 def valid_after(grid: Grid, t_s: float) -> int:
@@ -183,6 +194,17 @@ def test_row_05_a_host_clock_set_forward_is_followed_within_seconds_without_a_fa
     np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
     assert core.counters()["clock_restarts"] == 1
     assert valid_after(grid, 3600) > 13 * HZ
+    assert_restarts_are_marked(grid)
+
+
+def test_row_05_a_stall_just_after_the_host_clock_was_set_does_not_join_times_that_do_not_continue() -> None:
+    """The new times begin in the backlog, are seconds late, and begin once more."""
+    core = core_of()
+    late = (line(20, 22), after_stall(22, 30), line(30, 60))
+    grid = grid_of(core, line(0, 20), shifted(chain(*late), 3600.0))
+    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
+    assert core.counters()["clock_restarts"] >= 2
+    assert_restarts_are_marked(grid)
 
 
 def test_row_05_a_restarted_device_gives_no_false_slope() -> None:
@@ -198,6 +220,7 @@ def test_row_05_a_restarted_device_gives_no_false_slope() -> None:
     grid = grid_of(core, line(0, 20), restarted)
     np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=0.03)
     assert core.counters()["clock_restarts"] == 1
+    assert_restarts_are_marked(grid)
 
 
 # row 13

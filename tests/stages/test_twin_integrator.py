@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.config.models import TrayConfig
-from pipeline.runtime.decision_rules import DecisionRules
+from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context, StageError
 from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import cut, join
@@ -63,9 +63,11 @@ def twin_with_friction(friction: float, fans: int = 1) -> TwinFile:
     return replace(twin, balance=balance)
 
 
-def core_of(twin: TwinFile | None = None, **config: float) -> TwinIntegratorCore:
+def core_of(
+    twin: TwinFile | None = None, *, decision_rules: DecisionRules = CURRENT_RULES, **config: float
+) -> TwinIntegratorCore:
     settings = TwinIntegratorConfig.model_validate({"start_samples": 1, "warm_up_s": 0.0, **config})
-    return TwinIntegratorCore(twin or physical_twin(), settings, EPOCH_NS)
+    return TwinIntegratorCore(twin or physical_twin(), settings, EPOCH_NS, decision_rules=decision_rules)
 
 
 def of_session(grid: Grid, producer: str) -> Grid:
@@ -196,7 +198,7 @@ def test_a_free_run_is_not_valid_while_it_warms_up() -> None:
 
 
 def test_a_free_run_continues_through_a_short_silence_on_the_held_command() -> None:
-    command = np.concatenate([np.full(100, 40.0), np.full(50, 40.0), np.full(100, 70.0)])
+    command = np.concatenate([np.full(100, 40.0), np.full(51, 40.0), np.full(99, 70.0)])
     without = feed(core_of(), [grid_of(command)])
     core = core_of()
     grids = [grid_of(command[:100]), silent(50, 100, 40.0), grid_of(command[150:], first=150)]
@@ -282,8 +284,8 @@ def test_a_command_outside_the_training_range_is_not_valid() -> None:
     assert core.counters()["not_predicted_out_of_range"] == 2
 
 
-def why_not_of(command: list[float], **config: float) -> list[int]:
-    core = core_of(twin_with_friction(10.0), warm_up_s=0.03, **config)
+def why_not_of(command: list[float]) -> list[int]:
+    core = core_of(twin_with_friction(10.0), warm_up_s=0.03)
     return feed(core, [grid_of(np.array([40.0] * 5 + command))]).invalid_reason[5:, 0].tolist()
 
 
@@ -447,7 +449,7 @@ def test_a_problem_is_reported_only_until_a_matching_grid_arrives() -> None:
     assert core.problem() == ""
 
 
-@pytest.mark.parametrize("rules", [DecisionRules.TIME_AND_GAPS, DecisionRules.GRID_SESSIONS])
+@pytest.mark.parametrize("rules", [DecisionRules.TIME_AND_GAPS, DecisionRules.BREAKS])
 def test_another_session_of_the_resampler_starts_the_twin_again(rules: DecisionRules):
     """Its times may differ by tens of milliseconds: on a ramp, the balance saw a jump, and a healthy fan alarmed."""
     settings = TwinIntegratorConfig(start_samples=1, warm_up_s=0.05)
@@ -460,7 +462,35 @@ def test_another_session_of_the_resampler_starts_the_twin_again(rules: DecisionR
         of_session(grid_of(command, command, first=160), "resampler-all-2"),
     ]
     made = [message for block in blocks for message in core.step(block) if isinstance(message, Prediction)]
-    again = rules >= DecisionRules.GRID_SESSIONS
+    again = rules >= DecisionRules.BREAKS
     assert [(m.invalid_reason == InvalidReason.WARMING_UP).sum() for m in made] == [5, 0, 5 if again else 0, 0]
     assert core.counters()["free_runs"] == (2 if again else 1)
     assert [np.isnan(m.torque_balance_command[0, 0]) for m in made] == [True, False, again, False]
+
+
+@pytest.mark.parametrize("rules", [DecisionRules.TIME_AND_GAPS, DecisionRules.BREAKS])
+@pytest.mark.parametrize("moves_to", [50.0, 51.0, 70.0])
+def test_a_gap_in_which_the_command_has_moved_starts_the_twin_again(rules: DecisionRules, moves_to: float):
+    """The command was held meanwhile, and the twin is wrong by what the fan has done on the real one."""
+    core = core_of(decision_rules=rules)
+    low, high = physical_twin().card.command_range
+    command = np.concatenate((np.full(30, 50.0), np.full(70, moves_to)))
+    grid = grid_of(command, command)
+    grid.invalid_reason[30:50] = InvalidReason.GAP
+    grid.valid[30:50] = False
+    core.step(grid)
+    large = (moves_to - 50.0) * 0.2 > 0.01 * (high - low)
+    assert core.counters()["free_runs"] == (2 if large and rules >= DecisionRules.BREAKS else 1)
+
+
+def test_the_twin_starts_again_after_the_clock_of_the_device_has_restarted():
+    core = core_of()
+    grid = grid_of(np.full(100, 50.0), np.full(100, 50.0))
+    grid.invalid_reason[60] = InvalidReason.CLOCK_RESTARTED
+    grid.valid[60] = False
+    (prediction,) = (message for message in core.step(grid) if isinstance(message, Prediction))
+    assert core.counters()["free_runs"] == 2
+    balance = prediction.torque_balance_command[:, 0]
+    assert np.isfinite(balance[55])
+    assert np.isnan(balance[61:70]).all()
+    assert np.isfinite(balance[99])

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import select
+import threading
 import tty
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from pipeline.devices.simulated_device import PseudoTerminal
+from pipeline.devices.simulated_device import PseudoTerminal, wait_for_reader
 from pipeline.selftest.line_relay import LineRelay
 
 LIMIT_S = 20.0
@@ -25,8 +26,10 @@ class RelayedDevice:
         self.reader = os.open(folder / "port", os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self.reader)
         self.relay.start()
-        while not self.device.has_reader():
-            select.select([], [], [], 0.001)
+        wait_for_reader(self.device, "text", threading.Event())
+        assert self.device.write(b"begin")
+        while not self.receive(1).endswith(b"n"):  # what was sent to find the reader comes before
+            pass
 
     def send(self, data: bytes) -> None:
         """Send from the device and wait until the relay has taken it."""
