@@ -172,7 +172,7 @@ def test_states_and_reasons_of_a_newer_scorer_are_shown_with_their_number() -> N
     core = core_of(sink, fans=1)
     core.step(changed(score, state=state, invalid_reason=reason, valid=reason == 0))
     core.close()
-    assert sink.lane(0) == [(0, "unknown: unknown (8)"), (0.03, "normal"), (0.06, "unknown (99)")]
+    assert sink.lane(0) == [(0, f"unknown: unknown ({len(InvalidReason)})"), (0.03, "normal"), (0.06, "unknown (99)")]
 
 
 def test_a_taken_port_is_reported_under_the_setting_that_names_it() -> None:
