@@ -142,8 +142,8 @@ def _starving(health: Health, views: Sequence[StageView]) -> str:
     awaited = {each.key: (health.t_ns - each.since_t_ns) / NS_PER_S for each in health.waiting_for}
     for view in views:
         before = view.previous
-        if before is None or not view.alive:
-            continue
+        if before is None or not view.alive or before.t_ns > health.t_ns:
+            continue  # what a line sends that has just been connected is still on the way
         for stream, count in output_streams(before).items():  # sent a second ago or earlier
             seconds = awaited.get(stream[0], 0.0)
             if seconds > STARVED_AFTER_S and count > received.get(stream, 0):

@@ -22,6 +22,11 @@ def stop_on_signals(stop: threading.Event) -> None:
     threading.Thread(target=_obey, args=(reader, writer, stop), name="signals", daemon=True).start()
 
 
+def ignore_hangup() -> None:
+    """Go on when the terminal is closed, as when a connection to a remote host drops."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+
 def _obey(reader: socket.socket, _writer: socket.socket, stop: threading.Event) -> None:
     """`_writer` is held open for as long as this thread runs."""
     while True:

@@ -15,11 +15,13 @@ from pipeline.config.loading import load_config
 from pipeline.launch.event_log import EventLog
 from pipeline.launch.launcher import Launcher, Outcome
 from pipeline.launch.refused_messages import refused_lines
-from pipeline.runtime.signals import stop_on_signals
+from pipeline.runtime.signals import ignore_hangup, stop_on_signals
 
 
 def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_output: JsonOption = False) -> None:
     """Start all stages, restart those that die, stop all in order on Ctrl-C.
+
+    Events are written to standard error. The site keeps running when the terminal is closed; SIGTERM stops it, too.
 
     Exit codes: 0 stopped in order, nothing lost; 1 could not start, or a stage failed or was killed at the end;
     3 data were lost.
@@ -28,6 +30,7 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
     """
     stop = threading.Event()
     stop_on_signals(stop)  # first: what follows takes a second or two
+    ignore_hangup()
     settings = load_config(config, overrides or ())
     log = EventLog(sys.stderr.fileno())
     try:

@@ -131,6 +131,7 @@ def test_row_08_when_the_reader_of_its_output_goes_away_up_continues(tmp_path, e
         with chain.watcher() as watcher:
             first = eventually(lambda: (view := view_of(watcher, "recorder")) and view.alive and view, "it runs")
             os.close(pipe[0])  # nobody reads what it says from now on
+            up.send_signal(signal.SIGHUP)  # as when the terminal is closed
             os.kill(first.health.process_id, signal.SIGKILL)
 
             def is_back() -> bool:

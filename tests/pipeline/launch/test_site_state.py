@@ -77,6 +77,13 @@ def test_row_01_a_stage_without_input_while_its_producer_sends_is_starved():
     assert state.is_fault
 
 
+def test_row_01_a_stage_whose_producer_has_just_begun_to_send_is_not_starved():
+    resumed = view(PRODUCER, published_before=850)
+    assert resumed.previous
+    later = replace(resumed, previous=replace(resumed.previous, t_ns=WAITS.t_ns + 1))
+    assert states(later, view(WAITS))["twin_integrator"].word == Word.WAITING
+
+
 def test_row_01_a_stage_whose_producer_sends_nothing_waits():
     state = states(view(PRODUCER, published_before=800), view(WAITS))["twin_integrator"]
     assert (state.word, state.detail, state.is_fault) == (Word.WAITING, "waits for grid of tray1, for 12 s", False)
