@@ -14,7 +14,7 @@ grid. See docs/explanation/time.md.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Self
 
@@ -74,7 +74,7 @@ class ResamplerCore(Core):
         self._stale_for_ns = round(config.stale_for_s * NS_PER_S)
         knows_time = decision_rules >= DecisionRules.TIME_AND_GAPS
         self._marks_restarts = decision_rules >= DecisionRules.BREAKS
-        self._restart_t_ns: int | None = None  # of the first sample after a restart, until its grid sample is marked
+        self._restarts_t_ns: deque[int] = deque()  # of first samples after restarts whose grid samples are not made yet
         self._clock = DeviceClock(knows_backlogs=knows_time)
         self._guard = LineGuard(self._clock, self._period_ns) if knows_time else None
         self._last_readings = LastReadings(fans, self._gap_limit_ns)
@@ -213,7 +213,8 @@ class ResamplerCore(Core):
         if after_restart and self._guard and self._newest_t_ns != NEVER_NS:
             # Two segments of the device clock are not compared: a gap lies between, and nothing is interpolated.
             self._not_before_t_ns = self._newest_t_ns + self._gap_limit_ns + 1
-            self._restart_t_ns = max(t_ns, self._not_before_t_ns) if self._marks_restarts else None
+            if self._marks_restarts:
+                self._restarts_t_ns.append(max(t_ns, self._not_before_t_ns))
         if behind_ns < 0 and t_ns < self._not_before_t_ns:
             self._counts["dropped_after_clock_restart"] += 1
             return False
@@ -308,10 +309,9 @@ class ResamplerCore(Core):
         invalid_reason = np.zeros(speed.shape, np.uint8)
         if not all_true(valid):
             np.copyto(invalid_reason, reason, where=~valid)
-        if self._restart_t_ns is not None and t_ns[-1] >= self._restart_t_ns:
-            first = t_ns.searchsorted(self._restart_t_ns)
+        while self._restarts_t_ns and t_ns[-1] >= self._restarts_t_ns[0]:
+            first = t_ns.searchsorted(self._restarts_t_ns.popleft())
             valid[first], invalid_reason[first] = False, CLOCK_RESTARTED
-            self._restart_t_ns = None
         grid = Grid(
             fans=self._fans,
             period_ns=self._period_ns,
