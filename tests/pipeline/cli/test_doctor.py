@@ -84,8 +84,8 @@ def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(capsys, tmp_path,
         code, found = examine(capsys, DEMO / "demo.toml", *settings)
     assert code == 1
     assert found["problems"] == [
-        f"bus.endpoint = '{endpoint}': the program that listens there is not fantwin, or hangs, so no stage would "
-        "meet another: stop it, or choose another port"
+        f"bus.endpoint = '{endpoint}': the program that listens there is not fantwin, or hangs, so stages cannot "
+        "connect: stop it, or choose another port"
     ]
 
 
