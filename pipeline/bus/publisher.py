@@ -7,7 +7,7 @@ from collections import deque
 
 import zenoh
 
-from pipeline.bus.recovery import LAST_SEQUENCE, recovery_key
+from pipeline.bus.recovery import LAST_SEQUENCE, number_in, recovery_key
 from schemas.topics import Topic
 
 KEPT_BYTES = 16 << 20
@@ -67,9 +67,8 @@ class Publisher:
 
     def _answer(self, query: zenoh.Query) -> None:
         """Answer with what is kept of a range, and at the end with the number of published messages."""
-        first = _number(query.parameters.get("first"), 0)
-        last = _number(query.parameters.get("last"), LAST_SEQUENCE)
-        newest = max(1, _number(query.parameters.get("newest"), self._topic.history))
+        first, last, newest = (number_in(query.parameters.get(name) or "") for name in ("first", "last", "newest"))
+        first, last, newest = first or 0, LAST_SEQUENCE if last is None else last, newest or self._topic.history
         with self._of_all.lock:
             wanted = [payload for sequence, payload in self._kept if first <= sequence <= last][-newest:]
             published = self.published
@@ -78,8 +77,3 @@ class Publisher:
                 query.reply(self._recovery_key, payload)
             if query.parameters.get("count"):  # earlier versions do not ask, and would take it for a message
                 query.reply(self._recovery_key, b"", attachment=str(published).encode())
-
-
-def _number(text: str | None, otherwise: int) -> int:
-    """A number in a query, which anybody may have sent."""
-    return int(text) if text and text.isdecimal() and len(text) <= len(str(LAST_SEQUENCE)) else otherwise

@@ -100,7 +100,7 @@ class RecoveryRequest:
             return
         if sample.attachment is not None:
             if self._is_of_one:
-                self._end(_number(sample.attachment.to_bytes()))
+                self._end(number_in(sample.attachment.to_bytes().decode(errors="replace")))
             return
         size = len(sample.payload)
         if self._messages_left < 1 or size > self._bytes_left:
@@ -121,5 +121,6 @@ class RecoveryRequest:
         self._on_answer(Answer(messages, published, self._timed_out))
 
 
-def _number(text: bytes) -> int | None:
-    return int(text) if text.isdigit() and len(text) <= len(str(LAST_SEQUENCE)) else None
+def number_in(text: str) -> int | None:
+    """A number in a query or an answer, which anybody may have sent; None if it is none."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) <= len(str(LAST_SEQUENCE)) else None
