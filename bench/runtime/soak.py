@@ -14,7 +14,8 @@ import random
 import sys
 import tempfile
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -46,16 +47,28 @@ def soak(minutes: float, seed: int, folder: Path) -> tuple[list[Row], dict[str, 
     return rows, {label: tuple(max(each[label] for each in part) for part in parts) for label in STAGES}
 
 
+@contextmanager
+def _folder(keep: Path | None, seed: int) -> Iterator[Path]:
+    """Where a seed's site runs: a new folder in `keep`, or one that is removed at the end."""
+    if keep is not None:
+        (keep / f"seed-{seed}").mkdir(parents=True)
+        yield keep / f"seed-{seed}"
+        return
+    with tempfile.TemporaryDirectory(prefix="fantwin-soak-") as folder:
+        yield Path(folder)
+
+
 def main() -> None:
     """Print a line for each seed, or JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=30.0, help="wall time of each seed (default 30)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3], help="of the order of faults")
+    parser.add_argument("--keep", type=Path, help="a folder in which each seed's site and recordings stay")
     parser.add_argument("--json", action="store_true", help="print all rows as JSON")
     options = parser.parse_args()
     for seed in options.seeds:
-        with tempfile.TemporaryDirectory(prefix="fantwin-soak-") as folder:
-            rows, memory = soak(options.minutes, seed, Path(folder))
+        with _folder(options.keep, seed) as folder:
+            rows, memory = soak(options.minutes, seed, folder)
         if options.json:
             print(json.dumps({"seed": seed, "rows": [asdict(row) for row in rows], "memory_mb": memory}))
             continue
