@@ -1,0 +1,61 @@
+"""How the speed of a fan is measured: one definition for configuration, twin card, model maker and simulation."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+LONGEST_WINDOW_S = 60.0
+
+
+class Tacho(BaseModel):
+    """What a reading is of the speed.
+
+    "instantaneous": the speed at the time of the sample. "count": pulses counted over a window, shown until the next
+    count is complete, as microcontrollers and baseboard controllers of 4-pin fans do. "period": the time of the last
+    revolution, shown until the next pulse.
+    """
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    kind: Literal["instantaneous", "count", "period"] = "instantaneous"
+    pulses: Annotated[int, Field(ge=1, le=1000, description="pulses per revolution; 2 for 4-pin fans")] = 2
+    window_s: Annotated[
+        float, Field(ge=0, le=LONGEST_WINDOW_S, description="how long pulses are counted; for kind count only")
+    ] = 0.0
+    update_s: Annotated[
+        float,
+        Field(
+            ge=0, le=LONGEST_WINDOW_S, description="time between new counts; without it the window, one after another"
+        ),
+    ] = 0.0
+    delay_s: Annotated[
+        float, Field(ge=0, le=LONGEST_WINDOW_S, description="from the end of the measurement to the sample's time")
+    ] = 0.0
+
+    @model_validator(mode="after")
+    def _window_fits_kind(self) -> Self:
+        if self.kind == "count" and self.window_s <= 0:
+            raise ValueError('a tacho of kind "count" needs window_s, the seconds over which pulses are counted')
+        if self.kind != "count" and (self.window_s > 0 or self.update_s > 0):
+            raise ValueError(f'window_s and update_s are for a tacho of kind "count", not "{self.kind}"')
+        if self.update_s > self.window_s:
+            raise ValueError(f"update_s = {self.update_s:g} is longer than window_s = {self.window_s:g}")
+        return self
+
+    @property
+    def held_s(self) -> float:
+        """For how long one reading is shown, s; 0 where each sample is a reading of its own."""
+        return (self.update_s or self.window_s) if self.kind == "count" else 0.0
+
+    @property
+    def resolution_rad_s(self) -> float:
+        """Difference of two neighbouring readings, rad/s; 0 where it does not matter."""
+        return 2 * math.pi / (self.pulses * self.window_s) if self.kind == "count" else 0.0
+
+    @property
+    def mean_delay_s(self) -> float:
+        """Mean time from a speed to the sample that shows it, s; for kind "period" without half its period."""
+        return self.delay_s + (self.window_s + self.held_s) / 2
