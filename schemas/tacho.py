@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 LONGEST_WINDOW_S = 60.0
 
@@ -45,6 +46,13 @@ class Tacho(BaseModel):
             raise ValueError(f"update_s = {self.update_s:g} is longer than window_s = {self.window_s:g}")
         return self
 
+    def __str__(self) -> str:
+        delay = f", {self.delay_s:g} s late" if self.delay_s else ""
+        if self.kind != "count":
+            return self.kind + delay
+        update = f", updated every {self.update_s:g} s" if self.update_s else ""
+        return f"count over {self.window_s:g} s, {self.pulses} pulses a revolution{update}{delay}"
+
     @property
     def held_s(self) -> float:
         """For how long one reading is shown, s; 0 where each sample is a reading of its own."""
@@ -59,3 +67,20 @@ class Tacho(BaseModel):
     def mean_delay_s(self) -> float:
         """Mean time from a speed to the sample that shows it, s; for kind "period" without half its period."""
         return self.delay_s + (self.window_s + self.held_s) / 2
+
+
+def _as_sequence(value: Any) -> Any:
+    return (value,) if isinstance(value, Tacho | Mapping) else value
+
+
+Tachos: TypeAlias = Annotated[tuple[Tacho, ...], Field(min_length=1), BeforeValidator(_as_sequence)]
+"""The tachos of several fans: one that all have in common, or one for each. A single one may be written by itself."""
+
+INSTANTANEOUS: tuple[Tacho, ...] = (Tacho(),)
+
+
+def tacho_of_each_fan(tachos: Sequence[Tacho], fans: int) -> tuple[Tacho, ...]:
+    """(fans,) tachos, the common one repeated. Raises ValueError where they are of another number of fans."""
+    if len(tachos) not in (1, fans):
+        raise ValueError(f"{len(tachos)} tachos for {fans} fans; give one for all fans, or one for each")
+    return tuple(tachos) * (fans // len(tachos))

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
+
+from schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 
 CARD_PROPERTY = "fantwin.card"
 FORMAT_VERSION = 3
@@ -185,7 +186,8 @@ class TwinCard:
     parameter_std_errors, parameter_interval_95: of the physical model alone; a hybrid's parameters in force differ
     where its network has taken a share. sigma_rad_s: per fan, the healthy root mean square free-run error.
     speed_range_rad_s, command_range, rate_hz: of the training data; outside them the twin extrapolates. calibration:
-    of the alarms (scoring.limits), None before calibration.
+    of the alarms (scoring.limits), None before calibration. tacho: what the free run must pass before it is compared
+    with readings, and the command before the torque balance; one for all fans, or one for each.
     """
 
     kind: str
@@ -214,6 +216,7 @@ class TwinCard:
     command_unit: str
     speed_unit: Literal["rad/s"] = "rad/s"
     calibration: dict[str, Any] | None = None
+    tacho: Tachos = INSTANTANEOUS
     format_version: int = FORMAT_VERSION
 
     @model_validator(mode="after")
@@ -229,6 +232,7 @@ class TwinCard:
                 raise ValueError(f"balance.{name} must have one value for each fan")
         if len(self.fan_numbers) != self.fans:
             raise ValueError("training.fans must name each fan, or none")
+        tacho_of_each_fan(self.tacho, self.fans)
         if not self.command_range[0] < self.command_range[1]:
             raise ValueError("command_range must be in ascending order")
         return self
@@ -239,13 +243,18 @@ class TwinCard:
         return self.training.fans or tuple(range(self.fans))
 
     @property
+    def tacho_of_each_fan(self) -> tuple[Tacho, ...]:
+        """(fans,) tachos."""
+        return tacho_of_each_fan(self.tacho, self.fans)
+
+    @property
     def top_speed_rad_s(self) -> float:
         """The highest speed in the training data, in either direction."""
         return max(map(abs, self.speed_range_rad_s))
 
     def to_json(self) -> str:
         """One line of JSON."""
-        return json.dumps(asdict(self), allow_nan=False)
+        return json.dumps(_CARD.dump_python(self), allow_nan=False)
 
     @staticmethod
     def from_json(text: str) -> TwinCard:

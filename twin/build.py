@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from schemas.tacho import INSTANTANEOUS
 from schemas.twin_card import (
     BalanceCard,
     DataCard,
@@ -39,7 +40,7 @@ from twin.fitting.training import Physics, Progress
 from twin.kinds import BOTH_INPUTS, ModelKind, find_kind
 from twin.models.model import Model
 from twin.models.physics import PARAMETER_NAMES
-from twin.runs import Array, Run, common_fans
+from twin.runs import Array, Run, common_fans, common_tacho
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +90,16 @@ def train_twin(
     fan_numbers (what the recordings call the runs' fans; default: counted from 0), command_unit, data and
     validation_data (the files that the runs are from) and created (default: now) go into the card. The same seed and
     runs give the same model.
-    Raises TwinError when the runs do not determine the parameters, or the result cannot serve as a twin.
+    Raises TwinError when the runs do not determine the parameters, are not measured alike, or the result cannot serve
+    as a twin.
     """
     model_kind = find_kind(kind)
     _require_trainer(model_kind, trainer)
     fans = common_fans([*runs, *validation_runs])
     numbers = tuple(range(fans) if fan_numbers is None else fan_numbers)
+    if model_kind.predicts == "readings":
+        runs, validation_runs = _as_if_instantaneous(runs), _as_if_instantaneous(validation_runs)
+    tacho = common_tacho([*runs, *validation_runs])
     started_s = time.monotonic()
     identification = identify(runs)
     fitted = model_kind.fit(
@@ -155,6 +160,7 @@ def train_twin(
         ),
         versions=_versions(),
         command_unit=command_unit,
+        tacho=tacho[:1] if len(set(tacho)) == 1 else tacho,
     )
     return TrainedTwin(model, parameters, card, identification, validation)
 
@@ -171,6 +177,11 @@ def evaluate(
     model = loaded if isinstance(loaded, OnnxTwin) else loaded.model
     rows = fan_rows(loaded.card, common_fans(runs), fan_numbers)
     return evaluate_model(model, loaded.parameters[rows], np.array(loaded.card.sigma_rad_s)[rows], runs)
+
+
+def _as_if_instantaneous(runs: Sequence[Run]) -> list[Run]:
+    """The runs for a model whose output is compared with the readings as they are."""
+    return [replace(run, tacho=INSTANTANEOUS) for run in runs]
 
 
 def _require_trainer(kind: ModelKind, trainer: str) -> None:

@@ -7,6 +7,7 @@ with the function that fits it.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 from twin.errors import TwinError
 from twin.fitting.model_fits import FitRequest, FittedModel, Trainer, fit_narx, fit_network_ode, fit_physical
@@ -33,7 +34,8 @@ class ModelKind:
     """A kind of model.
 
     name: in cards and on the command line. title: for people. fit: from data to a model. trainers: those that can
-    train it. variants: what comparisons train; without any, the kind itself.
+    train it. variants: what comparisons train; without any, the kind itself. predicts: the speed, which the tacho then
+    measures, or the readings themselves.
     """
 
     name: str
@@ -41,11 +43,12 @@ class ModelKind:
     fit: Callable[[FitRequest], FittedModel]
     trainers: tuple[Trainer, ...] = ("levenberg-marquardt",)
     variants: tuple[Variant, ...] = ()
+    predicts: Literal["speed", "readings"] = "speed"
 
 
 KINDS = [
     ModelKind(PhysicalModel.kind, "physical", fit_physical),
-    ModelKind(Narx.kind, "NARX", fit_narx),
+    ModelKind(Narx.kind, "NARX", fit_narx, predicts="readings"),
     ModelKind(
         NeuralOde.kind,
         "neural ODE",

@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from twin.errors import TwinError
 
 Array = NDArray[np.float64]
@@ -24,7 +25,8 @@ class Run:
     """One uninterrupted recording.
 
     t_s: (n,) strictly increasing, irregular steps allowed. command: (n, fans), held from its sample to the next.
-    speed_rad_s: (n, fans), NaN where missing. One-dimensional command and speed mean a single fan.
+    speed_rad_s: (n, fans) readings, NaN where missing. One-dimensional command and speed mean a single fan.
+    tacho: of each fan what its readings are of its speed; one that all have in common is repeated.
     Raises TwinError when the shapes disagree, time does not increase, or a time or command is not finite.
     """
 
@@ -32,6 +34,7 @@ class Run:
     t_s: Array
     command: Array
     speed_rad_s: Array
+    tacho: tuple[Tacho, ...] = INSTANTANEOUS
 
     def __post_init__(self) -> None:
         t_s = np.array(self.t_s, dtype=np.float64)
@@ -57,6 +60,10 @@ class Run:
         for field, value in (("t_s", t_s), ("command", command), ("speed_rad_s", speed_rad_s)):
             value.setflags(write=False)
             object.__setattr__(self, field, value)
+        try:
+            object.__setattr__(self, "tacho", tacho_of_each_fan(self.tacho, command.shape[1]))
+        except ValueError as error:
+            raise TwinError(f"run {self.name!r}: {error}") from error
 
     @property
     def samples(self) -> int:
@@ -89,7 +96,12 @@ class Run:
         if not 0 <= index < self.fans:
             raise TwinError(f"run {self.name!r}: no fan {index} among {self.fans}; count from 0")
         column = slice(index, index + 1)
-        return replace(self, command=self.command[:, column], speed_rad_s=self.speed_rad_s[:, column])
+        return replace(
+            self,
+            command=self.command[:, column],
+            speed_rad_s=self.speed_rad_s[:, column],
+            tacho=self.tacho[column],
+        )
 
     def between(self, start_s: float, stop_s: float) -> "Run":
         """The samples with start_s <= t_s < stop_s."""
@@ -99,7 +111,7 @@ class Run:
     def rows(self, first: int, last: int) -> "Run":
         """The samples first <= k < last."""
         part = slice(first, last)
-        return Run(self.name, self.t_s[part], self.command[part], self.speed_rad_s[part])
+        return replace(self, t_s=self.t_s[part], command=self.command[part], speed_rad_s=self.speed_rad_s[part])
 
     def equal_parts(self, max_samples: int) -> list[tuple[int, int]]:
         """First and last row, for rows(), of about equal parts of at most max_samples; a lone sample is left out."""
@@ -143,6 +155,19 @@ def common_fans(runs: Sequence[Run]) -> int:
     if len(fans) > 1:
         raise TwinError(f"runs of {sorted(fans)} fans are mixed; give runs of one fan count")
     return fans.pop()
+
+
+def common_tacho(runs: Sequence[Run]) -> tuple[Tacho, ...]:
+    """(fans,) the tachos that all runs share. Raises TwinError when runs differ: they are not of the same readings."""
+    first = runs[0]
+    for run in runs:
+        for fan, (one, other) in enumerate(zip(first.tacho, run.tacho, strict=False)):
+            if one != other:
+                raise TwinError(
+                    f"fan {fan}: its speed is measured by {one} in run {first.name!r} and by {other} in run "
+                    f"{run.name!r}: give runs that are measured alike"
+                )
+    return first.tacho
 
 
 def starting_speed_rad_s(speed_rad_s: Array) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -33,14 +32,14 @@ def test_a_card_survives_conversion_to_json_and_back() -> None:
     [("hybrid", False, 4), ("physical", False, 4), ("neural-ode", False, 1), ("narx", True, 0)],
 )
 def test_fields_missing_from_early_cards_follow_from_their_kind(kind: str, fixed_rate: bool, used: int) -> None:
-    early = asdict(made_up_card(PhysicalModel(), 1)) | {"kind": kind}
+    early = json.loads(made_up_card(PhysicalModel(), 1).to_json()) | {"kind": kind}
     del early["fixed_rate"], early["used_parameters"]
     card = TwinCard.from_json(json.dumps(early))
     assert (card.fixed_rate, len(card.used_parameters)) == (fixed_rate, used)
 
 
 def test_standard_errors_of_early_cards_become_a_covariance_without_correlations() -> None:
-    early = asdict(made_up_card(PhysicalModel(), 1))
+    early = json.loads(made_up_card(PhysicalModel(), 1).to_json())
     del early["balance"]["covariance"]
     early["balance"]["std_errors"] = [[0.1, 0.2, 0.3, 0.4]]
     covariance = TwinCard.from_json(json.dumps(early)).balance.covariance
@@ -48,12 +47,30 @@ def test_standard_errors_of_early_cards_become_a_covariance_without_correlations
 
 
 def test_fields_of_a_later_card_are_ignored_and_its_kind_needs_not_be_known() -> None:
-    later = asdict(made_up_card(PhysicalModel(), 1)) | {"kind": "of tomorrow", "more": 1}
+    later = json.loads(made_up_card(PhysicalModel(), 1).to_json()) | {"kind": "of tomorrow", "more": 1}
     assert TwinCard.from_json(json.dumps(later)).kind == "of tomorrow"
 
 
+def test_the_tacho_is_one_for_all_fans_or_one_for_each_and_early_cards_are_instantaneous() -> None:
+    fields = json.loads(made_up_card(PhysicalModel(), 2).to_json())
+    del fields["tacho"]
+    slow, fast = ({"kind": "count", "window_s": window_s} for window_s in (1.0, 0.5))
+
+    def windows_s(tacho: object) -> list[float]:
+        card = TwinCard.from_json(json.dumps(fields | {"tacho": tacho}))
+        assert TwinCard.from_json(card.to_json()) == card
+        return [tacho.window_s for tacho in card.tacho_of_each_fan]
+
+    early = TwinCard.from_json(json.dumps(fields))
+    assert [tacho.kind for tacho in early.tacho_of_each_fan] == ["instantaneous"] * 2
+    assert windows_s(slow) == windows_s([slow]) == [1.0, 1.0]
+    assert windows_s([slow, fast]) == [1.0, 0.5]
+    with pytest.raises(CardError, match="3 tachos for 2 fans"):
+        windows_s([slow, fast, fast])
+
+
 def test_a_card_of_an_unknown_kind_must_state_the_fields_that_an_early_kind_implies() -> None:
-    later = asdict(made_up_card(PhysicalModel(), 1)) | {"kind": "of tomorrow"}
+    later = json.loads(made_up_card(PhysicalModel(), 1).to_json()) | {"kind": "of tomorrow"}
     del later["fixed_rate"]
     with pytest.raises(CardError, match="fixed_rate"):
         TwinCard.from_json(json.dumps(later))

@@ -1,12 +1,14 @@
 """Valid and invalid runs, and how a run is cut."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from schemas.tacho import Tacho
 from twin.errors import TwinError
-from twin.runs import Run, run_from_samples, starting_speed_rad_s
+from twin.runs import Run, common_tacho, run_from_samples, starting_speed_rad_s
 
 
 def ramp(times: list[float]) -> Run:
@@ -35,9 +37,18 @@ def test_equal_parts_follow_one_another_and_none_is_longer_than_allowed() -> Non
 
 
 def test_a_slice_of_time_and_of_a_fan_keeps_the_rest() -> None:
-    run = Run("two", np.arange(4.0), np.arange(8.0).reshape(4, 2), np.zeros((4, 2)))
+    tachos = tuple(Tacho(kind="count", window_s=window_s) for window_s in (1.0, 0.5))
+    run = Run("two", np.arange(4.0), np.arange(8.0).reshape(4, 2), np.zeros((4, 2)), tachos)
     part = run.between(1.0, 3.0).fan(1)
     np.testing.assert_array_equal(part.command, [[3.0], [5.0]])
+    assert part.tacho == tachos[1:]
+
+
+def test_runs_that_are_measured_differently_are_not_mixed() -> None:
+    one, other = (replace(ramp([0.0, 1.0]), tacho=(Tacho(kind="count", window_s=window_s),)) for window_s in (1.0, 0.5))
+    assert common_tacho([one, one]) == one.tacho
+    with pytest.raises(TwinError, match="count over 1 s.* and by count over 0.5 s.*measured alike"):
+        common_tacho([one, other])
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ their noise (midway between two samples by half its variance), and figures of di
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -42,7 +43,7 @@ def resampled(run: Run, rate_hz: float) -> Run:
     if steps < 1:
         raise TwinError(f"run {run.name!r}: {run.duration_s:.3g} s are shorter than one step at {rate_hz:g} Hz")
     t_s = run.t_s[0] + np.arange(steps + 1) / rate_hz
-    return Run(run.name, t_s, _mean_command(run, t_s), _speed_rad_s(run, t_s))
+    return replace(run, t_s=t_s, command=_mean_command(run, t_s), speed_rad_s=_speed_rad_s(run, t_s))
 
 
 def irregular(run: Run, seed: int = 0) -> Run:
@@ -57,7 +58,7 @@ def irregular(run: Run, seed: int = 0) -> Run:
     if len(kept) < 2:
         raise TwinError(f"run {run.name!r}: {run.samples} samples are too few to thin; give a longer run")
     t_s = run.t_s[kept]
-    return Run(run.name, t_s, _mean_command(run, t_s), run.speed_rad_s[kept])
+    return replace(run, t_s=t_s, command=_mean_command(run, t_s), speed_rad_s=run.speed_rad_s[kept])
 
 
 def on_grid(runs: Sequence[Run], grid: Grid, seed: int = 0) -> list[Run]:
