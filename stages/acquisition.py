@@ -13,7 +13,7 @@ repeated samples, convert units, put samples into messages.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
@@ -25,6 +25,7 @@ from pipeline.config.models import TrayConfig
 from pipeline.devices.device_clock import UINT32
 from pipeline.devices.device_sequence import DeviceSequence
 from pipeline.devices.host_clock import HOST_CLOCK, HostClock
+from pipeline.devices.input_quality import InputQuality
 from pipeline.devices.sample_source import (
     LinkDown,
     LinkUp,
@@ -41,7 +42,6 @@ from schemas.messages import Array, Command, Raw
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
 STEP_SHOWN_NS = 60 * NS_PER_S  # how long health says that the host clock was set
-QUALITY_WINDOW = 100  # readings from which the quality of the connection is computed
 FLOAT32_TOLERANCE = 1e-6
 
 
@@ -116,9 +116,8 @@ class AcquisitionCore(Core):
         self._block: list[_Received] = []
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
-        self._now_ns = self._last_valid_t_ns = self._last_input_t_ns = started_t_ns
-        self._last_fault = ""
-        self._recent_valid: deque[bool] = deque(maxlen=QUALITY_WINDOW)
+        self._now_ns = started_t_ns
+        self._quality = InputQuality(started_t_ns, config.silence_s)
 
     def step(self, item: Item) -> list[Raw]:
         """Handle input from the source, a change of its connection, or a command to send."""
@@ -130,13 +129,12 @@ class AcquisitionCore(Core):
         if isinstance(item, LinkUp):
             self._counts["line_up"] += 1
             self._down_reason = None
-            self._last_valid_t_ns = self._last_input_t_ns = self._now_ns
+            self._quality.start_waiting(self._now_ns)
         else:
             self._counts["line_down"] += self._down_reason is None  # the reason may change while it is down
             self._down_reason = item.reason
         self._sequence.connection_interrupted()
-        self._recent_valid.clear()
-        self._last_fault = ""
+        self._quality.connection_changed()
         return self._flush()
 
     def tick(self, now_ns: int) -> list[Raw]:
@@ -154,7 +152,8 @@ class AcquisitionCore(Core):
     def counters(self) -> Mapping[str, int]:
         """Input by kind; docs/reference/wire-protocol.md explains each counter."""
         steps = {"host_clock_steps": self._host_clock.steps} if self._host_clock.steps else {}
-        return {**self._counts, **steps}
+        lost_refused = self._counts["lost_refused"] + self._sequence.refused
+        return {**self._counts, **({"lost_refused": lost_refused} if lost_refused else {}), **steps}
 
     def samples_in(self, item: Item) -> int:
         """The readings in a batch."""
@@ -176,18 +175,11 @@ class AcquisitionCore(Core):
         return f"{was_set}, or the host was suspended: sample times follow it"
 
     def _problem_of_line(self) -> str:
-        name, silence_s = self._source.name, self._config.silence_s
         if self._down_reason is not None:
-            return f"{name}: {self._down_reason}"
-        if self._now_ns - self._last_input_t_ns > silence_s * NS_PER_S:
-            return f"{name}: nothing received for {silence_s:g} s; is the device powered, connected and sending?"
-        fault = f" (last fault: {self._last_fault})" if self._last_fault else ""
+            return f"{self._source.name}: {self._down_reason}"
         settings = ", ".join(filter(None, (self._source.settings_to_check, f"fans = {self._tray.fans}")))
-        if self._now_ns - self._last_valid_t_ns > silence_s * NS_PER_S:
-            return f"{name}: no valid sample for {silence_s:g} s{fault}; check {settings} of the [[tray]]"
-        if len(self._recent_valid) >= QUALITY_WINDOW // 5 and 2 * sum(self._recent_valid) < len(self._recent_valid):
-            return f"{name}: most input is faulty{fault}; check the wiring, and {settings} of the [[tray]]"
-        return ""
+        problem = self._quality.problem(self._now_ns, settings)
+        return f"{self._source.name}: {problem}" if problem else ""
 
     def _follow_host_clock(self) -> None:
         """A clock that was set forward is no silence."""
@@ -195,13 +187,12 @@ class AcquisitionCore(Core):
         if step is not self._seen_step:
             self._seen_step = step
             if step and not step.ahead_ns:
-                self._last_valid_t_ns = max(self._last_valid_t_ns, step.at_ns)
-                self._last_input_t_ns = max(self._last_input_t_ns, step.at_ns)
+                self._quality.wait_no_longer_than_since(step.at_ns)
 
     def _receive(self, batch: ReadingBatch) -> list[Raw]:
         if batch.byte_count:
             self._counts["bytes"] += batch.byte_count
-        self._last_input_t_ns = batch.received_t_ns
+        self._quality.add_input(batch.received_t_ns)
         self._now_ns = max(self._now_ns, batch.received_t_ns)
         messages: list[Raw] = []
         for item in batch.items:
@@ -222,34 +213,43 @@ class AcquisitionCore(Core):
         rejected = item if isinstance(item, Rejected) else self._why_refused(item)
         if rejected is None:
             assert isinstance(item, Reading)
-            self._recent_valid.append(True)
             return self._with_plausible_speeds(item)
         self._counts[rejected.kind] += 1
+        self._sequence.refused += rejected.is_sample
         if not rejected.harmless:
-            self._recent_valid.append(False)
-            self._last_fault = f"{rejected.kind}, {rejected.detail}"
+            self._counts["refused_input"] += 1
+            self._quality.add_fault(rejected)
         return None
 
     def _why_refused(self, reading: Reading) -> Rejected | None:
         tray = self._tray
         if not len(reading.command) == len(reading.speed) == tray.fans:
-            return Rejected("wrong_fan_count", f"a reading of {len(reading.speed)} fans, this tray has {tray.fans}")
+            detail = f"a reading of {len(reading.speed)} fans, this tray has {tray.fans}"
+            return Rejected("wrong_fan_count", detail, is_sample=True, setting=f"fans = {tray.fans}")
         for command in reading.command:
             # Without its actual command a sample cannot be scored, and a command must not be invented.
             if not within(command, tray.command_min, tray.command_max):
-                limits = f"{tray.command_min:g} to {tray.command_max:g}"
-                return Rejected("absurd_command", f"command {command:g} is outside {limits} of the [[tray]]")
+                limits = f"command_min = {tray.command_min:g} to command_max = {tray.command_max:g}"
+                detail = f"command {command:g} is outside {limits}"
+                return Rejected("absurd_command", detail, is_sample=True, setting="command_min and command_max")
         return None
 
     def _with_plausible_speeds(self, reading: Reading) -> Reading:
-        self._last_valid_t_ns = self._last_input_t_ns
         speed_max = self._tray.speed_max
         self._counts["no_speed"] += sum(map(math.isnan, reading.speed))
-        implausible = sum(abs(speed) > speed_max for speed in reading.speed)
-        if not implausible:
+        absurd = [speed for speed in reading.speed if abs(speed) > speed_max]
+        if not absurd:
+            self._quality.add_valid()
             return reading
-        self._counts["absurd_speed"] += implausible
-        return replace(reading, speed=tuple(math.nan if abs(v) > speed_max else v for v in reading.speed))
+        self._counts["absurd_speed"] += len(absurd)
+        speeds = tuple(math.nan if abs(v) > speed_max else v for v in reading.speed)
+        if all(map(math.isnan, speeds)):
+            self._counts["absurd_samples"] += 1
+            detail = f"speed {absurd[0]:g} is beyond speed_max = {speed_max:g} {self._tray.speed_unit}"
+            self._quality.add_fault(Rejected("absurd_speed", detail, setting="speed_max and speed_unit"))
+        else:
+            self._quality.add_valid()
+        return replace(reading, speed=speeds)
 
     def _flush(self) -> list[Raw]:
         block, self._block = self._block, []

@@ -54,12 +54,16 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """Input that is not a reading. `kind` is the name of the counter it is counted under."""
+    """Input that is no reading of the tray. `kind` is the name of the counter it is counted under."""
 
     kind: str
     detail: str
     harmless: bool = False
     """True if it is not a sign of a bad connection"""
+    is_sample: bool = False
+    """True if it is a sample: it is lost"""
+    setting: str = ""
+    """the setting of the tray that does not fit, for example `fans = 4`; empty if it is not known"""
 
 
 @dataclass(frozen=True, slots=True)

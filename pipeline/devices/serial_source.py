@@ -21,6 +21,8 @@ from pipeline.devices.serial_port import ReceivedBytes, SerialPort
 from pipeline.errors import UserError
 from schemas import wire
 
+_REFUSED_SAMPLES = (wire.FaultKind.WRONG_FAN_COUNT, wire.FaultKind.BAD_COMMAND)
+
 
 class ByteLink(Protocol):
     """Carries bytes both ways and knows no protocol. `SerialPort` says what each method does."""
@@ -45,6 +47,7 @@ class SerialSource:
         self._config = config
         self._link = link or SerialPort(str(self._path), config.baud)
         self._decoder = wire.Decoder(config.protocol, context.fans)
+        self._fans = context.fans
 
     @property
     def name(self) -> str:
@@ -69,7 +72,7 @@ class SerialSource:
         if not isinstance(item, ReceivedBytes):
             self._decoder.reset()
             return item
-        found = tuple(map(_reading_of, self._decoder.feed(item.data)))
+        found = tuple(map(self._reading_of, self._decoder.feed(item.data)))
         return ReadingBatch(item.received_t_ns, found, len(item.data))
 
     def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> bool:
@@ -91,9 +94,14 @@ class SerialSource:
             return [f"{self._path}: this user may not read and write it; join its group (often dialout)"]
         return []
 
-
-def _reading_of(found: wire.Frame | wire.Fault) -> Reading | Rejected:
-    if isinstance(found, wire.Sample):
-        return Reading(found.command, found.speed, found.clock_us, found.sequence)
-    assert isinstance(found, wire.Fault), "the decoder of a host gives samples and faults only"
-    return Rejected(found.kind.value, found.detail, harmless=found.kind is wire.FaultKind.RESYNC)
+    def _reading_of(self, found: wire.Frame | wire.Fault) -> Reading | Rejected:
+        if isinstance(found, wire.Sample):
+            return Reading(found.command, found.speed, found.clock_us, found.sequence)
+        assert isinstance(found, wire.Fault), "the decoder of a host gives samples and faults only"
+        return Rejected(
+            found.kind.value,
+            found.detail,
+            harmless=found.kind is wire.FaultKind.RESYNC,
+            is_sample=found.kind in _REFUSED_SAMPLES,
+            setting=f"fans = {self._fans}" if found.kind is wire.FaultKind.WRONG_FAN_COUNT else "",
+        )

@@ -57,13 +57,16 @@ class Outcome:
     failed: list[str] = field(default_factory=list)
     lost: dict[str, int] = field(default_factory=dict)
     refused: dict[str, dict[str, int]] = field(default_factory=dict)
-    """messages of others, by stage and counter; no loss"""
+    """messages of others and input of devices, by stage and counter; no loss"""
+    unusable: list[str] = field(default_factory=list)
+    """a line for each device that sent no sample that could be used"""
     run_folder: str = ""
 
     @property
     def exit_code(self) -> int:
-        """0: stopped in order; 3: data were lost; 1: a stage failed at the end, or had to be killed."""
-        if self.killed or self.failed:
+        """0: stopped in order; 3: data were lost; 1: a stage failed at the end or had to be killed, or all that a
+        device sent was refused."""
+        if self.killed or self.failed or self.unusable:
             return 1
         return 3 if any(self.lost.values()) else 0
 
@@ -102,8 +105,10 @@ class Launcher:
             finally:
                 self._stop_all()
                 ready = [slot for slot in self._slots if slot.was_ready]  # one that was never ready has lost nothing
-                self.outcome.lost = self._watcher.losses({each for slot in ready for each in slot.sessions})
+                sessions = {each for slot in ready for each in slot.sessions}
+                self.outcome.lost = self._watcher.losses(sessions)
                 self.outcome.refused = self._watcher.refused()
+                self.outcome.unusable = self._watcher.unusable(sessions)
         return self.outcome
 
     def _refuse_second_launcher(self, bus: Bus, stop: threading.Event) -> None:

@@ -13,7 +13,7 @@ from pipeline.bus.session import Bus
 from pipeline.config.models import NAME_PATTERN
 from pipeline.launch.known_sessions import KnownSessions
 from pipeline.launch.loss_accounting import Launched, label, losses
-from pipeline.launch.refused_messages import refused
+from pipeline.launch.refused_input import refused, unusable_lines
 from pipeline.launch.watched_alarms import WatchedAlarms
 from schemas.codec import CodecError, decode
 from schemas.messages import Alarm, Health
@@ -144,9 +144,14 @@ class SiteWatcher:
             return losses((each.health for each in self._believed()), launched)
 
     def refused(self) -> dict[str, dict[str, int]]:
-        """What every stage has refused, over all its sessions; see `pipeline.launch.refused_messages`."""
+        """What every stage has refused, over all its sessions; see `pipeline.launch.refused_input`."""
         with self._lock:
             return refused(each.health for each in self._believed())
+
+    def unusable(self, launched: Collection[Launched]) -> list[str]:
+        """A line for each device of which no sample could be used by the sessions given."""
+        with self._lock:
+            return unusable_lines((each.health for each in self._believed()), launched)
 
     def _believed(self) -> list[_Heard]:
         every = chain(self._unknown.values(), self._healths.values())

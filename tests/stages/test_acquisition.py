@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -131,8 +132,27 @@ def test_an_absurd_command_removes_the_sample_and_shows_as_a_loss() -> None:
     core = make_core(command_max=0.9)
     frames = [sample(0), sample(1, command=0.91), sample(2)]
     assert [raw.device_sequence.tolist() for raw in feed(core, frames)] == [[0], [2]]
-    assert core.counters()["absurd_command"] == 1
+    assert core.counters()["absurd_command"] == core.counters()["refused_input"] == 1
     assert core.counters()["lost_on_line"] == 1
+    assert core.counters().get("lost_refused", 0) == 0
+
+
+@pytest.mark.parametrize("sequences", [range(50), [None] * 50], ids=["numbered", "unnumbered"])
+def test_samples_refused_to_the_end_are_lost_though_no_gap_shows_them(sequences: Iterable[int | None]) -> None:
+    core = make_core(protocol="text")
+    feed(core, [sample(number, command=117) for number in sequences], "text")
+    assert core.counters()["lost_refused"] == core.counters()["absurd_command"] == 50
+    assert core.counters().get("samples", 0) == 0
+
+
+def test_a_refused_sample_is_counted_as_lost_once_and_a_corrupt_number_is_not_believed() -> None:
+    core, lost = make_core(command_max=0.9), []
+    absurd = [sample(5, command=2.0), sample(2**31, command=2.0), sample(6, command=2.0)]
+    for frame in [sample(4), *absurd, sample(8), Sample(0, 9, (0.5,), (1.0,)), sample(0)]:
+        feed(core, [frame])
+        lost.append(sum(count for name, count in core.counters().items() if name.startswith("lost_")))
+    assert lost == [0, 1, 2, 3, 3, 4, 4], "what was refused before a restart of the device stays lost"
+    assert core.counters()["device_restarts"] == 1
 
 
 def test_a_limit_rounded_to_float32_is_still_within_the_limit() -> None:
@@ -300,14 +320,48 @@ def test_a_silent_line_is_a_problem_after_two_seconds_and_not_before() -> None:
     assert core.problem() == ""
 
 
-def test_a_line_without_a_valid_frame_is_a_problem_that_says_what_to_check() -> None:
+def test_a_line_without_a_valid_frame_is_a_problem_that_names_the_setting() -> None:
     core = make_core()
     for second in range(4):
         core.tick(second * S)
         core.step(ReceivedBytes(encode("binary", Sample(1, 1, (0.5,), (1.0,))), second * S))
-    problem = core.problem()
-    assert problem.startswith("/dev/ttyTEST: no valid sample for 2 s (last fault: wrong_fan_count, frame of 1 fans")
-    assert problem.endswith("check baud = 115200, protocol = 'binary', fans = 2 of the [[tray]]")
+    fault = "wrong_fan_count: frame of 1 fans, this tray has 2"
+    assert core.problem() == f"/dev/ttyTEST: no valid sample ({fault}); check fans = 2 of the [[tray]]"
+
+
+def test_samples_outside_the_limits_of_the_tray_are_one_problem_whatever_their_values() -> None:
+    core = make_core()
+    problems = set()
+    for number in range(400):
+        feed(core, [sample(number, command=100.0 + number % 50)], t_ns=number * S // 10)
+        core.tick(number * S // 10)
+        problems.add(core.problem())
+    fault = "absurd_command: command 100 is outside command_min = 0 to command_max = 1"
+    expected = f"/dev/ttyTEST: no valid sample ({fault}); check command_min and command_max of the [[tray]]"
+    assert problems == {"", expected}
+
+
+def test_speeds_that_are_all_beyond_the_limit_are_a_problem_that_names_it() -> None:
+    core = make_core(speed_max=40, speed_unit="rpm")
+    assert len(feed(core, map(sample, range(30)))) == 30
+    assert core.counters()["absurd_samples"] == 30
+    fault = "absurd_speed: speed 100 is beyond speed_max = 40 rpm"
+    assert core.problem() == f"/dev/ttyTEST: no valid sample ({fault}); check speed_max and speed_unit of the [[tray]]"
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_noise_on_the_line_is_one_problem_whatever_it_looks_like(protocol: Protocol) -> None:
+    chance, core = random.Random(3), make_core(protocol=protocol)
+    problems = set()
+    for number in range(600):  # a minute
+        t_ns = number * S // 10
+        core.step(ReceivedBytes(chance.randbytes(40), t_ns))
+        if chance.random() < 0.3:
+            feed(core, [sample(number)], protocol, t_ns)
+        core.tick(t_ns)
+        problems.add(core.problem())
+    assert len(problems - {""}) <= 3, problems
+    assert all("check " in problem for problem in problems - {""})
 
 
 def test_mostly_faulty_frames_are_a_problem_although_some_are_valid() -> None:
@@ -315,7 +369,8 @@ def test_mostly_faulty_frames_are_a_problem_although_some_are_valid() -> None:
     for i in range(30):
         feed(core, [sample(i)])
         core.step(ReceivedBytes(b"\0\x09aa\0" * 2, S))
-    assert core.problem().startswith("/dev/ttyTEST: most input is faulty (last fault: truncated")
+    assert core.problem().startswith("/dev/ttyTEST: most input is faulty (truncated: ")
+    assert core.problem().endswith("check the wiring, and baud = 115200, protocol = 'binary', fans = 2 of the [[tray]]")
     feed(core, map(sample, range(30, 100)))
     assert core.problem() == ""
 

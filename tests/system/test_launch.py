@@ -130,6 +130,7 @@ def test_visitors_change_nothing_and_ctrl_c_stops_in_order_with_everything_recor
         "failed": [],
         "lost": dict.fromkeys(sorted(chain.stages), 0),
         "refused": {},
+        "unusable": [],
     }
     assert not any(map(is_running, chain.process_ids().values()))
     check_whole(chain)

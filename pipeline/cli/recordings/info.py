@@ -19,7 +19,7 @@ from rich.table import Table
 from pipeline.cli.options import JsonOption
 from pipeline.cli.progress import working
 from pipeline.launch.loss_accounting import label, losses
-from pipeline.launch.refused_messages import refused, refused_lines
+from pipeline.launch.refused_input import refused, refused_lines
 from pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key

@@ -22,7 +22,7 @@ from pipeline.config.models import Config
 from pipeline.errors import UserError
 from pipeline.launch.judged_fans import JudgedFans
 from pipeline.launch.processes import process_list
-from pipeline.launch.refused_messages import refused_lines
+from pipeline.launch.refused_input import refused_lines
 from pipeline.launch.site_state import StageState, Word, site_states
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.runtime.signals import stop_on_signals

@@ -14,7 +14,7 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.config.loading import load_config
 from pipeline.launch.event_log import EventLog
 from pipeline.launch.launcher import Launcher, Outcome
-from pipeline.launch.refused_messages import refused_lines
+from pipeline.launch.refused_input import refused_lines
 from pipeline.runtime.signals import ignore_hangup, stop_on_signals
 
 
@@ -23,8 +23,8 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
 
     Events are written to standard error. The site keeps running when the terminal is closed; SIGTERM stops it, too.
 
-    Exit codes: 0 stopped in order, nothing lost; 1 could not start, or a stage failed or was killed at the end;
-    3 data were lost.
+    Exit codes: 0 stopped in order, nothing lost; 1 could not start, a stage failed or was killed at the end, or all
+    that a device sent was refused; 3 data were lost.
 
     Example: fantwin up -c fantwin.toml
     """
@@ -40,6 +40,8 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
                 log.say(line)
             losses = ", ".join(f"{name} {count}" for name, count in outcome.lost.items() if count)
             log.say(f"stopped; lost: {losses or 'nothing'}; files in {outcome.run_folder}")
+            for line in outcome.unusable:
+                log.say(line)
     finally:
         log.close()
     if json_output:
@@ -50,7 +52,7 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
 
 def _print_json(outcome: Outcome) -> None:
     """To standard output, where somebody may read it; the exit code stands whether or not it can be written."""
-    names = ("run_folder", "restarts", "killed", "failed", "lost", "refused")
+    names = ("run_folder", "restarts", "killed", "failed", "lost", "refused", "unusable")
     found = {name: getattr(outcome, name) for name in names}
     with suppress(OSError):
         os.write(sys.stdout.fileno(), f"{json.dumps(found)}\n".encode())

@@ -184,7 +184,7 @@ def test_row_07_what_was_refused_of_a_second_process_is_said_and_is_no_loss(site
     watcher = SiteWatcher(site.outside, SITE)
     refusals = (Counter(name="refused_of_second", value=12),)
     view(site, watcher, replace(HEALTH, inputs=(), counters=refusals, lost=0))
-    assert "scorer: messages refused: 12 from a second process of a stage\n" in shown(watcher, site.judged())
+    assert "scorer: refused: 12 messages from a second process of a stage\n" in shown(watcher, site.judged())
     assert watcher.losses() == {"scorer": 0}
 
 

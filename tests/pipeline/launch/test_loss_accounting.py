@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pipeline.launch.loss_accounting import losses
-from pipeline.launch.refused_messages import refused, refused_lines
 from schemas.messages import Counter, Header, Health, Input, Output, StageStatus
 
 KEY = "fantwin/s/t/raw"
@@ -201,13 +200,6 @@ def test_row_13_a_host_clock_that_was_set_back_does_not_change_the_order_of_sess
     before = health("w1", "recorder", 500, OK, inputs=(line("a1", 0, 40),))
     after = health("w2", "recorder", 9, inputs=(line("a1", 45, 85), line("a2", 0, 50)))
     assert losses([KILLED, FOLLOWER, before, after])["recorder"] == 5 + 5
-
-
-def test_row_07_what_sessions_have_refused_is_added_up():
-    counted = (Counter(name="refused_of_second", value=5), Counter(name="refused_clocks", value=0))
-    sessions = [health(name, "recorder", 1, counters=counted) for name in ("w1", "w2")]
-    assert refused([*sessions, FOLLOWER]) == {"recorder": {"refused_of_second": 10}}
-    assert refused_lines(refused(sessions)) == ["recorder: messages refused: 10 from a second process of a stage"]
 
 
 def test_row_18_what_a_killed_recorder_had_not_flushed_and_a_killed_producer_cannot_send_again_is_lost():

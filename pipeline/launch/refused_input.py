@@ -1,0 +1,86 @@
+"""What stages have refused, over all their sessions: messages of others, and input of devices that is no usable sample.
+
+Refused input is shown apart from losses. A stage that has refused all that its device sent has failed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
+
+from pipeline.launch.loss_accounting import Launched, label
+from schemas.messages import Health
+
+WORDS = {
+    "refused_of_second": "messages from a second process of a stage",
+    "refused_of_replay": "commands of a replay",
+    "refused_clocks": "clock messages from others than the replay",
+    "refused_numbers": "messages with impossible numbers",
+    "refused_producers": "messages from unknown or too many producers",
+    "refused_too_large": "messages that are too large",
+    "refused_commands": "commands out of range or of another number of fans",
+    "refused_other_time": "samples of another time",
+    "refused_input": "pieces of input that are no usable sample",
+    "absurd_speed": "speeds beyond speed_max",
+}
+"""by counter"""
+_LINE = "protocol, baud and the wiring"
+_SETTINGS = {
+    "absurd_command": "command_min and command_max",
+    "absurd_samples": "speed_max and speed_unit",
+    "bad_command": "what the device sends as command",
+    "bad_number": _LINE,
+    "garbage": _LINE,
+    "oversized": _LINE,
+    "truncated": _LINE,
+    "wrong_crc": _LINE,
+    "wrong_fan_count": "fans",
+    "wrong_type": "whether the line returns what is sent",
+    "wrong_version": "the device's version of the protocol",
+}
+"""what to look at, by the counter of a fault (docs/reference/wire-protocol.md)"""
+
+
+def refused(healths: Iterable[Health]) -> dict[str, dict[str, int]]:
+    """How much each stage has refused, by its label and by counter; only what is not 0.
+
+    healths: the last of every session.
+    """
+    found = {name: {c: n for c, n in counts.items() if c in WORDS and n} for name, counts in _sums(healths).items()}
+    return {name: counts for name, counts in sorted(found.items()) if counts}
+
+
+def refused_lines(found: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """A line for each stage."""
+    return [
+        f"{name}: refused: {', '.join(f'{count} {WORDS[counter]}' for counter, count in counts.items())}"
+        for name, counts in found.items()
+    ]
+
+
+def unusable_lines(healths: Iterable[Health], launched: Collection[Launched]) -> list[str]:
+    """A line for each device of which no sample could be used: how much was refused, why, and what to look at.
+
+    healths: the last of every session; launched: the sessions that count.
+    """
+    lines: list[str] = []
+    for name, counts in sorted(_sums(each for each in healths if (label(each), each.process_id) in launched).items()):
+        pieces = counts["refused_input"] + counts["absurd_samples"]
+        kinds = Counter({kind: counts[kind] for kind in _SETTINGS if counts[kind]}).most_common()
+        if pieces and counts["samples"] == counts["absurd_samples"]:
+            why = ", ".join(f"{kind} {count}" for kind, count in kinds)
+            check = f"check {_SETTINGS[kinds[0][0]]} of the [[tray]]" if kinds else "check source of the [[tray]]"
+            lines.append(
+                f"{name}: no sample could be used, {pieces} were refused ({why or 'of unknown kind'}): {check}"
+            )
+    return lines
+
+
+def _sums(healths: Iterable[Health]) -> dict[str, Counter[str]]:
+    """The counters of all sessions of each stage together, by its label."""
+    sums: dict[str, Counter[str]] = {}
+    for health in healths:
+        counts = sums.setdefault(label(health), Counter())
+        for each in health.counters:
+            counts[each.name] += each.value
+    return sums

@@ -1,0 +1,69 @@
+"""What stages have refused: messages of others, and input of devices."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.launch.launcher import Outcome
+from pipeline.launch.refused_input import refused, refused_lines, unusable_lines
+from schemas.messages import Counter, Health, StageStatus
+from schemas.wire import FaultKind
+
+LAUNCHED = {("acquisition/bench", 7)}
+
+
+def health(name: str = "acquisition/bench", process_id: int = 7, /, **counters: int) -> Health:
+    stage, instance = name.split("/")
+    counts = tuple(Counter(name=name, value=value) for name, value in counters.items())
+    status = StageStatus.STOPPED
+    return Health(
+        stage=stage, instance=instance, status=status, t_ns=1, uptime_s=1.0, process_id=process_id, counters=counts
+    )
+
+
+def test_row_07_what_sessions_have_refused_is_added_up():
+    sessions = [health("recorder/all", refused_of_second=5, refused_clocks=0)] * 2
+    assert refused([*sessions, health(samples=3)]) == {"recorder": {"refused_of_second": 10}}
+    assert refused_lines(refused(sessions)) == ["recorder: refused: 10 messages from a second process of a stage"]
+
+
+def test_a_device_of_which_all_was_refused_is_named_with_the_count_and_the_setting():
+    sessions = [health(absurd_command=400, garbage=2, refused_input=402), health(absurd_command=10, refused_input=10)]
+    assert unusable_lines(sessions, LAUNCHED) == [
+        "acquisition/bench: no sample could be used, 412 were refused (absurd_command 410, garbage 2): "
+        "check command_min and command_max of the [[tray]]"
+    ]
+
+
+def test_speeds_that_are_all_beyond_the_limit_are_no_usable_sample():
+    (line,) = unusable_lines([health(samples=50, absurd_samples=50, absurd_speed=200)], LAUNCHED)
+    assert line.endswith("50 were refused (absurd_samples 50): check speed_max and speed_unit of the [[tray]]")
+
+
+@pytest.mark.parametrize(
+    "counters",
+    [
+        {"samples": 1, "garbage": 30, "refused_input": 30},
+        {"samples": 51, "absurd_samples": 50},
+        {"resync": 1},
+        {"line_up": 1},
+        {},
+    ],
+)
+def test_some_noise_and_a_device_that_sends_nothing_are_not_named(counters: dict[str, int]):
+    assert unusable_lines([health(**counters)], LAUNCHED) == []
+
+
+def test_sessions_that_others_have_started_do_not_count():
+    assert unusable_lines([health("acquisition/bench", 8, garbage=30, refused_input=30)], LAUNCHED) == []
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FaultKind if kind is not FaultKind.RESYNC])
+def test_every_fault_of_the_line_has_a_setting_to_look_at(kind: FaultKind):
+    (line,) = unusable_lines([health(refused_input=1, **{kind.value: 1})], LAUNCHED)
+    assert "source of the [[tray]]" not in line
+
+
+def test_a_device_of_which_all_was_refused_is_a_failure_of_the_site():
+    assert Outcome(lost={"acquisition/bench": 4}, unusable=["acquisition/bench: ..."]).exit_code == 1
+    assert Outcome(refused={"acquisition/bench": {"refused_input": 30}}).exit_code == 0
