@@ -1,7 +1,8 @@
 """Command profiles over time, for fans without commands from a host.
 
 A profile is a function of time, `command(t_s) -> (fans,)`, within `low..high`. Each fan has its own; the same seed
-gives the same commands. Profiles are periodic; only those made of steps jump where a period begins again.
+gives the same commands. Profiles are periodic; those made of steps, and the thermostat, jump where a period begins
+again.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulation.errors import SimulationError
+from simulation.thermostat import Thermostat
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -170,6 +172,7 @@ PROFILES: dict[str, Callable[[int, int, float, float], Excitation]] = {
     "multisine": Multisine,
     "chirp": Chirp,
     "manual": Manual,
+    "thermostat": Thermostat,
 }
 LOW, HIGH = 0.1, 0.95
 

@@ -2,14 +2,19 @@
 
 Each acts on one fan from `start_s` until `stop_s`, and has no effect afterwards. The meaning of `size` by kind:
 
-| kind | what it is | size | default |
-|---|---|---|---|
-| inlet | covered inlet | factor on the drag C_D | 1.6 |
-| rotor | disturbed rotor | braking torque, V | 1.0 |
-| wear | worn bearing | sliding friction added at stop, V; grows linearly from 0 at start | 0.8 |
-| supply | supply sag | factor on the supply voltage | 0.85 |
-| tacho-stuck | tacho repeats its last reading | (none) | |
-| tacho-dropout | tacho gives no reading (NaN) | share of missing readings, 0 to 1 | 1.0 |
+| kind | fans | what it is | size | default |
+|---|---|---|---|---|
+| inlet | dc | covered inlet | factor on the drag C_D | 1.6 |
+| rotor | dc | disturbed rotor | braking torque, V | 1.0 |
+| wear | dc | worn bearing | sliding friction added at stop, V; grows linearly from 0 at start | 0.8 |
+| supply | dc | supply sag | factor on the supply voltage | 0.85 |
+| clog | 4-pin | clogging | share of the speed lost; grows linearly from 0 within 180 s | 0.06 |
+| blade | 4-pin | something touches a blade | share of the speed lost | 0.10 |
+| bearing | 4-pin | worn bearing | share of the speed lost; runs up slower, coasts shorter | 0.03 |
+| blocked | 4-pin | the rotor cannot turn | (none) | |
+| no-power | 4-pin | the supply is gone | (none) | |
+| tacho-stuck | all | tacho repeats its last reading | (none) | |
+| tacho-dropout | all | tacho gives no reading (NaN): a loose wire | share of missing readings, 0 to 1 | 1.0 |
 """
 
 from __future__ import annotations
@@ -22,7 +27,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulation.errors import SimulationError
+from simulation.four_pin import FourPinDamage
 from simulation.plant import Disturbance
+
+CLOG_S = 180.0
+"""the time in which clogging reaches its size"""
+BEARING_UP_FACTOR, BEARING_DOWN_FACTOR = 1.8, 0.75
+"""of a worn bearing, on the time constants of a rise and of a fall"""
 
 
 @dataclass(frozen=True)
@@ -30,13 +41,19 @@ class _Kind:
     default_size: float | None  # None: this kind has no size
     smallest: float = 0.0
     largest: float = math.inf
+    fans: tuple[str, ...] = ("dc", "4-pin")
 
 
 KINDS: dict[str, _Kind] = {
-    "inlet": _Kind(1.6, smallest=0.01),
-    "rotor": _Kind(1.0),
-    "wear": _Kind(0.8),
-    "supply": _Kind(0.85),
+    "inlet": _Kind(1.6, smallest=0.01, fans=("dc",)),
+    "rotor": _Kind(1.0, fans=("dc",)),
+    "wear": _Kind(0.8, fans=("dc",)),
+    "supply": _Kind(0.85, fans=("dc",)),
+    "clog": _Kind(0.06, largest=1.0, fans=("4-pin",)),
+    "blade": _Kind(0.10, largest=1.0, fans=("4-pin",)),
+    "bearing": _Kind(0.03, largest=1.0, fans=("4-pin",)),
+    "blocked": _Kind(None, fans=("4-pin",)),
+    "no-power": _Kind(None, fans=("4-pin",)),
     "tacho-stuck": _Kind(None),
     "tacho-dropout": _Kind(1.0, largest=1.0),
 }
@@ -58,10 +75,12 @@ class Fault:
         return self.start_s <= t_s < self.stop_s
 
     def size_at(self, t_s: float) -> float:
-        """Its size at t_s while it is active; that of wear grows linearly."""
+        """Its size at t_s while it is active; that of wear and of clogging grows linearly."""
         assert self.size is not None
-        growth = (t_s - self.start_s) / (self.stop_s - self.start_s) if self.kind == "wear" else 1.0
-        return self.size * growth
+        since_s = t_s - self.start_s
+        if self.kind == "wear":
+            return self.size * (since_s / (self.stop_s - self.start_s))
+        return self.size * min(1.0, since_s / CLOG_S) if self.kind == "clog" else self.size
 
 
 def parse_fault(text: str) -> Fault:
@@ -116,13 +135,17 @@ def _check(fault: Fault, where: str) -> None:
         raise SimulationError(f"{where}: size = {fault.size:g}; give one from {kind.smallest:g}{upto}")
 
 
-def check_schedule(faults: Iterable[Fault], fans: int, duration_s: float) -> None:
-    """Check that these faults fit a tray of `fans` fans that runs for `duration_s`.
+def check_schedule(faults: Iterable[Fault], fans: int, duration_s: float, fan_kind: str = "dc") -> None:
+    """Check that these faults fit a tray of `fans` fans of a kind that runs for `duration_s`.
 
     Raises:
-        SimulationError: a fan does not exist, wear has no end, or a fault starts after the end.
+        SimulationError: such fans have no such fault, a fan does not exist, wear has no end, or a fault starts after
+            the end.
     """
     for fault in faults:
+        if fan_kind not in KINDS[fault.kind].fans:
+            own = ", ".join(name for name, kind in KINDS.items() if fan_kind in kind.fans)
+            raise SimulationError(f"{fault.kind} fault: {fan_kind} fans have no such fault; they have {own}")
         if fault.fan >= fans:
             raise SimulationError(
                 f"{fault.kind} fault: fan {fault.fan} does not exist; the tray has fans 0 to {fans - 1}"
@@ -161,6 +184,23 @@ def disturbance(faults: Sequence[Fault], fans: int, t_s: float) -> Disturbance:
         elif fault.kind == "supply":
             supply[fault.fan] *= fault.size_at(t_s)
     return Disturbance(drag, brake, supply)
+
+
+def four_pin_damage(faults: Iterable[Fault], fans: int, t_s: float) -> FourPinDamage:
+    """The damage of 4-pin fans at t_s. Several faults of one fan combine: factors multiply."""
+    speed, up, down = np.ones(fans), np.ones(fans), np.ones(fans)
+    blocked, unpowered = np.zeros(fans, np.bool_), np.zeros(fans, np.bool_)
+    for fault in faults:
+        if not fault.active(t_s):
+            continue
+        if fault.kind in ("clog", "blade", "bearing"):
+            speed[fault.fan] *= 1.0 - fault.size_at(t_s)
+        if fault.kind == "bearing":
+            up[fault.fan] *= BEARING_UP_FACTOR
+            down[fault.fan] *= BEARING_DOWN_FACTOR
+        blocked[fault.fan] |= fault.kind == "blocked"
+        unpowered[fault.fan] |= fault.kind == "no-power"
+    return FourPinDamage(speed, up, down, blocked, unpowered)
 
 
 def tacho_faults(faults: Sequence[Fault], fans: int, t_s: float) -> TachoFaults:

@@ -155,22 +155,6 @@ def advance(
 
 
 @dataclass(frozen=True)
-class Tacho:
-    """Measures speed: white noise, then rounding to `step_rad_s`; no direction, and 0 below `floor_rad_s`."""
-
-    noise_rad_s: float = 4.0
-    step_rad_s: float = 0.5
-    floor_rad_s: float = 2.0
-
-    def read(self, speed_rad_s: Array, rng: np.random.Generator) -> Array:
-        """(fans,) reading in rad/s of the speed (fans,)."""
-        magnitude = np.abs(speed_rad_s)
-        noisy = magnitude + self.noise_rad_s * rng.normal(size=magnitude.shape)
-        stepped = np.round(noisy / self.step_rad_s) * self.step_rad_s if self.step_rad_s > 0.0 else noisy
-        return np.where(magnitude < self.floor_rad_s, 0.0, np.maximum(stepped, 0.0))
-
-
-@dataclass(frozen=True)
 class DeviceClock:
     """The device clock: 32 bits of microseconds, fast by `drift_ppm` (negative: slow), at `start_us` at time 0."""
 

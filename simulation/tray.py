@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from simulation.errors import SimulationError
 from simulation.excitation import excitation
-from simulation.faults import Fault, check_schedule, disturbance, tacho_faults
-from simulation.plant import HEALTHY, DeviceClock, Tacho, advance, at_rest, tray_of_fans
+from simulation.fans import FanKind, simulated_fans
+from simulation.faults import Fault, check_schedule, tacho_faults
+from simulation.plant import DeviceClock
+from simulation.tacho import TachoSettings, simulated_tacho
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -34,6 +36,7 @@ class TraySettings:
     """Settings of a simulated tray."""
 
     fans: int = 8
+    fan: FanKind = "dc"
     rate_hz: float = 100.0
     duration_s: float = math.inf
     profile: str = "manual"
@@ -47,7 +50,7 @@ class TraySettings:
     """share of samples that are lost"""
     jitter_us: float = 100.0
     """standard deviation of the time of sampling, cut at 0.4 periods"""
-    tacho: Tacho = Tacho()
+    tacho: TachoSettings = TachoSettings()
     clock: DeviceClock = DeviceClock()
     faults: tuple[Fault, ...] = ()
 
@@ -75,12 +78,14 @@ class SimulatedTray:
         _check(settings)
         self.settings = settings
         self.fans = settings.fans
-        profile, *others = np.random.SeedSequence(settings.seed).generate_state(5).tolist()
-        self.parameters = tray_of_fans(settings.fans, settings.fans_seed, settings.fan_variation)
+        profile, *others = np.random.SeedSequence(settings.seed).generate_state(6).tolist()
         self._excitation = excitation(settings.profile, settings.fans, profile)
-        self._jitter_rng, self._loss_rng, self._tacho_rng, self._dropout_rng = map(np.random.default_rng, others)
-        self._state = at_rest(settings.fans)
-        self._disturbance = HEALTHY
+        self._jitter_rng, self._loss_rng, tacho, self._dropout_rng = map(np.random.default_rng, others[:4])
+        self._plant = simulated_fans(
+            settings.fan, settings.fans, settings.fans_seed, settings.fan_variation, seed=others[4]
+        )
+        self.parameters = self._plant.parameters
+        self._tacho = simulated_tacho(settings.tacho, settings.fans, tacho)
         self._command = np.zeros(settings.fans)
         self._override = np.full(settings.fans, np.nan)
         self._set_point_rad_s = np.full(settings.fans, np.nan)
@@ -99,11 +104,10 @@ class SimulatedTray:
     def take(self) -> TraySample:
         """Advance the fans to the next sample and measure it."""
         t_s, step_s = self._due_s, self._due_s - self._t_s
-        self._state = advance(self._state, self._command, step_s, self.parameters, self._disturbance)
-        self._t_s = t_s
+        self._turn(t_s, step_s)
         speed_rad_s = self._measure(t_s)
         self._command = self._next_duty(t_s, speed_rad_s, step_s)
-        self._disturbance = disturbance(self.settings.faults, self.fans, t_s)
+        self._plant.set_faults(self.settings.faults, t_s)
         self._record_faults(t_s)
         sample = TraySample(
             t_s,
@@ -144,12 +148,22 @@ class SimulatedTray:
         jitter_s = self._jitter_rng.normal() * self.settings.jitter_us * 1e-6
         return max(0.0, self._count * period_s + min(max(jitter_s, -limit_s), limit_s))
 
+    def _turn(self, t_s: float, step_s: float) -> None:
+        """Turn the fans until t_s, in pieces that are short enough for them and for their tachos."""
+        pieces = max(1, math.ceil(step_s / min(self._plant.longest_step_s, self._tacho.longest_piece_s)))
+        start_s, piece_s = self._t_s, step_s / pieces
+        for piece in range(pieces):
+            before = self._plant.speed_rad_s
+            self._plant.advance(self._command, piece_s)
+            piece_end_s = start_s + (piece + 1) * piece_s
+            self._tacho.turn(start_s + piece * piece_s, before, piece_end_s, self._plant.speed_rad_s)
+        self._t_s = t_s
+
     def _measure(self, t_s: float) -> Array:
         """(fans,) tacho readings. Faults do not change which random numbers are drawn."""
         faults = tacho_faults(self.settings.faults, self.fans, t_s)
-        measured = self.settings.tacho.read(self._state.speed_rad_s, self._tacho_rng)
-        self._reading_rad_s = np.where(faults.stuck, self._reading_rad_s, measured)
-        missing = self._dropout_rng.random(self.fans) < faults.dropout
+        self._reading_rad_s = np.where(faults.stuck, self._reading_rad_s, self._tacho.read())
+        missing = self._dropout_rng.random(self.fans) < np.maximum(faults.dropout, self.settings.tacho.missing_readings)
         return np.where(missing, np.nan, self._reading_rad_s)
 
     def _next_duty(self, t_s: float, speed_rad_s: Array, step_s: float) -> Array:
@@ -184,10 +198,13 @@ def _check(settings: TraySettings) -> None:
         ("jitter", settings.jitter_us, 0.0, math.inf),
         ("drift", settings.clock.drift_ppm, -100_000.0, 100_000.0),
         ("clock start", settings.clock.start_us, 0, 2**32 - 1),
-        ("tacho noise", settings.tacho.noise_rad_s, 0.0, math.inf),
+        ("tacho noise", settings.tacho.noise.noise_rad_s, 0.0, math.inf),
+        ("missing edges", settings.tacho.missing_edges, 0.0, 1.0),
+        ("double edges", settings.tacho.double_edges, 0.0, 1.0),
+        ("missing readings", settings.tacho.missing_readings, 0.0, 1.0),
     )
     for name, value, smallest, largest in limits:
         if not smallest <= value <= largest:
             upto = f"to {largest:g}" if math.isfinite(largest) else "on"
             raise SimulationError(f"{name} = {value:g}; give one from {smallest:g} {upto}")
-    check_schedule(settings.faults, settings.fans, settings.duration_s)
+    check_schedule(settings.faults, settings.fans, settings.duration_s, settings.fan)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from schemas.units import NS_PER_S
-from simulation.plant import fan
 from simulation.tray import SimulatedTray
 
 
@@ -31,6 +30,7 @@ def truth(tray: SimulatedTray, start_ns: int | None, *, complete: bool, counts: 
         **counts,
         "faults": [_fault(tray, number, start_ns, complete) for number in range(len(settings.faults))],
         "fans": settings.fans,
+        "fan": settings.fan,
         "rate_hz": settings.rate_hz,
         "profile": settings.profile,
         "seed": settings.seed,
@@ -39,8 +39,11 @@ def truth(tray: SimulatedTray, start_ns: int | None, *, complete: bool, counts: 
         "lost": settings.lost,
         "jitter_us": settings.jitter_us,
         "clock": asdict(settings.clock),
-        "tacho": asdict(settings.tacho),
-        "parameters": [asdict(fan(tray.parameters, index)) for index in range(settings.fans)],
+        "tacho": settings.tacho.as_record(),
+        "parameters": [
+            {name: float(values[fan]) for name, values in asdict(tray.parameters).items()}
+            for fan in range(settings.fans)
+        ],
     }
 
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from bench.detection.knobs import Knobs
 from schemas.messages import Array, Raw
-from simulation.plant import Disturbance, FanParameters, Tacho, advance, at_rest
+from simulation.plant import Disturbance, FanParameters, advance, at_rest
+from simulation.tacho import NoisyTacho
 from simulation.tray import LOOP_GAIN, LOOP_INTEGRAL_GAIN_PER_S
 
 RATE_HZ = 100.0
@@ -69,7 +70,7 @@ class Plant:
         self._days = 1.0 if days else 0.0
         self._density = DENSITY_BETWEEN_RUNS * weather.normal(size=runs)
         self._phase = weather.uniform(0.0, 2.0 * np.pi, size=runs)
-        self._tacho = Tacho()
+        self._tacho = NoisyTacho()
         self._reading = np.zeros(self._columns)
         self._integral = np.zeros(self._columns)
 

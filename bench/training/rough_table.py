@@ -15,8 +15,9 @@ import typer
 from bench.printing import JsonOption, progress, show
 from bench.training.four_models import held_out_figures, trained_in_s
 from simulation.excitation import Manual
-from simulation.plant import FanParameters, Tacho, advance, at_rest
+from simulation.plant import FanParameters, advance, at_rest
 from simulation.published_fan import RATE_HZ, SimulatedRun, random_stairs
+from simulation.tacho import NoisyTacho
 from twin.comparison import Contender, all_candidates, contend
 from twin.runs import Array, Run
 
@@ -52,7 +53,7 @@ def main(
 
 def simulated_plant(command: Array, seed: int, lag_s: float = 0.012) -> SimulatedRun:
     """The plant under duty (n, 1) at 100 Hz, from standstill, read by its tacho."""
-    parameters, tacho, rng = FanParameters(lag_s=lag_s), Tacho(), np.random.default_rng([seed, 2])
+    parameters, tacho, rng = FanParameters(lag_s=lag_s), NoisyTacho(), np.random.default_rng([seed, 2])
     state, true, read = at_rest(1), [], []
     for duty in command:
         true.append(state.speed_rad_s)

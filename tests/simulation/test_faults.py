@@ -6,11 +6,16 @@ import pytest
 
 from simulation.errors import SimulationError
 from simulation.faults import Fault, check_schedule, disturbance, parse_fault, tacho_faults
-from simulation.plant import Tacho
+from simulation.tacho import NoisyTacho, TachoSettings
 from simulation.tray import SimulatedTray, TraySettings
 
 QUIET = TraySettings(
-    fans=2, duration_s=12.0, profile="staircase", fan_variation=0.0, jitter_us=0.0, tacho=Tacho(0.0, 0.0)
+    fans=2,
+    duration_s=12.0,
+    profile="staircase",
+    fan_variation=0.0,
+    jitter_us=0.0,
+    tacho=TachoSettings(noise=NoisyTacho(0.0, 0.0)),
 )
 
 
@@ -111,6 +116,8 @@ def test_a_fault_is_read_from_the_command_line() -> None:
     [
         ("inlte:fan=2", "unknown kind 'inlte'; did you mean 'inlet'"),
         ("fire:fan=2", "unknown kind 'fire'; known: inlet, rotor, wear"),
+        ("blocked:fan=2,size=1", "blocked has no size"),
+        ("blade:fan=2,size=1.1", "give one from 0 to 1"),
         ("inlet:fna=2", "unknown key 'fna'; did you mean 'fan'"),
         ("inlet:fan=2,sizes=1", "unknown key 'sizes'; did you mean 'size'"),
         ("inlet", "fan is missing; fans count from 0"),
@@ -139,6 +146,7 @@ def test_a_wrong_fault_is_a_one_line_error_that_names_the_part(text: str, messag
         ("inlet:fan=2", "fan 2 does not exist; the tray has fans 0 to 1"),
         ("inlet:fan=1,start=10", "start = 10 s is after the end at 10 s"),
         ("wear:fan=1", "give stop=S"),
+        ("clog:fan=1", "dc fans have no such fault; they have inlet, rotor"),
     ],
 )
 def test_a_fault_that_does_not_fit_the_tray_is_refused(text: str, message: str) -> None:

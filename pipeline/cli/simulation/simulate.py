@@ -10,9 +10,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from pydantic import ValidationError
 
 from pipeline.cli.options import JsonOption
 from pipeline.devices.measured_table import read_table
@@ -22,6 +23,7 @@ from pipeline.errors import UserError
 from pipeline.recordings.simulated import record
 from pipeline.runtime.signals import stop_on_signals
 from schemas import wire
+from schemas.tacho import Tacho
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
 if TYPE_CHECKING:
@@ -29,16 +31,30 @@ if TYPE_CHECKING:
 
 Summary = dict[str, Any]
 
+_TACHO_OPTIONS = {
+    "kind": "--tacho",
+    "pulses": "--pulses",
+    "window_s": "--window",
+    "update_s": "--update",
+    "delay_s": "--tacho-delay",
+}
+
 _LINE = "Serial line"
 _RECORDING = "Write a recording instead"
 _FILE = "Play a measured file instead of simulating"
+_TACHO = "Tacho"
 _IMPERFECTIONS = "Imperfections of real trays"
 
 
 def simulate(
     fans: Annotated[int, typer.Option(help="Number of fans, 1 to 64.")] = 8,
     rate: Annotated[float, typer.Option(help="Samples per second.")] = 100.0,
-    profile: Annotated[str, typer.Option(help="Commands: staircase, prbs, multisine, chirp or manual.")] = "manual",
+    fan: Annotated[
+        Literal["dc", "4-pin"], typer.Option(help="Kind of fan: on a bridge, or with a PWM input of its own.")
+    ] = "dc",
+    profile: Annotated[
+        str, typer.Option(help="Commands: staircase, prbs, multisine, chirp, manual or thermostat.")
+    ] = "manual",
     seed: Annotated[int, typer.Option(help="Random seed of commands, noise, jitter and losses.")] = 1,
     duration: Annotated[float | None, typer.Option(help="Seconds to run; default: until Ctrl-C.")] = None,
     link: Annotated[
@@ -62,9 +78,36 @@ def simulate(
     fans_seed: Annotated[
         int, typer.Option(help="Random seed of the variation between fans.", rich_help_panel=_IMPERFECTIONS)
     ] = 1,
+    tacho: Annotated[
+        Literal["instantaneous", "count", "period"],
+        typer.Option(
+            help="What a reading is: the speed now, pulses counted over a window, or the last revolution.",
+            rich_help_panel=_TACHO,
+        ),
+    ] = "instantaneous",
+    pulses: Annotated[int, typer.Option(help="Pulses per revolution.", rich_help_panel=_TACHO)] = 2,
+    window: Annotated[
+        float, typer.Option(help="Seconds over which pulses are counted; for count.", rich_help_panel=_TACHO)
+    ] = 0.0,
+    update: Annotated[
+        float, typer.Option(help="Seconds between new counts; default: the window.", rich_help_panel=_TACHO)
+    ] = 0.0,
+    tacho_delay: Annotated[
+        float, typer.Option(help="Seconds by which readings are late.", rich_help_panel=_TACHO)
+    ] = 0.0,
     noise: Annotated[
-        float, typer.Option(help="Tacho noise, rad/s, standard deviation.", rich_help_panel=_IMPERFECTIONS)
+        float,
+        typer.Option(help="Noise of an instantaneous reading, rad/s, standard deviation.", rich_help_panel=_TACHO),
     ] = 4.0,
+    missing_edges: Annotated[
+        float, typer.Option(help="Share of pulses not seen, 0 to 1.", rich_help_panel=_TACHO)
+    ] = 0.0,
+    double_edges: Annotated[
+        float, typer.Option(help="Share of pulses seen twice, 0 to 1.", rich_help_panel=_TACHO)
+    ] = 0.0,
+    missing: Annotated[
+        float, typer.Option(help="Share of readings that are missing, 0 to 1.", rich_help_panel=_TACHO)
+    ] = 0.0,
     lost: Annotated[float, typer.Option(help="Share of samples lost, 0 to 1.", rich_help_panel=_IMPERFECTIONS)] = 0.0,
     jitter_us: Annotated[
         float, typer.Option(help="Jitter of the sampling time, standard deviation.", rich_help_panel=_IMPERFECTIONS)
@@ -130,6 +173,8 @@ def simulate(
     """Simulate a tray of fans on a serial port that any program can open.
 
     Example: fantwin simulate --link /tmp/fan-tray --fault inlet:fan=2,start=10,stop=18,size=1.6 --truth truth.json
+
+    A rack: fantwin simulate --fan 4-pin --fans 4 --tacho count --window 1.0 --pulses 2 --rate 10 --profile thermostat
     """
     device: SimulatedTray | TableDevice
     if from_csv:
@@ -146,9 +191,12 @@ def simulate(
             raise UserError("--time, --period, --command and --speed describe a file: name it with --from-csv FILE.csv")
         device = _tray(
             faults=fault or [],
-            tacho={"noise_rad_s": noise},
+            tacho=_tacho(kind=tacho, pulses=pulses, window_s=window, update_s=update, delay_s=tacho_delay),
+            noise_rad_s=noise,
+            shares={"missing_edges": missing_edges, "double_edges": double_edges, "missing_readings": missing},
             clock={"drift_ppm": drift_ppm, "start_us": clock_start_us},
             fans=fans,
+            fan=fan,
             rate_hz=rate,
             duration_s=math.inf if duration is None else duration,
             profile=profile,
@@ -188,7 +236,32 @@ def simulate(
     typer.echo(json.dumps(summary) if json_output else _count_text(played))
 
 
-def _tray(*, faults: list[str], tacho: Mapping[str, Any], clock: Mapping[str, Any], **settings: Any) -> SimulatedTray:
+def _tacho(**settings: Any) -> Tacho:
+    """The tacho with these settings; see `schemas.tacho.Tacho`.
+
+    Raises:
+        UserError: they do not fit one another, or one is out of range.
+    """
+    try:
+        return Tacho(**settings)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = f"{_TACHO_OPTIONS[str(first['loc'][0])]} {first['input']}: " if first["loc"] else ""
+        text = first["msg"].removeprefix("Value error, ")
+        for field in ("window_s", "update_s"):
+            text = text.replace(field, _TACHO_OPTIONS[field])
+        raise UserError(where + text) from error
+
+
+def _tray(
+    *,
+    faults: list[str],
+    tacho: Tacho,
+    noise_rad_s: float,
+    shares: Mapping[str, float],
+    clock: Mapping[str, Any],
+    **settings: Any,
+) -> SimulatedTray:
     """The tray with these settings; see `simulation.tray.TraySettings`.
 
     Raises:
@@ -196,14 +269,14 @@ def _tray(*, faults: list[str], tacho: Mapping[str, Any], clock: Mapping[str, An
     """
     from simulation.errors import SimulationError  # noqa: PLC0415  loaded only by the commands that need it
     from simulation.faults import parse_fault  # noqa: PLC0415
-    from simulation.plant import DeviceClock, Tacho  # noqa: PLC0415
+    from simulation.plant import DeviceClock  # noqa: PLC0415
+    from simulation.tacho import NoisyTacho, TachoSettings  # noqa: PLC0415
     from simulation.tray import SimulatedTray, TraySettings  # noqa: PLC0415
 
+    measured = TachoSettings(tacho, NoisyTacho(noise_rad_s), **shares)
     try:
         schedule = tuple(map(parse_fault, faults))
-        return SimulatedTray(
-            TraySettings(faults=schedule, tacho=Tacho(**tacho), clock=DeviceClock(**clock), **settings)
-        )
+        return SimulatedTray(TraySettings(faults=schedule, tacho=measured, clock=DeviceClock(**clock), **settings))
     except SimulationError as error:
         raise UserError(str(error)) from error
 

@@ -358,6 +358,11 @@ def test_a_link_never_replaces_a_file_but_does_replace_a_stale_link(tmp_path: Pa
         ({"fault": ["inlte:fan=1"]}, "did you mean 'inlet'"),
         ({"profile": "manuel"}, "did you mean 'manual'"),
         ({"fans": 65}, "fans = 65"),
+        ({"tacho": "count"}, 'a tacho of kind "count" needs --window'),
+        ({"window": 1.0}, '--window and --update are for a tacho of kind "count"'),
+        ({"tacho": "count", "window": 61.0}, r"--window 61\.0: Input should be less than or equal to 60"),
+        ({"fan": "4-pin", "fault": ["inlet:fan=1"]}, "4-pin fans have no such fault; they have clog"),
+        ({"missing": 1.5}, r"missing readings = 1\.5"),
         ({"fault": ["inlet:fan=8"]}, "fan 8 does not exist"),
         ({"time": "t:s"}, "name it with --from-csv"),
         ({"recording": Path("x.mcap")}, "--recording needs --duration"),
@@ -393,6 +398,23 @@ def test_a_recording_holds_the_tray_and_the_same_seed_and_epoch_give_the_same_by
     assert np.all(np.diff(t_ns) > 0)
     assert truth["faults"][0]["start_ns"] - 10**18 == pytest.approx(1e9, abs=5e6)
     assert all(raw.speed_rad_s.shape == (len(raw.host_receive_t_ns), 2) for raw in messages)
+
+
+def test_a_rack_of_4_pin_fans_is_recorded_with_counts_of_its_window(tmp_path: Path) -> None:
+    recording, truth = tmp_path / "rack.mcap", tmp_path / "truth.json"
+    rack = {"fan": "4-pin", "fans": 4, "tacho": "count", "window": 0.5, "rate": 10.0, "profile": "thermostat"}
+    simulate(recording=recording, truth=truth, duration=60.0, missing=0.05, fault=["blocked:fan=1,start=30"], **rack)
+    messages = raw_of(recording)
+    speed = np.concatenate([raw.speed_rad_s for raw in messages])
+    counts = speed * 2 * 0.5 / (2 * np.pi)
+    read = np.isfinite(counts)
+    assert counts[read] == pytest.approx(np.round(counts[read]))
+    assert 0.02 < 1.0 - read.mean() < 0.08
+    assert np.nanmax(speed[310:, 1]) == 0.0
+    said = truth_of(tmp_path)
+    assert said["fan"] == "4-pin"
+    assert (said["tacho"]["kind"], said["tacho"]["window_s"], said["tacho"]["pulses"]) == ("count", 0.5, 2)
+    assert said["parameters"][2]["duty_min"] == 0.2
 
 
 def test_line_and_recording_carry_the_same_samples(tmp_path: Path) -> None:

@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 
 from schemas.twin_card import DataCard
 from simulation.excitation import Staircase
-from simulation.plant import FanParameters, Tacho, advance, at_rest
+from simulation.plant import FanParameters, advance, at_rest
 from simulation.published_fan import published_fan
+from simulation.tacho import NoisyTacho
 from tests.pipeline.cli.test_train_commands import record
 from tests.support.browser import seen_in_browser
 from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run
@@ -326,7 +327,7 @@ def test_the_static_curve_is_where_torque_and_load_meet():
 
 def test_a_staircase_of_two_and_a_half_seconds_a_step_gives_the_static_curve_of_the_simulated_tray():
     profile, rng = Staircase(1, 1, 0.1, 0.95, hold_s=2.5), np.random.default_rng(1)
-    plant, tacho, state = FanParameters(), Tacho(), at_rest(1)
+    plant, tacho, state = FanParameters(), NoisyTacho(), at_rest(1)
     command = np.stack([profile.command(k / 100.0) for k in range(6000)])
     speed = np.empty_like(command)
     for k, duty in enumerate(command):
