@@ -163,7 +163,12 @@ class Recorder(Core):
         return ()
 
     def abort(self) -> None:
-        """Finish the file after a crash; it does not say that the recorder ended in order."""
+        """Finish the file after a crash; it does not say that the recorder ended in order. A recorder that has received
+        nothing, such as one that is refused at its start, leaves no file."""
+        if self._part and not (self._recorded or self._part.written or self._part.pending):
+            with suppress(OSError):
+                self._part.discard()
+            self._part = None
         self._attempt(self._end_part)
 
     def counters(self) -> Mapping[str, int]:
@@ -286,7 +291,6 @@ class Recorder(Core):
         if not self._problem:
             self._paused_ns, self._paused_because = self._now_ns, reason
             self._counts["pauses"] += 1
-            _LOG.error("NOTHING IS RECORDED: %s", reason)
         self._problem = f"NOTHING IS RECORDED: {reason}; recording resumes automatically when this is resolved"
 
     def _resume(self) -> None:
@@ -305,11 +309,6 @@ class Recorder(Core):
         if shortage:
             self._pause(shortage)
             return
-        _LOG.warning(
-            "recording resumed after %.1f s; messages lost in between: %d",
-            (self._now_ns - self._paused_ns) / NS_PER_S,
-            self._lost_in_pause,
-        )
         self._lost_in_pause = 0
         for envelope in self._held.take_all():
             self._record(envelope)

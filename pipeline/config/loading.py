@@ -151,10 +151,13 @@ def _check(model: type[_Model], values: Any, path: Path, section: str) -> _Model
 
 
 def _first_problem(error: ValidationError, model: type[BaseModel], section: str) -> str:
+    # a list whose only entry is wrong counts as too short, too: what is wrong within it says what to correct
+    found = error.errors()
+    found = [each for each in found if not any(_is_within(other["loc"], each["loc"]) for other in found)]
     # a misspelt key is both unknown and missing: the unknown one says what to correct
-    first = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
+    first = min(found, key=lambda problem: problem["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in ((section,) if section else ()) + first["loc"])
-    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
     if first["type"] == "extra_forbidden":
         known = _keys_at(model, first["loc"][:-1])
         return f"unknown key {_shown(where)}{nearest(str(first['loc'][-1]), known)}{more}"
@@ -163,6 +166,10 @@ def _first_problem(error: ValidationError, model: type[BaseModel], section: str)
     message = first["msg"].removeprefix("Value error, ")
     given = "" if isinstance(first["input"], dict) else f" = {_shown(first['input'])}"
     return f"{where}{given}: {message[0].lower()}{message[1:]}{more}"
+
+
+def _is_within(location: tuple[int | str, ...], outer: tuple[int | str, ...]) -> bool:
+    return len(location) > len(outer) and location[: len(outer)] == outer
 
 
 def _shown(value: object) -> str:

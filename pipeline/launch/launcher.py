@@ -80,7 +80,6 @@ class Launcher:
         self._path: Path = config.path
         self._overrides = tuple(overrides)
         self._say = say
-        self._report = SiteReport(config.bus.endpoint, say)
         self._slots = [_Slot(row, delay_s=config.launcher.restart_delay_s) for row in process_list(config)]
         self._watchdog = Watchdog(config.launcher.watchdog_s)
         self._is_started = False
@@ -98,6 +97,7 @@ class Launcher:
             self._watcher = SiteWatcher(bus, self._config.site)
             try:
                 self._start_all(stop)
+                self._report = SiteReport(self._config.bus.endpoint, self._say, HOST_CLOCK.now_ns())
                 while not stop.wait(_POLL_S):
                     self._check_processes()
                     self._report_changes()
@@ -213,8 +213,9 @@ class Launcher:
         hung = self._watchdog.hung(now)
         for slot in self._slots:
             if hung and slot.child and slot.row.label == hung[0]:
-                doing = f" ({slot.child.notices.status})" if slot.child.notices.status else ""
-                slot.hung = f"hangs: its main loop has not run for {hung[1]:.0f} s{doing}; killed"
+                status = slot.child.notices.status
+                before = f" (before that: {status})" if status not in ("", StageStatus.OK.words) else ""
+                slot.hung = f"hangs: its main loop has not run for {hung[1]:.0f} s{before}; killed"
                 slot.child.kill()
 
     def _report_changes(self) -> None:

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from pipeline.launch.event_log import without_figures
 from pipeline.launch.site_state import OFF_THE_BUS, StageState, Word
+from pipeline.launch.site_watcher import StageView
+from pipeline.runtime.health import LATENCY_WINDOW_S
+from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import CurrentAlarm
 
 _ALL = "all stages"
@@ -24,9 +27,13 @@ class RunningProcess:
 class SiteReport:
     """Reports each change once."""
 
-    def __init__(self, endpoint: str, say: Callable[[str], None]) -> None:
+    def __init__(self, endpoint: str, say: Callable[[str], None], started_t_ns: int) -> None:
+        """started_t_ns: when all stages had been started, host time."""
         self._endpoint = endpoint
         self._say = say
+        self._started_t_ns = started_t_ns
+        self._late_since_t_ns: dict[str, int] = {}
+        """by label"""
         self._said: dict[str, str] = {}
         """by subject: the last report, without its figures; empty: all is well"""
         self._alarms: dict[tuple[str, int], str] = {}
@@ -47,16 +54,32 @@ class SiteReport:
         for state in states:
             if state.view and state.view.alive:
                 subject = f"{state.label}: problem"
-                self._change(subject, state.view.health.problem, "the problem is resolved", name=state.label)
+                self._change(subject, self._problem(state.view), "the problem is resolved", name=state.label)
+
+    def _problem(self, view: StageView) -> str:
+        """The problem of a stage. One that only a single health reports, or that is from before the sources of the site
+        had started, is over: it would be said and resolved at once."""
+        before = view.previous
+        is_there = before is not None and before.problem and before.t_ns >= self._started_t_ns
+        return view.health.problem if is_there else ""
 
     def _fault(self, state: StageState, process: RunningProcess) -> str:
         """What is wrong with a stage whose process runs; empty if nothing is."""
         if state.word not in _UNHEARD:
-            return f"{state.word}: {state.detail}" if state.is_fault else ""
+            return f"{state.word}: {state.detail}" if state.is_fault and not self._is_catching_up(state) else ""
         if process.is_at_work:
             where = f"process {process.process_id} works, but is not heard at {self._endpoint}"
             return f"the connection to the bus is lost: {where}"
         return "silent: it hangs or is blocked"
+
+    def _is_catching_up(self, state: StageState) -> bool:
+        """Whether a stage has been late for no longer than its latencies reach back: after a restart, it and the stages
+        after it process what they missed."""
+        if state.word != Word.LATE or state.view is None:
+            self._late_since_t_ns.pop(state.label, None)
+            return False
+        t_ns = state.view.health.t_ns
+        return t_ns - self._late_since_t_ns.setdefault(state.label, t_ns) <= LATENCY_WINDOW_S * NS_PER_S
 
     def alarms(self, alarms: Iterable[CurrentAlarm]) -> None:
         """Say how the alarms have changed. alarms: the current one of each fan that had one."""

@@ -122,7 +122,7 @@ def _state_of_work(health: Health, views: Sequence[StageView]) -> tuple[Word, st
     """The state of a stage that is heard."""
     if starving := _starving(health, views):
         return Word.STARVED, starving
-    if health.latency_p50_ms > LATE_MS:
+    if health.latency_p50_ms > LATE_MS and health.status != StageStatus.STARTING:  # it catches up
         return Word.LATE, f"its outputs are {health.latency_p50_ms / 1e3:.0f} s old when they are sent"
     if health.waiting_for and health.status == StageStatus.OK:
         return Word.WAITING, waiting_text(health)

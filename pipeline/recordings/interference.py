@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 
 from pipeline.recordings.open_part import OpenPart
@@ -10,7 +9,6 @@ from schemas.units import NS_PER_S
 
 NEWS_SHOWN_NS = 60 * NS_PER_S
 """how long health reports it"""
-_LOG = logging.getLogger(__name__)
 
 
 class Interference:
@@ -36,7 +34,6 @@ class Interference:
                 f"{part.path}: another program deleted, moved or replaced the file while it was written; it was "
                 "restored with all messages; keep other programs away from it"
             )
-            _LOG.warning("%s", self._news)
 
     def end_part(self, part: OpenPart, now_ns: int) -> None:
         """Report what the part that has ended has lost."""
@@ -55,7 +52,6 @@ class Interference:
                 f"{part.path}: messages that were written and are not in the finished file: {part.absent}; check the "
                 "disk, and keep other programs away from it"
             )
-            _LOG.error("%s", self._news)
 
     def clock_set_back(self, now_ns: int) -> None:
         """The host's clock was set back to `now_ns`."""

@@ -29,6 +29,7 @@ class OpenPart(Protocol):
     def flush(self) -> None: ...  # noqa: D102
     def stay_in_place(self) -> None: ...  # noqa: D102
     def finish(self, *, has_ended: bool = False) -> None: ...  # noqa: D102
+    def discard(self) -> None: ...  # noqa: D102
 
 
 class PartsFolder(Protocol):

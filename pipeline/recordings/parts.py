@@ -15,6 +15,7 @@ from pathlib import Path
 from pipeline.recordings.contents import Contents, contents_of
 from pipeline.recordings.disk import Disk, DiskError, refused, sync_folder
 from pipeline.recordings.reading import RecordingError, read_metadata
+from pipeline.recordings.records import ACTIVE_SUFFIX
 from pipeline.recordings.repair import (
     FORMER_ORIGINAL_SUFFIX,
     ORIGINAL_SUFFIX,
@@ -23,7 +24,7 @@ from pipeline.recordings.repair import (
     repair_in_place,
 )
 from pipeline.recordings.sequence_ledger import SequenceLedger
-from pipeline.recordings.writing import ACTIVE_SUFFIX, RecordingWriter
+from pipeline.recordings.writing import RecordingWriter
 
 
 class RecordingParts:

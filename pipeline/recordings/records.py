@@ -54,8 +54,17 @@ _BLOCK_BYTES = 1 << 20
 _Kind = TypeVar("_Kind", bound=McapRecord)
 
 
+ACTIVE_SUFFIX = ".active"
+"""follows the name of a file that is being written"""
+
+
 class RecordingError(UserError):
     """A recording cannot be read or written. The message is one line."""
+
+
+def active_path(path: Path) -> Path:
+    """The name of a recording while it is being written."""
+    return path.with_name(path.name + ACTIVE_SUFFIX)
 
 
 class Record(NamedTuple):
@@ -108,7 +117,9 @@ class RecordReader:
                 self.size = os.fstat(file.fileno()).st_size
                 yield from self._records(file)
         except OSError as error:
-            raise RecordingError(f"{self.path}: cannot read the recording: {error.strerror}") from error
+            active = active_path(self.path)
+            advice = f"; it is still being written: name {active}" if active.exists() else ""
+            raise RecordingError(f"{self.path}: cannot read the recording: {error.strerror}{advice}") from error
 
     def _records(self, file: BinaryIO) -> Iterator[Record]:
         while True:

@@ -23,6 +23,7 @@ from pipeline.recordings.contents import NOT_A_RECORD, losses_outside_counts
 from pipeline.recordings.disk import AtomicAppendFile, not_being_written, refused, sync_folder
 from pipeline.recordings.index import SHORT_ENDING, write_ending
 from pipeline.recordings.records import (
+    ACTIVE_SUFFIX,
     MESSAGE,
     RecordingError,
     RecordReader,
@@ -31,7 +32,7 @@ from pipeline.recordings.records import (
 )
 from pipeline.recordings.scan import Scan, scan
 from pipeline.recordings.sequence_ledger import LEDGER_NAME, ledger_metadata
-from pipeline.recordings.writing import ACTIVE_SUFFIX, CHUNK_BYTES, free_name
+from pipeline.recordings.writing import CHUNK_BYTES, free_name
 
 ORIGINAL_SUFFIX = ".original"
 FORMER_ORIGINAL_SUFFIX = ".torn"

@@ -25,14 +25,13 @@ from pipeline.recordings.chunk import FillingChunk
 from pipeline.recordings.disk import AtomicAppendFile, Disk, refused, sync_folder
 from pipeline.recordings.index import SHORT_ENDING, Index, write_ending
 from pipeline.recordings.reading import METADATA_NAME
-from pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, indexed_reader, record_bytes
+from pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, active_path, indexed_reader, record_bytes
 from pipeline.recordings.sequence_ledger import BEFORE_NAME, SequenceLedger, ledger_metadata
 from schemas.codec import proto_type, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Health, Message, newest_t_ns
 from schemas.topics import topic_of
 
-ACTIVE_SUFFIX = ".active"
 CHUNK_BYTES = 64 * 1024
 """A crash loses what is not in a finished chunk; a reader holds one chunk in memory."""
 UNSYNCED_BYTES = 4 << 20
@@ -94,7 +93,7 @@ class RecordingWriter:
         self._index = Index()
         self._channels: dict[str, tuple[int, str]] = {}
         self._chunk = FillingChunk()
-        self._active = path.with_name(path.name + ACTIVE_SUFFIX)
+        self._active = active_path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._disk = Disk(path.parent)
@@ -290,7 +289,7 @@ class RecordingWriter:
 
     def _restore(self) -> None:
         for path in _part_names(self.path):  # where another file has taken its name, under the next one
-            active = path.with_name(path.name + ACTIVE_SUFFIX)
+            active = active_path(path)
             if path == self.path or not path.exists():
                 try:
                     path.parent.mkdir(parents=True, exist_ok=True)

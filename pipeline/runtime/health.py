@@ -52,6 +52,10 @@ class HealthBuilder:
         if t_ns and now_ns is not None:
             self._latencies_ms.append((time.monotonic(), (now_ns - t_ns) / 1e6))
 
+    def has_caught_up(self) -> None:
+        """What was sent until now was made of messages from before the start: its age is no latency."""
+        self._latencies_ms.clear()
+
     def build(
         self,
         *,

@@ -51,8 +51,16 @@ SOURCES_STOPPED, CORES_CLOSED, HEALTH_SENT, BUS_LEFT = 0.78, 0.88, 0.9, 0.95
 class Runner:
     """Runs one stage in this process until `stop` is set, then processes what is in flight and ends."""
 
-    def __init__(self, stage: Stage, config: Config, tray: str | None, stop: threading.Event) -> None:
-        """Build the stage. `tray` names the tray of a stage that has one process for each; `stop` ends `run`.
+    def __init__(
+        self,
+        stage: Stage,
+        config: Config,
+        tray: str | None,
+        stop: threading.Event,
+        on_health: Callable[[Health], None] | None = None,
+    ) -> None:
+        """Build the stage. `tray` names the tray of a stage that has one process for each; `stop` ends `run`;
+        `on_health` is called with each health message while it runs.
 
         Raises:
             StageError, ConfigError, BusError: it cannot be built; nothing has been published.
@@ -64,6 +72,7 @@ class Runner:
             raise UserError(f"{stage.name} runs one process for each tray: say which with --tray (one of {names})")
         self.stage = stage
         self.stop = stop
+        self._on_health = on_health or (lambda _health: None)
         self.launcher_gone = threading.Event()
         """Set when the process that started this stage has gone: it ends as soon as its producers have ended."""
         self._site = config.site
@@ -194,6 +203,7 @@ class Runner:
         if not self.stage.may_drop:
             self._catch_up()
             self._loop(self._has_caught_up, StageStatus.STARTING)
+            self._health.has_caught_up()
         self._bus.declare_alive(alive_key(self._site, self.stage.name, self._instance))
         for name, parts in self._parts.items():
             self._sources.start(name, parts)
@@ -422,6 +432,7 @@ class Runner:
         health = self._build_health(status)
         payload = encode(health)
         self._health_publisher.put(payload)
+        self._on_health(health)
         if "health" in self.stage.reads:
             # the bus does not return a session's own messages
             self._step(Envelope(self._health_publisher.key, "health", payload, HOST_CLOCK.now_ns(), health))

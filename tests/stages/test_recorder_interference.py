@@ -105,7 +105,7 @@ def test_row_03_the_file_that_replaced_a_recording_is_left_alone(tmp_path):
     assert read_metadata(run.folder / "recording-3.mcap").metadata["continues"] == "recording-2.mcap"
 
 
-def test_row_03_what_cannot_be_restored_is_lost_and_counted(tmp_path, monkeypatch, caplog):
+def test_row_03_what_cannot_be_restored_is_lost_and_counted(tmp_path, monkeypatch):
     run = Run(tmp_path)
     run.seconds(3)
     run.active.unlink()
@@ -122,9 +122,9 @@ def test_row_03_what_cannot_be_restored_is_lost_and_counted(tmp_path, monkeypatc
     run.core.close()
     assert run.recorded() == list(range(20, 60))
     assert run.core.counters()["lost_deleted"] == 20
-    assert "cannot be restored: Input/output error; messages lost with it: 20" in caplog.text
     contents = contents_of(run.folder / "recording-2.mcap")
     assert (contents.streams[STREAM].messages, contents.streams[STREAM].missing) == (40, 20)
+    assert "cannot be restored: Input/output error; messages lost with it: 20" in contents.metadata["paused_because"]
     assert contents.metadata["lost_in_pause"] == "20"
 
 

@@ -23,8 +23,8 @@ from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.arrays import Block, read_topics
 from pipeline.recordings.order import in_order
 from pipeline.recordings.reading import read_metadata, read_recording
+from pipeline.recordings.records import ACTIVE_SUFFIX
 from pipeline.recordings.tables import Form, TableFile, open_table
-from pipeline.recordings.writing import ACTIVE_SUFFIX
 from schemas.topics import current_name
 
 _PART = ".part"

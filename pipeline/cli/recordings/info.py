@@ -22,6 +22,7 @@ from pipeline.launch.loss_accounting import label, losses
 from pipeline.launch.refused_input import refused, refused_lines
 from pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
 from pipeline.recordings.metadata import CONFIGURATION
+from pipeline.recordings.records import active_path
 from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 from schemas.messages import Health
 from schemas.units import NS_PER_S
@@ -34,12 +35,14 @@ def info(
     """Show what a recording contains: time, trays, twins, messages and losses of each topic, problems of stages.
 
     With several parts, it also checks that each continues the one before. A file without an index is read in full, as
-    far as possible. Exit code 3 if messages are missing or a file is damaged.
+    far as possible; one that is still being written, up to its last flush. Exit code 3 if messages are missing or a
+    file is damaged.
 
     Example: fantwin info runs/recording.mcap
     """
     with working(f"reading {', '.join(str(file) for file in files)}"):
-        parts = sorted((contents_of(file) for file in dict.fromkeys(files)), key=lambda part: part.first_ns or 0)
+        present = dict.fromkeys(map(_present, files))
+        parts = sorted(map(contents_of, present), key=lambda part: part.first_ns or 0)
     breaks = continuity(parts)
     if json_output:
         typer.echo(json.dumps(as_json(parts, breaks)))
@@ -47,6 +50,11 @@ def info(
         _show(parts, breaks)
     if breaks or any(_has_lost(part) for part in parts):
         raise typer.Exit(3)
+
+
+def _present(file: Path) -> Path:
+    """The file, or its active name if it is still being written."""
+    return active_path(file) if not file.exists() and active_path(file).exists() else file
 
 
 def _sessions(parts: Iterable[Contents]) -> list[Health]:

@@ -15,11 +15,14 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.config.loading import load_config
 from pipeline.config.registry import STAGES
 from pipeline.errors import UserError
+from pipeline.launch.event_log import without_figures
 from pipeline.launch.processes import EXIT_CANNOT_START
 from pipeline.runtime.notifier import starting
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.signals import stop_on_signals
 from pipeline.runtime.stage import load_stage
+from schemas.messages import Health
+from schemas.streams import LOSS_PREFIX
 
 
 def run(
@@ -43,7 +46,8 @@ def run(
     stop_on_signals(stop)
     try:
         with starting():
-            runner = Runner(load_stage(stage), settings, tray, stop)
+            on_health = None if until_stdin_closes else Problems(stage).report  # the launcher reports them itself
+            runner = Runner(load_stage(stage), settings, tray, stop, on_health)
     except UserError as error:
         if not until_stdin_closes:
             raise
@@ -63,8 +67,27 @@ def run(
             json.dumps({"stage": stage, "lost": last.lost, "counters": {c.name: c.value for c in last.counters}})
         )
     if last.lost:
-        _say(f"{stage}: {last.lost} lost, see the counters in `fantwin status` or in the recording")
+        if not until_stdin_closes:
+            counts = ", ".join(
+                f"{c.name} {c.value}" for c in last.counters if c.name.startswith(LOSS_PREFIX) and c.value
+            )
+            _say(f"{stage}: {last.lost} lost" + (f" ({counts})" if counts else ""))
         raise typer.Exit(3)
+
+
+class Problems:
+    """Says what is wrong with a stage that runs alone, and when it is over."""
+
+    def __init__(self, stage: str) -> None:
+        self._stage = stage
+        self._said = ""
+
+    def report(self, health: Health) -> None:
+        """Handle a health message of the stage."""
+        meaning = without_figures(health.problem)
+        if meaning != self._said:
+            self._said = meaning
+            _say(f"{self._stage}: {health.problem or 'the problem is resolved'}")
 
 
 def _say(line: str) -> None:

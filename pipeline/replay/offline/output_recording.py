@@ -11,7 +11,8 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.recordings.metadata import recording_metadata
-from pipeline.recordings.writing import ACTIVE_SUFFIX, RecordingWriter
+from pipeline.recordings.records import active_path
+from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.offline.replay_input import ReplayInput
 from schemas.blocks import cut
 from schemas.messages import Grid, Header, Message, Prediction, Raw, Request, Score, newest_t_ns
@@ -29,7 +30,7 @@ def output_writer(replay_input: ReplayInput, output: Path) -> RecordingWriter:
         UserError: the file exists.
         RecordingError: it cannot be written.
     """
-    for path in (output, output.with_name(output.name + ACTIVE_SUFFIX)):
+    for path in (output, active_path(output)):
         if path.exists():
             raise UserError(f"{path}: exists already; name another file with -o, or remove it")
     contexts = [replay_input.contexts(tray)[-1] for tray in replay_input.trays]

@@ -186,6 +186,9 @@ def test_a_file_that_is_still_being_written_is_shown_up_to_what_is_on_disk(tmp_p
         writer.flush()
         writer.add_message(RAW_KEY, raw(1), 2)
         (found,) = shown(tmp_path / "r.mcap.active")["files"]
+        assert shown(tmp_path / "r.mcap")["files"] == [found], "it is found by the name that it will have"
+        error = error_of("replay", "--offline", tmp_path / "r.mcap")
+    assert error.endswith(f"; it is still being written: name {tmp_path}/r.mcap.active")
     assert found["damage"] == ["it is still being written"]
     assert found["topics"][RAW_KEY]["messages"] == 1
 

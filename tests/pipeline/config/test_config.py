@@ -150,6 +150,7 @@ def test_row_15_values_without_measure_are_one_line(text, overrides, words):
         parse(text, *overrides)
     line = str(caught.value)
     assert words in line
+    assert "more)" not in line, "what follows from the first problem is none of its own"
     assert "\n" not in line
     assert len(line) < 400
 

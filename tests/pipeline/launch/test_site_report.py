@@ -8,6 +8,8 @@ import pytest
 
 from pipeline.launch.site_report import RunningProcess, SiteReport
 from pipeline.launch.site_state import StageState, Word
+from pipeline.launch.site_watcher import StageView
+from schemas.units import NS_PER_S
 from tests.pipeline.launch.test_site_state import CONSUMER, view
 
 IDS = {"resampler": RunningProcess(11, is_at_work=True), "scorer": RunningProcess(12, is_at_work=True)}
@@ -20,7 +22,7 @@ def lines() -> list[str]:
 
 @pytest.fixture
 def report(lines: list[str]) -> SiteReport:
-    return SiteReport("tcp/x:1", lines.append)
+    return SiteReport("tcp/x:1", lines.append, CONSUMER.t_ns - NS_PER_S)
 
 
 def state(label: str, word: Word = Word.OK, detail: str = "") -> StageState:
@@ -69,9 +71,44 @@ def test_of_a_stage_whose_process_does_not_run_nothing_more_is_said(report, line
 def test_row_18_a_problem_whose_figures_change_is_said_once(report, lines):
     for free in ("12.3", "11.9", "11.5"):
         health = replace(CONSUMER, problem=f"{free} MB are free on the disk, but 100.0 MB are required")
-        report.stages([replace(state("recorder"), view=view(health))], {})
+        before = replace(health, t_ns=health.t_ns - NS_PER_S)
+        report.stages([replace(state("recorder"), view=StageView(health, before, alive=True))], {})
     report.stages([replace(state("recorder"), view=view(CONSUMER))], {})
     assert lines == [
         "recorder: 12.3 MB are free on the disk, but 100.0 MB are required",
         "recorder: the problem is resolved",
     ]
+
+
+def test_a_problem_from_before_the_sources_started_or_of_a_moment_is_not_said(lines):
+    report = SiteReport("tcp/x:1", lines.append, CONSUMER.t_ns - NS_PER_S)
+
+    def hear(t_ns: int, problem: str, before: str) -> None:
+        health = replace(CONSUMER, t_ns=t_ns, problem=problem)
+        previous = replace(health, t_ns=t_ns - NS_PER_S, problem=before)
+        report.stages([replace(state("resampler"), view=StageView(health, previous, alive=True))], {})
+
+    silent = "no raw samples"
+    hear(CONSUMER.t_ns - NS_PER_S, silent, silent)  # before the line was opened
+    hear(CONSUMER.t_ns - 1, silent, silent)
+    hear(CONSUMER.t_ns + NS_PER_S, "", silent)
+    hear(CONSUMER.t_ns + 2 * NS_PER_S, silent, "")
+    hear(CONSUMER.t_ns + 3 * NS_PER_S, "", silent)
+    assert lines == []
+    hear(CONSUMER.t_ns + 5 * NS_PER_S, silent, silent)
+    assert lines == ["resampler: no raw samples"]
+
+
+def test_a_stage_that_works_off_what_was_missed_during_a_restart_is_not_late(report, lines):
+    def hear(second: int, word: Word) -> None:
+        health = replace(CONSUMER, t_ns=CONSUMER.t_ns + second * NS_PER_S)
+        late = replace(state("scorer", word, "its outputs are 60 s old when they are sent"), view=view(health))
+        report.stages([state("resampler"), late], IDS)
+
+    for second in range(10):
+        hear(second, Word.LATE)
+    hear(10, Word.OK)
+    assert lines == []
+    for second in range(20, 40):
+        hear(second, Word.LATE)
+    assert lines == ["scorer: late: its outputs are 60 s old when they are sent"]

@@ -92,6 +92,8 @@ def test_row_01_a_stage_whose_producer_sends_nothing_waits():
 def test_row_01_a_stage_with_a_latency_of_many_seconds_is_late():
     state = states(view(replace(CONSUMER, latency_p50_ms=47_000.0)))["twin_integrator"]
     assert (state.word, state.detail) == (Word.LATE, "its outputs are 47 s old when they are sent")
+    starting = replace(CONSUMER, latency_p50_ms=47_000.0, status=StageStatus.STARTING)
+    assert states(view(starting))["twin_integrator"].word == Word.STARTING, "it works off what it missed"
 
 
 def test_row_16_a_stage_that_left_the_bus_without_stopping_is_gone():

@@ -144,7 +144,7 @@ def test_row_01_a_stage_that_is_stopped_for_good_is_killed_and_restarted(tmp_pat
                 return bool(view and view.alive and view.health.process_id != first.health.process_id)
 
             eventually(is_back, "the recorder is back", deadline_s=20)
-        assert line.endswith(" s (ok); killed, restarting in 0.2 s")
+        assert line.endswith(" s; killed, restarting in 0.2 s")
         assert up.end(signal.SIGINT) == 0
         assert up.output()["restarts"] == {"recorder": 1}
     finally:

@@ -23,8 +23,9 @@ from pipeline.recordings import writing
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.disk import AtomicAppendFile, DiskError
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from pipeline.recordings.records import ACTIVE_SUFFIX
 from pipeline.recordings.sequence_ledger import StreamCounts, counts_from_metadata
-from pipeline.recordings.writing import ACTIVE_SUFFIX, CHUNK_BYTES, RecordingWriter
+from pipeline.recordings.writing import CHUNK_BYTES, RecordingWriter
 from schemas.envelope import Envelope
 from schemas.messages import Alarm, Array, Command, Header, Message, Raw, Severity
 from schemas.topics import tray_key

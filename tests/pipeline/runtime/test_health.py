@@ -49,3 +49,10 @@ def test_latencies_are_of_the_last_ten_seconds(builder, monkeypatch):
     builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS, START_NS + 1_000_000)
     now_s[0] += LATENCY_WINDOW_S / 2 + 0.1
     assert health(builder, START_NS).latency_p50_ms == 1.0
+
+
+def test_what_was_sent_while_catching_up_is_no_latency(builder):
+    builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS, START_NS + 60_000_000_000)
+    builder.has_caught_up()
+    builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS, START_NS + 1_000_000)
+    assert health(builder, START_NS).latency_p99_ms == 1.0
