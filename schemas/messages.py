@@ -199,6 +199,8 @@ class Prediction:
     twin: str = ""
     torque_balance_command: Array = column("samples x fans", np.float64, added_later=True)
     torque_balance_sigma_command: Array = column("fans", np.float64, added_later=True)
+    reading_range_rad_s: Array = column("samples x fans", np.float64, optional=True)
+    averaged_command: Array = column("samples x fans", np.float64, optional=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

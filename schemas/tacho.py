@@ -68,6 +68,11 @@ class Tacho(BaseModel):
         """Mean time from a speed to the sample that shows it, s; for kind "period" without half its period."""
         return self.delay_s + (self.window_s + self.held_s) / 2
 
+    @property
+    def reach_s(self) -> float:
+        """The longest time from a speed to a sample that shows it, s; for kind "period" without its period."""
+        return self.delay_s + self.window_s + self.held_s
+
 
 def _as_sequence(value: Any) -> Any:
     return (value,) if isinstance(value, Tacho | Mapping) else value

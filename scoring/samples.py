@@ -33,7 +33,7 @@ def samples_of(prediction: Prediction) -> Samples:
     a controller takes it when a fan fails.
     """
     invalid_reason, balance = prediction.invalid_reason, prediction.torque_balance_command
-    residual = prediction.measured_speed_rad_s - prediction.predicted_speed_rad_s
+    residual = speed_residual_rad_s(prediction)
     with np.errstate(all="ignore"):
         speed_residual = residual / prediction.sigma_rad_s
         balance = balance / prediction.torque_balance_sigma_command
@@ -49,3 +49,10 @@ def samples_of(prediction: Prediction) -> Samples:
         missing=invalid_reason == InvalidReason.NO_SPEED,
         alive=~np.isin(invalid_reason, (InvalidReason.GAP, InvalidReason.STALE)),
     )
+
+
+def speed_residual_rad_s(prediction: Prediction) -> Array:
+    """(n, fans) how far each reading is from the nearest one that the tacho may show of a healthy fan, rad/s."""
+    residual = prediction.measured_speed_rad_s - prediction.predicted_speed_rad_s
+    half_range = prediction.reading_range_rad_s
+    return residual - residual.clip(-half_range, half_range) if len(half_range) else residual

@@ -14,7 +14,9 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array) -> Score:
     """The message of a block that was scored. state: (n, fans) of FanState."""
     valid, sigma = np.isfinite(scored.score), item.sigma_rad_s
     residual = item.measured_speed_rad_s - item.predicted_speed_rad_s
-    band = BAND_SIGMAS * sigma
+    band = np.broadcast_to(BAND_SIGMAS * sigma, residual.shape)
+    if len(item.reading_range_rad_s):
+        band = band + item.reading_range_rad_s
     of_prediction = item.invalid_reason
     why = np.where(of_prediction == InvalidReason.NONE, InvalidReason.WARMING_UP, of_prediction)
     return Score(
@@ -26,7 +28,7 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array) -> Score:
         predicted_speed_rad_s=item.predicted_speed_rad_s,
         lower_bound_rad_s=item.predicted_speed_rad_s - band,
         upper_bound_rad_s=item.predicted_speed_rad_s + band,
-        band_variance=np.broadcast_to(band**2, residual.shape),
+        band_variance=band**2,
         residual_rad_s=residual,
         smoothed_residual_rad_s=scored.speed_smoothed * sigma,
         outside=np.abs(residual) > band,

@@ -343,7 +343,7 @@ class ScorerCore(Core):
         self._diagnoser.take(
             item.t_ns,
             item.period_ns,
-            np.where(unknown, np.nan, item.command),
+            np.where(unknown, np.nan, item.averaged_command if len(item.averaged_command) else item.command),
             item.measured_speed_rad_s,
             scored.balance_baseline * item.torque_balance_sigma_command,
             scored.balance_baseline_s,

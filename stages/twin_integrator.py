@@ -34,6 +34,7 @@ from pipeline.runtime.twin_file import TwinFile, load_twin
 from schemas.blocks import select
 from schemas.messages import Array, Grid, InvalidReason, ModelCard, Prediction
 from schemas.units import NS_PER_S
+from scoring.expected_reading import AveragedCommand
 from scoring.torque_balance import BalanceModel, TorqueBalance
 
 RANGE_MARGIN = 0.05  # of the width of the training range: a twin is used this far beyond it
@@ -67,7 +68,8 @@ class TwinIntegratorCore(Core):
         self._twin = twin
         self._knows_breaks = decision_rules >= DecisionRules.BREAKS
         self._producer = ""  # of the newest grid
-        self._warm_up_ns = round(config.warm_up_s * NS_PER_S)
+        reach_s = max(tacho.reach_s for tacho in twin.tachos)
+        self._warm_up_ns = round((config.warm_up_s + reach_s) * NS_PER_S)
         self._hold_limit_ns = round(config.hold_limit_s * NS_PER_S)
         low, high = twin.card.command_range
         margin = RANGE_MARGIN * (high - low)
@@ -76,6 +78,8 @@ class TwinIntegratorCore(Core):
         self._off_below = twin.off_below
         self._run = FreeRun(twin, config.start_samples)
         self._balance = _balance_of(twin)
+        self._averages = any(tacho.window_s > 0.0 for tacho in twin.tachos)
+        self._averaged_command = AveragedCommand(twin.tachos, 1.0)
         self._card = [
             ModelCard(
                 t_ns=started_t_ns,
@@ -107,7 +111,11 @@ class TwinIntegratorCore(Core):
                 self._old_samples.add(item.t_ns, item.period_ns, self._last_t_ns)
             return messages
         self._old_samples.clear()
-        if grid.period_ns != self._period_ns or self._is_of_another_session(grid):
+        if grid.period_ns != self._period_ns:
+            self._run.set_period(grid.period_ns)
+            self._averaged_command = AveragedCommand(self._twin.tachos, grid.period_ns / NS_PER_S)
+            self._balance.reset()
+        elif self._is_of_another_session(grid):
             self._run.stop(np.ones_like(self._run.running))
             self._balance.reset()
         self._period_ns, self._producer = grid.period_ns, grid.header.producer
@@ -157,16 +165,16 @@ class TwinIntegratorCore(Core):
         run = self._run
         held_before = run.held_command
         inputs = self._inputs(grid)
-        predicted = np.empty(grid.command.shape)
+        predicted, reading_range = np.empty(grid.command.shape), np.empty(grid.command.shape)
         running, started_t_ns = np.empty(predicted.shape, np.bool_), np.empty(predicted.shape, np.int64)
         row = 0
         while row < len(predicted):
             self._start_and_stop(row, grid, inputs, held_before if row == 0 else inputs.command[row - 1])
             end = inputs.next_event(row, run.running)
             running[row:end], started_t_ns[row:end] = run.running, run.started_t_ns
-            speed_rad_s = self._advance(inputs.command[row:end])
-            end = row + len(speed_rad_s)
-            predicted[row:end] = speed_rad_s
+            reading_rad_s, half_range_rad_s = self._advance(inputs.command[row:end])
+            end = row + len(reading_rad_s)
+            predicted[row:end], reading_range[row:end] = reading_rad_s, half_range_rad_s
             if end > row + 1:
                 run.forget_readings(np.any(inputs.unknown[row + 1 : end], axis=0))
             row = end
@@ -180,7 +188,7 @@ class TwinIntegratorCore(Core):
         invalid_reason = np.where(settled, InvalidReason.OUT_OF_RANGE, InvalidReason.WARMING_UP)
         invalid_reason = np.where(settled & in_range, InvalidReason.NONE, invalid_reason)
         invalid_reason = np.where(grid.valid, invalid_reason, grid.invalid_reason).astype(np.uint8)
-        return self._prediction(grid, predicted, invalid_reason)
+        return self._prediction(grid, predicted, reading_range, invalid_reason)
 
     def _inputs(self, grid: Grid) -> FreeRunInputs:
         held_before = self._run.held_command
@@ -221,61 +229,70 @@ class TwinIntegratorCore(Core):
         if missing or overdue.any():
             run.stop(overdue | (missing > LONGEST_BRIDGE))
             while missing > 0 and run.running.any():
-                missing -= len(self._advance(np.tile(held_command, (missing, 1))))
+                missing -= len(self._advance(np.tile(held_command, (missing, 1)))[0])
         run.forget_readings(inputs.unknown[row])
         starting = run.add_readings(inputs.usable[row], grid.speed_rad_s[row])
         if starting.any():
             run.start(starting, int(grid.t_ns[row]), inputs.command[row])
             self._counts["free_runs"] += int(starting.sum())
 
-    def _advance(self, command: Array) -> Array:
-        speed_rad_s, diverged = self._run.advance(command, self._period_ns / NS_PER_S)
+    def _advance(self, command: Array) -> tuple[Array, Array]:
+        reading_rad_s, half_range_rad_s, diverged = self._run.advance(command)
         self._counts["diverged"] += int(diverged.sum())
-        return speed_rad_s
+        return reading_rad_s, half_range_rad_s
 
     def _without_twin(self, grid: Grid) -> Prediction:
         invalid_reason = np.where(grid.valid, InvalidReason.NO_TWIN, grid.invalid_reason).astype(np.uint8)
-        return self._prediction(grid, np.full(grid.command.shape, np.nan), invalid_reason)
+        nothing = np.full(grid.command.shape, np.nan)
+        return self._prediction(grid, nothing, nothing, invalid_reason)
 
-    def _torque_balance(self, grid: Grid) -> Array:
-        """Torque balance (n, fans) in command units. It starts again after missing samples."""
-        known = grid.valid & np.isfinite(grid.speed_rad_s) & np.isfinite(grid.command)
-        if self._last_t_ns is not None and grid.t_ns[0] - self._last_t_ns > self._longest_step_ns:
-            self._balance.reset()
+    def _torque_balance(self, grid: Grid) -> tuple[Array, Array]:
+        """The command averaged as the readings are, and the torque balance. Both (n, fans) in command units.
+
+        They start again after missing samples.
+        """
         restarted = (grid.invalid_reason == int(InvalidReason.CLOCK_RESTARTED)).any(axis=1)
-        if restarted[0]:
-            self._balance.reset()
-        breaks = (np.flatnonzero((np.diff(grid.t_ns) > self._longest_step_ns) | restarted[1:]) + 1).tolist()
-        parts = []
-        for first, last in pairwise((0, *breaks, len(grid.t_ns))):
-            if first:
+        last_t_ns = grid.t_ns[0] if self._last_t_ns is None else self._last_t_ns
+        breaks = (np.diff(grid.t_ns, prepend=last_t_ns) > self._longest_step_ns) | restarted
+        known = grid.valid & np.isfinite(grid.speed_rad_s) & np.isfinite(grid.command)
+        averaged, balance = np.empty(grid.command.shape), np.empty(grid.command.shape)
+        starts = [0, *(np.flatnonzero(breaks[1:]) + 1).tolist(), len(breaks)]
+        for first, last in pairwise(starts):
+            if breaks[first]:
                 self._balance.reset()
+                self._averaged_command.reset()
             rows = slice(first, last)
-            parts.append(
-                self._balance.update(
-                    self._period_ns / NS_PER_S, grid.command[rows], grid.speed_rad_s[rows], known[rows]
-                )
+            averaged[rows] = self._averaged_command.update(grid.command[rows]) if self._averages else grid.command[rows]
+            balance[rows] = self._balance.update(
+                self._period_ns / NS_PER_S,
+                averaged[rows],
+                grid.speed_rad_s[rows],
+                known[rows] & np.isfinite(averaged[rows]),
             )
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return averaged, balance
 
     @property
     def _longest_step_ns(self) -> int:
         return self._period_ns + (self._period_ns - 1) // 2  # above one and a half periods samples are missing
 
-    def _prediction(self, grid: Grid, predicted_speed_rad_s: Array, invalid_reason: Array) -> Prediction:
+    def _prediction(self, grid: Grid, predicted: Array, reading_range: Array, invalid_reason: Array) -> Prediction:
+        averaged_command, balance = self._torque_balance(grid)
+        nothing = np.zeros(0)
         return Prediction(
             fans=grid.fans,
             period_ns=grid.period_ns,
             t_ns=grid.t_ns,
             command=grid.command,
             measured_speed_rad_s=grid.speed_rad_s,
-            predicted_speed_rad_s=predicted_speed_rad_s,
+            predicted_speed_rad_s=predicted,
             sigma_rad_s=self._twin.sigma_rad_s,
             valid=invalid_reason == InvalidReason.NONE,
             invalid_reason=invalid_reason,
             twin=self._twin.card.name,
-            torque_balance_command=self._torque_balance(grid),
+            torque_balance_command=balance,
             torque_balance_sigma_command=self._twin.balance.sigma_command,
+            reading_range_rad_s=reading_range if self._averages else nothing,
+            averaged_command=averaged_command if self._averages else nothing,
         )
 
 

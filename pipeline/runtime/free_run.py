@@ -8,6 +8,8 @@ import numpy as np
 
 from pipeline.runtime.twin_file import TwinFile
 from schemas.messages import Array
+from schemas.units import NS_PER_S
+from scoring.expected_reading import ExpectedReading
 
 NEVER_NS = np.iinfo(np.int64).min // 2
 
@@ -53,6 +55,13 @@ class FreeRun:
         self._readings = np.zeros(fans, np.int64)  # counted towards a start
         self._sum_rad_s = np.zeros(fans)
         self._state = twin.initial_state(np.zeros(fans), self.held_command)
+        self.set_period(NS_PER_S)
+
+    def set_period(self, period_ns: int) -> None:
+        """End all free runs; the next ones are on a grid of this period."""
+        self.stop(np.ones_like(self.running))
+        self._period_s = period_ns / NS_PER_S
+        self._reading = ExpectedReading(self._twin.tachos, self._period_s)
 
     def hold(self, t_ns: Array, command: Array, known: Array) -> tuple[Array, Array]:
         """Hold the last known command where one is unknown. t_ns: (n,); command, known: (n, fans).
@@ -97,27 +106,30 @@ class FreeRun:
         speed = np.where(fans, self._sum_rad_s / np.maximum(self._readings, 1), 0.0)
         initial = self._twin.initial_state(speed, command)
         self._state = np.where(fans[:, np.newaxis], initial, self._state)
+        self._reading.start(fans, speed)
         self.started_t_ns[fans] = t_ns
         self.running |= fans
         self.forget_readings(fans)
 
-    def advance(self, command: Array, period_s: float) -> tuple[Array, Array]:
+    def advance(self, command: Array) -> tuple[Array, Array, Array]:
         """Run over a block, or over its first part. command: (n, fans), n >= 1.
 
-        Returns speeds (m, fans), NaN where no free run is active, and which fans (fans,) diverged at the last of
-        these samples. The run is cut at a divergence so that the result does not depend on the size of the block.
+        Returns the middle of the readings that the tachos may show and half of their range, (m, fans) rad/s, NaN where
+        no free run is active, and which fans (fans,) diverged at the last of these samples. The run is cut at a
+        divergence so that the result does not depend on the size of the block.
         """
         rows = len(command)
         if not self.running.any():
-            return np.full(command.shape, np.nan), np.zeros_like(self.running)
+            nothing = np.full(command.shape, np.nan)
+            return nothing, nothing, np.zeros_like(self.running)
         while True:
-            speed_rad_s, state = self._twin.advance(self._state, command[:rows], np.full(rows, period_s))
+            speed_rad_s, state = self._twin.advance(self._state, command[:rows], np.full(rows, self._period_s))
             finite = np.isfinite(speed_rad_s)
             diverged = self.running & ~(finite.all(axis=0) & np.isfinite(state).all(axis=1))
             if rows == 1 or not diverged.any():
                 break
             rows //= 2
         self._state = np.where((self.running & ~diverged)[:, np.newaxis], state, self._state)
-        predicted = np.where(self.running & finite, speed_rad_s, np.nan)
+        reading, half_range = self._reading.update(np.where(self.running & finite, speed_rad_s, np.nan))
         self.stop(diverged)
-        return predicted, diverged
+        return reading, half_range, diverged

@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.runtime.onnx_metadata import read_onnx_metadata
 from pipeline.runtime.stage import Context, StageError
 from schemas.messages import Array
+from schemas.tacho import Tacho, tacho_of_each_fan
 from schemas.twin_card import CARD_PROPERTY, BalanceCard, CardError, TwinCard
 
 if TYPE_CHECKING:
@@ -66,6 +67,11 @@ class TrayTwin:
     def fans(self) -> int:
         """The number of fans of the tray."""
         return len(self.sigma_rad_s)
+
+    @property
+    def tachos(self) -> tuple[Tacho, ...]:
+        """(fans,) how the speed of each fan is measured."""
+        return tacho_of_each_fan(self.card.tacho, self.fans)
 
     @property
     def off_below(self) -> Array:

@@ -17,6 +17,8 @@ from pipeline.runtime.stage import Context, StageError
 from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import cut, join
 from schemas.messages import Grid, Header, InvalidReason, ModelCard, Prediction
+from schemas.tacho import Tacho
+from scoring.samples import speed_residual_rad_s
 from stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
 from tests.support.twin_files import PARAMETERS, SIGMA_RAD_S, made_up_card, small_hybrid, still_balance, write_twin
 from twin.models import physics
@@ -494,3 +496,47 @@ def test_the_twin_starts_again_after_the_clock_of_the_device_has_restarted():
     assert np.isfinite(balance[55])
     assert np.isnan(balance[61:70]).all()
     assert np.isfinite(balance[99])
+
+
+COUNTING = Tacho(kind="count", window_s=1.0)
+
+
+def counted(speed: Floats, period_s: float, ends_s: float) -> Floats:
+    """(n,) means of a speed (n,) over one second, each shown until the next; windows end at ends_s + k s."""
+    rows, first = round(1.0 / period_s), round(ends_s / period_s)
+    ends = (np.arange(len(speed)) - first) // rows * rows + first
+    angle = np.concatenate((np.zeros(1), np.cumsum((speed[1:] + speed[:-1]) / 2)))
+    return (angle[np.maximum(ends, 0)] - angle[np.maximum(ends - rows, 0)]) / rows
+
+
+def test_a_healthy_fan_is_within_the_readings_of_a_counting_tacho_through_steps_and_not_without_one() -> None:
+    """Fans with windows that begin at different times; the reading is up to two seconds old."""
+    fans, period_s = 4, 0.1
+    command = np.repeat(stairs(1200), fans, axis=1)
+    speed = run_freely(np.zeros((fans, 2)), command, np.full(1200, period_s))[0]
+    readings = np.column_stack([counted(speed[:, fan], period_s, 0.3 * fan) for fan in range(fans)])
+    grid = grid_of(command, readings, period_ns=100_000_000)
+
+    def residual_of(twin: TwinFile, size: int) -> Floats:
+        prediction = feed(core_of(twin, warm_up_s=20.0), split(grid, size))
+        return np.where(prediction.valid, np.abs(speed_residual_rad_s(prediction)), 0.0)
+
+    known, unknown = physical_twin(fans, tacho=(COUNTING,)), physical_twin(fans)
+    residual = residual_of(known, 1200)
+    assert residual.max() < 0.05 * residual_of(unknown, 1200).max()
+    np.testing.assert_array_equal(residual_of(known, 7), residual)
+
+
+def test_the_torque_balance_of_counted_readings_is_taken_with_the_averaged_command() -> None:
+    period_s = 0.1
+    command = 20.0 + 5.0 * np.sin(np.arange(1200)[:, np.newaxis] * period_s / 2.0)
+    speed = run_freely(np.full((1, 2), 5.0), command, np.full(1200, period_s))[0]
+    grid = grid_of(command, counted(speed[:, 0], period_s, 0.0)[:, np.newaxis], period_ns=100_000_000)
+
+    def balance_of(**changes: Any) -> Floats:
+        prediction = feed(core_of(physical_twin(**changes)), [grid])
+        return prediction.torque_balance_command[100:, 0].reshape(-1, 10).mean(axis=1)  # over each reading
+
+    known, unknown = balance_of(tacho=(COUNTING,)), balance_of()
+    assert np.isfinite(known).all()
+    assert np.std(known) < 0.1 * np.std(unknown)
