@@ -42,20 +42,26 @@ _SETTINGS = {
 
 
 def refused(healths: Iterable[Health]) -> dict[str, dict[str, int]]:
-    """How much each stage has refused, by its label and by counter; only what is not 0.
+    """How much each stage has refused, by its label and by counter; only what is not 0. `refused_input` is the sum of
+    the faults of a device's input, which are there, too.
 
     healths: the last of every session.
     """
-    found = {name: {c: n for c, n in counts.items() if c in WORDS and n} for name, counts in _sums(healths).items()}
+    known = {*WORDS, *_SETTINGS}
+    found = {name: {c: n for c, n in counts.items() if c in known and n} for name, counts in _sums(healths).items()}
     return {name: counts for name, counts in sorted(found.items()) if counts}
 
 
 def refused_lines(found: Mapping[str, Mapping[str, int]]) -> list[str]:
     """A line for each stage."""
-    return [
-        f"{name}: refused: {', '.join(f'{count} {WORDS[counter]}' for counter, count in counts.items())}"
-        for name, counts in found.items()
-    ]
+    lines: list[str] = []
+    for name, counts in found.items():
+        kinds = ", ".join(
+            f"{kind} {count}" for kind, count in counts.items() if kind in _SETTINGS and kind not in WORDS
+        )
+        words = [f"{count} {WORDS[counter]}" for counter, count in counts.items() if counter in WORDS]
+        lines.append(f"{name}: refused: {', '.join(words)}" + (f" ({kinds})" if kinds else ""))
+    return lines
 
 
 def unusable_lines(healths: Iterable[Health], launched: Collection[Launched]) -> list[str]:

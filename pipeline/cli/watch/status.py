@@ -6,6 +6,7 @@ import json
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -20,13 +21,14 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.errors import UserError
-from pipeline.launch.judged_fans import JudgedFans
+from pipeline.launch.judged_fans import JudgedFans, Unjudged
 from pipeline.launch.processes import process_list
 from pipeline.launch.refused_input import refused_lines
 from pipeline.launch.site_state import StageState, Word, site_states
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from pipeline.runtime.signals import stop_on_signals
 from schemas.messages import Severity
+from schemas.streams import LOSS_PREFIX
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.current_alarms import CurrentAlarm, clock
@@ -49,8 +51,10 @@ def status(
     it prints once and exits. Losses count from the start of a stage (column `up`: how long ago), over all sessions
     heard while this command runs; `fantwin up` at its end and `fantwin info` count all sessions.
 
-    Exit code 1 if a stage is missing, gone, silent, starved or late, or if a fan is not judged; 3 if a stage has lost
-    data.
+    Below the table are the counters of what was lost and refused; --json has all counters.
+
+    Exit code 1 if a stage is missing, gone, silent, starved or late, or if a fan is not judged though the configuration
+    has a scorer; 3 if a stage has lost data.
 
     Example: fantwin status -c fantwin.toml --once
     """
@@ -75,7 +79,7 @@ def status(
                     live.update(stage_table(watcher, settings, judged))
             _require_a_stage(watcher, settings)
         states = site_states(watcher, process_list(settings))
-        if any(state.is_fault for state in states) or judged.unjudged(states):
+        if any(state.is_fault for state in states) or unjudged(states, judged):
             raise typer.Exit(1)
         if any(watcher.losses().values()):
             raise typer.Exit(3)
@@ -86,7 +90,7 @@ def _listen(watcher: SiteWatcher, config: Config, judged: JudgedFans, stop: thre
     began_s = time.monotonic()
     while not stop.wait(0.1) and time.monotonic() < began_s + _LISTEN_MAX_S:
         states = site_states(watcher, process_list(config))
-        is_complete = not any(state.is_fault for state in states) and not judged.unjudged(states)
+        is_complete = not any(state.is_fault for state in states) and not unjudged(states, judged)
         if is_complete and time.monotonic() > began_s + _LISTEN_S:
             return
 
@@ -116,14 +120,39 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Gro
             problems.append(Text(f"{state.label}: {state.detail}", style=style))
         if state.view and state.view.health.problem and state.view.alive:
             problems.append(Text(f"{state.label}: {state.view.health.problem}", style="red"))
-    problems += [Text(line, style="yellow") for line in refused_lines(watcher.refused())]
+    problems += [Text(line, style="yellow") for line in (*loss_lines(states), *refused_lines(watcher.refused()))]
     alarms = [_alarm_line(each) for each in watcher.current_alarms() if is_listed(each.newest)]
-    if not any(state.view and state.view.alive and state.view.health.stage == "scorer" for state in states):
-        unjudged = [Text("alarms unknown: no scorer is alive", style="red")]
+    if not _has_scorer(states):
+        not_judged = [Text("no fan is judged: the configuration has no scorer", style="yellow")]
+    elif not any(state.view and state.view.alive and state.view.health.stage == "scorer" for state in states):
+        not_judged = [Text("alarms unknown: no scorer is alive", style="red")]
     else:
-        unjudged = [Text(each.line(), style="red") for each in judged.unjudged(states)]
-    no_alarms = [] if alarms or unjudged else [Text("no alarms", style="green")]
-    return Group(*([table] if watcher.stages() else []), *problems, *alarms, *unjudged, *no_alarms)
+        not_judged = [Text(each.line(), style="red") for each in unjudged(states, judged)]
+    no_alarms = [] if alarms or not_judged else [Text("no alarms", style="green")]
+    return Group(*([table] if watcher.stages() else []), *problems, *alarms, *not_judged, *no_alarms)
+
+
+def _has_scorer(states: Sequence[StageState]) -> bool:
+    """Whether the configuration asks for a scorer, or one is heard."""
+    return any(state.label == "scorer" for state in states)
+
+
+def unjudged(states: Sequence[StageState], judged: JudgedFans) -> list[Unjudged]:
+    """The fans that should be judged and are not."""
+    return judged.unjudged(states) if _has_scorer(states) else []
+
+
+def loss_lines(states: Sequence[StageState]) -> list[str]:
+    """What the sessions that run have lost, by counter and input."""
+    lines: list[str] = []
+    for state in states:
+        if state.view and state.view.health.lost:
+            health = state.view.health
+            counts = [(each.name, each.value) for each in health.counters if each.name.startswith(LOSS_PREFIX)]
+            missing = [(f"missing on {'/'.join(each.key.split('/')[2:])}", each.missing) for each in health.inputs]
+            found = ", ".join(f"{name} {count}" for name, count in (*counts, *missing) if count)
+            lines.append(f"{state.label}: lost since its start: {found}")
+    return lines
 
 
 def _figures(view: StageView | None, lost: int) -> list[str | Text]:
@@ -161,7 +190,7 @@ def as_json(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> dict[st
     return {
         "stages": [_state_as_json(state, lost.get(state.label, 0)) for state in states],
         "alarms": [current.as_json() for current in watcher.current_alarms()],
-        "not_judged": [each.as_json() for each in judged.unjudged(states)],
+        "not_judged": [each.as_json() for each in unjudged(states, judged)],
     }
 
 

@@ -18,10 +18,11 @@ from rich.console import Console
 
 from pipeline.bus.publisher import Publisher
 from pipeline.bus.session import Bus
-from pipeline.cli.watch.status import as_json, stage_table
+from pipeline.cli.watch.status import as_json, loss_lines, stage_table, unjudged
 from pipeline.config.loading import load_config
 from pipeline.config.models import BusConfig
 from pipeline.launch.judged_fans import JudgedFans
+from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher, StageView
 from schemas.codec import encode, type_name
 from schemas.messages import (
@@ -176,7 +177,7 @@ def test_row_18_the_loss_of_a_stage_that_was_restarted_while_it_is_watched_does_
     judged = site.judged()
     (stage,) = document(watcher, judged)["stages"]
     assert (stage["lost"], stage["uptime_s"]) == (7 + 2, 180.0)
-    (row,) = (line for line in shown(watcher, judged).splitlines() if line.strip().startswith("scorer"))
+    (row,) = (line for line in shown(watcher, judged).splitlines() if line.strip().startswith("scorer "))
     assert (row.split()[2:4], row.split()[-1]) == (["3", "min"], "9")
 
 
@@ -262,6 +263,23 @@ def test_row_01_no_alarms_is_not_said_while_a_fan_is_not_judged(site):
     assert "tray1: fan 0 not judged: no speed" in text
     assert "no alarms" not in text
     assert document(watcher, judged)["not_judged"] == [{"tray": TRAY, "fans": [0], "why": "no speed"}]
+
+
+def test_a_site_without_a_scorer_is_well_and_does_not_say_that_there_are_no_alarms(site):
+    watcher = SiteWatcher(site.outside, SITE)
+    recorder = replace(HEALTH, stage="recorder", header=Header("recorder-all-1", 0, ""))
+    line = Input(key="fantwin/demo/tray1/raw", producer="p", received=9, missing=3, duplicated=0, next_sequence=12)
+    state = StageState("recorder", Word.OK, "", StageView(replace(recorder, inputs=(line,)), None, alive=True), True)
+    console = Console(width=120, file=io.StringIO(), record=True)
+    nobody = JudgedFans(site.outside, SITE, load_config(DEMO / "demo.toml").trays, watcher)
+    assert unjudged([state], nobody) == []
+    assert unjudged([replace(state, label="scorer")], nobody) != []
+    assert loss_lines([state]) == ["recorder: lost since its start: lost_on_purpose 4, missing on tray1/raw 3"]
+    config = load_config(DEMO / "demo.toml", ['launcher.stages=["recorder"]'])
+    console.print(stage_table(watcher, config, nobody))
+    text = console.export_text()
+    assert "no fan is judged: the configuration has no scorer" in text
+    assert "no alarms" not in text
 
 
 def test_a_stage_that_vanished_is_shown_as_gone(site):

@@ -27,6 +27,13 @@ def test_row_07_what_sessions_have_refused_is_added_up():
     assert refused_lines(refused(sessions)) == ["recorder: refused: 10 messages from a second process of a stage"]
 
 
+def test_noise_on_a_line_is_listed_with_its_kinds():
+    found = refused([health(samples=9, garbage=3, truncated=1, resync=1, refused_input=4)])
+    assert found == {"acquisition/bench": {"garbage": 3, "truncated": 1, "refused_input": 4}}
+    words = "4 pieces of input that are no usable sample (garbage 3, truncated 1)"
+    assert refused_lines(found) == [f"acquisition/bench: refused: {words}"]
+
+
 def test_a_device_of_which_all_was_refused_is_named_with_the_count_and_the_setting():
     sessions = [health(absurd_command=400, garbage=2, refused_input=402), health(absurd_command=10, refused_input=10)]
     assert unusable_lines(sessions, LAUNCHED) == [
