@@ -25,7 +25,7 @@ from pipeline.viewing.loopback import check_free
 from pipeline.viewing.stages_page import StagesPage
 from pipeline.viewing.trace import Trace, state_changes, state_name, trace_of
 from schemas.messages import Alarm, Array, Health, Message, ModelCard, Score, Severity, Transition
-from scoring.alarms.current_alarms import CurrentAlarm
+from scoring.alarms.current_alarms import words_of
 
 NO_RERUN = f"the viewer needs the extra `view`: take viewer out of launcher.stages, or {how_to_install('view')}"
 FLUSH_PERIOD_NS = 500_000_000
@@ -85,13 +85,11 @@ class ViewSink(Protocol):
 def alarm_line(alarm: Alarm) -> tuple[str, str]:
     """Level and text of an alarm's transition, for the log."""
     happened = alarm.transition.words
-    if alarm.severity == Severity.NONE and alarm.transition == Transition.REPUBLISHED:
-        states = CurrentAlarm(alarm, alarm.message, (), "").states()
-        return "INFO", f"{happened} ({', '.join(states)}): {alarm.message}"
-    if alarm.transition not in (Transition.RAISED, Transition.SEVERITY, Transition.REPUBLISHED):
-        return "INFO", f"{happened}: {alarm.message}"
+    is_bad = alarm.active or alarm.transition != Transition.REPUBLISHED
+    if not is_bad or alarm.transition not in (Transition.RAISED, Transition.SEVERITY, Transition.REPUBLISHED):
+        return "INFO", f"{happened}: {words_of(alarm)}"
     level = "ERROR" if alarm.severity == Severity.ALARM else "WARN"
-    return level, f"{alarm.severity.words} {happened}: {alarm.message}"
+    return level, f"{alarm.severity.words} {happened}: {words_of(alarm)}"
 
 
 @dataclass(slots=True)

@@ -42,7 +42,7 @@ class CurrentAlarm:
         alarm = self.newest
         word = alarm.severity.name if alarm.active else alarm.transition.name.lower().replace("_", " ")
         silenced = " (silenced)" if alarm.active and is_silenced(alarm) else ""
-        return f"{word}{silenced}  {alarm.header.tray}  {alarm.message}"
+        return f"{word}{silenced}  {alarm.header.tray}  {words_of(alarm)}"
 
     def states(self) -> list[str]:
         """The states the alarm is in, for people."""
@@ -90,6 +90,17 @@ class CurrentAlarm:
         }
 
 
+def words_of(alarm: Alarm) -> str:
+    """The message of an alarm, for people. Of one that is over, a restarted scorer says "still stands" too while it is
+    listed: its words are part of recordings, so this says what holds it on the list."""
+    if alarm.transition != Transition.REPUBLISHED or alarm.active:
+        return alarm.message
+    over = {"cleared", "acknowledged", "never raised"}
+    holds = ", ".join(state for state in CurrentAlarm(alarm, "", (), "").states() if state not in over)
+    before = "no alarm" if alarm.severity == Severity.NONE else "back to normal"
+    return f"fan {alarm.fan}: {before}{f', {holds}' if holds else ''}"
+
+
 def current_alarms(messages: Iterable[Alarm]) -> list[CurrentAlarm]:
     """The alarm of each fan with a message, by tray and fan. messages: in the order received."""
     by_fan: dict[tuple[str, int], list[Alarm]] = {}
@@ -121,7 +132,7 @@ def _current(messages: Sequence[Alarm]) -> CurrentAlarm:
     newest, describing, with_causes, acknowledging = _parts(messages)
     return CurrentAlarm(
         newest,
-        message=describing.message if describing else "",
+        message=words_of(describing) if describing else "",
         causes=with_causes.causes if with_causes else (),
         acknowledged_by=acknowledging.operator_name if acknowledging and newest.acknowledged else "",
     )

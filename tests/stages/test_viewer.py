@@ -111,7 +111,12 @@ def play(core: Core, scores: Sequence[Score]) -> None:
         (
             {"transition": Transition.REPUBLISHED, "active": False, "severity": Severity.NONE, "suppressed": True},
             "INFO",
-            "republished (never raised, suppressed): so",
+            "republished: fan 0: no alarm, suppressed",
+        ),
+        (
+            {"transition": Transition.REPUBLISHED, "active": False, "severity": Severity.ALARM, "acknowledged": False},
+            "INFO",
+            "republished: fan 0: back to normal, unacknowledged",
         ),
     ],
 )

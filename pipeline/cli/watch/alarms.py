@@ -34,7 +34,7 @@ from schemas.topics import alive_key, tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.alarm_text import CANNOT_TELL, CAUSES
-from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, until
+from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, until, words_of
 
 _DISCOVERY_S = 5.0  # every stage sends several health messages in this time
 _SCORES_S = 3.0  # a score of every tray arrives in this time
@@ -293,7 +293,7 @@ def _transition_line(alarm: Alarm) -> Text:
         style=_STYLES.get(alarm.severity, "bold red") if alarm.active else "",
     )
     return Text.assemble(
-        f"{clock(alarm.t_ns)}  {_name(alarm)}  {alarm.severity.name:7}  ", word, f"{why}  {alarm.message}"
+        f"{clock(alarm.t_ns)}  {_name(alarm)}  {alarm.severity.name:7}  ", word, f"{why}  {words_of(alarm)}"
     )
 
 

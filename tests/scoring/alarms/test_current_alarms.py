@@ -119,3 +119,22 @@ def test_a_machine_gets_it_all_as_json():
     assert shown["causes"] == [{"cause": "drag_up", "probability": 0.8, "evidence": ""}]
     assert (shown["severity"], shown["retained"], shown["presented"]) == ("warning", True, False)
     assert shown["shelved_until_t_ns"] == 7
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"active": True}, "fan 0: still stands"),
+        ({"active": False}, "fan 0: back to normal, unacknowledged"),
+        ({"active": False, "acknowledged": True, "latched": True}, "fan 0: back to normal, latched"),
+        ({"active": False, "acknowledged": True}, "fan 0: back to normal"),
+        (
+            {"active": False, "acknowledged": True, "severity": Severity.NONE, "suppressed": True},
+            "fan 0: no alarm, suppressed",
+        ),
+    ],
+)
+def test_of_an_alarm_that_is_over_it_is_not_said_after_a_restart_that_it_stands(more, words):
+    current = one(alarm(Transition.REPUBLISHED, **{"message": "fan 0: still stands"} | more))
+    assert current.message == words
+    assert current.line().endswith(f"  a  {words}")
