@@ -239,10 +239,12 @@ def build(context: Context) -> BuiltStage:
 
 
 def check(context: Context) -> list[str]:
-    """Report a missing extra and ports that are taken."""
+    """Report a missing extra, and ports that another program has taken."""
     config: ViewerConfig = context.config
     problems = [] if importlib.util.find_spec("rerun") else [NO_RERUN]
-    ports = {"grpc_port": config.grpc_port, "web_port": config.web_port} if config.serve else {}
+    ports = (
+        {"grpc_port": config.grpc_port, "web_port": config.web_port} if config.serve and not context.is_running else {}
+    )
     for key, port in ports.items():
         try:
             check_free(port, f"viewer.{key}", "viewer.serve = false")

@@ -101,6 +101,8 @@ class Context:
     configuration_text: str = field(default="", repr=False)
     overrides: tuple[str, ...] = ()
     """the keys set on the command line, `key=value`"""
+    is_running: bool = False
+    """for a check: this stage already runs on this host, and has taken itself what it needs"""
     decision_rules: DecisionRules = CURRENT_RULES
     """an older version only while an older recording is replayed"""
 

@@ -217,7 +217,7 @@ def _clock_forward(site: ScratchSite) -> str:
 
 
 SCENARIOS = (
-    Scenario("kill", "each stage that is killed is restarted, and nothing it had received is lost", _kills),
+    Scenario("kill", "each stage that is killed is restarted, and judging goes on", _kills),
     Scenario("hang", "a stage that hangs is killed and restarted", _hang),
     Scenario("silence", "a silent line is reported", _silence),
     Scenario("backlog", f"a line that stalls {STALL_S:.0f} s and delivers its backlog raises no alarm", _backlog),

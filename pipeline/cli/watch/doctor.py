@@ -7,8 +7,9 @@ import os
 import re
 import shutil
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Annotated
@@ -21,13 +22,17 @@ from pipeline.bus.errors import BusError
 from pipeline.bus.session import Bus
 from pipeline.cli.options import JsonOption, SetOption
 from pipeline.config.loading import load_config
-from pipeline.config.models import BusConfig, Config, ConfigError
+from pipeline.config.models import Config, ConfigError
 from pipeline.launch.processes import process_list
 from pipeline.optional_dependencies import how_to_install
+from pipeline.runtime.sessions import GOSSIP_S, Session
 from pipeline.runtime.stage import Context, load_stage
+from schemas.topics import sessions_key
 
 _DEVELOPMENT_EXTRAS = {"dev", "bench"}  # used by tests and benches only
 _MIN_FREE_BYTES = 1 << 30
+_LOOKS = 4
+"""for the sessions of a site, GOSSIP_S apart"""
 
 
 def doctor(
@@ -69,8 +74,9 @@ def _findings(config: Path | None, overrides: list[str] | None) -> Iterator[tupl
         return
     yield True, f"{config}: site {settings.site!r}, trays {', '.join(tray.name for tray in settings.trays)}"
     yield from _check_run_folder(settings.run_folder)
-    yield from _check_bus(settings.bus)
-    yield from _check_stages(settings)
+    running: dict[str, Session] = {}
+    yield from _check_bus(settings, running)
+    yield from _check_stages(settings, running)
 
 
 def _check_packages() -> Iterator[tuple[bool, str]]:
@@ -110,9 +116,9 @@ def _check_run_folder(folder: Path) -> Iterator[tuple[bool, str]]:
     yield enough, f"run_folder {folder}: {free / 1e9:.1f} GB free{advice}"
 
 
-def _check_bus(config: BusConfig) -> Iterator[tuple[bool, str]]:
-    """Whether processes can meet at the endpoint."""
-    endpoint = config.endpoint
+def _check_bus(settings: Config, running: dict[str, Session]) -> Iterator[tuple[bool, str]]:
+    """Whether processes can meet at the endpoint. Adds the sessions of the site that run there, by name."""
+    config, endpoint = settings.bus, settings.bus.endpoint
     if problem := endpoint_problem(endpoint):
         yield False, problem
     elif not accepts_connections(endpoint):
@@ -122,14 +128,29 @@ def _check_bus(config: BusConfig) -> Iterator[tuple[bool, str]]:
         )
     else:
         try:
-            Bus(config, listens=False).close()
-            yield True, f"bus.endpoint {endpoint}: fantwin answers there"
+            running |= _sessions(settings)
+            site = f"site {settings.site!r} runs there" if running else "fantwin answers there"
+            yield True, f"bus.endpoint {endpoint}: {site}"
         except BusError:
             yield False, foreign_program(endpoint)
 
 
-def _check_stages(config: Config) -> Iterator[tuple[bool, str]]:
+def _sessions(settings: Config) -> dict[str, Session]:
+    """The sessions of the site that run, by name; those are waited for that the first one met still introduces."""
+    stop, found = threading.Event(), set[str]()
+    with Bus(settings.bus, listens=False) as bus:
+        bus.wait_for_others(stop)
+        for _ in range(_LOOKS):
+            found |= bus.alive(sessions_key(settings.site))
+            stop.wait(GOSSIP_S)
+    sessions = filter(None, map(Session.of_key, found))
+    return {session.name: session for session in sessions}
+
+
+def _check_stages(config: Config, running: Mapping[str, Session]) -> Iterator[tuple[bool, str]]:
     for row in process_list(config):
+        session = running.get(row.label)
+        is_here = session is not None and session.host == Session.of_this_process(row.stage, row.instance, 0, "").host
         stage = load_stage(row.stage)
         trays = (config.tray(row.tray),) if row.tray else config.trays
         groups = [(tray,) for tray in trays] if stage.core_per_tray else [trays]
@@ -144,12 +165,13 @@ def _check_stages(config: Config) -> Iterator[tuple[bool, str]]:
                     folder=config.folder,
                     run_folder=config.run_folder,
                     started_t_ns=time.time_ns(),
+                    is_running=is_here,
                 )
             )
         ]
         yield from ((False, f"{row.label}: {problem}") for problem in problems)
         if not problems:
-            yield True, f"{row.label}: can start"
+            yield True, f"{row.label}: {f'runs already ({session.process})' if session else 'can start'}"
 
 
 def _version(package: str) -> str:

@@ -15,8 +15,11 @@ from pathlib import Path
 import pytest
 import typer
 
+from pipeline.bus.session import Bus
 from pipeline.cli.watch import doctor as module
 from pipeline.cli.watch.doctor import doctor
+from pipeline.config.models import BusConfig
+from pipeline.runtime.sessions import Session
 from tests.support.running_chain import DEMO
 
 
@@ -87,6 +90,24 @@ def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(capsys, tmp_path,
         f"bus.endpoint = '{endpoint}': the program that listens there is not fantwin, or hangs, so stages cannot "
         "connect: stop it, or choose another port"
     ]
+
+
+def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_stranger_are(capsys, tmp_path, port, endpoint):
+    with socket.create_server(("127.0.0.1", 0)) as taken, Bus(BusConfig(endpoint=endpoint)) as bus:
+        viewer_port = taken.getsockname()[1]
+        settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", f"bus.endpoint='{endpoint}'"]
+        settings += [f"viewer.grpc_port={viewer_port}", "viewer.web_port=0", "launcher.stages=['resampler', 'viewer']"]
+        code, found = examine(capsys, DEMO / "demo.toml", *settings)
+        assert code == 1
+        assert f"viewer: viewer.grpc_port: port {viewer_port} on 127.0.0.1 is taken" in found["problems"][0]
+        assert f"bus.endpoint {endpoint}: fantwin answers there" in found["good"]
+
+        session = Session.of_this_process("viewer", "all", 1, "viewer-all-1")
+        bus.declare_alive(session.key("demo"))
+        code, found = examine(capsys, DEMO / "demo.toml", *settings)
+        assert (code, found["problems"]) == (0, [])
+        runs = f"viewer: runs already ({session.process})"
+        assert {f"bus.endpoint {endpoint}: site 'demo' runs there", runs, "resampler: can start"} <= set(found["good"])
 
 
 def test_a_missing_configuration_is_a_problem_and_no_crash(capsys, tmp_path):
