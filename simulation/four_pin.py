@@ -160,12 +160,12 @@ class FourPinFans:
     def _surroundings(self, duration_s: float) -> Array:
         """(fans,) factor of supply, air and wandering on the wanted speed."""
         p = self.parameters
-        load = np.square(self.speed_rad_s / p.speed_max_rad_s).reshape(-1, self._per_supply).mean(axis=1)
+        load = np.square(self.speed_rad_s / p.speed_max_rad_s).reshape(-1, self._per_supply).sum(axis=1)
         kept = np.exp(-duration_s / np.asarray(p.wander_s))
         drawn = self._rng.normal(size=len(self._wander))
         self._wander = kept * self._wander + p.wander * np.sqrt(1.0 - kept * kept) * drawn
         air = p.air * np.sin(2.0 * np.pi * self._t_s / np.asarray(p.air_period_s) + self._phase)
-        return (1.0 - p.sag * np.repeat(load, self._per_supply)) * (1.0 + air) * (1.0 + self._wander)
+        return (1.0 - p.sag / self._per_supply * np.repeat(load, self._per_supply)) * (1.0 + air) * (1.0 + self._wander)
 
     def _blocked(self, speed_rad_s: Array, duration_s: float) -> Array:
         is_blocked = np.asarray(self.damage.is_blocked)

@@ -15,7 +15,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.tacho import Tacho
+from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from simulation.errors import SimulationError
 
 Array: TypeAlias = NDArray[np.float64]
@@ -46,7 +46,8 @@ class NoisyTacho:
 class TachoSettings:
     """How the speed of each fan of a tray is measured, and what goes wrong in it."""
 
-    measurement: Tacho = Tacho()
+    measurement: tuple[Tacho, ...] = INSTANTANEOUS
+    """one for all fans, or one for each; only those that count may differ"""
     noise: NoisyTacho = NoisyTacho()
     """of readings of kind "instantaneous"; those of pulses are exact up to their resolution"""
     missing_edges: float = 0.0
@@ -58,11 +59,12 @@ class TachoSettings:
 
     def as_record(self) -> dict[str, Any]:
         """The settings as one table of plain values, for the ground truth."""
-        return asdict(self.noise) | self.measurement.model_dump() | {
+        return asdict(self.noise) | {
+            "measurement": [tacho.model_dump() for tacho in self.measurement],
             "missing_edges": self.missing_edges,
             "double_edges": self.double_edges,
             "missing_readings": self.missing_readings,
-        }  # fmt: skip
+        }
 
 
 class SimulatedTacho(Protocol):
@@ -84,14 +86,22 @@ def simulated_tacho(settings: TachoSettings, fans: int, rng: np.random.Generator
     """The tachos of a tray of fans with these settings.
 
     Raises:
-        SimulationError: such a tacho cannot be simulated.
+        SimulationError: such tachos cannot be simulated.
     """
-    tacho = settings.measurement
+    try:
+        tachos = tacho_of_each_fan(settings.measurement, fans)
+    except ValueError as error:
+        raise SimulationError(str(error)) from error
+    tacho = tachos[0]
+    if any(other.kind != tacho.kind or other.delay_s != tacho.delay_s for other in tachos):
+        raise SimulationError("the tachos of a simulated tray are of one kind and equally late")
     simulated: SimulatedTacho
     if tacho.kind == "instantaneous":
         simulated = InstantaneousTacho(settings.noise, fans, rng)
     elif tacho.kind == "count":
-        simulated = CountingTacho([tacho] * fans, settings.missing_edges, settings.double_edges, rng)
+        simulated = CountingTacho(tachos, settings.missing_edges, settings.double_edges, rng)
+    elif any(other.pulses != tacho.pulses for other in tachos):
+        raise SimulationError("simulated tachos of kind period have equally many pulses")
     else:
         simulated = PeriodTacho(tacho.pulses, fans, settings.missing_edges, settings.double_edges, rng)
     return DelayedTacho(simulated, tacho.delay_s) if tacho.delay_s > 0.0 else simulated

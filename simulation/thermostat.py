@@ -49,6 +49,10 @@ class Thermostat:
         """(fans,) duty in force at t_s."""
         return self._steps[int(t_s * UPDATES_HZ + 1e-6) % len(self._steps)] / STEPS
 
+    def is_on(self, times_s: Array, fan: int) -> NDArray[np.bool_]:
+        """Whether a fan has a duty at times; same shape."""
+        return self._steps[(times_s * UPDATES_HZ + 1e-6).astype(np.int64) % len(self._steps), fan] > 0
+
 
 def _zone_c(rng: np.random.Generator, samples: int) -> Array:
     """(samples,) settled temperature of a zone: levels, each held for a while; warm at first."""

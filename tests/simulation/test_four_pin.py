@@ -117,7 +117,7 @@ RACK = TraySettings(
     rate_hz=10.0,
     duration_s=60.0,
     profile="thermostat",
-    tacho=TachoSettings(Tacho(kind="count", window_s=0.5)),
+    tacho=TachoSettings((Tacho(kind="count", window_s=0.5),)),
 )
 
 
@@ -157,10 +157,10 @@ def test_the_same_seed_gives_the_same_rack_and_another_another() -> None:
 
 
 def test_the_readings_of_a_rack_do_not_depend_on_how_often_they_are_reported() -> None:
-    steady = replace(RACK, jitter_us=0.0, duration_s=25.0, tacho=TachoSettings(Tacho(kind="count", window_s=1.0)))
+    steady = replace(RACK, jitter_us=0.0, duration_s=25.0, tacho=TachoSettings((Tacho(kind="count", window_s=1.0),)))
     _, ten = samples(steady, duty=0.5)
     _, hundred = samples(replace(steady, rate_hz=100.0), duty=0.5)
-    resolution = steady.tacho.measurement.resolution_rad_s
+    resolution = steady.tacho.measurement[0].resolution_rad_s
     # the wandering is drawn step by step, so the courses differ by that alone
     assert np.abs(ten[100:] - hundred[1000::10][: len(ten) - 100]).max() < 3 * resolution
 

@@ -97,7 +97,7 @@ def test_a_false_edge_in_a_revolution_doubles_a_reading_and_a_missing_one_takes_
 def test_a_delay_shows_what_was_measured_before() -> None:
     speed = wandering(5.0, 2)
     now = readings(PeriodTacho(2, 2, 0.0, 0.0, np.random.default_rng(5)), speed)
-    late = simulated_tacho(TachoSettings(Tacho(kind="period", delay_s=0.295)), 2, np.random.default_rng(5))
+    late = simulated_tacho(TachoSettings((Tacho(kind="period", delay_s=0.295),)), 2, np.random.default_rng(5))
     assert isinstance(late, DelayedTacho)
     assert np.array_equal(readings(late, speed)[30:], now[:-30])
 

@@ -87,8 +87,12 @@ def simulate(
     ] = "instantaneous",
     pulses: Annotated[int, typer.Option(help="Pulses per revolution.", rich_help_panel=_TACHO)] = 2,
     window: Annotated[
-        float, typer.Option(help="Seconds over which pulses are counted; for count.", rich_help_panel=_TACHO)
-    ] = 0.0,
+        list[float] | None,
+        typer.Option(
+            help="Seconds over which pulses are counted: one for all fans, or one per fan. Repeatable.",
+            rich_help_panel=_TACHO,
+        ),
+    ] = None,
     update: Annotated[
         float, typer.Option(help="Seconds between new counts; default: the window.", rich_help_panel=_TACHO)
     ] = 0.0,
@@ -191,7 +195,10 @@ def simulate(
             raise UserError("--time, --period, --command and --speed describe a file: name it with --from-csv FILE.csv")
         device = _tray(
             faults=fault or [],
-            tacho=_tacho(kind=tacho, pulses=pulses, window_s=window, update_s=update, delay_s=tacho_delay),
+            tachos=tuple(
+                _tacho(kind=tacho, pulses=pulses, window_s=one, update_s=update, delay_s=tacho_delay)
+                for one in window or [0.0]
+            ),
             noise_rad_s=noise,
             shares={"missing_edges": missing_edges, "double_edges": double_edges, "missing_readings": missing},
             clock={"drift_ppm": drift_ppm, "start_us": clock_start_us},
@@ -256,7 +263,7 @@ def _tacho(**settings: Any) -> Tacho:
 def _tray(
     *,
     faults: list[str],
-    tacho: Tacho,
+    tachos: tuple[Tacho, ...],
     noise_rad_s: float,
     shares: Mapping[str, float],
     clock: Mapping[str, Any],
@@ -273,7 +280,7 @@ def _tray(
     from simulation.tacho import NoisyTacho, TachoSettings  # noqa: PLC0415
     from simulation.tray import SimulatedTray, TraySettings  # noqa: PLC0415
 
-    measured = TachoSettings(tacho, NoisyTacho(noise_rad_s), **shares)
+    measured = TachoSettings(tachos, NoisyTacho(noise_rad_s), **shares)
     try:
         schedule = tuple(map(parse_fault, faults))
         return SimulatedTray(TraySettings(faults=schedule, tacho=measured, clock=DeviceClock(**clock), **settings))

@@ -359,8 +359,9 @@ def test_a_link_never_replaces_a_file_but_does_replace_a_stale_link(tmp_path: Pa
         ({"profile": "manuel"}, "did you mean 'manual'"),
         ({"fans": 65}, "fans = 65"),
         ({"tacho": "count"}, 'a tacho of kind "count" needs --window'),
-        ({"window": 1.0}, '--window and --update are for a tacho of kind "count"'),
-        ({"tacho": "count", "window": 61.0}, r"--window 61\.0: Input should be less than or equal to 60"),
+        ({"window": [1.0]}, '--window and --update are for a tacho of kind "count"'),
+        ({"tacho": "count", "window": [61.0]}, r"--window 61\.0: Input should be less than or equal to 60"),
+        ({"tacho": "count", "window": [1.0, 0.5]}, "2 tachos for 8 fans; give one for all fans, or one for each"),
         ({"fan": "4-pin", "fault": ["inlet:fan=1"]}, "4-pin fans have no such fault; they have clog"),
         ({"missing": 1.5}, r"missing readings = 1\.5"),
         ({"fault": ["inlet:fan=8"]}, "fan 8 does not exist"),
@@ -402,18 +403,21 @@ def test_a_recording_holds_the_tray_and_the_same_seed_and_epoch_give_the_same_by
 
 def test_a_rack_of_4_pin_fans_is_recorded_with_counts_of_its_window(tmp_path: Path) -> None:
     recording, truth = tmp_path / "rack.mcap", tmp_path / "truth.json"
-    rack = {"fan": "4-pin", "fans": 4, "tacho": "count", "window": 0.5, "rate": 10.0, "profile": "thermostat"}
-    simulate(recording=recording, truth=truth, duration=60.0, missing=0.05, fault=["blocked:fan=1,start=30"], **rack)
+    rack = {"fan": "4-pin", "fans": 4, "tacho": "count", "rate": 10.0, "profile": "thermostat"}
+    windows = [1.0, 1.0, 0.5, 0.5]
+    faults = ["blocked:fan=1,start=30"]
+    simulate(recording=recording, truth=truth, duration=60.0, window=windows, missing=0.05, fault=faults, **rack)
     messages = raw_of(recording)
     speed = np.concatenate([raw.speed_rad_s for raw in messages])
-    counts = speed * 2 * 0.5 / (2 * np.pi)
+    counts = speed * 2 * np.array(windows) / (2 * np.pi)
     read = np.isfinite(counts)
     assert counts[read] == pytest.approx(np.round(counts[read]))
     assert 0.02 < 1.0 - read.mean() < 0.08
     assert np.nanmax(speed[310:, 1]) == 0.0
     said = truth_of(tmp_path)
     assert said["fan"] == "4-pin"
-    assert (said["tacho"]["kind"], said["tacho"]["window_s"], said["tacho"]["pulses"]) == ("count", 0.5, 2)
+    assert [tacho["window_s"] for tacho in said["tacho"]["measurement"]] == windows
+    assert {(tacho["kind"], tacho["pulses"]) for tacho in said["tacho"]["measurement"]} == {("count", 2)}
     assert said["parameters"][2]["duty_min"] == 0.2
 
 
