@@ -69,6 +69,19 @@ def test_racks_turn_the_same_whatever_the_rate_of_their_reports(rate_hz: float) 
         assert np.array_equal(mine[both], theirs[both])
 
 
+def test_a_count_is_shown_from_the_report_after_its_window_ended() -> None:
+    _, speed = courses(100.0, is_faulty=False)
+    phases = set()
+    for column in range(COUNT * RACK_FANS):
+        window_rows = round(TACHOS[column % RACK_FANS].window_s * 100)
+        changes = np.flatnonzero(np.diff(speed[:, column]) != 0.0) + 1
+        changes = changes[np.isfinite(speed[changes, column]) & np.isfinite(speed[changes - 1, column])]
+        phase = int(np.bincount(changes % window_rows).argmax())
+        assert np.isin(changes % window_rows, [(phase - 1) % window_rows, phase, (phase + 1) % window_rows]).all()
+        phases.add(phase % 10)
+    assert len(phases) > 3  # and not at the steps of the simulation
+
+
 def test_each_rack_has_each_fault_once_on_a_fan_that_is_on_and_the_truth_says_so() -> None:
     truth = events(fault_schedule(built()))
     command, _ = courses(10.0, is_faulty=True)

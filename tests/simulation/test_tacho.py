@@ -63,6 +63,13 @@ def test_a_count_is_the_mean_speed_of_its_own_window_to_within_one_step_of_its_r
     assert len(np.unique(np.round(phases_s, 3))) == fans
 
 
+def test_a_window_that_ends_within_a_piece_holds_the_revolutions_until_then() -> None:
+    counting = counts_of(Tacho(kind="count", window_s=0.05, pulses=1000))
+    counting.turn(0.0, np.zeros(1), 1.0, np.full(1, 100.0))  # 20 windows of a steady run-up
+    middle_s = counting.shown_from_s - 0.025
+    assert counting.read() == pytest.approx(100.0 * middle_s, abs=0.13)
+
+
 def test_edges_that_are_missed_or_seen_twice_shift_the_mean_by_their_share() -> None:
     speed = np.full((6001, 8), 200.0)
     window = Tacho(kind="count", window_s=0.5)

@@ -413,7 +413,7 @@ def test_a_rack_of_4_pin_fans_is_recorded_with_counts_of_its_window(tmp_path: Pa
     read = np.isfinite(counts)
     assert counts[read] == pytest.approx(np.round(counts[read]))
     assert 0.02 < 1.0 - read.mean() < 0.08
-    assert np.nanmax(speed[310:, 1]) == 0.0
+    assert np.nanmax(speed[330:, 1]) == 0.0
     said = truth_of(tmp_path)
     assert said["fan"] == "4-pin"
     assert [tacho["window_s"] for tacho in said["tacho"]["measurement"]] == windows
