@@ -11,7 +11,7 @@ from pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
 from schemas.messages import Health
 from schemas.topics import topic_of
 
-_WATCHED_TOPICS = {"alarm", "score"}
+_WATCHED_TOPICS = {"alarm", "score", "snapshot"}
 
 
 class KnownSessions:

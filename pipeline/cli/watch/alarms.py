@@ -113,9 +113,10 @@ def alarms(
     )
     stop_on_signals(stop)
     with Bus(settings.bus, stop, listens=False) as bus:
-        wait_for_stages(bus, SiteWatcher(bus, settings.site), settings, stop)
+        watcher = SiteWatcher(bus, settings.site)
+        wait_for_stages(bus, watcher, settings, stop)
         fans = set(range(settings.tray(name).fans)) if number < 0 else {number}
-        answers = ask(bus, settings.site, name, request, fans, timeout_s, stop)
+        answers = ask(bus, settings.site, name, request, fans, timeout_s, stop, watcher)
     _report(asked, name, answers, json_output)
 
 

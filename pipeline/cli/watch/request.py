@@ -10,6 +10,7 @@ from dataclasses import replace
 
 from pipeline.bus.session import Bus
 from pipeline.errors import UserError
+from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.messages import Alarm, Header, Request
 from schemas.topics import BY_NAME, tray_key
@@ -18,11 +19,19 @@ _POLL_S = 0.05
 
 
 def ask(
-    bus: Bus, site: str, tray: str, request: Request, fans: set[int], timeout_s: float, stop: threading.Event
+    bus: Bus,
+    site: str,
+    tray: str,
+    request: Request,
+    fans: set[int],
+    timeout_s: float,
+    stop: threading.Event,
+    watcher: SiteWatcher,
 ) -> list[Alarm]:
     """Publish a request and return the answers for `fans`, in the order of their numbers.
 
-    The stages must have been discovered before, or the request may reach none of them.
+    The stages must have been discovered before, or the request may reach none of them. `watcher` knows whose answers
+    count: those of the session that owns the scorer.
 
     Raises:
         UserError: an answer is missing after `timeout_s`.
@@ -31,7 +40,8 @@ def ask(
     publisher = bus.publisher(tray_key(site, tray, "request"), BY_NAME["request"], type_name(Request), producer)
     name = f"{producer}/{publisher.published}"
     received: queue.Queue[bytes] = queue.Queue()
-    bus.subscribe(tray_key(site, tray, "alarm"), lambda _key, payload: received.put(payload))
+    key = tray_key(site, tray, "alarm")
+    bus.subscribe(key, lambda _key, payload: received.put(payload))
     publisher.put(encode(replace(request, header=Header(producer, publisher.published, tray))))
     answers: dict[int, Alarm] = {}
     until_s = time.monotonic() + timeout_s
@@ -45,6 +55,6 @@ def ask(
             alarm = decode(Alarm, received.get(timeout=_POLL_S))
         except (queue.Empty, CodecError):
             continue
-        if isinstance(alarm, Alarm) and alarm.request == name:
+        if isinstance(alarm, Alarm) and alarm.request == name and watcher.counts(key, alarm.header.producer):
             answers[alarm.fan] = alarm
     return [answers[fan] for fan in sorted(fans)]

@@ -61,10 +61,15 @@ def wear(
         stop = threading.Event()
         stop_on_signals(stop)
         with Bus(settings.bus, stop, listens=False) as bus:
-            wait_for_stages(bus, SiteWatcher(bus, settings.site), settings, stop, what="wear")
-            key = tray_key(settings.site, "*", "snapshot")
-            replies = bus.recover(key)
-            snapshots = [snapshot for _, payload in replies for snapshot in _decoded(payload)]
+            watcher = SiteWatcher(bus, settings.site)
+            wait_for_stages(bus, watcher, settings, stop, what="wear")
+            answers = bus.recover(tray_key(settings.site, "*", "snapshot"))
+            snapshots = [
+                snapshot
+                for key, payload in answers
+                for snapshot in _decoded(payload)
+                if watcher.counts(key, snapshot.header.producer)
+            ]
         nothing = "no scorer has recorded wear so far: it does so every minute; try again later"
     found = [
         (tray, snapshot.t_ns, wear) for tray, snapshot in _latest(snapshots).items() for wear in _wear_in(snapshot)

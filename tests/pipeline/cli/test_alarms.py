@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.bus.session import Bus
 from pipeline.cli.watch.alarms import OperatorAction, alarm_lines
 from pipeline.config.loading import load_config
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Core, Stage
+from schemas.codec import decode, encode, type_name
 from schemas.messages import (
     Action,
     Alarm,
@@ -30,6 +32,7 @@ from schemas.messages import (
     StageStatus,
     Transition,
 )
+from schemas.topics import BY_NAME, tray_key
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from scoring.alarms.tray_conditions import TrayConditions
@@ -119,8 +122,8 @@ class Site:
             build=lambda _context: BuiltStage(self.core),
         )
         self._stop = threading.Event()
-        config = load_config(DEMO / "demo.toml", [f"bus.endpoint='{endpoint}'"])
-        self.runner = Runner(stage, config, None, self._stop)
+        self.config = load_config(DEMO / "demo.toml", [f"bus.endpoint='{endpoint}'"])
+        self.runner = Runner(stage, self.config, None, self._stop)
         self.last: Any = None
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -264,6 +267,27 @@ def test_watching_prints_what_happens_as_it_happens(site):
         assert watching.wait(20) == 0
     assert (cleared["transition"], cleared["fan"], cleared["active"]) == ("cleared", 3, False)
     assert (acknowledged["transition"], acknowledged["acknowledged_by"]) == ("acknowledged", "Ann")
+
+
+def test_row_10_an_answer_of_a_stranger_is_none(site):
+    """Somebody who reads the request grants it before the scorer can."""
+    key, site.core.deaf = tray_key(SITE, TRAY, "alarm"), True
+    with Bus(site.config.bus) as bus:
+        stranger = bus.publisher(key, BY_NAME["alarm"], type_name(Alarm), "stranger")
+        heard = threading.Event()
+
+        def grant(_key: str, payload: bytes) -> None:
+            header = decode(Request, payload).header
+            alarm = site.core._alarm(3, Transition.ACKNOWLEDGED, site.core.conditions.alarm_state(3), "granted")
+            name = f"{header.producer}/{header.sequence}"
+            stranger.put(encode(replace(alarm, header=Header("stranger", 0, TRAY), request=name)))
+            heard.set()
+
+        bus.subscribe(tray_key(SITE, TRAY, "request"), grant)
+        eventually(site.runner._bus._session.info.peers_zid, "they have met")
+        refusal = site.refused("ack", TRAY, 3, "--timeout", 1)
+    assert heard.is_set()
+    assert "no answer for fan 3 within 1 s" in refusal
 
 
 def test_a_scorer_that_does_not_answer_is_reported_after_the_timeout(site):
