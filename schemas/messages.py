@@ -378,6 +378,14 @@ class AwaitedInput:
     since_t_ns: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class Note:
+    """What a stage works with and has done for a tray, one line; an empty tray: for all."""
+
+    tray: str
+    text: str
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Health:
     """Status of a stage, and what it has received, sent and lost."""
@@ -399,6 +407,7 @@ class Health:
     waiting_for: tuple[AwaitedInput, ...] = ()
     newest_input_t_ns: int = 0
     newest_output_t_ns: int = 0
+    notes: tuple[Note, ...] = ()
 
 
 Message: TypeAlias = (

@@ -1,10 +1,13 @@
 """Resampler: irregular raw samples to a uniform time grid.
 
 Reads: topic `raw` (device clock us, host time of receipt ns, command, speed rad/s).
-Writes: topic `grid`: `rate_hz` samples a second at absolute multiples of the period (t_ns % period_ns == 0), speed
-interpolated linearly, command held (that of the last sample at or before the grid time).
+Writes: topic `grid`: samples at absolute multiples of the period (t_ns % period_ns == 0), speed interpolated linearly,
+command held (that of the last sample at or before the grid time).
 Timing: a grid sample is published as soon as a raw sample at or after its time has arrived. If one fan has no reading,
 all fans wait for its next one, at most `gap_limit_s`. If no samples arrive, the wait is at most `watermark_s`.
+
+Without `rate_hz`, the rate of the grid follows from the line: samples are kept until its rate is known, after one to
+five seconds, and are then put on the grid. The rate stays until the resampler is started again.
 
 Gaps longer than `gap_limit_s` are never bridged. Their grid samples are not valid: GAP up to `watermark_s` after the
 last raw sample, then STALE; `stale_for_s` after it the grid ends until samples arrive again. Content depends on sample
@@ -14,87 +17,91 @@ grid. See docs/explanation/time.md.
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from typing import Self
 
-import numpy as np
 from pydantic import Field, model_validator
 
-from pipeline.devices.device_clock import UINT32, DeviceClock
-from pipeline.devices.device_sequence import LARGEST_GAP
-from pipeline.devices.interpolation import NEVER_NS, LastReadings, Samples, all_true, interpolate_samples
-from pipeline.devices.line_guard import LineGuard
-from pipeline.runtime.clock import is_of_replay
+from pipeline.devices.line_rate import (
+    ENOUGH_SAMPLES,
+    LONGEST_WAIT_US,
+    MIN_SAMPLES,
+    RATES_HZ,
+    GridTiming,
+    LineRate,
+    SampleTimes,
+    grid_rate_hz,
+    grid_timing,
+    is_too_slow,
+)
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
+from pipeline.runtime.sample_grid import SampleGrid
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
-from schemas.blocks import cut, join
-from schemas.messages import Array, Grid, InvalidReason, Raw
+from schemas.messages import Grid, Raw
 from schemas.units import NS_PER_S
 
-LONGEST_TICK_NS = NS_PER_S // 10  # a longer pause between ticks is a host that stalled, not a silent source
-SET_BACK_NS = NS_PER_S  # a new sample this much older than the newest: a replay was restarted
-MAX_ENDED_PRODUCERS = 64
-GAP, STALE, NO_SPEED, CLOCK_RESTARTED = (
-    np.uint8(reason)
-    for reason in (InvalidReason.GAP, InvalidReason.STALE, InvalidReason.NO_SPEED, InvalidReason.CLOCK_RESTARTED)
-)
+FASTER = 2.0  # a line that sends so many times the samples of its grid has changed
 
 
 class ResamplerConfig(StageConfig):
-    """Section `[resampler]`."""
+    """Section `[resampler]`. What is not given follows from the line."""
 
-    rate_hz: float = Field(default=100.0, gt=0, le=100_000, description="samples a second on the grid")
+    rate_hz: float | None = Field(
+        default=None,
+        gt=0,
+        le=100_000,
+        description="samples a second on the grid; without it that of the line, rounded, at most 100",
+    )
     block_size: int = Field(default=1, ge=1, le=4096, description="samples a message; 1 has the lowest latency")
-    gap_limit_s: float = Field(default=0.1, gt=0, description="no interpolation between samples further apart")
-    watermark_s: float = Field(default=0.5, gt=0, description="how long to wait for samples before a gap is published")
-    stale_for_s: float = Field(default=5.0, gt=0, description="the grid ends this long after the last sample")
+    gap_limit_s: float | None = Field(
+        default=None,
+        gt=0,
+        description="no interpolation between samples further apart; without it five periods, at least 0.1 s",
+    )
+    watermark_s: float | None = Field(
+        default=None,
+        gt=0,
+        description="how long to wait before a gap is published; without it 0.5 s, or gap_limit_s if longer",
+    )
+    stale_for_s: float | None = Field(
+        default=None,
+        gt=0,
+        description="the grid ends this long after the last sample; without it 5 s, or twice watermark_s if longer",
+    )
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
-        if not self.gap_limit_s <= self.watermark_s <= self.stale_for_s:
+        given_s = [limit_s for limit_s in (self.gap_limit_s, self.watermark_s, self.stale_for_s) if limit_s is not None]
+        if any(earlier_s > later_s for earlier_s, later_s in pairwise(given_s)):
             raise ValueError("gap_limit_s, watermark_s and stale_for_s must not decrease in this order")
         return self
 
-
-def first_grid_time(t_ns: int, period_ns: int) -> int:
-    """The first multiple of `period_ns` at or after `t_ns`."""
-    return -(-t_ns // period_ns) * period_ns
+    def timing(self, rate_hz: float) -> GridTiming:
+        """The times of a grid of this rate."""
+        return grid_timing(rate_hz, self.gap_limit_s, self.watermark_s, self.stale_for_s)
 
 
 class ResamplerCore(Core):
-    """The grid of one tray. Samples that are dropped and gaps are counted."""
+    """The grid of one tray, at the rate of the configuration or at that of its line."""
 
     def __init__(self, fans: int, config: ResamplerConfig, *, decision_rules: DecisionRules = CURRENT_RULES) -> None:
         self._fans = fans
-        self._block_size = config.block_size
-        self._period_ns = round(NS_PER_S / config.rate_hz)
-        self._gap_limit_ns = round(config.gap_limit_s * NS_PER_S)
-        self._watermark_ns = round(config.watermark_s * NS_PER_S)
-        self._stale_for_ns = round(config.stale_for_s * NS_PER_S)
-        knows_time = decision_rules >= DecisionRules.TIME_AND_GAPS
-        self._marks_restarts = decision_rules >= DecisionRules.BREAKS
-        self._restarts_t_ns: deque[int] = deque()  # of first samples after restarts whose grid samples are not made yet
-        self._clock = DeviceClock(knows_backlogs=knows_time)
-        self._guard = LineGuard(self._clock, self._period_ns) if knows_time else None
-        self._last_readings = LastReadings(fans, self._gap_limit_ns)
-        # The last raw sample at or before the next grid time, and all later ones.
-        self._held = Samples(np.zeros(0, np.int64), np.zeros((0, fans)), np.zeros((0, fans)))
-        self._newest_t_ns = NEVER_NS
-        self._next_t_ns = NEVER_NS
-        self._not_before_t_ns = NEVER_NS  # earlier samples are not accepted: the clock has restarted
-        self._pending: list[Grid] = []  # not yet published
-        self._pending_rows = 0
-        self._in_gap = False
-        self._silence_ns = 0
-        self._tick_t_ns: int | None = None
+        self._config = config
+        self._decision_rules = decision_rules
+        self._line = LineRate()
+        self._line_hz: float | None = None
+        """as found; None: not yet, or not asked for"""
+        self._waiting: list[Raw] = []
+        """until the rate of the line is known"""
+        self._newest = SampleTimes(ENOUGH_SAMPLES)
         self._wrong_fans = 0
-        self._set_back_ns = 0  # by how much the host clock was set back, until it has caught up
-        self._producer = ""
-        self._sequence = -1  # of the newest message of this producer
-        self._ended_producers: dict[str, None] = {}  # the latest that another one has followed
-        self._device_sequence: int | None = None  # of the newest raw sample
         self._counts: Counter[str] = Counter()
+        self._grid: SampleGrid | None = None
+        self._timing: GridTiming | None = None
+        if config.rate_hz is not None:
+            self._start(config.rate_hz)
 
     def step(self, item: Raw) -> list[Grid]:
         """Add raw samples; returns the grid as far as it is determined."""
@@ -103,237 +110,90 @@ class ResamplerCore(Core):
             self._counts["lost_wrong_fan_count"] += len(item.host_receive_t_ns)
             return []
         self._wrong_fans = 0
-        self._counts["samples_in"] += len(item.host_receive_t_ns)
-        if self._guard is None or is_of_replay(item.header.producer) or self._is_repeated(item):
-            self._add(item, self._is_new(item))
-            return self._blocks()
-        for message in self._guard.admit(item, is_of_ended=item.header.producer in self._ended_producers):
-            self._add(message, is_new=message.header.producer == self._guard.producer)
-        return self._blocks()
+        self._newest.add(item)
+        if self._grid is not None:
+            return self._grid.step(item)
+        if self._waiting and self._waiting[-1].header.producer != item.header.producer:
+            # the recording says of the first grid what it was made from: messages of one session of acquisition
+            self._counts["lost_before_rate"] += sum(len(each.host_receive_t_ns) for each in self._waiting)
+            self._waiting.clear()
+        self._waiting.append(item)
+        return list(self._grid_of_line()) if self._line.add(item) else []
 
     def tick(self, now_ns: int) -> list[Grid]:
-        """Add up how long no samples have arrived; past the watermark, publish the grid without them."""
-        if self._tick_t_ns is not None:
-            self._silence_ns += min(max(now_ns - self._tick_t_ns, 0), LONGEST_TICK_NS)
-        self._tick_t_ns = now_ns
-        if self._silence_ns < self._watermark_ns:
-            return []
-        return self.publish_until(self._newest_t_ns + self._silence_ns - self._watermark_ns)
+        """Past the watermark, publish the grid without samples."""
+        return self._grid.tick(now_ns) if self._grid else []
 
     def publish_until(self, t_ns: int) -> list[Grid]:
-        """Publish the grid up to `t_ns` without waiting for more samples."""
-        self._fill(t_ns, final=True)
-        return self._blocks(flush=True)
+        """Publish the grid up to `t_ns` without waiting for more samples, as a session did that then ended."""
+        grids = [*self._grid_of_line()] if self._waiting and t_ns > 0 else []
+        return [*grids, *self._grid.publish_until(t_ns)] if self._grid else grids
 
     def close(self) -> list[Grid]:
-        """Publish the grid up to the newest raw sample."""
-        for message in self._guard.close() if self._guard else ():
-            self._add(message, is_new=True)
-        return self.publish_until(self._newest_t_ns)
+        """Publish the grid up to the newest raw sample, however few there are."""
+        grids = [*self._grid_of_line()] if self._waiting else []
+        return [*grids, *self._grid.close()] if self._grid else grids
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/time.md explains each counter."""
-        of_guard = self._guard.counts if self._guard else {}
-        return {**self._counts, **of_guard, "clock_restarts": max(0, self._clock.segments - 1)}
+        return {**(self._grid.counters() if self._grid else {}), **self._counts}
+
+    def notes(self) -> list[str]:
+        """The rate of the grid and where it comes from, and how much of the grid lies in gaps."""
+        if self._grid is None or self._timing is None:
+            waiting = sum(len(item.host_receive_t_ns) for item in self._waiting)
+            return [f"the rate of the line is being measured ({waiting} samples so far)"] if waiting else []
+        line = "" if self._line_hz is None else f" (the line sends {_rate(self._line_hz)} samples a second)"
+        counts = self._grid.counters()
+        samples, in_gaps = counts.get("grid_samples", 0), counts.get("grid_samples_in_gaps", 0)
+        share = 100 * min(in_gaps / samples, 1) if samples else 0.0
+        gaps = f"gaps longer than {self._timing.gap_limit_ns / NS_PER_S:g} s: {counts.get('gaps', 0)}"
+        return [f"grid of {self._timing.rate_hz:g} Hz{line}; {gaps}, {share:.1f} % of the grid"]
 
     def problem(self) -> str:
-        """No samples, samples of another number of fans, or a host clock that was set back."""
+        """No samples, those of another number of fans, a line that does not fit the grid, or a host clock set back."""
         if self._wrong_fans:
             return f"raw samples of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
-        if self._silence_ns >= self._watermark_ns:
-            return (
-                f"no raw samples for more than {self._watermark_ns / NS_PER_S:g} s: see acquisition in `fantwin status`"
-            )
-        if self._set_back_ns:
-            return (
-                f"the host clock was set back by {self._set_back_ns / NS_PER_S:.0f} s, or a replay was restarted: "
-                "samples are refused until it has caught up; restart the stages"
-            )
-        return self._guard.problem() if self._guard else ""
+        if self._grid is None or self._timing is None:
+            return ""
+        return self._grid.problem() or self._misfit(self._timing)
 
-    def _add(self, item: Raw, is_new: bool) -> None:
-        """Add the samples of a message of the line; is_new: neither repeated nor one of an ended session."""
-        self._silence_ns = 0
-        times, restarts = self._times(item, is_new)
-        accepted = [k for k, t_ns in enumerate(times) if self._is_accepted(t_ns, is_new, after_restart=k in restarts)]
-        if accepted:
-            t_ns, command, speed = np.array(times, np.int64), item.command, item.speed_rad_s
-            if len(accepted) < len(times):
-                t_ns, command, speed = t_ns[accepted], command[accepted], speed[accepted]
-            self._held = self._held.extended(t_ns, command, speed)
-            self._fill(self._newest_t_ns, final=False)
+    def _misfit(self, timing: GridTiming) -> str:
+        """Why the newest samples do not fit the grid."""
+        newest = self._newest
+        if newest.count < MIN_SAMPLES or (newest.count < ENOUGH_SAMPLES and newest.span_us < LONGEST_WAIT_US):
+            return ""
+        line_hz = newest.line_hz
+        apart = f"samples arrive {_rate(line_hz)} times a second"
+        if self._config.rate_hz is None and is_too_slow(line_hz):
+            return f"{apart}: too slow to be judged; let the device send at least {RATES_HZ[0]} a second"
+        if line_hz * timing.gap_limit_ns < NS_PER_S:
+            what = "rate_hz and gap_limit_s" if self._config.rate_hz or self._config.gap_limit_s else ""
+            todo = f"leave out {what} of [resampler], they follow from the line" if what else "restart the resampler"
+            return f"{apart}, further apart than gap_limit_s = {timing.gap_limit_ns / NS_PER_S:g}: {todo}"
+        if self._config.rate_hz is None and grid_rate_hz(line_hz) >= FASTER * timing.rate_hz:
+            return f"{apart}, and the grid has {timing.rate_hz:g} Hz since they were fewer: restart the resampler"
+        return ""
 
-    def _is_repeated(self, item: Raw) -> bool:
-        """Whether the bus has delivered a message of the present producer again."""
-        return item.header.producer == self._producer and item.header.sequence <= self._sequence
+    def _grid_of_line(self) -> Iterator[Grid]:
+        """Start the grid at the rate of the line, and put the samples that have waited on it."""
+        self._line_hz = self._line.line_hz
+        grid = self._start(grid_rate_hz(self._line_hz))
+        waiting, self._waiting = self._waiting, []
+        for item in waiting:
+            yield from grid.step(item)
 
-    def _is_new(self, item: Raw) -> bool:
-        """Whether a message is newer than all before: neither repeated nor one of an ended session."""
-        return item.header.producer not in self._ended_producers and not self._is_repeated(item)
+    def _start(self, rate_hz: float) -> SampleGrid:
+        config = self._config
+        if self._line_hz is not None and is_too_slow(self._line_hz):
+            config = config.model_copy(update={"gap_limit_s": config.gap_limit_s or 1.0 / rate_hz})
+        self._timing = config.timing(rate_hz)
+        self._grid = SampleGrid(self._fans, self._timing, config.block_size, self._decision_rules)
+        return self._grid
 
-    def _times(self, item: Raw, is_new: bool) -> tuple[list[int], set[int]]:
-        """Host time of each sample, ns, and the rows at which the clock of the device has restarted."""
-        times, clock_us, restarts = item.host_receive_t_ns.tolist(), item.device_clock_us.tolist(), set[int]()
-        for row, us in enumerate(clock_us):
-            segments = self._clock.segments
-            times[row] = self._clock.to_host_ns(us, times[row], follows=row > 0 or self._follows(item))
-            if self._clock.segments != segments:
-                restarts.add(row)
-            if row == 0 and is_new:
-                self._follow_device(item, same_device_run=not restarts)
-        if times and not clock_us and is_new:
-            self._follow_device(item, same_device_run=True)
-        return times, restarts
 
-    def _follows(self, item: Raw) -> bool:
-        """Whether the device has not restarted since the newest sample, by its own numbers."""
-        sequence = item.device_sequence
-        if not len(sequence) or self._device_sequence is None:
-            return False
-        return 0 < (int(sequence[0]) - self._device_sequence) % UINT32 < LARGEST_GAP
-
-    def _follow_device(self, item: Raw, same_device_run: bool) -> None:
-        """Count what the device sent while acquisition was down, from the first sample of its next session."""
-        sequence = item.device_sequence
-        if item.header.producer != self._producer and len(sequence) and self._device_sequence is not None:
-            missing = (int(sequence[0]) - self._device_sequence) % UINT32 - 1
-            if same_device_run and 0 < missing < LARGEST_GAP:
-                self._counts["lost_between_sessions"] += missing
-        if item.header.producer != self._producer:
-            self._ended_producers[self._producer] = None
-            self._ended_producers.pop(item.header.producer, None)
-            if len(self._ended_producers) > MAX_ENDED_PRODUCERS:
-                del self._ended_producers[next(iter(self._ended_producers))]
-        self._producer, self._sequence = item.header.producer, item.header.sequence
-        self._device_sequence = int(sequence[-1]) if len(sequence) else None
-
-    def _is_accepted(self, t_ns: int, is_new: bool, *, after_restart: bool) -> bool:
-        """Whether a sample is newer than all before; counts the reason if not."""
-        behind_ns = self._newest_t_ns - t_ns
-        if after_restart and self._guard and self._newest_t_ns != NEVER_NS:
-            # Two segments of the device clock are not compared: a gap lies between, and nothing is interpolated.
-            self._not_before_t_ns = self._newest_t_ns + self._gap_limit_ns + 1
-            if self._marks_restarts:
-                self._restarts_t_ns.append(max(t_ns, self._not_before_t_ns))
-        if behind_ns < 0 and t_ns < self._not_before_t_ns:
-            self._counts["dropped_after_clock_restart"] += 1
-            return False
-        if is_new and behind_ns > SET_BACK_NS:
-            self._counts["lost_clock_set_back"] += 1
-            self._set_back_ns = self._set_back_ns or behind_ns
-            return False
-        if behind_ns >= 0:
-            self._counts["out_of_order" if behind_ns else "repeated"] += 1
-            return False
-        self._set_back_ns = 0
-        if self._newest_t_ns == NEVER_NS:
-            self._next_t_ns = first_grid_time(t_ns, self._period_ns)
-        elif t_ns <= self._next_t_ns - self._period_ns:  # its grid samples were published without it
-            self._counts["lost_too_late"] += 1
-        self._newest_t_ns = t_ns
-        return True
-
-    def _fill(self, until_t_ns: int, final: bool) -> None:
-        """Add grid samples up to a time. `final`: without waiting for more readings."""
-        while True:
-            self._release_samples()
-            times = self._held.t_ns
-            if not len(times) or self._next_t_ns > until_t_ns:
-                return
-            last_t_ns = times.item(0)
-            next_raw_t_ns = times.item(1) if len(times) > 1 else None
-            in_gap = next_raw_t_ns is None or next_raw_t_ns - last_t_ns > self._gap_limit_ns
-            if self._next_t_ns == last_t_ns or not in_gap:
-                if not self._fill_between(until_t_ns, final):
-                    return
-            elif self._next_t_ns - last_t_ns <= self._stale_for_ns:
-                end_t_ns = until_t_ns if next_raw_t_ns is None else min(until_t_ns, next_raw_t_ns - 1)
-                self._fill_gap(min(end_t_ns, last_t_ns + self._stale_for_ns))
-            elif next_raw_t_ns is None:
-                return
-            else:
-                skipped_t_ns, self._next_t_ns = self._next_t_ns, first_grid_time(next_raw_t_ns, self._period_ns)
-                self._count_gap((self._next_t_ns - skipped_t_ns) // self._period_ns)
-
-    def _release_samples(self) -> None:
-        """Keep only the last of the samples at or before the next grid time."""
-        last = self._held.t_ns.searchsorted(self._next_t_ns, "right").item() - 1
-        if last > 0:
-            self._last_readings.update(self._held, last)
-            self._held = self._held.rows(slice(last, None))
-
-    def _fill_between(self, until_t_ns: int, final: bool) -> bool:
-        """Add grid samples up to the next gap. Returns False if the rest has to wait for a reading."""
-        samples = self._held
-        if samples.t_ns.item(-1) - samples.t_ns.item(0) > self._gap_limit_ns:
-            gaps = np.flatnonzero(np.diff(samples.t_ns) > self._gap_limit_ns)
-            samples = samples.rows(slice(gaps[0] + 1)) if len(gaps) else samples
-        t_ns = self._grid_times(min(until_t_ns, samples.t_ns.item(-1)))
-        at = samples.t_ns.searchsorted(t_ns, "right") - 1
-        waits = False
-        has = np.isfinite(samples.speed_rad_s)
-        if all_true(has):
-            speed = interpolate_samples(t_ns, at, samples)
-        elif all_true(has == has[0]) and all_true(has[0] | self._last_readings.too_old(t_ns[0])):
-            speed = np.where(has[0], interpolate_samples(t_ns, at, samples), np.nan)
-        else:
-            speed, may_arrive = self._last_readings.interpolate(t_ns, at, samples, self._newest_t_ns)
-            waiting = may_arrive.any(axis=1)
-            if not final and waiting.any():
-                waits, known = True, slice(np.argmax(waiting))
-                t_ns, at, speed = t_ns[known], at[known], speed[known]
-        if len(t_ns):
-            self._in_gap = False
-            self._append(t_ns, samples.command.take(at, axis=0), speed, NO_SPEED)
-        return not waits
-
-    def _fill_gap(self, until_t_ns: int) -> None:
-        """Add grid samples without speeds, with the last command."""
-        t_ns = self._grid_times(until_t_ns)
-        shape = (len(t_ns), self._fans)
-        reason = np.where(t_ns - self._held.t_ns[0] <= self._watermark_ns, GAP, STALE)
-        self._count_gap(len(t_ns))
-        self._append(t_ns, np.broadcast_to(self._held.command[0], shape), np.full(shape, np.nan), reason[:, np.newaxis])
-
-    def _count_gap(self, samples: int) -> None:
-        self._counts["gaps"] += not self._in_gap
-        self._counts["grid_samples_in_gaps"] += samples
-        self._in_gap = True
-
-    def _grid_times(self, until_t_ns: int) -> Array:
-        return np.arange(self._next_t_ns, until_t_ns + 1, self._period_ns)
-
-    def _append(self, t_ns: Array, command: Array, speed: Array, reason: Array | np.uint8) -> None:
-        """Append grid samples, at least one; `reason` is the invalid_reason of those without a speed."""
-        valid = np.isfinite(speed)
-        invalid_reason = np.zeros(speed.shape, np.uint8)
-        if not all_true(valid):
-            np.copyto(invalid_reason, reason, where=~valid)
-        while self._restarts_t_ns and t_ns[-1] >= self._restarts_t_ns[0]:
-            first = t_ns.searchsorted(self._restarts_t_ns.popleft())
-            valid[first], invalid_reason[first] = False, CLOCK_RESTARTED
-        grid = Grid(
-            fans=self._fans,
-            period_ns=self._period_ns,
-            t_ns=t_ns,
-            command=command,
-            speed_rad_s=speed,
-            valid=valid,
-            invalid_reason=invalid_reason,
-        )
-        self._pending.append(grid)
-        self._pending_rows += len(t_ns)
-        self._next_t_ns = t_ns.item(-1) + self._period_ns
-
-    def _blocks(self, flush: bool = False) -> list[Grid]:
-        size, rows = self._block_size, self._pending_rows
-        count = rows if flush else rows - rows % size
-        if not count:
-            return []
-        grid = join(self._pending)
-        self._pending = [cut(grid, count, rows)] if count < rows else []
-        self._pending_rows = rows - count
-        return [grid] if rows == size else [cut(grid, k, min(k + size, count)) for k in range(0, count, size)]
+def _rate(line_hz: float) -> str:
+    return f"{line_hz:.3g}"
 
 
 def build(context: Context) -> BuiltStage:

@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
+from pipeline.runtime.judged_share import JudgedShare
 from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.snapshot_store import SnapshotStore
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
@@ -142,6 +143,7 @@ class ScorerCore(Core):
         self._snapshot_store = snapshot_store
         self._wrong_fans = 0
         self._old_samples = OldSamples()
+        self._judged_share = JudgedShare()
         self._counts: Counter[str] = Counter()
         self._not_restored = ""
         """why the snapshot was not used as a whole, for people"""
@@ -245,6 +247,10 @@ class ScorerCore(Core):
         }
         return {**self._counts, **of_alarms}
 
+    def notes(self) -> list[str]:
+        """Which share of the samples was judged, and why the others were not."""
+        return self._judged_share.notes
+
     def problem(self) -> str:
         """What people should look at: input, snapshot, fans without a score, baselines at their limit, wear."""
         if self._wrong_fans:
@@ -327,6 +333,7 @@ class ScorerCore(Core):
         state, events = self._alarms.update(item.t_ns, item.period_ns, scored.score, valid)
         score = score_of(item, scored, state)
         self._unscored.update(item.period_ns, valid, score.invalid_reason)
+        self._judged_share.add(valid, score.invalid_reason)
         self._feed_wear(item, scored, state)
         period_s = item.period_ns / NS_PER_S
         sigma_command = item.torque_balance_sigma_command

@@ -11,14 +11,13 @@ import numpy as np
 
 from pipeline.config.loading import parse_config
 from pipeline.config.models import Config
+from pipeline.devices.line_rate import GAP_PERIODS
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_recording
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
 from schemas.messages import Raw
 from schemas.units import NS_PER_S
 
-GAP_PERIODS = 5.0
-"""gaps of up to so many sample periods are bridged"""
 _SAMPLED = 500
 """samples of a tray from which the period is measured"""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from pipeline.config.loading import load_config, parse_config
 from pipeline.config.models import Config
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
+from pipeline.runtime.decision_rules import FORMER_GRID, DecisionRules
 from schemas.envelope import Envelope
 
 
@@ -47,7 +49,34 @@ def attached_config(
     """
     if CONFIGURATION not in metadata.attachments:
         return None
-    return _parsed(file, metadata, [*_recorded_overrides(file, metadata), *overrides], stages)
+    former = _former_defaults(file, metadata)
+    return _parsed(file, metadata, [*former, *_recorded_overrides(file, metadata), *overrides], stages)
+
+
+def recorded_rules(file: Path, metadata: RecordingMetadata) -> DecisionRules:
+    """The version of the rules that the recorded decisions were made by.
+
+    Raises:
+        RecordingError: it is of a newer version of fantwin.
+    """
+    version = metadata.metadata.get("decision_rules", str(int(DecisionRules.FIRST)))
+    try:
+        return DecisionRules(int(version))
+    except ValueError as error:
+        raise RecordingError(
+            f"{file}: its decisions were made by rules {version!r}, which this version does not know: update fantwin"
+        ) from error
+
+
+def _former_defaults(file: Path, metadata: RecordingMetadata) -> list[str]:
+    """Overrides that give an older recording the grid it was recorded with, where its configuration says nothing."""
+    if recorded_rules(file, metadata) >= DecisionRules.RATE_OF_LINE:
+        return []
+    try:
+        given = tomllib.loads(metadata.attachments[CONFIGURATION].decode(errors="replace")).get("resampler", {})
+    except ValueError:  # reported where it is parsed
+        return []
+    return [f"resampler.{key}={value}" for key, value in FORMER_GRID.items() if key not in given]
 
 
 def _parsed(file: Path, metadata: RecordingMetadata, overrides: Iterable[str], stages: Iterable[str]) -> Config:

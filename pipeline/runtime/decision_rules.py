@@ -21,6 +21,10 @@ class DecisionRules(IntEnum):
     BREAKS = 3
     """The twin starts again where the grid does not continue: with another session of the resampler, another segment of
     the clock of the device, or a gap in which the command has moved."""
+    RATE_OF_LINE = 4
+    """Times of the grid that are not configured follow from the line. Before they were those of `FORMER_GRID`."""
 
 
 CURRENT_RULES = max(DecisionRules)
+FORMER_GRID = {"rate_hz": 100.0, "gap_limit_s": 0.1, "watermark_s": 0.5, "stale_for_s": 5.0}
+"""settings of `[resampler]` where a configuration of before RATE_OF_LINE says nothing"""

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from schemas.messages import AwaitedInput, Counter, Health, Input, Message, Output, StageStatus, newest_t_ns
+from schemas.messages import AwaitedInput, Counter, Health, Input, Message, Note, Output, StageStatus, newest_t_ns
 from schemas.streams import stage_losses
 from schemas.units import NS_PER_S
 
@@ -65,6 +65,7 @@ class HealthBuilder:
         outputs: Iterable[Output],
         counters: Mapping[str, int],
         now_ns: int,
+        notes: Iterable[Note] = (),
     ) -> Health:
         """The health message as of now."""
         problem = "; ".join(filter(None, problems))
@@ -95,4 +96,5 @@ class HealthBuilder:
             ),
             newest_input_t_ns=self._newest_input_t_ns,
             newest_output_t_ns=self._newest_output_t_ns,
+            notes=tuple(notes),
         )

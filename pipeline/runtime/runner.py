@@ -35,7 +35,7 @@ from pipeline.runtime.sources import Sources
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.envelope import Envelope
-from schemas.messages import Clock, Header, Health, Message, StageStatus
+from schemas.messages import Clock, Header, Health, Message, Note, StageStatus
 from schemas.streams import stage_losses
 from schemas.topics import BY_NAME, alive_key, health_key, sessions_key, topic_of, tray_key
 
@@ -425,6 +425,9 @@ class Runner:
             outputs=self._outputs.counts() if with_counts else (),
             counters=self._counters() if with_counts else {},
             now_ns=HOST_CLOCK.now_ns(),
+            notes=[Note(tray=name, text=note) for name, parts in self._parts.items() for note in parts.core.notes()]
+            if with_counts
+            else (),
         )
         return replace(health, header=Header(self.producer, self._health_publisher.published, ""))
 

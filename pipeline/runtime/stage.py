@@ -68,6 +68,10 @@ class Core(Protocol):
         """How many samples an item of the source holds: so many are lost if there is no time to process it."""
         return 1
 
+    def notes(self) -> Sequence[str]:
+        """What the core works with and has done, a line each, for people; nothing that is wrong."""
+        return ()
+
     def problem(self) -> str:
         """One line on what is wrong now and what to do; empty when all is well."""
         return ""

@@ -17,6 +17,7 @@ from stages.resampler import ResamplerConfig, ResamplerCore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 HZ = 100
+FIXED = ResamplerConfig(rate_hz=HZ)
 PERIOD_NS = NS_PER_S // HZ
 RAD_S_PER_S = 10.0
 """the speed rises this fast, so that an error of time shows as an error of slope"""
@@ -53,7 +54,7 @@ def after_stall(from_s: float, until_s: float, received_s: float | None = None) 
 
 
 def core_of(rules: DecisionRules = max(DecisionRules)) -> ResamplerCore:
-    return ResamplerCore(1, ResamplerConfig(block_size=512), decision_rules=rules)
+    return ResamplerCore(1, FIXED.model_copy(update={"block_size": 512}), decision_rules=rules)
 
 
 def grid_of(core: ResamplerCore, *parts: Iterable[Raw]) -> Grid:

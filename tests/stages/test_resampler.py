@@ -20,6 +20,7 @@ from stages.resampler import ResamplerConfig, ResamplerCore
 EPOCH_NS = 1_700_000_000_000_000_000
 
 STEP_NS = 10_000_000
+FIXED = ResamplerConfig(rate_hz=100.0)
 NAN = float("nan")
 
 
@@ -58,7 +59,7 @@ def joined(grids: Iterable[Grid]) -> Grid:
 
 
 def run(messages: Iterable[Raw], fans: int = 1, **config: float) -> tuple[Grid, ResamplerCore]:
-    core = ResamplerCore(fans, ResamplerConfig.model_validate(config))
+    core = ResamplerCore(fans, ResamplerConfig.model_validate({"rate_hz": 100.0} | config))
     grids = [grid for message in messages for grid in core.step(message)]
     return joined([*grids, *core.close()]), core
 
@@ -106,13 +107,13 @@ def test_the_command_is_that_of_the_last_sample_at_or_before() -> None:
 
 
 def test_a_grid_sample_is_published_with_the_first_raw_sample_at_or_after_it() -> None:
-    core = ResamplerCore(1, ResamplerConfig())
+    core = ResamplerCore(1, FIXED)
     steps = [core.step(raw(at(t), np.zeros(1))) for t in (0.001, 0.009, 0.0101, 0.02)]
     assert [[seconds_of(g.t_ns).round(3).tolist() for g in grids] for grids in steps] == [[], [], [[0.01]], [[0.02]]]
 
 
 def test_blocks_have_the_size_asked_for() -> None:
-    core = ResamplerCore(1, ResamplerConfig(block_size=7))
+    core = ResamplerCore(1, FIXED.model_copy(update={"block_size": 7}))
     grids = core.step(raw(at(*np.arange(0.0, 0.2, 0.01)), np.zeros(20)))
     assert [len(grid.t_ns) for grid in grids] == [7, 7]
     assert [len(grid.t_ns) for grid in core.close()] == [6]
@@ -122,7 +123,7 @@ def test_blocks_have_the_size_asked_for() -> None:
 @given(st.lists(st.integers(-3 * STEP_NS, 12 * STEP_NS), min_size=1, max_size=80))
 def test_for_any_sample_times_the_grid_rises_without_repeats_and_never_bridges_a_gap(steps: list[int]) -> None:
     t_ns = EPOCH_NS + np.cumsum(steps)
-    core = ResamplerCore(1, ResamplerConfig())
+    core = ResamplerCore(1, FIXED)
     grids = [*core.step(raw(t_ns, np.arange(0.0, len(t_ns)))), *core.close()]
     if not grids:
         return
@@ -131,7 +132,7 @@ def test_for_any_sample_times_the_grid_rises_without_repeats_and_never_bridges_a
     accepted = np.unique(np.maximum.accumulate(t_ns))
     right = np.searchsorted(accepted, grid.t_ns)
     spans = accepted[right] - accepted[np.maximum(right - 1, 0)]
-    bridged = (accepted[right] == grid.t_ns) | (spans <= ResamplerConfig().gap_limit_s * NS_PER_S)
+    bridged = (accepted[right] == grid.t_ns) | (spans <= FIXED.timing(100.0).gap_limit_ns)
     np.testing.assert_array_equal(grid.valid[:, 0], bridged)
     np.testing.assert_array_equal(np.isfinite(grid.speed_rad_s[:, 0]), bridged)
 
@@ -176,7 +177,7 @@ def _ticks(core: ResamplerCore, from_s: float, to_s: float, period_s: float = 0.
 
 def test_a_replay_gives_the_grid_that_was_published_during_a_silence() -> None:
     messages = [raw(at(0.0, 0.01), np.ones(2)), raw(at(3.0, 3.01), np.ones(2))]
-    core = ResamplerCore(1, ResamplerConfig())
+    core = ResamplerCore(1, FIXED)
     live = [*core.step(messages[0]), *_ticks(core, 0.01, 2.9)]
     assert joined(live).invalid_reason[-1, 0] == InvalidReason.STALE
     live += core.step(messages[1])
@@ -185,7 +186,7 @@ def test_a_replay_gives_the_grid_that_was_published_during_a_silence() -> None:
 
 
 def test_nothing_is_published_before_the_watermark_or_beyond_the_end() -> None:
-    core = ResamplerCore(1, ResamplerConfig())
+    core = ResamplerCore(1, FIXED)
     core.step(raw(at(0.0), np.ones(1)))
     assert _ticks(core, 0.0, 0.5) == []
     assert core.problem() == ""
@@ -198,7 +199,7 @@ def test_nothing_is_published_before_the_watermark_or_beyond_the_end() -> None:
 
 
 def test_a_stalled_host_is_not_a_silent_source() -> None:
-    core = ResamplerCore(1, ResamplerConfig())
+    core = ResamplerCore(1, FIXED)
     core.step(raw(at(0.0), np.ones(1)))
     assert _ticks(core, 0.0, 0.2) == []
     assert core.tick(int(at(30.0)[0])) == []
@@ -206,7 +207,7 @@ def test_a_stalled_host_is_not_a_silent_source() -> None:
 
 
 def test_new_samples_end_a_silence() -> None:
-    core = ResamplerCore(1, ResamplerConfig())
+    core = ResamplerCore(1, FIXED)
     core.step(raw(at(0.0), np.ones(1)))
     assert _ticks(core, 0.0, 0.4) == []
     core.step(raw(at(0.4), np.ones(1)))
@@ -214,13 +215,13 @@ def test_new_samples_end_a_silence() -> None:
 
 
 def test_an_incomplete_block_is_published_at_the_watermark() -> None:
-    core = ResamplerCore(1, ResamplerConfig(block_size=50))
+    core = ResamplerCore(1, FIXED.model_copy(update={"block_size": 50}))
     assert core.step(raw(at(0.0, 0.01), np.ones(2))) == []
     assert joined(_ticks(core, 0.0, 0.56)).t_ns[:2].tolist() == at(0.0, 0.01).tolist()
 
 
 def test_a_sample_that_arrives_after_its_grid_time_was_published_is_counted_as_lost() -> None:
-    core = ResamplerCore(1, ResamplerConfig())
+    core = ResamplerCore(1, FIXED)
     core.step(raw(at(0.0), np.ones(1)))
     given_up = joined(_ticks(core, 0.0, 0.7))
     grid = joined(core.step(raw(at(0.01, 0.5, 0.55), np.array([5.0, 6.0, 7.0]))))
@@ -256,7 +257,7 @@ def test_readings_too_far_apart_are_not_interpolated_though_samples_kept_arrivin
 
 
 def test_a_tacho_that_fails_delays_the_others_once_by_the_gap_limit() -> None:
-    core = ResamplerCore(2, ResamplerConfig())
+    core = ResamplerCore(2, FIXED)
     sizes = [
         sum(len(g.t_ns) for g in core.step(raw(at(k / 100), np.array([[1.0, 1.0 if k < 10 else NAN]]), fans=2)))
         for k in range(40)
@@ -273,7 +274,7 @@ def test_samples_waiting_for_a_reading_are_published_when_the_stage_closes() -> 
 
 
 def test_a_fan_without_a_tacho_does_not_delay_the_others() -> None:
-    core = ResamplerCore(2, ResamplerConfig())
+    core = ResamplerCore(2, FIXED)
     for k in range(50):
         grids = core.step(raw(at(k / 100), np.array([[1.0, NAN]]), fans=2))
         assert [seconds_of(g.t_ns).tolist() for g in grids] == [[k / 100]]
@@ -344,7 +345,7 @@ def test_repeated_raw_messages_change_nothing() -> None:
 
 
 def test_samples_of_another_number_of_fans_are_counted_and_reported() -> None:
-    core = ResamplerCore(2, ResamplerConfig())
+    core = ResamplerCore(2, FIXED)
     assert core.step(raw(at(0.0, 0.01), np.zeros(2), fans=3)) == []
     assert core.counters()["lost_wrong_fan_count"] == 2
     assert "fans = 2" in core.problem()
@@ -401,7 +402,7 @@ def moved(message: Raw, by_s: float) -> Raw:
 @pytest.mark.parametrize("producer", ["replay-a", "replay-b"], ids=["running on", "another"])
 def test_samples_of_a_replay_that_goes_back_are_counted_and_reported_until_it_has_caught_up(producer: str) -> None:
     message = raw(at(0.0, 0.01), np.zeros(2))
-    core = ResamplerCore(1, ResamplerConfig())
+    core = ResamplerCore(1, FIXED)
     core.step(stamped(message, "replay-a", 0))
     assert core.problem() == ""
     core.step(stamped(moved(message, -3600), producer, 1))
@@ -418,7 +419,7 @@ def test_samples_of_a_replay_that_goes_back_are_counted_and_reported_until_it_ha
 
 def test_messages_repeated_or_late_from_an_ended_session_are_not_a_clock_set_back() -> None:
     message = raw(at(0.0, 0.01), np.zeros(2))
-    core = ResamplerCore(1, ResamplerConfig())
+    core = ResamplerCore(1, FIXED)
     core.step(stamped(message, "a", 0))
     core.step(stamped(moved(message, 5), "a", 2))
     core.step(stamped(message, "a", 0))
@@ -431,7 +432,7 @@ def test_messages_repeated_or_late_from_an_ended_session_are_not_a_clock_set_bac
 
 def test_a_late_message_of_an_ended_session_counts_no_loss_between_sessions() -> None:
     message = raw(at(0.0, 0.01), np.zeros(2))
-    core = ResamplerCore(1, ResamplerConfig())
+    core = ResamplerCore(1, FIXED)
     for producer, sequence, by_s, first in (("a", 0, 0, 0), ("b", 0, 0.9, 10), ("a", 1, 0.1, 2), ("b", 1, 1, 12)):
         numbered = replace(moved(message, by_s), device_sequence=np.array([first, first + 1], np.uint32))
         core.step(stamped(numbered, producer, sequence))
@@ -439,7 +440,7 @@ def test_a_late_message_of_an_ended_session_counts_no_loss_between_sessions() ->
 
 
 def test_another_number_of_fans_is_reported_until_the_right_one_arrives() -> None:
-    core = ResamplerCore(1, ResamplerConfig())
+    core = ResamplerCore(1, FIXED)
     core.step(raw(at(0.0), np.zeros(1), fans=2))
     assert "raw samples of 2 fans" in core.problem()
     core.step(raw(at(0.01), np.zeros(1)))

@@ -123,7 +123,7 @@ def in_blocks(items: Iterable[Raw | ByTime], sizes: Iterable[int]) -> Iterable[R
         yield join(block)
 
 
-def driven(items: Iterable[Raw | ByTime], **config: float) -> tuple[list[bytes], dict[str, int], str]:
+def driven(items: Iterable[Raw | ByTime], **config: float | None) -> tuple[list[bytes], dict[str, int], str]:
     """All columns, to the bit, and the counters and problem of the core."""
     core, grids = ResamplerCore(3, ResamplerConfig.model_validate(config)), []
     with np.errstate(invalid="ignore"):
@@ -143,7 +143,7 @@ def driven(items: Iterable[Raw | ByTime], **config: float) -> tuple[list[bytes],
     sizes=st.lists(st.integers(1, 64), min_size=1, max_size=4),
     out_block=st.sampled_from([1, 7, 512]),
     clock_us=st.sampled_from([None, 0, 2**32 - 10_300_000]),
-    rate_hz=st.sampled_from([7.0, 50.0, 100.0, 1000.0]),
+    rate_hz=st.sampled_from([None, 7.0, 50.0, 100.0, 1000.0]),
 )
 def test_blocks_of_any_size_give_the_same_grid_to_the_bit(
     happenings: list[tuple[str, int]],
@@ -151,7 +151,7 @@ def test_blocks_of_any_size_give_the_same_grid_to_the_bit(
     sizes: list[int],
     out_block: int,
     clock_us: int | None,
-    rate_hz: float,
+    rate_hz: float | None,
 ) -> None:
     line = ScriptedLink(seed, clock_us)
     items = [item for what, count in happenings for item in line.items(what, count)]

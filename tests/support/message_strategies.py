@@ -17,6 +17,7 @@ from schemas.messages import (
     Input,
     InputPosition,
     Message,
+    Note,
     Output,
 )
 
@@ -47,7 +48,7 @@ def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
         return SCALARS[name]
     if isinstance(hint, type) and issubclass(hint, OpenEnum):
         return st.integers(0, LARGEST_ENUM_VALUE).map(hint)
-    for record in (Counter, Input, Output, Diagnosis, AwaitedInput):
+    for record in (Counter, Input, Output, Diagnosis, AwaitedInput, Note):
         if hint == tuple[record, ...]:
             values = {name: SCALARS.get(name, OF_TYPE[hint]) for name, hint in other_fields(record).items()}
             return st.lists(st.builds(record, **values), max_size=3).map(tuple)

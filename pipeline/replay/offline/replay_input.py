@@ -17,7 +17,7 @@ from pipeline.replay.default_config import default_config, first_raw
 from pipeline.replay.offline.offline_pipeline import OfflinePipeline
 from pipeline.replay.offline.plan import PlanReader, TrayPlan, undisturbed_plan
 from pipeline.replay.offline.raw_blocks import RawBlocks
-from pipeline.replay.resolve_config import attached_config
+from pipeline.replay.resolve_config import attached_config, recorded_rules
 from pipeline.replay.stage_chain import StageChain, decision_chain
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context
@@ -161,7 +161,7 @@ def open_replay_input(
             is_as_recorded=is_as_recorded,
             is_same_grid=attached is not None and base.sections["resampler"] == attached.sections["resampler"],
             stages=stages,
-            decision_rules=_decision_rules(ordered[0], metadata) if is_as_recorded else CURRENT_RULES,
+            decision_rules=recorded_rules(ordered[0], metadata) if is_as_recorded else CURRENT_RULES,
             start_s=start_s,
             end_s=end_s,
         )
@@ -205,21 +205,6 @@ def _twin_of(
     if tray.name in recorded:
         return recorded[tray.name]
     raise RecordingError(f"{path}: no twin of {tray.name} in this recording: name one with --twin FILE.onnx")
-
-
-def _decision_rules(path: Path, metadata: RecordingMetadata) -> DecisionRules:
-    """The version of the rules that the recorded decisions were made by.
-
-    Raises:
-        RecordingError: it is of a newer version of fantwin.
-    """
-    version = metadata.metadata.get("decision_rules", str(int(DecisionRules.FIRST)))
-    try:
-        return DecisionRules(int(version))
-    except ValueError as error:
-        raise RecordingError(
-            f"{path}: its decisions were made by rules {version!r}, which this version does not know: update fantwin"
-        ) from error
 
 
 def _started_t_ns(path: Path, metadata: RecordingMetadata, first: Mapping[str, Sequence[Raw]]) -> int:

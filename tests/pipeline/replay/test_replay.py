@@ -84,7 +84,7 @@ def test_the_status_line_shows_time_position_rate_and_messages():
 
 
 def test_round_after_round_a_resampler_sees_a_device_that_restarts_with_a_short_gap_and_no_loss(tmp_path):
-    core = ResamplerCore(8, ResamplerConfig())
+    core = ResamplerCore(8, ResamplerConfig(rate_hz=100.0))
     playback = RecordingPlayback([write_raw(tmp_path / "long.mcap", 300)], ("raw",))
     times: list[int] = []
     for number, entry in playback.rounds():

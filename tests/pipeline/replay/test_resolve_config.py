@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 
 from pipeline.config.models import Config, ConfigError
+from pipeline.recordings.reading import read_metadata
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.live.recording_playback import RecordingPlayback
-from pipeline.replay.resolve_config import resolve_config, trays_of
+from pipeline.replay.resolve_config import attached_config, resolve_config, trays_of
 from schemas.topics import tray_key
+from stages.resampler import ResamplerConfig
 from tests.support.replay_data import START_NS, raw_of
 
 TOML = """
@@ -66,3 +68,18 @@ def test_an_attached_configuration_that_cannot_be_used_is_one_line_that_names_th
 def test_trays_are_those_that_any_part_names(tmp_path):
     parts = [recording(tmp_path / "a.mcap", {"trays": "a,b"}), recording(tmp_path / "b.mcap", {"trays": "c"})]
     assert trays_of([*parts, recording(tmp_path / "c.mcap", {})]) == {"a", "b", "c"}
+
+
+@pytest.mark.parametrize(
+    ("rules", "rate_hz", "gap_limit_s"), [(None, 100.0, 0.35), ("3", 100.0, 0.35), ("4", None, 0.35)]
+)
+def test_an_older_recording_keeps_the_grid_it_was_recorded_with(tmp_path, rules, rate_hz, gap_limit_s):
+    toml = f"{TOML}[resampler]\ngap_limit_s = {gap_limit_s}\n"
+    metadata = {"trays": "tray1"} | ({"decision_rules": rules} if rules else {})
+    path = recording(tmp_path / "r.mcap", metadata, {"configuration.toml": toml.encode()})
+    found = attached_config(path, read_metadata(path), ("resampler",), ["resampler.block_size=512"])
+    assert found
+    section = found.sections["resampler"]
+    assert isinstance(section, ResamplerConfig)
+    assert (section.rate_hz, section.gap_limit_s, section.block_size) == (rate_hz, gap_limit_s, 512)
+    assert section.stale_for_s == (5.0 if rate_hz else None)

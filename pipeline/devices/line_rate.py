@@ -1,0 +1,173 @@
+"""The rate of a tray's line, measured from its first samples, and the grid that follows from it.
+
+The rate of the grid is taken from a short ladder, so that a resampler that is started again comes to the same one: two
+measurements of one line differ by a few per cent, the steps of the ladder by 25 % or more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from schemas.messages import Raw
+from schemas.units import NS_PER_S
+
+RATES_HZ = (1, 2, 5, 10, 20, 25, 50, 100)
+"""rates of a grid that follows from the line; a faster line gets the last one"""
+GAP_PERIODS = 5.0
+"""gaps of up to so many sample periods are bridged"""
+SHORTEST_GAP_S = 0.1
+WATERMARK_S = 0.5
+STALE_FOR_S = 5.0
+MIN_SAMPLES = 6
+LONGEST_WAIT_US = 5_000_000  # after this MIN_SAMPLES are enough: a slow line must not wait for long
+ENOUGH_SAMPLES = 26
+SHORTEST_WAIT_US = 1_000_000  # a host that stalls delivers the samples of a tenth of a second at once
+MAX_SAMPLES = 2000
+UINT32 = 1 << 32
+
+
+@dataclass(frozen=True)
+class GridTiming:
+    """The times of a grid, all in ns: see the settings of `[resampler]`."""
+
+    period_ns: int
+    gap_limit_ns: int
+    watermark_ns: int
+    stale_for_ns: int
+
+    @property
+    def rate_hz(self) -> float:
+        """Grid samples a second."""
+        return NS_PER_S / self.period_ns
+
+
+def grid_timing(
+    rate_hz: float, gap_limit_s: float | None, watermark_s: float | None, stale_for_s: float | None
+) -> GridTiming:
+    """The times of a grid of this rate. What is None follows from the rate and from the limits that are given.
+
+    The gap limit is five periods, at least 0.1 s, and not above a limit that is given. The watermark is at least the
+    gap limit, and the grid ends after at least twice the watermark.
+    """
+    given_s = [limit_s for limit_s in (watermark_s, stale_for_s) if limit_s is not None]
+    gap_s = min(max(SHORTEST_GAP_S, GAP_PERIODS / rate_hz), *given_s, math.inf) if gap_limit_s is None else gap_limit_s
+    longest_s = math.inf if stale_for_s is None else stale_for_s
+    watermark_s = min(max(WATERMARK_S, gap_s), longest_s) if watermark_s is None else watermark_s
+    stale_for_s = max(STALE_FOR_S, 2.0 * watermark_s) if stale_for_s is None else stale_for_s
+    return GridTiming(
+        period_ns=round(NS_PER_S / rate_hz),
+        gap_limit_ns=round(gap_s * NS_PER_S),
+        watermark_ns=round(watermark_s * NS_PER_S),
+        stale_for_ns=round(stale_for_s * NS_PER_S),
+    )
+
+
+def grid_rate_hz(line_hz: float) -> int:
+    """The rate on the ladder that is nearest to that of a line, by ratio."""
+    bounds = [math.sqrt(low * high) for low, high in pairwise(RATES_HZ)]
+    return RATES_HZ[int(np.searchsorted(bounds, line_hz))]
+
+
+def is_too_slow(line_hz: float) -> bool:
+    """Whether a line is slower than the slowest grid can be."""
+    return line_hz < RATES_HZ[0] / math.sqrt(2.0)
+
+
+class SampleTimes:
+    """The times of a line's newest samples: of the device's clock, or of receipt if it has none.
+
+    They start again with another session of acquisition, and where a clock goes back.
+    """
+
+    def __init__(self, most: int) -> None:
+        """most: how many times are kept."""
+        self._source: tuple[str, bool] | None = None  # producer, and whether its device has a clock
+        self._most = most
+        self._times_us: deque[int] = deque(maxlen=most)
+
+    def add(self, message: Raw) -> None:
+        """Add the samples of a message."""
+        for us in self.times_of(message)[-self._most :]:
+            self.add_time(us)
+
+    def times_of(self, message: Raw) -> list[int]:
+        """The times of a message that follows, for `add_time`."""
+        has_clock = len(message.device_clock_us) > 0
+        if self._source != (message.header.producer, has_clock):
+            self._source = message.header.producer, has_clock
+            self._times_us.clear()
+        return message.device_clock_us.tolist() if has_clock else (message.host_receive_t_ns // 1000).tolist()
+
+    def add_time(self, us: int) -> None:
+        """Add the time of one sample."""
+        times_us, has_clock = self._times_us, self._source is not None and self._source[1]
+        if not times_us:
+            times_us.append(us)
+            return
+        step_us = us - times_us[-1]
+        if has_clock:
+            step_us = (step_us + UINT32 // 2) % UINT32 - UINT32 // 2
+        if step_us < 0:
+            times_us.clear()
+            times_us.append(us)
+        elif step_us > 0 or not has_clock:  # samples that are read together have one time of receipt
+            times_us.append(times_us[-1] + step_us)
+
+    @property
+    def count(self) -> int:
+        """How many times there are."""
+        return len(self._times_us)
+
+    @property
+    def span_us(self) -> int:
+        """From the first time to the last."""
+        return self._times_us[-1] - self._times_us[0] if self._times_us else 0
+
+    @property
+    def line_hz(self) -> float:
+        """Samples a second: the median over spans of a quarter of the samples; infinite if no time passed."""
+        steps = max(1, self.count // 4)
+        times_us = np.array(self._times_us, np.int64)
+        spans_us = times_us[steps:] - times_us[:-steps]
+        median_us = float(np.median(spans_us)) / steps if len(spans_us) else 0.0
+        return 1e6 / median_us if median_us > 0.0 else math.inf
+
+
+class LineRate:
+    """Measures the rate of a line from its first samples.
+
+    The result depends on the samples only, and not on how they are divided into messages.
+    """
+
+    def __init__(self) -> None:
+        self._times = SampleTimes(MAX_SAMPLES)
+        self._seen = 0
+
+    def add(self, message: Raw) -> bool:
+        """Add the samples of a message; returns whether they are enough for `line_hz`."""
+        for us in self._times.times_of(message):
+            if self.is_enough:
+                break
+            self._seen += 1
+            self._times.add_time(us)
+        return self.is_enough
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether there are enough samples. After very many without a usable time they are, too."""
+        count, span_us = self._times.count, self._times.span_us
+        return (
+            (count >= ENOUGH_SAMPLES and span_us >= SHORTEST_WAIT_US)
+            or (count >= MIN_SAMPLES and span_us >= LONGEST_WAIT_US)
+            or self._seen >= MAX_SAMPLES
+        )
+
+    @property
+    def line_hz(self) -> float:
+        """Samples a second."""
+        return self._times.line_hz

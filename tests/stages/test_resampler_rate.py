@@ -1,0 +1,195 @@
+"""stages.resampler: without settings, rate, gap limit and watermark of the grid follow from the line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.devices.line_rate import RATES_HZ, grid_rate_hz
+from schemas.blocks import join
+from schemas.messages import Array, Grid, Header, InvalidReason, Raw
+from schemas.units import NS_PER_S
+from stages.resampler import ResamplerConfig, ResamplerCore
+
+EPOCH_NS = 1_700_000_000_000_000_000
+CLOCK_START_US = 2**32 - 3_000_000  # it wraps while the rate is being measured
+
+
+def samples(times_s: Array, *, clock: bool = True, producer: str = "p", first: int = 0) -> list[Raw]:
+    """One sample a message, received up to 5 ms late."""
+    delays_s = np.random.default_rng(1).uniform(0.001, 0.005, len(times_s)) if clock else np.zeros(len(times_s))
+    return [
+        Raw(
+            header=Header(producer, first + k, "tray1"),
+            fans=1,
+            host_receive_t_ns=np.array([EPOCH_NS + round((t_s + delay_s) * NS_PER_S)]),
+            device_clock_us=np.array([(CLOCK_START_US + round(t_s * 1e6)) % 2**32] if clock else [], np.uint32),
+            command=np.array([[0.5]]),
+            speed_rad_s=np.array([[100.0 + t_s]]),
+        )
+        for k, (t_s, delay_s) in enumerate(zip(times_s.tolist(), delays_s.tolist(), strict=True))
+    ]
+
+
+def times(rate_hz: float, seconds: float, jitter: float = 0.0) -> Array:
+    """jitter: largest, in periods."""
+    count = round(seconds * rate_hz)
+    return (np.arange(count) + np.random.default_rng(2).uniform(-jitter, jitter, count)) / rate_hz
+
+
+def grid_of(messages: Iterable[Raw], **config: float) -> tuple[Grid, ResamplerCore]:
+    core = ResamplerCore(1, ResamplerConfig.model_validate(config))
+    grids = [grid for message in messages for grid in core.step(message)]
+    return join([*grids, *core.close()]), core
+
+
+@pytest.mark.parametrize("clock", [True, False], ids=["clock", "no clock"])
+@pytest.mark.parametrize(
+    ("line_hz", "jitter", "grid_hz"),
+    [(1, 0.05, 1), (2, 0.0, 2), (2.1, 0.3, 2), (10, 0.3, 10), (64, 0.3, 50), (100, 0.3, 100), (1000, 0.2, 100)],
+)
+def test_the_grid_has_the_rate_of_the_line_and_no_sample_of_it_is_a_gap(
+    line_hz: float, jitter: float, grid_hz: int, clock: bool
+) -> None:
+    line_s = times(line_hz, 30, jitter)
+    grid, core = grid_of(samples(line_s, clock=clock))
+    assert grid.period_ns == NS_PER_S // grid_hz
+    assert grid.valid.all()
+    assert core.counters().get("gaps", 0) == 0
+    assert core.counters()["samples_in"] == len(line_s)
+    assert core.problem() == ""
+    assert f"grid of {grid_hz} Hz (the line sends " in core.notes()[0]
+    # nothing is lost at the beginning: the grid starts with the first sample and has its values
+    first_s, last_s = (grid.t_ns[[0, -1]] - EPOCH_NS) / NS_PER_S
+    assert first_s - line_s[0] < 1 / grid_hz + 0.01
+    assert line_s[-1] - last_s < 1 / grid_hz + 0.01
+    np.testing.assert_allclose(grid.speed_rad_s[:, 0] - 100.0, (grid.t_ns - EPOCH_NS) / NS_PER_S, atol=0.012)
+
+
+@pytest.mark.parametrize(("line_hz", "bridged_s"), [(1, 4.0), (10, 0.4), (100, 0.09)])
+def test_a_real_gap_is_still_one(line_hz: float, bridged_s: float) -> None:
+    line_s = times(line_hz, 60)
+    lost = (line_s > 20) & (line_s < 20 + 8 / line_hz + 0.1)
+    short = (line_s > 40) & (line_s < 40 + bridged_s)
+    grid, core = grid_of(samples(line_s[~lost & ~short]))
+    in_gap = np.isin(grid.invalid_reason[:, 0], (InvalidReason.GAP, InvalidReason.STALE))
+    assert core.counters()["gaps"] == 1
+    assert in_gap.sum() >= 7
+    at_s = (grid.t_ns - EPOCH_NS) / NS_PER_S
+    assert (at_s[in_gap] > 19.9).all()
+    assert (at_s[in_gap] < 30).all()
+
+
+@pytest.mark.parametrize("line_hz", [2, 10, 64, 100])
+def test_a_line_of_the_rate_of_its_grid_gives_the_grid_of_that_setting(line_hz: float) -> None:
+    messages = samples(times(line_hz, 20, 0.2))
+    found, _ = grid_of(messages)
+    given, _ = grid_of(messages, rate_hz=NS_PER_S / found.period_ns)
+    for name in ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason"):
+        assert getattr(found, name).tobytes() == getattr(given, name).tobytes(), name
+
+
+def test_a_restarted_resampler_comes_to_the_same_rate_wherever_it_begins() -> None:
+    for line_hz in (1, 2, 4.8, 10, 20, 25, 64, 100):
+        messages = samples(times(line_hz, 60, 0.3))
+        starts = range(0, len(messages) // 2, max(1, len(messages) // 20))
+        periods = {grid_of(messages[start:])[0].period_ns for start in starts}
+        assert periods == {NS_PER_S // grid_rate_hz(line_hz)}, line_hz
+
+
+@pytest.mark.parametrize("lost_share", [0.05, 0.15])
+def test_lost_samples_and_pauses_while_it_is_measured_do_not_change_the_rate(lost_share: float) -> None:
+    rng = np.random.default_rng(4)
+    for line_hz in (1, 2, 10, 100):
+        line_s = times(line_hz, 60)
+        line_s = line_s[rng.random(len(line_s)) > lost_share]
+        line_s[3:] += 1.5  # acquisition had to connect again
+        grid, _ = grid_of(samples(line_s))
+        assert grid.period_ns == NS_PER_S // line_hz
+
+
+def test_samples_read_together_without_a_clock_count_as_those_of_their_line() -> None:
+    line_s = np.floor(times(100, 5) / 0.04) * 0.04  # a host that reads every 40 ms
+    grid, _ = grid_of(samples(line_s, clock=False))
+    assert grid.period_ns == NS_PER_S // 100
+
+
+def test_few_samples_get_a_grid_at_the_end() -> None:
+    grid, _ = grid_of(samples(times(10, 0.5)))
+    assert grid.period_ns == NS_PER_S // 10
+    assert len(grid.t_ns) >= 4
+    assert ResamplerCore(1, ResamplerConfig()).close() == []
+
+
+def test_a_session_of_acquisition_that_ends_before_there_is_a_rate_is_counted() -> None:
+    messages = [*samples(times(10, 0.9), producer="a"), *samples(times(10, 20) + 100.0, producer="b")]
+    grid, core = grid_of(messages)
+    assert grid.period_ns == NS_PER_S // 10
+    assert grid.t_ns[0] > EPOCH_NS + 100 * NS_PER_S
+    assert (core.counters()["samples_in"], core.counters()["lost_before_rate"]) == (200, 9)
+
+
+def test_a_line_too_slow_to_be_judged_is_named_and_nothing_of_it_is_bridged() -> None:
+    core = ResamplerCore(1, ResamplerConfig())
+    grids = [grid for message in samples(times(0.2, 120)) for grid in core.step(message)]
+    assert core.problem() == (
+        "samples arrive 0.2 times a second: too slow to be judged; let the device send at least 1 a second"
+    )
+    assert join(grids).valid.mean() < 0.25  # only at the samples themselves
+    slow, core = grid_of(samples(times(0.2, 120)), rate_hz=0.2)  # asked for: the limits follow from that
+    assert slow.valid.all()
+    assert core.problem() == ""
+
+
+def test_a_line_that_does_not_fit_the_configured_grid_is_named() -> None:
+    grid, core = grid_of(samples(times(9, 20)), rate_hz=100.0)
+    assert not grid.valid.all()
+    assert core.problem() == (
+        "samples arrive 9 times a second, further apart than gap_limit_s = 0.1: "
+        "leave out rate_hz and gap_limit_s of [resampler], they follow from the line"
+    )
+    assert core.notes() == ["grid of 100 Hz; gaps longer than 0.1 s: 1, 100.0 % of the grid"]
+
+
+def test_a_line_that_becomes_faster_or_slower_is_named() -> None:
+    slow, fast = samples(times(10, 20)), samples(times(100, 20) + 20, first=200)
+    _, core = grid_of([*slow, *fast])
+    assert core.problem() == (
+        "samples arrive 100 times a second, and the grid has 10 Hz since they were fewer: restart the resampler"
+    )
+    _, core = grid_of(
+        [*fast, *[replace(m, header=Header("p", 9000 + k, "tray1")) for k, m in enumerate(samples(times(2, 40) + 40))]]
+    )
+    assert core.problem().endswith("further apart than gap_limit_s = 0.1: restart the resampler")
+
+
+def test_samples_of_the_wrong_number_of_fans_are_reported_before_there_is_a_grid() -> None:
+    core = ResamplerCore(2, ResamplerConfig())
+    for message in samples(times(10, 5)):
+        core.step(message)
+    assert "fans = 2" in core.problem()
+    assert core.counters()["lost_wrong_fan_count"] == 50
+
+
+@pytest.mark.parametrize(
+    ("given", "expected_s"),
+    [
+        ({}, (0.1, 0.5, 5.0)),
+        ({"gap_limit_s": 1.0}, (1.0, 1.0, 5.0)),
+        ({"watermark_s": 8.0}, (0.1, 8.0, 16.0)),
+        ({"watermark_s": 0.05}, (0.05, 0.05, 5.0)),
+        ({"stale_for_s": 0.2}, (0.1, 0.2, 0.2)),
+    ],
+)
+def test_limits_that_are_not_given_follow_and_keep_their_order(
+    given: dict[str, float], expected_s: tuple[float, float, float]
+) -> None:
+    timing = ResamplerConfig.model_validate(given).timing(100.0)
+    limits_ns = (timing.gap_limit_ns, timing.watermark_ns, timing.stale_for_ns)
+    assert limits_ns == tuple(round(limit_s * NS_PER_S) for limit_s in expected_s)
+    for rate_hz in RATES_HZ:
+        timing = ResamplerConfig().timing(rate_hz)
+        assert 3 * timing.period_ns <= timing.gap_limit_ns <= timing.watermark_ns <= timing.stale_for_ns
