@@ -89,6 +89,11 @@ class SiteWatcher:
         for its_key, payload in self._bus.recover(key):
             self._on_alarm(its_key, payload)
 
+    def ask_for_health(self, stage: str, instance: str) -> None:
+        """Fetch the last health of a stage, instead of waiting for its next one."""
+        for key, payload in self._bus.recover(health_key(self._site, stage, instance)):
+            self._on_health(key, payload)
+
     def stages(self) -> list[StageView]:
         """The latest session of every stage instance, by name; one whose token is there, if there is one."""
         with self._lock:

@@ -41,7 +41,9 @@ from schemas.topics import BY_NAME, alive_key, health_key, sessions_key, topic_o
 
 TICK_S = 0.05
 HEALTH_PERIOD_S = 1.0
-LOSS_REPORT_S = 0.2  # losses are reported this soon, so that a stage that is killed leaves few unreported
+LOSS_REPORT_S = (
+    0.2  # losses, and that a command has arrived, are reported this soon: a killed stage leaves few unreported
+)
 PRODUCERS_END_LIMIT_S = 10.0  # how long a stage whose launcher has gone waits for its producers to end
 # When each part of the end must be over, as shares of launcher.stop_timeout_s: the rest is for the process itself.
 CAUGHT_UP, DRAINED, WORK_ENDED = 0.4, 0.7, 0.75
@@ -135,6 +137,8 @@ class Runner:
         )
         self._notifier = Notifier.from_environment()
         self._ending = Ending(stage.name, config.launcher.stop_timeout_s)
+        self._owes_answer = False
+        """a command has arrived: the next health, which says so, is sent soon"""
         self._active_core: str | None = None
         """the core whose method is being called, or has raised"""
 
@@ -228,7 +232,9 @@ class Runner:
                 for name, parts in self._parts.items():
                     now_ns = self._clock.tick_ns(name)
                     self._call(name, lambda core=parts.core, now_ns=now_ns: core.tick(now_ns), from_timer=True)
-                if now >= next_health or (now >= next_loss and self._lost() > reported_lost):
+                news = self._owes_answer or self._lost() > reported_lost
+                if now >= next_health or (now >= next_loss and news):
+                    self._owes_answer = False
                     next_health, next_loss = now + HEALTH_PERIOD_S, now + LOSS_REPORT_S
                     reported_lost = self._publish_health(status).lost
                 self._notifier.at_work(self._health.summary)
@@ -367,6 +373,7 @@ class Runner:
             envelope.topic == self.stage.reads[0] and not self._has_source
         ):  # samples of a device do not depend on any input
             self._outputs.advance(header.tray, envelope.topic, header)
+        self._owes_answer |= self._has_source
         core, item = self._parts[name].core, envelope if self.stage.wants_envelopes else envelope.message
         self._call(name, lambda: core.step(item), input_tray=header.tray)
 

@@ -20,6 +20,7 @@ from pipeline.cli.options import JsonOption
 from pipeline.cli.progress import working
 from pipeline.launch.loss_accounting import label, losses
 from pipeline.launch.refused_input import refused, refused_lines
+from pipeline.launch.stage_notes import note_lines, notes_as_json
 from pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.records import active_path
@@ -98,6 +99,7 @@ def _part_as_json(part: Contents) -> dict[str, Any]:
             label(health): {
                 "status": health.status.name.lower(),
                 "problem": health.problem,
+                "notes": notes_as_json(health),
                 "lost": lost[label(health)],
                 "counters": {counter.name: counter.value for counter in health.counters},
             }
@@ -126,7 +128,10 @@ def _show(parts: Sequence[Contents], breaks: Iterable[str]) -> None:
             console.print(line)
         if part.streams or part.others:
             console.print(_table(part))
-        for health in sorted(part.healths, key=label):
+        healths = sorted(part.healths, key=label)
+        for line in note_lines(healths):
+            console.print(escape(line))
+        for health in healths:
             if health.problem:
                 console.print(f"[red]{escape(label(health))}: {escape(health.problem)}[/red]")
         for line in part.recovered:

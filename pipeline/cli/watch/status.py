@@ -26,6 +26,7 @@ from pipeline.launch.processes import process_list
 from pipeline.launch.refused_input import refused_lines
 from pipeline.launch.site_state import StageState, Word, site_states
 from pipeline.launch.site_watcher import SiteWatcher, StageView
+from pipeline.launch.stage_notes import note_lines, notes_as_json
 from pipeline.runtime.signals import stop_on_signals
 from schemas.messages import Severity
 from schemas.streams import LOSS_PREFIX
@@ -120,6 +121,7 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Gro
             problems.append(Text(f"{state.label}: {state.detail}", style=style))
         if state.view and state.view.health.problem and state.view.alive:
             problems.append(Text(f"{state.label}: {state.view.health.problem}", style="red"))
+    notes = [Text(line) for line in note_lines(state.view.health for state in states if state.view)]
     problems += [Text(line, style="yellow") for line in (*loss_lines(states), *refused_lines(watcher.refused()))]
     alarms = [_alarm_line(each) for each in watcher.current_alarms() if is_listed(each.newest)]
     if not _has_scorer(states):
@@ -129,7 +131,7 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Gro
     else:
         not_judged = [Text(each.line(), style="red") for each in unjudged(states, judged)]
     no_alarms = [] if alarms or not_judged else [Text("no alarms", style="green")]
-    return Group(*([table] if watcher.stages() else []), *problems, *alarms, *not_judged, *no_alarms)
+    return Group(*([table] if watcher.stages() else []), *notes, *problems, *alarms, *not_judged, *no_alarms)
 
 
 def _has_scorer(states: Sequence[StageState]) -> bool:
@@ -207,6 +209,7 @@ def _state_as_json(state: StageState, lost: int) -> dict[str, object]:
         "alive": view.alive,
         "status": health.status.name.lower(),
         "problem": health.problem,
+        "notes": notes_as_json(health),
         "process_id": health.process_id,
         "rate_in_hz": round(view.rate_in_hz, 1),
         "rate_out_hz": round(view.rate_out_hz, 1),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli.watch.command import _message
+from pipeline.cli.watch.commanding import command_of
 from pipeline.config.models import TrayConfig
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO, Chain, RunningCommand, fantwin
@@ -44,7 +44,7 @@ def test_without_an_acquisition_the_command_is_reported_as_not_received(chain):
 
 
 def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():
-    message = _message(TrayConfig(name="a", fans=2, speed_unit="rpm", speed_max=9000), 1, 6000.0, True)
+    message = command_of(TrayConfig(name="a", fans=2, speed_unit="rpm", speed_max=9000), {1: 6000.0}, is_set_point=True)
     np.testing.assert_allclose(message.set_point_rad_s, [np.nan, 6000 * 2 * np.pi / 60])
     assert np.isnan(message.command).all()
 

@@ -14,7 +14,7 @@ from pipeline.recordings import contents
 from pipeline.recordings.contents import contents_of
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Counter, Header, Health, Input, ModelCard, StageStatus
+from schemas.messages import Counter, Header, Health, Input, ModelCard, Note, StageStatus
 from schemas.topics import health_key, tray_key
 from tests.pipeline.recordings.test_parts import part, parts_in
 from tests.pipeline.recordings.test_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
@@ -48,6 +48,7 @@ def recording(path: Path) -> Path:
                 problem=problem,
                 counters=(Counter(name="lost_samples", value=3 * number),),
                 lost=3 * number,
+                notes=(Note(tray="tray1", text="grid of 10 Hz"),),
             )
             writer.add_message(health_key("plant", "acquisition", "tray1"), health, 6 * SECOND_NS)
     return path
@@ -76,6 +77,7 @@ def test_metadata_twins_and_stages_are_in_the_json(tmp_path):
         "acquisition/tray1": {
             "status": "degraded",
             "problem": "the line is silent: look at the cable",
+            "notes": [{"tray": "tray1", "text": "grid of 10 Hz"}],
             "lost": 3,
             "counters": {"lost_samples": 3},
         }
@@ -93,6 +95,7 @@ def test_the_text_shows_the_same(tmp_path):
         "twin of tray1: demo, hybrid, sha256 abababababab",
         "attached: configuration.toml, tray1.onnx",
         "acquisition/tray1: the line is silent: look at the cable\n",
+        "acquisition/tray1, tray1: grid of 10 Hz\n",
         "lost, over all sessions of each stage: acquisition/tray1 3",
     ):
         assert words in output

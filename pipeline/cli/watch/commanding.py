@@ -1,0 +1,120 @@
+"""Commands to the fans of one tray, sent through its acquisition, which says what became of them."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import Config, TrayConfig
+from pipeline.errors import UserError
+from pipeline.launch.site_watcher import SiteWatcher
+from schemas.codec import encode, type_name
+from schemas.messages import Command, Header, Health
+from schemas.topics import BY_NAME, tray_key
+from schemas.units import RAD_S_PER_UNIT
+
+_T = TypeVar("_T")
+_ANSWER_S = 5.0  # acquisition answers within a quarter of a second, on a busy host within one or two
+_POLL_S = 0.01
+
+
+def chosen_tray(config: Config, name: str | None) -> TrayConfig:
+    """The tray that `--tray` names; the only one if it is not given.
+
+    Raises:
+        UserError: there are several, or none of this name.
+    """
+    names = [each.name for each in config.trays]
+    if name is None and len(names) > 1:
+        raise UserError(f"name the tray with --tray (trays: {', '.join(names)})")
+    return config.tray(name or names[0])
+
+
+def command_of(tray: TrayConfig, values: dict[int, float], *, is_set_point: bool = False) -> Command:
+    """A command without a header. values: by fan; the other fans stay as they are.
+
+    Raises:
+        UserError: the tray has no such fan, or a value is outside its limits.
+    """
+    wanted, unchanged = np.full((2, tray.fans), np.nan)
+    low, high = (-tray.speed_max, tray.speed_max) if is_set_point else (tray.command_min, tray.command_max)
+    for fan, value in values.items():
+        if not 0 <= fan < tray.fans:
+            raise UserError(f"--fan {fan}: tray {tray.name} has fans 0 to {tray.fans - 1}")
+        if not low <= value <= high:  # NaN is in no range
+            what = f"set-point, {tray.speed_unit}," if is_set_point else "command"
+            raise UserError(f"--fan {fan} {value:g}: the {what} must be within {low:g} to {high:g} of tray {tray.name}")
+        wanted[fan] = value * RAD_S_PER_UNIT[tray.speed_unit] if is_set_point else value
+    columns = (unchanged, wanted) if is_set_point else (wanted, unchanged)
+    return Command(fans=tray.fans, t_ns=time.time_ns(), command=columns[0], set_point_rad_s=columns[1])
+
+
+class CommandSender:
+    """Sends commands to one tray."""
+
+    def __init__(self, bus: Bus, site: str, tray: str, stop: threading.Event) -> None:
+        self._watcher = SiteWatcher(bus, site)
+        self._tray = tray
+        self._stop = stop
+        self._producer = f"command-{tray}-{secrets.token_hex(4)}"
+        key = tray_key(site, tray, "command")
+        self._publisher = bus.publisher(key, BY_NAME["command"], type_name(Command), self._producer)
+        self._before: Health | None = None
+        """the last health before the first command"""
+
+    def connect(self) -> None:
+        """Wait for the tray's acquisition.
+
+        Raises:
+            UserError: there is none.
+        """
+        name = ("acquisition", self._tray)
+        self._wait(lambda: name in self._watcher.alive() or None)
+        if self._acquisition() is None:
+            self._watcher.ask_for_health(*name)
+        self._before = self._wait(self._acquisition)
+
+    def send(self, message: Command) -> None:
+        """Publish a command."""
+        header = Header(self._producer, self._publisher.published, self._tray)
+        self._publisher.put(encode(replace(message, header=header)))
+
+    def confirm(self) -> None:
+        """Wait until acquisition has received all commands.
+
+        Raises:
+            UserError: it has not, or could not send one to the device.
+        """
+        after, before = self._wait(self._received), self._before
+        is_same = before is not None and after.header.producer == before.header.producer
+        if _not_sent(after) > (_not_sent(before) if before and is_same else 0):
+            reason = after.problem or "it was refused"
+            raise UserError(f"tray {self._tray}: acquisition could not send the command: {reason}")
+
+    def _acquisition(self) -> Health | None:
+        name = ("acquisition", self._tray)
+        views = (view for view in self._watcher.stages() if view.alive)
+        return next((view.health for view in views if (view.health.stage, view.health.instance) == name), None)
+
+    def _received(self) -> Health | None:
+        health, sent = self._acquisition(), self._publisher.published
+        inputs = [each for each in health.inputs if each.producer == self._producer] if health else []
+        return health if any(each.received >= sent for each in inputs) else None
+
+    def _wait(self, find: Callable[[], _T | None]) -> _T:
+        until_s = time.monotonic() + _ANSWER_S
+        while (found := find()) is None:
+            if time.monotonic() > until_s or self._stop.wait(_POLL_S):
+                raise UserError(f"no acquisition of tray {self._tray} received the command: is `fantwin up` running?")
+        return found
+
+
+def _not_sent(health: Health) -> int:
+    return sum(c.value for c in health.counters if c.name in ("lost_commands", "refused_commands"))
