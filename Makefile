@@ -4,6 +4,7 @@
 # make selftest  the faults of practice on a simulated site, as a table of promised and seen
 # make bench  measurements, as ratios
 # make schema regenerate the code of schemas/fan.proto
+# make configuration  write docs/reference/configuration.md again
 # make twin   train the demo's twin again
 # make lock   pin the dependencies again
 # make clean  remove what was built (and nothing that was recorded)
@@ -18,7 +19,7 @@ BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_t
 	$(addprefix bench.runtime.,restart recorder_throughput recorder_kills replay_bus replay_speed stage_memory)
 SOURCES := schemas scoring pipeline simulation stages twin tests bench
 
-.PHONY: demo test check selftest bench schema twin lock clean
+.PHONY: demo test check selftest bench schema configuration twin lock clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.runtime
@@ -42,6 +43,9 @@ bench: $(VENV)/.benches
 
 schema: $(VENV)/.development
 	$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. schemas/fan.proto
+
+configuration: $(VENV)/.development
+	$(BIN)/python -m pipeline.config.reference_page > docs/reference/configuration.md
 
 twin: $(VENV)/.development
 	sh pipeline/demo/train_twin.sh $(BIN)/fantwin

@@ -26,11 +26,16 @@ LONGEST_SHOWN = 100
 
 
 class _File(Section):
-    site: Name = "site"
-    run_folder: Path = Path("runs")
+    site: Name = Field(default="site", description="name of the site: it begins the keys on the bus")
+    run_folder: Path = Field(default=Path("runs"), description="where recordings, snapshots and logs are written")
     bus: BusConfig = BusConfig()
     launcher: LauncherConfig = LauncherConfig()
     tray: tuple[TrayConfig, ...] = Field(min_length=1)
+
+
+def top_level() -> type[BaseModel]:
+    """The model of the whole file without the sections of stages."""
+    return _File
 
 
 def load_config(path: Path, overrides: Iterable[str] = (), stages: Iterable[str] | None = None) -> Config:

@@ -62,7 +62,9 @@ class BusConfig(Section):
     """How processes find one another. On one host the first process to start listens on `endpoint`, the others
     connect there and learn of each other; if it dies, the next to start takes its place."""
 
-    mode: Literal["peer", "client"] = "peer"
+    mode: Literal["peer", "client"] = Field(
+        default="peer", description="peer: processes meet without a router; client: all go through `fantwin router`"
+    )
     endpoint: str = Field(
         default="tcp/127.0.0.1:7447", description="where peers meet, or the router's address for clients"
     )
@@ -104,7 +106,7 @@ class TrayConfig(Section):
 
     short_form_keys: ClassVar[tuple[str, ...]] = ("port", "baud", "protocol")
 
-    name: Name
+    name: Name = Field(description="letters, digits, `_` and `-`; names of trays differ")
     fans: int = Field(ge=1, le=64, description="number of fans in every sample")
     source: Annotated[SourceConfig, BeforeValidator(parse_source)] = Field(
         default={"kind": "serial"}, validate_default=True, description="where samples come from; used by acquisition"

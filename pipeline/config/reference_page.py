@@ -1,0 +1,121 @@
+"""docs/reference/configuration.md: every key of the configuration, from the models that check it.
+
+`python -m pipeline.config.reference_page` writes the page to standard output; `make configuration` writes the file.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from pipeline.config.loading import LARGEST_FILE_BYTES, top_level
+from pipeline.config.models import BusConfig, LauncherConfig, TrayConfig
+from pipeline.config.registry import STAGES
+from pipeline.devices.source_kinds import SOURCE_KINDS
+
+_INTRODUCTION = f"""# Configuration
+
+One TOML file of at most {LARGEST_FILE_BYTES >> 20} MiB holds the settings of a site. Only a `[[tray]]` with `name` and
+`fans` is required. Unknown keys are refused, with the nearest known one. Keys that end in `_s` are in seconds. Relative
+paths start at the folder of the file. `--set` changes a key for one command: `--set scorer.on_delay_s=1.0`,
+`--set tray.0.port=/dev/ttyUSB1`. `fantwin doctor -c FILE` checks a file.
+
+Where the default is empty, the description says what holds; times of the `[scorer]` are then those that the twin was
+calibrated with.
+
+This page is made from the models in the code: `make configuration`.
+"""
+_TYPE_WORDS = {str: "text", int: "integer", float: "number", bool: "`true` or `false`", Path: "path"}
+_BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+
+
+def page() -> str:
+    """The page, in Markdown."""
+    tables = ("bus", "launcher", "tray")
+    parts = [
+        _INTRODUCTION,
+        "## The file\n",
+        _table(top_level(), but=tables),
+        "## `[[tray]]`\n",
+        "One for each tray. `port`, `baud` and `protocol` may be written in it directly, for a serial source.\n",
+        _table(TrayConfig, but=()),
+        *_sources(),
+        "## `[bus]`\n",
+        _table(BusConfig, but=()),
+        "## `[launcher]`\n",
+        _table(LauncherConfig, but=()),
+    ]
+    for name, row in STAGES.items():
+        stage = row.load()
+        start = "" if row.enabled_by == "default" else " It runs if the file has this section."
+        parts += [
+            f"## `[{name}]`\n",
+            f"{stage.about[0].upper()}{stage.about[1:]}.{start}\n",
+            _table(stage.config, but=()),
+        ]
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(parts))
+
+
+def _sources() -> Iterator[str]:
+    for kind, row in SOURCE_KINDS.items():
+        module, _, name = row.config.partition(":")
+        yield f'### `source = {{ kind = "{kind}", ... }}`\n'
+        yield _table(getattr(import_module(module), name), but=("kind",))
+
+
+def _table(model: type[BaseModel], but: Iterable[str]) -> str:
+    """The keys of a section, one a row."""
+    rows = [
+        f"| `{key}` | {_values(field)} | {_default(field)} | {field.description or ''} |"
+        for key, field in model.model_fields.items()
+        if key not in but
+    ]
+    return "\n".join(["| key | value | default | |", "|---|---|---|---|", *rows, ""])
+
+
+def _values(field: FieldInfo) -> str:
+    annotation = next((each for each in get_args(field.annotation) if each is not NoneType), None)
+    is_optional = NoneType in get_args(field.annotation)
+    bounds = [
+        f"{words} {_number(getattr(rule, name))}"
+        for rule in field.metadata
+        for name, words in _BOUNDS.items()
+        if getattr(rule, name, None) is not None
+    ]
+    return ", ".join([_type_words(annotation if is_optional else field.annotation), *bounds])
+
+
+def _type_words(annotation: Any) -> str:
+    if get_origin(annotation) is Literal:
+        return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
+    if get_origin(annotation) is tuple:
+        return f"list of {_type_words(get_args(annotation)[0])}"
+    return _TYPE_WORDS.get(annotation, "see below")
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "required"
+    if field.default is None:
+        return ""
+    if isinstance(field.default, dict):
+        return "`{ " + ", ".join(f"{key} = {json.dumps(value)}" for key, value in field.default.items()) + " }`"
+    value = str(field.default) if isinstance(field.default, Path) else field.default
+    return _number(value) if type(value) in (int, float) else f"`{json.dumps(value)}`"
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if value == int(value) else str(value)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())
