@@ -35,6 +35,7 @@ from pipeline.devices.line_rate import (
     grid_rate_hz,
     grid_timing,
     is_too_slow,
+    leaves_gaps,
 )
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.sample_grid import SampleGrid
@@ -143,7 +144,7 @@ class ResamplerCore(Core):
         if self._grid is None or self._timing is None:
             waiting = sum(len(item.host_receive_t_ns) for item in self._waiting)
             return [f"the rate of the line is being measured ({waiting} samples so far)"] if waiting else []
-        line = "" if self._line_hz is None else f" (the line sends {_rate(self._line_hz)} samples a second)"
+        line = "" if self._line_hz is None else f" (the line sends {self._line_hz:.3g} samples a second)"
         counts = self._grid.counters()
         samples, in_gaps = counts.get("grid_samples", 0), counts.get("grid_samples_in_gaps", 0)
         share = 100 * min(in_gaps / samples, 1) if samples else 0.0
@@ -164,13 +165,14 @@ class ResamplerCore(Core):
         if newest.count < MIN_SAMPLES or (newest.count < ENOUGH_SAMPLES and newest.span_us < LONGEST_WAIT_US):
             return ""
         line_hz = newest.line_hz
-        apart = f"samples arrive {_rate(line_hz)} times a second"
+        about = float(f"{line_hz:.1g}")  # a text that changes would be reported each time
+        apart = f"samples arrive about {about:g} times a second"
         if self._config.rate_hz is None and is_too_slow(line_hz):
             return f"{apart}: too slow to be judged; let the device send at least {RATES_HZ[0]} a second"
-        if line_hz * timing.gap_limit_ns < NS_PER_S:
+        if leaves_gaps(line_hz, timing):
             what = "rate_hz and gap_limit_s" if self._config.rate_hz or self._config.gap_limit_s else ""
             todo = f"leave out {what} of [resampler], they follow from the line" if what else "restart the resampler"
-            return f"{apart}, further apart than gap_limit_s = {timing.gap_limit_ns / NS_PER_S:g}: {todo}"
+            return f"{apart}, too few for gap_limit_s = {timing.gap_limit_ns / NS_PER_S:g}: {todo}"
         if self._config.rate_hz is None and grid_rate_hz(line_hz) >= FASTER * timing.rate_hz:
             return f"{apart}, and the grid has {timing.rate_hz:g} Hz since they were fewer: restart the resampler"
         return ""
@@ -190,10 +192,6 @@ class ResamplerCore(Core):
         self._timing = config.timing(rate_hz)
         self._grid = SampleGrid(self._fans, self._timing, config.block_size, self._decision_rules)
         return self._grid
-
-
-def _rate(line_hz: float) -> str:
-    return f"{line_hz:.3g}"
 
 
 def build(context: Context) -> BuiltStage:

@@ -110,7 +110,9 @@ def _default(field: FieldInfo) -> str:
     if isinstance(field.default, dict):
         return "`{ " + ", ".join(f"{key} = {json.dumps(value)}" for key, value in field.default.items()) + " }`"
     value = str(field.default) if isinstance(field.default, Path) else field.default
-    return _number(value) if type(value) in (int, float) else f"`{json.dumps(value)}`"
+    return (
+        _number(value) if isinstance(value, int | float) and not isinstance(value, bool) else f"`{json.dumps(value)}`"
+    )
 
 
 def _number(value: float) -> str:

@@ -20,6 +20,7 @@ RATES_HZ = (1, 2, 5, 10, 20, 25, 50, 100)
 """rates of a grid that follows from the line; a faster line gets the last one"""
 GAP_PERIODS = 5.0
 """gaps of up to so many sample periods are bridged"""
+FEWEST_PERIODS = 1.5  # of a gap limit: with fewer, samples that are a little late are gaps
 SHORTEST_GAP_S = 0.1
 WATERMARK_S = 0.5
 STALE_FOR_S = 5.0
@@ -76,6 +77,11 @@ def grid_rate_hz(line_hz: float) -> int:
 def is_too_slow(line_hz: float) -> bool:
     """Whether a line is slower than the slowest grid can be."""
     return line_hz < RATES_HZ[0] / math.sqrt(2.0)
+
+
+def leaves_gaps(line_hz: float, timing: GridTiming) -> bool:
+    """Whether the samples of a line are so far apart that many of the spans between them count as gaps."""
+    return line_hz * timing.gap_limit_ns < FEWEST_PERIODS * NS_PER_S
 
 
 class SampleTimes:

@@ -136,7 +136,7 @@ def test_a_line_too_slow_to_be_judged_is_named_and_nothing_of_it_is_bridged() ->
     core = ResamplerCore(1, ResamplerConfig())
     grids = [grid for message in samples(times(0.2, 120)) for grid in core.step(message)]
     assert core.problem() == (
-        "samples arrive 0.2 times a second: too slow to be judged; let the device send at least 1 a second"
+        "samples arrive about 0.2 times a second: too slow to be judged; let the device send at least 1 a second"
     )
     assert join(grids).valid.mean() < 0.25  # only at the samples themselves
     slow, core = grid_of(samples(times(0.2, 120)), rate_hz=0.2)  # asked for: the limits follow from that
@@ -145,25 +145,25 @@ def test_a_line_too_slow_to_be_judged_is_named_and_nothing_of_it_is_bridged() ->
 
 
 def test_a_line_that_does_not_fit_the_configured_grid_is_named() -> None:
-    grid, core = grid_of(samples(times(9, 20)), rate_hz=100.0)
+    grid, core = grid_of(samples(times(10, 20, 0.2)), rate_hz=100.0)
     assert not grid.valid.all()
     assert core.problem() == (
-        "samples arrive 9 times a second, further apart than gap_limit_s = 0.1: "
+        "samples arrive about 10 times a second, too few for gap_limit_s = 0.1: "
         "leave out rate_hz and gap_limit_s of [resampler], they follow from the line"
     )
-    assert core.notes() == ["grid of 100 Hz; gaps longer than 0.1 s: 1, 100.0 % of the grid"]
+    assert core.notes()[0].startswith("grid of 100 Hz; gaps longer than 0.1 s: ")
 
 
 def test_a_line_that_becomes_faster_or_slower_is_named() -> None:
     slow, fast = samples(times(10, 20)), samples(times(100, 20) + 20, first=200)
     _, core = grid_of([*slow, *fast])
     assert core.problem() == (
-        "samples arrive 100 times a second, and the grid has 10 Hz since they were fewer: restart the resampler"
+        "samples arrive about 100 times a second, and the grid has 10 Hz since they were fewer: restart the resampler"
     )
     _, core = grid_of(
         [*fast, *[replace(m, header=Header("p", 9000 + k, "tray1")) for k, m in enumerate(samples(times(2, 40) + 40))]]
     )
-    assert core.problem().endswith("further apart than gap_limit_s = 0.1: restart the resampler")
+    assert core.problem().endswith("too few for gap_limit_s = 0.1: restart the resampler")
 
 
 def test_samples_of_the_wrong_number_of_fans_are_reported_before_there_is_a_grid() -> None:

@@ -21,6 +21,7 @@ from pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign
 from pipeline.bus.errors import BusError
 from pipeline.bus.session import Bus
 from pipeline.cli.options import JsonOption, SetOption
+from pipeline.cli.watch.line_check import check_line
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, ConfigError
 from pipeline.launch.processes import process_list
@@ -39,15 +40,20 @@ def doctor(
     config: Annotated[Path | None, typer.Option("-c", "--config", help="Also check this configuration.")] = None,
     overrides: SetOption = None,
     json_output: JsonOption = False,
+    listen_s: Annotated[
+        float, typer.Option(min=0.0, max=600.0, help="How long to listen to the line of each tray; 0: not at all.")
+    ] = 2.0,
 ) -> None:
     """Check the installation, and a configuration if one is given.
+
+    It listens to the line of each tray and names what does not fit: rate, commands, speeds, fans, unit.
 
     Exit code 1 if there is a problem to fix.
 
     Example: fantwin doctor -c fantwin.toml
     """
     problems, good = [], []
-    for ok, line in _findings(config, overrides):
+    for ok, line in _findings(config, overrides, listen_s):
         (good if ok else problems).append(line)
     if json_output:
         typer.echo(json.dumps({"ok": not problems, "problems": problems, "good": good}))
@@ -61,7 +67,7 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _findings(config: Path | None, overrides: list[str] | None) -> Iterator[tuple[bool, str]]:
+def _findings(config: Path | None, overrides: list[str] | None, listen_s: float) -> Iterator[tuple[bool, str]]:
     """(in order or not, one line) for each check."""
     yield True, f"Python {sys.version.split()[0]}"
     yield from _check_packages()
@@ -76,7 +82,7 @@ def _findings(config: Path | None, overrides: list[str] | None) -> Iterator[tupl
     yield from _check_run_folder(settings.run_folder)
     running: dict[str, Session] = {}
     yield from _check_bus(settings, running)
-    yield from _check_stages(settings, running)
+    yield from _check_stages(settings, running, listen_s)
 
 
 def _check_packages() -> Iterator[tuple[bool, str]]:
@@ -147,31 +153,31 @@ def _sessions(settings: Config) -> dict[str, Session]:
     return {session.name: session for session in sessions}
 
 
-def _check_stages(config: Config, running: Mapping[str, Session]) -> Iterator[tuple[bool, str]]:
+def _check_stages(config: Config, running: Mapping[str, Session], listen_s: float) -> Iterator[tuple[bool, str]]:
     for row in process_list(config):
         session = running.get(row.label)
         is_here = session is not None and session.host == Session.of_this_process(row.stage, row.instance, 0, "").host
         stage = load_stage(row.stage)
         trays = (config.tray(row.tray),) if row.tray else config.trays
         groups = [(tray,) for tray in trays] if stage.core_per_tray else [trays]
-        problems = [
-            problem
-            for group in groups
-            for problem in stage.check(
-                Context(
-                    site=config.site,
-                    trays=group,
-                    config=config.sections[row.stage],
-                    folder=config.folder,
-                    run_folder=config.run_folder,
-                    started_t_ns=time.time_ns(),
-                    is_running=is_here,
-                )
+        contexts = [
+            Context(
+                site=config.site,
+                trays=group,
+                config=config.sections[row.stage],
+                folder=config.folder,
+                run_folder=config.run_folder,
+                started_t_ns=time.time_ns(),
+                is_running=is_here,
             )
+            for group in groups
         ]
+        problems = [problem for context in contexts for problem in stage.check(context)]
         yield from ((False, f"{row.label}: {problem}") for problem in problems)
         if not problems:
             yield True, f"{row.label}: {f'runs already ({session.process})' if session else 'can start'}"
+        if row.stage == "acquisition" and listen_s and not problems:
+            yield from check_line(contexts[0], config, listen_s, is_running=session is not None)
 
 
 def _version(package: str) -> str:

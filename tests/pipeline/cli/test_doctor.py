@@ -36,7 +36,7 @@ def port() -> Iterator[str]:
 def examine(capsys: pytest.CaptureFixture[str], config: Path | None = None, *settings: str) -> tuple[int, dict]:
     code = 0
     try:
-        doctor(config, list(settings), json_output=True)
+        doctor(config, list(settings), json_output=True, listen_s=0.0)
     except typer.Exit as end:
         code = end.exit_code
     return code, json.loads(capsys.readouterr().out)

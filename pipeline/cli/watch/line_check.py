@@ -1,0 +1,168 @@
+"""Listens to the line of one tray and says what does not fit its configuration: rate, range, fans, unit.
+
+Acquisition's own core reads the source, so that the samples are those that a running site would get. If acquisition
+runs already, its samples are taken from the bus instead.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from pipeline.bus.session import Bus
+from pipeline.config.models import Config, TrayConfig
+from pipeline.devices.line_rate import MAX_SAMPLES, GridTiming, SampleTimes, grid_rate_hz, is_too_slow, leaves_gaps
+from pipeline.runtime.stage import Context, StageError, load_stage
+from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
+from schemas.codec import CodecError, decode
+from schemas.messages import Array, Raw
+from schemas.topics import tray_key
+from schemas.units import NS_PER_S, RAD_S_PER_UNIT
+
+FIRST_SAMPLE_S = 6.0
+"""a microcontroller restarts when its port is opened, and sends its first sample after some seconds"""
+FASTEST_FAN_RAD_S = 5000.0
+"""48,000 rpm: a larger speed was given in another unit"""
+RATE_TOLERANCE = 0.01
+Finding = tuple[bool, str]
+"""in order or not, and one line"""
+
+
+def check_line(context: Context, config: Config, seconds: float, *, is_running: bool) -> list[Finding]:
+    """Listen to the tray's line for some seconds after its first sample.
+
+    context: of acquisition and one tray. is_running: acquisition runs already.
+    """
+    tray = context.tray
+    samples, problem = _from_bus(config, tray, seconds) if is_running else _from_source(context, seconds)
+    found = [(False, f"{tray.name}: {problem}")] if problem else []
+    if not samples:
+        return found or [(False, f"{tray.name}: no sample in {FIRST_SAMPLE_S:g} s")]
+    twin = _twin(context)
+    return [*found, *((ok, f"{tray.name}: {line}") for ok, line in _findings(samples, tray, config, twin))]
+
+
+def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str]:
+    """The samples that acquisition would publish, and what it would report as its problem."""
+    settings = context.config.model_copy(update={"block_size": 1, "silence_s": min(1.0, seconds)})
+    built = load_stage("acquisition").build(Context(**(vars(context) | {"config": settings})))
+    core, source = built.core, built.source
+    assert source is not None
+    items: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    samples: list[Raw] = []
+    source.start(items.put)
+    try:
+        until_s = time.monotonic() + FIRST_SAMPLE_S
+        while (left_s := until_s - time.monotonic()) > 0:
+            with suppress(queue.Empty):
+                found = core.step(items.get(timeout=min(left_s, 0.05)))
+                if found and not samples:
+                    until_s = time.monotonic() + seconds
+                samples += [message for message in found if isinstance(message, Raw)]
+            core.tick(time.time_ns())
+    finally:
+        source.stop()
+    problem = core.problem()
+    kinds = {name: n for name, n in core.counters().items() if n and name not in _HARMLESS}
+    if not problem and kinds.get("refused_input"):
+        named = ", ".join(f"{name} {n}" for name, n in kinds.items() if name != "refused_input")
+        problem = f"{kinds['refused_input']} of the inputs cannot be used: {named}; see docs/reference/wire-protocol.md"
+    return samples, problem
+
+
+_HARMLESS = {"bytes", "samples", "line_up", "line_down", "no_speed"}
+
+
+def _from_bus(config: Config, tray: TrayConfig, seconds: float) -> tuple[list[Raw], str]:
+    received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    samples: list[Raw] = []
+    with Bus(config.bus, listens=False) as bus:
+        bus.subscribe(tray_key(config.site, tray.name, "raw"), lambda _key, payload: received.put(payload))
+        until_s = time.monotonic() + FIRST_SAMPLE_S
+        while (left_s := until_s - time.monotonic()) > 0:
+            with suppress(queue.Empty, CodecError):
+                message = decode(Raw, received.get(timeout=min(left_s, 0.05)))
+                assert isinstance(message, Raw)
+                if not samples:
+                    until_s = time.monotonic() + seconds
+                samples.append(message)
+    return samples, ""
+
+
+def _twin(context: Context) -> TrayTwin | None:
+    if context.tray.twin is None:
+        return None
+    try:
+        return load_tray_twin(twin_path(context), context.tray.fans)
+    except StageError:  # the twin integrator reports it
+        return None
+
+
+def _findings(samples: Sequence[Raw], tray: TrayConfig, config: Config, twin: TrayTwin | None) -> Iterator[Finding]:
+    fitting = [sample for sample in samples if sample.fans == tray.fans]
+    if not fitting:
+        yield False, f"samples of {samples[0].fans} fans, [[tray]] says fans = {tray.fans}: correct one of them"
+        return
+    times = SampleTimes(MAX_SAMPLES)
+    for sample in fitting:
+        times.add(sample)
+    yield _rate(times, config, twin)
+    command = np.concatenate([sample.command for sample in fitting])
+    speed_rad_s = np.concatenate([sample.speed_rad_s for sample in fitting])
+    yield from _ranges(command, speed_rad_s, tray, twin)
+
+
+def _rate(times: SampleTimes, config: Config, twin: TrayTwin | None) -> Finding:
+    """Whether the rate of the line fits the resampler and the twin."""
+    if times.span_us == 0 or not np.isfinite(times.line_hz):
+        return True, "one sample: the rate of the line is not known yet; --listen-s 10 listens for longer"
+    line_hz = times.line_hz
+    apart = f"{line_hz:.3g} samples a second"
+    settings: Any = config.sections.get("resampler")
+    if settings is None:
+        return True, apart
+    if settings.rate_hz is None and is_too_slow(line_hz):
+        return False, f"{apart}: too slow to be judged; let the device send at least 1 a second"
+    timing: GridTiming = settings.timing(settings.rate_hz or grid_rate_hz(line_hz))
+    if leaves_gaps(line_hz, timing):
+        limit = f"resampler.gap_limit_s = {timing.gap_limit_ns / NS_PER_S:g}"
+        return (
+            False,
+            f"{apart}, too few for {limit}: leave out rate_hz and gap_limit_s, they follow from the line",
+        )
+    if twin and twin.card.fixed_rate and abs(timing.rate_hz / twin.card.rate_hz - 1) > RATE_TOLERANCE:
+        return False, (
+            f"{apart} give a grid of {timing.rate_hz:g} Hz, and twin {twin.card.name} is valid at "
+            f"{twin.card.rate_hz:.4g} Hz only: set resampler.rate_hz = {twin.card.rate_hz:.3g}"
+        )
+    return True, f"{apart}: grid of {timing.rate_hz:g} Hz, gaps are longer than {timing.gap_limit_ns / NS_PER_S:g} s"
+
+
+def _ranges(command: Array, speed_rad_s: Array, tray: TrayConfig, twin: TrayTwin | None) -> Iterator[Finding]:
+    """Commands and speeds. command, speed_rad_s: (n, fans)."""
+    per_unit = RAD_S_PER_UNIT[tray.speed_unit]
+    silent = np.flatnonzero(~np.isfinite(speed_rad_s).any(axis=0)).tolist()
+    if silent:
+        names = ", ".join(map(str, silent))
+        yield False, f"no speed of fan {names}: is its tacho connected?"
+    low, high = float(command.min()), float(command.max())
+    if twin and not (twin.card.command_range[0] <= high and low <= twin.card.command_range[1]):
+        known = "{:g} to {:g}".format(*twin.card.command_range)
+        yield False, f"commands {low:g} to {high:g}, and the twin knows {known}: do device and twin have one unit?"
+    if len(silent) == speed_rad_s.shape[1]:
+        return
+    fastest_rad_s = float(np.nanmax(np.abs(speed_rad_s)))
+    limit_rad_s = min(FASTEST_FAN_RAD_S, 3.0 * twin.card.top_speed_rad_s if twin else FASTEST_FAN_RAD_S)
+    if fastest_rad_s > limit_rad_s:
+        other = "rpm" if tray.speed_unit == "rad/s" else "rad/s"
+        known = f"; the twin knows {twin.card.top_speed_rad_s / per_unit:.0f}" if twin else ""
+        yield False, f'speeds up to {fastest_rad_s / per_unit:.0f} {tray.speed_unit}{known}: is speed_unit "{other}"?'
+        return
+    slowest = float(np.nanmin(speed_rad_s)) / per_unit
+    speeds = f"speeds {slowest:.0f} to {float(np.nanmax(speed_rad_s)) / per_unit:.0f} {tray.speed_unit}"
+    yield True, f"commands {low:g} to {high:g}, {speeds}: are these what the fans do?"

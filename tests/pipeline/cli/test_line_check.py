@@ -1,0 +1,113 @@
+"""`fantwin doctor` listens to the line, and names what does not fit the configuration."""
+
+from __future__ import annotations
+
+import os
+import threading
+import tty
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.cli.watch.line_check import _findings, check_line
+from pipeline.config.loading import parse_config
+from pipeline.config.models import Config
+from pipeline.runtime.stage import Context
+from schemas.messages import Raw
+from schemas.units import NS_PER_S
+
+TOML = """
+[[tray]]
+name = "tray1"
+fans = 2
+protocol = "text"
+"""
+
+
+def config_of(**keys: object) -> Config:
+    overrides = [f"{key.replace('__', '.')}={value}" for key, value in keys.items()]
+    return parse_config(TOML, Path("fantwin.toml"), overrides, ("acquisition", "resampler"))
+
+
+def samples(rate_hz: float, command: float, speed_rad_s: float, fans: int = 2) -> list[Raw]:
+    return [
+        Raw(
+            fans=fans,
+            host_receive_t_ns=np.array([round((1e9 + k / rate_hz) * NS_PER_S)]),
+            command=np.full((1, fans), command),
+            speed_rad_s=np.full((1, fans), speed_rad_s + k),
+        )
+        for k in range(max(3, round(2 * rate_hz)))
+    ]
+
+
+def found(rate_hz: float, command: float = 0.5, speed_rad_s: float = 300.0, fans: int = 2, **keys: object) -> list:
+    config = config_of(**keys)
+    return list(_findings(samples(rate_hz, command, speed_rad_s, fans), config.trays[0], config, None))
+
+
+@pytest.mark.parametrize(("line_hz", "grid_hz", "gap_s"), [(1, 1, "5"), (10, 10, "0.5"), (100, 100, "0.1")])
+def test_a_line_that_fits_is_shown_with_its_grid_and_ranges(line_hz: float, grid_hz: int, gap_s: str) -> None:
+    rate, ranges = found(line_hz, tray__0__speed_unit="rpm")
+    assert rate == (True, f"{line_hz} samples a second: grid of {grid_hz} Hz, gaps are longer than {gap_s} s")
+    assert ranges[0]
+    assert ranges[1].startswith("commands 0.5 to 0.5, speeds 2865 to ")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (
+            {"rate_hz": 10, "resampler__rate_hz": 100},
+            "too few for resampler.gap_limit_s = 0.1: leave out rate_hz",
+        ),
+        ({"rate_hz": 0.2}, "0.2 samples a second: too slow to be judged; let the device send at least 1 a second"),
+        ({"rate_hz": 10, "speed_rad_s": 9000.0}, 'speeds up to 9019 rad/s: is speed_unit "rpm"?'),
+        ({"rate_hz": 10, "speed_rad_s": float("nan")}, "no speed of fan 0, 1: is its tacho connected?"),
+        ({"rate_hz": 10, "fans": 3}, "samples of 3 fans, [[tray]] says fans = 2: correct one of them"),
+    ],
+)
+def test_what_does_not_fit_is_one_line_that_says_what_to_do(line: dict, words: str) -> None:
+    problems = [text for ok, text in found(**line) if not ok]
+    assert len(problems) == 1
+    assert words in problems[0]
+
+
+@pytest.mark.parametrize(
+    ("command", "speed", "words"),
+    [("117", "1200", "command 117 is outside command_min = 0 to command_max = 1"), ("0.5", "1200", None)],
+)
+def test_a_port_is_listened_to_as_acquisition_does(command: str, speed: str, words: str | None) -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    stop = threading.Event()
+
+    def device() -> None:
+        clock_us = 0
+        while not stop.wait(0.02):
+            clock_us += 20_000
+            os.write(master, f"S {clock_us} {clock_us // 20_000} {command} {speed} {command} {speed}\n".encode())
+
+    sender = threading.Thread(target=device)
+    sender.start()
+    try:
+        port, unit = {"tray__0__port": f"'{os.ttyname(slave)}'"}, {"tray__0__speed_unit": "rpm"}
+        config = config_of(**port, **unit)
+        context = Context(
+            site="site", trays=config.trays, config=config.sections["acquisition"], folder=Path(), run_folder=Path(),
+            started_t_ns=0,
+        )  # fmt: skip
+        lines = check_line(context, config, 1.0, is_running=False)
+    finally:
+        stop.set()
+        sender.join()
+        os.close(slave)
+        os.close(master)
+    if words is None:
+        assert all(ok for ok, _ in lines), lines
+        assert lines[0][1].endswith("grid of 50 Hz, gaps are longer than 0.1 s")
+        assert f"speeds {speed} to {speed} rpm" in lines[1][1]
+    else:
+        assert [ok for ok, _ in lines] == [False]
+        assert words in lines[0][1]
