@@ -9,7 +9,7 @@ Baselines stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -18,6 +18,7 @@ import numpy as np
 
 from schemas.messages import Array, Statistic
 from schemas.units import NS_PER_S
+from scoring.baseline.movement import Movement
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Signal
 from scoring.detectors.motion import Motion
 from scoring.detectors.smoothed import SmoothedSettings
@@ -56,6 +57,8 @@ class ScoredBlock:
     """the baseline at the end of commissioning; NaN before"""
     balance_at_limit: Array
     """whether the baseline is held at the adaptation limit"""
+    ratios: Array
+    """(n, rows of the table, fans) every statistic in multiples of its limit; NaN where it is not scored"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,11 +93,18 @@ class FanScorer:
     """Scores one tray's fans. The result does not depend on how samples are cut into blocks."""
 
     def __init__(
-        self, fans: int, limits: Limits, *, for_calibration: bool = False, forgets_over_gaps: bool = True
+        self,
+        fans: int,
+        limits: Limits,
+        *,
+        for_calibration: bool = False,
+        forgets_over_gaps: bool = True,
+        skips_transients: bool = True,
     ) -> None:
         """for_calibration: keep what calibration needs, for `observed`; statistics then grow beyond their limits.
 
         forgets_over_gaps: False only to decide as for recordings made before statistics started again after gaps.
+        skips_transients: False only to decide as for recordings made before fans that moved were not commissioned.
         """
         self.limits = limits
         self.residuals = {source: Residual(fans, source, limits) for source in RESIDUALS}
@@ -115,6 +125,7 @@ class FanScorer:
         }
         self._statistics = np.array([row.statistic for row in self._rows])
         self._motion = Motion(fans)
+        self._movement = Movement(fans) if skips_transients else None
         self._gaps = Gaps(len(INPUTS), fans) if forgets_over_gaps else None
         self._memories = self._memories_ns()
         self._shortest_memory_ns = min(memory_ns for _, _, memory_ns in self._memories)
@@ -135,6 +146,12 @@ class FanScorer:
 
     def update(self, block: Samples) -> ScoredBlock:
         """Score a block of at least one sample."""
+        return joined([scored for _, scored in self.stretches(block)])
+
+    def stretches(self, block: Samples) -> Iterator[tuple[slice, ScoredBlock]]:
+        """Score a block of at least one sample in stretches within one interval of the baselines: the rows of each, and
+        their scores. Between them the caller may decide what the interval is worth, see `learn_nothing`.
+        """
         if self.origin_t_ns is None:
             self.origin_t_ns = int(block.t_ns[0])
         intervals = (block.t_ns - self.origin_t_ns) // self._interval_ns
@@ -142,7 +159,6 @@ class FanScorer:
         after_gap: Array = np.any(missing_ns > self._shortest_memory_ns, axis=(1, 2))
         cuts = np.flatnonzero((np.diff(intervals) != 0) | after_gap[1:]) + 1
         edges = [0, *cuts.tolist(), len(intervals)]
-        scored = []
         for first, last in pairwise(edges):
             number = int(intervals[first])
             if number != self._interval:
@@ -150,10 +166,15 @@ class FanScorer:
                 self._interval = number
             if after_gap[first]:
                 self._forget(missing_ns[first])
-            scored.append(self._score(block, slice(first, last)))
-        if len(scored) == 1:
-            return scored[0]
-        return ScoredBlock(**{name: np.concatenate([getattr(s, name) for s in scored]) for name in vars(scored[0])})
+            stretch = slice(first, last)
+            yield stretch, self._score(block, stretch)
+
+    def learn_nothing(self, fans: Array) -> None:
+        """The baselines of some fans, (fans,) of bool, learn nothing from the present interval: those with an alarm. A
+        fan without a baseline gets one.
+        """
+        has_one = np.any([self.residuals[source].baseline.is_set for source in RESIDUALS], axis=0)
+        self._below_half_limit[fans & has_one] = self._within_limit[fans & has_one] = False
 
     def observed(self) -> list[Observation]:
         """Observations since the last call, in the order of their samples; only if `for_calibration`."""
@@ -168,6 +189,8 @@ class FanScorer:
             residual.reset(fans)
         for detector in self.detectors.values():
             detector.reset(fans)
+        if self._movement:
+            self._movement.restart(fans)
         self._below_half_limit[fans] = self._within_limit[fans] = True
 
     @property
@@ -199,8 +222,10 @@ class FanScorer:
 
     def _end_interval(self, period_ns: int) -> None:
         expected = self._interval_ns // period_ns
+        commissioning = np.any([self.residuals[source].baseline.is_commissioning for source in RESIDUALS], axis=0)
+        moving = self._movement.end_interval(commissioning) if self._movement else None
         for source, residual in self.residuals.items():
-            first = residual.baseline.end_interval(expected, self._within_limit, self._below_half_limit)
+            first = residual.baseline.end_interval(expected, self._within_limit, self._below_half_limit, moving)
             residual.reset(first)
             for row in self._rows:
                 if row.source == source and row.name in self.detectors:
@@ -237,7 +262,10 @@ class FanScorer:
         """Score samples of one interval."""
         speed_rad_s, alive = block.speed_rad_s[stretch], block.alive[stretch]
         period_s = block.period_ns / NS_PER_S
-        transient_rad_s = self._motion.update(speed_rad_s, period_s)
+        motion_rad_s = self._motion.update(speed_rad_s, period_s)
+        transient_rad_s = np.abs(motion_rad_s)
+        if self._movement:
+            self._movement.add(motion_rad_s, speed_rad_s)
 
         def residual(source: Signal, values: Array, valid: Array) -> _ScoredResidual:
             return self._score_residual(source, values[stretch], valid[stretch], speed_rad_s, transient_rad_s, period_s)
@@ -260,11 +288,15 @@ class FanScorer:
                 ("tacho", alive, _NOTHING, _NOTHING),
             )
         }
-        ratios = np.zeros((len(self._rows), *speed_rad_s.shape))
+        ratios = np.full((len(self._rows), *speed_rad_s.shape), np.nan)
         for number, row in enumerate(self._rows):
             if row.name in self.detectors:
-                valid = inputs[row.source].valid
-                ratios[number] = np.where(valid, self.detectors[row.name].update(inputs[row.source]), 0.0)
+                np.copyto(
+                    ratios[number],
+                    self.detectors[row.name].update(inputs[row.source]),
+                    where=inputs[row.source].valid,
+                )
+        every_ratio, ratios = ratios, np.where(np.isnan(ratios), 0.0, ratios)
         if self._observations is not None:
             persistent: dict[Signal, Array] = {"speed": speed.persistent, "balance": balance.persistent}
             expected: dict[Signal, Array] = {"speed": speed.expected, "balance": balance.expected}
@@ -296,6 +328,7 @@ class FanScorer:
             balance_baseline_s=np.broadcast_to(baseline_s, alive.shape),
             balance_commissioned=np.where(baseline.is_commissioning, np.nan, balance.commissioned),
             balance_at_limit=np.broadcast_to(baseline.is_at_limit, alive.shape),
+            ratios=every_ratio.swapaxes(0, 1),
         )
 
     def _score_residual(
@@ -328,6 +361,7 @@ class FanScorer:
             "below_half_limit": self._below_half_limit.tolist(),
             "within_limit": self._within_limit.tolist(),
             "motion": self._motion.snapshot(),
+            **({"movement": self._movement.snapshot()} if self._movement else {}),
             **({"gaps": self._gaps.snapshot()} if self._gaps else {}),
             "detectors": {name: detector.snapshot() for name, detector in self.detectors.items()},
             **{source: residual.snapshot() for source, residual in self.residuals.items()},
@@ -352,6 +386,8 @@ class FanScorer:
         for flags, name in ((self._below_half_limit, "below_half_limit"), (self._within_limit, "within_limit")):
             restore_column(flags, name, state[name])
         self._motion.restore(state["motion"])
+        if self._movement and "movement" in state:
+            self._movement.restore(state["movement"])
         if self._gaps and "gaps" in state:
             self._gaps.restore(state["gaps"])
         for source, residual in self.residuals.items():
@@ -362,6 +398,13 @@ class FanScorer:
         origin_t_ns = state["origin_t_ns"]
         self.origin_t_ns = None if origin_t_ns is None else int(origin_t_ns)
         self._interval = int(state["interval"])
+
+
+def joined(parts: Sequence[ScoredBlock]) -> ScoredBlock:
+    """The scores of successive stretches as one block."""
+    if len(parts) == 1:
+        return parts[0]
+    return ScoredBlock(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
 
 
 _NOTHING = np.zeros((0, 0))  # the tacho has no residual

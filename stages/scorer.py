@@ -44,10 +44,13 @@ from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_manager import AlarmContext, AlarmManager
 from scoring.alarms.alarm_text import AlarmText
 from scoring.alarms.fan_condition import ConditionSettings
+from scoring.alarms.return_rule import HoldingDetector
+from scoring.alarms.tray_conditions import AlarmEvent
 from scoring.alarms.unscored_monitor import UnscoredMonitor
+from scoring.detectors.table import rows
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.diagnosis.regression_window import HealthyBalance
-from scoring.fan_scorer import HALF_LIMIT, FanScorer, ScoredBlock
+from scoring.fan_scorer import HALF_LIMIT, FanScorer, ScoredBlock, joined
 from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
 from scoring.limits import Limits, Timing, uncalibrated
 from scoring.samples import samples_of
@@ -55,6 +58,7 @@ from scoring.score_message import score_of
 from scoring.snapshot_times import with_times_moved
 from scoring.wear.wear_monitor import WearMonitor
 
+IN_ALARM = (FanState.ALARM, FanState.RETURNING)
 SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
 SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
 NEW_START = "baselines, alarms and wear start from the beginning"
@@ -81,7 +85,7 @@ class ScorerConfig(StageConfig):
     baseline_s: float | None = Field(default=None, gt=0, description="length of an interval of commissioning")
     adaptation_s: float | None = Field(default=None, gt=0, description="time constant of the baseline in the long run")
     on_delay_s: float | None = Field(default=None, ge=0, description="how long a limit must be exceeded to raise")
-    off_delay_s: float = Field(default=1.0, ge=0, description="how long a return must last to clear")
+    off_delay_s: float = Field(default=1.0, ge=0, description="how long a return must last at least to clear")
     deadband: float = Field(default=0.25, ge=0, lt=1, description="share of its limit below which a return begins")
     alarm_ratio: float = Field(default=1.5, ge=1, description="score from which a warning is an alarm")
     latching: bool = Field(default=False, description="whether a cleared alarm stays until it is reset")
@@ -128,6 +132,7 @@ class ScorerCore(Core):
         self._config = config
         self._text = AlarmText(speed_unit, twin.command_unit)
         self._forgets_over_gaps = decision_rules >= DecisionRules.TIME_AND_GAPS
+        self._holds = decision_rules >= DecisionRules.HOLDING
         self._scorer = self._new_scorer()
         self._settings = ConditionSettings(
             on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),
@@ -138,6 +143,7 @@ class ScorerCore(Core):
             confirming=config.confirming,
             data_lost_after_ns=DATA_LOST_AFTER_NS if self._forgets_over_gaps else None,
             settling_ns=self._scorer.longest_memory_ns,
+            detectors=self._holding_detectors() if self._holds else (),
         )
         self._unscored = UnscoredMonitor(fans, max(1, round(config.not_judged_s * NS_PER_S)))
         self._snapshot_store = snapshot_store
@@ -171,7 +177,24 @@ class ScorerCore(Core):
         """from a snapshot that was not yet compared with the first prediction"""
 
     def _new_scorer(self) -> FanScorer:
-        return FanScorer(self._fans, self._twin.limits, forgets_over_gaps=self._forgets_over_gaps)
+        return FanScorer(
+            self._fans,
+            self._twin.limits,
+            forgets_over_gaps=self._forgets_over_gaps,
+            skips_transients=self._holds,
+        )
+
+    def _holding_detectors(self) -> tuple[HoldingDetector, ...]:
+        """What decides on the return of alarms, in the order of the table."""
+        detectors = {row.name: self._scorer.detectors.get(row.name) for row in rows()}
+        return tuple(
+            HoldingDetector(
+                row.name,
+                off_delay_ns=round(max(self._config.off_delay_s, detector.off_delay_s if detector else 0.0) * NS_PER_S),
+                grows_with_speed=row.source != "tacho",
+            )
+            for row, detector in zip(rows(), detectors.values(), strict=True)
+        )
 
     def restore(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
         """Continue from a snapshot. Returns the messages that report it.
@@ -327,10 +350,9 @@ class ScorerCore(Core):
         return discarded
 
     def _score(self, item: Prediction) -> tuple[Score, list[Alarm]]:
-        scored = self._scorer.update(samples_of(item))
+        scored, state, events = self._decide(item)
         valid = np.isfinite(scored.score)
         self._feed_diagnoser(item, scored)
-        state, events = self._alarms.update(item.t_ns, item.period_ns, scored.score, valid)
         score = score_of(item, scored, state)
         self._unscored.update(item.period_ns, valid, score.invalid_reason)
         self._judged_share.add(valid, score.invalid_reason)
@@ -343,6 +365,26 @@ class ScorerCore(Core):
             balance_limit_command=self._scorer.limit_sigmas("balance", period_s) * sigma_command,
         )
         return score, self._alarms.emit(events, score, context)
+
+    def _decide(self, item: Prediction) -> tuple[ScoredBlock, Array, list[AlarmEvent]]:
+        """The scores, the states (n, fans) and the alarms' events. While an alarm is active, baselines stay."""
+        speed = np.where(np.isfinite(item.predicted_speed_rad_s), item.predicted_speed_rad_s, item.measured_speed_rad_s)
+        parts: list[ScoredBlock] = []
+        states: list[Array] = []
+        events: list[AlarmEvent] = []
+        for rows_of, part in self._scorer.stretches(samples_of(item)):
+            valid = np.isfinite(part.score)
+            was_active = self._alarms.active
+            state, happened = self._alarms.update(
+                item.t_ns[rows_of], item.period_ns, part.score, valid, part.ratios, speed[rows_of]
+            )
+            if self._holds:
+                in_alarm = was_active | self._alarms.active | np.isin(state, IN_ALARM).any(axis=0)
+                self._scorer.learn_nothing(in_alarm)
+            parts.append(part)
+            states.append(state)
+            events += [replace(event, row=event.row + rows_of.start) for event in happened]
+        return joined(parts), np.concatenate(states), events
 
     def _feed_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
         unknown = np.isin(item.invalid_reason, (InvalidReason.GAP, InvalidReason.STALE))

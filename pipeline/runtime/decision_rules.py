@@ -23,6 +23,10 @@ class DecisionRules(IntEnum):
     the clock of the device, or a gap in which the command has moved."""
     RATE_OF_LINE = 4
     """Times of the grid that are not configured follow from the line. Before they were those of `FORMER_GRID`."""
+    HOLDING = 5
+    """An alarm returns by the detectors that exceeded, each after its own off-delay, and only where its fault would
+    show; meanwhile the fan's baselines stay. Baselines are not commissioned from a fan that changes its speed. Less
+    probable causes are not listed, and a diagnosis that says nothing new is not sent."""
 
 
 CURRENT_RULES = max(DecisionRules)

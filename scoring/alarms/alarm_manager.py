@@ -57,9 +57,22 @@ class AlarmManager:
         """for each producer of requests, the sequence of the first one that is not answered"""
         self.raised = self.cleared = self.too_short = 0
 
-    def update(self, t_ns: Array, period_ns: int, score: Array, valid: Array) -> tuple[Array, list[AlarmEvent]]:
-        """Process a block; t_ns (n,), score and valid (n, fans). Returns the states (n, fans) and the events."""
-        result = self._conditions.update(t_ns, period_ns, score, valid)
+    @property
+    def active(self) -> Array:
+        """(fans,) whether each fan's alarm is active."""
+        return self._conditions.active
+
+    def update(
+        self,
+        t_ns: Array,
+        period_ns: int,
+        score: Array,
+        valid: Array,
+        ratios: Array | None = None,
+        speed_rad_s: Array | None = None,
+    ) -> tuple[Array, list[AlarmEvent]]:
+        """Process a block; see TrayConditions.update. Returns the states (n, fans) and the events."""
+        result = self._conditions.update(t_ns, period_ns, score, valid, ratios, speed_rad_s)
         self.too_short += result.too_short
         return result.state, result.events
 

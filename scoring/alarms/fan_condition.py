@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from schemas.messages import Action, FanState, Severity, Transition
+from scoring.alarms.return_rule import AlarmReturn, HoldingDetector, ReturnEvidence
 from scoring.former_snapshot_keys import FORMER_CONDITION_KEYS, current_keys
 
 NORMAL, SUSPECT, ALARM, RETURNING = map(int, (FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING))
@@ -41,6 +42,9 @@ class ConditionSettings:
     versions"""
     settling_ns: int = 0
     """time of valid samples after a gap, from which on low ratios count: statistics have started again"""
+    detectors: tuple[HoldingDetector, ...] = ()
+    """of which those that exceeded decide on the return, see scoring.alarms.return_rule; empty: the largest ratio of
+    all decides, after off_delay_ns, as in recordings of former versions"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,14 +81,18 @@ class FanCondition:
         self._excursion_t_ns = 0  # first sample of the excursion; meaningless when NORMAL
         self._held_ns = 0  # time since SUSPECT or RETURNING began
         self._settled_ns = 0  # time of valid samples since the gap, while the alarm is stale
+        self._return = AlarmReturn(settings.detectors, settings.return_ratio)
 
-    def update(self, t_ns: int, period_ns: int, ratio: float) -> Sequence[tuple[Transition, AlarmState]]:
+    def update(
+        self, t_ns: int, period_ns: int, ratio: float, evidence: ReturnEvidence | None = None
+    ) -> Sequence[tuple[Transition, AlarmState]]:
         """Process one valid sample and return the transitions, in order.
 
-        ratio: the statistic closest to its limit, as a multiple of that limit.
+        ratio: the statistic closest to its limit, as a multiple of that limit. evidence: of each detector, where they
+        decide on the return.
         """
         if self.alarm_state.active:
-            return self._update_active(period_ns, ratio)
+            return self._update_active(period_ns, ratio, evidence)
         if not ratio > 1:
             self.fan_state = NORMAL
             return ()
@@ -95,6 +103,9 @@ class FanCondition:
             self.fan_state = SUSPECT
             return ()
         self.fan_state = ALARM
+        if evidence is not None:
+            self._return.begin()
+            self._return.update(period_ns, evidence)
         self.alarm_state = replace(
             self.alarm_state,
             active=True,
@@ -111,6 +122,7 @@ class FanCondition:
     def lose_data(self) -> Sequence[tuple[Transition, AlarmState]]:
         """The time without valid samples has become too long: delays end, and an active alarm becomes stale."""
         self._held_ns = self._settled_ns = 0
+        self._return.begin_delays_again()
         if not self.alarm_state.active:
             self.fan_state = NORMAL
             return ()
@@ -162,6 +174,8 @@ class FanCondition:
             Action.COMMISSION: (Transition.COMMISSIONING, {}),
         }
         transition, changed = granted[action]
+        if action == Action.COMMISSION:
+            self._return.forget_sizes()
         self.alarm_state = replace(self.alarm_state, **changed, comment=comment or self.alarm_state.comment)
         return transition, ""
 
@@ -175,6 +189,7 @@ class FanCondition:
             "excursion_t_ns": self._excursion_t_ns,
             "held_ns": self._held_ns,
             "settled_ns": self._settled_ns,
+            **({"holds": self._return.snapshot()} if self._settings.detectors else {}),
             **alarm,
         }
 
@@ -193,6 +208,7 @@ class FanCondition:
         condition._excursion_t_ns = _time(stored["excursion_t_ns"])
         condition._held_ns = _time(stored["held_ns"])
         condition._settled_ns = _time(stored.get("settled_ns", 0))
+        condition._return = AlarmReturn.restore(settings.detectors, settings.return_ratio, stored.get("holds"))
         condition.alarm_state = AlarmState(
             active=condition.fan_state in (ALARM, RETURNING),
             severity=Severity.known(stored["severity"]),
@@ -209,26 +225,30 @@ class FanCondition:
         )
         return condition
 
-    def _update_active(self, period_ns: int, ratio: float) -> Sequence[tuple[Transition, AlarmState]]:
+    def _update_active(
+        self, period_ns: int, ratio: float, evidence: ReturnEvidence | None
+    ) -> Sequence[tuple[Transition, AlarmState]]:
         if not self.alarm_state.stale:
-            return self._update_judged(period_ns, ratio)
+            return self._update_judged(period_ns, ratio, evidence)
         self._settled_ns += period_ns
         if ratio < self._settings.return_ratio and self._settled_ns < self._settings.settling_ns:
             return ()
         self.alarm_state = replace(self.alarm_state, stale=False)
         restored = (Transition.DATA_RESTORED, self.alarm_state)
-        return (restored, *self._update_judged(period_ns, ratio))
+        return (restored, *self._update_judged(period_ns, ratio, evidence))
 
-    def _update_judged(self, period_ns: int, ratio: float) -> Sequence[tuple[Transition, AlarmState]]:
-        if not ratio < self._settings.return_ratio:
+    def _update_judged(
+        self, period_ns: int, ratio: float, evidence: ReturnEvidence | None
+    ) -> Sequence[tuple[Transition, AlarmState]]:
+        is_below, is_over = self._returned(period_ns, ratio, evidence)
+        if not is_below:
             self.fan_state = ALARM
             severity = self._severity(ratio)
             if severity <= self.alarm_state.severity:
                 return ()
             self.alarm_state = replace(self.alarm_state, severity=severity)
             return ((Transition.SEVERITY, self.alarm_state),)
-        self._held_ns = 0 if self.fan_state == ALARM else self._held_ns + period_ns
-        if self._held_ns < self._settings.off_delay_ns:
+        if not is_over:
             self.fan_state = RETURNING
             return ()
         self.fan_state = NORMAL
@@ -237,6 +257,15 @@ class FanCondition:
         if self.alarm_state.shelved_until_t_ns != UNTIL_IT_CLEARS_T_NS:
             return (cleared,)
         return cleared, self.unshelve()
+
+    def _returned(self, period_ns: int, ratio: float, evidence: ReturnEvidence | None) -> tuple[bool, bool]:
+        """Whether the sample belongs to a return, and whether the return is complete."""
+        if evidence is not None:
+            return self._return.update(period_ns, evidence)
+        if not ratio < self._settings.return_ratio:
+            return False, False
+        self._held_ns = 0 if self.fan_state == ALARM else self._held_ns + period_ns
+        return True, self._held_ns >= self._settings.off_delay_ns
 
     def _severity(self, ratio: float) -> Severity:
         return Severity.ALARM if ratio >= self._settings.alarm_ratio else Severity.WARNING

@@ -22,6 +22,7 @@ from scoring.alarms.fan_condition import (
     ConditionSettings,
     FanCondition,
 )
+from scoring.alarms.return_rule import ReturnEvidence
 
 UNKNOWN = int(FanState.UNKNOWN)
 NEVER_NS = -(1 << 62)
@@ -58,8 +59,20 @@ class TrayConditions:
         self._last_valid_t_ns = np.full(fans, NEVER_NS, np.int64)
         self._refresh_all()
 
-    def update(self, t_ns: Array, period_ns: int, ratio: Array, valid: Array) -> BlockResult:
-        """Process a block. t_ns: (n,), rising; ratio, valid: (n, fans), see `Condition.update`."""
+    def update(
+        self,
+        t_ns: Array,
+        period_ns: int,
+        ratio: Array,
+        valid: Array,
+        ratios: Array | None = None,
+        speed_rad_s: Array | None = None,
+    ) -> BlockResult:
+        """Process a block. t_ns: (n,), rising; ratio, valid: (n, fans), see `Condition.update`.
+
+        ratios (n, detectors, fans) and speed_rad_s (n, fans): see ReturnEvidence; where detectors decide on the return.
+        """
+        by_detector = bool(self._settings.detectors)
         state = np.where(valid, NORMAL, UNKNOWN).astype(np.uint8)
         events: list[AlarmEvent] = []
         too_short = 0
@@ -67,6 +80,11 @@ class TrayConditions:
         for fan in np.flatnonzero(busy | (self._shelved_until_t_ns <= t_ns[-1])).tolist():
             condition = self._conditions[fan]
             rows = np.flatnonzero(valid[:, fan]) if busy[fan] else np.zeros(0, np.intp)
+            evidence: dict[int, ReturnEvidence] = {}
+            if by_detector and len(rows):
+                assert ratios is not None and speed_rad_s is not None
+                samples = zip(ratios[rows, :, fan].tolist(), speed_rad_s[rows, fan].tolist(), strict=True)
+                evidence = dict(zip(rows.tolist(), (ReturnEvidence(*sample) for sample in samples), strict=True))
             steps = [(row, _SAMPLE) for row in rows.tolist()]
             if busy[fan]:
                 steps += [(row, _DATA_LOST) for row in self._data_lost_rows(fan, t_ns, rows)]
@@ -80,7 +98,7 @@ class TrayConditions:
                 elif step == _UNSHELVE:
                     transitions = (condition.unshelve(),)
                 else:
-                    transitions = condition.update(int(t_ns[row]), period_ns, float(ratio[row, fan]))
+                    transitions = condition.update(int(t_ns[row]), period_ns, float(ratio[row, fan]), evidence.get(row))
                     state[row, fan] = condition.fan_state
                 events += [AlarmEvent(row, fan, *transition) for transition in transitions]
                 too_short += before == SUSPECT and condition.fan_state == NORMAL
@@ -122,6 +140,11 @@ class TrayConditions:
             self._refresh(fan)
         return answers
 
+    @property
+    def active(self) -> Array:
+        """(fans,) whether each fan's alarm is active."""
+        return self._active.copy()
+
     def alarm_state(self, fan: int) -> AlarmState:
         """The present state of a fan's alarm."""
         return self._conditions[fan].alarm_state
@@ -157,6 +180,7 @@ class TrayConditions:
 
     def _refresh_all(self) -> None:
         self._not_normal = np.zeros(len(self._conditions), np.bool_)
+        self._active = np.zeros(len(self._conditions), np.bool_)
         self._shelved_until_t_ns = np.full(len(self._conditions), UNTIL_IT_CLEARS_T_NS, np.int64)
         for fan in range(len(self._conditions)):
             self._refresh(fan)
@@ -164,5 +188,6 @@ class TrayConditions:
     def _refresh(self, fan: int) -> None:
         """Keep the columns by which `update` finds the fans to process sample by sample; it skips the others."""
         condition = self._conditions[fan]
+        self._active[fan] = condition.alarm_state.active
         self._not_normal[fan] = condition.fan_state != NORMAL
         self._shelved_until_t_ns[fan] = condition.alarm_state.shelved_until_t_ns or UNTIL_IT_CLEARS_T_NS

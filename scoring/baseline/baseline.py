@@ -115,10 +115,14 @@ class Baseline(ColumnState):
         self._squares += np.rint(known * known * FIXED_POINT_ONE).astype(np.int64).sum(axis=0)
         self._counts += valid.sum(axis=0)
 
-    def end_interval(self, samples: int, within_limit: Array, below_half_limit: Array) -> Array:
+    def end_interval(
+        self, samples: int, within_limit: Array, below_half_limit: Array, moving: Array | None = None
+    ) -> Array:
         """End the present interval of so many samples. Returns which fans have just got their first baseline.
 
-        within_limit, below_half_limit: (fans,) whether every statistic stayed there during the interval.
+        within_limit, below_half_limit: (fans,) whether every statistic stayed there during the interval. moving:
+        (fans,) whether the fan moved, so that only its first baseline may come from the interval
+        (scoring.baseline.movement); None: no fan.
         """
         counts = np.maximum(self._counts, 1)
         information = self._scaling_squares / counts / FIXED_POINT_ONE
@@ -132,6 +136,8 @@ class Baseline(ColumnState):
         self.unsteady_intervals += unsteady
         good = seen & ~unsteady & np.where(self.is_commissioning, within_limit, below_half_limit)
         first = good & (self.intervals == 0)
+        if moving is not None:
+            good &= first | ~(moving & self.is_commissioning)
         self._learn(mean, information, good)
         self.intervals += good
         for column in (self._sums, self._scaling_squares, self._squares, self._counts):

@@ -161,6 +161,11 @@ class Detector(ColumnState):
     def memory_s(self) -> float:
         """How long samples affect the statistic. After a longer gap it starts again: nothing before it counts."""
 
+    @property
+    def off_delay_s(self) -> float:
+        """How long the statistic must stay low for its alarm to be over: as long as the fault may still be in it."""
+        return self.memory_s
+
     @abstractmethod
     def limit_sigmas(self, period_s: float) -> float:
         """The smallest constant shift of the residual that the statistic ends up reporting, sigma; inf: it reports

@@ -24,14 +24,16 @@ class Motion(ColumnState):
         """rad/s; NaN before the first reading"""
 
     def update(self, speed_rad_s: Array, period_s: float) -> Array:
-        """Take speeds, (n, fans) rad/s. Returns the measure, (n, fans) rad/s, 0 where there is no reading."""
+        """Take speeds, (n, fans) rad/s. Returns the distance from the low-pass with its sign, (n, fans) rad/s, 0 where
+        there is no reading. The measure is its size.
+        """
         valid = np.isfinite(speed_rad_s)
         new = np.isnan(self.past.value) & valid.any(axis=0)
         if new.any():
             first = valid[:, new].argmax(axis=0)
             self.past.value[new] = speed_rad_s[first, np.flatnonzero(new)]
         speed = np.where(valid, speed_rad_s, 0.0)
-        return np.where(valid, np.abs(speed - self.past.update(speed, valid, period_s)), 0.0)
+        return np.where(valid, speed - self.past.update(speed, valid, period_s), 0.0)
 
     @property
     def memory_s(self) -> float:

@@ -28,6 +28,7 @@ from scoring.detectors.detector import (
 from scoring.detectors.low_pass import LowPass
 
 MISSING_TIME_CONSTANT_S = 2.0
+LOOSE_S = 30.0  # a loose contact comes and goes: after so long without a failure it is taken to be good again
 STUCK_MARGIN, MIN_STUCK_S = 3.0, 2.0  # times the longest repetition of healthy runs
 MISSING_MARGIN, MIN_MISSING_SHARE, MAX_MISSING_SHARE = 3.0, 0.25, 0.9  # times the largest share of healthy runs
 
@@ -100,6 +101,11 @@ class Tacho(Detector):
     def memory_s(self) -> float:
         """Of the share of missing readings. A repetition ends at the first sample without a reading."""
         return self._missing.memory_s
+
+    @property
+    def off_delay_s(self) -> float:
+        """See Detector."""
+        return LOOSE_S
 
     def limit_sigmas(self, period_s: float) -> float:
         """It does not watch a residual."""

@@ -126,7 +126,7 @@ def test_a_block_on_which_the_scorer_crashed_is_judged_after_the_restart(
         feed(crashed, blocks[:-1])
         store.save(snapshot_of(crashed))
         with monkeypatch.context() as patch:
-            patch.setattr(FanScorer, "update", crash)
+            patch.setattr(FanScorer, "stretches", crash)
             with pytest.raises(ZeroDivisionError):
                 crashed.step(blocks[-1])
         crashed.abort()

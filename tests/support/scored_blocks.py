@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.snapshot_store import SnapshotStore
 from schemas.messages import Action, Alarm, Header, InvalidReason, Prediction, Request, Score, ScorerSnapshot
 from schemas.units import SpeedUnit
@@ -69,12 +70,13 @@ def core_of(
     calibration: Mapping[str, Any] | None = None,
     sha256: str = "twin",
     snapshot_store: SnapshotStore | None = None,
+    decision_rules: DecisionRules = CURRENT_RULES,
     **config: Any,
 ) -> ScorerCore:
     """Without a calibration: limits on the speed residual alone, 2 SIGMA."""
     settings = ScorerConfig.model_validate(config)
     twin = HealthyTwin(sha256, limits_in_force(settings, calibration), [balance_of_a_fan()] * fans, "%")
-    return ScorerCore(fans, unit, settings, twin, snapshot_store)
+    return ScorerCore(fans, unit, settings, twin, snapshot_store, decision_rules)
 
 
 def prediction_of(

@@ -1,0 +1,146 @@
+"""When the alarm of a fan returns: the detectors that exceeded their limit decide, each after an off-delay of its own.
+
+A detector holds an alarm from the sample at which it exceeds its limit. It has returned when it has been below
+`return_ratio` for as long as samples affect it (`Detector.off_delay_s`): until then the fault may still be in it, and a
+contact that comes and goes is good for a moment only.
+
+Only samples that could show the fault count. A blade that is touched takes ten per cent of the speed: 200 rpm at
+2,000 rpm, which is beyond a limit of 150, and 70 rpm at 700 rpm, which is not. So the largest ratio over speed that the
+alarm has had says at which speeds it would be seen; below them the alarm stands as it is, and so it does while the
+detector has nothing to score. A statistic is late, so its ratio belongs to the highest speed that is still in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+NOT_BELOW = -1
+LARGEST = 1e300  # ratio over speed of a fault that shows at any speed
+
+
+@dataclass(frozen=True)
+class HoldingDetector:
+    """What the rule knows about a detector."""
+
+    name: str
+    off_delay_ns: int
+    grows_with_speed: bool
+    """whether the same fault is larger at a higher speed: of a residual, not of the tacho"""
+
+
+@dataclass(frozen=True)
+class ReturnEvidence:
+    """A sample of one fan. ratios: of each detector, NaN where it has nothing to score; speed_rad_s: of the twin."""
+
+    ratios: Sequence[float]
+    speed_rad_s: float
+
+
+@dataclass
+class _Hold:
+    """One detector that holds the alarm."""
+
+    ratio_per_rad_s: float = 0.0
+    """largest so far"""
+    below_ns: int = NOT_BELOW
+    """how long it has been below the ratio of return, in samples that could show the fault"""
+    peak_rad_s: float = 0.0
+    """highest speed of the last off-delay"""
+    peak_age_ns: int = 0
+
+    def follow(self, speed_rad_s: float, period_ns: int, off_delay_ns: int) -> None:
+        """Keep the highest speed."""
+        self.peak_age_ns += period_ns
+        if speed_rad_s >= self.peak_rad_s or self.peak_age_ns > off_delay_ns:
+            self.peak_rad_s, self.peak_age_ns = speed_rad_s, 0
+
+    def shows_at(self, speed_rad_s: float, ratio: float) -> bool:
+        """Whether the fault would be seen at a speed, with at least this ratio."""
+        return self.ratio_per_rad_s >= LARGEST or self.ratio_per_rad_s * speed_rad_s >= ratio
+
+    def exceed(self, ratio: float) -> None:
+        """The limit is exceeded, by this ratio."""
+        here = min(ratio / self.peak_rad_s, LARGEST) if self.peak_rad_s > 0.0 else LARGEST
+        self.ratio_per_rad_s, self.below_ns = max(self.ratio_per_rad_s, here), NOT_BELOW
+
+
+class AlarmReturn:
+    """The detectors that hold the alarm of one fan."""
+
+    def __init__(self, detectors: Sequence[HoldingDetector], return_ratio: float) -> None:
+        self._detectors = detectors
+        self._return_ratio = return_ratio
+        self._holds: dict[str, _Hold] = {}
+
+    def begin(self) -> None:
+        """An alarm is being raised: the detectors that exceed their limit from now on hold it."""
+        self._holds = {}
+
+    def update(self, period_ns: int, sample: ReturnEvidence) -> tuple[bool, bool]:
+        """Take a sample. Returns whether no detector is above its ratio of return, and whether all have returned."""
+        speed = abs(sample.speed_rad_s) if math.isfinite(sample.speed_rad_s) else 0.0
+        above, over = False, True
+        for detector, ratio in zip(self._detectors, sample.ratios, strict=True):
+            hold = self._holds.get(detector.name)
+            if hold is None:
+                if not ratio > 1.0:
+                    continue
+                hold = self._holds[detector.name] = _Hold()
+            hold.follow(speed, period_ns, detector.off_delay_ns)
+            shows = not detector.grows_with_speed or hold.shows_at(speed, self._return_ratio)
+            if ratio > 1.0:
+                hold.exceed(ratio)
+            elif ratio >= self._return_ratio:
+                hold.below_ns = NOT_BELOW
+            elif ratio < self._return_ratio and shows:
+                hold.below_ns = 0 if hold.below_ns == NOT_BELOW else hold.below_ns + period_ns
+            above |= ratio >= self._return_ratio
+            over &= hold.below_ns >= detector.off_delay_ns
+        return not above, over
+
+    def begin_delays_again(self) -> None:
+        """After a gap the off-delays start again."""
+        for hold in self._holds.values():
+            hold.below_ns = NOT_BELOW
+
+    def forget_sizes(self) -> None:
+        """With another baseline the fault has another size: every sample counts again."""
+        for hold in self._holds.values():
+            hold.ratio_per_rad_s = LARGEST
+
+    def hold_by_all(self) -> None:
+        """Every detector holds the alarm: of one that a former version raised, it is not known which did."""
+        self._holds = {detector.name: _Hold(LARGEST) for detector in self._detectors}
+
+    def snapshot(self) -> dict[str, Any]:
+        """The state, as JSON values."""
+        return {name: asdict(hold) for name, hold in self._holds.items()}
+
+    @classmethod
+    def restore(
+        cls, detectors: Sequence[HoldingDetector], return_ratio: float, stored: Mapping[str, Any] | None
+    ) -> Self:
+        """The state of a snapshot; None: of a former version, of which every detector holds the alarm.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is no such snapshot.
+        """
+        restored = cls(detectors, return_ratio)
+        if stored is None:
+            restored.hold_by_all()
+            return restored
+        used = {detector.name for detector in detectors}
+        restored._holds = {
+            str(name): _Hold(
+                ratio_per_rad_s=float(hold["ratio_per_rad_s"]),
+                below_ns=int(hold["below_ns"]),
+                peak_rad_s=float(hold["peak_rad_s"]),
+                peak_age_ns=int(hold["peak_age_ns"]),
+            )
+            for name, hold in stored.items()
+            if name in used
+        }
+        return restored

@@ -1,0 +1,55 @@
+"""Whether a fan changes its speed during an interval: such an interval says little about the offset of the fan.
+
+The residual of a fan that speeds up contains the errors of the twin's inertia and of the tacho's delay. The measure is
+the mean distance of the speed from its low-pass over one second (scoring.detectors.motion), with its sign, so that the
+noise of the tacho averages out, relative to the mean speed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from schemas.messages import Array
+from scoring.detectors.state import ColumnState
+
+MOVING_SHARE = 0.05  # of the speed
+MAX_MOVING_INTERVALS = 60  # of commissioning, after which they count like others: some fans always move
+FIXED_POINT_ONE = 1 << 20  # one rad/s; integer sums do not depend on how samples are cut
+LARGEST_RAD_S = 1e6  # larger values are clipped to this
+
+
+class Movement(ColumnState):
+    """The movement of a tray's fans in the present interval."""
+
+    def __init__(self, fans: int) -> None:
+        self._motions = np.zeros(fans, np.int64)
+        self._speeds = np.zeros(fans, np.int64)
+        self._moving_intervals = np.zeros(fans, np.int64)
+
+    def add(self, motion_rad_s: Array, speed_rad_s: Array) -> None:
+        """Take samples, (n, fans) each; speeds may be NaN, where the motion is 0."""
+        self._motions += _fixed(motion_rad_s).sum(axis=0)
+        self._speeds += _fixed(np.abs(np.nan_to_num(speed_rad_s))).sum(axis=0)
+
+    def end_interval(self, commissioning: Array) -> Array:
+        """End the interval. Returns (fans,) whether fans are not to be commissioned from it, because they moved.
+
+        commissioning: (fans,) whether fans are being commissioned.
+        """
+        moving = np.abs(self._motions) > MOVING_SHARE * self._speeds
+        moving &= self._moving_intervals < MAX_MOVING_INTERVALS
+        self._moving_intervals += moving & commissioning
+        self._motions[:] = self._speeds[:] = 0
+        return moving
+
+    def restart(self, fans: Array) -> None:
+        """Some fans, (fans,) of bool, are commissioned again."""
+        self._moving_intervals[fans] = 0
+
+    def columns(self) -> dict[str, Array]:
+        """See ColumnState."""
+        return {"motions": self._motions, "speeds": self._speeds, "moving_intervals": self._moving_intervals}
+
+
+def _fixed(values: Array) -> Array:
+    return np.rint(values.clip(-LARGEST_RAD_S, LARGEST_RAD_S) * FIXED_POINT_ONE).astype(np.int64)

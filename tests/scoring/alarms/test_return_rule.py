@@ -1,0 +1,138 @@
+"""scoring.alarms.return_rule: which detectors hold an alarm, for how long, and at which samples they can let it go."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.messages import Action, FanState, Transition
+from scoring.alarms.fan_condition import ConditionSettings
+from scoring.alarms.return_rule import HoldingDetector
+from scoring.alarms.tray_conditions import TrayConditions
+
+STEP_NS = 10
+SETTINGS = ConditionSettings(
+    on_delay_ns=0,
+    off_delay_ns=0,
+    detectors=(
+        HoldingDetector("speed_smoothed", 20, grows_with_speed=True),
+        HoldingDetector("speed_drift", 100, grows_with_speed=True),
+        HoldingDetector("sensor", 300, grows_with_speed=False),
+    ),
+)
+UP, MID, LOW, NONE = 1.2, 0.9, 0.1, math.nan
+FULL, SLOW = 200.0, 70.0
+CALM = (LOW, LOW, LOW)
+Sample = tuple[float, float, float]
+
+
+class Fan:
+    """The alarm of one fan; `play` returns the numbers of the samples at which it was raised and cleared."""
+
+    def __init__(self) -> None:
+        self.conditions = TrayConditions(1, SETTINGS)
+        self.samples = 0
+
+    def play(self, samples: Sequence[Sample], speed: float = FULL) -> list[tuple[int, Transition]]:
+        ratios = np.array(samples)[:, :, np.newaxis]
+        score = np.nanmax(ratios, axis=1)
+        t_ns = (self.samples + 1 + np.arange(len(samples))) * STEP_NS
+        result = self.conditions.update(t_ns, STEP_NS, score, np.isfinite(score), ratios, np.full(score.shape, speed))
+        events = [(self.samples + event.row, event.transition) for event in result.events]
+        self.samples += len(samples)
+        self.state = FanState(int(result.state[-1, 0]))
+        return events
+
+
+def test_a_detector_that_never_exceeded_does_not_keep_an_alarm_that_another_raised() -> None:
+    fan = Fan()
+    fan.play([(UP, LOW, LOW)])
+    assert fan.play([(LOW, MID, LOW)] * 3) == [(3, Transition.CLEARED)], (
+        "after 20 ns, the drift is just below its limit"
+    )
+
+
+def test_each_detector_that_exceeded_has_an_off_delay_of_its_own() -> None:
+    fan = Fan()
+    fan.play([(UP, LOW, LOW), (UP, UP, LOW)])
+    assert fan.play([CALM] * 20) == [(12, Transition.CLEARED)], "the drift holds it for 100 ns"
+
+
+def test_readings_that_come_back_for_a_moment_clear_nothing() -> None:
+    fan = Fan()
+    fan.play([(LOW, LOW, UP)])
+    assert fan.play(([CALM] * 25 + [(LOW, LOW, UP)]) * 8) == []
+    assert fan.play([CALM] * 40) == [(fan.samples - 10, Transition.CLEARED)]
+
+
+def test_a_fault_too_small_to_be_seen_at_a_lower_speed_has_not_gone_there() -> None:
+    fan = Fan()
+    fan.play([(UP, LOW, LOW)])
+    assert fan.play([CALM] * 500, SLOW) == []
+    assert fan.state == FanState.RETURNING
+    assert fan.play([CALM] * 3, FULL) == [(503, Transition.CLEARED)]
+
+
+def test_a_fault_large_enough_to_be_seen_there_has_gone() -> None:
+    fan = Fan()
+    fan.play([(4.0, LOW, LOW)])
+    assert fan.play([CALM] * 3, SLOW) == [(3, Transition.CLEARED)]
+
+
+def test_where_its_residual_is_not_scored_a_detector_neither_returns_nor_exceeds() -> None:
+    fan = Fan()
+    fan.play([(UP, LOW, LOW)])
+    assert fan.play([(NONE, NONE, LOW)] * 500) == []
+    assert fan.play([CALM] * 3) == [(503, Transition.CLEARED)]
+
+
+def test_after_commissioning_every_speed_counts_again() -> None:
+    fan = Fan()
+    fan.play([(UP, LOW, LOW)])
+    fan.conditions.request(Action.COMMISSION, [0], 0)
+    assert fan.play([CALM] * 3, SLOW) == [(3, Transition.CLEARED)]
+
+
+def test_an_alarm_of_a_former_snapshot_is_held_by_every_detector() -> None:
+    former = TrayConditions(1, ConditionSettings(0, 0))
+    former.update(np.array([0]), STEP_NS, np.array([[UP]]), np.array([[True]]))
+    fan = Fan()
+    fan.conditions.restore(json.loads(json.dumps(former.snapshot())))
+    assert fan.play([CALM] * 50) == [(30, Transition.CLEARED)], "after the longest off-delay"
+
+
+ratio = st.sampled_from([LOW, LOW, LOW, MID, UP, 3.0, NONE])
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    history=st.lists(st.tuples(st.tuples(ratio, ratio, ratio), st.sampled_from([0.0, SLOW, FULL, NONE])), max_size=120),
+    cut=st.integers(0, 120),
+)
+def test_neither_blocks_nor_a_restart_change_anything(history: list[tuple[Sample, float]], cut: int) -> None:
+    def played(*stretches: list[tuple[Sample, float]]) -> tuple[list[Any], dict[str, Any]]:
+        conditions, events, first = TrayConditions(1, SETTINGS), [], 0
+        for stretch in stretches:
+            if not stretch:
+                continue
+            restarted = TrayConditions(1, SETTINGS)
+            restarted.restore(json.loads(json.dumps(conditions.snapshot(), allow_nan=False)))
+            conditions = restarted
+            ratios = np.array([sample for sample, _ in stretch])[:, :, np.newaxis]
+            speed = np.array([speed for _, speed in stretch])[:, np.newaxis]
+            score = np.where(np.isnan(ratios).all(axis=1), np.nan, np.nan_to_num(ratios).max(axis=1))
+            t_ns = (first + np.arange(len(stretch))) * STEP_NS
+            result = conditions.update(t_ns, STEP_NS, score, np.isfinite(score), ratios, speed)
+            events += [(event.row + first, event.transition, event.alarm_state) for event in result.events]
+            first += len(stretch)
+        return events, conditions.snapshot()
+
+    whole = played(history)
+    assert played(history[:cut], history[cut:]) == whole
+    assert played(*([sample] for sample in history)) == whole
