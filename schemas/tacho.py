@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
 
 LONGEST_WINDOW_S = 60.0
 
@@ -21,7 +22,10 @@ class Tacho(BaseModel):
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    kind: Literal["instantaneous", "count", "period"] = "instantaneous"
+    kind: Annotated[
+        Literal["instantaneous", "count", "period"],
+        Field(description="the speed at the time of the sample, pulses over a window, or the time of a revolution"),
+    ] = "instantaneous"
     pulses: Annotated[int, Field(ge=1, le=1000, description="pulses per revolution; 2 for 4-pin fans")] = 2
     window_s: Annotated[
         float, Field(ge=0, le=LONGEST_WINDOW_S, description="how long pulses are counted; for kind count only")
@@ -89,3 +93,16 @@ def tacho_of_each_fan(tachos: Sequence[Tacho], fans: int) -> tuple[Tacho, ...]:
     if len(tachos) not in (1, fans):
         raise ValueError(f"{len(tachos)} tachos for {fans} fans; give one for all fans, or one for each")
     return tuple(tachos) * (fans // len(tachos))
+
+
+def tachos_to_json(tachos: Sequence[Tacho]) -> str:
+    """One line of JSON, a list."""
+    return json.dumps([tacho.model_dump(exclude_defaults=True) for tacho in tachos])
+
+
+def tachos_from_json(text: str) -> tuple[Tacho, ...]:
+    """The inverse of tachos_to_json. Raises ValueError where the text is not such a list."""
+    return _TACHOS.validate_json(text)
+
+
+_TACHOS: TypeAdapter[tuple[Tacho, ...]] = TypeAdapter(Tachos)

@@ -29,7 +29,7 @@ from twin.evaluation.accuracy import (
     free_run_residuals,
 )
 from twin.evaluation.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
-from twin.export.fan_rows import fan_rows
+from twin.export.fan_rows import fan_rows, measured_as_in_card
 from twin.export.onnx_export import export_onnx
 from twin.export.onnx_twin import OnnxTwin
 from twin.fitting.balance import FILTER_RATE_PER_S
@@ -170,12 +170,14 @@ def evaluate(
 ) -> Evaluation:
     """Figures of a twin, or of its file, on runs.
 
-    fan_numbers: what the recordings call the runs' fans, as in fan_rows. A twin of one fan serves any.
+    fan_numbers: what the recordings call the runs' fans, as in fan_rows. A twin of one fan serves any. The tachos are
+    those of the twin's card.
     Raises TwinError when the fans do not fit.
     """
     loaded = OnnxTwin(twin) if isinstance(twin, str | Path) else twin
     model = loaded if isinstance(loaded, OnnxTwin) else loaded.model
     rows = fan_rows(loaded.card, common_fans(runs), fan_numbers)
+    runs = measured_as_in_card(loaded.card, rows, runs)
     return evaluate_model(model, loaded.parameters[rows], np.array(loaded.card.sigma_rad_s)[rows], runs)
 
 

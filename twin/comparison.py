@@ -10,6 +10,7 @@ from schemas.twin_card import DataCard
 from twin.build import TrainedTwin, evaluate, train_twin
 from twin.errors import TwinError
 from twin.evaluation.accuracy import Evaluation, evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
+from twin.export.fan_rows import measured_as_in_card
 from twin.fitting.training import Progress
 from twin.kinds import KINDS, Variant
 from twin.models.physics import LAG, PARAMETER_NAMES
@@ -108,7 +109,8 @@ def contend(
         )
     except TwinError as error:
         return Contender(candidate, invalid_reason=str(error))
-    residual = free_run_residuals(trained.model, trained.parameters, evaluation_pieces(runs))
+    pieces = evaluation_pieces(measured_as_in_card(trained.card, range(trained.card.fans), runs))
+    residual = free_run_residuals(trained.model, trained.parameters, pieces)
     return Contender(
         candidate,
         trained,

@@ -158,26 +158,33 @@ def common_fans(runs: Sequence[Run]) -> int:
 
 
 def common_tacho(runs: Sequence[Run]) -> tuple[Tacho, ...]:
-    """(fans,) the tachos that all runs share. Raises TwinError when runs differ: they are not of the same readings."""
+    """(fans,) the tachos that all runs share; none without runs. Raises TwinError when runs differ in them."""
+    if not runs:
+        return ()
     first = runs[0]
     for run in runs:
         for fan, (one, other) in enumerate(zip(first.tacho, run.tacho, strict=False)):
             if one != other:
                 raise TwinError(
-                    f"fan {fan}: its speed is measured by {one} in run {first.name!r} and by {other} in run "
-                    f"{run.name!r}: give runs that are measured alike"
+                    f"fan {fan}: measured by {one} in run {first.name!r}, and by {other} in run {run.name!r}: "
+                    "give runs that are measured alike"
                 )
     return first.tacho
 
 
-def starting_speed_rad_s(speed_rad_s: Array) -> Array:
-    """(fans,) mean of the first five measured speeds of (n, fans); NaN for a fan never measured."""
-    start = np.full(speed_rad_s.shape[1], np.nan)
-    for fan, column in enumerate(speed_rad_s.T):
-        measured = column[np.isfinite(column)][:STARTING_SAMPLES]
-        if measured.size:
-            start[fan] = measured.mean()
-    return start
+def starting_samples(t_s: Array, speed_rad_s: Array, tacho: Sequence[Tacho]) -> NDArray[np.bool_]:
+    """(n, batch) the first five readings that show mostly the time after the start. t_s, speed_rad_s: (n, batch)."""
+    after_start = np.isfinite(speed_rad_s) & (t_s - t_s[0] >= [each.mean_delay_s for each in tacho])
+    return after_start & (np.cumsum(after_start, axis=0) <= STARTING_SAMPLES)
+
+
+def starting_speed_rad_s(speed_rad_s: Array, early: NDArray[np.bool_] | None = None) -> Array:
+    """(fans,) mean of the first five measured speeds of (n, fans), or of the `early` ones; NaN for a fan without."""
+    if early is None:
+        measured = np.isfinite(speed_rad_s)
+        early = measured & (np.cumsum(measured, axis=0) <= STARTING_SAMPLES)
+    columns = zip(speed_rad_s.T, early.T, strict=True)
+    return np.array([column[wanted].mean() if wanted.any() else np.nan for column, wanted in columns])
 
 
 def _columns(values: ArrayLike) -> Array:

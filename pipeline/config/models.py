@@ -17,6 +17,7 @@ from pipeline.config.registry import STAGES
 from pipeline.devices.sample_source import SourceConfig
 from pipeline.devices.source_kinds import parse_source
 from pipeline.errors import UserError
+from schemas.tacho import Tachos, tacho_of_each_fan
 from schemas.topics import RESERVED_TRAY_NAMES
 from schemas.units import SpeedUnit
 
@@ -116,6 +117,11 @@ class TrayConfig(Section):
     command_min: float = Field(default=0.0, description="smallest command the device may send or be sent")
     command_max: float = Field(default=1.0, description="largest command the device may send or be sent")
     twin: Path | None = Field(default=None, description="ONNX file of the healthy twin")
+    tacho: Tachos = Field(
+        default={"kind": "instantaneous"},
+        validate_default=True,
+        description="how the speed is measured: one tacho for all fans, or a list with one for each",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -138,6 +144,11 @@ class TrayConfig(Section):
         if value in RESERVED_TRAY_NAMES:
             raise ValueError(f"{value!r} is a reserved name")
         return value
+
+    @model_validator(mode="after")
+    def _tacho_for_each_fan(self) -> Self:
+        tacho_of_each_fan(self.tacho, self.fans)
+        return self
 
     @model_validator(mode="after")
     def _commands_in_order(self) -> Self:

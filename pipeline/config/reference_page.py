@@ -21,6 +21,7 @@ from pipeline.config.loading import LARGEST_FILE_BYTES, top_level
 from pipeline.config.models import BusConfig, LauncherConfig, TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.devices.source_kinds import SOURCE_KINDS
+from schemas.tacho import Tacho
 
 _INTRODUCTION = f"""# Configuration
 
@@ -35,6 +36,7 @@ calibrated with.
 This page is made from the models in the code: `make configuration`.
 """
 _TYPE_WORDS = {str: "text", int: "integer", float: "number", bool: "`true` or `false`", Path: "path"}
+_ELSEWHERE = "see below"
 _BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 
 
@@ -49,6 +51,9 @@ def page() -> str:
         "One for each tray. `port`, `baud` and `protocol` may be written in it directly, for a serial source.\n",
         _table(TrayConfig, but=()),
         *_sources(),
+        "### `tacho = { kind = ..., ... }`\n",
+        "What a reading is of the speed ([tachos](../explanation/tachos.md)).\n",
+        _table(Tacho, but=()),
         "## `[bus]`\n",
         _table(BusConfig, but=()),
         "## `[launcher]`\n",
@@ -98,8 +103,9 @@ def _type_words(annotation: Any) -> str:
     if get_origin(annotation) is Literal:
         return " or ".join(f"`{json.dumps(value)}`" for value in get_args(annotation))
     if get_origin(annotation) is tuple:
-        return f"list of {_type_words(get_args(annotation)[0])}"
-    return _TYPE_WORDS.get(annotation, "see below")
+        of_one = _type_words(get_args(annotation)[0])
+        return of_one if of_one == _ELSEWHERE else f"list of {of_one}"
+    return _TYPE_WORDS.get(annotation, _ELSEWHERE)
 
 
 def _default(field: FieldInfo) -> str:

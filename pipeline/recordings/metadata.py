@@ -7,7 +7,9 @@ import json
 import logging
 from importlib.metadata import version
 
+from pipeline.recordings.reading import TACHO_KEY
 from pipeline.runtime.stage import Context
+from schemas.tacho import INSTANTANEOUS, tachos_to_json
 
 CONFIGURATION = "configuration.toml"
 _LOG = logging.getLogger(__name__)
@@ -27,6 +29,8 @@ def recording_metadata(context: Context) -> tuple[dict[str, str], dict[str, byte
     for tray in context.trays:
         metadata[f"fans.{tray.name}"] = str(tray.fans)
         metadata[f"speed_unit.{tray.name}"] = tray.speed_unit
+        if tray.tacho != INSTANTANEOUS:
+            metadata[f"{TACHO_KEY}.{tray.name}"] = tachos_to_json(tray.tacho)
         if tray.twin is not None:
             path = context.resolve(tray.twin)
             try:

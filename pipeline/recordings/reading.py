@@ -24,12 +24,15 @@ from pipeline.recordings.records import (
 )
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
+from schemas.tacho import INSTANTANEOUS, Tacho, tachos_from_json
 from schemas.topics import current_name, topic_of
 
 __all__ = ["METADATA_NAME", "Reading", "RecordingError", "RecordingMetadata", "read_metadata", "read_recording"]
 
 METADATA_NAME = "fantwin"
 """the metadata record that describes a recording"""
+TACHO_KEY = "tacho"
+"""with the name of a tray: its tachos, as schemas.tacho writes them"""
 
 
 @dataclass
@@ -142,6 +145,18 @@ class RecordingMetadata:
     def speed_unit(self, tray: str) -> str:
         """The unit in which people see a tray's speeds: the tray's, the recording's, or rad/s."""
         return self.metadata.get(f"speed_unit.{tray}") or self.metadata.get("speed_unit", "rad/s")
+
+    def tacho(self, tray: str) -> tuple[Tacho, ...]:
+        """How the speeds of a tray were measured; instantaneous where the recording does not say.
+
+        Raises:
+            RecordingError: what it says cannot be read.
+        """
+        text = self.metadata.get(f"{TACHO_KEY}.{tray}")
+        try:
+            return tachos_from_json(text) if text else INSTANTANEOUS
+        except ValueError as error:
+            raise RecordingError(f"the metadata are damaged: {TACHO_KEY}.{tray} is not a list of tachos") from error
 
 
 def read_metadata(path: Path) -> RecordingMetadata:

@@ -17,6 +17,7 @@ from pipeline.devices.device_clock import DeviceClock
 from pipeline.devices.measured_table import hold_last
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from schemas.messages import Array, Raw
+from schemas.tacho import Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
 
 
@@ -41,6 +42,8 @@ class RecordedTray:
     runs: tuple[RecordedRun, ...]
     speed_unit: str
     """unit in which its speeds are displayed"""
+    tacho: tuple[Tacho, ...]
+    """of each fan of its runs"""
     damage: str
     """what of the file could not be read, in one line; empty if all of it was read"""
 
@@ -79,7 +82,13 @@ def read_runs(
     runs = [run for run in runs if len(run.t_s) > 1]
     if not runs:
         raise RecordingError(f"{path}: fewer than two raw samples from {from_s:g} s to {to_s:g} s; see --from and --to")
-    return RecordedTray(tuple(runs), read_metadata(path).speed_unit(name), reading.damage)
+    metadata = read_metadata(path)
+    try:
+        tacho = tacho_of_each_fan(metadata.tacho(name), messages[0].fans)
+    except (ValueError, RecordingError) as error:
+        raise RecordingError(f"{path}: {error}") from error
+    chosen = tacho if fans is None else tuple(tacho[fan] for fan in fans)
+    return RecordedTray(tuple(runs), metadata.speed_unit(name), chosen, reading.damage)
 
 
 Columns = tuple[Array, Array, Array]

@@ -16,6 +16,7 @@ from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
 from schemas.messages import Raw
+from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.units import NS_PER_S
 
 _SAMPLED = 500
@@ -72,7 +73,15 @@ def default_config(
     for tray, messages in first.items():
         unit = metadata.speed_unit(tray) if metadata.speed_unit(tray) in ("rad/s", "rpm") else "rad/s"
         text += f'\n[[tray]]\nname = {json.dumps(tray)}\nfans = {messages[0].fans}\nspeed_unit = "{unit}"\n'
+        if (tacho := metadata.tacho(tray)) != INSTANTANEOUS:
+            text += f"tacho = [{', '.join(_toml_table(its) for its in tacho)}]\n"
     return parse_config(text, path, overrides, stages)
+
+
+def _toml_table(tacho: Tacho) -> str:
+    # Numbers and simple texts are written alike in JSON and in TOML.
+    items = (f"{key} = {json.dumps(value)}" for key, value in tacho.model_dump(exclude_defaults=True).items())
+    return f"{{ {', '.join(items)} }}"
 
 
 def _period_s(messages: Sequence[Raw]) -> float:

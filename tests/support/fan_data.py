@@ -3,11 +3,12 @@
 
 import numpy as np
 
+from schemas.tacho import Tacho
 from simulation import published_fan
 from simulation.published_fan import DRAG, INERTIA, NOISE_RAD_S, RATE_HZ, ROUGH_RANGE, VISCOUS
 from twin.runs import Array, Run
 
-__all__ = ["NOISE_RAD_S", "PUBLISHED_PARAMETERS", "RATE_HZ", "published_run", "rough_run", "stairs"]
+__all__ = ["NOISE_RAD_S", "PUBLISHED_PARAMETERS", "RATE_HZ", "counted_run", "published_run", "rough_run", "stairs"]
 
 PUBLISHED_PARAMETERS = np.array([INERTIA, VISCOUS, DRAG])
 
@@ -28,3 +29,28 @@ def published_run(seed: int, duration_s: float = 40.0, fans: int = 1) -> Run:
 def rough_run(seed: int, duration_s: float = 40.0, fans: int = 1, low: float = ROUGH_RANGE[0]) -> Run:
     """Fans with a dead zone in the drive and Stribeck friction, whose physics differ by 10 % from fan to fan."""
     return published_fan.rough_run(seed, duration_s, fans, low=low).run
+
+
+def counted_run(seed: int, tacho: Tacho, duration_s: float = 120.0, rate_hz: float = 10.0) -> Run:
+    """The published fan, measured by a counting tacho whose windows begin at a random time, without other noise.
+
+    Its commands change with the samples only.
+    """
+    held = round(RATE_HZ / rate_hz)
+    command = np.repeat(
+        stairs(np.random.default_rng(seed), round(duration_s * rate_hz), 1, *published_fan.TEST_RANGE), held, axis=0
+    )
+    speed_rad_s = published_fan.published_fan(command, seed, "counted").true_speed_rad_s[:, 0]
+    t_s = np.arange(len(speed_rad_s)) / RATE_HZ
+    turned = np.concatenate(([0.0], np.cumsum((speed_rad_s[1:] + speed_rad_s[:-1]) / (2.0 * RATE_HZ))))
+    first_s, phase = np.random.default_rng([seed, 2]).uniform(size=2)
+    ends_s = tacho.held_s * (first_s + np.arange(np.ceil(duration_s / tacho.held_s)))
+
+    def pulses_until(at_s: Array) -> Array:
+        return np.floor(phase + np.interp(at_s, t_s, turned) * tacho.pulses / (2.0 * np.pi))
+
+    counts = pulses_until(ends_s) - pulses_until(ends_s - tacho.window_s)
+    sampled = t_s[::held]
+    latest = np.searchsorted(ends_s, sampled - tacho.delay_s, side="right") - 1
+    readings = np.where(latest >= 0, counts[latest] * tacho.resolution_rad_s, np.nan)
+    return Run(f"counted {seed}", sampled, command[::held], readings, (tacho,))

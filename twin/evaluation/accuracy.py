@@ -2,7 +2,9 @@
 
 The main figures are those of the free run: it starts from the first five measured speeds, as a deployed twin does, and
 is driven by the commands alone. Runs are split at long gaps and restarted after them. The one-step error, from measured
-speeds to the next one, is given for comparison and is a weak measure. Missing samples are ignored. RMSE, maximum error
+speeds to the next one, is given for comparison and is a weak measure. Missing samples are ignored. What the tachos are
+expected to show of the free run is compared with what they showed (twin.measurement), from when on a reading shows
+nothing of the time before the start. RMSE, maximum error
 and R2 are equations (32) to (34) of Peng and Chen, the band of two sigma (35) and (36).
 """
 
@@ -15,8 +17,9 @@ from numpy.typing import NDArray
 
 from schemas.units import NS_PER_S
 from twin.errors import TwinError
+from twin.measurement import Measurement, measurement_of
 from twin.models.model import TwinModel
-from twin.runs import STARTING_SAMPLES, Array, Run, common_fans, starting_speed_rad_s
+from twin.runs import Array, Run, common_fans, starting_samples, starting_speed_rad_s
 
 Flags = NDArray[np.bool_]
 
@@ -31,7 +34,8 @@ class Figures:
     """Free-run figures in rad/s (r2 and coverage without unit), and the one-step error beside them.
 
     Infinite where the free run diverged; NaN where nothing was measured, and r2 where the speed never changed.
-    coverage_2_sigma: the share of samples within two healthy standard deviations of the free run.
+    coverage_2_sigma: the share of samples within two healthy standard deviations of the free run. floor_rad_s: the
+    rmse that the tachos would leave a perfect model; 0 where they are instantaneous, for their noise is not known.
     """
 
     rmse_rad_s: float
@@ -40,6 +44,7 @@ class Figures:
     one_step_rmse_rad_s: float
     coverage_2_sigma: float
     samples: int
+    floor_rad_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -53,17 +58,18 @@ class Evaluation:
 def evaluate_model(model: TwinModel, parameters: Array, sigma_rad_s: Array, runs: Sequence[Run]) -> Evaluation:
     """Evaluate on runs. parameters: (fans, 4). sigma_rad_s: (fans,) healthy standard deviation of the free run."""
     pieces = evaluation_pieces(runs)
-    speed = np.concatenate([piece.speed_rad_s for piece in pieces])
-    residual = free_run_residuals(model, parameters, pieces)
+    speed = np.concatenate([compared_readings(piece) for piece in pieces])
+    expected = [free_run_readings(model, parameters, piece) for piece in pieces]
+    residual = _residual(speed, np.concatenate(expected))
+    with np.errstate(invalid="ignore"):
+        noise = [measurement_of(piece).noise_rad_s(its) for piece, its in zip(pieces, expected, strict=True)]
     one_step = one_step_residuals(model, parameters, pieces)
-    within = np.abs(residual) <= 2.0 * sigma_rad_s
     measured = np.isfinite(speed)
     squared_deviation = np.where(measured, speed - _column_mean(speed), 0.0) ** 2
-    per_fan = tuple(
-        _figures(measured[:, fan], residual[:, fan], one_step[:, fan], within[:, fan], squared_deviation[:, fan])
-        for fan in range(speed.shape[1])
+    found = _Samples(
+        measured, residual, one_step, np.abs(residual) <= 2.0 * sigma_rad_s, squared_deviation, np.concatenate(noise)
     )
-    return Evaluation(per_fan, _figures(measured, residual, one_step, within, squared_deviation))
+    return Evaluation(tuple(_figures(found.of(fan)) for fan in range(speed.shape[1])), _figures(found))
 
 
 def evaluation_pieces(runs: Sequence[Run]) -> list[Run]:
@@ -75,15 +81,29 @@ def evaluation_pieces(runs: Sequence[Run]) -> list[Run]:
     return pieces
 
 
-def free_run_speeds(model: TwinModel, parameters: Array, piece: Run) -> Array:
-    """(n, fans) speeds from the measured start and the commands alone; not finite where the free run diverged."""
+def compared_readings(piece: Run) -> Array:
+    """(n, fans) readings in rad/s; NaN where missing, and where they show time before the start of the piece."""
+    return np.where(measurement_of(piece).comparable, piece.speed_rad_s, np.nan)
+
+
+def free_run_readings(model: TwinModel, parameters: Array, piece: Run) -> Array:
+    """(n, fans) readings in rad/s that the tachos are expected to show of a free run.
+
+    It follows from the measured start and the commands alone; not finite where it diverged.
+    """
     state = _starting_state(model, parameters, piece)
-    return model.advance(state, piece.command, piece.step_s, parameters)[0]
+    speed_rad_s = model.advance(state, piece.command, piece.step_s, parameters)[0]
+    return measurement_of(piece).of_speed(speed_rad_s)
 
 
 def free_run_residuals(model: TwinModel, parameters: Array, pieces: Sequence[Run]) -> Array:
-    """(samples, fans) measured minus free run over pieces one after the other: NaN missing, infinite diverged."""
-    return np.concatenate([_residual(piece.speed_rad_s, free_run_speeds(model, parameters, piece)) for piece in pieces])
+    """(samples, fans) reading minus that of the free run over pieces one after the other.
+
+    NaN where there is nothing to compare (compared_readings), infinite where the free run diverged.
+    """
+    return np.concatenate(
+        [_residual(compared_readings(piece), free_run_readings(model, parameters, piece)) for piece in pieces]
+    )
 
 
 def healthy_sigma_rad_s(residual: Array) -> Array:
@@ -108,22 +128,23 @@ def one_step_residuals(model: TwinModel, parameters: Array, pieces: Sequence[Run
 
 
 def _starting_state(model: TwinModel, parameters: Array, piece: Run) -> Array:
-    """The state whose free run is nearest, in least squares, to the first five measured speeds of each fan.
+    """The state whose free run is nearest, in least squares, to the first five readings of each fan.
 
-    Their mean is the speed at their middle: an accelerating fan would start too fast, the more so the longer its
-    sample period.
+    With a tacho that averages, to the first five that show mostly the time after the start. Their mean is the speed at
+    their middle: an accelerating fan would start too fast, the more so the longer its sample period.
     """
-    measured = np.isfinite(piece.speed_rad_s)
-    early = measured & (np.cumsum(measured, axis=0) <= STARTING_SAMPLES)
+    times = np.broadcast_to(piece.t_s[:, np.newaxis], piece.speed_rad_s.shape)
+    early = starting_samples(times, piece.speed_rad_s, piece.tacho)
     rows = slice(0, int(np.flatnonzero(early.any(axis=1)).max(initial=0)) + 1)
+    measurement = Measurement(times[rows], piece.tacho)
 
     def beginning(speed_rad_s: Array) -> Array:
         state = model.state_layout.initial_state(speed_rad_s, piece.command[0])
         predicted, _ = model.advance(state, piece.command[rows], piece.step_s[rows], parameters)
-        return np.where(early[rows], predicted, 0.0)
+        return np.where(early[rows], measurement.of_speed(predicted), 0.0)
 
     known = np.where(early, piece.speed_rad_s, 0.0)[rows]
-    start = np.nan_to_num(starting_speed_rad_s(piece.speed_rad_s))
+    start = np.nan_to_num(starting_speed_rad_s(piece.speed_rad_s, early))
     nudge = START_NUDGE * (1.0 + np.abs(start))
     for _ in range(START_ITERATIONS):
         predicted = beginning(start)
@@ -194,21 +215,38 @@ def _residual(measured: Array, predicted: Array) -> Array:
     return np.where(diverged, np.inf, measured - predicted)
 
 
-def _figures(measured: Flags, residual: Array, one_step: Array, within: Flags, squared_deviation: Array) -> Figures:
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """What figures are made of, (n, fans) or (n,)."""
+
+    measured: Flags
+    residual: Array
+    one_step: Array
+    within: Flags
+    squared_deviation: Array
+    noise: Array
+
+    def of(self, fan: int) -> "_Samples":
+        return _Samples(*(values[:, fan] for values in vars(self).values()))
+
+
+def _figures(found: _Samples) -> Figures:
+    measured = found.measured
     samples = int(np.count_nonzero(measured))
     if samples == 0:
         return Figures(np.nan, np.nan, np.nan, np.nan, np.nan, 0)
-    total, errors = float(squared_deviation.sum()), np.where(measured, residual, 0.0)
+    total, errors = float(found.squared_deviation.sum()), np.where(measured, found.residual, 0.0)
     with np.errstate(over="ignore"):
         squares = float(np.sum(errors**2))
-    steps = one_step[np.isfinite(one_step)]
+    steps = found.one_step[np.isfinite(found.one_step)]
     return Figures(
         rmse_rad_s=float(np.sqrt(squares / samples)),
         max_error_rad_s=float(np.abs(errors).max()),
         r2=1.0 - squares / total if total > 0.0 else np.nan,
         one_step_rmse_rad_s=float(np.sqrt(np.mean(steps**2))) if steps.size else np.nan,
-        coverage_2_sigma=float(np.count_nonzero(within & measured) / samples),
+        coverage_2_sigma=float(np.count_nonzero(found.within & measured) / samples),
         samples=samples,
+        floor_rad_s=float(np.sqrt(np.mean(found.noise[measured] ** 2))),
     )
 
 

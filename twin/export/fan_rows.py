@@ -1,9 +1,11 @@
 """Matches the fans of a twin with the fans of runs."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from schemas.twin_card import TwinCard
 from twin.errors import TwinError
+from twin.runs import Run
 
 
 def fan_rows(card: TwinCard, fans: int, fan_numbers: Sequence[int] | None = None) -> list[int]:
@@ -29,3 +31,12 @@ def fan_rows(card: TwinCard, fans: int, fan_numbers: Sequence[int] | None = None
         f"twin {card.name!r} has {card.fans} fans and does not say which, the runs have {in_runs}; "
         "give recordings of as many fans, or retrain"
     )
+
+
+def measured_as_in_card(card: TwinCard, rows: Sequence[int], runs: Sequence[Run]) -> list[Run]:
+    """The runs with the tachos of a twin: what its free run has to pass before it is compared with their readings.
+
+    rows: as fan_rows gives them.
+    """
+    tacho = tuple(card.tacho_of_each_fan[row] for row in rows)
+    return [replace(run, tacho=tacho) for run in runs]

@@ -10,12 +10,19 @@ the mean of w_k and w_k+1,
     x_k = v_k - inertia (w_k+1 - w_k) / h - viscous m_k - drag m_k |m_k| - friction
     f_k+1 = a f_k + (1 - a) x_k,    f_0 = 0,        balance_k = f_k / (1 - a^k)
 
+The readings of a tacho that averages take the place of the speed, and v_k is then what that tacho would show of the
+command (twin.measurement): v_k = (M v(t_k) + M v(t_k+1)) / 2.
+
 The filter weighs the difference quotient by (1 - a) / h, which is about lambda: white tacho noise of standard deviation
 s makes a balance of about inertia lambda s, whatever the rate. twin.fitting.balance_fit finds the coefficients.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
+from twin.measurement import Measurement
 from twin.models.lag import effective_command
 from twin.models.recursion import linear_recursion
 from twin.runs import Array
@@ -24,14 +31,21 @@ FILTER_RATE_PER_S = 3.0
 COEFFICIENTS = ("inertia", "viscous", "drag", "friction")
 
 
-def torque_balance(command: Array, speed_rad_s: Array, period_s: float, coefficients: Array, lag_s: Array) -> Array:
+def torque_balance(
+    command: Array,
+    speed_rad_s: Array,
+    period_s: float,
+    coefficients: Array,
+    lag_s: Array,
+    tacho: Sequence[Tacho] = INSTANTANEOUS,
+) -> Array:
     """(n, fans) balance in units of the command; NaN at first, and wherever the speed was not known.
 
     command, speed_rad_s: (n, fans) on a grid of period_s; an unknown speed is NaN, and the filter restarts after it.
     coefficients: (fans, 4) in the order of COEFFICIENTS. lag_s: (fans,); before the first sample the command is taken
-    as constant.
+    as constant. tacho: one for all fans, or one for each.
     """
-    terms, _ = filtered_terms(command, speed_rad_s, period_s, lag_s)
+    terms, _ = filtered_terms(command, speed_rad_s, period_s, lag_s, tacho)
     return balance_of(terms, coefficients)
 
 
@@ -40,12 +54,16 @@ def balance_of(terms: Array, coefficients: Array) -> Array:
     return terms[..., 0] - np.sum(terms[..., 1:] * coefficients, axis=-1)
 
 
-def filtered_terms(command: Array, speed_rad_s: Array, period_s: float, lag_s: Array) -> tuple[Array, Array]:
+def filtered_terms(
+    command: Array, speed_rad_s: Array, period_s: float, lag_s: Array, tacho: Sequence[Tacho] = INSTANTANEOUS
+) -> tuple[Array, Array]:
     """The balance is linear: (n, fans, 5) filtered command and what each coefficient multiplies; arguments as above.
 
     Beside it (n, fans) weight of measured samples in the filter, from 0 at a start to 1.
     """
     acting, _ = effective_command(command, np.full((len(command), 1), period_s), lag_s, command[0])
+    times = np.broadcast_to(period_s * np.arange(len(command), dtype=np.float64)[:, np.newaxis], command.shape)
+    acting = Measurement(times, tacho_of_each_fan(tacho, command.shape[1])).of_command(acting)
     middle = (speed_rad_s[1:] + speed_rad_s[:-1]) / 2.0
     rise = np.diff(speed_rad_s, axis=0) / period_s
     one = np.ones_like(middle)

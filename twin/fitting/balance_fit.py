@@ -17,7 +17,8 @@ Fuller, Measurement Error Models, 1987, section 1.1). So least squares is chosen
 that of the physics times sqrt(r), with r = inertia / J, but between 1/2 and 1: noise does not explain a J of twice the
 inertia or more.
 
-A fan that stands, starts or stops is left out, and so is the first second of each stretch. Errors are those of the
+A fan that stands, starts or stops is left out, and so is the first second of each stretch; with a tacho that averages
+also as long as a reading shows any of that. Errors are those of the
 identification where coefficients come from there, otherwise of the jackknife over the groups, which allows for errors
 that are correlated within a group and for runs that differ.
 """
@@ -35,6 +36,7 @@ from twin.evaluation.resampling import resampled
 from twin.evaluation.residual_analysis import analyse_residual
 from twin.fitting.balance import COEFFICIENTS, FILTER_RATE_PER_S, balance_of, filtered_terms
 from twin.fitting.identification import Identification
+from twin.measurement import measurement_of
 from twin.models.physics import LAG
 from twin.runs import GAP_IN_MEDIAN_PERIODS, Array, Run
 
@@ -122,12 +124,12 @@ def _stretches(runs: Sequence[Run], lag_s: Array, lowest_speed_rad_s: Array) -> 
                 continue
             grid = resampled(piece, rate_hz)
             speed = np.column_stack([_bridged(of_fan) for of_fan in grid.speed_rad_s.T])
-            terms, weight = filtered_terms(grid.command, speed, 1.0 / rate_hz, lag_s)
+            terms, weight = filtered_terms(grid.command, speed, 1.0 / rate_hz, lag_s, grid.tacho)
             standing = np.abs(speed) < lowest_speed_rad_s
-            reach = round(SETTLING_S * rate_hz)
+            reach = round((SETTLING_S + max(tacho.reach_s for tacho in grid.tacho)) * rate_hz)
             near_standstill = maximum_filter1d(standing.astype(np.int8), 2 * reach + 1, axis=0, mode="nearest") > 0
             settled = weight >= 1.0 - np.exp(-FILTER_RATE_PER_S * SETTLING_S)
-            counts = settled & ~near_standstill
+            counts = settled & ~near_standstill & measurement_of(grid).comparable
             found.append(_Stretch(index, grid, np.where(counts[..., np.newaxis], terms, np.nan)))
     return found
 

@@ -1,6 +1,8 @@
 """Levenberg-Marquardt on the free-run error, with exact sensitivities.
 
-Minimises the sum of a pseudo-Huber loss of (measured - free run) / scale over every measured sample. The unknowns are
+Minimises the sum of a pseudo-Huber loss of (reading - that of the free run) / scale over every sample that is compared.
+What the tachos are expected to show of a free run is linear in it (twin.measurement), and so in its sensitivities. The
+unknowns are
 
     the weights of a network, shared by all fans,
     each fan's own physics (twin.models.physical: ln J, two ln dampings, lag), and
@@ -95,7 +97,8 @@ class NetworkPrior:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A candidate: its free run and residual (n, batch), zero where missing, and its cost (fans,) without the prior."""
+    """A candidate: its free run and the residual of its readings (n, batch), zero where nothing is compared, and its
+    cost (fans,) without the prior."""
 
     unknowns: Unknowns
     speed_rad_s: Array
@@ -214,7 +217,7 @@ class FreeRunProblem:
         speed, _ = free_run(equation, unknowns.initial_speed_rad_s, command, data.step_s, guess)
         scale = self.scale_rad_s[data.fan]
         with np.errstate(over="ignore", invalid="ignore"):
-            residual = np.where(data.measured, data.speed_rad_s - speed, 0.0)
+            residual = np.where(data.compared, data.speed_rad_s - data.measurement.of_speed(speed), 0.0)
             loss = HUBER_DELTA**2 * (np.hypot(1.0, residual / (HUBER_DELTA * scale)) - 1.0)
             cost = np.bincount(data.fan, loss.sum(axis=0), self.fans).astype(np.float64)
         cost[~np.isfinite(cost)] = np.inf
@@ -263,13 +266,13 @@ class FreeRunProblem:
         return squares, gradient
 
     def sample_weights(self, residual: Array, part: slice) -> Array:
-        """(n, batch) the pseudo-Huber loss's weight of each sample: 1 for small residuals, 0 where missing."""
+        """(n, batch) the pseudo-Huber loss's weights: 1 for small residuals, 0 where nothing is compared."""
         data = self.trajectories
         scaled = residual / self.scale_rad_s[data.fan[part]]
-        return np.where(data.measured[:, part], 1.0 / np.hypot(1.0, scaled / HUBER_DELTA), 0.0)
+        return np.where(data.compared[:, part], 1.0 / np.hypot(1.0, scaled / HUBER_DELTA), 0.0)
 
     def sensitivities(self, point: Point, part: slice) -> Array:
-        """(n, batch, M) derivatives of the free run by weights, physics unknowns and initial speed."""
+        """(n, batch, M) derivatives of the free run's readings by weights, physics unknowns and initial speed."""
         data = self.trajectories
         fan, step_s = data.fan[part], data.step_s[:, part]
         parameters = self.parameters(point.unknowns)[fan]
@@ -282,7 +285,8 @@ class FreeRunProblem:
             by_parameters[..., :LAG] = raw[..., self.weights : -2]
         chain = parameters_by_unknowns(point.unknowns.physics, self.top_speed_rad_s)[fan]
         by_own = np.einsum("nbp,bpq->nbq", by_parameters, chain)
-        return np.concatenate((raw[..., : self.weights], by_own, raw[..., -1:]), axis=-1)
+        sensitivities = np.concatenate((raw[..., : self.weights], by_own, raw[..., -1:]), axis=-1)
+        return data.measurement.of_speed(sensitivities, part)
 
     def step(self, point: Point, squares: Array, gradient: Array, damping: Array) -> Unknowns:
         """The damped Gauss-Newton step: initial speeds eliminated first, then each fan's physics, then the weights."""
@@ -366,9 +370,9 @@ class FreeRunProblem:
         )
 
     def rmse_rad_s(self, point: Point) -> float:
-        """Root mean square of the residual over all measured samples."""
+        """Root mean square of the residual over all samples that are compared."""
         with np.errstate(over="ignore"):
-            return float(np.sqrt(np.sum(point.residual**2) / np.count_nonzero(self.trajectories.measured)))
+            return float(np.sqrt(np.sum(point.residual**2) / np.count_nonzero(self.trajectories.compared)))
 
 
 def robust_scale(residual: Array, trajectories: Trajectories) -> Array:
@@ -381,9 +385,9 @@ def robust_scale(residual: Array, trajectories: Trajectories) -> Array:
     scale = np.ones(fans)
     for fan in np.unique(trajectories.fan):
         columns = trajectories.fan == fan
-        measured = trajectories.measured[:, columns]
-        magnitude = np.abs(residual[:, columns][measured])
-        span = float(np.ptp(trajectories.speed_rad_s[:, columns][measured]))
+        compared = trajectories.compared[:, columns]
+        magnitude = np.abs(residual[:, columns][compared])
+        span = float(np.ptp(trajectories.speed_rad_s[:, columns][compared]))
         # A magnitude beyond the range carries no information and may be infinite.
         robust_std = float(np.quantile(np.fmin(magnitude, span), 0.9)) / NORMAL_90_PERCENT
         scale[fan] = max(robust_std, 1e-6 * span, np.finfo(float).tiny)

@@ -72,14 +72,17 @@ def identifiability_warnings(runs: Sequence[Run], parameters: Array, covariance:
     )
 
 
-def misfit_warnings(pieces: Sequence[Run], rmse_rad_s: Array) -> tuple[str, ...]:
-    """One line for each fan whose free run stays clear of its noise. rmse_rad_s: (fans,). pieces: without gaps."""
+def misfit_warnings(pieces: Sequence[Run], rmse_rad_s: Array, floor_rad_s: Array) -> tuple[str, ...]:
+    """One line for each fan whose free run stays clear of its noise. pieces: without gaps.
+
+    rmse_rad_s: (fans,). floor_rad_s: (fans,) of it due to the tacho alone, 0 where that is instantaneous.
+    """
     return tuple(
         f"fan {fan}: the physical model misses the speed by {rmse:.3g} rad/s, of which noise explains {noise:.3g}: "
         "friction, dead zone or drive bend its parameters, and their intervals, which hold for the equation as it is, "
         "are too narrow; a hybrid learns the difference"
         for fan, rmse in enumerate(rmse_rad_s)
-        if rmse > MISFIT * (noise := _noise(pieces, fan)) > 0.0
+        if rmse > MISFIT * (noise := floor_rad_s[fan] or _noise(pieces, fan)) > 0.0
     )
 
 
@@ -285,7 +288,12 @@ def _speed_range(pieces: Sequence[Run], fan: int) -> tuple[float, float]:
 
 
 def _noise(pieces: Sequence[Run], fan: int) -> float:
-    """Robust standard deviation of white noise with the second differences of the speed, in rad/s."""
+    """Standard deviation of the noise of a speed that does not change, in rad/s.
+
+    That of the tacho's resolution where it counts; or else, robust, of white noise with the second differences.
+    """
+    if graded := pieces[0].tacho[fan].resolution_rad_s / np.sqrt(6.0):
+        return float(graded)
     bends = np.concatenate([np.diff(piece.speed_rad_s[:, fan], 2) for piece in pieces])
     bends = bends[np.isfinite(bends)]
     return float(1.4826 * np.median(np.abs(bends)) / np.sqrt(6.0)) if bends.size else 0.0

@@ -1,7 +1,8 @@
 """The physical parameters of each fan, with their confidence intervals.
 
 First the filtering operator (twin.fitting.filtering): least squares for a = alpha / J, a_N = C_D / J and b = 1 / J,
-equations (11) to (20) of Peng and Chen. Its one free choice, lambda, is made by the data: of a ladder of values, the
+equations (11) to (20) of Peng and Chen, on the readings and on the commands as the tacho would show them
+(twin.measurement). Its one free choice, lambda, is made by the data: of a ladder of values, the
 largest whose parameters give nearly the smallest free-run error. A small lambda is sensitive to slow drift; a large one
 follows the response to the command, which is what has to be learned.
 
@@ -32,6 +33,7 @@ from twin.fitting.filtering import filtered_regression
 from twin.fitting.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, fit_free_run
 from twin.fitting.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings, misfit_warnings
 from twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
+from twin.measurement import with_measured_command
 from twin.models import physics
 from twin.models.integration import free_run
 from twin.models.physical import PhysicalModel, fitted_unknowns, parameters_by_unknowns, physical_parameters
@@ -123,7 +125,7 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
         top_speed_rad_s=top_speed,
         iterations=iterations,
         warnings=identifiability_warnings(runs, parameters, covariance),
-        misfits=misfit_warnings(pieces, rmse_rad_s),
+        misfits=misfit_warnings(pieces, rmse_rad_s, _floor_rad_s(fit, trajectories, fans)),
     )
 
 
@@ -160,7 +162,8 @@ def _filtered_start(pieces: Sequence[Run], top_speed_rad_s: Array) -> tuple[Arra
     longest_s = max(piece.duration_s for piece in pieces)
     step_s = min(piece.median_period_s for piece in pieces)
     ladder = np.geomspace(4.0 / longest_s, 0.5 / step_s, LAMBDA_LADDER)
-    candidates = np.array([[filtering_operator(pieces, fan, rung) for fan in range(fans)] for rung in ladder])
+    alike = [with_measured_command(piece) for piece in pieces]
+    candidates = np.array([[filtering_operator(alike, fan, rung) for fan in range(fans)] for rung in ladder])
     trajectories = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, 1.0))
     candidates = np.array([_stable(candidate, top_speed_rad_s) for candidate in candidates])
     errors = np.array([_free_run_errors(candidate, trajectories) for candidate in candidates])
@@ -181,10 +184,10 @@ def _free_run_errors(parameters: Array, trajectories: Trajectories) -> Array:
     equation = FanEquation(parameters[trajectories.fan], None)
     initial, guess = trajectories.starting_speed_rad_s(), trajectories.interpolated_speed_rad_s()
     speed, _ = free_run(equation, initial, trajectories.command, trajectories.step_s, guess)
-    measured = trajectories.measured
-    error = np.where(measured, np.abs(trajectories.speed_rad_s - speed), 0.0).sum(axis=0)
+    compared, shown = trajectories.compared, trajectories.measurement.of_speed(speed)
+    error = np.where(compared, np.abs(trajectories.speed_rad_s - shown), 0.0).sum(axis=0)
     fans = len(parameters)
-    mean = np.bincount(trajectories.fan, error, fans) / np.bincount(trajectories.fan, measured.sum(axis=0), fans)
+    mean = np.bincount(trajectories.fan, error, fans) / np.bincount(trajectories.fan, compared.sum(axis=0), fans)
     return np.where(np.isfinite(mean), mean, np.inf)
 
 
@@ -198,7 +201,7 @@ def _refine(
     """The fit of the free run from parameters (fans, 4), and what _covariance says of it."""
     fans = len(start)
     start_physics = fitted_unknowns(start, top_speed_rad_s)
-    pull = inertia_anchor(np.count_nonzero(trajectories.measured) / fans)
+    pull = inertia_anchor(np.count_nonzero(trajectories.compared) / fans)
     prior = Prior(0.0, pull, start_physics if anchor is None else fitted_unknowns(anchor, top_speed_rad_s))
     fit = fit_free_run(
         PhysicalModel(),
@@ -270,7 +273,15 @@ def _covariance(
 def _rmse_rad_s(fit: FreeRunFit, trajectories: Trajectories, fans: int) -> Array:
     """(fans,) root mean square of the free-run residual."""
     squares = np.bincount(trajectories.fan, np.sum(fit.point.residual**2, axis=0), fans)
-    return np.sqrt(squares / np.bincount(trajectories.fan, trajectories.measured.sum(axis=0), fans))
+    return np.sqrt(squares / np.bincount(trajectories.fan, trajectories.compared.sum(axis=0), fans))
+
+
+def _floor_rad_s(fit: FreeRunFit, trajectories: Trajectories, fans: int) -> Array:
+    """(fans,) root mean square that the tachos would leave a perfect model."""
+    measurement, compared = trajectories.measurement, trajectories.compared
+    noise = measurement.noise_rad_s(measurement.of_speed(fit.point.speed_rad_s))
+    squares = np.bincount(trajectories.fan, np.sum(noise**2, axis=0, where=compared), fans)
+    return np.sqrt(squares / np.bincount(trajectories.fan, compared.sum(axis=0), fans))
 
 
 def _physical_basis(speed_rad_s: Array, command: Array) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 
 from twin.fitting.filtering import filtered_regression
 from twin.fitting.identification import Identification
+from twin.measurement import with_measured_command
 from twin.models.lag import effective_command
 from twin.models.model import NetworkOde
 from twin.models.network import TanhNetwork
@@ -92,7 +93,7 @@ def _output_regression(model: NetworkOde, pieces: Sequence[Run], identification:
     """Filtered target (m,), less the known acceleration, and output-layer regressors (m, units + 1) of all fans."""
     targets, regressors = [], []
     lambda_per_s = float(np.median(identification.lambda_per_s))
-    for piece in pieces:
+    for piece in map(with_measured_command, pieces):
         acting, _ = effective_command(
             piece.command, piece.step_s[:, np.newaxis], identification.parameters[:, LAG], piece.command[0]
         )

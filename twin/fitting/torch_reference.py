@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from twin.errors import TwinError
 from twin.evaluation.accuracy import evaluation_pieces
 from twin.fitting.identification import Identification
 from twin.fitting.training import SHORT_STRETCH_TIME_CONSTANTS, Progress
@@ -69,13 +70,17 @@ def train_adam(
     """Train from the model's weights on stretches of ten time constants; returns the best iterate, and max_iterations.
 
     Each stretch starts from the mean of its first five measured speeds. Its physics, the lag included, stay as they
-    were identified.
+    were identified. Raises TwinError for tachos that average: the published recipe takes readings for speeds.
     """
     pieces = evaluation_pieces(runs)
+    if any(tacho.reach_s > 0.0 for run in pieces for tacho in run.tacho):
+        raise TwinError(
+            "trainer 'adam' takes readings for speeds, which a counting tacho's are not; use levenberg-marquardt"
+        )
     period_s = min(piece.median_period_s for piece in pieces)
     longest_s = float(identification.time_constant_s.max())
     data = cut_into_trajectories(pieces, stretch_samples(longest_s, period_s, SHORT_STRETCH_TIME_CONSTANTS))
-    measured = _tensor(data.measured)
+    measured = _tensor(data.compared)
     speed = _tensor(np.nan_to_num(data.speed_rad_s))
     parameters = identification.parameters[data.fan]
     acting, _ = effective_command(data.command, data.step_s, parameters[:, LAG], data.command_before)

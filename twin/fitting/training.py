@@ -37,7 +37,7 @@ from twin.models.model import NetworkOde
 from twin.models.network import Scaling
 from twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
 from twin.models.physics import LAG, PARAMETER_NAMES
-from twin.runs import STARTING_SAMPLES, Array, Run
+from twin.runs import Array, Run
 
 Progress = Callable[[int, int, float], None]
 """Called with iterations done, iterations at most, and the present free-run rmse in rad/s."""
@@ -183,7 +183,6 @@ class _BestFreeRun:
         self.progress = progress
         self.iterations = 0
         self.guess_rad_s = self.data.interpolated_speed_rad_s()
-        self.early = self.data.measured & (np.cumsum(self.data.measured, axis=0) <= STARTING_SAMPLES)
         self.problem.scale_rad_s = robust_scale(self._free_run(untrained).residual, self.data)
         self.best, self.best_loss = untrained, float(self._free_run(untrained).cost.sum())
         self.stalled_iterations = 0
@@ -217,6 +216,8 @@ class _BestFreeRun:
         """From the speeds whose free runs are nearest to the first measured ones, as in twin.evaluation.accuracy."""
         started = Unknowns(unknowns.weights, unknowns.physics, self.data.starting_speed_rad_s())
         point = self.problem.evaluate(started, self.guess_rad_s)
-        missed = np.sum(point.residual, axis=0, where=self.early) / self.early.sum(axis=0)
+        early = self.data.early
+        residual = self.data.speed_rad_s - self.data.measurement.of_speed(point.speed_rad_s)
+        missed = np.sum(residual, axis=0, where=early) / early.sum(axis=0)
         nearer = started.initial_speed_rad_s + np.where(np.isfinite(missed), missed, 0.0)
         return self.problem.evaluate(replace(started, initial_speed_rad_s=nearer), point.speed_rad_s)

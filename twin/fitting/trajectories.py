@@ -1,17 +1,21 @@
 """Runs cut into many short free runs that are integrated side by side.
 
 Time is the only axis that has to be processed in order, so fitting cuts runs into stretches of a few time constants and
-treats stretches and fans alike as one batch. Each stretch has its own initial speed.
+treats stretches and fans alike as one batch. Each stretch has its own initial speed. A tacho that averages shows at
+first the time before: a stretch that continues another begins earlier by that time, which is not compared again.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.tacho import Tacho
 from twin.errors import TwinError
-from twin.runs import Array, Run, starting_speed_rad_s
+from twin.measurement import Measurement
+from twin.runs import Array, Run, common_tacho, starting_samples, starting_speed_rad_s
 
 MIN_SAMPLES = 200
 MAX_SAMPLES = 12_000
@@ -25,6 +29,7 @@ class Trajectories:
     fan: (batch,) which fan each stretch belongs to. command, speed_rad_s, step_s: (n, batch). Padding has a step of
     zero, which leaves the state where it is, and a speed of NaN, which counts as missing. command_before: (batch,), the
     command in force before each stretch, which stands for the lagged one: a lag is short beside a stretch.
+    tacho: of each fan. lead_in: (batch,) so many first samples belong to the stretch before.
     """
 
     fan: NDArray[np.intp]
@@ -32,28 +37,48 @@ class Trajectories:
     command: Array
     speed_rad_s: Array
     step_s: Array
+    tacho: tuple[Tacho, ...]
+    lead_in: NDArray[np.intp]
 
-    @property
-    def measured(self) -> NDArray[np.bool_]:
-        """(n, batch) which samples hold a measured speed."""
-        return np.isfinite(self.speed_rad_s)
+    @cached_property
+    def measurement(self) -> Measurement:
+        """From the speeds of the stretches to the readings that are expected."""
+        start = np.zeros((1, len(self.fan)))
+        t_s = np.concatenate((start, np.cumsum(self.step_s[:-1], axis=0)))
+        return Measurement(t_s, [self.tacho[fan] for fan in self.fan.tolist()])
+
+    @cached_property
+    def compared(self) -> NDArray[np.bool_]:
+        """(n, batch) which readings a free run is compared with."""
+        own = np.arange(len(self.speed_rad_s))[:, np.newaxis] >= self.lead_in
+        return np.isfinite(self.speed_rad_s) & self.measurement.comparable & own
+
+    @cached_property
+    def early(self) -> NDArray[np.bool_]:
+        """(n, batch) the readings that a free run starts from (twin.runs.starting_samples)."""
+        return starting_samples(self.measurement.t_s, self.speed_rad_s, self.measurement.tacho)
 
     def thinned(self, max_samples: int) -> "Trajectories":
         """Some of the stretches, always the same ones of a random choice, with at most about max_samples in all."""
         count = min(len(self.fan), max(1, max_samples // len(self.command)))
-        chosen = np.sort(np.random.default_rng(0).permutation(len(self.fan))[:count])
+        return self.of_columns(np.sort(np.random.default_rng(0).permutation(len(self.fan))[:count]))
+
+    def of_columns(self, chosen: NDArray[np.intp]) -> "Trajectories":
+        """The stretches with these indices."""
         return Trajectories(
             self.fan[chosen],
             self.command_before[chosen],
             self.command[:, chosen],
             self.speed_rad_s[:, chosen],
             self.step_s[:, chosen],
+            self.tacho,
+            self.lead_in[chosen],
         )
 
     def interpolated_speed_rad_s(self) -> Array:
         """(n, batch) the speeds, the missing ones interpolated: a first guess of a free run."""
         samples = np.arange(len(self.speed_rad_s))
-        measured = self.measured
+        measured = np.isfinite(self.speed_rad_s)
         columns = [
             np.interp(samples, samples[known], speed[known])
             for speed, known in zip(self.speed_rad_s.T, measured.T, strict=True)
@@ -62,37 +87,50 @@ class Trajectories:
 
     def starting_speed_rad_s(self) -> Array:
         """(batch,) mean of the first measured speeds of each stretch."""
-        return starting_speed_rad_s(self.speed_rad_s)
+        return starting_speed_rad_s(self.speed_rad_s, self.early)
 
 
 def cut_into_trajectories(runs: Sequence[Run], max_samples: int) -> Trajectories:
-    """Every fan of every run, in equal stretches of at most max_samples. Stretches without two speeds are left out.
+    """Every fan of every run, in equal stretches of at most max_samples, and before each what its first readings show.
 
-    The runs must not hold gaps (Run.split_at_gaps). Raises TwinError when nothing is left.
+    Stretches without two speeds are left out. The runs must not hold gaps (Run.split_at_gaps) and must be measured
+    alike. Raises TwinError when nothing is left.
     """
-    parts = [(run, first, last) for run in runs for first, last in run.equal_parts(max_samples)]
-    length = max((last - first for _, first, last in parts), default=0)
-    fans = runs[0].fans if runs else 0
+    tacho = common_tacho(runs)
+    reach_s = max((each.reach_s for each in tacho), default=0.0)
+    parts = [
+        (run, _begin(run, first, reach_s), first, last) for run in runs for first, last in run.equal_parts(max_samples)
+    ]
+    length = max((last - begin for _, begin, _, last in parts), default=0)
+    fans = len(tacho)
     shape = (length, len(parts), fans)
     command, step_s, speed = np.zeros(shape), np.zeros(shape), np.full(shape, np.nan)
     before = np.zeros(shape[1:])
-    for index, (run, first, last) in enumerate(parts):
-        part = run.rows(first, last)
+    for index, (run, begin, _, last) in enumerate(parts):
+        part = run.rows(begin, last)
         command[: part.samples, index] = part.command
         speed[: part.samples, index] = part.speed_rad_s
         step_s[: part.samples - 1, index] = part.step_s[:-1, np.newaxis]
-        before[index] = run.command[max(first - 1, 0)]
-    usable = np.flatnonzero(np.isfinite(speed).sum(axis=0).ravel() >= 2)
+        before[index] = run.command[max(begin - 1, 0)]
+    flat = (length, len(parts) * fans)
+    everything = Trajectories(
+        fan=np.tile(np.arange(fans), len(parts)),
+        command_before=before.ravel(),
+        command=command.reshape(flat),
+        speed_rad_s=speed.reshape(flat),
+        step_s=step_s.reshape(flat),
+        tacho=tacho,
+        lead_in=np.repeat([first - begin for _, begin, first, _ in parts], fans),
+    )
+    usable = np.flatnonzero(everything.compared.sum(axis=0) >= 2)
     if not usable.size:
         raise TwinError("the runs hold no stretch with two measured speeds; check the speed column")
-    flat = (length, -1)
-    return Trajectories(
-        fan=np.tile(np.arange(fans), len(parts))[usable],
-        command_before=before.ravel()[usable],
-        command=command.reshape(flat)[:, usable],
-        speed_rad_s=speed.reshape(flat)[:, usable],
-        step_s=step_s.reshape(flat)[:, usable],
-    )
+    return everything.of_columns(usable)
+
+
+def _begin(run: Run, first: int, reach_s: float) -> int:
+    """The last sample from which on sample `first` shows nothing of the time before; 0 where there is none."""
+    return int(max(np.searchsorted(run.t_s, run.t_s[first] - reach_s, side="right") - 1, 0))
 
 
 def stretch_samples(time_constant_s: float, period_s: float, time_constants: float) -> int:

@@ -7,13 +7,13 @@ import numpy as np
 
 from schemas.twin_card import DataCard, TwinCard
 from twin.build import evaluate
-from twin.evaluation.accuracy import Evaluation, Figures, evaluation_pieces, free_run_speeds
+from twin.evaluation.accuracy import Evaluation, Figures, compared_readings, evaluation_pieces, free_run_readings
 from twin.evaluation.residual_analysis import ResidualAnalysis, analyse_residual
-from twin.export.fan_rows import fan_rows
+from twin.export.fan_rows import fan_rows, measured_as_in_card
 from twin.export.onnx_twin import OnnxTwin
 from twin.report.speed_bins import SpeedBin, speed_bins
 from twin.report.timeline import Timeline, timeline
-from twin.runs import Array, Run
+from twin.runs import Array, Run, common_fans
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,9 @@ def report_content(
     Raises TwinError when the twin does not fit the runs, or there is nothing to evaluate.
     """
     evaluation = evaluate(twin, runs, fan_numbers)
-    pieces = evaluation_pieces(runs)
-    fans = pieces[0].fans
+    fans = common_fans(runs)
     rows = fan_rows(twin.card, fans, fan_numbers)
+    pieces = evaluation_pieces(measured_as_in_card(twin.card, rows, runs))
     parameters, sigma_rad_s = twin.parameters[rows], np.array(twin.card.sigma_rad_s)[rows]
     identified, intervals_95 = (
         np.array(of_card)[rows] for of_card in (twin.card.identified_parameters, twin.card.parameter_interval_95)
@@ -106,9 +106,10 @@ def report_content(
     command, measured = (
         np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("command", "speed_rad_s")
     )
-    predicted = np.concatenate([free_run_speeds(twin, parameters, piece) for piece in pieces])
+    predicted = np.concatenate([free_run_readings(twin, parameters, piece) for piece in pieces])
     predicted[~np.isfinite(predicted)] = np.nan
-    error = np.where(np.isfinite(measured) & ~np.isfinite(predicted), np.inf, measured - predicted)
+    compared = np.concatenate([compared_readings(piece) for piece in pieces])
+    error = np.where(np.isfinite(compared) & ~np.isfinite(predicted), np.inf, compared - predicted)
     residuals = analyse_residual(error, pieces)
     return Content(
         twin=twin,

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
+from pydantic import ValidationError
 
 from pipeline.cli.options import JsonOption
 from pipeline.config.models import NAME_PATTERN
 from pipeline.devices.measured_table import Table, read_table
+from pipeline.devices.tacho_evidence import tacho_hints
 from pipeline.errors import UserError
+from pipeline.recordings.reading import TACHO_KEY
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Raw
+from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan, tachos_to_json
 from schemas.topics import RESERVED_TRAY_NAMES, tray_key
+from schemas.units import NS_PER_S
 
 SITE = "imported"
 SAMPLES_PER_MESSAGE = 100
@@ -46,32 +52,70 @@ def import_table(
         str | None, typer.Option(metavar="TIME", help="Time between rows of a table without a time column, e.g. 10ms.")
     ] = None,
     tray: Annotated[str, typer.Option(help="Name of the tray in the recording.")] = "tray1",
+    tacho: Annotated[
+        Literal["instantaneous", "count", "period"], typer.Option(help="How the speeds were measured.")
+    ] = "instantaneous",
+    pulses: Annotated[int, typer.Option(help="Pulses of a tacho per revolution.")] = 2,
+    window_s: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--window",
+            metavar="S",
+            help="Seconds over which pulses are counted: one for all fans, or one per fan. Repeatable.",
+        ),
+    ] = None,
+    update_s: Annotated[
+        float, typer.Option("--update", metavar="S", help="Seconds between new counts. Default: the window.")
+    ] = 0.0,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing recording.")] = False,
     json_output: JsonOption = False,
 ) -> None:
     """Turn a measured table into a recording, the data format of training, evaluation and replay.
 
-    Irregularities (repeated times, gaps, empty cells) are counted and reported; speeds are never filled in.
+    Irregularities (repeated times, gaps, empty cells) are counted and reported; speeds are never filled in. Tachos of
+    ordinary fans count pulses: say over which time, or see the hint.
 
-    Example: fantwin import FILE.csv --time t:s --command u --speed y:rpm -o REC.mcap
+    Example: fantwin import FILE.csv --time t:s --command u --speed y:rpm --tacho count --window 1 -o REC.mcap
     """
     if not re.match(NAME_PATTERN, tray) or tray in RESERVED_TRAY_NAMES:
         raise UserError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
     if output.exists() and not force:
         raise UserError(f"{output}: exists; name another file with -o, or replace it with --force")
+    tachos = _tachos(tacho, pulses, window_s or [0.0], update_s, len(speed))
     table = read_table(file, time, command, speed, period=period)
-    write_table(table, output, tray)
+    write_table(table, output, tray, tachos)
+    hints = tacho_hints(table.t_ns / NS_PER_S, table.speed_rad_s, tachos, range(table.fans))
     if json_output:
-        typer.echo(json.dumps(import_summary(table, output)))
+        typer.echo(json.dumps(import_summary(table, output) | {"hints": hints}))
         return
     fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"
     period = f"{table.median_period_s * 1e3:.3g} ms apart (median)"
     typer.echo(f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {period}")
     for note in (*filter(None, [table.assumed]), *table.notes):
         typer.echo(f"  {note}")
+    for hint in hints:
+        typer.echo(f"hint: {hint}; see --tacho and --window", err=True)
 
 
-def write_table(table: Table, output: Path, tray: str) -> None:
+def _tachos(
+    kind: Literal["instantaneous", "count", "period"],
+    pulses: int,
+    windows_s: Sequence[float],
+    update_s: float,
+    fans: int,
+) -> tuple[Tacho, ...]:
+    try:
+        tachos = [Tacho(kind=kind, pulses=pulses, window_s=window_s, update_s=update_s) for window_s in windows_s]
+        tacho_of_each_fan(tachos, fans)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UserError(f"--tacho {kind}: {first['msg'].removeprefix('Value error, ')}; see --window") from error
+    except ValueError as error:
+        raise UserError(f"--window: {error}") from error
+    return tuple(tachos)
+
+
+def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...] = INSTANTANEOUS) -> None:
     """Write the samples of a table as raw messages; the time of receipt is the time in the table.
 
     Raises:
@@ -84,6 +128,8 @@ def write_table(table: Table, output: Path, tray: str) -> None:
         "trays": tray,
         "speed_unit": table.speed_unit,
     }
+    if tachos != INSTANTANEOUS:
+        metadata[f"{TACHO_KEY}.{tray}"] = tachos_to_json(tachos)
     with RecordingWriter(output, metadata, t_ns=int(table.t_ns[0]), overwrite=True) as writer:
         for sequence, first in enumerate(range(0, len(table.t_ns), SAMPLES_PER_MESSAGE)):
             rows = slice(first, first + SAMPLES_PER_MESSAGE)

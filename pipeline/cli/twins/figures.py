@@ -21,6 +21,7 @@ def figures_in(figures: Figures, rad_s_per_unit: float) -> dict[str, float | int
         "r2": figures.r2,
         "one_step_rmse": figures.one_step_rmse_rad_s / rad_s_per_unit,
         "coverage_2_sigma": figures.coverage_2_sigma,
+        "tacho_floor": figures.floor_rad_s / rad_s_per_unit,
     }
     return {name: value if math.isfinite(value) else None for name, value in values.items()} | {
         "samples": figures.samples
@@ -39,8 +40,9 @@ def shown(value: float | None, form: str = FOUR_DIGITS, undefined: str = "undefi
 def sentence(figures: dict[str, Any], unit: str) -> str:
     """Figures in one line."""
     text = {name: shown(figures[name]) for name in ("rmse", "max_error", "one_step_rmse")}
+    floor = f" (a perfect model: {shown(figures['tacho_floor'])} by the tacho alone)" if figures["tacho_floor"] else ""
     return (
-        f"free run: rmse {text['rmse']} {unit}, max error {text['max_error']} {unit}, "
+        f"free run: rmse {text['rmse']} {unit}{floor}, max error {text['max_error']} {unit}, "
         f"R2 {shown(figures['r2'], '.4f')}, {shown(figures['coverage_2_sigma'], '.1%')} within 2 sigma; "
         f"one step: rmse {text['one_step_rmse']} {unit}; {figures['samples']} samples"
     )

@@ -65,6 +65,8 @@ def identify(
     Console().print(_table(result))
     for warning in result["warnings"]:
         typer.secho(f"warning: {warning}", fg=typer.colors.YELLOW, err=True)
+    for hint in result["hints"]:
+        typer.secho(f"hint: {hint}; see `tacho` in [[tray]]", fg=typer.colors.YELLOW, err=True)
 
 
 def as_json(found: Identification, training_data: TrainingData) -> dict[str, Any]:
@@ -95,6 +97,7 @@ def as_json(found: Identification, training_data: TrainingData) -> dict[str, Any
         "speed_unit": training_data.speed_unit,
         "iterations": found.iterations,
         "warnings": training_data.with_fan_numbers([*found.warnings, *found.misfits]),
+        "hints": training_data.tacho_hints(),
     }
 
 

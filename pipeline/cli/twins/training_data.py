@@ -14,9 +14,11 @@ import typer
 
 from pipeline.cli.options import fan_numbers
 from pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT
+from pipeline.devices.tacho_evidence import tacho_hints
 from pipeline.errors import UserError
 from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.runs import RecordedRun, read_runs
+from schemas.tacho import Tacho
 
 if TYPE_CHECKING:
     from schemas.twin_card import DataCard
@@ -59,6 +61,11 @@ class TrainingData:
             *(re.sub(r"^fan (\d+):", lambda found: f"fan {self.fans[int(found[1])]}:", line) for line in warnings),
         ]
 
+    def tacho_hints(self) -> list[str]:
+        """What speaks against the declared tachos in the longest run; see pipeline.devices.tacho_evidence."""
+        longest = max(self.recorded, key=lambda run: len(run.t_s))
+        return tacho_hints(longest.t_s, longest.speed_rad_s, self.runs[0].tacho, self.fans)
+
 
 def read_training_data(
     recordings: Sequence[Path], tray: str | None, fans: str | None, from_s: float, to_s: float
@@ -72,12 +79,14 @@ def read_training_data(
     from twin.runs import Run  # noqa: PLC0415
 
     recorded: list[RecordedRun] = []
+    tachos: list[tuple[Tacho, ...]] = []
     units: dict[str, Path] = {}
     for path in recordings:
         found = read_runs(path, tray, fan_numbers(fans), from_s, to_s)
         if found.damage:
             typer.echo(found.damage, err=True)
         recorded += found.runs
+        tachos += [found.tacho] * len(found.runs)
         units.setdefault(found.speed_unit, path)
     if len(units) > 1:
         found_units = " and ".join(f"{unit} ({path})" for unit, path in units.items())
@@ -86,7 +95,10 @@ def read_training_data(
     if unit not in RAD_S_PER_TABLE_UNIT:
         raise UserError(f"{units[unit]}: unknown speed unit {unit!r}; known: {', '.join(RAD_S_PER_TABLE_UNIT)}")
     with twin_errors():
-        cleaned = [without_outliers(Run(run.path.stem, run.t_s, run.command, run.speed_rad_s)) for run in recorded]
+        cleaned = [
+            without_outliers(Run(run.path.stem, run.t_s, run.command, run.speed_rad_s, tacho))
+            for run, tacho in zip(recorded, tachos, strict=True)
+        ]
     numbers = fan_numbers(fans) or list(range(recorded[0].command.shape[1]))
     outliers = tuple(
         f"{run.path}: fan {fan}: {share:.1%} of the speeds are outliers and left out; check the tacho and its wiring"

@@ -8,8 +8,12 @@ import pytest
 
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.runs import read_runs
+from pipeline.replay.default_config import default_config, first_raw
 from schemas.messages import Array, Raw
+from schemas.tacho import Tacho
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.twin_files import write_twin
+from twin.models.physical import PhysicalModel
 
 
 def measured(folder: Path, rows: int = 1234, start_s: float = 0.0) -> tuple[Path, Array]:
@@ -95,6 +99,37 @@ def test_the_recording_has_unit_source_and_tray_in_its_metadata(tmp_path):
     assert {entry.key for entry in entries} == {"fantwin/imported/bench-2/raw"}
     assert {entry.message.header.tray for entry in entries} == {"bench-2"}
     assert [entry.message.header.sequence for entry in entries] == list(range(13))
+
+
+def test_the_tachos_are_in_the_recording_and_in_the_configuration_made_for_it(tmp_path):
+    path, _ = measured(tmp_path)
+    recording = tmp_path / "r.mcap"
+    tachos = ("--tacho", "count", "--window", "1", "--window", "0.5", "--update", "0.25")
+    assert fantwin("import", path, *ARGUMENTS, *tachos, "-o", recording).exit_code == 0
+    expected = tuple(Tacho(kind="count", window_s=window_s, update_s=0.25) for window_s in (1.0, 0.5))
+    assert read_runs(recording).tacho == expected
+    assert read_runs(recording, fans=[1]).tacho == expected[1:]
+    metadata = read_metadata(recording)
+    twin = write_twin(tmp_path / "twin.onnx", PhysicalModel(), 2)
+    config = default_config(recording, metadata, first_raw([recording], metadata), twin, (), ())
+    assert config.tray("tray1").tacho == expected
+    for wrong, words in (
+        (("--tacho", "count"), "needs window_s"),
+        (("--tacho", "count", *["--window", "1"] * 3), "3 tachos for 2 fans"),
+    ):
+        assert words in error_of("import", path, *ARGUMENTS, *wrong, "-o", tmp_path / "wrong.mcap")
+
+
+def test_speeds_that_look_counted_are_pointed_out_unless_they_are_declared_so(tmp_path):
+    t_s = np.arange(0.0, 60.0, 0.1)
+    rpm = 30.0 * np.rint((1200.0 + 600.0 * np.sin(np.floor(t_s) / 5.0)) / 30.0)
+    path = tmp_path / "counted.csv"
+    np.savetxt(path, np.column_stack([t_s, rpm, rpm]), delimiter=",", header="t,u,y", comments="")
+    arguments = ("import", path, "--time", "t:s", "--command", "u", "--speed", "y:rpm", "-o", tmp_path / "r.mcap")
+    result = fantwin(*arguments)
+    assert "hint: fan 0: readings are multiples of 30 rpm and change every 1.00 s: a count over 1 s" in result.stderr
+    declared = fantwin(*arguments, "--tacho", "count", "--window", "1", "--force")
+    assert "hint" not in declared.stderr
 
 
 def test_the_same_table_gives_the_same_bytes(tmp_path):

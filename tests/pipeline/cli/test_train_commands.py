@@ -2,6 +2,7 @@
 
 import builtins
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,16 +10,19 @@ import pytest
 
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Raw
+from schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
 from schemas.topics import tray_key
-from tests.support.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, published_run
+from tests.support.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, counted_run, published_run
 from tests.support.fantwin_command import error_of, fantwin
+from twin.export.onnx_twin import OnnxTwin
 from twin.runs import Run
 
 RPM = 60 / (2 * np.pi)
 
 
 def record(path: Path, run: Run, unit: str = "rad/s", tray: str = "tray1") -> Path:
-    with RecordingWriter(path, {"speed_unit": unit}, overwrite=True) as writer:
+    metadata = {"speed_unit": unit, f"tacho.{tray}": tachos_to_json(run.tacho)}
+    with RecordingWriter(path, metadata, overwrite=True) as writer:
         t_ns = np.rint(run.t_s * 1e9).astype(np.int64)
         raw = Raw(
             header=Header("test", 0, tray),
@@ -57,6 +61,26 @@ def test_identify_finds_the_published_fan(folder):
         assert low < fan[name] < high
         assert fan[name] == pytest.approx(published, rel=0.15)
     assert result["speed_unit"] == "rad/s"
+
+
+def test_the_tacho_of_a_recording_counts_and_readings_that_speak_for_another_are_pointed_out(tmp_path):
+    tacho = Tacho(kind="count", window_s=0.53)
+    run = counted_run(1, tacho, 60.0)
+    declared = record(tmp_path / "declared.mcap", run)
+    undeclared = record(tmp_path / "undeclared.mcap", replace(run, tacho=INSTANTANEOUS))
+    inertia, hints = {}, {}
+    for path in (declared, undeclared):
+        result = json.loads(fantwin("identify", path, "--json").stdout)
+        inertia[path], hints[path] = result["fans"][0]["J"], result["hints"]
+    assert inertia[declared] == pytest.approx(PUBLISHED_PARAMETERS[0], rel=0.3)
+    assert inertia[undeclared] > 2.0 * PUBLISHED_PARAMETERS[0]
+    assert hints[declared] == []
+    assert hints[undeclared][0].startswith("fan 0: readings are multiples of 56.6 rpm and change every 0.53 s: a count")
+    mixed = error_of("train", declared, undeclared, "--model", "physical", "-o", tmp_path / "twin.onnx")
+    assert "give runs that are measured alike" in mixed
+    trained = fantwin("train", declared, "--model", "physical", "-o", tmp_path / "twin.onnx")
+    assert "by the tacho alone" in trained.stdout
+    assert OnnxTwin(tmp_path / "twin.onnx").card.tacho == (tacho,)
 
 
 def test_identify_shows_a_row_for_each_fan(folder):

@@ -47,6 +47,12 @@ def test_a_good_file_gives_every_enabled_stage_its_section():
         ("site = \n", ["not valid TOML"]),
         (GOOD.replace("0.25", "inf"), ["scorer.on_delay_s = inf", "finite"]),
         (GOOD.replace("fans = 8", "fans = 8\nspeed_max = nan"), ["tray.0.speed_max = nan", "finite"]),
+        (GOOD.replace("fans = 8", 'fans = 8\ntacho = { kind = "count" }'), ["tray.0.tacho", "needs window_s"]),
+        (
+            GOOD.replace("fans = 8", 'fans = 8\ntacho = { kind = "count", window = 1 }'),
+            ["tray.0.tacho.0.window", "did you mean 'window_s'"],
+        ),
+        (GOOD.replace("fans = 8", "fans = 8\ntacho = [{}, {}]"), ["tray.0", "2 tachos for 8 fans"]),
         (GOOD + '[launcher]\nstages = ["scorr"]\n', ["unknown stage 'scorr'", "did you mean 'scorer'"]),
         ("scorer = 3\n" + GOOD.replace("[scorer]\non_delay_s = 0.25", ""), ["'scorer' must be a section"]),
     ],
@@ -59,6 +65,16 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(text, words):
     assert "\n" not in line
     for word in words:
         assert word in line
+
+
+def test_a_tacho_is_one_for_all_fans_of_a_tray_or_one_for_each():
+    def windows_s(text: str) -> list[float]:
+        return [tacho.window_s for tacho in parse(GOOD.replace("fans = 8", text)).tray("a").tacho]
+
+    count = '{ kind = "count", pulses = 2, window_s = %s }'
+    assert windows_s("fans = 8") == [0.0]
+    assert windows_s(f"fans = 8\ntacho = {count % 1.0}") == [1.0]
+    assert windows_s(f"fans = 2\ntacho = [{count % 1.0}, {count % 0.5}]") == [1.0, 0.5]
 
 
 def test_launcher_stages_says_which_stages_are_enabled():

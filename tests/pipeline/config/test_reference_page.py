@@ -23,4 +23,4 @@ def test_every_key_is_described_and_has_a_type() -> None:
         if not field.description and key not in ("bus", "launcher", "tray")
     ]
     assert not undescribed
-    assert page().count("see below") == 1  # source
+    assert page().count("see below") == 2  # source, tacho

@@ -1,0 +1,92 @@
+"""Fans whose tachos count: averaging and holding are the tacho's and not the fan's inertia."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from schemas.tacho import INSTANTANEOUS, Tacho
+from tests.support.fan_data import PUBLISHED_PARAMETERS, counted_run, published_run
+from twin.build import TrainedTwin, evaluate, train_twin
+from twin.errors import TwinError
+from twin.fitting.trajectories import cut_into_trajectories
+from twin.kinds import find_kind
+from twin.measurement import measurement_of
+from twin.runs import Run
+
+# Not a multiple of the sample period: ages of readings then take all values, as between clocks that drift.
+TACHO = Tacho(kind="count", window_s=0.53)
+
+
+@pytest.fixture(scope="module")
+def runs() -> tuple[Run, Run]:
+    return counted_run(1, TACHO, 200.0), counted_run(2, TACHO, 100.0)
+
+
+@pytest.fixture(scope="module")
+def twin(runs: tuple[Run, Run]) -> TrainedTwin:
+    return train_twin(runs[:1], runs[1:], "physical", name="counted")
+
+
+def taken_as_instantaneous(run: Run) -> Run:
+    return replace(run, tacho=INSTANTANEOUS)
+
+
+def test_the_physics_are_those_of_the_fan_and_the_error_is_that_of_the_tacho(
+    twin: TrainedTwin, runs: tuple[Run, Run]
+) -> None:
+    found = twin.identification.parameters[0, :3] / PUBLISHED_PARAMETERS
+    np.testing.assert_allclose(found, 1.0, atol=0.15)
+    figures = twin.validation.pooled
+    assert figures.rmse_rad_s == pytest.approx(figures.floor_rad_s, rel=0.1)
+    assert twin.card.tacho == (TACHO,)
+    naive = train_twin([taken_as_instantaneous(runs[0])], [taken_as_instantaneous(runs[1])], "physical", name="naive")
+    assert naive.identification.parameters[0, 0] > 3.0 * PUBLISHED_PARAMETERS[0]
+    assert naive.validation.pooled.rmse_rad_s > 1.5 * figures.rmse_rad_s
+    assert naive.card.balance.sigma_command[0] > 3.0 * twin.card.balance.sigma_command[0]
+
+
+def test_a_twin_is_evaluated_by_the_tacho_of_its_card_and_not_where_readings_show_the_time_before(
+    twin: TrainedTwin, runs: tuple[Run, Run]
+) -> None:
+    held_out = runs[1]
+    figures = evaluate(twin, [taken_as_instantaneous(held_out)]).pooled
+    assert figures == evaluate(twin, [held_out]).pooled == twin.validation.pooled
+    late = held_out.t_s - held_out.t_s[0] >= TACHO.reach_s
+    assert figures.samples == np.count_nonzero(np.isfinite(held_out.speed_rad_s[:, 0]) & late)
+
+
+def test_the_noise_of_a_tacho_is_that_of_its_resolution_and_of_the_age_of_its_readings() -> None:
+    steady = replace(published_run(1, 10.0), tacho=(TACHO,))
+    measurement = measurement_of(steady)
+    np.testing.assert_allclose(
+        measurement.noise_rad_s(np.full_like(steady.speed_rad_s, 100.0)), TACHO.resolution_rad_s / np.sqrt(6.0)
+    )
+    rising = measurement.noise_rad_s(1e4 * steady.t_s[:, np.newaxis])
+    np.testing.assert_allclose(rising, 1e4 * TACHO.held_s / np.sqrt(12.0), rtol=1e-3)
+
+
+def test_stretches_overlap_by_what_their_first_readings_show_and_compare_each_reading_once(
+    runs: tuple[Run, Run],
+) -> None:
+    run = runs[0]
+    stretches = cut_into_trajectories([run], 250)
+    assert len(stretches.fan) == 8
+    comparable = np.isfinite(run.speed_rad_s) & measurement_of(run).comparable
+    assert np.count_nonzero(stretches.compared) == np.count_nonzero(comparable)
+    assert all(stretches.measurement.comparable[first, k] for k, first in enumerate(stretches.lead_in) if k > 0)
+
+
+def test_a_narx_predicts_readings_as_they_are(runs: tuple[Run, Run]) -> None:
+    part = runs[0].rows(0, 500)
+    twin = train_twin([part], [], "narx", name="narx", max_iterations=2)
+    assert find_kind("narx").predicts == "readings"
+    assert twin.card.tacho == INSTANTANEOUS
+
+
+def test_runs_that_are_measured_differently_and_the_published_trainer_are_refused(runs: tuple[Run, Run]) -> None:
+    one, other = runs
+    with pytest.raises(TwinError, match="measured alike"):
+        train_twin([one], [taken_as_instantaneous(other)], "physical", name="mixed")
+    with pytest.raises(TwinError, match="trainer 'adam' takes readings for speeds"):
+        train_twin([one], [], "hybrid", name="adam", trainer="adam", max_iterations=1)

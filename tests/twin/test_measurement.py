@@ -1,0 +1,70 @@
+"""The expected readings of a tacho against its definition, by brute force."""
+
+import numpy as np
+import pytest
+
+from schemas.tacho import Tacho
+from twin.measurement import Measurement
+
+SLOW = Tacho(kind="count", window_s=1.0)
+TACHOS = [SLOW, Tacho(kind="count", window_s=0.5, update_s=0.1, delay_s=0.07), Tacho(delay_s=0.3), Tacho()]
+
+
+def uneven_times(samples: int, signals: int) -> np.ndarray:
+    steps = np.random.default_rng(3).uniform(0.02, 0.18, (samples, signals))
+    return 5.0 + np.cumsum(steps, axis=0)
+
+
+def mean_reading(tacho: Tacho, t_s: float, times: np.ndarray, signal: np.ndarray, held: bool) -> float:
+    """The mean over many ages and many instants of the window."""
+    fine = (np.arange(400) + 0.5) / 400
+    at_s = t_s - tacho.delay_s - np.add.outer(tacho.held_s * fine, tacho.window_s * fine)
+    if held:
+        return float(signal[np.maximum(np.searchsorted(times, at_s, side="right") - 1, 0)].mean())
+    return float(np.interp(at_s, times, signal).mean())
+
+
+@pytest.mark.parametrize("held", [False, True], ids=["speed", "command"])
+def test_the_expected_reading_is_the_mean_over_window_and_age(held: bool) -> None:
+    times = uneven_times(80, len(TACHOS))
+    signals = 200.0 + 50.0 * np.random.default_rng(4).standard_normal(times.shape).cumsum(axis=0)
+    measurement = Measurement(times, TACHOS)
+    shown = measurement.of_command(signals) if held else measurement.of_speed(signals)
+    for column, tacho in enumerate(TACHOS[:3]):
+        # Also where the window reaches before the first sample, whose value then counts as constant.
+        for k in (0, 3, 15, 40, 78):
+            ends = (k, k + 1) if held else (k,)
+            at_ends = [mean_reading(tacho, times[i, column], times[:, column], signals[:, column], held) for i in ends]
+            assert shown[k, column] == pytest.approx(np.mean(at_ends), abs=0.3 if held else 0.01)
+
+
+def test_a_constant_is_left_as_it_is_and_a_ramp_is_late_by_the_mean_delay() -> None:
+    times = uneven_times(500, len(TACHOS))
+    measurement = Measurement(times, TACHOS)
+    np.testing.assert_allclose(measurement.of_speed(np.full_like(times, 300.0)), 300.0, rtol=1e-13)
+    late = times - measurement.of_speed(times)
+    for column, tacho in enumerate(TACHOS):
+        known = measurement.comparable[:, column]
+        np.testing.assert_allclose(late[known, column], tacho.mean_delay_s, atol=1e-9)
+        assert times[known, column][0] >= times[0, column] + tacho.reach_s
+
+
+def test_derivatives_and_parts_of_the_batch_give_the_same_numbers_and_padding_does_not_count() -> None:
+    times = uneven_times(60, len(TACHOS))
+    times[50:, 1] = times[50, 1]
+    signals = np.random.default_rng(5).standard_normal((60, len(TACHOS), 3))
+    measurement = Measurement(times, TACHOS)
+    whole = measurement.of_speed(signals)
+    np.testing.assert_allclose(measurement.of_speed(signals[..., 1]), whole[..., 1], rtol=1e-12)
+    np.testing.assert_allclose(measurement.of_speed(signals[:, 1:3], slice(1, 3)), whole[:, 1:3], rtol=1e-12)
+    signals[51:, 1] = 1e3
+    np.testing.assert_allclose(measurement.of_speed(signals)[:51, 1], whole[:51, 1], atol=1e-6)
+
+
+def test_instantaneous_tachos_leave_the_arrays_themselves() -> None:
+    times = uneven_times(20, 2)
+    signals = np.random.default_rng(6).standard_normal(times.shape)
+    measurement = Measurement(times, [Tacho(), Tacho(kind="period")])
+    assert measurement.of_speed(signals) is signals
+    assert measurement.of_command(signals) is signals
+    assert measurement.comparable.all()
