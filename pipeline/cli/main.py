@@ -25,6 +25,7 @@ COMMANDS = {
     "alarms": "watch.alarms",
     "wear": "watch.wear",
     "command": "watch.command",
+    "sweep": "watch.sweep",
     "doctor": "watch.doctor",
     "selftest": "watch.selftest",
     "router": "watch.router",

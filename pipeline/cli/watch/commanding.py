@@ -62,7 +62,7 @@ class CommandSender:
     def __init__(self, bus: Bus, site: str, tray: str, stop: threading.Event) -> None:
         self._watcher = SiteWatcher(bus, site)
         self._tray = tray
-        self._stop = stop
+        self.stop = stop
         self._producer = f"command-{tray}-{secrets.token_hex(4)}"
         key = tray_key(site, tray, "command")
         self._publisher = bus.publisher(key, BY_NAME["command"], type_name(Command), self._producer)
@@ -111,7 +111,7 @@ class CommandSender:
     def _wait(self, find: Callable[[], _T | None]) -> _T:
         until_s = time.monotonic() + _ANSWER_S
         while (found := find()) is None:
-            if time.monotonic() > until_s or self._stop.wait(_POLL_S):
+            if time.monotonic() > until_s or self.stop.wait(_POLL_S):
                 raise UserError(f"no acquisition of tray {self._tray} received the command: is `fantwin up` running?")
         return found
 

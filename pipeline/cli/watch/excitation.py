@@ -1,0 +1,177 @@
+"""Moves the commands of fans so that a recording determines their twins: all levels, up and down, long and short.
+
+How long a step lasts follows from the fans: two steps over the whole range show their time constants first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from pipeline.errors import UserError
+from schemas.messages import Array
+
+LEVELS = (0.5, 1.0, 0.25, 0.75, 0.0, 0.6, 0.1, 0.9, 0.35, 0.8, 0.2, 0.65, 0.45)
+"""of the range, held until the speed has settled"""
+SHORT_LEVELS = (0.2, 0.8, 0.4, 1.0, 0.6, 0.3, 0.9, 0.5, 0.1, 0.7)
+"""of the range, held for a time constant: the fan never settles"""
+SETTLING = 5.0
+"""time constants until a speed has settled"""
+SHORTEST_S, LONGEST_S = 0.5, 60.0
+"""of a step; a fan that has not settled after the longest is slower than a fan can be"""
+SHORTEST_PROBE_S = 3.0
+_POLL_S = 0.1
+_SETTLED = 0.02  # of the whole change: so little changes any more
+_FOLLOWS = 0.05  # of the top speed: a fan that changes less over the whole range does not follow its command
+_NOISE_SIGMAS = 5.0  # a smaller change is not told from noise
+_TOLERANCE = 0.02  # of the range: a device rounds its commands
+
+
+class Observed(NamedTuple):
+    """Samples since a moment. t_s: (n,), since that moment. command, speed_rad_s: (n, fans)."""
+
+    t_s: Array
+    command: Array
+    speed_rad_s: Array
+
+
+class TrayLine(Protocol):
+    """The tray as an excitation sees it."""
+
+    def send(self, values: Mapping[int, float]) -> None:
+        """Send commands, by fan; returns when the device has them. Raises `UserError` if they cannot be sent."""
+        ...
+
+    def observed(self) -> Observed:
+        """The samples since the last command."""
+        ...
+
+    def wait(self, seconds: float) -> bool:
+        """Wait; returns whether the user wants to stop."""
+        ...
+
+
+class StoppedError(Exception):
+    """The user wants to stop."""
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """One excitation of some fans of a tray, between two commands."""
+
+    line: TrayLine
+    fans: Sequence[int]
+    low: float
+    high: float
+    rounds: int
+    progress: Callable[[str], None]
+    """is given a line for each step"""
+
+    def run(self) -> dict[int, float]:
+        """Move the commands; returns the time constant of each fan, s; NaN for one that does not follow its command.
+
+        Raises:
+            StoppedError: the user wants to stop.
+            UserError: something else sets the commands, or a command cannot be sent.
+        """
+        time_constants_s = self._time_constants()
+        slowest_s = np.nanmax([*time_constants_s.values(), SHORTEST_S / SETTLING])
+        steps = list(self._steps(float(slowest_s)))
+        left_s = sum(hold_s for _, hold_s in steps)
+        for number, (command, hold_s) in enumerate(steps, 1):
+            self.progress(f"step {number} of {len(steps)}: command {command:g} for {hold_s:.1f} s, {left_s:.0f} s left")
+            self.line.send(dict.fromkeys(self.fans, command))
+            self._wait(hold_s)
+            self._check_obeyed(command)
+            left_s -= hold_s
+        return time_constants_s
+
+    def _steps(self, slowest_s: float) -> Iterator[tuple[float, float]]:
+        """Command and duration, s, of each step."""
+        long_s = min(max(SETTLING * slowest_s, SHORTEST_S), LONGEST_S)
+        short_s = min(max(slowest_s, SHORTEST_S), LONGEST_S)
+        for number in range(self.rounds):
+            order = -1 if number % 2 else 1
+            for levels, hold_s in ((LEVELS, long_s), (SHORT_LEVELS, short_s)):
+                for level in levels[::order]:
+                    yield self.low + level * (self.high - self.low), hold_s
+
+    def _time_constants(self) -> dict[int, float]:
+        """The longer one of each fan, of a step up and one down over the whole range."""
+        found = np.full((2, len(self.fans)), np.nan)
+        self._settle(self.low, "to the lowest command")
+        for row, (command, words) in enumerate(((self.high, "up"), (self.low, "down"))):
+            found[row] = self._settle(command, f"{words}, to measure the time constants")
+        slowest_s = np.where(np.isfinite(found), found, -np.inf).max(axis=0)
+        constants = {fan: float(s) if s >= 0 else np.nan for fan, s in zip(self.fans, slowest_s, strict=True)}
+        for fan, seconds in constants.items():
+            follows = f"time constant {seconds:.2g} s" if np.isfinite(seconds) else "does not follow its command"
+            self.progress(f"fan {fan}: {follows}")
+        if not np.isfinite(slowest_s).any():
+            raise UserError(
+                f"no fan follows its command from {self.low:g} to {self.high:g}: do the fans have power and a tacho?"
+            )
+        return constants
+
+    def _settle(self, command: float, words: str) -> Array:
+        """Send a command and wait until all speeds have settled. Returns the time constants, (fans,)."""
+        self.progress(f"command {command:g}: {words}")
+        self.line.send(dict.fromkeys(self.fans, command))
+        waited_s = 0.0
+        while waited_s < LONGEST_S:
+            self._wait(_POLL_S)
+            waited_s += _POLL_S
+            seen = self.line.observed()
+            if waited_s >= SHORTEST_PROBE_S and has_settled(seen.t_s, seen.speed_rad_s[:, self.fans]):
+                break
+        self._check_obeyed(command)
+        seen = self.line.observed()
+        return time_constants(seen.t_s, seen.speed_rad_s[:, self.fans])
+
+    def _wait(self, seconds: float) -> None:
+        if self.line.wait(seconds):
+            raise StoppedError
+
+    def _check_obeyed(self, command: float) -> None:
+        applied = self.line.observed().command
+        if not len(applied):
+            raise UserError("no sample arrives any more: see acquisition in `fantwin status`")
+        wrong = np.abs(applied[-1, self.fans] - command) > _TOLERANCE * (self.high - self.low)
+        if wrong.any():
+            fan = self.fans[int(np.argmax(wrong))]
+            raise UserError(
+                f"fan {fan} has command {applied[-1, fan]:g} and not {command:g}: something else sets it; stop that"
+            )
+
+
+def has_settled(t_s: Array, speed_rad_s: Array) -> bool:
+    """Whether the speeds (n, fans) of the time since a step (n,) have stopped changing, beside noise."""
+    if len(t_s) < SETTLING:
+        return False
+    thirds = [(t_s >= t_s[-1] * share) & (t_s < t_s[-1] * (share + 1 / 6) + 1e-9) for share in (4 / 6, 5 / 6)]
+    if not all(rows.any() for rows in thirds):
+        return False
+    before, after = (_mean(speed_rad_s[rows]) for rows in thirds)
+    noise = np.nanstd(speed_rad_s[thirds[1]], axis=0) if thirds[1].sum() > 1 else 0.0
+    largest = np.maximum(np.abs(after - _mean(speed_rad_s[:1])), _FOLLOWS * np.abs(after))
+    return bool(np.all((np.abs(after - before) <= _SETTLED * largest + noise / 2) | ~np.isfinite(after)))
+
+
+def time_constants(t_s: Array, speed_rad_s: Array) -> Array:
+    """When each fan (fans,) has made 63 % of its change, s; NaN where the speed hardly changes or is not known."""
+    if len(t_s) < SETTLING:
+        return np.full(speed_rad_s.shape[1], np.nan)
+    settled = speed_rad_s[-max(1, len(t_s) // 6) :]
+    first, last = _mean(speed_rad_s[:1]), _mean(settled)
+    change, noise = last - first, np.std(settled, axis=0)
+    follows = np.abs(change) > np.maximum(_FOLLOWS * np.maximum(np.abs(first), np.abs(last)), _NOISE_SIGMAS * noise)
+    made = np.abs(speed_rad_s - first) >= (1 - np.exp(-1)) * np.abs(change)
+    return np.where(follows, t_s[np.argmax(made, axis=0)], np.nan)
+
+
+def _mean(speed_rad_s: Array) -> Array:
+    known = np.isfinite(speed_rad_s)
+    return np.where(known, speed_rad_s, 0.0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)

@@ -1,0 +1,173 @@
+"""`fantwin sweep`: move the commands of a tray's fans, so that a recording determines their twins."""
+
+from __future__ import annotations
+
+import json
+import math
+import queue
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from pipeline.bus.session import Bus
+from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of
+from pipeline.cli.watch.excitation import Excitation, Observed, StoppedError
+from pipeline.config.loading import load_config
+from pipeline.config.models import TrayConfig
+from pipeline.errors import UserError
+from pipeline.runtime.signals import stop_on_signals
+from schemas.codec import CodecError, decode
+from schemas.messages import Raw
+from schemas.topics import tray_key
+from schemas.units import NS_PER_S
+
+_FIRST_SAMPLE_S = 5.0
+
+
+def sweep(
+    config: ConfigOption = DEFAULT_CONFIG,
+    tray: Annotated[str | None, typer.Option(help="The tray; required if there are several.")] = None,
+    fans: Annotated[str, typer.Option(metavar="all|N,N,...", help="The fans that are moved, together.")] = "all",
+    low: Annotated[float | None, typer.Option(help="Lowest command; without it command_min of the tray.")] = None,
+    high: Annotated[float | None, typer.Option(help="Highest command; without it command_max of the tray.")] = None,
+    safe: Annotated[
+        float | None,
+        typer.Option(help="The command at the end and after Ctrl-C; without it the one that each fan had before."),
+    ] = None,
+    rounds: Annotated[int, typer.Option(min=1, max=100, help="How often all levels are passed.")] = 2,
+    overrides: SetOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Move the commands of all fans over their range while `fantwin up` records: levels up and down, long and short.
+
+    Two steps over the whole range show the time constants of the fans; each level then lasts five of the longest. At
+    the end, after Ctrl-C and after an error the fans get a safe command. Nothing else may set the commands meanwhile.
+
+    Example: fantwin sweep -c fantwin.toml --fans all --low 0.2
+    """
+    settings = load_config(config, overrides or (), stages=())
+    chosen = chosen_tray(settings, tray)
+    numbers = _fans(fans, chosen)
+    lowest, highest = chosen.command_min if low is None else low, chosen.command_max if high is None else high
+    if not chosen.command_min <= lowest < highest <= chosen.command_max:
+        limits = f"{chosen.command_min:g} to {chosen.command_max:g}"
+        raise UserError(f"--low {lowest:g} --high {highest:g}: name a range within {limits} of tray {chosen.name}")
+    if safe is not None:
+        command_of(chosen, {numbers[0]: safe})
+    stop = threading.Event()
+    stop_on_signals(stop)
+    steps: list[str] = []
+
+    def progress(line: str) -> None:
+        steps.append(line)
+        if not json_output:
+            typer.echo(line)
+
+    with Bus(settings.bus, stop, listens=False) as bus:
+        line = _BusLine(bus, settings.site, chosen, stop)
+        before = line.connect()
+        at_end = {fan: float(before[fan]) if safe is None else safe for fan in numbers}
+        left_at = ", ".join(f"fan {fan} {value:g}" for fan, value in at_end.items())
+        progress(f"at the end and after Ctrl-C the fans get these commands: {left_at}")
+        is_stopped, constants_s = False, dict[int, float]()
+        try:
+            constants_s = Excitation(line, numbers, lowest, highest, rounds, progress).run()
+        except StoppedError:
+            is_stopped = True
+        finally:
+            _leave(line, at_end, left_at)
+    if json_output:
+        known = {str(fan): value if math.isfinite(value) else None for fan, value in constants_s.items()}
+        left = {str(fan): value for fan, value in at_end.items()}
+        content = {
+            "tray": chosen.name,
+            "time_constants_s": known,
+            "steps": steps,
+            "left_at": left,
+            "stopped": is_stopped,
+        }
+        typer.echo(json.dumps(content))
+    else:
+        typer.echo(f"{'stopped' if is_stopped else 'done'}; the fans are left at these commands: {left_at}")
+    if is_stopped:
+        raise typer.Exit(1)
+
+
+def _leave(line: _BusLine, at_end: Mapping[int, float], left_at: str) -> None:
+    """Send the safe command, whatever happened before."""
+    line.stop = threading.Event()
+    try:
+        line.send(at_end)
+    except UserError as error:
+        raise UserError(f"THE FANS KEEP THE LAST COMMAND; send these by hand: {left_at} ({error})") from error
+
+
+def _fans(words: str, tray: TrayConfig) -> list[int]:
+    if words == "all":
+        return list(range(tray.fans))
+    try:
+        numbers = sorted({int(word) for word in words.split(",")})
+    except ValueError as error:
+        raise UserError(f"--fans {words}: write all, or numbers with commas: --fans 0,2") from error
+    if not all(0 <= number < tray.fans for number in numbers):
+        raise UserError(f"--fans {words}: tray {tray.name} has fans 0 to {tray.fans - 1}")
+    return numbers
+
+
+class _BusLine:
+    """The tray through its acquisition."""
+
+    def __init__(self, bus: Bus, site: str, tray: TrayConfig, stop: threading.Event) -> None:
+        self.stop = stop
+        self._tray = tray
+        self._received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._samples: list[Raw] = []
+        self._sender = CommandSender(bus, site, tray.name, stop)
+        bus.subscribe(tray_key(site, tray.name, "raw"), lambda _key, payload: self._received.put(payload))
+
+    def connect(self) -> np.ndarray:
+        """Wait for acquisition and its first sample; returns the commands (fans,) of that."""
+        self._sender.connect()
+        waited_s = 0.0
+        while not self._take():
+            if waited_s > _FIRST_SAMPLE_S or self.wait(0.05):
+                raise UserError(f"tray {self._tray.name}: no sample arrives: see acquisition in `fantwin status`")
+            waited_s += 0.05
+        return self._samples[-1].command[-1]
+
+    def send(self, values: Mapping[int, float]) -> None:
+        """Send commands, by fan."""
+        self._sender.stop = self.stop
+        self._sender.send(command_of(self._tray, dict(values)))
+        self._sender.confirm()
+        self._take()
+        self._samples = self._samples[-1:]  # the speed from which the step begins
+
+    def observed(self) -> Observed:
+        """The samples since the last command."""
+        self._take()
+        times = np.concatenate([sample.host_receive_t_ns for sample in self._samples])
+        return Observed(
+            (times - times[0]) / NS_PER_S,
+            np.concatenate([sample.command for sample in self._samples]),
+            np.concatenate([sample.speed_rad_s for sample in self._samples]),
+        )
+
+    def wait(self, seconds: float) -> bool:
+        """Wait; returns whether the user wants to stop."""
+        return self.stop.wait(seconds)
+
+    def _take(self) -> bool:
+        """Take what has arrived; returns whether there is any sample."""
+        with suppress(queue.Empty):
+            while True:
+                with suppress(CodecError):
+                    sample = decode(Raw, self._received.get_nowait())
+                    if isinstance(sample, Raw) and sample.fans == self._tray.fans and len(sample.host_receive_t_ns):
+                        self._samples.append(sample)
+        return bool(self._samples)

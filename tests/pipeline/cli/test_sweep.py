@@ -1,0 +1,117 @@
+"""`fantwin sweep`: the excitation of simulated fans, in simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from pipeline.cli.watch.excitation import LEVELS, SETTLING, SHORT_LEVELS, Excitation, Observed, StoppedError
+from pipeline.errors import UserError
+from tests.support.fantwin_command import error_of
+from tests.support.running_chain import DEMO
+
+PERIOD_S = 0.1
+
+
+class FirstOrderFans:
+    """Fans whose speed follows the command with a time constant; reported at 10 Hz with noise."""
+
+    def __init__(self, time_constants_s: list[float], top_rad_s: float = 300.0, stop_after_s: float = np.inf) -> None:
+        self.tau_s = np.array(time_constants_s)
+        self.top_rad_s = np.full(len(time_constants_s), top_rad_s)
+        self.command = np.full(len(time_constants_s), 0.4)
+        self.speed = self.top_rad_s * self.command
+        self.now_s, self.stop_after_s = 0.0, stop_after_s
+        self.sent: list[tuple[float, dict[int, float]]] = []
+        self.forced: float | None = None
+        self._rng = np.random.default_rng(1)
+        self._rows: list[tuple[float, np.ndarray, np.ndarray]] = []
+        self._sample()
+
+    def send(self, values: Mapping[int, float]) -> None:
+        self.sent.append((self.now_s, dict(values)))
+        for fan, value in values.items():
+            self.command[fan] = value
+        self._rows = self._rows[-1:]
+
+    def observed(self) -> Observed:
+        t_s, command, speed = zip(*self._rows, strict=True)
+        return Observed(np.array(t_s) - t_s[0], np.array(command), np.array(speed))
+
+    def wait(self, seconds: float) -> bool:
+        for _ in range(round(seconds / PERIOD_S)):
+            self.now_s += PERIOD_S
+            self.speed += (self.top_rad_s * self.command - self.speed) * (1 - np.exp(-PERIOD_S / self.tau_s))
+            self._sample()
+        return self.now_s >= self.stop_after_s
+
+    def _sample(self) -> None:
+        command = self.command.copy() if self.forced is None else np.full_like(self.command, self.forced)
+        self._rows.append((self.now_s, command, self.speed + self._rng.normal(0.0, 2.0, len(self.speed))))
+
+
+def swept(line: FirstOrderFans, rounds: int = 1, low: float = 0.2, high: float = 1.0) -> tuple[dict, list[str]]:
+    said: list[str] = []
+    fans = range(len(line.tau_s))
+    return Excitation(line, list(fans), low, high, rounds, said.append).run(), said
+
+
+@pytest.mark.parametrize("slowest_s", [0.4, 1.5, 6.0])
+def test_each_level_lasts_until_the_slowest_fan_has_settled(slowest_s: float) -> None:
+    line = FirstOrderFans([slowest_s / 2, slowest_s])
+    found, said = swept(line)
+    assert found[1] == pytest.approx(slowest_s, rel=0.25, abs=PERIOD_S)
+    steps = line.sent[3:]
+    durations_s = np.diff([at_s for at_s, _ in steps])
+    assert durations_s[: len(LEVELS)] == pytest.approx(SETTLING * found[1], rel=0.1)
+    assert (durations_s[len(LEVELS) :] < 0.4 * durations_s[0]).all()
+    assert sum("step " in words for words in said) == len(LEVELS) + len(SHORT_LEVELS)
+    assert said[-1].startswith("step 23 of 23: command ")
+
+
+def test_all_levels_of_the_range_are_passed_and_none_outside() -> None:
+    line = FirstOrderFans([0.5])
+    swept(line, rounds=2)
+    values = [value for _, sent in line.sent for value in sent.values()]
+    assert (min(values), max(values)) == (0.2, 1.0)
+    assert len(set(np.round(values, 3))) >= 15
+
+
+def test_ctrl_c_ends_it_at_once() -> None:
+    line = FirstOrderFans([1.0], stop_after_s=20.0)
+    with pytest.raises(StoppedError):
+        swept(line)
+    assert line.now_s < 30.0
+
+
+def test_a_fan_that_does_not_follow_is_named_and_the_others_go_on() -> None:
+    line = FirstOrderFans([1.0, 1.0])
+    line.top_rad_s[1] = 0.0
+    line.speed[1] = 0.0
+    found, said = swept(line)
+    assert np.isfinite(found[0])
+    assert np.isnan(found[1])
+    assert "fan 1: does not follow its command" in said
+
+
+def test_where_something_else_sets_the_command_it_says_so() -> None:
+    line = FirstOrderFans([1.0])
+    line.forced = 0.5
+    with pytest.raises(UserError, match=r"fan 0 has command 0.5 and not 0.2: something else sets it"):
+        swept(line)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("--low 0.5 --high 0.4", "name a range within 0 to 1 of tray tray1"),
+        ("--high 255", "name a range within 0 to 1 of tray tray1"),
+        ("--fans 0,8", "tray tray1 has fans 0 to 7"),
+        ("--fans both", "write all, or numbers with commas"),
+        ("--safe 2", "the command must be within 0 to 1"),
+    ],
+)
+def test_what_the_tray_cannot_do_is_refused_in_one_line(words: str, expected: str) -> None:
+    assert expected in error_of("sweep", "-c", DEMO / "demo.toml", *words.split())
