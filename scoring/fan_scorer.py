@@ -207,6 +207,19 @@ class FanScorer:
         ]
         return min(limits, default=np.inf)
 
+    def limit_at(self, source: Signal, speed_rad_s: Array, statistic: int, period_s: float) -> Array:
+        """(fans,) how far the residual may be from its baseline at these speeds, sigma; infinite without a limit.
+
+        By the detector of a statistic if that watches this residual and finds shifts; else by the smoothed residual.
+        """
+        of_source = [row for row in self._rows if row.source == source and row.name in self.detectors]
+        limits = {row.statistic: self.detectors[row.name].limit_sigmas(period_s) for row in of_source}
+        limit = limits.get(statistic, np.inf)
+        if not np.isfinite(limit):
+            limit = self.limit_sigmas(source, period_s)
+        mean_std = self.limits.residual(source).mean_residual_std
+        return limit / mean_std * self.residuals[source].limit_std(speed_rad_s)
+
     def persistent_limit_sigmas(self, source: Signal, period_s: float) -> float:
         """How far a shift that stays may be from the commissioned baseline, sigma; infinite without any limit.
 

@@ -98,6 +98,14 @@ class Residual:
         persistent = standardised / self._persistent_std(scaling, speed_rad_s, transient_rad_s, valid)
         return standardised.clip(-clip, clip), persistent.clip(-clip, clip)
 
+    def limit_std(self, speed_rad_s: Array) -> Array:
+        """(fans,) what limits of a constant residual are relative to at these constant speeds (fans,), sigma."""
+        speed, still = speed_rad_s[np.newaxis], np.zeros((1, len(speed_rad_s)))
+        valid = np.isfinite(speed)
+        scaling = self.scaling(speed, valid)
+        relative = self._residual_std(speed, valid) * self._persistent_std(scaling, speed, still, valid)
+        return np.broadcast_to(relative, speed.shape)[0]
+
     @property
     def memory_s(self) -> float:
         """How long samples affect the smoothed residual."""

@@ -48,6 +48,7 @@ from scoring.alarms.return_rule import HoldingDetector
 from scoring.alarms.tray_conditions import AlarmEvent
 from scoring.alarms.unscored_monitor import UnscoredMonitor
 from scoring.detectors.table import rows
+from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.fan_scorer import HALF_LIMIT, FanScorer, ScoredBlock, joined
@@ -165,7 +166,7 @@ class ScorerCore(Core):
 
     def _start_new(self) -> None:
         self._scorer = self._new_scorer()
-        self._diagnoser = Diagnoser(self._twin.balances)
+        self._diagnoser = Diagnoser(self._twin.balances, Advice(self._twin.command_unit) if self._holds else None)
         self._wear = WearMonitor(
             self._twin.balances, self._diagnoser, self._config.wear_every_s, self._twin.command_unit
         )
@@ -357,14 +358,23 @@ class ScorerCore(Core):
         self._unscored.update(item.period_ns, valid, score.invalid_reason)
         self._judged_share.add(valid, score.invalid_reason)
         self._feed_wear(item, scored, state)
-        period_s = item.period_ns / NS_PER_S
-        sigma_command = item.torque_balance_sigma_command
-        context = AlarmContext(
-            balance_command=scored.balance_smoothed * sigma_command,
-            limit_rad_s=self._scorer.limit_sigmas("speed", period_s) * item.sigma_rad_s,
-            balance_limit_command=self._scorer.limit_sigmas("balance", period_s) * sigma_command,
-        )
+        sigma_rad_s, sigma_command = item.sigma_rad_s, item.torque_balance_sigma_command
+
+        def limits(row: int, fan: int) -> tuple[float, float]:
+            of_speed, of_balance = self._limits_at(item, row, int(scored.statistic[row, fan]))
+            return float((of_speed * sigma_rad_s)[fan]), float((of_balance * sigma_command)[fan])
+
+        context = AlarmContext(balance_command=scored.balance_smoothed * sigma_command, limits=limits)
         return score, self._alarms.emit(events, score, context)
+
+    def _limits_at(self, item: Prediction, row: int, statistic: int) -> tuple[Array | float, Array | float]:
+        """How far both residuals may be from their baselines, by the alarm's statistic; (fans,) or for all, sigma."""
+        period_s = item.period_ns / NS_PER_S
+        if not self._holds:
+            return self._scorer.limit_sigmas("speed", period_s), self._scorer.limit_sigmas("balance", period_s)
+        speed = item.measured_speed_rad_s[row]
+        of_speed = self._scorer.limit_at("speed", speed, statistic, period_s)
+        return of_speed, self._scorer.limit_at("balance", speed, statistic, period_s)
 
     def _decide(self, item: Prediction) -> tuple[ScoredBlock, Array, list[AlarmEvent]]:
         """The scores, the states (n, fans) and the alarms' events. While an alarm is active, baselines stay."""

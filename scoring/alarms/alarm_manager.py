@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -36,11 +36,12 @@ MAX_REQUESTERS = 64  # the latest whose requests are remembered; docs/reference/
 
 @dataclass(frozen=True, eq=False)
 class AlarmContext:
-    """How far fans are from their twins. balance_command: (n, fans), less baseline; limits: (fans,), inf for none."""
+    """How far fans are from their twins, and how far they may be."""
 
     balance_command: Array
-    limit_rad_s: Array
-    balance_limit_command: Array
+    """(n, fans) less baseline"""
+    limits: Callable[[int, int], tuple[float, float]]
+    """at a row, of a fan: of the speed, rad/s, and of the torque balance, command; infinite for none"""
 
 
 class AlarmManager:
@@ -91,7 +92,9 @@ class AlarmManager:
         def diagnose_due(t_ns: Array) -> None:
             for row, fan in self._diagnoser.due(t_ns) if len(t_ns) else ():
                 if self._persists(row, fan, score, context):
-                    emit(row, fan, Transition.DIAGNOSED, causes=self._diagnoser.diagnose(fan, int(t_ns[row])))
+                    causes = self._diagnoser.diagnose(fan, int(t_ns[row]))
+                    if self._diagnoser.says_more(causes, self._next_message(fan).causes):
+                        emit(row, fan, Transition.DIAGNOSED, causes=causes)
 
         for event in events:
             diagnose_due(score.t_ns[: event.row])
@@ -233,12 +236,13 @@ class AlarmManager:
 
 def _measured(row: int, fan: int, score: Score, context: AlarmContext) -> dict[str, Any]:
     """The fields of an alarm that describe its sample; 0 where nothing is known."""
+    limit_rad_s, balance_limit_command = context.limits(row, fan)
     return {
         "t_ns": int(score.t_ns[row]),
         "residual_rad_s": float(np.nan_to_num(score.smoothed_residual_rad_s[row, fan])),
-        "limit_rad_s": _finite_or_0(context.limit_rad_s[fan]),
+        "limit_rad_s": _finite_or_0(limit_rad_s),
         "torque_balance_command": float(np.nan_to_num(context.balance_command[row, fan])),
-        "torque_balance_limit_command": _finite_or_0(context.balance_limit_command[fan]),
+        "torque_balance_limit_command": _finite_or_0(balance_limit_command),
         "statistic": Statistic(int(score.statistic[row, fan])),
         "score": float(np.nan_to_num(score.score[row, fan])),
     }

@@ -14,14 +14,17 @@ from schemas.messages import Array
 from schemas.messages import Diagnosis as CauseMessage
 from schemas.units import NS_PER_S
 from scoring.detectors.deviation import summed_deviation
-from scoring.diagnosis.diagnosis import RankedCause, diagnose
+from scoring.diagnosis.advice import Advice
+from scoring.diagnosis.diagnosis import ADVICE, RankedCause, diagnose
 from scoring.diagnosis.regression_window import HealthyBalance, Window
 
 WINDOW_S = 95.0
 AGAIN_AFTER_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # after the raise; the last window still contains some health
 MAX_SAMPLES = 1 << 16  # of a fan's window; at very high rates the window is shorter than WINDOW_S
 MAX_VALUE = 1e9  # larger speeds and commands count as missing: their powers would overflow
-MIN_PROBABILITY = 0.005  # less probable causes are not reported
+MIN_PROBABILITY = 0.15  # less probable causes are not listed, except the first
+FORMER_MIN_PROBABILITY = 0.005
+NEWS = 0.1  # a change of a probability that is worth a message
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +40,10 @@ class _Block:
 class Diagnoser:
     """Diagnoses the fans of one tray. Rows are selected by time: the cuts between blocks make no difference."""
 
-    def __init__(self, healthy: Sequence[HealthyBalance]) -> None:
+    def __init__(self, healthy: Sequence[HealthyBalance], advice: Advice | None = ADVICE) -> None:
+        """advice: None only to diagnose as for recordings made before there was any; see `diagnose`."""
         self._healthy = healthy
+        self._advice = advice
         self._blocks: deque[_Block] = deque()
         self._period_ns = 0
         self._due: dict[int, list[int]] = {}
@@ -93,8 +98,15 @@ class Diagnoser:
         window = self.window(fan, t_ns, self._onset_t_ns.get(fan, t_ns))
         if window is None:
             return ()
-        causes = diagnose(window, self._healthy[fan]).causes
-        return tuple(_message(cause) for cause in causes if cause.probability >= MIN_PROBABILITY)
+        causes = diagnose(window, self._healthy[fan], self._advice).causes
+        least = FORMER_MIN_PROBABILITY if self._advice is None else min(MIN_PROBABILITY, causes[0].probability)
+        return tuple(_message(cause) for cause in causes if cause.probability >= least)
+
+    def says_more(self, causes: Sequence[CauseMessage], than: Sequence[CauseMessage]) -> bool:
+        """Whether causes are worth a message after others: in another order, or with other probabilities."""
+        if self._advice is None or [each.cause for each in causes] != [each.cause for each in than]:
+            return True
+        return any(abs(new.probability - old.probability) >= NEWS for new, old in zip(causes, than, strict=True))
 
     def snapshot(self) -> dict[str, Any]:
         """The scheduled diagnoses, as JSON values; the samples are not included."""

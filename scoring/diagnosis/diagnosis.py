@@ -18,16 +18,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.hypotheses import CAUSES, Comparison, Explanation, log_sum
 from scoring.diagnosis.regression_window import Array, HealthyBalance, RegressionWindow, Window
 from scoring.diagnosis.sensor_evidence import dropout_log_ratio, stuck_log_ratio
 
 CANNOT_TELL, STUCK, DROPOUT = "cannot_tell", "sensor_stuck", "sensor_dropout"
+CANNOT_TELL_YET = "cannot tell yet"
+ADVICE = Advice()
 MIN_AFTER_ONSET_S = 0.2
 CLEAR_RATIO = 0.5
 """the diagnosis is clear if `cannot_tell` has less than this share of the first cause's probability"""
 STEADY_SHARE = 0.05
 """a speed that varies by less than this share excites nothing"""
+DROPOUT_BEFORE_ONSET_S = 10.0
+"""readings may have been missing for so long before their share exceeded its limit"""
 
 
 @dataclass(frozen=True)
@@ -66,8 +71,11 @@ class Diagnosis:
         return self.causes[0]
 
 
-def diagnose(window: Window, healthy: HealthyBalance) -> Diagnosis:
+def diagnose(window: Window, healthy: HealthyBalance, advice: Advice | None = ADVICE) -> Diagnosis:
     """Diagnose one fan from its last seconds, some before the onset of the fault and all since.
+
+    advice: on what would show the cause, where it is unclear; None only to diagnose as for recordings made before there
+    was any. Missing readings then counted from the onset of the alarm, not from the first of them.
 
     About three seconds of health before the onset are enough; the samples after it decide. The diagnosis can be
     repeated as samples arrive. It takes milliseconds.
@@ -76,7 +84,8 @@ def diagnose(window: Window, healthy: HealthyBalance) -> Diagnosis:
     speed, onset = window.speed_rad_s[heard], int(np.count_nonzero(heard[: window.onset]))
     regression = RegressionWindow(window, healthy)
     stuck, repeats = stuck_log_ratio(speed, onset)
-    dropout, missing = dropout_log_ratio(speed, onset)
+    dropout_onset = onset if advice is None else _first_missing(speed, onset, window.period_s)
+    dropout, missing = dropout_log_ratio(speed, dropout_onset)
     enough = len(regression.speeds_after) * window.period_s >= MIN_AFTER_ONSET_S
     if enough:
         comparison = Comparison(regression, healthy)
@@ -95,8 +104,11 @@ def diagnose(window: Window, healthy: HealthyBalance) -> Diagnosis:
     weight /= weight.sum()
     evidence: dict[str, tuple[Evidence | None, str]] = {one.cause.name: _evidence(one) for one in explanations}
     evidence[STUCK] = _of_stuck(repeats, window.period_s)
-    evidence[DROPOUT] = _of_dropout(missing)
-    evidence[CANNOT_TELL] = None, _clarity(names, weight, healthy_share, regression.speeds_after if enough else None)
+    evidence[DROPOUT] = _of_dropout(missing, 0.0 if advice is None else (len(speed) - dropout_onset) * window.period_s)
+    unclear = _clarity(names, weight, healthy_share, regression.speeds_after if enough else None)
+    if advice is not None and unclear.startswith(CANNOT_TELL_YET):
+        unclear = advice.added_to(unclear, window, healthy)
+    evidence[CANNOT_TELL] = None, unclear
     causes = [
         RankedCause(name, float(share), *evidence.get(name, (None, "no speed to judge by")))
         for name, share in zip(names, weight, strict=True)
@@ -120,11 +132,20 @@ def _of_stuck(repeats: int, period_s: float) -> tuple[Evidence | None, str]:
     return found, f"the last {repeats} readings are all the same, for {repeats * period_s:.2g} s"
 
 
-def _of_dropout(missing: float) -> tuple[Evidence | None, str]:
+def _first_missing(speed_rad_s: Array, onset: int, period_s: float) -> int:
+    """Since when readings are missing: the first missing one of the last seconds before the onset, or the onset."""
+    first = max(0, onset - round(DROPOUT_BEFORE_ONSET_S / period_s))
+    missing = np.flatnonzero(~np.isfinite(speed_rad_s[first:onset]))
+    return first + int(missing[0]) if len(missing) else onset
+
+
+def _of_dropout(missing: float, seconds: float) -> tuple[Evidence | None, str]:
+    """seconds: over which the share was counted; 0 leaves it out."""
     if not missing:
         return None, "no reading is missing"
     found = Evidence("missing readings", missing, missing, missing, "share")
-    return found, f"{100 * missing:.0f} % of the readings are missing"
+    over = f" of the last {seconds:.2g} s" if seconds else ""
+    return found, f"{100 * missing:.0f} % of the readings{over} are missing"
 
 
 def _clarity(names: list[str], weight: Array, healthy_share: float, speeds_after: Array | None) -> str:
@@ -133,10 +154,10 @@ def _clarity(names: list[str], weight: Array, healthy_share: float, speeds_after
     if weight[-1] < weight[first] * CLEAR_RATIO:
         return f"little doubt: {names[first]} is more than twice as probable as all others together"
     if speeds_after is None:
-        return "cannot tell yet: too few speeds since the onset"
+        return f"{CANNOT_TELL_YET}: too few speeds since the onset"
     if healthy_share > 0.5:
-        return "cannot tell yet: the torque balance is that of a healthy fan"
+        return f"{CANNOT_TELL_YET}: the torque balance is that of a healthy fan"
     low, high = np.quantile(speeds_after, (0.05, 0.95))
     if high - low < STEADY_SHARE * high:
-        return "cannot tell yet: the command is not moving"
-    return f"cannot tell yet: {names[first]} and {names[second]} explain it alike"
+        return f"{CANNOT_TELL_YET}: the command is not moving"
+    return f"{CANNOT_TELL_YET}: {names[first]} and {names[second]} explain it alike"

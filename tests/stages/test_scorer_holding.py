@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
-from schemas.messages import InvalidReason, Prediction, Transition
+from schemas.messages import InvalidReason, Prediction, Statistic, Transition
 from stages.scorer import ScorerCore
 from tests.support.scored_blocks import CALIBRATION, SIGMA, Floats, core_of, feed, prediction_of
 
@@ -96,3 +98,28 @@ def test_a_fan_is_not_commissioned_from_its_run_up() -> None:
 
     assert baseline(FORMER) > 0.1 * SIGMA
     assert baseline(CURRENT_RULES) < 0.1 * SIGMA
+
+
+@pytest.mark.parametrize("rules", [FORMER, CURRENT_RULES])
+def test_a_diagnosis_that_says_nothing_new_is_no_message(rules: DecisionRules) -> None:
+    samples = 70 * SECOND
+    residual = noise(samples) - np.where(np.arange(samples)[:, np.newaxis] > 10 * SECOND, 2.0 * SIGMA, 0.0)
+    _, alarms = feed(core_after_commissioning(rules), [prediction(residual)])
+    causes = [[(each.cause, each.probability) for each in alarm.causes] for alarm in alarms if alarm.causes]
+    repeats = sum(
+        [name for name, _ in one] == [name for name, _ in other]
+        and all(abs(p - q) < 0.1 for (_, p), (_, q) in zip(one, other, strict=True))
+        for one, other in pairwise(causes)
+    )
+    assert (repeats == 0) == (rules >= DecisionRules.HOLDING)
+    assert all(p >= 0.15 for one in causes for _, p in one) == (rules >= DecisionRules.HOLDING)
+
+
+@pytest.mark.parametrize(("rules", "limit_rad_s"), [(FORMER, 7.9), (CURRENT_RULES, 2.0)])
+def test_the_limit_beside_a_drift_is_the_one_of_the_drift(rules: DecisionRules, limit_rad_s: float) -> None:
+    """Half a sigma adds up; the smoothed residual may be nearly two away."""
+    residual = noise(20 * SECOND) - np.where(np.arange(20 * SECOND)[:, np.newaxis] > 5 * SECOND, 1.2 * SIGMA, 0.0)
+    _, alarms = feed(core_after_commissioning(rules), [prediction(residual)])
+    assert alarms[0].statistic == Statistic.SPEED_DRIFT
+    assert alarms[0].limit_rad_s == pytest.approx(limit_rad_s, abs=0.05)
+    assert f"rad/s below the twin (limit {limit_rad_s:.2g}), for long" in alarms[0].message

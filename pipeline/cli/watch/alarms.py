@@ -35,11 +35,11 @@ from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.alarm_text import CANNOT_TELL, CAUSES
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, until, words_of
+from scoring.diagnosis.diagnoser import MIN_PROBABILITY
 
 _DISCOVERY_S = 5.0  # every stage sends several health messages in this time
 _SCORES_S = 3.0  # a score of every tray arrives in this time
 _POLL_S = 0.02
-_MIN_PROBABILITY = 0.05  # less probable causes are not listed
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 _STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 
@@ -303,9 +303,11 @@ def _name(alarm: Alarm) -> str:
 
 
 def _probable(causes: Iterable[Diagnosis]) -> str:
-    """The causes with a probability that is listed, the most probable first."""
+    """The most probable cause, and the others that are probable enough to be listed."""
     return ", ".join(
-        f"{each.cause} {100 * each.probability:.0f} %" for each in causes if each.probability >= _MIN_PROBABILITY
+        f"{each.cause} {100 * each.probability:.0f} %"
+        for number, each in enumerate(causes)
+        if not number or each.probability >= MIN_PROBABILITY
     )
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from schemas.messages import Transition
 from scoring.detectors.deviation import summed_deviation
-from scoring.diagnosis.diagnoser import MAX_SAMPLES, Diagnoser
+from scoring.diagnosis.diagnoser import MAX_SAMPLES, MIN_PROBABILITY, Diagnoser
 from tests.support.scored_blocks import (
     CALIBRATION,
     NEEDED,
@@ -55,7 +55,8 @@ def test_a_fan_that_needs_more_command_at_a_held_speed_is_diagnosed() -> None:
     at = int(times(1300)[-1])
     diagnoser.raised(0, at, EPOCH_NS + 10 * S)
     causes = diagnoser.diagnose(0, at)
-    assert sum(cause.probability for cause in causes) == pytest.approx(1.0, abs=0.05)
+    assert min(cause.probability for cause in causes) >= MIN_PROBABILITY, "less probable ones are not listed"
+    assert sum(cause.probability for cause in causes) > 0.7
     probabilities = {cause.cause: cause.probability for cause in causes}
     assert sum(probabilities.get(name, 0.0) for name in ("drag_down", "sensor_stuck", "sensor_dropout")) < 0.05
     assert [cause.probability for cause in causes] == sorted((c.probability for c in causes), reverse=True)
