@@ -126,6 +126,8 @@ class RawBlocks:
                 has_begun = True
             elif producer == span.producer or not has_begun or span.last is not None:
                 continue
+            else:  # of a producer that was killed, the recorder may lack the last messages, which this session consumed
+                after_gap |= self._count_gap(span.producer, due, span.last_known + 1)
             after_gap |= self._count_gap(producer, due, sequence)
             due[producer] = sequence + 1
             yield producer, sequence, envelope.payload, after_gap
@@ -137,9 +139,10 @@ class RawBlocks:
         yield "", 0, b"", after_gap
 
     def _count_gap(self, producer: str, due: dict[str, int], end: int) -> bool:
-        """Count the producer's messages from the one that is due up to `end`, which is not one of them. Returns whether
-        there are any."""
+        """Count the producer's messages from the one that is due up to `end`, which is then due. Returns whether there
+        are any."""
         first = due.get(producer, end)
+        due[producer] = max(first, end)
         if end > first:
             self._gaps[producer, first] = max(self._gaps.get((producer, first), 0), end - first)
         return end > first

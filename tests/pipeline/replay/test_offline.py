@@ -297,6 +297,25 @@ def test_row_14_scores_before_raw_messages_that_are_missing_at_the_end_are_compa
     assert "lacks 20 raw messages" in found.reasons[0]
 
 
+def test_row_14_the_last_raw_message_of_a_killed_acquisition_may_have_reached_the_resampler_only(tmp_path):
+    site = Site(tmp_path, seed=4)
+    site.run(150)
+    killed, last = site.source.producer, site.source.published["raw"] - 1
+    site.restart_source()
+    site.kill("resampler")
+    site.run(100)
+
+    def without(entry):
+        header = entry.message.header
+        is_last = entry.topic == "raw" and (header.producer, header.sequence) == (killed, last)
+        return None if is_last else entry.message
+
+    found = verified_in_part(changed(site.finished(), tmp_path / "without.mcap", without))
+    assert found.equal >= 148
+    assert found.not_comparable
+    assert "lacks 1 raw messages" in found.reasons[0]
+
+
 @pytest.mark.parametrize("stage", ["resampler", "twin_integrator", "scorer"])
 def test_row_14_a_session_that_fell_into_a_pause_of_the_recorder_leaves_the_rest_comparable(tmp_path, stage):
     site = Site(tmp_path, seed=4)
