@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -11,8 +11,10 @@ from rich.console import Console
 from rich.progress import Progress
 
 from pipeline.devices.simulated_device import Device, DeviceSample, PlaybackCounts
+from pipeline.recordings.reading import TACHO_KEY
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Raw
+from schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
 from schemas.topics import tray_key
 from schemas.units import NS_PER_S
 
@@ -20,11 +22,14 @@ SITE, TRAY, PRODUCER = "simulated", "tray1", "simulate"
 SAMPLES_PER_MESSAGE = 100
 
 
-def record(device: Device, path: Path, epoch_ns: int, duration_s: float, speed_unit: str) -> PlaybackCounts:
+def record(
+    device: Device, path: Path, epoch_ns: int, duration_s: float, speed_unit: str, tachos: Sequence[Tacho]
+) -> PlaybackCounts:
     """Write all samples of a device as Raw messages; equal arguments give equal bytes.
 
     epoch_ns: time of t_s = 0; the time of receipt of a sample is that of its measurement. duration_s: for the progress
-    on stderr. speed_unit: unit to display speeds in; samples are in rad/s. An existing recording is replaced.
+    on stderr. speed_unit: unit to display speeds in; samples are in rad/s. tachos: how they are measured. An existing
+    recording is replaced.
 
     Raises:
         RecordingError: it cannot be written.
@@ -37,6 +42,8 @@ def record(device: Device, path: Path, epoch_ns: int, duration_s: float, speed_u
         "trays": TRAY,
         "speed_unit": speed_unit,
     }
+    if tuple(tachos) != INSTANTANEOUS:
+        metadata[f"{TACHO_KEY}.{TRAY}"] = tachos_to_json(tachos)
     with (
         RecordingWriter(path, metadata, t_ns=epoch_ns, overwrite=True) as writer,
         Progress(console=Console(stderr=True), transient=True) as progress,

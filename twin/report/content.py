@@ -42,8 +42,9 @@ class Parameter:
 class FanContent:
     """One fan. Arrays (n,) are in rad/s or command units, over all pieces one after the other.
 
-    column: of the runs. number: as the recording counts fans. predicted_rad_s: NaN where the free run diverged.
-    error_rad_s: measured minus free run, NaN where nothing was measured, infinite where the free run diverged.
+    column: of the runs. number: as the recording counts fans. predicted_rad_s: the readings expected of the free
+    run, NaN where it diverged. error_rad_s: measured minus that, NaN where nothing is compared, infinite where the free
+    run diverged.
     """
 
     column: int

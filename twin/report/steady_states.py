@@ -24,7 +24,7 @@ MOST_STEPS = 20_000
 
 @dataclass(frozen=True)
 class Hold:
-    """A held command, for lasted_s; needed_s is the time that the fan takes to settle.
+    """A held command, for lasted_s; needed_s is the time that the fan, and its tacho, take to settle.
 
     speed_rad_s: the mean from there on, NaN where the hold was too short or nothing was measured.
     """
@@ -98,7 +98,8 @@ def _holds(piece: Run, fan: int, parameters: Array, tolerance: float, top_speed_
             continue
         age_s = piece.t_s[part] - piece.t_s[part[0]]
         ends_rad_s = float(np.nanmean(speeds[:end])), float(np.nanmean(speeds[-end:]))
-        needed_s = _settling_s(*ends_rad_s, float(age_s[-1]), parameters, SETTLED * top_speed_rad_s)
+        settling_s = _settling_s(*ends_rad_s, float(age_s[-1]), parameters, SETTLED * top_speed_rad_s)
+        needed_s = settling_s + piece.tacho[fan].reach_s
         settled = speeds[(age_s >= needed_s) & np.isfinite(speeds)]
         mean_rad_s = float(settled.mean()) if settled.size else np.nan
         holds.append(Hold(float(command[part].mean()), float(age_s[-1]), needed_s, mean_rad_s))

@@ -23,7 +23,7 @@ from pipeline.errors import UserError
 from pipeline.recordings.simulated import record
 from pipeline.runtime.signals import stop_on_signals
 from schemas import wire
-from schemas.tacho import Tacho
+from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
 if TYPE_CHECKING:
@@ -181,6 +181,7 @@ def simulate(
     A rack: fantwin simulate --fan 4-pin --fans 4 --tacho count --window 1.0 --pulses 2 --rate 10 --profile thermostat
     """
     device: SimulatedTray | TableDevice
+    tachos = INSTANTANEOUS
     if from_csv:
         if recording or fault:
             raise UserError(
@@ -193,12 +194,13 @@ def simulate(
     else:
         if time or period or command or speed:
             raise UserError("--time, --period, --command and --speed describe a file: name it with --from-csv FILE.csv")
+        tachos = tuple(
+            _tacho(kind=tacho, pulses=pulses, window_s=one, update_s=update, delay_s=tacho_delay)
+            for one in window or [0.0]
+        )
         device = _tray(
             faults=fault or [],
-            tachos=tuple(
-                _tacho(kind=tacho, pulses=pulses, window_s=one, update_s=update, delay_s=tacho_delay)
-                for one in window or [0.0]
-            ),
+            tachos=tachos,
             noise_rad_s=noise,
             shares={"missing_edges": missing_edges, "double_edges": double_edges, "missing_readings": missing},
             clock={"drift_ppm": drift_ppm, "start_us": clock_start_us},
@@ -221,7 +223,8 @@ def simulate(
             raise UserError(f"--duration {duration}: a recording needs a finite number of seconds")
         if recording.exists() and not force:
             raise UserError(f"{recording}: exists; name another file with --recording, or replace it with --force")
-        played = record(device, recording, clock.time_ns() if epoch_ns is None else epoch_ns, duration, speed_unit)
+        epoch_ns = clock.time_ns() if epoch_ns is None else epoch_ns
+        played = record(device, recording, epoch_ns, duration, speed_unit, tachos)
         summary = summary_of(played, complete=True)
         _save(truth, summary)
     else:

@@ -128,6 +128,10 @@ def compare(
         return
     Console().print(table(result))
     typer.echo(f"* best: smallest free-run rmse over {SOURCE_MEANING[source]}.")
+    if floor := next(
+        its["figures"][source]["tacho_floor"] for its in result["models"] if its["model"] == result["best"]
+    ):
+        typer.echo(f"The tacho alone would leave a perfect model an rmse of {shown(floor)} {result['speed_unit']}.")
     if folder:
         typer.echo(f"{folder}: the twins and comparison.json")
     for its in result["models"]:

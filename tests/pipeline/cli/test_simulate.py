@@ -20,9 +20,10 @@ from pipeline.devices.measured_table import read_table
 from pipeline.devices.simulated_device import PseudoTerminal, play, wait_for_reader
 from pipeline.devices.table_device import TableDevice, TableSample
 from pipeline.errors import UserError
-from pipeline.recordings.reading import read_recording
+from pipeline.recordings.reading import read_metadata, read_recording
 from schemas import wire
 from schemas.messages import Raw
+from schemas.tacho import Tacho
 from tests.support.running_chain import eventually
 
 FANTWIN = (
@@ -419,6 +420,7 @@ def test_a_rack_of_4_pin_fans_is_recorded_with_counts_of_its_window(tmp_path: Pa
     assert [tacho["window_s"] for tacho in said["tacho"]["measurement"]] == windows
     assert {(tacho["kind"], tacho["pulses"]) for tacho in said["tacho"]["measurement"]} == {("count", 2)}
     assert said["parameters"][2]["duty_min"] == 0.2
+    assert read_metadata(recording).tacho("tray1") == tuple(Tacho(kind="count", window_s=each) for each in windows)
 
 
 def test_line_and_recording_carry_the_same_samples(tmp_path: Path) -> None:
