@@ -26,7 +26,7 @@ SHORTEST_PROBE_S = 3.0
 _POLL_S = 0.1
 _SETTLED = 0.02  # of the whole change: so little changes any more
 _FOLLOWS = 0.05  # of the top speed: a fan that changes less over the whole range does not follow its command
-_NOISE_SIGMAS = 5.0  # a smaller change is not told from noise
+_NOISE_SIGMAS = 5.0  # a smaller change may be noise
 _TOLERANCE = 0.02  # of the range: a device rounds its commands
 
 
