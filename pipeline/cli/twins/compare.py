@@ -23,6 +23,7 @@ from pipeline.cli.twins.training_data import (
     ToOption,
     TrainingData,
     TrayOption,
+    WindowOption,
     data_cards,
     make_folder,
     read_held_out,
@@ -68,6 +69,7 @@ def compare(
     test_to_s: Annotated[float, typer.Option("--test-to", help="Like --to, for --test.")] = math.inf,
     tray: TrayOption = None,
     fans: FansOption = None,
+    window_s: WindowOption = None,
     seed: Annotated[int, typer.Option(help="The same seed and recordings give the same twins.")] = 0,
     iterations: Annotated[
         int | None, typer.Option(min=1, help="Maximum iterations. Default: depends on the model.")
@@ -85,11 +87,13 @@ def compare(
         from twin.comparison import best, contend, source_of  # noqa: PLC0415  loads twin only when it is needed
 
         chosen = _chosen(model)
-        training_data = read_training_data(recordings, tray, fans, from_s, to_s)
+        training_data = read_training_data(recordings, tray, fans, from_s, to_s, window_s)
         held_out = (
-            read_held_out(training_data, validate, tray, fans, validate_from_s, validate_to_s) if validate else None
+            read_held_out(training_data, validate, tray, fans, validate_from_s, validate_to_s, window_s)
+            if validate
+            else None
         )
-        untouched = read_held_out(training_data, test, tray, fans, test_from_s, test_to_s) if test else None
+        untouched = read_held_out(training_data, test, tray, fans, test_from_s, test_to_s, window_s) if test else None
         folder = make_folder(output) if output else None
         validation_runs, test_runs = (part.runs if part else [] for part in (held_out, untouched))
         data, validation_data = data_cards(training_data), data_cards(held_out) if held_out else ()

@@ -14,12 +14,14 @@ from rich.table import Table
 from pipeline.cli.options import JsonOption
 from pipeline.cli.progress import working
 from pipeline.cli.twins.training_data import (
+    TACHO_ADVICE,
     FansOption,
     FromOption,
     RecordingsArgument,
     ToOption,
     TrainingData,
     TrayOption,
+    WindowOption,
     read_training_data,
     twin_errors,
 )
@@ -42,6 +44,7 @@ def identify(
     to_s: ToOption = math.inf,
     tray: TrayOption = None,
     fans: FansOption = None,
+    window_s: WindowOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Find J, alpha and C_D of J w' + alpha w + C_D w|w| = command for each fan, and the lag of its command.
@@ -54,7 +57,7 @@ def identify(
     with twin_errors():
         from twin.fitting.identification import identify as identify_fans  # noqa: PLC0415  loads twin only when it is needed
 
-        training_data = read_training_data(recordings, tray, fans, from_s, to_s)
+        training_data = read_training_data(recordings, tray, fans, from_s, to_s, window_s)
         samples = sum(run.samples for run in training_data.runs)
         with working(f"identifying {training_data.runs[0].fans} fan(s) from {samples:,} samples each"):
             found = identify_fans(training_data.runs)
@@ -66,7 +69,7 @@ def identify(
     for warning in result["warnings"]:
         typer.secho(f"warning: {warning}", fg=typer.colors.YELLOW, err=True)
     for hint in result["hints"]:
-        typer.secho(f"hint: {hint}; see `tacho` in [[tray]]", fg=typer.colors.YELLOW, err=True)
+        typer.secho(f"hint: {hint}; {TACHO_ADVICE}", fg=typer.colors.YELLOW, err=True)
 
 
 def as_json(found: Identification, training_data: TrainingData) -> dict[str, Any]:

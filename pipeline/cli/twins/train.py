@@ -13,12 +13,14 @@ from pipeline.cli.options import JsonOption
 from pipeline.cli.progress import training_progress
 from pipeline.cli.twins.figures import figures_in, sentence, shown
 from pipeline.cli.twins.training_data import (
+    TACHO_ADVICE,
     FansOption,
     FromOption,
     RecordingsArgument,
     ToOption,
     TrainingData,
     TrayOption,
+    WindowOption,
     check_writable,
     data_cards,
     read_held_out,
@@ -49,6 +51,7 @@ def train(
     validate_to_s: Annotated[float, typer.Option("--validate-to", help="Like --to, for --validate.")] = math.inf,
     tray: TrayOption = None,
     fans: FansOption = None,
+    window_s: WindowOption = None,
     name: Annotated[str | None, typer.Option(help="Name of the twin. Default: the name of the file.")] = None,
     seed: Annotated[int, typer.Option(help="The same seed and recordings give the same twin.")] = 0,
     trainer: Annotated[Trainer, typer.Option(help="adam is the published one.")] = "levenberg-marquardt",
@@ -77,9 +80,11 @@ def train(
 
         find_kind(model)
         check_writable(output, ".onnx")
-        training_data = read_training_data(recordings, tray, fans, from_s, to_s)
+        training_data = read_training_data(recordings, tray, fans, from_s, to_s, window_s)
         held_out = (
-            read_held_out(training_data, validate, tray, fans, validate_from_s, validate_to_s) if validate else None
+            read_held_out(training_data, validate, tray, fans, validate_from_s, validate_to_s, window_s)
+            if validate
+            else None
         )
         with training_progress(training_data) as start:
             trained = train_twin(
@@ -108,6 +113,8 @@ def train(
     typer.echo(f"  {balance_sentence(result)}")
     for warning in result["warnings"]:
         typer.echo(warning, err=True)
+    for hint in result["hints"]:
+        typer.echo(f"hint: {hint}; {TACHO_ADVICE}", err=True)
 
 
 def balance_sentence(result: dict[str, Any]) -> str:
@@ -138,4 +145,5 @@ def as_json(trained: TrainedTwin, training_data: TrainingData, output: Path) -> 
         "iterations": card.training.iterations,
         "duration_s": card.training.duration_s,
         "warnings": training_data.with_fan_numbers(trained.identification.warnings),
+        "hints": training_data.tacho_hints(),
     }

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
+from pydantic import ValidationError
 
 from pipeline.cli.options import fan_numbers
 from pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT
@@ -30,8 +31,18 @@ RecordingsArgument: TypeAlias = Annotated[
 FromOption: TypeAlias = Annotated[float, typer.Option("--from", help="Use each recording from this second on.")]
 ToOption: TypeAlias = Annotated[float, typer.Option("--to", help="Use each recording up to this second.")]
 TrayOption: TypeAlias = Annotated[str | None, typer.Option(help="Which tray, where a recording has several.")]
+WindowOption: TypeAlias = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--window",
+        metavar="S",
+        help="Seconds over which tachos count two pulses a revolution, in place of what the recordings say: one for "
+        "all fans, or one for each. Repeatable.",
+    ),
+]
 FansOption: TypeAlias = Annotated[str | None, typer.Option(help="Only these fans, counted from 0, e.g. 0,2.")]
 
+TACHO_ADVICE = "see `tacho` in [[tray]], or --window for recordings that do not say"
 MANY_OUTLIERS = 0.001
 _EXTRA_MODULES = ("jinja2", "matplotlib", "onnx", "scipy", "torch")
 
@@ -68,9 +79,16 @@ class TrainingData:
 
 
 def read_training_data(
-    recordings: Sequence[Path], tray: str | None, fans: str | None, from_s: float, to_s: float
+    recordings: Sequence[Path],
+    tray: str | None,
+    fans: str | None,
+    from_s: float,
+    to_s: float,
+    windows_s: Sequence[float] | None = None,
 ) -> TrainingData:
     """The runs of several recordings, their outliers left out. Damage in a recording is reported on stderr.
+
+    windows_s: of tachos that count, in place of the recordings' own; see WindowOption.
 
     Raises:
         UserError: a recording cannot be used, or they are not in one unit.
@@ -78,6 +96,7 @@ def read_training_data(
     from twin.fitting.outliers import without_outliers  # noqa: PLC0415  the command line loads twin only when it is needed
     from twin.runs import Run  # noqa: PLC0415
 
+    counted = counting_tachos(windows_s) if windows_s else None
     recorded: list[RecordedRun] = []
     tachos: list[tuple[Tacho, ...]] = []
     units: dict[str, Path] = {}
@@ -86,7 +105,7 @@ def read_training_data(
         if found.damage:
             typer.echo(found.damage, err=True)
         recorded += found.runs
-        tachos += [found.tacho] * len(found.runs)
+        tachos += [counted or found.tacho] * len(found.runs)
         units.setdefault(found.speed_unit, path)
     if len(units) > 1:
         found_units = " and ".join(f"{unit} ({path})" for unit, path in units.items())
@@ -107,6 +126,18 @@ def read_training_data(
         if share > MANY_OUTLIERS
     )
     return TrainingData([run for run, _ in cleaned], recorded, unit, numbers, outliers)
+
+
+def counting_tachos(windows_s: Sequence[float]) -> tuple[Tacho, ...]:
+    """Tachos that count the usual two pulses a revolution over these windows.
+
+    Raises:
+        UserError: a window is not possible.
+    """
+    try:
+        return tuple(Tacho(kind="count", window_s=window_s) for window_s in windows_s)
+    except ValidationError as error:
+        raise UserError(f"--window: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
 
 
 @contextmanager
@@ -151,13 +182,14 @@ def read_held_out(
     fans: str | None,
     from_s: float,
     to_s: float,
+    windows_s: Sequence[float] | None = None,
 ) -> TrainingData:
     """Recordings for evaluation, which take no part in the fit.
 
     Raises:
         UserError: they cannot be used, are in another unit, or overlap the training data.
     """
-    held_out = read_training_data(recordings, tray, fans, from_s, to_s)
+    held_out = read_training_data(recordings, tray, fans, from_s, to_s, windows_s)
     if held_out.speed_unit != training_data.speed_unit:
         raise UserError(
             f"{recordings[0]}: speeds in {held_out.speed_unit}, the training data are in {training_data.speed_unit}: "
