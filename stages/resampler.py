@@ -2,7 +2,7 @@
 
 Reads: topic `raw` (device clock us, host time of receipt ns, command, speed rad/s).
 Writes: topic `grid`: samples at absolute multiples of the period (t_ns % period_ns == 0), speed interpolated linearly,
-command held (that of the last sample at or before the grid time).
+command held (that of the last sample at or before the grid time). The readings of a counting tacho are held, too.
 Timing: a grid sample is published as soon as a raw sample at or after its time has arrived. If one fan has no reading,
 all fans wait for its next one, at most `gap_limit_s`. If no samples arrive, the wait is at most `watermark_s`.
 
@@ -18,7 +18,7 @@ grid. See docs/explanation/time.md.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Self
 
@@ -41,6 +41,7 @@ from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.sample_grid import SampleGrid
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
 from schemas.messages import Grid, Raw
+from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
 
 FASTER = 2.0  # a line that sends so many times the samples of its grid has changed
@@ -87,8 +88,17 @@ class ResamplerConfig(StageConfig):
 class ResamplerCore(Core):
     """The grid of one tray, at the rate of the configuration or at that of its line."""
 
-    def __init__(self, fans: int, config: ResamplerConfig, *, decision_rules: DecisionRules = CURRENT_RULES) -> None:
+    def __init__(
+        self,
+        fans: int,
+        config: ResamplerConfig,
+        *,
+        tachos: Sequence[Tacho] = INSTANTANEOUS,
+        decision_rules: DecisionRules = CURRENT_RULES,
+    ) -> None:
+        """tachos: how the speed is measured, one for all fans or one for each."""
         self._fans = fans
+        self._tachos = tacho_of_each_fan(tachos, fans)
         self._config = config
         self._decision_rules = decision_rules
         self._line = LineRate()
@@ -190,13 +200,14 @@ class ResamplerCore(Core):
         if self._line_hz is not None and is_too_slow(self._line_hz):
             config = config.model_copy(update={"gap_limit_s": config.gap_limit_s or 1.0 / rate_hz})
         self._timing = config.timing(rate_hz)
-        self._grid = SampleGrid(self._fans, self._timing, config.block_size, self._decision_rules)
+        self._grid = SampleGrid(self._tachos, self._timing, config.block_size, self._decision_rules)
         return self._grid
 
 
 def build(context: Context) -> BuiltStage:
     """The core of one tray."""
-    return BuiltStage(ResamplerCore(context.tray.fans, context.config, decision_rules=context.decision_rules))
+    tray, rules = context.tray, context.decision_rules
+    return BuiltStage(ResamplerCore(tray.fans, context.config, tachos=tray.tacho, decision_rules=rules))
 
 
 STAGE = Stage(

@@ -36,25 +36,27 @@ def all_true(mask: Array) -> bool:
     return np.count_nonzero(mask) == mask.size
 
 
-def interpolate_samples(t_ns: Array, at: Array, samples: Samples) -> Array:
+def interpolate_samples(t_ns: Array, at: Array, samples: Samples, is_held: Array) -> Array:
     """Speeds (n, fans) at t_ns (n,), if every fan has a reading in every sample.
 
-    at: (n,), index of the last sample at or before each time.
+    at: (n,), index of the last sample at or before each time. is_held: (fans,) of bool, see LastReadings.
     """
     after = at + 1
     here_t_ns, here = samples.t_ns.take(at), samples.speed_rad_s.take(at, axis=0)
     since_ns = t_ns - here_t_ns
     span_ns = samples.t_ns.take(after, mode="clip") - here_t_ns
-    share = since_ns / np.maximum(span_ns, 1)
-    between = here + share[:, np.newaxis] * (samples.speed_rad_s.take(after, axis=0, mode="clip") - here)
+    share = np.where(is_held, 0.0, (since_ns / np.maximum(span_ns, 1))[:, np.newaxis])
+    between = here + share * (samples.speed_rad_s.take(after, axis=0, mode="clip") - here)
     return np.where((since_ns == 0)[:, np.newaxis], here, between)
 
 
 class LastReadings:
     """The last reading of each fan before the samples that are still held."""
 
-    def __init__(self, fans: int, limit_ns: int) -> None:
+    def __init__(self, fans: int, limit_ns: int, is_held: Array) -> None:
+        """is_held: (fans,) of bool, the tacho shows a reading until the next one: it is held, not interpolated."""
         self._limit_ns = limit_ns
+        self._is_held = is_held
         self._fans = np.arange(fans)
         self._t_ns = np.full(fans, NEVER_NS, np.int64)
         self._speed_rad_s = np.full(fans, np.nan)
@@ -98,7 +100,8 @@ class LastReadings:
         since_ns = t_ns[:, np.newaxis] - here_t_ns
         span_ns = reading_t_ns[after, fans] - here_t_ns
         near = ~none & (span_ns <= self._limit_ns)
-        between = here + since_ns / np.where(near, span_ns, 1) * (speed[after, fans] - here)
+        share = np.where(self._is_held, 0.0, since_ns / np.where(near, span_ns, 1))
+        between = here + share * (speed[after, fans] - here)
         found = np.where(since_ns == 0, here, np.where(near, between, np.nan))
         may_arrive = none & (since_ns > 0) & (newest_t_ns - here_t_ns <= self._limit_ns)
         return found, may_arrive

@@ -7,7 +7,7 @@ docs/explanation/time.md.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from pipeline.runtime.clock import is_of_replay
 from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import cut, join
 from schemas.messages import Array, Grid, InvalidReason, Raw
+from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
 
 LONGEST_TICK_NS = NS_PER_S // 10  # a longer pause between ticks is a host that stalled, not a silent source
@@ -39,9 +40,13 @@ def first_grid_time(t_ns: int, period_ns: int) -> int:
 class SampleGrid:
     """The grid of one tray. Samples that are dropped and gaps are counted."""
 
-    def __init__(self, fans: int, timing: GridTiming, block_size: int, decision_rules: DecisionRules) -> None:
-        """block_size: samples a message."""
-        self._fans = fans
+    def __init__(
+        self, tachos: Sequence[Tacho], timing: GridTiming, block_size: int, decision_rules: DecisionRules
+    ) -> None:
+        """tachos: one for each fan; readings that a tacho shows until the next one are held. block_size: samples a
+        message."""
+        self._fans = fans = len(tachos)
+        self._is_held = np.array([tacho.held_s > 0.0 for tacho in tachos])
         self._block_size = block_size
         self._period_ns = timing.period_ns
         self._gap_limit_ns = timing.gap_limit_ns
@@ -52,7 +57,7 @@ class SampleGrid:
         self._restarts_t_ns: deque[int] = deque()  # of first samples after restarts whose grid samples are not made yet
         self._clock = DeviceClock(knows_backlogs=knows_time)
         self._guard = LineGuard(self._clock, self._period_ns) if knows_time else None
-        self._last_readings = LastReadings(fans, self._gap_limit_ns)
+        self._last_readings = LastReadings(fans, self._gap_limit_ns, self._is_held)
         # The last raw sample at or before the next grid time, and all later ones.
         self._held = Samples(np.zeros(0, np.int64), np.zeros((0, fans)), np.zeros((0, fans)))
         self._newest_t_ns = NEVER_NS
@@ -240,9 +245,9 @@ class SampleGrid:
         waits = False
         has = np.isfinite(samples.speed_rad_s)
         if all_true(has):
-            speed = interpolate_samples(t_ns, at, samples)
+            speed = interpolate_samples(t_ns, at, samples, self._is_held)
         elif all_true(has == has[0]) and all_true(has[0] | self._last_readings.too_old(t_ns[0])):
-            speed = np.where(has[0], interpolate_samples(t_ns, at, samples), np.nan)
+            speed = np.where(has[0], interpolate_samples(t_ns, at, samples, self._is_held), np.nan)
         else:
             speed, may_arrive = self._last_readings.interpolate(t_ns, at, samples, self._newest_t_ns)
             waiting = may_arrive.any(axis=1)

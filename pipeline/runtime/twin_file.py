@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 from pipeline.runtime.stage import Context, StageError
 from pipeline.runtime.tray_twin import TrayTwin, for_fans, read_file, tray_twin, twin_path
 from schemas.messages import Array
+from schemas.tacho import Tacho, tacho_of_each_fan
 from schemas.twin_card import GRAPH_INPUTS, GRAPH_OUTPUTS, TwinCard
 
 Advance: TypeAlias = Callable[[Array, Array, Array], tuple[Array, Array]]
@@ -58,9 +59,22 @@ def load_twin(context: Context) -> TwinFile:
     """The twin of a context's one tray, ready to run.
 
     Raises:
-        StageError: the tray names none, or one that cannot be used.
+        StageError: the tray names none, or one that cannot be used or was trained with other tachos.
     """
-    return TwinFile.load(twin_path(context), context.tray.fans)
+    path = twin_path(context)
+    twin = TwinFile.load(path, context.tray.fans)
+    of_tray = tacho_of_each_fan(context.tray.tacho, context.tray.fans)
+    if twin.tachos != of_tray and any(tacho.window_s > 0.0 for tacho in twin.tachos):
+        raise StageError(
+            f"{path}: the twin was trained on readings by {_text(twin.tachos)}, but [[tray]] tacho is "
+            f"{_text(of_tray)}: correct tacho, or train a twin on recordings of this tray"
+        )
+    return twin
+
+
+def _text(tachos: Sequence[Tacho]) -> str:
+    """Each different tacho once."""
+    return ", ".join(dict.fromkeys(map(str, tachos)))
 
 
 def _session(path: Path, content: bytes) -> Any:

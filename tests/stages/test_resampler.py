@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from schemas.blocks import join
 from schemas.messages import Grid, Header, InvalidReason, Raw
+from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
 from stages.resampler import ResamplerConfig, ResamplerCore
 
@@ -445,3 +447,18 @@ def test_another_number_of_fans_is_reported_until_the_right_one_arrives() -> Non
     assert "raw samples of 2 fans" in core.problem()
     core.step(raw(at(0.01), np.zeros(1)))
     assert core.problem() == ""
+
+
+def test_readings_that_a_tacho_shows_until_the_next_are_held_and_others_interpolated() -> None:
+    """Also where a fan misses a reading, which another way of the grid handles."""
+    tachos = (Tacho(kind="count", window_s=1.0), Tacho())
+    core = ResamplerCore(2, ResamplerConfig(rate_hz=100.0, gap_limit_s=0.1), tachos=tachos)
+    speed = np.repeat(np.arange(8.0)[:, np.newaxis], 2, axis=1)
+    speed[4, :] = np.nan
+    t_ns = EPOCH_NS + np.arange(8) * 40_000_000 + 5_000_000
+    raw = Raw(fans=2, host_receive_t_ns=t_ns, command=np.zeros((8, 2)), speed_rad_s=speed)
+    grid = join([*core.step(raw), *core.close()])
+    since_s = (grid.t_ns - t_ns[0]) / 1e9 / 0.04
+    np.testing.assert_allclose(grid.speed_rad_s[:, 1], since_s, atol=1e-6)
+    held = np.floor(since_s)
+    np.testing.assert_array_equal(grid.speed_rad_s[:, 0], np.where(held == 4, 3, held))

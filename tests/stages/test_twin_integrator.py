@@ -17,7 +17,7 @@ from pipeline.runtime.stage import Context, StageError
 from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import cut, join
 from schemas.messages import Grid, Header, InvalidReason, ModelCard, Prediction
-from schemas.tacho import Tacho
+from schemas.tacho import INSTANTANEOUS, Tacho
 from scoring.samples import speed_residual_rad_s
 from stages.twin_integrator import STAGE, TwinIntegratorConfig, TwinIntegratorCore
 from tests.support.twin_files import PARAMETERS, SIGMA_RAD_S, made_up_card, small_hybrid, still_balance, write_twin
@@ -412,8 +412,8 @@ def test_a_block_with_another_number_of_fans_is_counted_as_lost_and_reported() -
     assert "fans = 1" in core.problem()
 
 
-def _context(folder: Path, twin: Path | None) -> Context:
-    tray = TrayConfig(name="tray1", fans=2, twin=twin)
+def _context(folder: Path, twin: Path | None, *tacho: Tacho) -> Context:
+    tray = TrayConfig(name="tray1", fans=2, twin=twin, tacho=tacho or INSTANTANEOUS)
     return Context("site", (tray,), TwinIntegratorConfig(), folder, folder, EPOCH_NS)
 
 
@@ -540,3 +540,12 @@ def test_the_torque_balance_of_counted_readings_is_taken_with_the_averaged_comma
     known, unknown = balance_of(tacho=(COUNTING,)), balance_of()
     assert np.isfinite(known).all()
     assert np.std(known) < 0.1 * np.std(unknown)
+
+
+def test_a_twin_of_another_tacho_is_refused_with_what_to_correct(tmp_path: Path) -> None:
+    write_twin(tmp_path / "twin.onnx", tacho=[COUNTING.model_dump()])
+    assert not STAGE.check(_context(tmp_path, Path("twin.onnx"), COUNTING))
+    assert STAGE.check(_context(tmp_path, Path("twin.onnx")))
+    (problem,) = STAGE.check(_context(tmp_path, Path("twin.onnx"), Tacho(kind="count", window_s=0.5)))
+    assert "trained on readings by count over 1 s, 2 pulses" in problem
+    assert "[[tray]] tacho is count over 0.5 s" in problem
