@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.tacho import Tacho
+from scoring.expected_reading import AveragedCommand
 from twin.measurement import Measurement
 
 SLOW = Tacho(kind="count", window_s=1.0)
@@ -68,3 +69,16 @@ def test_instantaneous_tachos_leave_the_arrays_themselves() -> None:
     assert measurement.of_speed(signals) is signals
     assert measurement.of_command(signals) is signals
     assert measurement.comparable.all()
+
+
+@pytest.mark.parametrize("tacho", TACHOS[:2], ids=str)
+def test_the_runtime_averages_commands_as_the_maker_does(tacho: Tacho) -> None:
+    period_s = 0.1
+    command = np.repeat(np.random.default_rng(7).uniform(0.0, 100.0, 60), 10)[:, np.newaxis]
+    measurement = Measurement(period_s * np.arange(len(command))[:, np.newaxis], [tacho])
+    of_runtime = AveragedCommand([tacho], period_s).update(command)
+    both = np.isfinite(of_runtime) & measurement.comparable
+    assert np.count_nonzero(both) > 550
+    expected = measurement.of_command(command)[both]
+    # The maker holds commands, the runtime takes them as linear between samples, half a sample earlier.
+    assert np.std(of_runtime[both] - expected) < 0.02 * np.std(expected)
