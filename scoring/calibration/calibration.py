@@ -60,6 +60,16 @@ class TooLittleError(Exception):
         """the lowest rate that can be declared with this running"""
 
 
+class FragmentedError(Exception):
+    """A residual was never scored for a whole second, so nothing is known about how it varies from second to second."""
+
+    def __init__(self, source: Signal, scored_s: float) -> None:
+        super().__init__(source, scored_s)
+        self.source = source
+        self.scored_s = scored_s
+        """how long it was scored, summed over fans"""
+
+
 def calibrate(
     runs: Runs,
     top_speed_rad_s: float,
@@ -75,6 +85,7 @@ def calibrate(
 
     Raises:
         TooLittleError: the runs are too short for the rate, and extrapolate is not set; or too short for any limit.
+        FragmentedError: samples are missing in every second.
         MixedRatesError: the runs are not all of one sampling period.
     """
     unlimited = HealthyResidual(baseline=UNLIMITED)
@@ -89,6 +100,9 @@ def calibrate(
     is_enough = found.fan_s >= needed_s
     if found.windows < MIN_WINDOWS or not (is_enough or extrapolate):
         raise TooLittleError(found.fan_s / 3600, needed_s / 3600, NEEDED_ALARMS * DAY_S / max(found.fan_s, 1.0))
+    for source, moments in found.moments.items():
+        if moments.count.sum() and not moments.seconds:
+            raise FragmentedError(source, float(moments.count.sum()) * found.period_s)
     target = min(false_alarms_per_day / DAY_S * found.fan_s / found.windows, MAX_ALARM_SHARE)
     limits = _with(limits, LimitRule.FIXED, lambda row, settings: settings.fixed(found.observed[row.name]))
     is_long = found.fan_s > VARIATION_FAN_S
@@ -107,7 +121,7 @@ def calibrate(
         fan_hours=found.fan_s / 3600,
         runs=len(found.maxima),
     )
-    return limits.model_copy(update={"declared_rate": rate})
+    return Limits.model_validate(limits.model_copy(update={"declared_rate": rate}).model_dump())
 
 
 def _with_variation(

@@ -65,13 +65,15 @@ class Drift(Detector):
         self._settings = settings
         self._mean_residual_std = context.mean_residual_std
         deviation = summed_deviation(context.autocorrelation_time_s, settings.period_s)
-        self._limit_sigma_s = deviation * settings.limit
+        self.limit_sigma_s = deviation * settings.limit
+        """the limit of the sum, sigma seconds"""
+        self.reference_sigmas, self.period_s = settings.reference_sigmas, settings.period_s
         cap = CAP_LIMITS * settings.limit * deviation if context.capped else math.inf
         self._cusum = Cusum(context.fans, settings.reference_sigmas, cap)
 
     def update(self, block: DetectorInput) -> Array:
         """See Detector."""
-        return self._cusum.update(block.persistent, block.valid, block.period_s) / self._limit_sigma_s
+        return self._cusum.update(block.persistent, block.valid, block.period_s) / self.limit_sigma_s
 
     def reset(self, fans: Array) -> None:
         """See Detector."""
@@ -80,7 +82,7 @@ class Drift(Detector):
     @property
     def memory_s(self) -> float:
         """The time in which a residual of zero takes a sum at its cap back to zero."""
-        return CAP_LIMITS * self._limit_sigma_s / self._settings.reference_sigmas
+        return CAP_LIMITS * self.limit_sigma_s / self._settings.reference_sigmas
 
     def limit_sigmas(self, period_s: float) -> float:
         """The reference value: any larger shift adds up until it reaches the limit."""

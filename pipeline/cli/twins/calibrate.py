@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,13 +16,14 @@ from rich.table import Table
 from pipeline.cli.options import JsonOption, SetOption
 from pipeline.cli.progress import working
 from pipeline.cli.twins.calibration_check import check_declared_rate
+from pipeline.cli.twins.drops_found import drop_lines, drops_found
 from pipeline.cli.twins.outlier_run_check import outlier_warning
 from pipeline.cli.twins.training_data import sha256_of, twin_errors
 from pipeline.errors import UserError
 from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.runtime.tray_twin import load_tray_twin
-from schemas.units import NS_PER_S
-from scoring.calibration.calibration import TooLittleError
+from schemas.units import NS_PER_S, SpeedUnit
+from scoring.calibration.calibration import FragmentedError, TooLittleError
 from scoring.calibration.calibration import calibrate as find_limits
 from scoring.calibration.healthy_statistics import MixedRatesError
 from scoring.detectors.table import rows
@@ -85,15 +87,19 @@ def calibrate(
     if healthy:
         if false_alarms_per_day is None:
             raise UserError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
-        limits, warning = _calibrated(twin, healthy, false_alarms_per_day, extrapolate, overrides or [], seed)
+        limits, warning, speed_unit = _calibrated(
+            twin, healthy, false_alarms_per_day, extrapolate, overrides or [], seed
+        )
         output = output or twin
         _write(twin, output, limits)
         result = {"twin": str(output), "calibration": json.loads(limits.model_dump_json())}
         result["warnings"] = [warning] if warning else []
+        drops = drops_found(output, speed_unit)
+        result |= {"speed_unit": speed_unit, "drops_found": [drop.as_json() for drop in drops]}
         if warning:
             typer.echo(warning, err=True)
         if not json_output:
-            _print(output, limits)
+            _print(output, limits, drop_lines(drops, speed_unit))
     check = check_declared_rate(output or twin, verify, overrides or []) if verify else None
     if check:
         result["verify"] = check.as_json()
@@ -107,8 +113,8 @@ def calibrate(
 
 def _calibrated(
     twin: Path, healthy: list[Path], per_day: float, extrapolate: bool, overrides: list[str], seed: int
-) -> tuple[Limits, str]:
-    """The limits, and a warning about the recordings, empty if there is none."""
+) -> tuple[Limits, str, SpeedUnit]:
+    """The limits, a warning about the recordings, empty if there is none, and the unit of speeds in the first."""
     known = load_tray_twin(twin)
     top_speed_rad_s = known.card.top_speed_rad_s
     if top_speed_rad_s <= 0.0:
@@ -121,6 +127,8 @@ def _calibrated(
             raise UserError(_too_little(error, per_day)) from error
         except MixedRatesError as error:
             raise UserError(_mixed_rates(error)) from error
+        except FragmentedError as error:
+            raise UserError(_fragmented(error)) from error
         show("comparing the recordings")
         warning = outlier_warning(runs, limits, top_speed_rad_s)
     assert limits.declared_rate
@@ -130,7 +138,7 @@ def _calibrated(
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         }
     )
-    return limits.model_copy(update={"declared_rate": declared_rate}), warning
+    return limits.model_copy(update={"declared_rate": declared_rate}), warning, runs.speed_unit
 
 
 def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path], overrides: list[str]) -> None:
@@ -189,6 +197,14 @@ def _mixed_rates(error: MixedRatesError) -> str:
     )
 
 
+def _fragmented(error: FragmentedError) -> str:
+    what = "speed" if error.source == "speed" else "torque balance"
+    return (
+        f"the {what} was scored for {error.scored_s:.0f} s, but never for a whole second: each lacks samples, "
+        "so no limit can be set; `fantwin info` shows what is missing, `fantwin doctor` what does not fit the line"
+    )
+
+
 def _rate(per_day: float) -> str:
     return f"{per_day:g} false alarm{'s' * (per_day != 1)} per fan and day"
 
@@ -216,7 +232,7 @@ def _write(twin: Path, output: Path, limits: Limits) -> None:
         raise UserError(f"{output}: cannot write the twin: {error.strerror}") from error
 
 
-def _print(output: Path, limits: Limits) -> None:
+def _print(output: Path, limits: Limits, drops: Sequence[str]) -> None:
     rate = limits.declared_rate
     assert rate
     console = Console(highlight=False, soft_wrap=True)
@@ -233,4 +249,6 @@ def _print(output: Path, limits: Limits) -> None:
     else:
         low, high = rate.interval_95
         console.print(f"declared: {declared} (95 % interval from these data: {low:.3g} to {high:.3g})")
+    for line in drops:
+        console.print(line, markup=False)
     console.print("test it on other healthy recordings: fantwin calibrate TWIN.onnx --verify OTHER.mcap")

@@ -11,6 +11,7 @@ from pipeline.errors import UserError
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
+from schemas.units import SpeedUnit
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.limits import Timing
 from scoring.samples import Samples, samples_of
@@ -86,6 +87,16 @@ class HealthyRuns:
                 "choose one with --set"
             )
         return first
+
+    @property
+    def speed_unit(self) -> SpeedUnit:
+        """The unit in which people are shown the speeds of the first recording.
+
+        Raises:
+            UserError: it cannot be used.
+        """
+        with open_replay_input([self._paths[0]], None, self._overrides, self._twin) as replay_input:
+            return replay_input.trays[0].speed_unit
 
     def _of(self, path: Path) -> Iterator[tuple[RecordedTray, Iterator[Samples]]]:
         with open_replay_input([path], None, self._overrides, self._twin) as replay_input:

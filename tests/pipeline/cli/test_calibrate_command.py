@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -106,12 +107,16 @@ def test_the_output_is_readable(output_of_calibration: str) -> None:
     assert "calibrated.onnx: alarms calibrated on 0.06" in output_of_calibration
     assert f"declared: {PER_DAY} false alarms per fan and day" in output_of_calibration
     assert "--verify" in output_of_calibration
+    assert re.search(r"found at \d+ rad/s: a drop of [\d.]+ rad/s at once", output_of_calibration)
 
 
 def test_json_is_one_document_of_the_limits_and_the_test_of_them(folder: Path) -> None:
     result = calibrate(folder, "-o", folder / "json.onnx", "--json", "--verify", folder / "other.mcap")
     document = json.loads(result.stdout)
     assert document["twin"].endswith("json.onnx")
+    assert document["speed_unit"] == "rad/s"
+    for drop in document["drops_found"]:
+        assert 0 < drop["within_a_minute"] <= drop["at_once"] <= drop["speed"]
     Limits.model_validate(document["calibration"])
     assert document["verify"]["kept"] is True
     assert document["verify"]["fan_hours"] == pytest.approx(FANS * 60 / 3600, rel=0.1)
