@@ -75,7 +75,7 @@ def test_instantaneous_tachos_leave_the_arrays_themselves() -> None:
 def test_the_runtime_averages_commands_as_the_maker_does(tacho: Tacho) -> None:
     period_s = 0.1
     command = np.repeat(np.random.default_rng(7).uniform(0.0, 100.0, 60), 10)[:, np.newaxis]
-    measurement = Measurement(period_s * np.arange(len(command))[:, np.newaxis], [tacho])
+    measurement = Measurement(period_s * np.arange(len(command), dtype=np.float64)[:, np.newaxis], [tacho])
     of_runtime = AveragedCommand([tacho], period_s).update(command)
     both = np.isfinite(of_runtime) & measurement.comparable
     assert np.count_nonzero(both) > 550
