@@ -18,6 +18,8 @@ class InvalidReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     INVALID_REASON_NO_SPEED: _ClassVar[InvalidReason]
     INVALID_REASON_NO_TWIN: _ClassVar[InvalidReason]
     INVALID_REASON_CLOCK_RESTARTED: _ClassVar[InvalidReason]
+    INVALID_REASON_STOPPED: _ClassVar[InvalidReason]
+    INVALID_REASON_STARTING: _ClassVar[InvalidReason]
 
 class FanState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -27,6 +29,8 @@ class FanState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     FAN_STATE_ALARM: _ClassVar[FanState]
     FAN_STATE_RETURNING: _ClassVar[FanState]
     FAN_STATE_COMMISSIONING: _ClassVar[FanState]
+    FAN_STATE_STOPPED: _ClassVar[FanState]
+    FAN_STATE_STARTING: _ClassVar[FanState]
 
 class Statistic(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -38,6 +42,7 @@ class Statistic(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     STATISTIC_BALANCE_DRIFT: _ClassVar[Statistic]
     STATISTIC_BALANCE_VARIANCE_GROWTH: _ClassVar[Statistic]
     STATISTIC_SENSOR: _ClassVar[Statistic]
+    STATISTIC_STANDSTILL: _ClassVar[Statistic]
 
 class Transition(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -96,12 +101,16 @@ INVALID_REASON_SATURATED: InvalidReason
 INVALID_REASON_NO_SPEED: InvalidReason
 INVALID_REASON_NO_TWIN: InvalidReason
 INVALID_REASON_CLOCK_RESTARTED: InvalidReason
+INVALID_REASON_STOPPED: InvalidReason
+INVALID_REASON_STARTING: InvalidReason
 FAN_STATE_UNKNOWN: FanState
 FAN_STATE_NORMAL: FanState
 FAN_STATE_SUSPECT: FanState
 FAN_STATE_ALARM: FanState
 FAN_STATE_RETURNING: FanState
 FAN_STATE_COMMISSIONING: FanState
+FAN_STATE_STOPPED: FanState
+FAN_STATE_STARTING: FanState
 STATISTIC_NONE: Statistic
 STATISTIC_SPEED_SMOOTHED: Statistic
 STATISTIC_SPEED_DRIFT: Statistic
@@ -110,6 +119,7 @@ STATISTIC_BALANCE_SMOOTHED: Statistic
 STATISTIC_BALANCE_DRIFT: Statistic
 STATISTIC_BALANCE_VARIANCE_GROWTH: Statistic
 STATISTIC_SENSOR: Statistic
+STATISTIC_STANDSTILL: Statistic
 TRANSITION_NONE: Transition
 TRANSITION_RAISED: Transition
 TRANSITION_SEVERITY: Transition

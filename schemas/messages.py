@@ -31,6 +31,8 @@ class InvalidReason(OpenEnum):
     NO_SPEED = 6
     NO_TWIN = 7
     CLOCK_RESTARTED = 8
+    STOPPED = 9
+    STARTING = 10
 
 
 class FanState(OpenEnum):
@@ -42,6 +44,8 @@ class FanState(OpenEnum):
     ALARM = 3
     RETURNING = 4
     COMMISSIONING = 5
+    STOPPED = 6
+    STARTING = 7
 
 
 class Statistic(OpenEnum):
@@ -55,6 +59,7 @@ class Statistic(OpenEnum):
     BALANCE_DRIFT = 5
     BALANCE_VARIANCE_GROWTH = 6
     SENSOR = 7
+    STANDSTILL = 8
 
 
 class Transition(OpenEnum):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
+from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 
 CARD_PROPERTY = "fantwin.card"
@@ -187,7 +188,8 @@ class TwinCard:
     where its network has taken a share. sigma_rad_s: per fan, the healthy root mean square free-run error.
     speed_range_rad_s, command_range, rate_hz: of the training data; outside them the twin extrapolates. calibration:
     of the alarms (scoring.limits), None before calibration. tacho: what the free run must pass before it is compared
-    with readings, and the command before the torque balance; one for all fans, or one for each.
+    with readings, and the command before the torque balance; one for all fans, or one for each. standstill: how the
+    fans stop, stand and start; None in early cards, and where the runs do not show at which commands fans turn.
     """
 
     kind: str
@@ -217,6 +219,7 @@ class TwinCard:
     speed_unit: Literal["rad/s"] = "rad/s"
     calibration: dict[str, Any] | None = None
     tacho: Tachos = INSTANTANEOUS
+    standstill: Standstill | None = None
     format_version: int = FORMAT_VERSION
 
     @model_validator(mode="after")

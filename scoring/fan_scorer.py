@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from schemas.messages import Array, Statistic
+from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
 from scoring.baseline.movement import Movement
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Signal
@@ -97,6 +98,7 @@ class FanScorer:
         fans: int,
         limits: Limits,
         *,
+        tachos: Sequence[Tacho] = INSTANTANEOUS,
         for_calibration: bool = False,
         forgets_over_gaps: bool = True,
         skips_transients: bool = True,
@@ -111,7 +113,12 @@ class FanScorer:
         contexts = {
             source: residual.context(fans, capped=not for_calibration) for source, residual in self.residuals.items()
         }
-        of_tacho = DetectorContext(fans=fans, smoothing_s=limits.timing.smoothing_s, capped=not for_calibration)
+        of_tacho = DetectorContext(
+            fans=fans,
+            smoothing_s=limits.timing.smoothing_s,
+            capped=not for_calibration,
+            tachos=tacho_of_each_fan(tachos, fans),
+        )
         self._rows = rows()
         self.detectors: dict[str, Detector] = {
             row.name: row.detector(limits.detectors[row.name], contexts.get(row.source, of_tacho))
@@ -123,7 +130,7 @@ class FanScorer:
             source: any(row.source == source and row.name in self.detectors for row in self._rows)
             for source in RESIDUALS
         }
-        self._statistics = np.array([row.statistic for row in self._rows])
+        self._statistics: Array = np.array([row.statistic for row in self._rows])
         self._motion = Motion(fans)
         self._movement = Movement(fans) if skips_transients else None
         self._gaps = Gaps(len(INPUTS), fans) if forgets_over_gaps else None
@@ -294,6 +301,9 @@ class FanScorer:
                 persistent=persistent,
                 speed_rad_s=speed_rad_s,
                 missing=block.missing[stretch],
+                idle=block.idle[stretch],
+                command=block.command[stretch],
+                predicted_rad_s=block.predicted_rad_s[stretch],
             )
             for source, valid, standardised, persistent in (
                 ("speed", speed.scored, speed.standardised, speed.persistent),
@@ -317,6 +327,9 @@ class FanScorer:
                 Observation(ratios=ratios, persistent=persistent, expected=expected, transient_rad_s=transient_rad_s)
             )
         largest = ratios.argmax(axis=0)
+        for number, row in enumerate(self._rows):
+            if row.comes_first:
+                largest = np.where(ratios[number] > 1.0, number, largest)
         score = ratios.max(axis=0)
         highest = score.max(axis=0)
         self._below_half_limit &= highest <= HALF_LIMIT

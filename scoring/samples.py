@@ -20,8 +20,13 @@ class Samples:
     speed_valid: Array
     balance: Array
     balance_valid: Array
+    command: Array
+    predicted_rad_s: Array
+    """what a healthy fan would read; NaN without a free run"""
     missing: Array
     """the tacho gave no reading"""
+    idle: Array
+    """the command stops the fan, or it has just started: nothing is compared with the twin"""
     alive: Array
     """samples arrived on the line"""
 
@@ -46,6 +51,9 @@ def samples_of(prediction: Prediction) -> Samples:
         speed_valid=prediction.valid & np.isfinite(speed_residual),
         balance=balance,
         balance_valid=balance_counts & np.isfinite(balance),
+        command=prediction.command,
+        predicted_rad_s=prediction.predicted_speed_rad_s,
+        idle=np.isin(invalid_reason, (InvalidReason.STOPPED, InvalidReason.STARTING)),
         missing=invalid_reason == InvalidReason.NO_SPEED,
         alive=~np.isin(invalid_reason, (InvalidReason.GAP, InvalidReason.STALE)),
     )

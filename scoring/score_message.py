@@ -18,6 +18,9 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array) -> Score:
     if len(item.reading_range_rad_s):
         band = band + item.reading_range_rad_s
     of_prediction = item.invalid_reason
+    idle = ((InvalidReason.STOPPED, FanState.STOPPED), (InvalidReason.STARTING, FanState.STARTING))
+    for reason, of_idle in idle:
+        state = np.where((of_prediction == reason) & ~valid, int(of_idle), state)
     why = np.where(of_prediction == InvalidReason.NONE, InvalidReason.WARMING_UP, of_prediction)
     return Score(
         fans=item.fans,

@@ -40,6 +40,8 @@ from schemas.messages import (
     ScorerSnapshot,
     Transition,
 )
+from schemas.standstill import Standstill
+from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_manager import AlarmContext, AlarmManager
 from scoring.alarms.alarm_text import AlarmText
@@ -47,6 +49,7 @@ from scoring.alarms.fan_condition import ConditionSettings
 from scoring.alarms.return_rule import HoldingDetector
 from scoring.alarms.tray_conditions import AlarmEvent
 from scoring.alarms.unscored_monitor import UnscoredMonitor
+from scoring.detectors.standstill import StandstillSettings
 from scoring.detectors.table import rows
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnoser import Diagnoser
@@ -112,6 +115,9 @@ class HealthyTwin:
     limits: Limits
     balances: Sequence[HealthyBalance]
     command_unit: str = ""
+    tachos: tuple[Tacho, ...] = INSTANTANEOUS
+    """one for all fans, or one for each"""
+    standstill: Standstill | None = None
 
 
 class ScorerCore(Core):
@@ -166,7 +172,8 @@ class ScorerCore(Core):
 
     def _start_new(self) -> None:
         self._scorer = self._new_scorer()
-        self._diagnoser = Diagnoser(self._twin.balances, Advice(self._twin.command_unit) if self._holds else None)
+        twin, advice = self._twin, Advice(self._twin.command_unit) if self._holds else None
+        self._diagnoser = Diagnoser(twin.balances, advice, twin.tachos, twin.standstill)
         self._wear = WearMonitor(
             self._twin.balances, self._diagnoser, self._config.wear_every_s, self._twin.command_unit
         )
@@ -181,6 +188,7 @@ class ScorerCore(Core):
         return FanScorer(
             self._fans,
             self._twin.limits,
+            tachos=self._twin.tachos,
             forgets_over_gaps=self._forgets_over_gaps,
             skips_transients=self._holds,
         )
@@ -486,24 +494,36 @@ def build(context: Context) -> BuiltStage:
     )
 
 
-def limits_in_force(config: ScorerConfig, calibration: Mapping[str, Any] | None) -> Limits:
+def limits_in_force(
+    config: ScorerConfig, calibration: Mapping[str, Any] | None, standstill: Standstill | None = None
+) -> Limits:
     """The limits of a twin's card, or those of a twin without calibration, with the scorer's settings applied.
+
+    standstill: of the card; calibration does not change it.
 
     Raises:
         ValidationError: the calibration is not valid.
     """
     if calibration is None:
-        return uncalibrated(config.alarm_sigmas, config.timing(Timing())).times(config.limit_factor)
-    limits = Limits.model_validate(calibration)
+        limits = uncalibrated(config.alarm_sigmas, config.timing(Timing()))
+        return _with_standstill(limits, standstill).times(config.limit_factor)
+    limits = _with_standstill(Limits.model_validate(calibration), standstill)
     timing = config.timing(limits.timing)
     declared_rate = limits.declared_rate if timing == limits.timing else None  # it holds for the calibrated times
     return limits.model_copy(update={"timing": timing, "declared_rate": declared_rate}).times(config.limit_factor)
 
 
+def _with_standstill(limits: Limits, standstill: Standstill | None) -> Limits:
+    if standstill is None:
+        return limits
+    settings = StandstillSettings(healthy=standstill)
+    return limits.model_copy(update={"detectors": {**limits.detectors, "standstill": settings}})
+
+
 def _healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
     again = "calibrate it again: fantwin calibrate"
     try:
-        limits = limits_in_force(context.config, twin.card.calibration)
+        limits = limits_in_force(context.config, twin.card.calibration, twin.card.standstill)
     except ValidationError as error:
         first = error.errors()[0]
         why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
@@ -514,7 +534,9 @@ def _healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
             raise StageError(
                 f"{context.tray.twin}: its calibration is of {fans} fans, the tray has {context.tray.fans}; {again}"
             )
-    return HealthyTwin(twin.sha256, limits, twin.healthy_balances(), twin.card.command_unit)
+    return HealthyTwin(
+        twin.sha256, limits, twin.healthy_balances(), twin.card.command_unit, twin.card.tacho, twin.card.standstill
+    )
 
 
 def check(context: Context) -> list[str]:

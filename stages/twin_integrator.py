@@ -11,6 +11,10 @@ command is held for `hold_limit_s`; then the free run ends, and a new one starts
 not valid in the first `warm_up_s` of a free run (WARMING_UP), nor in the first `warm_up_s` after a command that was out
 of the twin's range or too small to turn the rotor (OUT_OF_RANGE).
 
+Where the card says how fans stop and start (schemas.standstill), nothing is predicted for a fan that its command stops
+(STOPPED). Its free run ends, and the next one starts from measured speeds once it turns; until that has settled,
+samples are not valid (STARTING).
+
 The *torque balance* is computed as well: the command given minus the command that a healthy fan needs for the
 measured motion. It needs no free run and is available a third of a second after the first sample
 (scoring.torque_balance).
@@ -27,12 +31,13 @@ import scipy.signal  # noqa: F401  the torque balance loads it on first use: not
 from pydantic import Field
 
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
-from pipeline.runtime.free_run import FreeRun, FreeRunInputs
+from pipeline.runtime.free_run import NEVER_NS, FreeRun, FreeRunInputs
 from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from pipeline.runtime.twin_file import TwinFile, load_twin
 from schemas.blocks import select
 from schemas.messages import Array, Grid, InvalidReason, ModelCard, Prediction
+from schemas.standstill import Standstill
 from schemas.units import NS_PER_S
 from scoring.expected_reading import AveragedCommand
 from scoring.torque_balance import BalanceModel, TorqueBalance
@@ -43,6 +48,7 @@ LONGEST_BRIDGE = (
 )  # grid samples; above half a second at 100 kHz a new start is faster than running through the loss
 LARGEST_MOVE_S = 0.01  # times the width of the training range: a move of the command times the gap in which it was held
 HIGHEST_SPEED = 1.5  # times the top training speed: the balance is used up to there
+START_TIME_CONSTANTS = 5.0  # of a fan that slows down: how long the start kick of its drive lasts
 RATE_TOLERANCE = 0.01  # a card holds the measured rate
 
 
@@ -75,9 +81,19 @@ class TwinIntegratorCore(Core):
         margin = RANGE_MARGIN * (high - low)
         self._largest_move = LARGEST_MOVE_S * (high - low)
         self._lowest_command, self._highest_command = low - margin, high + margin
-        self._off_below = twin.off_below
+        self._standstill = twin.card.standstill
+        self._off_below = twin.off_below if self._standstill is None else _off_below(twin, self._standstill)
         self._run = FreeRun(twin, config.start_samples)
-        self._balance = _balance_of(twin)
+        self._starting = np.zeros(twin.fans, np.bool_)
+        """(fans,) stopped by the command before, and no free run has settled since"""
+        self._stopped_t_ns = np.full(twin.fans, NEVER_NS)
+        """(fans,) when the command stopped the fan last"""
+        self._start_up_ns = self._warm_up_ns
+        if self._standstill is not None:
+            start_s = (self._standstill.start_s or 0.0) + reach_s
+            settling_s = START_TIME_CONSTANTS * (self._standstill.coast_time_constant_s or 0.0)
+            self._start_up_ns = max(self._warm_up_ns, round((start_s + settling_s) * NS_PER_S))
+        self._balance = _balance_of(twin, self._off_below)
         self._averages = any(tacho.window_s > 0.0 for tacho in twin.tachos)
         self._averaged_command = AveragedCommand(twin.tachos, 1.0)
         self._card = [
@@ -182,13 +198,38 @@ class TwinIntegratorCore(Core):
         in_range &= grid.command >= self._off_below
         beyond = np.isfinite(grid.command) & ~in_range  # where it is unknown, the free run uses the last known command
         since_t_ns = np.maximum(started_t_ns, self._run.last_out_of_range(grid.t_ns, beyond))
-        settled = running & ((grid.t_ns[:, np.newaxis] - since_t_ns >= self._warm_up_ns) | ~in_range)
+        warm = running & (grid.t_ns[:, np.newaxis] - since_t_ns >= self._warm_up_ns)
+        if self._standstill is not None:
+            warm &= grid.t_ns[:, np.newaxis] - self._last_stopped(grid.t_ns, inputs.stopped) >= self._start_up_ns
+        settled = warm | (running & ~in_range)
         in_range &= np.isfinite(predicted) | ~running
         self._counts["not_predicted_out_of_range"] += int((settled & ~in_range).sum())
         invalid_reason = np.where(settled, InvalidReason.OUT_OF_RANGE, InvalidReason.WARMING_UP)
         invalid_reason = np.where(settled & in_range, InvalidReason.NONE, invalid_reason)
-        invalid_reason = np.where(grid.valid, invalid_reason, grid.invalid_reason).astype(np.uint8)
+        judged = grid.valid
+        if self._standstill is not None:
+            starting = self._is_starting(inputs.stopped, warm)
+            invalid_reason = np.where(starting, InvalidReason.STARTING, invalid_reason)
+            invalid_reason = np.where(inputs.stopped, InvalidReason.STOPPED, invalid_reason)
+            judged = judged | ((inputs.stopped | starting) & (grid.invalid_reason == InvalidReason.NO_SPEED))
+        invalid_reason = np.where(judged, invalid_reason, grid.invalid_reason).astype(np.uint8)
         return self._prediction(grid, predicted, reading_range, invalid_reason)
+
+    def _last_stopped(self, t_ns: Array, stopped: Array) -> Array:
+        """(n, fans) ns: when the command stopped the fan last."""
+        last = np.maximum.accumulate(np.where(stopped, t_ns[:, np.newaxis], NEVER_NS), axis=0)
+        last = np.maximum(last, self._stopped_t_ns)
+        self._stopped_t_ns = last[-1].copy()
+        return last
+
+    def _is_starting(self, stopped: Array, warm: Array) -> Array:
+        """(n, fans) whether no free run has become warm since the command stopped the fan."""
+        row = np.arange(1, len(stopped) + 1)[:, np.newaxis]
+        last_stopped = np.maximum.accumulate(np.where(stopped, row, 0), axis=0)
+        last_warm = np.maximum.accumulate(np.where(warm, row, 0), axis=0)
+        starting: Array = np.where((last_stopped == 0) & (last_warm == 0), self._starting, last_stopped > last_warm)
+        self._starting = starting[-1].copy()
+        return starting
 
     def _inputs(self, grid: Grid) -> FreeRunInputs:
         held_before = self._run.held_command
@@ -201,11 +242,18 @@ class TwinIntegratorCore(Core):
             moved = np.diff(command, axis=0, prepend=held_before[np.newaxis])
             overdue |= known & (np.abs(moved) * gap_ns > self._largest_move * NS_PER_S)
             overdue |= grid.invalid_reason == int(InvalidReason.CLOCK_RESTARTED)
+        usable = known & grid.valid & np.isfinite(grid.speed_rad_s)
+        stopped = np.zeros(usable.shape, np.bool_)
+        if self._standstill is not None:
+            stopped = known & self._standstill.stops(grid.command, grid.speed_rad_s)
+            overdue |= stopped
+            usable &= ~stopped & (self._standstill.turns(grid.speed_rad_s) | ~self._standstill.drives(grid.command))
         return FreeRunInputs(
             command=command,
             unknown=~known,
             overdue=overdue,
-            usable=known & grid.valid & np.isfinite(grid.speed_rad_s),
+            stopped=stopped,
+            usable=usable,
             missing=self._missing(grid.t_ns, np.all(silent, axis=1)),
         )
 
@@ -296,7 +344,12 @@ class TwinIntegratorCore(Core):
         )
 
 
-def _balance_of(twin: TwinFile) -> TorqueBalance:
+def _off_below(twin: TwinFile, standstill: Standstill) -> Array:
+    """(fans,) as TrayTwin.off_below, where the friction of a fan is not above a command that turns it."""
+    return np.minimum(twin.off_below, standstill.turning_command)
+
+
+def _balance_of(twin: TwinFile, off_below: Array) -> TorqueBalance:
     balance = twin.balance
     return TorqueBalance(
         BalanceModel(
@@ -308,7 +361,7 @@ def _balance_of(twin: TwinFile) -> TorqueBalance:
             filter_rate_per_s=balance.filter_rate_per_s,
             lowest_speed_rad_s=balance.lowest_speed_rad_s,
             highest_speed_rad_s=HIGHEST_SPEED * twin.card.top_speed_rad_s,
-            off_below=twin.off_below,
+            off_below=off_below,
         )
     )
 

@@ -36,6 +36,7 @@ from twin.fitting.balance import FILTER_RATE_PER_S
 from twin.fitting.balance_fit import BalanceFit, fit_balance
 from twin.fitting.identification import Identification, identify
 from twin.fitting.model_fits import FitRequest, Trainer
+from twin.fitting.standstill import find_standstill
 from twin.fitting.training import Physics, Progress
 from twin.kinds import BOTH_INPUTS, ModelKind, find_kind
 from twin.models.model import Model
@@ -161,6 +162,7 @@ def train_twin(
         versions=_versions(),
         command_unit=command_unit,
         tacho=tacho[:1] if len(set(tacho)) == 1 else tacho,
+        standstill=find_standstill([*runs, *validation_runs]),
     )
     return TrainedTwin(model, parameters, card, identification, validation)
 

@@ -25,8 +25,8 @@ from scoring.samples import Samples, samples_of
 from twin.export.calibrated import with_calibration
 
 NAME = "fantwin"
-COLUMNS = ("speed_rad_s", "speed_residual", "balance")
-FLAGS = ("speed_valid", "balance_valid", "missing", "alive")
+COLUMNS = ("speed_rad_s", "speed_residual", "balance", "command", "predicted_rad_s")
+FLAGS = ("speed_valid", "balance_valid", "missing", "idle", "alive")
 
 
 class Scorer:

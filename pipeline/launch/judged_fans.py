@@ -17,10 +17,10 @@ from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import CodecError, decode
 from schemas.messages import InvalidReason, Score
 from schemas.topics import tray_key
-from scoring.alarms.unscored_monitor import REASONS
+from scoring.alarms.unscored_monitor import JUDGED_AT_REST, REASONS
 
 JUDGED_WITHIN_S = 5.0
-"""a fan is judged now if it had a valid score this recently"""
+"""a fan is judged now if it had a valid score, or was stopped or starting, this recently"""
 _SAMPLED_S = 0.1  # scores of a tray are looked at this often: a fast line sends hundreds a second
 _LAST_JUDGE = "scorer"
 
@@ -43,6 +43,26 @@ class Unjudged:
     def as_json(self) -> dict[str, object]:
         """For machines; no fans: all of the tray."""
         return {"tray": self.tray, "fans": list(self.fans), "why": self.why}
+
+
+@dataclass(frozen=True)
+class AtRest:
+    """Fans of one tray that their command stops, or that are starting."""
+
+    tray: str
+    fans: tuple[int, ...]
+    reason: InvalidReason
+
+    def line(self) -> str:
+        """For people."""
+        names = ", ".join(map(str, self.fans))
+        one = len(self.fans) == 1
+        why = f"stopped by {'its' if one else 'their'} command" if self.reason == InvalidReason.STOPPED else "starting"
+        return f"{self.tray}: {'fan' if one else 'fans'} {names}: {why}"
+
+    def as_json(self) -> dict[str, object]:
+        """For machines."""
+        return {"tray": self.tray, "fans": list(self.fans), "state": self.reason.words}
 
 
 class JudgedFans:
@@ -85,8 +105,20 @@ class JudgedFans:
             return
         with self._lock:
             self._seen_s[tray] = now_s
-            judged_s[score.valid.any(axis=0)] = now_s
+            judged = score.valid | np.isin(score.invalid_reason, JUDGED_AT_REST)
+            judged_s[judged.any(axis=0)] = now_s
             self._reasons[tray] = score.invalid_reason[-1]
+
+    def at_rest(self) -> list[AtRest]:
+        """The fans that are stopped or starting now; they are judged by whether they stand or turn as commanded."""
+        oldest_s = self._now_s() - JUDGED_WITHIN_S
+        with self._lock:
+            return [
+                AtRest(tray.name, tuple(np.flatnonzero(self._reasons[tray.name] == reason).tolist()), reason)
+                for tray in self._trays
+                for reason in JUDGED_AT_REST
+                if self._seen_s.get(tray.name, -np.inf) >= oldest_s and (self._reasons[tray.name] == reason).any()
+            ]
 
     def unjudged(self, states: Sequence[StageState]) -> list[Unjudged]:
         """The fans that are not judged now, and why. states: of the site's stages; one may be the reason."""

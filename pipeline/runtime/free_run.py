@@ -23,7 +23,9 @@ class FreeRunInputs:
     unknown: Array
     """the command of this sample is not known"""
     overdue: Array
-    """a command has been held for longer than allowed"""
+    """the free run has to end: a command has been held for longer than allowed, or it stops the fan"""
+    stopped: Array
+    """the command stops the fan"""
     usable: Array
     """the sample has a reading and a command, so that it counts towards a start"""
     missing: Array

@@ -89,10 +89,14 @@ class AlarmManager:
             measured = {"t_ns": int(score.t_ns[row])} if lost else _measured(row, fan, score, context)
             alarms.append(self._emit(replace(self._next_message(fan), **measured, transition=transition, **changed)))
 
+        def causes_at(row: int, fan: int) -> tuple[Diagnosis, ...]:
+            t_ns, against_command = int(score.t_ns[row]), score.statistic[row, fan] == Statistic.STANDSTILL
+            return (self._diagnoser.of_standstill if against_command else self._diagnoser.diagnose)(fan, t_ns)
+
         def diagnose_due(t_ns: Array) -> None:
             for row, fan in self._diagnoser.due(t_ns) if len(t_ns) else ():
                 if self._persists(row, fan, score, context):
-                    causes = self._diagnoser.diagnose(fan, int(t_ns[row]))
+                    causes = causes_at(row, fan)
                     if self._diagnoser.says_more(causes, self._next_message(fan).causes):
                         emit(row, fan, Transition.DIAGNOSED, causes=causes)
 
@@ -103,7 +107,9 @@ class AlarmManager:
                 self.raised += 1
                 t_ns = int(score.t_ns[event.row])
                 self._diagnoser.raised(fan, t_ns, event.alarm_state.onset_t_ns)
-                changed["causes"] = self._diagnoser.diagnose(fan, t_ns)
+                changed["causes"] = causes_at(event.row, fan)
+            elif event.transition == Transition.SEVERITY and score.statistic[event.row, fan] == Statistic.STANDSTILL:
+                changed["causes"] = causes_at(event.row, fan)
             elif event.transition == Transition.CLEARED:
                 self.cleared += 1
                 self._diagnoser.cleared(fan)

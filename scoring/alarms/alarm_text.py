@@ -6,13 +6,15 @@ earlier versions differ.
 
 from __future__ import annotations
 
-from schemas.messages import Alarm, Transition
+from schemas.messages import Alarm, Statistic, Transition
 from schemas.units import SpeedUnit
 from scoring.alarms.alarm_flags import is_listed
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.table import row_of
+from scoring.diagnosis.standstill_causes import STANDSTILL_CAUSES
 
 CANNOT_TELL = "cannot_tell"
+LIKELY = 0.15  # less probable causes of a fan that does not turn or stop are not named
 CAUSES = {
     "drag_up": "more drag (airflow blocked, filter clogged)",
     "drag_down": "less drag (blade lost, airflow freer than before)",
@@ -22,6 +24,7 @@ CAUSES = {
     "sensor_stuck": "a stuck tacho",
     "sensor_dropout": "a tacho that drops out",
     "sensor_scaling": "a tacho that counts wrongly",
+    **STANDSTILL_CAUSES,
     CANNOT_TELL: "cannot tell yet",
 }
 TRANSITIONS = {
@@ -69,6 +72,8 @@ class AlarmText:
         return row.detector.text(alarm, row.source, self._units)
 
     def _cause_if_known(self, alarm: Alarm) -> str:
+        if alarm.statistic == Statistic.STANDSTILL and _is_against_command(alarm):
+            return f": {_likely(alarm)}"
         known = alarm.causes and alarm.causes[0].cause != CANNOT_TELL
         return f"; {self._cause(alarm)}" if known else ""
 
@@ -76,8 +81,19 @@ class AlarmText:
         if not alarm.causes:
             return "cause unknown"
         first = alarm.causes[0]
+        if _is_against_command(alarm):
+            return f"{first.evidence}: {_likely(alarm)}"
         name = CAUSES.get(first.cause, first.cause)
         if first.cause == CANNOT_TELL:
             return first.evidence or name  # the evidence begins with the name
         evidence = f": {first.evidence}" if first.evidence else ""
         return f"{name}, {100 * first.probability:.0f} %{evidence}"
+
+
+def _is_against_command(alarm: Alarm) -> bool:
+    return bool(alarm.causes) and alarm.causes[0].cause in STANDSTILL_CAUSES
+
+
+def _likely(alarm: Alarm) -> str:
+    likely = [each for each in alarm.causes if each.probability >= LIKELY]
+    return ", ".join(f"{STANDSTILL_CAUSES[each.cause]} {100 * each.probability:.0f} %" for each in likely)

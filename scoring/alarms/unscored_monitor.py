@@ -18,7 +18,11 @@ REASONS = {
     InvalidReason.NO_SPEED: "no speed",
     InvalidReason.NO_TWIN: "the twin does not fit the grid's rate",
     InvalidReason.CLOCK_RESTARTED: "the clock of the device keeps restarting",
+    InvalidReason.STOPPED: "stopped by its command",
+    InvalidReason.STARTING: "starting",
 }
+JUDGED_AT_REST = (InvalidReason.STOPPED, InvalidReason.STARTING)
+"""a fan without a score for one of these reasons is judged by whether it stands or turns as commanded"""
 
 
 class UnscoredMonitor:
@@ -32,8 +36,9 @@ class UnscoredMonitor:
 
     def update(self, period_ns: int, valid: Array, invalid_reason: Array) -> None:
         """Process a block; valid, invalid_reason: (n, fans)."""
-        scored = valid.any(axis=0)
-        rows_since = np.where(scored, np.argmax(valid[::-1], axis=0), len(valid))
+        judged = valid | np.isin(invalid_reason, JUDGED_AT_REST)
+        scored = judged.any(axis=0)
+        rows_since = np.where(scored, np.argmax(judged[::-1], axis=0), len(valid))
         self._unscored_ns = np.where(scored, 0, self._unscored_ns) + rows_since * period_ns
         self._invalid_reason = invalid_reason[-1]
         self._was_scored |= scored

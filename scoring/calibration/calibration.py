@@ -32,7 +32,7 @@ from scoring.calibration.windows import WindowMaxima, peaks
 from scoring.detectors.detector import UNREACHED, DetectorRow, DetectorSettings, HealthyEvidence, LimitRule, Signal
 from scoring.detectors.deviation import smoothed_deviation
 from scoring.detectors.smoothed import SmoothedSettings
-from scoring.detectors.table import rows
+from scoring.detectors.table import calibrated_rows
 from scoring.fan_scorer import RESIDUALS
 from scoring.limits import DeclaredRate, Limits, Timing
 
@@ -92,7 +92,7 @@ def calibrate(
     limits = Limits(
         speed=unlimited,
         balance=unlimited,
-        detectors={row.name: row.detector.settings.unreached() for row in rows()},
+        detectors={row.name: row.detector.settings.unreached() for row in calibrated_rows()},
         timing=timing,
     )
     found = healthy_statistics(runs, limits, top_speed_rad_s)
@@ -108,10 +108,10 @@ def calibrate(
     is_long = found.fan_s > VARIATION_FAN_S
     part = truncate_runs(runs, len(found.maxima), VARIATION_FAN_S) if is_long else runs
     limits = _with_variation(part, limits, found, crossover_speed_rad_s)
-    limits = _with_rough_limits(part, limits, target / len(rows()), top_speed_rad_s)
+    limits = _with_rough_limits(part, limits, target / len(calibrated_rows()), top_speed_rad_s)
     found = healthy_statistics(runs, limits, top_speed_rad_s)
     factors = _factors(found, target)
-    limits = limits.scaled(dict(zip((row.name for row in rows()), factors.tolist(), strict=True)))
+    limits = limits.scaled(dict(zip((row.name for row in calibrated_rows()), factors.tolist(), strict=True)))
     if not is_enough:
         limits = _cautious(limits, found)
     rate = DeclaredRate(
@@ -143,7 +143,7 @@ def _with_variation(
         return with_baseline(residual, baselines[source]).model_copy(update={"fan_offsets": offsets[source]})
 
     missing = [source for source in RESIDUALS if not found.moments[source].count.sum()]
-    used = {row.name: limits.detectors[row.name] for row in rows() if row.source not in missing}
+    used = {row.name: limits.detectors[row.name] for row in calibrated_rows() if row.source not in missing}
     limits = _each(limits, varying).model_copy(update={"detectors": used})
     seen = healthy_statistics(runs, limits, top_speed_rad_s)
     return _each(
@@ -165,7 +165,7 @@ def _with_rough_limits(runs: Runs, limits: Limits, share: float, top_speed_rad_s
 
 
 def _calibrated(limits: Limits, found: HealthyStatistics, rule: LimitRule, share: float) -> Limits:
-    level = {row.name: _level(found, number, share) for number, row in enumerate(rows())}
+    level = {row.name: _level(found, number, share) for number, row in enumerate(calibrated_rows())}
     return _with(limits, rule, lambda row, now: now.calibrated(level[row.name], _evidence(row, limits, found)))
 
 
@@ -203,9 +203,9 @@ def _smoothed_std(limits: Limits, source: Signal, found: HealthyStatistics) -> f
 
 def _cautious(limits: Limits, found: HealthyStatistics) -> Limits:
     """Limits where the running is too short to set them by rarity; see DetectorSettings.cautious_factor."""
-    used = [row for row in rows() if row.name in limits.detectors]
+    used = [row for row in calibrated_rows() if row.name in limits.detectors]
     factors = {row.name: limits.detectors[row.name].cautious_factor(_evidence(row, limits, found)) for row in used}
-    limits = limits.scaled({row.name: factors.get(row.name) or 1.0 for row in rows()})
+    limits = limits.scaled({row.name: factors.get(row.name) or 1.0 for row in calibrated_rows()})
     detectors = {
         row.name: limits.detectors[row.name].cautious(_evidence(row, limits, found))
         for row in used
@@ -222,7 +222,7 @@ def _with(
         row.name: change(row, limits.detectors[row.name])
         if row.detector.settings.rule is rule
         else limits.detectors[row.name]
-        for row in rows()
+        for row in calibrated_rows()
         if row.name in limits.detectors
     }
     return limits.model_copy(update={"detectors": detectors})
@@ -235,7 +235,7 @@ def _each(limits: Limits, change: Callable[[HealthyResidual, Signal], HealthyRes
 
 def _factors(found: HealthyStatistics, target: float) -> Array:
     """(rows of the table,) factors on the limits, with which a share `target` of the windows has an alarm."""
-    count = len(rows())
+    count = len(calibrated_rows())
     often = min(max(target, SEEN_WINDOWS / found.windows), MAX_ALARM_SHARE)
     at = np.array([_level(found, number, often / count) for number in range(count)])
     together = np.concatenate([peaks(_score(run, at)).ravel() for run in found.maxima])
@@ -245,7 +245,7 @@ def _factors(found: HealthyStatistics, target: float) -> Array:
     )  # the equivalent number of independent statistics
     factors = [
         1.0 if row.detector.settings.rule is LimitRule.FIXED else _level(found, number, target / independent)
-        for number, row in enumerate(rows())
+        for number, row in enumerate(calibrated_rows())
     ]
     return _with_alarms_at_most(found, np.array(factors), int(target * found.windows + ROUNDING))
 
@@ -256,7 +256,9 @@ def _with_alarms_at_most(found: HealthyStatistics, factors: Array, allowed: int)
     The limit that raises most alarms is increased beyond a few excursions at a time.
     """
     factors = factors.copy()
-    by_rarity = [number for number, row in enumerate(rows()) if row.detector.settings.rule is not LimitRule.FIXED]
+    by_rarity = [
+        number for number, row in enumerate(calibrated_rows()) if row.detector.settings.rule is not LimitRule.FIXED
+    ]
     while True:
         too_many = sum(int((peaks(_score(run, factors)) > 1.0).sum()) for run in found.maxima) - allowed
         excursions = {
@@ -267,7 +269,7 @@ def _with_alarms_at_most(found: HealthyStatistics, factors: Array, allowed: int)
         most = max(by_rarity, key=lambda number: len(beyond[number]))
         if too_many <= 0 or not len(beyond[most]):
             return factors
-        at_once = min(max(too_many // len(rows()), 1), len(beyond[most]))
+        at_once = min(max(too_many // len(calibrated_rows()), 1), len(beyond[most]))
         factors[most] *= beyond[most][at_once - 1] * (1.0 + ROUNDING)
 
 

@@ -10,13 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from schemas.messages import Array
+from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.units import NS_PER_S
 from scoring.baseline.fan_offsets import Cells
 from scoring.calibration.residual_moments import MOTION_BINS, SPEED_BINS, ResidualMoments, octaves
 from scoring.calibration.windows import WindowMaxima, Windows, peaks
 from scoring.detectors.detector import DetectorRow, Signal
 from scoring.detectors.smoothed import Smoothed
-from scoring.detectors.table import rows
+from scoring.detectors.table import calibrated_rows, rows
 from scoring.fan_scorer import RESIDUALS, FanScorer, Observation, ScoredBlock
 from scoring.limits import Limits
 from scoring.samples import Samples
@@ -33,6 +34,8 @@ class HealthyRun(NamedTuple):
     blocks: Iterable[Samples]
     known_as: range | None = None
     """the numbers of these fans in the twin; None where it does not know its fans one by one"""
+    tachos: tuple[Tacho, ...] = INSTANTANEOUS
+    """how their speeds are measured: one for all fans, or one for each"""
 
 
 Runs = Callable[[], Iterable[HealthyRun]]
@@ -127,8 +130,9 @@ class _RunStatistics:
     def __init__(self, found: HealthyStatistics, run: HealthyRun, limits: Limits) -> None:
         self._found = found
         self._run = run
-        self._scorer = FanScorer(run.fans, limits, for_calibration=True)
-        self._windows = Windows(run.fans, len(rows()), limits.timing.on_delay_s)
+        self._scorer = FanScorer(run.fans, limits, for_calibration=True, tachos=run.tachos)
+        self._rows = [rows().index(row) for row in calibrated_rows()]
+        self._windows = Windows(run.fans, len(calibrated_rows()), limits.timing.on_delay_s)
         self._seconds = {source: _SecondMeans() for source in RESIDUALS}
         self._standardised_seconds = {source: _SecondMeans() for source in RESIDUALS}
         self._cells = {source: np.zeros((2, run.fans, SPEED_BINS)) for source in RESIDUALS}
@@ -137,7 +141,7 @@ class _RunStatistics:
         """Score a block."""
         found, scored = self._found, self._scorer.update(block)
         seen = self._scorer.observed()
-        ratios = np.concatenate([one.ratios for one in seen], axis=1)
+        ratios = np.concatenate([one.ratios[self._rows] for one in seen], axis=1)
         has_score = np.isfinite(scored.score)
         self._windows.add(block.t_ns, block.period_ns, ratios, has_score)
         found.fan_s += float(has_score.sum()) * found.period_s
@@ -166,7 +170,7 @@ class _RunStatistics:
         transient_rad_s = np.concatenate([one.transient_rad_s for one in seen])
         octave = np.log2(np.maximum(transient_rad_s / found.top_speed_rad_s, 1e-9))
         moving = np.clip(np.ceil(octave) + MOTION_BINS - 1, 0, MOTION_BINS - 1).astype(int)
-        for number, row in enumerate(rows()):
+        for number, row in enumerate(calibrated_rows()):
             if row.source == source:
                 found.ratio_sums[row.name] += float(ratios[number][use].sum())
                 if row.detector is Smoothed:

@@ -15,6 +15,7 @@ from typing import ClassVar, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field
 
 from schemas.messages import Alarm, Array
+from schemas.tacho import Tacho
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.state import ColumnState
 
@@ -28,6 +29,7 @@ class LimitRule(Enum):
 
     FIRST = "by rarity, and before the others: how far residuals are clipped and followed depends on it"
     RARITY = "by rarity: healthy fans exceed it as seldom as the declared false-alarm rate asks"
+    GIVEN = "not by calibration: with the twin itself"
     FIXED = "not by rarity: constant, or by the largest value that healthy runs reached (`DetectorSettings.fixed`)"
 
 
@@ -117,6 +119,8 @@ class DetectorContext:
     """of the healthy residual; 0: white"""
     mean_residual_std: float = 1.0
     """mean over speeds of the standard deviation of the healthy residual, sigma"""
+    tachos: tuple[Tacho, ...] = ()
+    """of each fan; only for detectors of the tacho"""
     capped: bool = True
     """False: statistics may grow without bound, for calibration to see how far"""
 
@@ -138,6 +142,11 @@ class DetectorInput:
     """the readings of the tacho, NaN where there is none"""
     missing: Array
     """the tacho gave no reading"""
+    idle: Array
+    """the command stops the fan, or it has just started"""
+    command: Array
+    predicted_rad_s: Array
+    """what a healthy fan would read, NaN where it is not known"""
 
 
 class Detector(ColumnState):
@@ -191,3 +200,5 @@ class DetectorRow:
     """the value of schemas.messages.Statistic that scores and alarms carry"""
     source: Signal
     detector: type[Detector]
+    comes_first: bool = False
+    """above its limit it is reported before all others, however far they exceed theirs: it says what is wrong"""

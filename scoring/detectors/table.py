@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from schemas.messages import Statistic
-from scoring.detectors.detector import DetectorRow
+from scoring.detectors.detector import DetectorRow, LimitRule
 from scoring.detectors.drift import Drift
 from scoring.detectors.smoothed import Smoothed
+from scoring.detectors.standstill import StandstillDetector
 from scoring.detectors.tacho import Tacho
 from scoring.detectors.variance_growth import VarianceGrowth
 
@@ -17,12 +18,18 @@ DETECTORS = (
     DetectorRow("balance_drift", Statistic.BALANCE_DRIFT, "balance", Drift),
     DetectorRow("balance_variance_growth", Statistic.BALANCE_VARIANCE_GROWTH, "balance", VarianceGrowth),
     DetectorRow("sensor", Statistic.SENSOR, "tacho", Tacho),
+    DetectorRow("standstill", Statistic.STANDSTILL, "tacho", StandstillDetector, comes_first=True),
 )
 
 
 def rows() -> tuple[DetectorRow, ...]:
     """All rows. Of statistics equally close to their limits the first one is reported."""
     return DETECTORS
+
+
+def calibrated_rows() -> tuple[DetectorRow, ...]:
+    """The rows whose limits calibration sets."""
+    return tuple(row for row in rows() if row.detector.settings.rule is not LimitRule.GIVEN)
 
 
 def row_of(statistic: int) -> DetectorRow | None:

@@ -1,7 +1,9 @@
 """The tacho itself: readings that repeat, and readings that are missing.
 
-A stuck tacho repeats its last value. A healthy one may do so for a while, where it counts coarsely and the fan runs
-evenly; calibration measures for how long. Missing readings are limited by their share.
+A stuck tacho repeats its last value. A healthy one may do so for a while; calibration measures for how long. A tacho
+that counts or holds its readings repeats them for as long as the fan runs evenly. Of such a tacho only samples count at
+which a healthy fan would read something else, because its speed has changed by more than the tacho resolves. Missing
+readings are limited by their share. While the command stops the fan, and while it starts, neither is judged.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from scoring.detectors.low_pass import LowPass
 
 MISSING_TIME_CONSTANT_S = 2.0
 LOOSE_S = 30.0  # a loose contact comes and goes: after so long without a failure it is taken to be good again
+MOVED_STEPS, MOVED_SHARE = 3.0, 0.1  # of the resolution, and of the speed: less may be noise, or an error of the twin
 STUCK_MARGIN, MIN_STUCK_S = 3.0, 2.0  # times the longest repetition of healthy runs
 MISSING_MARGIN, MIN_MISSING_SHARE, MAX_MISSING_SHARE = 3.0, 0.25, 0.9  # times the largest share of healthy runs
 
@@ -70,25 +73,42 @@ class Tacho(Detector):
         """(fans,) the last reading, rad/s"""
         self._repeated_ns = np.zeros(context.fans, np.int64)
         """(fans,) for how long it has repeated"""
+        self._healthy_rad_s = np.full(context.fans, np.nan)
+        """(fans,) what a healthy fan would have read when the reading began to repeat"""
+        self._holds = np.array([tacho.kind != "instantaneous" for tacho in context.tachos])
+        self._resolution_rad_s = np.array([tacho.resolution_rad_s for tacho in context.tachos])
         self._missing = LowPass(context.fans, MISSING_TIME_CONSTANT_S)
         self._longest_s = self._largest_share = 0.0
 
     def update(self, block: DetectorInput) -> Array:
         """See Detector. An invalid sample is one at which the line was silent."""
-        known = block.valid & np.isfinite(block.speed_rad_s)
-        stuck_s = self._stuck_s(np.where(known, block.speed_rad_s, np.nan), block.period_ns)
-        share = self._missing.update(block.missing.astype(np.float64), block.valid, block.period_s)
+        judged = block.valid & ~block.idle
+        speed_rad_s = np.where(judged & np.isfinite(block.speed_rad_s), block.speed_rad_s, np.nan)
+        stuck_s = self._stuck_s(speed_rad_s, block.predicted_rad_s, block.period_ns)
+        share = self._missing.update(block.missing.astype(np.float64), judged, block.period_s)
         self._longest_s = max(self._longest_s, float(stuck_s.max()))
         self._largest_share = max(self._largest_share, float(share.max()))
         return np.maximum(stuck_s / self._settings.stuck_s, share / self._settings.missing_share)
 
-    def _stuck_s(self, speed_rad_s: Array, period_ns: int) -> Array:
-        """(n, fans) for how long each reading has repeated, s. A fan at rest reads zero and is not stuck."""
+    def _stuck_s(self, speed_rad_s: Array, predicted_rad_s: Array, period_ns: int) -> Array:
+        """(n, fans) for how long each reading has repeated, s, against the prediction where the tacho holds readings.
+
+        A fan at rest reads zero and is not stuck.
+        """
         before = np.vstack((self._last, speed_rad_s))[:-1]
         same = (speed_rad_s == before) & (speed_rad_s != 0.0)
         rows = np.arange(1, len(speed_rad_s) + 1)[:, np.newaxis]
         changed = np.maximum.accumulate(np.where(same, 0, rows), axis=0)
-        repeated_ns = (rows - changed) * period_ns + np.where(changed == 0, self._repeated_ns, 0)
+        counted: Array = same
+        if self._holds.any():
+            first = np.take_along_axis(predicted_rad_s, np.maximum(changed - 1, 0), axis=0)
+            first = np.where(changed == 0, self._healthy_rad_s, first)
+            least = np.maximum(MOVED_STEPS * self._resolution_rad_s, MOVED_SHARE * np.abs(first))
+            counted = same & (~self._holds | (np.abs(predicted_rad_s - first) > least))
+            self._healthy_rad_s = first[-1].copy()
+        total = np.cumsum(counted, axis=0) * period_ns
+        at_change = np.maximum.accumulate(np.where(same, 0, total), axis=0)
+        repeated_ns = total - at_change + np.where(changed == 0, self._repeated_ns, 0)
         self._last, self._repeated_ns = speed_rad_s[-1].copy(), repeated_ns[-1].copy()
         return repeated_ns / NS_PER_S
 
@@ -117,7 +137,8 @@ class Tacho(Detector):
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
-        return {"last": self._last, "repeated_ns": self._repeated_ns, "missing": self._missing.value}
+        held = {"healthy_rad_s": self._healthy_rad_s} if self._holds.any() else {}
+        return {"last": self._last, "repeated_ns": self._repeated_ns, **held, "missing": self._missing.value}
 
     @classmethod
     def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:

@@ -12,11 +12,14 @@ import numpy as np
 
 from schemas.messages import Array
 from schemas.messages import Diagnosis as CauseMessage
+from schemas.standstill import Standstill
+from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
 from scoring.detectors.deviation import summed_deviation
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnosis import ADVICE, RankedCause, diagnose
 from scoring.diagnosis.regression_window import HealthyBalance, Window
+from scoring.diagnosis.standstill_causes import standstill_causes
 
 WINDOW_S = 95.0
 AGAIN_AFTER_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # after the raise; the last window still contains some health
@@ -40,10 +43,20 @@ class _Block:
 class Diagnoser:
     """Diagnoses the fans of one tray. Rows are selected by time: the cuts between blocks make no difference."""
 
-    def __init__(self, healthy: Sequence[HealthyBalance], advice: Advice | None = ADVICE) -> None:
-        """advice: None only to diagnose as for recordings made before there was any; see `diagnose`."""
+    def __init__(
+        self,
+        healthy: Sequence[HealthyBalance],
+        advice: Advice | None = ADVICE,
+        tachos: Sequence[Tacho] = INSTANTANEOUS,
+        standstill: Standstill | None = None,
+    ) -> None:
+        """advice: None only to diagnose as for recordings made before there was any; see `diagnose`. standstill: None
+        where the detector of it is not used.
+        """
         self._healthy = healthy
         self._advice = advice
+        self._tachos = tacho_of_each_fan(tachos, len(healthy))
+        self._standstill = standstill
         self._blocks: deque[_Block] = deque()
         self._period_ns = 0
         self._due: dict[int, list[int]] = {}
@@ -107,6 +120,14 @@ class Diagnoser:
         if self._advice is None or [each.cause for each in causes] != [each.cause for each in than]:
             return True
         return any(abs(new.probability - old.probability) >= NEWS for new, old in zip(causes, than, strict=True))
+
+    def of_standstill(self, fan: int, t_ns: int) -> tuple[CauseMessage, ...]:
+        """The causes of a fan that does not turn or stop as commanded, as `diagnose`."""
+        window = self.window(fan, t_ns, self._onset_t_ns.get(fan, t_ns))
+        if window is None or self._standstill is None:
+            return ()
+        causes = standstill_causes(window, self._standstill, self._healthy[fan], self._tachos[fan])
+        return tuple(_message(cause) for cause in causes if cause.probability >= MIN_PROBABILITY)
 
     def snapshot(self) -> dict[str, Any]:
         """The scheduled diagnoses, as JSON values; the samples are not included."""

@@ -43,7 +43,10 @@ def samples_of(speed: Array, balance: Array, first: int = 0, period_ns: int = ST
         speed_valid=np.isfinite(speed),
         balance=balance,
         balance_valid=np.isfinite(balance),
+        command=np.full(speed.shape, 50.0),
+        predicted_rad_s=np.full(speed.shape, 100.0),
         missing=np.zeros(speed.shape, np.bool_),
+        idle=np.zeros(speed.shape, np.bool_),
         alive=np.ones(speed.shape, np.bool_),
     )
 

@@ -26,7 +26,7 @@ from schemas.units import NS_PER_S, SpeedUnit
 from scoring.calibration.calibration import FragmentedError, TooLittleError
 from scoring.calibration.calibration import calibrate as find_limits
 from scoring.calibration.healthy_statistics import MixedRatesError
-from scoring.detectors.table import rows
+from scoring.detectors.table import calibrated_rows
 from scoring.limits import Limits, Timing
 
 EXIT_BROKEN = 3
@@ -238,7 +238,7 @@ def _print(output: Path, limits: Limits, drops: Sequence[str]) -> None:
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"{output}: alarms calibrated on {rate.fan_hours:.3g} fan-hours in {_runs(rate.runs)}", markup=False)
     table = Table("detector", "settings", box=None, pad_edge=False)
-    for row in rows():
+    for row in calibrated_rows():
         settings = limits.detectors.get(row.name)
         shown = ", ".join(f"{name} {value:.3g}" for name, value in settings) if settings else "not used"
         table.add_row(row.name, shown)

@@ -17,7 +17,8 @@ from schemas.messages import FanState, InvalidReason, Score
 from schemas.topics import tray_key
 from schemas.units import RAD_S_PER_UNIT
 
-_STYLES = {FanState.NORMAL: "green", FanState.UNKNOWN: "dim", FanState.SUSPECT: "yellow"}
+_AT_REST = (FanState.STOPPED, FanState.STARTING)
+_STYLES = {FanState.NORMAL: "green", FanState.SUSPECT: "yellow", **dict.fromkeys((FanState.UNKNOWN, *_AT_REST), "dim")}
 
 
 class DemoScreen:
@@ -74,7 +75,7 @@ class DemoScreen:
             state = FanState(score.state[-1, fan])
             why = (
                 ""
-                if score.valid[-1, fan]
+                if score.valid[-1, fan] or state in _AT_REST
                 else f" ({InvalidReason(score.invalid_reason[-1, fan]).name.lower().replace('_', ' ')})"
             )
             table.add_row(

@@ -130,8 +130,9 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Gro
         not_judged = [Text("alarms unknown: no scorer is alive", style="red")]
     else:
         not_judged = [Text(each.line(), style="red") for each in unjudged(states, judged)]
+    at_rest = [Text(each.line(), style="dim") for each in judged.at_rest()]
     no_alarms = [] if alarms or not_judged else [Text("no alarms", style="green")]
-    return Group(*([table] if watcher.stages() else []), *notes, *problems, *alarms, *not_judged, *no_alarms)
+    return Group(*([table] if watcher.stages() else []), *notes, *problems, *alarms, *not_judged, *at_rest, *no_alarms)
 
 
 def _has_scorer(states: Sequence[StageState]) -> bool:
@@ -193,6 +194,7 @@ def as_json(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> dict[st
         "stages": [_state_as_json(state, lost.get(state.label, 0)) for state in states],
         "alarms": [current.as_json() for current in watcher.current_alarms()],
         "not_judged": [each.as_json() for each in unjudged(states, judged)],
+        "at_rest": [each.as_json() for each in judged.at_rest()],
     }
 
 

@@ -39,7 +39,9 @@ class HealthyRuns:
         self._twin = twin
         self._overrides = overrides
         self._progress = progress
-        self._knows_fans = load_tray_twin(twin).fans > 1
+        loaded = load_tray_twin(twin)
+        self._knows_fans = loaded.fans > 1
+        self._tachos = loaded.card.tacho
         self._pass = 0
         self._kept: list[HealthyRun] | None = None
         self.trays: list[RecordedTray] = []
@@ -63,7 +65,7 @@ class HealthyRuns:
                 for tray, blocks in self._of(path):
                     self.trays.append(tray)
                     known_as = range(tray.fans) if self._knows_fans else None
-                    yield kept.recording(HealthyRun(str(path), tray.fans, blocks, known_as))
+                    yield kept.recording(HealthyRun(str(path), tray.fans, blocks, known_as, self._tachos))
             except CodecError as error:
                 raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
         self._kept = kept.complete

@@ -96,3 +96,17 @@ def test_row_01_without_scores_the_first_stage_that_does_not_work_is_the_reason(
 def test_bytes_that_are_no_score_of_the_tray_judge_nothing(listener, payload):
     listener.judged.add("a", payload)
     assert len(listener.lines()) == 2
+
+
+def test_a_fan_that_its_command_stops_is_judged_and_said_to_be_stopped(listener):
+    listener.score("a", InvalidReason.STOPPED, InvalidReason.NONE, InvalidReason.STOPPED, InvalidReason.STARTING)
+    listener.score("b", InvalidReason.STOPPED)
+    assert listener.lines() == []
+    assert [each.line() for each in listener.judged.at_rest()] == [
+        "a: fans 0, 2: stopped by their command",
+        "a: fan 3: starting",
+        "b: fan 0: stopped by its command",
+    ]
+    assert listener.judged.at_rest()[1].as_json() == {"tray": "a", "fans": [3], "state": "starting"}
+    listener.now_s += 2 * JUDGED_WITHIN_S
+    assert listener.judged.at_rest() == []

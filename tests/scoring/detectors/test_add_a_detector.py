@@ -157,7 +157,7 @@ def test_its_limit_is_calibrated_by_rarity_with_the_others() -> None:
     peak = limits.detectors["balance_peak"]
     assert isinstance(peak, PeakSettings)
     assert 2.0 < peak.limit < 6.0, "of white residuals of standard deviation one"
-    assert limits.detectors.keys() == {row.name for row in table.rows()}
+    assert limits.detectors.keys() == {row.name for row in table.calibrated_rows()}
 
 
 def test_a_row_may_have_a_fixed_limit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from schemas.tacho import Tacho as TachoKind
 from scoring.detectors.cusum import LARGEST_SIGMAS, ONE, Cusum
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput
 from scoring.detectors.drift import Drift, DriftSettings
@@ -51,6 +53,9 @@ def block_of(
         persistent=residual,
         speed_rad_s=residual if speed is None else speed,
         missing=np.zeros(valid.shape, np.bool_) if missing is None else missing,
+        idle=np.zeros(valid.shape, np.bool_),
+        command=np.ones(valid.shape),
+        predicted_rad_s=residual,
     )
 
 
@@ -256,3 +261,25 @@ def test_some_fans_start_again_and_the_others_continue() -> None:
     assert low_pass.value[1] != 0.0
     assert cusum.sums[0, 1] > 0
     assert growth.columns()["square"][1] > 0.0
+
+
+@pytest.mark.parametrize("cuts", [(), (130, 131, 260)])
+def test_a_tacho_that_counts_is_stuck_only_where_a_healthy_one_would_read_something_else(cuts: tuple[int, ...]) -> None:
+    tacho = TachoKind(kind="count", window_s=1.0)
+    of = DetectorContext(fans=2, smoothing_s=0.2, tachos=(tacho, TachoKind()))
+    sensor = Tacho(TachoSettings(stuck_s=0.5), of)
+    speed = np.full((400, 2), 100.0)
+    predicted = np.full((400, 2), 100.0)
+    predicted[200:] = 100.0 + 3.5 * tacho.resolution_rad_s
+    predicted[300:] = 100.0
+    whole = block_of(speed, np.ones(speed.shape, np.bool_))
+    edges = (0, *cuts, 400)
+    parts = []
+    for first, last in pairwise(edges):
+        rows = {name: value[first:last] for name, value in vars(whole).items() if isinstance(value, np.ndarray)}
+        parts.append(sensor.update(replace(whole, **rows | {"predicted_rad_s": predicted[first:last]})))
+    stuck_s = np.concatenate(parts) * 0.5
+    assert stuck_s[:200, 0].max() == 0.0, "the fan runs evenly"
+    np.testing.assert_allclose(stuck_s[200:300, 0], STEP_S * np.arange(1, 101))
+    np.testing.assert_allclose(stuck_s[300:, 0], 1.0)
+    np.testing.assert_allclose(stuck_s[:, 1], STEP_S * np.arange(400), err_msg="each reading is one of its own")

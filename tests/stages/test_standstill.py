@@ -1,0 +1,168 @@
+"""Stopping, standing and starting through twin integrator and scorer: states of a healthy fan, and what is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from schemas.blocks import cut
+from schemas.messages import Alarm, FanState, Grid, InvalidReason, Prediction, Score, Statistic, Transition
+from schemas.standstill import Standstill
+from schemas.tacho import INSTANTANEOUS
+from scoring.alarms.current_alarms import current_alarms
+from stages.scorer import HealthyTwin, ScorerConfig, ScorerCore, limits_in_force
+from tests.stages.test_twin_integrator import core_of, physical_twin, run_freely
+from tests.support.scored_blocks import balance_of_a_fan
+
+EPOCH_NS = 1_700_000_000_000_000_000
+PERIOD_S = 0.05
+HEALTHY = Standstill(
+    turning_command=20.0,
+    standing_below_rad_s=50.0,
+    off_command=0.0,
+    start_s=1.0,
+    coast_s=4.0,
+    coast_time_constant_s=1.0,
+)
+Floats = NDArray[np.float64]
+
+
+@dataclass
+class Seen:
+    """What a scorer emitted for one fan; times in s since the first sample."""
+
+    state: NDArray[np.uint8]
+    scores: Floats
+    alarms: list[Alarm]
+    problem: str
+
+    def at(self, seconds: float) -> FanState:
+        return FanState(self.state[round(seconds / PERIOD_S)])
+
+    def times(self, transition: Transition) -> list[float]:
+        return [round((a.t_ns - EPOCH_NS) / 1e9, 3) for a in self.alarms if a.transition == transition]
+
+
+def commands(*levels: tuple[float, float]) -> Floats:
+    return np.concatenate([np.full(round(seconds / PERIOD_S), level) for level, seconds in levels])
+
+
+def speed_of(command: Floats) -> Floats:
+    """The speed of a healthy fan that begins at rest."""
+    speed, _ = run_freely(np.zeros((1, 2)), command[:, np.newaxis], np.full(len(command), PERIOD_S))
+    return np.asarray(speed[:, 0])
+
+
+def seen(command: Floats, speed: Floats, *, block: int = 7, healthy: Standstill | None = HEALTHY) -> Seen:
+    """Only the detector of standstill can raise an alarm."""
+    config = ScorerConfig(alarm_sigmas=1e6, not_judged_s=5.0)
+    twin = HealthyTwin("t", limits_in_force(config, None, healthy), [balance_of_a_fan()], "%", INSTANTANEOUS, healthy)
+    integrator, scorer = core_of(physical_twin(standstill=healthy), warm_up_s=1.0), ScorerCore(1, "rad/s", config, twin)
+    messages, problems = [], set()
+    valid = np.isfinite(speed)[:, np.newaxis]
+    grid = Grid(
+        fans=1,
+        period_ns=round(PERIOD_S * 1e9),
+        t_ns=EPOCH_NS + np.arange(len(command)) * round(PERIOD_S * 1e9),
+        command=command[:, np.newaxis],
+        speed_rad_s=speed[:, np.newaxis],
+        valid=valid,
+        invalid_reason=np.where(valid, InvalidReason.NONE, InvalidReason.NO_SPEED).astype(np.uint8),
+    )
+    for first in range(0, len(command), block):
+        for prediction in integrator.step(cut(grid, first, min(first + block, len(command)))):
+            if isinstance(prediction, Prediction):
+                messages += scorer.step(prediction)
+                problems.add(scorer.problem())
+    scores = [m for m in messages if isinstance(m, Score)]
+    return Seen(
+        np.concatenate([score.state[:, 0] for score in scores]),
+        np.concatenate([score.score[:, 0] for score in scores]),
+        [m for m in messages if isinstance(m, Alarm)],
+        "; ".join(sorted(problems - {""})),
+    )
+
+
+def test_a_fan_that_is_stopped_stands_and_starts_again_is_healthy() -> None:
+    command = commands((80.0, 20.0), (0.0, 30.0), (25.0, 20.0))
+    found = seen(command, speed_of(command))
+    assert found.alarms == []
+    assert found.problem == "", "a fan that stands as commanded is judged"
+    assert found.at(19.0) == FanState.NORMAL
+    assert {found.at(t) for t in (20.0, 21.0, 30.0, 49.9)} == {FanState.STOPPED}, "coasting and standing"
+    assert {found.at(t) for t in (50.0, 51.0, 54.0)} == {FanState.STARTING}
+    assert found.at(60.0) == FanState.NORMAL
+
+
+def test_a_device_without_a_reading_at_rest_is_healthy_too() -> None:
+    command = commands((80.0, 20.0), (0.0, 30.0), (25.0, 20.0))
+    speed = speed_of(command)
+    found = seen(command, np.where(speed < 20.0, np.nan, speed))
+    assert found.alarms == []
+    assert (found.at(45.0), found.at(50.2), found.at(65.0)) == (FanState.STOPPED, FanState.STARTING, FanState.NORMAL)
+
+
+@pytest.mark.parametrize("block", [1, 64])
+def test_a_blocked_fan_at_its_minimum_is_an_alarm_that_a_stop_does_not_end(block: int) -> None:
+    command = commands((25.0, 20.0), (0.0, 10.0), (25.0, 10.0), (25.0, 30.0))
+    speed = speed_of(command)
+    speed[round(15.0 / PERIOD_S) : round(40.0 / PERIOD_S)] = 0.0
+    found = seen(command, speed, block=block)
+    (raised_s,) = found.times(Transition.RAISED)
+    assert 15.5 < raised_s < 15.8
+    (raised, *_) = found.alarms
+    assert raised.statistic == Statistic.STANDSTILL
+    assert raised.message.startswith("fan 0: does not turn although commanded to 25: blocked 6")
+    assert [each.cause for each in raised.causes[:2]] == ["blocked", "no_tacho"]
+    assert found.at(25.0) == FanState.STOPPED
+    assert found.times(Transition.DATA_LOST) == [pytest.approx(22.0, abs=0.1)]
+    (cleared_s,) = found.times(Transition.CLEARED)
+    assert cleared_s > 40.0, "only a fan that turns again ends it"
+    (alarm,) = current_alarms(found.alarms)
+    assert alarm.causes[0].cause == "blocked"
+    other = seen(command, speed, block=7)
+    np.testing.assert_array_equal(found.scores, other.scores)
+    assert [vars(alarm) for alarm in found.alarms] == [vars(alarm) for alarm in other.alarms]
+
+
+def test_a_fan_without_power_coasts_and_that_tells_it_from_a_blocked_one() -> None:
+    command = commands((80.0, 40.0))
+    driven = command.copy()
+    driven[round(20.0 / PERIOD_S) :] = 0.0
+    found = seen(command, speed_of(driven))
+    (raised, *_) = found.alarms
+    assert raised.causes[0].cause == "no_power"
+    assert raised.causes[0].probability > 0.8
+
+
+@pytest.mark.parametrize(("reading", "causes"), [(0.0, ["blocked", "no_power", "no_tacho"]), (np.nan, ["no_tacho"])])
+def test_a_fan_that_does_not_start_is_an_alarm_after_three_times_the_longest_start(
+    reading: float, causes: list[str]
+) -> None:
+    command = commands((80.0, 20.0), (0.0, 20.0), (80.0, 10.0))
+    speed = speed_of(command)
+    speed[round(40.0 / PERIOD_S) :] = reading
+    found = seen(command, speed)
+    (raised_s,) = found.times(Transition.RAISED)
+    limit_s = 3.0 if reading == 0.0 else 2.0
+    assert 40.0 + limit_s < raised_s < 40.3 + limit_s
+    assert [each.cause for each in found.alarms[0].causes if each.probability > 0.15] == causes
+
+
+def test_a_fan_that_turns_although_its_command_stops_it_is_an_alarm() -> None:
+    command = commands((80.0, 20.0), (0.0, 30.0))
+    found = seen(command, speed_of(np.full(len(command), 80.0)))
+    (raised_s,) = found.times(Transition.RAISED)
+    assert 32.0 < raised_s < 32.3
+    assert found.alarms[0].message == (
+        "fan 0: turns although the command of 0 stops it: still driven 70 %, turned by the air 30 %"
+    )
+
+
+def test_a_card_without_it_decides_as_before() -> None:
+    command = commands((80.0, 20.0), (0.0, 20.0), (80.0, 20.0))
+    found = seen(command, speed_of(command), healthy=None)
+    assert not {FanState.STOPPED, FanState.STARTING} & set(map(FanState, found.state.tolist()))

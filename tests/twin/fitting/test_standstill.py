@@ -1,0 +1,87 @@
+"""twin.fitting.standstill: what runs with stops and starts show, as a tacho that counts over a second reports them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from schemas.standstill import Standstill
+from schemas.tacho import Tacho
+from twin.fitting.standstill import find_standstill
+from twin.runs import Array, Run
+
+PERIOD_S = 0.1
+COUNT = Tacho(kind="count", window_s=1.0)
+PLATEAU, PER_COMMAND, COAST_S = 30.0, 2.0, 1.3
+
+
+def measured(*levels: tuple[float, float], start_delay_s: float = 0.0, tacho: Tacho = COUNT) -> Run:
+    """A fan under levels (command, seconds): at least at its plateau above a command of 20, slower down than up."""
+    command = np.concatenate([np.full(round(seconds / PERIOD_S), level) for level, seconds in levels])
+    speed, now, driven_s = np.zeros(len(command)), 0.0, 0.0
+    for row, level in enumerate(command):
+        driven_s = driven_s + PERIOD_S if level > 20.0 else 0.0
+        target = max(PLATEAU, PER_COMMAND * level) if driven_s > start_delay_s else 0.0
+        now += (target - now) * PERIOD_S / (0.8 if target > now else COAST_S)
+        speed[row] = now
+    t_s: Array = PERIOD_S * np.arange(len(command))
+    return Run("levels", t_s, command, _counted(speed, tacho), (tacho,))
+
+
+def _counted(speed: Array, tacho: Tacho) -> Array:
+    window = round(tacho.window_s / PERIOD_S)
+    if not window:
+        return speed
+    counts = speed[: len(speed) // window * window].reshape(-1, window).mean(axis=1) / tacho.resolution_rad_s
+    shown = np.repeat(np.floor(counts + 1e-9) * tacho.resolution_rad_s, window)
+    return np.concatenate((np.zeros(window), shown))[: len(speed)]
+
+
+STOPS = ((100.0, 30.0), (0.0, 40.0), (40.0, 30.0), (10.0, 40.0), (30.0, 40.0), (80.0, 20.0))
+
+
+def test_stops_and_starts_are_found_with_their_times() -> None:
+    found = find_standstill([measured(*STOPS)])
+    assert found is not None
+    assert (found.off_command, found.turning_command) == (10.0, 30.0)
+    assert 0.4 * PER_COMMAND * 30.0 < found.standing_below_rad_s < 0.6 * PER_COMMAND * 30.0
+    assert found.start_s is not None
+    assert 0.5 < found.start_s <= COUNT.reach_s + 1.0
+    assert found.coast_time_constant_s == pytest.approx(COAST_S, rel=0.5)
+    expected_s = COAST_S * np.log(PER_COMMAND * 100.0 / found.standing_below_rad_s)
+    assert found.coast_s is not None
+    assert expected_s < found.coast_s < expected_s + COUNT.reach_s + 1.0
+    assert found.lapse_s == 0.0
+
+
+def test_a_fan_that_never_stopped_shows_what_turns_it_and_nothing_else() -> None:
+    found = find_standstill([measured((100.0, 30.0), (40.0, 30.0), (60.0, 30.0))])
+    assert found is not None
+    assert found == Standstill(turning_command=40.0, standing_below_rad_s=found.standing_below_rad_s)
+    command, standing, turning = np.array([0.0, 0.0, 40.0, 5.0]), np.zeros(4), np.full(4, 100.0)
+    assert found.stops(command, standing).tolist() == [True, True, False, False]
+    assert not found.stops(command, turning).any(), "it may turn at its minimum speed without a command"
+
+
+def test_a_slow_start_is_not_a_command_that_stops_the_fan() -> None:
+    found = find_standstill([measured(*STOPS, start_delay_s=15.0)])
+    assert found is not None
+    assert (found.off_command, found.turning_command) == (10.0, 30.0)
+    assert found.start_s is not None
+    assert 15.0 < found.start_s < 18.5
+
+
+def test_lapses_of_the_tacho_are_measured() -> None:
+    run = measured((100.0, 60.0), (0.0, 40.0), (100.0, 60.0), tacho=Tacho())
+    speed = run.speed_rad_s.copy()
+    speed[300:307] = 0.0
+    found = find_standstill([replace(run, speed_rad_s=speed)])
+    assert found is not None
+    assert found.lapse_s == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize("run", [measured((-50.0, 30.0), (50.0, 30.0)), measured((0.0, 30.0))])
+def test_nothing_is_said_of_fans_that_turn_both_ways_or_never(run: Run) -> None:
+    assert find_standstill([run]) is None

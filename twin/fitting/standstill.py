@@ -1,0 +1,176 @@
+"""How healthy fans stop, stand and start, from measured runs.
+
+A command *turns* the fans if one turned under it, or under lower ones, for `STEADY_S`, and did not slow down. It
+*stops* them if one stood under it, or under higher ones, for `STOOD_S`; what follows the last increase of the command
+before a start belongs to the start. Readings lag, so both times are extended by the reach of the tacho.
+
+A reading of half of the lowest steady speed is taken for that of a fan that stands or comes to rest: a fan that loses
+its power is then recognised before the last pulse, and a windmilling one is not called turning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+from schemas.standstill import Standstill
+from twin.runs import Array, Run
+
+STEADY_S = 5.0
+STOOD_S = 10.0
+STEADY_SHARE = 0.8  # of the reading before: a fan that loses more slows down
+LOWEST_SHARE_OF_TOP = 0.05  # a lower reading is of a fan that stands, whatever the lowest steady speed
+STANDING_SHARE = 0.5  # of the lowest steady speed
+LOWEST_QUANTILE = 0.001  # of steady readings: one odd reading does not set the lowest steady speed
+MIN_LOG_FALL = 0.5  # a shorter coast says little about the time constant
+
+
+@dataclass(frozen=True, eq=False)
+class _FanSeries:
+    """One fan in one stretch without gaps, at equal steps of time. speed_rad_s: sizes, NaN where missing."""
+
+    period_s: float
+    command: Array
+    speed_rad_s: Array
+    reach_s: float
+    mean_delay_s: float
+
+    def lowest_command(self, seconds: float) -> Array:
+        """(n,) the lowest command of the last seconds; NaN before so many have passed."""
+        return self._of_past(minimum_filter1d, seconds)
+
+    def highest_command(self, seconds: float) -> Array:
+        """(n,) the highest command of the last seconds; NaN before so many have passed."""
+        return self._of_past(maximum_filter1d, seconds)
+
+    def _of_past(self, extreme: Callable[..., Array], seconds: float) -> Array:
+        size = round((seconds + self.reach_s) / self.period_s) + 1
+        found = extreme(self.command, size, origin=(size - 1) // 2)
+        found[: size - 1] = np.nan
+        return found
+
+
+def find_standstill(runs: Sequence[Run]) -> Standstill | None:
+    """What the runs show; None where they do not show at which commands fans turn, or drive them both ways."""
+    series = [one for run in runs for one in _series(run)]
+    speeds = [one.speed_rad_s[np.isfinite(one.speed_rad_s)] for one in series]
+    if not any(len(one) for one in speeds) or any((one.command < 0.0).any() for one in series):
+        return None
+    top = max(float(one.max()) for one in speeds if len(one))
+    if top <= 0.0:
+        return None
+    standing_below = LOWEST_SHARE_OF_TOP * top
+    off, turning = _commands(series, standing_below)
+    if turning is None:
+        return None
+    steady = [_steady_speeds(one, turning, standing_below) for one in series]
+    lowest = float(np.quantile(np.concatenate(steady), LOWEST_QUANTILE)) if any(map(len, steady)) else 0.0
+    standing_below = max(standing_below, STANDING_SHARE * lowest)
+    off, turning = _commands(series, standing_below)
+    if turning is None:
+        return None
+    found = Standstill(turning_command=turning, standing_below_rad_s=standing_below, off_command=off)
+    starts_s = [start_s for one in series for start_s in _starts(one, found)]
+    coasts = [coast for one in series for coast in _coasts(one, found)]
+    constants_s = [constant_s for _, constant_s, _ in coasts if constant_s > 0.0]
+    log_fall = float(np.log(top / standing_below))
+    from_top_s = [seconds + constant_s * max(log_fall - log, 0.0) for seconds, constant_s, log in coasts]
+    return found.model_copy(
+        update={
+            "start_s": max(starts_s, default=None),
+            "coast_s": max(from_top_s, default=None),
+            "coast_time_constant_s": float(np.median(constants_s)) if constants_s else None,
+            "lapse_s": _longest_lapse_s(series, found, max(starts_s, default=STEADY_S)),
+        }
+    )
+
+
+def _series(run: Run) -> Iterator[_FanSeries]:
+    for stretch in run.split_at_gaps():
+        period_s = stretch.median_period_s
+        rows = np.searchsorted(stretch.t_s, np.arange(stretch.t_s[0], stretch.t_s[-1], period_s), side="right") - 1
+        for fan, tacho in enumerate(stretch.tacho):
+            command, speed = stretch.command[rows, fan], np.abs(stretch.speed_rad_s[rows, fan])
+            yield _FanSeries(period_s, command, speed, tacho.reach_s, tacho.mean_delay_s)
+
+
+def _commands(series: Sequence[_FanSeries], standing_below: float) -> tuple[float | None, float | None]:
+    """The highest command that stops fans, and the lowest above it that turns them."""
+    stopping = [command for one in series for command in _stopping_commands(one, standing_below)]
+    off = max(stopping, default=None)
+    turning = min(
+        (
+            float(commands.min())
+            for one in series
+            if len(commands := _turning_commands(one, standing_below, -np.inf if off is None else off))
+        ),
+        default=None,
+    )
+    return off, turning
+
+
+def _stopping_commands(one: _FanSeries, standing_below: float) -> Iterator[float]:
+    lowest = one.lowest_command(STOOD_S)
+    increases = np.flatnonzero(np.diff(one.command, prepend=one.command[:1]) > 0.0)
+    for first, last in _stretches(one.speed_rad_s < standing_below):
+        end = last
+        if last < len(one.command):  # it starts: from the last increase on
+            before = increases[np.searchsorted(increases, last, side="right") - 1] if len(increases) else 0
+            end = int(before) if first < before <= last else first
+        stood = lowest[first:end]
+        if np.isfinite(stood).any():
+            yield float(np.nanmax(stood))
+
+
+def _turning_commands(one: _FanSeries, standing_below: float, above: float) -> Array:
+    highest = one.highest_command(STEADY_S)
+    ago = max(1, round(STEADY_S / 2 / one.period_s))
+    before = np.concatenate((np.full(ago, np.nan), one.speed_rad_s))[: len(one.speed_rad_s)]
+    steady = (one.speed_rad_s >= standing_below) & (one.speed_rad_s >= STEADY_SHARE * before)
+    return highest[steady & (highest > above)]
+
+
+def _steady_speeds(one: _FanSeries, turning: float, standing_below: float) -> Array:
+    return one.speed_rad_s[(one.lowest_command(STEADY_S) >= turning) & (one.speed_rad_s >= standing_below)]
+
+
+def _starts(one: _FanSeries, found: Standstill) -> Iterator[float]:
+    """Times from a command to turn, given to a fan that stood, to the first reading of a fan that turns, s."""
+    turns = found.turns(one.speed_rad_s)
+    for first, last in _stretches(found.drives(one.command)):
+        if first and one.speed_rad_s[first] < found.standing_below_rad_s and turns[first:last].any():
+            yield float(turns[first:last].argmax()) * one.period_s
+
+
+def _coasts(one: _FanSeries, found: Standstill) -> Iterator[tuple[float, float, float]]:
+    """From a command to stop to the first reading of a fan that stands: time, its time constant, log of the fall."""
+    stands = one.speed_rad_s < found.standing_below_rad_s
+    for first, last in _stretches(found.stops(one.command, one.speed_rad_s)):
+        if first and found.turns(one.speed_rad_s[first]) and stands[first:last].any():
+            seconds = float(stands[first:last].argmax()) * one.period_s
+            log = float(np.log(one.speed_rad_s[first] / found.standing_below_rad_s))
+            constant_s = max(seconds - one.mean_delay_s, 0.0) / log if log >= MIN_LOG_FALL else 0.0
+            yield seconds, constant_s, log
+
+
+def _longest_lapse_s(series: Sequence[_FanSeries], found: Standstill, start_s: float) -> float:
+    longest = 0.0
+    for one in series:
+        turns = found.turns(one.speed_rad_s)
+        for first, last in _stretches(found.drives(one.command)):
+            started = first + round(start_s / one.period_s)
+            rows = started + np.flatnonzero(turns[started:last])
+            if len(rows):
+                stands = one.speed_rad_s[rows[0] : rows[-1]] < found.standing_below_rad_s
+                longest = max([longest, *((end - begin) * one.period_s for begin, end in _stretches(stands))])
+    return longest
+
+
+def _stretches(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """First and one past the last row of each stretch of true flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False]))))
+    return zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
