@@ -12,6 +12,7 @@ from schemas.messages import (
     Alarm,
     Array,
     Diagnosis,
+    FanState,
     Header,
     Request,
     Score,
@@ -121,6 +122,8 @@ class AlarmManager:
 
     def _persists(self, row: int, fan: int, score: Score, context: AlarmContext) -> bool:
         """Whether the fault of the last message persists; otherwise a diagnosis would include its end."""
+        if score.state[row, fan] in (FanState.STOPPED, FanState.STARTING):
+            return False
         now, before = abs(context.balance_command[row, fan]), abs(self._next_message(fan).torque_balance_command)
         detector = row_of(int(score.statistic[row, fan]))
         of_tacho = detector is not None and detector.source == "tacho"

@@ -14,7 +14,6 @@ from scoring.detectors.table import row_of
 from scoring.diagnosis.standstill_causes import STANDSTILL_CAUSES
 
 CANNOT_TELL = "cannot_tell"
-LIKELY = 0.15  # less probable causes of a fan that does not turn or stop are not named
 CAUSES = {
     "drag_up": "more drag (airflow blocked, filter clogged)",
     "drag_down": "less drag (blade lost, airflow freer than before)",
@@ -95,5 +94,4 @@ def _is_against_command(alarm: Alarm) -> bool:
 
 
 def _likely(alarm: Alarm) -> str:
-    likely = [each for each in alarm.causes if each.probability >= LIKELY]
-    return ", ".join(f"{STANDSTILL_CAUSES[each.cause]} {100 * each.probability:.0f} %" for each in likely)
+    return ", ".join(f"{STANDSTILL_CAUSES[each.cause]} {100 * each.probability:.0f} %" for each in alarm.causes)

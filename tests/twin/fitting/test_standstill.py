@@ -26,7 +26,7 @@ def measured(*levels: tuple[float, float], start_delay_s: float = 0.0, tacho: Ta
         target = max(PLATEAU, PER_COMMAND * level) if driven_s > start_delay_s else 0.0
         now += (target - now) * PERIOD_S / (0.8 if target > now else COAST_S)
         speed[row] = now
-    t_s: Array = PERIOD_S * np.arange(len(command))
+    t_s = np.arange(len(command), dtype=np.float64) * PERIOD_S
     return Run("levels", t_s, command, _counted(speed, tacho), (tacho,))
 
 
