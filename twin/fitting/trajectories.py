@@ -20,6 +20,7 @@ from twin.runs import Array, Run, common_tacho, starting_samples, starting_speed
 MIN_SAMPLES = 200
 MAX_SAMPLES = 12_000
 MAX_PADDED = 4
+ROUNDING_S = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +131,9 @@ def cut_into_trajectories(runs: Sequence[Run], max_samples: int) -> Trajectories
 
 def _begin(run: Run, first: int, reach_s: float) -> int:
     """The last sample from which on sample `first` shows nothing of the time before; 0 where there is none."""
-    return int(max(np.searchsorted(run.t_s, run.t_s[first] - reach_s, side="right") - 1, 0))
+    if reach_s == 0.0:
+        return first
+    return int(max(np.searchsorted(run.t_s, run.t_s[first] - reach_s - ROUNDING_S, side="right") - 1, 0))
 
 
 def stretch_samples(time_constant_s: float, period_s: float, time_constants: float) -> int:
