@@ -60,6 +60,7 @@ from scoring.limits import Limits, Timing, uncalibrated
 from scoring.samples import samples_of
 from scoring.score_message import score_of
 from scoring.snapshot_times import with_times_moved
+from scoring.wear.slow_change import WEAR_HINT
 from scoring.wear.wear_monitor import WearMonitor
 
 IN_ALARM = (FanState.ALARM, FanState.RETURNING)
@@ -71,6 +72,7 @@ ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
 READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_KEPT}"
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
 RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
+FOLLOWED_FAR = 0.5  # of its adaptation limit, from which on it is said how far a baseline has followed a fan
 DATA_LOST_AFTER_NS = 2 * NS_PER_S  # an active alarm is not confirmed by data after so long without a score
 SET_BACK_NS = NS_PER_S  # a snapshot further ahead of the present is of a clock that was set back since
 BACK_IN_TIME_NS = 120 * NS_PER_S  # a restarted producer catches up with less; older samples are of another recording
@@ -171,6 +173,7 @@ class ScorerCore(Core):
         """the snapshot is of later times than now: the first prediction shows whether all times have gone back"""
 
     def _start_new(self) -> None:
+        self._sigma_rad_s = np.ones(self._fans)
         self._scorer = self._new_scorer()
         twin, advice = self._twin, Advice(self._twin.command_unit) if self._holds else None
         self._diagnoser = Diagnoser(twin.balances, advice, twin.tachos, twin.standstill)
@@ -280,8 +283,20 @@ class ScorerCore(Core):
         return {**self._counts, **of_alarms}
 
     def notes(self) -> list[str]:
-        """Which share of the samples was judged, and why the others were not."""
-        return self._judged_share.notes
+        """Which share of the samples was judged, and why the others were not; fans that change slowly."""
+        return [*self._judged_share.notes, *self._wear.notices(), *self._followed()]
+
+    def _followed(self) -> list[str]:
+        """Fans whose baseline of the speed has followed them far since commissioning, in tenths of what it may."""
+        baseline, unit = self._scorer.residuals["speed"].baseline, self._text.units
+        limit = self._twin.limits.speed.baseline.adaptation_limit_sigmas
+        moved = np.where(baseline.is_set, baseline.value - baseline.commissioned, 0.0) / max(limit, 1e-9)
+        lines = []
+        for fan in np.flatnonzero(np.abs(moved) >= FOLLOWED_FAR).tolist():
+            share = f"{10 * int(10.0 * moved[fan]):+d} %"
+            most = f"{unit.shown_speed(limit * self._sigma_rad_s[fan])} {unit.speed}"
+            lines.append(f"fan {fan}: the baseline of its speed has followed it by {share} of {most}: {WEAR_HINT}")
+        return lines
 
     def problem(self) -> str:
         """What people should look at: input, snapshot, fans without a score, baselines at their limit, wear."""
@@ -359,6 +374,7 @@ class ScorerCore(Core):
         return discarded
 
     def _score(self, item: Prediction) -> tuple[Score, list[Alarm]]:
+        self._sigma_rad_s = item.sigma_rad_s
         scored, state, events = self._decide(item)
         valid = np.isfinite(scored.score)
         self._feed_diagnoser(item, scored)

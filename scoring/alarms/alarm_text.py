@@ -49,7 +49,7 @@ class AlarmText:
 
     def __init__(self, speed_unit: SpeedUnit, command_unit: str) -> None:
         """command_unit: empty where the twin does not name it."""
-        self._units = AlarmUnits(speed_unit, command_unit)
+        self.units = AlarmUnits(speed_unit, command_unit)
 
     def of(self, alarm: Alarm, refusal: str = "") -> str:
         """The line. refusal: the reason why a request was refused."""
@@ -68,7 +68,7 @@ class AlarmText:
         row = row_of(alarm.statistic)
         if row is None:
             return f"a statistic of a newer version is {alarm.score:.1f} times its limit"
-        return row.detector.text(alarm, row.source, self._units)
+        return row.detector.text(alarm, row.source, self.units)
 
     def _cause_if_known(self, alarm: Alarm) -> str:
         if alarm.statistic == Statistic.STANDSTILL and _is_against_command(alarm):

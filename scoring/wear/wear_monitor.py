@@ -20,6 +20,7 @@ from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.former_snapshot_keys import FORMER_WEAR_KEYS, current_keys
 from scoring.wear.reidentification import parameter_shifts
+from scoring.wear.slow_change import slow_changes
 from scoring.wear.trend import NS_PER_DAY, LimitForecast, Trend, WearSeries, forecast_limit
 
 UNITS = {"balance": "command", "drag": "relative", "friction": "command", "gain": "relative"}
@@ -62,6 +63,9 @@ class WearMonitor:
         self._disturbed_t_ns = np.full(len(healthy), NEVER_NS)
         """(fans,) the last sample that no point may look back on"""
         self._fans = [_FanWear() for _ in healthy]
+        self._noticed_t_ns: list[int] = []
+        """the last point of each fan when the notices were made"""
+        self._notices: list[str] = []
 
     def update(
         self,
@@ -127,6 +131,16 @@ class WearMonitor:
         others = ", ".join(str(other) for _, other, *_ in sorted(soon)[1:])
         advice = f"inspect it, and fan {others}" if others else "inspect it"
         return f"fan {number} is wearing: its torque balance will reach the limit {when}; {advice}"
+
+    def notices(self) -> list[str]:
+        """A line for each fan that has changed slowly against the fans beside it."""
+        measured_t_ns = [fan.t_ns for fan in self._fans]
+        if measured_t_ns != self._noticed_t_ns:
+            self._noticed_t_ns = measured_t_ns
+            has_drag = any(len(fan.series["drag"]) for fan in self._fans)
+            parameter = "drag" if has_drag else "gain"  # the drag of some fans was identified as zero
+            self._notices = slow_changes(parameter, [fan.series[parameter] for fan in self._fans])
+        return self._notices
 
     def snapshot(self) -> dict[str, Any]:
         """The whole state, as JSON values, and the present wear of each parameter for `fantwin wear`."""

@@ -22,7 +22,7 @@ from pipeline.cli.twins.training_data import sha256_of, twin_errors
 from pipeline.errors import UserError
 from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.runtime.tray_twin import load_tray_twin
-from schemas.units import NS_PER_S, SpeedUnit
+from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
 from scoring.calibration.calibration import FragmentedError, TooLittleError
 from scoring.calibration.calibration import calibrate as find_limits
 from scoring.calibration.healthy_statistics import MixedRatesError
@@ -94,7 +94,7 @@ def calibrate(
         _write(twin, output, limits)
         result = {"twin": str(output), "calibration": json.loads(limits.model_dump_json())}
         result["warnings"] = [warning] if warning else []
-        drops = drops_found(output, speed_unit)
+        drops = drops_found(output, RAD_S_PER_UNIT[speed_unit])
         result |= {"speed_unit": speed_unit, "drops_found": [drop.as_json() for drop in drops]}
         if warning:
             typer.echo(warning, err=True)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.runtime.tray_twin import load_tray_twin
-from schemas.units import RAD_S_PER_UNIT, SpeedUnit
 from scoring.calibration.detectable import SHARES, detectable_drops
 from scoring.limits import Limits
 
@@ -27,7 +26,7 @@ class Drop:
         return {name: value if np.isfinite(value) else None for name, value in vars(self).items()}
 
 
-def drops_found(path: Path, unit: SpeedUnit) -> list[Drop]:
+def drops_found(path: Path, rad_s_per_unit: float) -> list[Drop]:
     """The drops at some speeds up to the top speed of training; none without a calibration.
 
     Raises:
@@ -36,7 +35,7 @@ def drops_found(path: Path, unit: SpeedUnit) -> list[Drop]:
     twin = load_tray_twin(path)
     if twin.card.calibration is None:
         return []
-    limits, rad_s = Limits.model_validate(twin.card.calibration), RAD_S_PER_UNIT[unit]
+    limits, rad_s = Limits.model_validate(twin.card.calibration), rad_s_per_unit
     speeds = [share * twin.card.top_speed_rad_s for share in SHARES]
     of_fans = [
         detectable_drops(limits, float(sigma), balance, speeds)
@@ -51,12 +50,12 @@ def drops_found(path: Path, unit: SpeedUnit) -> list[Drop]:
     ]
 
 
-def drop_lines(drops: Sequence[Drop], unit: SpeedUnit) -> list[str]:
+def drop_lines(drops: Sequence[Drop], unit: str) -> list[str]:
     """One line for each speed."""
     return [f"found at {_of(drop.speed)} {unit}: {_found(drop, unit)}" for drop in drops]
 
 
-def _found(drop: Drop, unit: SpeedUnit) -> str:
+def _found(drop: Drop, unit: str) -> str:
     if not np.isfinite(drop.within_a_minute):
         return "no drop, not even standstill"
     at_once = f"a drop of {_of(drop.at_once)} {unit} at once"

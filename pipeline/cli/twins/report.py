@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated
 
 import typer
 
@@ -25,7 +25,6 @@ from pipeline.cli.twins.training_data import (
     twin_errors,
 )
 from pipeline.errors import UserError
-from schemas.units import SpeedUnit
 
 
 def report(
@@ -50,14 +49,13 @@ def report(
     with twin_errors():
         from twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415  the command line loads twin only when it is needed
         from twin.report.assessment import assess, level_of  # noqa: PLC0415
-        from twin.report.content import SpeedUnit as ShownUnit  # noqa: PLC0415
-        from twin.report.content import report_content  # noqa: PLC0415
+        from twin.report.content import SpeedUnit, report_content  # noqa: PLC0415
         from twin.report.page import report_page  # noqa: PLC0415
 
         loaded = OnnxTwin(twin)
         check_writable(output, ".html")
         training_data = read_training_data(recordings, tray, fans, from_s, to_s)
-        unit = ShownUnit(training_data.speed_unit, training_data.rad_s_per_unit)
+        unit = SpeedUnit(training_data.speed_unit, training_data.rad_s_per_unit)
         with working(f"drawing {output}"):
             content = report_content(loaded, training_data.runs, data_cards(training_data), unit, fan_numbers(fans))
             assessment = assess(content)
@@ -68,8 +66,7 @@ def report(
         raise UserError(f"{output}: cannot be written: {error.strerror}; name another file with -o") from error
     warnings = [*training_data.outliers, *assessment.warnings]
     pooled = figures_in(content.evaluation.pooled, training_data.rad_s_per_unit)
-    speed_unit = cast("SpeedUnit", training_data.speed_unit)  # of a recorded configuration, which is checked
-    drops = drops_found(twin, speed_unit)
+    drops = drops_found(twin, training_data.rad_s_per_unit)
     if json_output:
         by_fan = [
             {
@@ -91,7 +88,7 @@ def report(
         return
     typer.echo(f"{output}: {assessment.headline}")
     typer.echo(f"  {sentence(pooled, unit.name)}")
-    for line in drop_lines(drops, speed_unit) or ["alarms are not calibrated: fantwin calibrate"]:
+    for line in drop_lines(drops, unit.name) or ["alarms are not calibrated: fantwin calibrate"]:
         typer.echo(f"  {line}")
     for warning in warnings:
         typer.echo(warning, err=True)

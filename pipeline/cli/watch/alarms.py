@@ -27,6 +27,7 @@ from pipeline.launch.judged_fans import JudgedFans, Unjudged
 from pipeline.launch.processes import process_list
 from pipeline.launch.site_state import site_states
 from pipeline.launch.site_watcher import SiteWatcher
+from pipeline.launch.stage_notes import note_lines
 from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
 from schemas.messages import Action, Alarm, Diagnosis, Request, Severity, Transition, newest_t_ns
@@ -36,6 +37,7 @@ from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.alarm_text import CANNOT_TELL, CAUSES
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, until, words_of
 from scoring.diagnosis.diagnoser import MIN_PROBABILITY
+from scoring.wear.slow_change import WEAR_HINT
 
 _DISCOVERY_S = 5.0  # every stage sends several health messages in this time
 _SCORES_S = 3.0  # a score of every tray arrives in this time
@@ -134,14 +136,17 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
     found = [each for each in current_alarms(sorted(known, key=newest_t_ns)) if show_all or is_listed(each.newest)]
     console = Console(soft_wrap=True, highlight=False)
     unjudged = _wait_until_judged(watcher, judged, config, stop)
+    slow = _slow_changes(watcher)
     if json_output:
         shown = {"alarms": [each.as_json() for each in found], "not_judged": [each.as_json() for each in unjudged]}
+        shown |= {"slow_changes": slow}
         typer.echo(json.dumps(shown))
     else:
         for each in found:
             console.print(alarm_lines(each))
-        for each in unjudged:
-            console.print(Text(each.line(), style="red"))
+        lines = [Text(line, style="yellow") for line in slow] + [Text(each.line(), style="red") for each in unjudged]
+        for line in lines:
+            console.print(line)
         if not found and not unjudged:
             console.print(Text("no alarms", style="green"))
     names = {(alarm.header.producer, alarm.header.sequence, alarm.header.tray) for alarm in known}
@@ -159,6 +164,12 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
             console.print(_transition_line(alarm))
     if unjudged and not watch:
         raise typer.Exit(1)
+
+
+def _slow_changes(watcher: SiteWatcher) -> list[str]:
+    """What scorers say about fans that change slowly, which is no alarm yet."""
+    notes = note_lines(view.health for view in watcher.stages() if view.alive)
+    return [line for line in notes if line.endswith(WEAR_HINT)]
 
 
 def _wait_until_judged(

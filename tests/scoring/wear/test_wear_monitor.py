@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 from schemas.blocks import cut
 from schemas.messages import Action, Alarm, Header, Prediction, ScorerSnapshot, Transition
 from scoring.torque_balance import BalanceModel, TorqueBalance
+from scoring.wear.slow_change import WEAR_HINT
 from stages.scorer import ScorerCore
 from tests.support.scored_blocks import (
     CALIBRATION,
@@ -179,6 +181,15 @@ def test_wear_that_is_far_from_its_limit_is_not_reported() -> None:
     assert list(live_through(slow, 4, growth_per_day=0.04, swing=0.002)) == []
     assert worn(WORN, "balance", slow)["reached_t_ns"] is not None
     assert slow.problem() == ""
+
+
+def test_slow_change_is_noticed_before_it_is_an_alarm() -> None:
+    """Half a day, in which one of two fans takes 5 % more command; limits are wide."""
+    clogging = core_of(2, calibration=CALIBRATION, baseline_s=3.0, limit_factor=5.0)
+    assert list(live_through(clogging, 0.5, every_hours=0.5, growth_per_day=5.0, swing=0.0)) == []
+    (notice,) = [note for note in clogging.notes() if note.endswith(WEAR_HINT)]
+    assert re.match(r"fan 1: drag \+\d\.\d % over 1\d h, the fans beside it [+-]0\.\d %: ", notice)
+    assert clogging.problem() == ""
 
 
 def test_less_than_a_day_gives_no_forecast() -> None:
