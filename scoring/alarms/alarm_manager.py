@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -27,6 +28,7 @@ from scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from scoring.alarms.tray_conditions import AlarmEvent, TrayConditions
 from scoring.detectors.table import row_of
 from scoring.diagnosis.diagnoser import Diagnoser
+from scoring.diagnosis.standstill_causes import STANDSTILL_CAUSES
 from scoring.former_snapshot_keys import FORMER_ALARM_KEYS, current_keys
 
 PERSISTING_SHARE = (
@@ -55,6 +57,8 @@ class AlarmManager:
         self._alarm_text = alarm_text
         self._last_emitted: dict[int, Alarm] = {}
         """the last message about each fan"""
+        self._against_command = np.zeros(fans, np.bool_)
+        """(fans,) whether the statistic of the last sample was that of standstill"""
         self._answered: dict[str, int] = {}
         """for each producer of requests, the sequence of the first one that is not answered"""
         self.raised = self.cleared = self.too_short = 0
@@ -94,8 +98,15 @@ class AlarmManager:
             t_ns, against_command = int(score.t_ns[row]), score.statistic[row, fan] == Statistic.STANDSTILL
             return (self._diagnoser.of_standstill if against_command else self._diagnoser.diagnose)(fan, t_ns)
 
+        begins = self._standstill_begins(score)
+
         def diagnose_due(t_ns: Array) -> None:
-            for row, fan in self._diagnoser.due(t_ns) if len(t_ns) else ():
+            due = set(self._diagnoser.due(t_ns)) if len(t_ns) else set()
+            while begins and begins[0][0] < len(t_ns):
+                row, fan = begins.popleft()
+                if self._is_standstill_news(fan):
+                    due.add((row, fan))
+            for row, fan in sorted(due):
                 if self._persists(row, fan, score, context):
                     causes = causes_at(row, fan)
                     if self._diagnoser.says_more(causes, self._next_message(fan).causes):
@@ -119,6 +130,21 @@ class AlarmManager:
             emit(event.row, fan, event.transition, **changed)
         diagnose_due(score.t_ns)
         return alarms
+
+    def _standstill_begins(self, score: Score) -> deque[tuple[int, int]]:
+        """Rows and fans at which the statistic becomes that of standstill."""
+        now = score.statistic == Statistic.STANDSTILL
+        before = np.vstack((self._against_command, now))[:-1]
+        self._against_command = now[-1].copy()
+        return deque((row, fan) for row, fan in np.argwhere(now & ~before).tolist())
+
+    def _is_standstill_news(self, fan: int) -> bool:
+        """Whether standstill is news about a fan: its alarm is active, and no cause of standstill is named yet.
+
+        Later starts of a fan that does not turn say less about the cause than the moment at which it came to rest.
+        """
+        last = self._next_message(fan)
+        return last.active and not any(each.cause in STANDSTILL_CAUSES for each in last.causes)
 
     def _persists(self, row: int, fan: int, score: Score, context: AlarmContext) -> bool:
         """Whether the fault of the last message persists; otherwise a diagnosis would include its end."""

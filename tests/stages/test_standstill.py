@@ -56,9 +56,16 @@ def speed_of(command: Floats) -> Floats:
     return np.asarray(speed[:, 0])
 
 
-def seen(command: Floats, speed: Floats, *, block: int = 7, healthy: Standstill | None = HEALTHY) -> Seen:
-    """Only the detector of standstill can raise an alarm."""
-    config = ScorerConfig(alarm_sigmas=1e6, not_judged_s=5.0)
+def seen(
+    command: Floats,
+    speed: Floats,
+    *,
+    block: int = 7,
+    healthy: Standstill | None = HEALTHY,
+    alarm_sigmas: float = 1e6,
+) -> Seen:
+    """With alarm_sigmas as it is, only the detector of standstill can raise an alarm."""
+    config = ScorerConfig(alarm_sigmas=alarm_sigmas, not_judged_s=5.0)
     twin = HealthyTwin("t", limits_in_force(config, None, healthy), [balance_of_a_fan()], "%", INSTANTANEOUS, healthy)
     integrator, scorer = core_of(physical_twin(standstill=healthy), warm_up_s=1.0), ScorerCore(1, "rad/s", config, twin)
     messages, problems = [], set()
@@ -136,6 +143,20 @@ def test_a_fan_without_power_coasts_and_that_tells_it_from_a_blocked_one() -> No
     (raised, *_) = found.alarms
     assert raised.causes[0].cause == "no_power"
     assert raised.causes[0].probability > 0.8
+
+
+def test_the_cause_is_said_at_once_when_a_fan_with_an_alarm_comes_to_rest() -> None:
+    command = commands((80.0, 40.0))
+    driven = command.copy()
+    driven[round(20.0 / PERIOD_S) :] = 0.0
+    speed = speed_of(driven)
+    found = seen(command, speed, alarm_sigmas=5.0)
+    raised, *later = found.alarms
+    assert raised.statistic == Statistic.SPEED_SMOOTHED
+    at_rest_s = float(np.flatnonzero((speed < HEALTHY.standing_below_rad_s) & (command > driven))[0]) * PERIOD_S
+    first = next(alarm for alarm in later if alarm.causes and alarm.causes[0].cause == "no_power")
+    assert at_rest_s + 0.4 < (first.t_ns - EPOCH_NS) / 1e9 < at_rest_s + 0.7
+    assert first.message.startswith("fan 0: does not turn although commanded to 80: no power")
 
 
 @pytest.mark.parametrize(("reading", "causes"), [(0.0, ["blocked", "no_power", "no_tacho"]), (np.nan, ["no_tacho"])])
