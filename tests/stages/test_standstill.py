@@ -36,6 +36,7 @@ class Seen:
 
     state: NDArray[np.uint8]
     scores: Floats
+    predicted_rad_s: Floats
     alarms: list[Alarm]
     problem: str
 
@@ -88,6 +89,7 @@ def seen(
     return Seen(
         np.concatenate([score.state[:, 0] for score in scores]),
         np.concatenate([score.score[:, 0] for score in scores]),
+        np.concatenate([score.predicted_speed_rad_s[:, 0] for score in scores]),
         [m for m in messages if isinstance(m, Alarm)],
         "; ".join(sorted(problems - {""})),
     )
@@ -102,6 +104,8 @@ def test_a_fan_that_is_stopped_stands_and_starts_again_is_healthy() -> None:
     assert {found.at(t) for t in (20.0, 21.0, 30.0, 49.9)} == {FanState.STOPPED}, "coasting and standing"
     assert {found.at(t) for t in (50.0, 51.0, 54.0)} == {FanState.STARTING}
     assert found.at(60.0) == FanState.NORMAL
+    at_rest = np.isnan(found.predicted_rad_s[round(20.0 / PERIOD_S) : round(50.0 / PERIOD_S)])
+    assert at_rest.all(), "the free run ends with the command that stops the fan"
 
 
 def test_a_device_without_a_reading_at_rest_is_healthy_too() -> None:
