@@ -12,6 +12,7 @@ from schemas.units import SpeedUnit
 from scoring.alarms.alarm_text import CAUSES, AlarmText
 from scoring.diagnosis.diagnosis import CANNOT_TELL, DROPOUT, STUCK
 from scoring.diagnosis.hypotheses import CAUSES as HYPOTHESES
+from scoring.diagnosis.standstill_causes import STANDSTILL_CAUSES
 
 
 def line(
@@ -64,7 +65,7 @@ def test_the_first_cause_is_named_with_its_probability_and_evidence_where_there_
 
 
 def test_every_cause_that_can_be_found_has_words() -> None:
-    assert set(CAUSES) == {cause.name for cause in HYPOTHESES} | {CANNOT_TELL, STUCK, DROPOUT}
+    assert set(CAUSES) == {cause.name for cause in HYPOTHESES} | {CANNOT_TELL, STUCK, DROPOUT} | set(STANDSTILL_CAUSES)
 
 
 @pytest.mark.parametrize("transition", [t for t in Transition if t != Transition.NONE])
