@@ -96,7 +96,7 @@ def test_fresh_healthy_fans_alarm_as_often_as_declared(memory_s: float) -> None:
     low, high = limits.declared_rate.interval_95
     assert 0.5 * declared < low < declared < high < 2.0 * declared
     assert not limits.declared_rate.extrapolated
-    alarms = sum(len(alarms_of(limits, blocks, fans)) for _, fans, blocks, _ in coarse_and_short(memory_s, 3)())
+    alarms = sum(len(alarms_of(limits, blocks, fans)) for _, fans, blocks, *_ in coarse_and_short(memory_s, 3)())
     fresh_low, fresh_high = (count / FAN_DAYS for count in poisson_interval(alarms))
     assert fresh_low < 1.25 * high
     assert fresh_high > 0.75 * low
@@ -148,7 +148,7 @@ def test_the_same_seed_gives_the_same_limits() -> None:
 
 def test_the_limit_of_repeated_readings_allows_for_a_coarse_healthy_tacho() -> None:
     def coarse() -> Iterator[HealthyRun]:
-        for name, fans, blocks, _ in healthy(0.0, 9, runs=1)():
+        for name, fans, blocks, *_ in healthy(0.0, 9, runs=1)():
             made = list(blocks)
             made[5].speed_rad_s[50:250, 3] = 77.0  # 2 s
             yield HealthyRun(name, fans, made)
@@ -159,7 +159,7 @@ def test_the_limit_of_repeated_readings_allows_for_a_coarse_healthy_tacho() -> N
 
 def test_the_limit_of_missing_readings_stays_below_a_dead_tacho() -> None:
     def misses() -> Iterator[HealthyRun]:
-        for name, fans, blocks, _ in healthy(0.0, 10, runs=1)():
+        for name, fans, blocks, *_ in healthy(0.0, 10, runs=1)():
             made = list(blocks)
             for number, block in enumerate(made):
                 block.missing[number % 2 :: 2, 3] = True
@@ -229,8 +229,8 @@ def test_another_day_raises_no_alarm_at_other_speeds_and_a_fault_does(
 ) -> None:
     limits = limits_of_days[1]
     fresh = list(days(21, 1, 3)())
-    assert sum(len(alarms_of(limits, blocks, fans)) for _, fans, blocks, _ in fresh) <= 5  # two are declared
-    _, fans, blocks, _ = next(iter(days(22, 1, 1)()))
+    assert sum(len(alarms_of(limits, blocks, fans)) for _, fans, blocks, *_ in fresh) <= 5  # two are declared
+    _, fans, blocks, *_ = next(iter(days(22, 1, 1)()))
     late = [
         replace(b, speed_residual=b.speed_residual + 1.5 * (b.t_ns >= 30_000_000_000)[:, np.newaxis]) for b in blocks
     ]
@@ -250,7 +250,7 @@ def test_errors_of_the_twin_are_learned_for_each_fan_that_it_knows() -> None:
     assert np.abs(known.speed.expected_residual_sigmas).max() < 0.3, "the offsets of the fans are not counted twice"
     assert known.speed.mean_residual_std < unknown.speed.mean_residual_std - 0.05
     fresh = list(days(24, 0, 3, 20, 60, COARSE_NS, wrong_sigmas=1.0)())
-    assert sum(len(alarms_of(known, blocks, fans)) for _, fans, blocks, _ in fresh) <= 7  # three are declared
+    assert sum(len(alarms_of(known, blocks, fans)) for _, fans, blocks, *_ in fresh) <= 7  # three are declared
     with pytest.raises(ValueError, match="limits of 20 fans for 3"):
         FanScorer(3, known)
     assert known.of(range(2, 5)).speed.fan_offsets == known.speed.fan_offsets.of(range(2, 5))
@@ -262,7 +262,7 @@ def test_the_recordings_themselves_have_no_more_alarms_than_declared() -> None:
     runs = days(25, 0, 8, fans=10, seconds=60, period_ns=COARSE_NS)
 
     def with_one_that_strays() -> Iterator[HealthyRun]:
-        for number, (name, fans, blocks, known_as) in enumerate(runs()):
+        for number, (name, fans, blocks, known_as, _) in enumerate(runs()):
             strays = np.where((np.arange(fans) == 3) & (number % 2 == 0), 4.0, 0.0)
             late = [
                 replace(b, speed_residual=b.speed_residual + strays * ((b.t_ns // 10_000_000_000) == 5)[:, np.newaxis])
@@ -272,7 +272,7 @@ def test_the_recordings_themselves_have_no_more_alarms_than_declared() -> None:
 
     declared = 60.0
     limits = calibrate(with_one_that_strays, TOP_RAD_S, Timing(), declared)
-    alarms = sum(len(alarms_of(limits, blocks, fans)) for _, fans, blocks, _ in with_one_that_strays())
+    alarms = sum(len(alarms_of(limits, blocks, fans)) for _, fans, blocks, *_ in with_one_that_strays())
     assert alarms <= declared * 8 * 60.0 * 10 / 86_400.0
 
 
