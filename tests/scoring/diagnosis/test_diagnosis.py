@@ -13,6 +13,7 @@ from scoring.diagnosis.diagnosis import Diagnosis, Evidence, RankedCause, diagno
 from scoring.diagnosis.regression_window import FIRST_ERROR, HealthyBalance, RegressionWindow, Window, acting_command
 from scoring.wear.reidentification import parameter_shifts
 from simulation.faults import Fault
+from simulation.plant import FanParameters
 from simulation.tray import SimulatedTray, TraySettings
 from tests.support import diagnosis_data as data
 from twin.models.lag import effective_command
@@ -437,6 +438,7 @@ def test_nine_of_ten_simulated_faults_are_named_rightly_under_excitation(loop) -
         begun = round(FAULT_S / data.STEP_S)
         # A growing fault is seen late; the detector's onset of a step is a little off.
         onset = begun + (400 if kind == "wear" else 7)
+        assert isinstance(tray.parameters, FanParameters)
         fan_lag_s = float(np.asarray(tray.parameters.lag_s)[fan])
         healthy = healthy_balance(command[:begun, fan], speed[:begun, fan], fan_lag_s)
         rows = slice(begun - 400, None)
