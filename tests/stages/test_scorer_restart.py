@@ -48,8 +48,9 @@ def bits(scores: Sequence[Score], from_t_ns: int = 0) -> dict[str, bytes]:
 
 
 def without_causes(alarms: Sequence[Alarm]) -> list[str]:
-    """A restarted scorer diagnoses with fewer samples."""
-    return [repr(replace(alarm, causes=(), message="")) for alarm in alarms]
+    """A restarted scorer diagnoses with fewer samples; then another diagnosis may say something new."""
+    others = (alarm for alarm in alarms if alarm.transition != Transition.DIAGNOSED)
+    return [repr(replace(alarm, causes=(), message="")) for alarm in others]
 
 
 def eventful() -> Prediction:
