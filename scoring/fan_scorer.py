@@ -58,6 +58,9 @@ class ScoredBlock:
     """the baseline at the end of commissioning; NaN before"""
     balance_at_limit: Array
     """whether the baseline is held at the adaptation limit"""
+    speed_learned_scale: Array
+    balance_learned_scale: Array
+    """of the baseline, see Baseline.learned_scale"""
     ratios: Array
     """(n, rows of the table, fans) every statistic in multiples of its limit; NaN where it is not scored"""
 
@@ -214,10 +217,13 @@ class FanScorer:
         ]
         return min(limits, default=np.inf)
 
-    def limit_at(self, source: Signal, speed_rad_s: Array, statistic: int, period_s: float) -> Array:
+    def limit_at(
+        self, source: Signal, speed_rad_s: Array, statistic: int, period_s: float, learned_scale: Array
+    ) -> Array:
         """(fans,) how far the residual may be from its baseline at these speeds, sigma; infinite without a limit.
 
         By the detector of a statistic if that watches this residual and finds shifts; else by the smoothed residual.
+        learned_scale: (fans,) of the baseline at that time, see ScoredBlock.
         """
         of_source = [row for row in self._rows if row.source == source and row.name in self.detectors]
         limits = {row.statistic: self.detectors[row.name].limit_sigmas(period_s) for row in of_source}
@@ -225,7 +231,7 @@ class FanScorer:
         if not np.isfinite(limit):
             limit = self.limit_sigmas(source, period_s)
         mean_std = self.limits.residual(source).mean_residual_std
-        return limit / mean_std * self.residuals[source].limit_std(speed_rad_s)
+        return limit / mean_std * self.residuals[source].limit_std(speed_rad_s, learned_scale)
 
     def persistent_limit_sigmas(self, source: Signal, period_s: float) -> float:
         """How far a shift that stays may be from the commissioned baseline, sigma; infinite without any limit.
@@ -354,6 +360,8 @@ class FanScorer:
             balance_baseline_s=np.broadcast_to(baseline_s, alive.shape),
             balance_commissioned=np.where(baseline.is_commissioning, np.nan, balance.commissioned),
             balance_at_limit=np.broadcast_to(baseline.is_at_limit, alive.shape),
+            speed_learned_scale=np.broadcast_to(self.residuals["speed"].baseline.learned_scale, alive.shape),
+            balance_learned_scale=np.broadcast_to(baseline.learned_scale, alive.shape),
             ratios=every_ratio.swapaxes(0, 1),
         )
 

@@ -98,12 +98,15 @@ class Residual:
         persistent = standardised / self._persistent_std(scaling, speed_rad_s, transient_rad_s, valid)
         return standardised.clip(-clip, clip), persistent.clip(-clip, clip)
 
-    def limit_std(self, speed_rad_s: Array) -> Array:
-        """(fans,) what limits of a constant residual are relative to at these constant speeds (fans,), sigma."""
+    def limit_std(self, speed_rad_s: Array, learned_scale: Array | None = None) -> Array:
+        """(fans,) what limits of a constant residual are relative to at these constant speeds (fans,), sigma.
+
+        learned_scale: see Baseline.offset_uncertainty.
+        """
         speed, still = speed_rad_s[np.newaxis], np.zeros((1, len(speed_rad_s)))
         valid = np.isfinite(speed)
         scaling = self.scaling(speed, valid)
-        relative = self._residual_std(speed, valid) * self._persistent_std(scaling, speed, still, valid)
+        relative = self._residual_std(speed, valid) * self._persistent_std(scaling, speed, still, valid, learned_scale)
         return np.broadcast_to(relative, speed.shape)[0]
 
     @property
@@ -135,7 +138,12 @@ class Residual:
         return np.where(valid, np.interp(np.abs(speed_rad_s), healthy.speeds_rad_s, healthy.residual_std), 1.0)
 
     def _persistent_std(
-        self, scaling: Array, speed_rad_s: Array, transient_rad_s: Array, valid: Array
+        self,
+        scaling: Array,
+        speed_rad_s: Array,
+        transient_rad_s: Array,
+        valid: Array,
+        learned_scale: Array | None = None,
     ) -> Array | float:
         """Of the low-frequency residual, relative to its median: by speed, by motion, and by an uncertain baseline."""
         healthy = self._healthy
@@ -147,7 +155,7 @@ class Residual:
             relative = relative * np.sqrt(1.0 + np.square(transient_rad_s / healthy.transient_scale_rad_s))
         if healthy.baseline.rms_sigmas > 0.0:
             # so that an unknown offset stays within the reference value of the drift
-            uncertainty = np.where(valid, self.baseline.offset_uncertainty(scaling), 0.0)
+            uncertainty = np.where(valid, self.baseline.offset_uncertainty(scaling, learned_scale), 0.0)
             relative = relative + uncertainty / self._reference_sigmas
         return relative
 

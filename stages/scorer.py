@@ -385,20 +385,24 @@ class ScorerCore(Core):
         sigma_rad_s, sigma_command = item.sigma_rad_s, item.torque_balance_sigma_command
 
         def limits(row: int, fan: int) -> tuple[float, float]:
-            of_speed, of_balance = self._limits_at(item, row, int(scored.statistic[row, fan]))
+            of_speed, of_balance = self._limits_at(item, scored, row, int(scored.statistic[row, fan]))
             return float((of_speed * sigma_rad_s)[fan]), float((of_balance * sigma_command)[fan])
 
         context = AlarmContext(balance_command=scored.balance_smoothed * sigma_command, limits=limits)
         return score, self._alarms.emit(events, score, context)
 
-    def _limits_at(self, item: Prediction, row: int, statistic: int) -> tuple[Array | float, Array | float]:
+    def _limits_at(
+        self, item: Prediction, scored: ScoredBlock, row: int, statistic: int
+    ) -> tuple[Array | float, Array | float]:
         """How far both residuals may be from their baselines, by the alarm's statistic; (fans,) or for all, sigma."""
         period_s = item.period_ns / NS_PER_S
         if not self._holds:
             return self._scorer.limit_sigmas("speed", period_s), self._scorer.limit_sigmas("balance", period_s)
         speed = item.measured_speed_rad_s[row]
-        of_speed = self._scorer.limit_at("speed", speed, statistic, period_s)
-        return of_speed, self._scorer.limit_at("balance", speed, statistic, period_s)
+        return (
+            self._scorer.limit_at("speed", speed, statistic, period_s, scored.speed_learned_scale[row]),
+            self._scorer.limit_at("balance", speed, statistic, period_s, scored.balance_learned_scale[row]),
+        )
 
     def _decide(self, item: Prediction) -> tuple[ScoredBlock, Array, list[AlarmEvent]]:
         """The scores, the states (n, fans) and the alarms' events. While an alarm is active, baselines stay."""

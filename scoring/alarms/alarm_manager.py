@@ -28,7 +28,7 @@ from scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from scoring.alarms.tray_conditions import AlarmEvent, TrayConditions
 from scoring.detectors.table import row_of
 from scoring.diagnosis.diagnoser import Diagnoser
-from scoring.diagnosis.standstill_causes import STANDSTILL_CAUSES
+from scoring.diagnosis.shown_causes import STANDSTILL_CAUSES
 from scoring.former_snapshot_keys import FORMER_ALARM_KEYS, current_keys
 
 PERSISTING_SHARE = (

@@ -11,7 +11,7 @@ from schemas.units import SpeedUnit
 from scoring.alarms.alarm_flags import is_listed
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.table import row_of
-from scoring.diagnosis.standstill_causes import STANDSTILL_CAUSES
+from scoring.diagnosis.shown_causes import STANDSTILL_CAUSES
 
 CANNOT_TELL = "cannot_tell"
 CAUSES = {

@@ -96,9 +96,13 @@ class Baseline(ColumnState):
         total = np.maximum(weights.sum(axis=0), MIN_INFORMATION)
         return np.sqrt((weights * self.interval_information).sum(axis=0) / total)
 
-    def offset_uncertainty(self, scaling: Array) -> Array:
-        """(n, fans) how far the fan's offset at a scaling (n, fans) may be from the scaled baseline, sigma."""
-        return OFFSET_RANGE_RMS * self._settings.rms_sigmas * np.maximum(scaling - self.learned_scale, 0.0)
+    def offset_uncertainty(self, scaling: Array, learned_scale: Array | None = None) -> Array:
+        """(n, fans) how far the fan's offset at a scaling (n, fans) may be from the scaled baseline, sigma.
+
+        learned_scale: (fans,) of an earlier interval; None: the present one.
+        """
+        learned = self.learned_scale if learned_scale is None else learned_scale
+        return OFFSET_RANGE_RMS * self._settings.rms_sigmas * np.maximum(scaling - learned, 0.0)
 
     def restart(self, fans: Array) -> None:
         """Commission some fans again, (fans,) of bool."""

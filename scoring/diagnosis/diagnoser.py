@@ -19,13 +19,13 @@ from scoring.detectors.deviation import summed_deviation
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnosis import ADVICE, RankedCause, diagnose
 from scoring.diagnosis.regression_window import HealthyBalance, Window
+from scoring.diagnosis.shown_causes import MIN_PROBABILITY
 from scoring.diagnosis.standstill_causes import standstill_causes
 
 WINDOW_S = 95.0
 AGAIN_AFTER_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # after the raise; the last window still contains some health
 MAX_SAMPLES = 1 << 16  # of a fan's window; at very high rates the window is shorter than WINDOW_S
 MAX_VALUE = 1e9  # larger speeds and commands count as missing: their powers would overflow
-MIN_PROBABILITY = 0.15  # less probable causes are not listed, except the first
 FORMER_MIN_PROBABILITY = 0.005
 NEWS = 0.1  # a change of a probability that is worth a message
 

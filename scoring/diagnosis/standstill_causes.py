@@ -18,17 +18,8 @@ from schemas.standstill import Standstill
 from schemas.tacho import Tacho
 from scoring.diagnosis.diagnosis import Evidence, RankedCause
 from scoring.diagnosis.regression_window import Array, HealthyBalance, Window
+from scoring.diagnosis.shown_causes import BLOCKED, NO_POWER, NO_TACHO, STILL_DRIVEN, WINDMILLING
 
-BLOCKED, NO_POWER, NO_TACHO = "blocked", "no_power", "no_tacho"
-STILL_DRIVEN, WINDMILLING = "still_driven", "windmilling"
-STANDSTILL_CAUSES = {
-    BLOCKED: "blocked",
-    NO_POWER: "no power",
-    NO_TACHO: "no signal of the tacho",
-    STILL_DRIVEN: "still driven",
-    WINDMILLING: "turned by the air",
-}
-"""names for people"""
 FELL_AT_ONCE = {BLOCKED: 0.5, NO_POWER: 0.05, NO_TACHO: 0.2}
 """prior probabilities of the faults after which the reading falls at once; no power: the connector is off"""
 COASTED = 0.25

@@ -8,11 +8,15 @@ where what is left is large, and far beyond the scatter of the points.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from schemas.messages import Array
 from schemas.units import NS_PER_S
-from scoring.wear.trend import Array, WearSeries
+
+if TYPE_CHECKING:  # it loads scipy, which a command that shows alarms does not need
+    from scoring.wear.trend import WearSeries
 
 WEAR_HINT = "see fantwin wear"
 """each notice ends with it"""

@@ -36,7 +36,7 @@ from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.alarm_text import CANNOT_TELL, CAUSES
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, until, words_of
-from scoring.diagnosis.diagnoser import MIN_PROBABILITY
+from scoring.diagnosis.shown_causes import MIN_PROBABILITY
 from scoring.wear.slow_change import WEAR_HINT
 
 _DISCOVERY_S = 5.0  # every stage sends several health messages in this time

@@ -47,7 +47,7 @@ class HealthySite:
     def recordings(self) -> list[Path]:
         return []
 
-    def command(self, *_words: object):
+    def command(self, *_words: object, limit_s: float):
         return type("Done", (), {"returncode": 0, "stdout": "equal: 5 samples\n", "stderr": ""})
 
 

@@ -12,7 +12,7 @@ from schemas.units import SpeedUnit
 from scoring.alarms.alarm_text import CAUSES, AlarmText
 from scoring.diagnosis.diagnosis import CANNOT_TELL, DROPOUT, STUCK
 from scoring.diagnosis.hypotheses import CAUSES as HYPOTHESES
-from scoring.diagnosis.standstill_causes import STANDSTILL_CAUSES
+from scoring.diagnosis.shown_causes import STANDSTILL_CAUSES
 
 
 def line(

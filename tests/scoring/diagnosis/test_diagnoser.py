@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from schemas.messages import Transition
 from scoring.detectors.deviation import summed_deviation
-from scoring.diagnosis.diagnoser import MAX_SAMPLES, MIN_PROBABILITY, Diagnoser
+from scoring.diagnosis.diagnoser import MAX_SAMPLES, Diagnoser
+from scoring.diagnosis.shown_causes import MIN_PROBABILITY
 from tests.support.scored_blocks import (
     CALIBRATION,
     NEEDED,
