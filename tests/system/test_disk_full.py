@@ -77,9 +77,7 @@ def test_a_full_disk_loses_nothing_that_memory_can_hold(small_disk):
     ballast = small_disk / "ballast"
     ballast.write_bytes(bytes(SIZE_BYTES - 3_900_000))
     until(run.core.problem, run)
-    assert re.search(
-        r"NOTHING IS RECORDED: .*recording-\d.mcap: cannot be written any more: No space left", run.core.problem()
-    )
+    assert re.search(r"NOTHING IS RECORDED: .*make room", run.core.problem())
     for _ in range(5):
         run.second()
     assert run.core.problem(), "there is still no room"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pipeline.recordings.reading import read_recording
-from schemas.messages import Message, ModelCard, Raw, Score
+from schemas.messages import InvalidReason, Message, ModelCard, Raw, Score
 from tests.support.fantwin_command import fantwin
 from tests.support.running_chain import DEADLINE_S, RunningCommand
 
@@ -94,15 +94,16 @@ def check(rig: Rig, folder: Path, messages: list[Message]) -> None:
     truth = json.loads((folder / f"{rig.tray}.json").read_text())
     assert truth["bytes_unread"] == 0
     assert sum(len(raw.host_receive_t_ns) for raw in raws) == truth["samples_sent"] > 0
-    valid, command, measured, residual = (
+    valid, invalid_reason, command, measured, residual = (
         np.concatenate([getattr(score, column) for score in scores])
-        for column in ("valid", "command", "measured_speed_rad_s", "residual_rad_s")
+        for column in ("valid", "invalid_reason", "command", "measured_speed_rad_s", "residual_rad_s")
     )
     card = next(json.loads(message.card_json) for message in messages if isinstance(message, ModelCard))
     low, high = card["command_range"]
     beyond = (command < low - 0.05 * (high - low)) | (command > high + 0.05 * (high - low))
     assert not valid[beyond].any(), "a twin is not valid beyond its training commands"
-    assert valid.mean() > 0.25
+    stands = invalid_reason == InvalidReason.STOPPED
+    assert (valid | stands).mean() > 0.25
     assert np.isfinite(residual[valid]).all()
     assert np.sqrt(np.mean(residual[valid] ** 2)) < 0.1 * np.nanmax(measured)
 
