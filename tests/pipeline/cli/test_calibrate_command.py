@@ -79,11 +79,11 @@ def test_the_limits_are_in_the_card_and_the_rest_of_the_twin_is_unchanged(folder
 def test_the_limits_decide_what_a_replay_finds(folder: Path, calibrated: Path) -> None:
     """Of a healthy run, at limits for an alarm of each fan a minute, at three tenths of them, and at three times."""
     twins = (calibrated, strict(folder, calibrated), with_limits(folder / "wide.onnx", calibrated, 3.0))
-    usual, longer, shorter = (
+    calibrated_s, strict_s, wide_s = (
         alarmed_s(fantwin("replay", folder / "other.mcap", "--offline", "--twin", twin, "--json").stdout)
         for twin in twins
     )
-    assert longer > usual > shorter
+    assert strict_s > calibrated_s > wide_s
 
 
 def alarmed_s(replayed: str) -> float:
