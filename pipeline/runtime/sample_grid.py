@@ -103,6 +103,7 @@ class SampleGrid:
         """Publish the grid up to the newest raw sample."""
         for message in self._guard.close() if self._guard else ():
             self._add(message, is_new=True)
+        self._silence_ns = 0  # a line that ended before its resampler is no problem of the last health
         return self.publish_until(self._newest_t_ns)
 
     def counters(self) -> Mapping[str, int]:

@@ -462,3 +462,14 @@ def test_readings_that_a_tacho_shows_until_the_next_are_held_and_others_interpol
     np.testing.assert_allclose(grid.speed_rad_s[:, 1], since_s, atol=1e-6)
     held = np.floor(since_s)
     np.testing.assert_array_equal(grid.speed_rad_s[:, 0], np.where(held == 4, 3, held))
+
+
+def test_the_silence_before_an_orderly_stop_is_no_problem_of_the_last_health() -> None:
+    core = ResamplerCore(1, ResamplerConfig(rate_hz=100.0))
+    t_ns = EPOCH_NS + np.arange(5) * 10_000_000
+    core.step(Raw(fans=1, host_receive_t_ns=t_ns, command=np.zeros((5, 1)), speed_rad_s=np.zeros((5, 1))))
+    for k in range(20):
+        core.tick(EPOCH_NS + k * 100_000_000)
+    assert "no raw samples" in core.problem()
+    core.close()
+    assert not core.problem()
