@@ -92,7 +92,8 @@ class LineGuard:
     def _admit_sample(self, sample: Raw, is_of_ended: bool) -> list[Raw]:
         step_ns = _time_of(sample) - self._newest_t_ns
         own = self.producer in (None, sample.header.producer)
-        if abs(step_ns) <= APART_NS and is_of_ended:
+        # An earlier sample of the same message may have made its producer the line's again.
+        if abs(step_ns) <= APART_NS and is_of_ended and not own:
             return [self._shifted(sample)]
         if (own and step_ns >= -APART_NS) or abs(step_ns) <= APART_NS:
             return [self._of_line(sample)]

@@ -9,7 +9,7 @@ from operator import methodcaller
 from typing import TypeAlias
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from schemas.blocks import join
@@ -144,6 +144,9 @@ def driven(items: Iterable[Raw | ByTime], **config: float | None) -> tuple[list[
     out_block=st.sampled_from([1, 7, 512]),
     clock_us=st.sampled_from([None, 0, 2**32 - 10_300_000]),
     rate_hz=st.sampled_from([None, 7.0, 50.0, 100.0, 1000.0]),
+)
+@example(  # a former producer becomes the line's again within a message, and its last sample counts
+    [("regular", 1), ("another time", 8), ("regular", 160), ("another time", 8)], 1, [64], 1, None, 7.0
 )
 def test_blocks_of_any_size_give_the_same_grid_to_the_bit(
     happenings: list[tuple[str, int]],
