@@ -24,7 +24,7 @@ _SAMPLED = 500
 
 
 def first_raw(paths: Sequence[Path], metadata: RecordingMetadata) -> dict[str, list[Raw]]:
-    """The first raw messages of each tray, some hundred samples.
+    """The first raw messages of each tray, some hundred samples, without messages that have none.
 
     Raises:
         RecordingError: there are none.
@@ -40,6 +40,8 @@ def first_raw(paths: Sequence[Path], metadata: RecordingMetadata) -> dict[str, l
             except CodecError:
                 continue
             assert isinstance(message, Raw)
+            if not len(message.host_receive_t_ns):
+                continue
             found.setdefault(tray, []).append(message)
             samples[tray] = samples.get(tray, 0) + len(message.host_receive_t_ns)
         if trays and all(samples.get(name, 0) >= _SAMPLED for name in trays):

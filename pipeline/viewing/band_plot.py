@@ -22,6 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from pipeline.errors import UserError
+from pipeline.recordings.dates import format_utc, has_date
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.viewing.trace import Trace, state_changes, trace_of
 from schemas.messages import Array, Score
@@ -176,8 +177,9 @@ def _figure(trace: Trace, fans: Sequence[int], faults: Sequence[Fault]) -> Figur
         _draw_panel(panel, trace, fan, mine)
         _draw_lanes(lanes, trace, fan, mine, with_truth=bool(faults))
         if row == len(fans) - 1:
-            start = np.datetime_as_string(trace.t_ns[:1].astype("datetime64[ns]"), unit="s")[0].replace("T", " ")
-            lanes.set_xlabel(f"time since {start} UTC (s)")
+            start_ns = int(trace.t_ns[0])
+            since = format_utc(start_ns) if has_date(start_ns) else "the first sample shown"
+            lanes.set_xlabel(f"time since {since} (s)")
         else:
             lanes.tick_params(axis="x", length=0, labelbottom=False)
     return figure

@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,6 +21,7 @@ from pipeline.launch.loss_accounting import label, losses
 from pipeline.launch.refused_input import refused, refused_lines
 from pipeline.launch.stage_notes import note_lines, notes_as_json
 from pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
+from pipeline.recordings.dates import format_clock, format_local
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.records import active_path
 from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
@@ -154,7 +154,7 @@ def _about(part: Contents) -> list[str]:
     metadata = part.metadata
     lines = [f"[bold]{escape(str(part.path))}[/bold]: {part.size_bytes / 1e6:,.2f} MB, {part.messages} messages"]
     if part.first_ns is not None and part.last_ns is not None:
-        lines.append(f"from {_date(part.first_ns)} to {_date(part.last_ns)}: {_duration_s(part):,.1f} s")
+        lines.append(f"from {format_local(part.first_ns)} to {format_local(part.last_ns)}: {_duration_s(part):,.1f} s")
     if not metadata and not part.streams:
         lines.append("not a fantwin recording: it has no fantwin channels")
     if "part" in metadata:
@@ -226,8 +226,4 @@ def _tray(key: str) -> str:
 
 
 def _time(t_ns: int | None) -> str:
-    return "" if t_ns is None else datetime.fromtimestamp(t_ns / NS_PER_S).strftime("%H:%M:%S")
-
-
-def _date(t_ns: int) -> str:
-    return datetime.fromtimestamp(t_ns / NS_PER_S).isoformat(sep=" ", timespec="milliseconds")
+    return "" if t_ns is None else format_clock(t_ns)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,11 +11,11 @@ import typer
 from pipeline.cli.options import JsonOption
 from pipeline.cli.progress import working
 from pipeline.recordings.contents import losses, messages_as_text
+from pipeline.recordings.dates import format_local
 from pipeline.recordings.repair import Recovery
 from pipeline.recordings.repair import recover as recover_file
 from pipeline.recordings.scan import Scan
 from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
-from schemas.units import NS_PER_S
 
 
 def recover(
@@ -54,7 +53,7 @@ def _lines(file: Path, recovery: Recovery) -> list[str]:
         kept = f"; the original is kept as {recovery.original}" if recovery.original else ""
         lines = [f"{file}: {messages_as_text(found.messages)} recovered in {recovery.path}{kept}"]
     for topic, counts in _by_topic(found).items():
-        last = f", the last at {_time(counts.last_ns)}" if counts.last_ns is not None else ""
+        last = f", the last at {format_local(counts.last_ns)}" if counts.last_ns is not None else ""
         missing = f", {counts.missing} missing" if counts.missing else ""
         lines.append(f"  {topic}: {messages_as_text(counts.messages)}{missing}{last}")
     lost = losses(found)
@@ -93,7 +92,3 @@ def as_json(file: Path, recovery: Recovery) -> dict[str, Any]:
 
 def _by_topic(found: Scan) -> dict[str, StreamCounts]:
     return sum_by_key(found.streams.items()) | found.counts.others
-
-
-def _time(t_ns: int) -> str:
-    return datetime.fromtimestamp(t_ns / NS_PER_S).isoformat(sep=" ", timespec="milliseconds")

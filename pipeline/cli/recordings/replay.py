@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
@@ -19,6 +18,7 @@ from rich.live import Live
 from rich.text import Text
 
 from pipeline.cli.options import JsonOption, SetOption
+from pipeline.recordings.dates import format_utc
 from pipeline.replay.live.keyboard import Keys
 from pipeline.replay.live.pace import Pace
 from pipeline.replay.live.player import Progress
@@ -28,7 +28,6 @@ from pipeline.replay.resolve_config import resolve_config
 from pipeline.replay.stage_chain import replay_starts
 from pipeline.runtime.signals import stop_on_signals
 from schemas.topics import TOPICS
-from schemas.units import NS_PER_S
 
 REPLAYED = tuple(topic.name for topic in TOPICS if topic.recorded and topic.name != "health")
 """the topics replayed by default; the health of stages that are not running is not one of them"""
@@ -212,12 +211,11 @@ def _status_line(console: Console, end_s: float | None, seconds_at: Callable[[in
 
 def status_line(progress: Progress, at_s: float, end_s: float | None) -> str:
     """One line: recorded time, position in the recording, rate, messages sent."""
-    utc = datetime.fromtimestamp(progress.t_ns / NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
     position = f"{at_s:.2f} s" + (f" of {end_s:.2f} s" if end_s is not None and not progress.round else "")
     rounds = f"  round {progress.round + 1}" if progress.round else ""
     rate = "as fast as possible" if math.isinf(progress.rate) else f"x {progress.rate:g}"
     state = "paused, " if progress.paused else ""
-    return f"{utc} UTC  {position}{rounds}  {state}{rate}  {progress.messages:,} sent  ({_KEYS_HELP})"
+    return f"{format_utc(progress.t_ns)}  {position}{rounds}  {state}{rate}  {progress.messages:,} sent  ({_KEYS_HELP})"
 
 
 def _summary(outcome: Outcome) -> str:

@@ -17,10 +17,11 @@ from rich.progress import Progress, SpinnerColumn, TextColumn
 from rich.table import Table
 
 from pipeline.errors import UserError
+from pipeline.recordings.dates import format_utc, has_date
 from pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, episodes
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from pipeline.replay.offline.rescoring import RescoredTray, rescore
-from pipeline.replay.offline.verify import CannotCompareError, format_utc
+from pipeline.replay.offline.verify import CannotCompareError
 from schemas.units import NS_PER_S
 
 EXIT_DIFFERS, EXIT_CANNOT_COMPARE, EXIT_LOST = 1, 2, 3
@@ -96,7 +97,7 @@ def _result(replay_input: ReplayInput, trays: Sequence[RescoredTray], took_s: fl
     scored_s = sum(tray.hours for tray in trays) * 3600
     result: dict[str, Any] = {
         "alarms": [episode.as_json() for episode in now],
-        "start_ns": min((tray.start_ns for tray in trays if tray.samples), default=0),
+        "start_ns": replay_input.first_sample_t_ns,
         "hours": sum(tray.hours for tray in trays),
         "samples": sum(tray.samples for tray in trays),
         "lost": sum(tray.lost for tray in trays),
@@ -198,7 +199,8 @@ def _print_verified(found: dict[str, Any], console: Console) -> None:
 def _print_alarms(console: Console, title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> None:
     if not alarms:
         return
-    console.print(_table(f"{title}, s since {format_utc(start_ns)}", alarms[:_SHOWN], start_ns))
+    date = f" ({format_utc(start_ns)})" if has_date(start_ns) else ""
+    console.print(_table(f"{title}, s since the first sample{date}", alarms[:_SHOWN], start_ns))
     if len(alarms) > _SHOWN:
         console.print(f"and {len(alarms) - _SHOWN} more; all with --json")
 

@@ -22,6 +22,7 @@ from pipeline.cli.watch.alarms import wait_for_stages
 from pipeline.config.loading import load_config
 from pipeline.errors import UserError
 from pipeline.launch.site_watcher import SiteWatcher
+from pipeline.recordings.dates import format_local, has_date
 from pipeline.recordings.reading import read_recording
 from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
@@ -153,13 +154,14 @@ def _rows(tray: str, t_ns: int, state: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
     unit = escape(state["command_unit"])
+    date = f"{datetime.fromtimestamp(t_ns / NS_PER_S):%Y-%m-%d %H:%M}"
     without = [str(number) for number, fan in enumerate(state["fans"]) if not fan["t_ns"]]
     caption = [f"balance, friction: command{f' in {unit}' if unit else ''}; drag, gain: % of healthy"]
     caption += [f"no data yet for fan {', '.join(without)}: {_NEEDED}"] if without else []
     table = Table(
         "fan",
         "parameter",
-        title=f"wear of {escape(tray)} up to {datetime.fromtimestamp(t_ns / NS_PER_S):%Y-%m-%d %H:%M}",
+        title=f"wear of {escape(tray)} up to {date if has_date(t_ns) else format_local(t_ns)}",
         title_justify="left",
         caption="\n".join(caption),
         caption_justify="left",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,7 +22,7 @@ from pipeline.replay.stage_chain import StageChain, decision_chain
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Message, Raw
+from schemas.messages import Alarm, Message
 
 
 @dataclass
@@ -40,6 +40,8 @@ class ReplayInput:
     """at least the resampler's settings are"""
     started_t_ns: int
     """when the recording began"""
+    first_sample_t_ns: int
+    """of all trays: when it was received"""
     stages: StageChain
     decision_rules: DecisionRules
     """those of the recording; with another configuration or twin those of today"""
@@ -135,6 +137,7 @@ def open_replay_input(
     for path in ordered[1:]:
         _refuse_another_run(ordered[0], metadata, path)
     first = first_raw(ordered, metadata)
+    first_sample_t_ns = min(int(messages[0].host_receive_t_ns[0]) for messages in first.values())
     stages = decision_chain()
     with tempfile.TemporaryDirectory() as folder:
         recorded = _recorded_twins(metadata, Path(folder), first)
@@ -157,7 +160,8 @@ def open_replay_input(
             metadata=metadata,
             config=replace(base, trays=trays),
             twins={tray.name: _twin_of(tray, base, attached, recorded, twin, ordered[0]) for tray in trays},
-            started_t_ns=_started_t_ns(ordered[0], metadata, first),
+            started_t_ns=_started_t_ns(ordered[0], metadata, first_sample_t_ns),
+            first_sample_t_ns=first_sample_t_ns,
             is_as_recorded=is_as_recorded,
             is_same_grid=attached is not None and base.sections["resampler"] == attached.sections["resampler"],
             stages=stages,
@@ -207,10 +211,10 @@ def _twin_of(
     raise RecordingError(f"{path}: no twin of {tray.name} in this recording: name one with --twin FILE.onnx")
 
 
-def _started_t_ns(path: Path, metadata: RecordingMetadata, first: Mapping[str, Sequence[Raw]]) -> int:
+def _started_t_ns(path: Path, metadata: RecordingMetadata, first_sample_t_ns: int) -> int:
     started = metadata.metadata.get("started_t_ns")
     if started is None:
-        return min(int(message.host_receive_t_ns[0]) for messages in first.values() for message in messages[:1])
+        return first_sample_t_ns
     try:
         return int(started)
     except ValueError as error:

@@ -38,9 +38,9 @@ class RescoredTray:
     not_judged: Counter[str] = field(default_factory=Counter)
     """samples of fans that could not be scored, by reason"""
     period_ns: int = 0
-    start_ns: int = 0
-    end_ns: int = 0
-    """times of the first and the last scored sample"""
+    start_ns: int = np.iinfo(np.int64).max
+    end_ns: int = np.iinfo(np.int64).min
+    """times of the first and the last sample with a score message"""
     alarms: list[Alarm] = field(default_factory=list)
     recorded_alarms: list[Alarm] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)
@@ -79,7 +79,7 @@ class RescoredTray:
             self._newest_t_ns = int(score.t_ns[0]) - 1
         self.period_ns = score.period_ns
         first_ns, last_ns = int(score.t_ns[0]), int(score.t_ns[-1])
-        self.start_ns = min(self.start_ns or first_ns, first_ns)
+        self.start_ns = min(self.start_ns, first_ns)
         self.end_ns = max(self.end_ns, last_ns)
         new = score.t_ns > self._newest_t_ns
         self._newest_t_ns = max(self._newest_t_ns, last_ns)

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
 from pipeline.errors import UserError
+from pipeline.recordings.dates import format_utc
 from pipeline.replay.offline.plan import BEGINNING, Limit, Session
 from schemas.blocks import cut
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header, decode_together
 from schemas.fields import columns
 from schemas.messages import Alarm, Array, Message, Score
-from schemas.units import NS_PER_S
 
 MAX_NAMED = 5
 """differences that are described"""
@@ -227,11 +226,6 @@ def compare_alarms(
             continue
         found.alarms_different += 1
         found.name(f"{found.tray}: alarm {_describe(alarm)} recorded, none replayed")
-
-
-def format_utc(t_ns: int) -> str:
-    """A time in ns since the epoch as UTC in ISO 8601, to the millisecond."""
-    return datetime.fromtimestamp(t_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def _scores(envelopes: Iterable[Envelope], producer: str) -> Iterator[Score]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from typer.testing import Result
 
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.writing import RecordingWriter
-from schemas.messages import Alarm, InvalidReason
+from schemas.messages import Alarm, InvalidReason, Raw
+from schemas.units import NS_PER_S
 from tests.pipeline.replay.test_offline import changed
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.killed_site import Site
@@ -164,6 +166,28 @@ def test_an_imported_table_is_judged_at_the_rate_of_the_twin(tmp_path):
     out = tmp_path / "out.mcap"
     assert replay(bare, "--twin", tmp_path / "twin.onnx", "-o", out).exit_code == 0
     assert json.loads(replay("--json", out).stdout)["samples"] > 550, "the output made from a table can be judged again"
+
+
+@pytest.mark.parametrize("zero_ns", [0, 5 * NS_PER_S])
+def test_times_of_a_table_without_dates_are_seconds_since_its_first_sample(tmp_path, zero_ns):
+    recorded = [entry.message for entry in read_recording(GOLDEN, ("raw",))]
+    table, twin = tmp_path / "table.mcap", tmp_path / "twin.onnx"
+    twin.write_bytes(read_metadata(GOLDEN).attachments["tray1.onnx"])
+    with RecordingWriter(table, {"source": "a table"}) as writer:
+        for raw in recorded:
+            assert isinstance(raw, Raw) and isinstance(recorded[0], Raw)
+            t_ns = raw.host_receive_t_ns - recorded[0].host_receive_t_ns[0] + zero_ns
+            writer.add_message("fantwin/imported/tray1/raw", replace(raw, host_receive_t_ns=t_ns), int(t_ns[-1]))
+    for part in ((), ("--start", "1")):
+        document = json.loads(replay("--json", table, "--twin", twin, *part).stdout)
+        (alarm,) = document["alarms"]
+        assert document["start_ns"] == zero_ns
+        lines = replay(table, "--twin", twin, *part).stdout.splitlines()
+        assert lines[0] == "alarms, s since the first sample" and "1970" not in "".join(lines)
+        (row,) = [line for line in lines if line.lstrip().startswith("tray1")]
+        assert f" {(alarm['raised_ns'] - zero_ns) / NS_PER_S:.2f} " in row
+    shown = fantwin("info", table).stdout
+    assert f"from {zero_ns / NS_PER_S:.3f} s to" in shown and "1970" not in shown
 
 
 def test_no_file_is_ever_written_over(tmp_path):

@@ -76,7 +76,7 @@ def test_deciding_again_is_handed_over_as_it_was_asked_for(recording, tmp_path, 
 def test_the_status_line_shows_time_position_rate_and_messages():
     progress = Progress(START_NS + 12_500_000_000, 4.0, paused=False, round=0, messages=12345)
     line = status_line(progress, 12.5, 60.0)
-    for words in ("2023-11-14 22:13:32.500 UTC", "12.50 s of 60.00 s", "x 4 ", "12,345 sent", "space"):
+    for words in ("2023-11-14T22:13:32.500Z", "12.50 s of 60.00 s", "x 4 ", "12,345 sent", "space"):
         assert words in line
     later = Progress(START_NS, math.inf, paused=True, round=2, messages=0)
     assert "round 3" in status_line(later, 12.5, 60.0)

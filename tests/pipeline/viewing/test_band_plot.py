@@ -56,7 +56,7 @@ def test_title_axis_and_legend_name_everything_with_its_unit(tmp_path: Path) -> 
     assert [axes.get_ylabel() for axes in panels] == ["speed (rpm)", "speed (rpm)"]
     assert panels[0].get_title(loc="left") == "fan 1   no alarm"
     assert panels[1].get_title(loc="left") == "fan 2   covered inlet at 8.0 s, alarm 0.50 s later"
-    assert figure.axes[-1].get_xlabel() == "time since 2023-11-14 22:13:20 UTC (s)"
+    assert figure.axes[-1].get_xlabel() == "time since 2023-11-14T22:13:20.000Z (s)"
     texts = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert texts[:5] == ["measured", "twin", "twin ± 2σ", "outside the band (1 in 20 when healthy)", "alarm active"]
     assert set(texts[5:]) == {"true fault", "state: normal", "suspect", "alarm", "returning", "unknown: not scored"}
