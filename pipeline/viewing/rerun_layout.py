@@ -22,10 +22,11 @@ FANS_ON_A_PAGE = 8  # Rerun draws a page of a hundred plots only seven times a s
 MARGIN_FOR_LEGEND = {1: 0.12, 2: 0.25, 4: 0.45}  # columns of plots -> share of the window kept free at the right
 
 LINE_WIDTH = 1.2
-WHITE = (235, 235, 235)
-GREEN = (60, 220, 110)
-RED = (255, 60, 60)
-GREY = (150, 150, 150)
+# Lines are legible on the dark and on the light background of Rerun.
+VIOLET = (160, 100, 250)
+GREEN = (25, 160, 75)
+RED = (240, 50, 50)
+GREY = (135, 135, 135)
 STATE_COLORS = {
     "normal": (38, 150, 76),
     "suspect": (250, 178, 0),
@@ -46,7 +47,7 @@ class TrayLayout:
 
 
 def fan_path(tray: str, fan: int, part: str) -> str:
-    """Entity of one fan: `part` is `speed` (measured, twin), `alarm_zone`, `outside` or `not_scored`."""
+    """Entity of one fan: `part` is `speed` (measured, twin), `deviation`, `outside` or `not_scored`."""
     return f"{tray}/fan_{fan}/{part}"
 
 
@@ -61,20 +62,22 @@ def log_path(tray: str) -> str:
 
 
 def speed_style(unit: SpeedUnit, width: float) -> rr.Measurements:
-    """Style of the two series of a fan's `speed`, measured and twin with band; width 0 shows the band only."""
+    """Style of the series of a fan's `speed`: measured, twin with band, and the lowest and highest ends of the band,
+    which are not seen: an axis fits the lines, not the bands around them. Width 0 shows the band only."""
+    twin = f"twin ± 2σ ({unit})"
     return rr.Measurements.from_fields(
-        names=[f"measured ({unit})", f"twin ± 2σ ({unit})"],
-        colors=[WHITE, GREEN],
-        widths=[width, width],
+        names=[f"measured ({unit})", twin, twin, twin],
+        colors=[VIOLET, GREEN, GREEN, GREEN],
+        widths=[width, width, 0.0, 0.0],
     )
 
 
 def log_styles(recording: rr.RecordingStream, tray: TrayLayout) -> None:
     """Log the static names, colours and widths of every series of a tray."""
     for fan in tray.fans:
-        zone = rr.Measurements.from_fields(names=["alarm zone"] * 2, colors=[RED] * 2, widths=[0.0, 0.0])
+        deviation = rr.Measurements.from_fields(names="deviation in alarm", colors=RED, widths=0.0)
         recording.log(fan_path(tray.name, fan, "speed"), speed_style(tray.speed_unit, LINE_WIDTH), static=True)
-        recording.log(fan_path(tray.name, fan, "alarm_zone"), zone, static=True)
+        recording.log(fan_path(tray.name, fan, "deviation"), deviation, static=True)
         recording.log(
             fan_path(tray.name, fan, "outside"),
             rr.SeriesPoints(names="outside the band", colors=RED, marker_sizes=2.0),
@@ -94,11 +97,8 @@ def log_styles(recording: rr.RecordingStream, tray: TrayLayout) -> None:
 
 
 def blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_picture: bool = False) -> rrb.Blueprint:
-    """The whole layout, with a window of `window_s` seconds that follows the newest data.
-
-    A picture has no panels and shows nothing later than the cursor.
-    """
-    tabs: list[rrb.Container | rrb.View] = [_tray_tab(tray, window_s, for_picture) for tray in trays]
+    """The whole layout, with a window of `window_s` seconds that follows the newest data. A picture has no panels."""
+    tabs: list[rrb.Container | rrb.View] = [_tray_tab(tray, window_s) for tray in trays]
     if not for_picture:
         tabs.append(rrb.TextDocumentView(origin=f"/{STAGES_PATH}", name="stages"))
     return rrb.Blueprint(
@@ -110,18 +110,17 @@ def blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_picture: bool
     )
 
 
-def _tray_tab(tray: TrayLayout, window_s: float, for_picture: bool) -> rrb.Container:
+def _tray_tab(tray: TrayLayout, window_s: float) -> rrb.Container:
     starts = range(0, len(tray.fans), FANS_ON_A_PAGE)
-    pages = [_page(tray, tray.fans[start : start + FANS_ON_A_PAGE], window_s, for_picture) for start in starts]
+    pages = [_page(tray, tray.fans[start : start + FANS_ON_A_PAGE], window_s) for start in starts]
     return rrb.Tabs(*pages, active_tab=0, name=tray.name) if len(pages) > 1 else pages[0]
 
 
-def _page(tray: TrayLayout, fans: Sequence[int], window_s: float, for_picture: bool) -> rrb.Container:
+def _page(tray: TrayLayout, fans: Sequence[int], window_s: float) -> rrb.Container:
     """Up to `FANS_ON_A_PAGE` plots, their state lanes and the tray's log."""
     name = tray.name if len(fans) == len(tray.fans) else f"{tray.name} / fans {fans[0]} to {fans[-1]}"
     columns = 1 if len(fans) <= 2 else 2 if len(fans) <= 4 else 4
     axis = _rolling(window_s, MARGIN_FOR_LEGEND[columns])
-    past = _until_cursor() if for_picture else None
     lanes = rrb.StateTimelineView(
         origin=f"/{tray.name}",
         contents=[f"/{state_path(tray.name, fan)}" for fan in fans],
@@ -130,22 +129,21 @@ def _page(tray: TrayLayout, fans: Sequence[int], window_s: float, for_picture: b
     )
     lane_share = (1.7 + len(fans)) / 24
     return rrb.Vertical(
-        rrb.Grid(*(_fan_view(tray, fan, axis, past) for fan in fans), grid_columns=columns),
+        rrb.Grid(*(_fan_view(tray, fan, axis) for fan in fans), grid_columns=columns),
         rrb.Horizontal(lanes, _log_view(tray.name), column_shares=[3, 2]),
         row_shares=[1 - lane_share, lane_share],
         name=name,
     )
 
 
-def _fan_view(tray: TrayLayout, fan: int, axis: rrb.TimeAxis, past: rrb.VisibleTimeRange | None) -> rrb.TimeSeriesView:
+def _fan_view(tray: TrayLayout, fan: int, axis: rrb.TimeAxis) -> rrb.TimeSeriesView:
     speed = fan_path(tray.name, fan, "speed")
     fill, lines = speed_style(tray.speed_unit, 0.0), speed_style(tray.speed_unit, LINE_WIDTH)
     return rrb.TimeSeriesView(
         origin=f"/{tray.name}/fan_{fan}",
-        contents=[f"/{fan_path(tray.name, fan, part)}" for part in ("speed", "alarm_zone", "outside", "not_scored")],
+        contents=[f"/{fan_path(tray.name, fan, part)}" for part in ("speed", "deviation", "outside", "not_scored")],
         name=f"{tray.name} / fan {fan} speed ({tray.speed_unit})",
         axis_x=axis,
-        time_ranges=past,
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
         # A single band is faint. Drawing the same data twice makes it solid and sends no more bytes.
         overrides={speed: [fill.visualizer(), lines.visualizer()]},
@@ -167,8 +165,3 @@ def _rolling(window_s: float, margin: float) -> rrb.TimeAxis:
     """A window that follows the cursor; the share `margin` of it stays empty at the right."""
     cursor = rrb.TimeRangeBoundary.cursor_relative
     return rrb.TimeAxis(view_range=rr.TimeRange(start=cursor(seconds=-window_s), end=cursor(seconds=margin * window_s)))
-
-
-def _until_cursor() -> rrb.VisibleTimeRange:
-    boundary = rrb.TimeRangeBoundary
-    return rrb.VisibleTimeRange(TIMELINE, start=boundary.infinite(), end=boundary.cursor_relative())

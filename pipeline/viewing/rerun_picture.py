@@ -14,11 +14,12 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 from PIL import Image
 from rerun.chunk import Chunk, RrdReader
@@ -99,7 +100,10 @@ def draw_picture(
         )
     contents = _read(rrd)
     layout = _layout(rrd, contents, tray, fans)
-    end_ns = contents.last_ns if at_s is None else contents.first_ns + round(at_s * NS_PER_S)
+    end_ns = contents.last_ns
+    if at_s is not None:
+        end_ns = contents.first_ns + round(at_s * NS_PER_S)
+        contents = _until(contents, end_ns)
     with _headless_viewer() as viewer:
         began_s = time.monotonic()
         recording = rr.RecordingStream(APPLICATION)
@@ -144,11 +148,29 @@ def _read(rrd: Path) -> _Rrd:
             unit: SpeedUnit = "rpm" if name.endswith("(rpm)") else "rad/s"
             trays.setdefault(parts[0], ([], unit))[0].append(int(parts[1].removeprefix("fan_")))
         else:
-            times.append(np.asarray(batch.column(TIMELINE)).astype("datetime64[ns]").astype(np.int64))
+            times.append(_times_ns(batch))
     if not times:
         raise PictureError(f"{rrd}: holds no speeds drawn by the viewer stage")
     all_times = np.concatenate(times)
     return _Rrd(chunks, trays, int(all_times.min()), int(all_times.max()))
+
+
+def _until(contents: _Rrd, end_ns: int) -> _Rrd:
+    """What is in a view up to a time: a log, and an axis that fits what it shows, would go beyond the cursor."""
+    chunks: list[Chunk] = []
+    for chunk in contents.chunks:
+        batch = chunk.to_record_batch()
+        if chunk.is_static or TIMELINE not in batch.schema.names:
+            chunks.append(chunk)
+            continue
+        is_kept = _times_ns(batch) <= end_ns
+        if is_kept.any():
+            chunks += Chunk.from_record_batch(batch.filter(pa.array(is_kept)))
+    return replace(contents, chunks=chunks, last_ns=min(end_ns, contents.last_ns))
+
+
+def _times_ns(batch: pa.RecordBatch) -> Array:
+    return np.asarray(batch.column(TIMELINE)).astype("datetime64[ns]").astype(np.int64)
 
 
 def _layout(rrd: Path, contents: _Rrd, tray: str | None, fans: Sequence[int] | None) -> TrayLayout:

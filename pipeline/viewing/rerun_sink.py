@@ -1,7 +1,7 @@
 """The viewer's sink: a Rerun recording that goes to a file and to live viewers on this host.
 
-Each fan has one entity with its series side by side, and one `send_columns` per flush. Alarm zones, samples outside the
-band and samples without a score are sent only if there are any.
+Each fan has one entity with its series side by side, and one `send_columns` per flush. Deviations in alarm, samples
+outside the band and samples without a score are sent only if there are any.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ from schemas.messages import Array
 APPLICATION = "fantwin"
 FLUSH_LIMIT_S = 2.0
 """how long a flush may take; it is called twice a second and usually takes milliseconds"""
-ZONE_HEIGHT = 2.0  # of an alarm zone, in half heights of the band
 # Rerun's page server runs in a shell that ends with this process, even when it is killed: the pipe to its input closes.
 _PAGE_SCRIPT = '"$@" >/dev/null 2>&1 & cat >/dev/null; kill $!'
 
@@ -176,26 +175,25 @@ class RerunSink:
     def _draw_fan(self, trace: Trace, fan: int) -> None:
         measured, predicted, half_width = trace.measured[:, fan], trace.predicted[:, fan], trace.half_width[:, fan]
         scored = trace.valid[:, fan]
-        shown = np.stack([np.where(scored, measured, np.nan), predicted], axis=1)
-        variances = np.stack([np.zeros_like(half_width), half_width**2], axis=1)
+        ends = _ends_of_band(predicted, half_width)
+        shown = np.stack([np.where(scored, measured, np.nan), predicted, *ends], axis=1)
+        none = np.zeros_like(half_width)
+        variances = np.stack([none, half_width**2, none, none], axis=1)
         self._send_measurements(fan_path(trace.tray, fan, "speed"), trace.t_ns, shown, variances)
-        self._draw_zone(trace, fan)
+        self._draw_deviation(trace, fan)
         outside = trace.outside[:, fan]
         if outside.any():
             columns = rr.Scalars.columns(scalars=measured[outside])
             self._send(fan_path(trace.tray, fan, "outside"), trace.t_ns[outside], columns)
         self._send_where(fan_path(trace.tray, fan, "not_scored"), trace.t_ns, np.where(scored, np.nan, measured))
 
-    def _draw_zone(self, trace: Trace, fan: int) -> None:
-        """Send the red zones above and below the band while an alarm is active."""
-        path = fan_path(trace.tray, fan, "alarm_zone")
-        half_width = trace.half_width[:, fan]
-        zone = np.where(trace.in_alarm[:, fan], trace.predicted[:, fan], np.nan)
-        if not self._has_news(path, zone):
-            return
-        half_height = half_width * ZONE_HEIGHT / 2
-        middles = np.stack([zone + half_width + half_height, zone - half_width - half_height], axis=1)
-        self._send_measurements(path, trace.t_ns, middles, np.stack([half_height**2] * 2, axis=1))
+    def _draw_deviation(self, trace: Trace, fan: int) -> None:
+        """Send the red area between twin and measured speed while an alarm is active."""
+        path = fan_path(trace.tray, fan, "deviation")
+        measured, predicted = trace.measured[:, fan], trace.predicted[:, fan]
+        middle = np.where(trace.in_alarm[:, fan], (measured + predicted) / 2, np.nan)
+        if self._has_news(path, middle):
+            self._send_measurements(path, trace.t_ns, middle[:, None], ((measured - predicted)[:, None] / 2) ** 2)
 
     def _send_where(self, path: str, t_ns: Array, values: Array) -> None:
         if self._has_news(path, values):
@@ -217,6 +215,15 @@ class RerunSink:
     def _send(self, path: str, t_ns: Array, columns: rr.ComponentColumnList) -> None:
         time = rr.TimeColumn(TIMELINE, timestamp=t_ns.astype("datetime64[ns]"))
         self._recording.send_columns(path, indexes=[time], columns=columns)
+
+
+def _ends_of_band(predicted: Array, half_width: Array) -> tuple[Array, Array]:
+    """The lowest and the highest value (n,) of a stretch of the band, each where it lies; NaN elsewhere."""
+    low, high = np.full_like(predicted, np.nan), np.full_like(predicted, np.nan)
+    if np.isfinite(predicted).any():
+        lowest, highest = np.nanargmin(predicted - half_width), np.nanargmax(predicted + half_width)
+        low[lowest], high[highest] = (predicted - half_width)[lowest], (predicted + half_width)[highest]
+    return low, high
 
 
 def _serve_page(web_port: int, grpc_port: int) -> subprocess.Popen[bytes]:

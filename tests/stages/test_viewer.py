@@ -303,15 +303,15 @@ def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp
     rows = rows_of(tmp_path / "view.rrd")
     speed = rows["/tray1/fan_2/speed"]
     assert [t for t, _ in speed] == np.concatenate([score.t_ns for score in scores]).tolist()
-    measured, predicted = np.array([row["Measurements:values"] for _, row in speed]).T
+    measured, predicted, lowest, highest = np.array([row["Measurements:values"] for _, row in speed]).T
     rpm = 1 / RAD_S_PER_UNIT["rpm"]
     np.testing.assert_allclose(measured, np.concatenate([s.measured_speed_rad_s[:, 2] for s in scores]) * rpm)
     np.testing.assert_allclose(predicted, np.concatenate([s.predicted_speed_rad_s[:, 2] for s in scores]) * rpm)
     np.testing.assert_allclose([row["Measurements:variances"][1] for _, row in speed], (2 * SIGMA * rpm) ** 2)
-    assert styles_of(tmp_path / "view.rrd", "/tray1/fan_2/speed", "Measurements:names") == [
-        "measured (rpm)",
-        "twin ± 2σ (rpm)",
-    ]
+    assert np.nanmin(lowest) == pytest.approx(predicted.min() - 2 * SIGMA * rpm), "an axis fits all of the band"
+    assert np.nanmax(highest) == pytest.approx(predicted.max() + 2 * SIGMA * rpm)
+    names = styles_of(tmp_path / "view.rrd", "/tray1/fan_2/speed", "Measurements:names")
+    assert names == ["measured (rpm)", *["twin ± 2σ (rpm)"] * 3]
     outside = np.concatenate([score.outside[:, 2] for score in scores])
     assert len(rows["/tray1/fan_2/outside"]) == np.count_nonzero(outside)
     states = [row["StateChange:state"][0] for _, row in rows["/tray1/state/fan_2"]]
@@ -335,26 +335,34 @@ def test_a_replay_of_an_old_recording_has_no_data_at_the_host_time(tmp_path: Pat
     assert r"- **scorer**: two \| \*lines\*" in page and "f40" in page
 
 
-def test_an_alarm_zone_lies_beyond_the_band_on_both_sides_and_ends_with_the_alarm(tmp_path: Path) -> None:
+def test_in_an_alarm_the_area_between_twin_and_measured_speed_is_red(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=20, fault_s=(8.0, 14.0))
     core = build(context(tmp_path)).core
     play(core, scores)
     core.close()
     rows = rows_of(tmp_path / "view.rrd")
-    zone = rows["/tray1/fan_2/alarm_zone"]
-    predicted = dict(rows["/tray1/fan_2/speed"])
-    red = [(t, row) for t, row in zone if np.isfinite(row["Measurements:values"]).all()]
+    area = rows["/tray1/fan_2/deviation"]
+    drawn = dict(rows["/tray1/fan_2/speed"])
+    red = [(t, row) for t, row in area if np.isfinite(row["Measurements:values"]).all()]
     assert [(t - START_NS) / 1e9 for t, _ in (red[0], red[-1])] == [8.5, 14.5 - STEP_NS / 1e9]
-    assert np.isnan(zone[-1][1]["Measurements:values"]).all()
+    assert np.isnan(area[-1][1]["Measurements:values"]).all()
     for t, row in red:
-        (above, below), (variance, _) = row["Measurements:values"], row["Measurements:variances"]
-        middle = predicted[t]["Measurements:values"][1]
-        assert above - np.sqrt(variance) == pytest.approx(middle + 2 * SIGMA)
-        assert below + np.sqrt(variance) == pytest.approx(middle - 2 * SIGMA)
-    assert "/tray1/fan_0/alarm_zone" not in rows
+        (middle,), (variance,) = row["Measurements:values"], row["Measurements:variances"]
+        measured, predicted, *_ = drawn[t]["Measurements:values"]
+        ends = middle - np.sqrt(variance), middle + np.sqrt(variance)
+        assert ends == pytest.approx(sorted((measured, predicted)))
+    assert "/tray1/fan_0/deviation" not in rows
 
 
-def test_a_zone_open_at_the_end_of_a_flush_is_ended_by_the_next_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("background", [(13, 16, 17), (255, 255, 255)], ids=["dark", "light"])
+def test_every_line_is_legible_in_both_themes(background: tuple[int, int, int]) -> None:
+    layout: Any = pytest.importorskip("pipeline.viewing.rerun_layout", exc_type=ModuleNotFoundError)
+    for color in (layout.VIOLET, layout.GREEN, layout.RED, layout.GREY):
+        lighter, darker = sorted((luminance(color), luminance(background)), reverse=True)
+        assert (lighter + 0.05) / (darker + 0.05) > 3.0, f"contrast of {color}, as WCAG asks of graphics"
+
+
+def test_an_area_open_at_the_end_of_a_flush_is_ended_by_the_next_one(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=0.3, fans=1, faulty_fan=None, gap_fan=None)
     in_alarm = np.full((10, 1), FanState.ALARM, np.uint8)
     core = build(context(tmp_path, fans=1)).core
@@ -362,8 +370,8 @@ def test_a_zone_open_at_the_end_of_a_flush_is_ended_by_the_next_one(tmp_path: Pa
         core.step(score)
         core.tick((number + 1) * FLUSH_PERIOD_NS)
     core.close()
-    zone = rows_of(tmp_path / "view.rrd")["/tray1/fan_0/alarm_zone"]
-    drawn = [bool(np.isfinite(row["Measurements:values"]).all()) for _, row in zone]
+    area = rows_of(tmp_path / "view.rrd")["/tray1/fan_0/deviation"]
+    drawn = [bool(np.isfinite(row["Measurements:values"]).all()) for _, row in area]
     assert drawn == [True] * 10 + [False] * 10
 
 
@@ -462,6 +470,12 @@ def context(folder: Path, *, fans: int = 3, speed_unit: Any = "rad/s", serve: bo
 
 def changed(score: Score, **columns: Any) -> Score:
     return Score(**{**vars(score), **columns})
+
+
+def luminance(color: tuple[int, int, int]) -> float:
+    """Relative luminance of an sRGB colour (WCAG 2)."""
+    linear = [c / 3294.6 if c <= 10 else ((c / 255 + 0.055) / 1.055) ** 2.4 for c in color]
+    return float(np.dot(linear, [0.2126, 0.7152, 0.0722]))
 
 
 def card() -> ModelCard:

@@ -14,9 +14,9 @@ from PIL import Image
 from pipeline.cli.recordings.picture import picture
 from pipeline.errors import UserError
 from stages.viewer import PAGE_PERIOD_NS, build
-from tests.stages.test_viewer import LATER_NS, card, context, free_port, health, play
+from tests.stages.test_viewer import LATER_NS, card, changed, context, free_port, health, play
 from tests.support.running_chain import eventually
-from tests.support.score_data import made_up_tray
+from tests.support.score_data import START_NS, made_up_tray
 
 rerun_picture = pytest.importorskip("pipeline.viewing.rerun_picture", exc_type=ModuleNotFoundError)
 needs_a_driver = pytest.mark.skipif(
@@ -39,11 +39,11 @@ def view_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @needs_a_driver
-def test_a_healthy_fan_shows_a_green_band_and_a_faulty_one_red_zones_too(view_file: Path) -> None:
+def test_a_healthy_fan_shows_a_green_band_and_a_faulty_one_a_red_deviation_too(view_file: Path) -> None:
     healthy = colors(rerun_picture.draw_picture(view_file, view="fan 0").png)
     faulty = colors(rerun_picture.draw_picture(view_file, view="fan 2").png)
-    assert healthy["band"] > 0.05 and faulty["band"] > 0.05
-    assert healthy["zone"] < 1e-3 and faulty["zone"] > 0.02
+    assert healthy["band"] > 0.04 and faulty["band"] > 0.04
+    assert healthy["deviation"] < 1e-3 and faulty["deviation"] > 0.02
     assert faulty["red points"] > 3 * healthy["red points"] > 0
     assert healthy["measured"] > 0.002
 
@@ -58,9 +58,27 @@ def test_the_lanes_show_normal_alarm_and_unknown_in_their_colors(view_file: Path
 @pytest.mark.slow
 @needs_a_driver
 def test_nothing_after_the_end_of_the_picture_is_drawn(view_file: Path) -> None:
+    until = rerun_picture._until(rerun_picture._read(view_file), START_NS + 7_500_000_000)
+    times = [rerun_picture._times_ns(chunk.to_record_batch()) for chunk in until.chunks if not chunk.is_static]
+    assert max(each.max() for each in times) == until.last_ns == START_NS + 7_500_000_000
+    assert not [chunk for chunk in until.chunks if chunk.entity_path == "/tray1/log"], "alarms come later"
     before_the_fault = rerun_picture.draw_picture(view_file, fans=[2], at_s=7.5, view="fan 2")
-    assert colors(before_the_fault.png)["zone"] < 1e-3
+    assert colors(before_the_fault.png)["deviation"] < 1e-3
     assert colors(before_the_fault.png)["band"] > 0.02
+
+
+@pytest.mark.slow
+@needs_a_driver
+def test_a_plot_shows_all_of_a_band_that_is_wide(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(seconds=5, fans=1, faulty_fan=None, gap_fan=None)
+    core = build(context(tmp_path, fans=1)).core
+    steady = np.full((10, 1), 300.0)
+    play(core, [changed(score, predicted_speed_rad_s=steady, measured_speed_rad_s=steady + 0.1) for score in scores])
+    core.close()
+    image = Image.open(BytesIO(rerun_picture.draw_picture(tmp_path / "view.rrd", window_s=5.0, view="fan 0").png))
+    red, green, blue = np.asarray(image.convert("RGB")).astype(int)[:, image.width // 2].T
+    band = np.flatnonzero((green > 60) & (green > 2 * red) & (green > 1.5 * blue))
+    assert 0.02 < band[0] / image.height < 0.2 and 0.8 < band[-1] / image.height < 0.98
 
 
 @pytest.mark.slow
@@ -139,7 +157,7 @@ def shown_ns(viewer: Any) -> int:
 
 
 def colors(png: bytes) -> dict[str, float]:
-    """The shares of a picture that have the colours of a band, a zone, points, a line and lanes."""
+    """The shares of a picture that have the colours of a band, a deviation, points, a line and lanes."""
     red, green, blue = np.asarray(Image.open(BytesIO(png)).convert("RGB")).astype(int).transpose(2, 0, 1)
 
     def near(r: int, g: int, b: int, by: int = 12) -> float:
@@ -147,9 +165,9 @@ def colors(png: bytes) -> dict[str, float]:
 
     return {
         "band": float(((green > 2 * red) & (green > 1.5 * blue) & (green > 60) & (green < 140)).mean()),
-        "zone": near(60, 24, 24),
-        "red points": near(255, 60, 60, by=25),
-        "measured": float(((red > 200) & (green > 200) & (blue > 200)).mean()),
+        "deviation": float(((red > 50) & (red < 100) & (red > 2 * green) & (red > 2 * blue)).mean()),
+        "red points": near(240, 50, 50, by=25),
+        "measured": float(((blue > 130) & (blue > 1.2 * green) & (red > 70)).mean()),
         "lane normal": near(32, 120, 62, by=16),
         "lane alarm": near(178, 30, 30, by=16),
         "lane unknown": near(95, 95, 95, by=16),
