@@ -7,7 +7,8 @@ Timing: a grid sample is published as soon as a raw sample at or after its time 
 all fans wait for its next one, at most `gap_limit_s`. If no samples arrive, the wait is at most `watermark_s`.
 
 Without `rate_hz`, the rate of the grid follows from the line: samples are kept until its rate is known, after one to
-five seconds, and are then put on the grid. The rate stays until the resampler is started again.
+five seconds, and are then put on the grid. The rate stays until the resampler is started again. Of the samples that are
+kept, the least delayed one says how late the first one was.
 
 Gaps longer than `gap_limit_s` are never bridged. Their grid samples are not valid: GAP up to `watermark_s` after the
 last raw sample, then STALE; `stale_for_s` after it the grid ends until samples arrive again. Content depends on sample
@@ -19,6 +20,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Self
 
@@ -192,6 +194,8 @@ class ResamplerCore(Core):
         self._line_hz = self._line.line_hz
         grid = self._start(grid_rate_hz(self._line_hz))
         waiting, self._waiting = self._waiting, []
+        if self._decision_rules >= DecisionRules.FIRST_DELAY:
+            waiting[0] = _received_earlier(waiting[0], self._line.first_lateness_ns)
         for item in waiting:
             yield from grid.step(item)
 
@@ -202,6 +206,13 @@ class ResamplerCore(Core):
         self._timing = config.timing(rate_hz)
         self._grid = SampleGrid(self._tachos, self._timing, config.block_size, self._decision_rules)
         return self._grid
+
+
+def _received_earlier(message: Raw, lateness_ns: int) -> Raw:
+    """The same, its first sample received earlier: all times of the device follow from that."""
+    t_ns = message.host_receive_t_ns.copy()
+    t_ns[:1] -= lateness_ns
+    return replace(message, host_receive_t_ns=t_ns)
 
 
 def build(context: Context) -> BuiltStage:

@@ -15,7 +15,7 @@ Decisions follow from the samples alone, one by one: a replay makes the same, ho
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -53,29 +53,34 @@ class LineGuard:
         """`refused_other_time`: samples that were refused; `lost_other_time`: too many were held;
         `host_clock_set_back`: how often it was"""
 
-    def admit(self, message: Raw, *, is_of_ended: bool = False) -> list[Raw]:
+    def admit(self, message: Raw, *, is_of_ended: bool = False) -> Iterator[Raw]:
         """The samples to process now; none while it is undecided whether they belong to the line.
+
+        Each is to be processed before the next is asked for: the clock of the device takes part in the decisions.
 
         is_of_ended: from a producer that another one has followed. What it still sends near the line does not make it
         the line's producer again.
         """
         t_ns = message.host_receive_t_ns
         if not len(t_ns):
-            return [message]
+            yield message
+            return
         if self.producer is None:
             self._newest_t_ns = int(t_ns[0])
         if len(t_ns) == 1:
-            return self._admit_sample(message, is_of_ended)
+            yield from self._admit_sample(message, is_of_ended)
+            return
         own = self.producer in (None, message.header.producer)
         steps_ns = np.diff(t_ns, prepend=self._newest_t_ns)
         apart = steps_ns < -APART_NS if own and not self._shift_ns else np.abs(steps_ns) > APART_NS
         if self._held or apart.any():
-            samples = (cut(message, row, row + 1) for row in range(len(t_ns)))
-            return [admitted for sample in samples for admitted in self._admit_sample(sample, is_of_ended)]
+            for row in range(len(t_ns)):
+                yield from self._admit_sample(cut(message, row, row + 1), is_of_ended)
+            return
         if not is_of_ended:
             self._steps_ns = (*self._steps_ns, *np.clip(steps_ns[-2:], 0, LONGEST_STEP_NS).tolist())[-2:]
             self.producer, self._newest_t_ns = message.header.producer, int(t_ns[-1])
-        return [self._shifted(message)]
+        yield self._shifted(message)
 
     def close(self) -> list[Raw]:
         """What is still held and may be of the line: what goes forward."""

@@ -153,15 +153,34 @@ class LineRate:
     def __init__(self) -> None:
         self._times = SampleTimes(MAX_SAMPLES)
         self._seen = 0
+        self._first_t_ns = self._last_t_ns = 0
+        self._last_span_us = 0
+        self.first_lateness_ns = 0
+        """how much later the first sample arrived than with the delay of the least delayed one of the first second;
+        0 if the device has no clock"""
 
     def add(self, message: Raw) -> bool:
         """Add the samples of a message; returns whether they are enough for `line_hz`."""
-        for us in self._times.times_of(message):
+        for us, t_ns in zip(self._times.times_of(message), message.host_receive_t_ns.tolist(), strict=True):
             if self.is_enough:
                 break
             self._seen += 1
+            if not self._times.count:
+                self._first_t_ns = self._last_t_ns = t_ns
+                self._last_span_us = self.first_lateness_ns = 0
             self._times.add_time(us)
+            if len(message.device_clock_us):
+                self._compare_delay(t_ns)
         return self.is_enough
+
+    def _compare_delay(self, t_ns: int) -> None:
+        """Compare the delay of the newest sample, received at t_ns, with that of the first."""
+        span_us = self._times.span_us  # it falls where the clock of the device went back
+        if self._last_span_us <= span_us <= SHORTEST_WAIT_US and t_ns >= self._last_t_ns:
+            self._last_span_us, self._last_t_ns = span_us, t_ns
+            self.first_lateness_ns = max(self.first_lateness_ns, self._first_t_ns + span_us * 1000 - t_ns)
+        else:
+            self._last_span_us = SHORTEST_WAIT_US + 1  # a later sample says nothing about the first one
 
     @property
     def is_enough(self) -> bool:

@@ -27,6 +27,8 @@ class DecisionRules(IntEnum):
     """An alarm returns by the detectors that exceeded, each after its own off-delay, and only where its fault would
     show; meanwhile the fan's baselines stay. Baselines are not commissioned from a fan that changes its speed. Less
     probable causes are not listed, and a diagnosis that says nothing new is not sent."""
+    FIRST_DELAY = 6
+    """Times of a line begin with the smallest delay of its first second, not with that of its first sample."""
 
 
 CURRENT_RULES = max(DecisionRules)

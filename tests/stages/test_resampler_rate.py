@@ -19,8 +19,9 @@ CLOCK_START_US = 2**32 - 3_000_000  # it wraps while the rate is being measured
 
 
 def samples(times_s: Array, *, clock: bool = True, producer: str = "p", first: int = 0) -> list[Raw]:
-    """One sample a message, received up to 5 ms late."""
+    """One sample a message, received up to 5 ms late, the first one the least."""
     delays_s = np.random.default_rng(1).uniform(0.001, 0.005, len(times_s)) if clock else np.zeros(len(times_s))
+    delays_s[:1] = np.minimum(delays_s[:1], 0.001)
     return [
         Raw(
             header=Header(producer, first + k, "tray1"),
@@ -44,6 +45,20 @@ def grid_of(messages: Iterable[Raw], **config: float) -> tuple[Grid, ResamplerCo
     core = ResamplerCore(1, ResamplerConfig.model_validate(config))
     grids = [grid for message in messages for grid in core.step(message)]
     return join([*grids, *core.close()]), core
+
+
+def test_a_first_sample_that_arrived_late_does_not_make_all_times_late() -> None:
+    messages = samples(times(50, 20))
+    late = [replace(m, host_receive_t_ns=np.maximum(m.host_receive_t_ns, EPOCH_NS + 400_000_000)) for m in messages]
+    on_time, _ = grid_of(messages)
+    for received in (late, [join(late[k : k + 30]) for k in range(0, len(late), 30)]):
+        grid, core = grid_of(received)
+        assert core.counters()["clock_restarts"] == 0
+        early_rad_s = np.interp(on_time.t_ns, grid.t_ns, grid.speed_rad_s[:, 0]) - on_time.speed_rad_s[:, 0]
+        assert np.abs(early_rad_s[1:-1]).max() < 0.006  # the speed rises by 1 rad/s each second: 6 ms
+
+    given, _ = grid_of(late, rate_hz=50.0)
+    assert given.t_ns[0] > grid.t_ns[0] + 300_000_000
 
 
 @pytest.mark.parametrize("clock", [True, False], ids=["clock", "no clock"])
