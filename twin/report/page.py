@@ -38,8 +38,8 @@ class Figure:
     narrow_svg: str = ""
 
 
-def report_page(content: Content, assessment: Assessment | None = None) -> str:
-    """The page. assessment: by default, that of the content."""
+def report_page(content: Content, assessment: Assessment | None = None, alarms: Sequence[str] = ()) -> str:
+    """The page. assessment: by default, that of the content. alarms: what raises one with this twin, in sentences."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"shown": shown, "svg": Markup}
     template = environment.from_string(files("twin.report").joinpath("page.html").read_text(encoding="utf-8"))
@@ -55,6 +55,7 @@ def report_page(content: Content, assessment: Assessment | None = None) -> str:
         physics_used=content.card.used_parameters,
         level_of=level_of,
         refined=any(it.in_force != it.value for fan in content.fans for it in fan.parameters),
+        alarms=alarms,
         as_declared=AS_DECLARED,
         looser=LOOSER,
         drawn=drawn,

@@ -41,8 +41,9 @@ def report(
 ) -> None:
     """Run a twin freely over recordings and write the result as one self-contained HTML page.
 
-    It holds the figures of `fantwin evaluate`, an assessment in words, fit and error over time, histogram, whiteness,
-    cross-correlation with the command, static curve, parameters with 95 % intervals and the model card.
+    It holds the figures of `fantwin evaluate`, an assessment in words, what raises an alarm, fit and error over time,
+    histogram, whiteness, cross-correlation with the command, static curve, parameters with 95 % intervals and the model
+    card.
 
     Example: fantwin report TWIN.onnx held-out.mcap -o report.html
     """
@@ -59,14 +60,15 @@ def report(
         with working(f"drawing {output}"):
             content = report_content(loaded, training_data.runs, data_cards(training_data), unit, fan_numbers(fans))
             assessment = assess(content)
-            page = report_page(content, assessment)
+            drops = drops_found(twin, training_data.rad_s_per_unit)
+            alarms = drop_lines(drops, unit.name) or ["alarms are not calibrated: fantwin calibrate"]
+            page = report_page(content, assessment, alarms)
     try:
         output.write_text(page, encoding="utf-8")
     except OSError as error:
         raise UserError(f"{output}: cannot be written: {error.strerror}; name another file with -o") from error
     warnings = [*training_data.outliers, *assessment.warnings]
     pooled = figures_in(content.evaluation.pooled, training_data.rad_s_per_unit)
-    drops = drops_found(twin, training_data.rad_s_per_unit)
     if json_output:
         by_fan = [
             {
@@ -88,7 +90,7 @@ def report(
         return
     typer.echo(f"{output}: {assessment.headline}")
     typer.echo(f"  {sentence(pooled, unit.name)}")
-    for line in drop_lines(drops, unit.name) or ["alarms are not calibrated: fantwin calibrate"]:
+    for line in alarms:
         typer.echo(f"  {line}")
     for warning in warnings:
         typer.echo(warning, err=True)

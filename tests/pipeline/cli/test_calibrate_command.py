@@ -116,6 +116,16 @@ def test_the_output_is_readable(output_of_calibration: str) -> None:
     assert re.search(r"found at \d+ rad/s: a drop of [\d.]+ rad/s at once", output_of_calibration)
 
 
+def test_the_page_of_a_report_says_what_raises_an_alarm_as_the_terminal_does(
+    folder: Path, calibrated: Path, output_of_calibration: str
+) -> None:
+    page = folder / "report.html"
+    lines = [line for line in output_of_calibration.splitlines() if line.startswith("found at")]
+    result = fantwin("report", calibrated, folder / "other.mcap", "-o", page)
+    assert result.exit_code == 0, result.output
+    assert lines and all(line in result.stdout and f"<li>{line}</li>" in page.read_text() for line in lines)
+
+
 def test_json_is_one_document_of_the_limits_and_the_test_of_them(folder: Path) -> None:
     result = calibrate(folder, "-o", folder / "json.onnx", "--json", "--verify", folder / "other.mcap")
     document = json.loads(result.stdout)
