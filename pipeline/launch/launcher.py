@@ -18,6 +18,7 @@ from pipeline.launch.processes import EXIT_CANNOT_START, Child, StageProcess, pr
 from pipeline.launch.site_report import RunningProcess, SiteReport
 from pipeline.launch.site_state import site_states
 from pipeline.launch.site_watcher import SiteWatcher
+from pipeline.launch.stage_notes import note_lines
 from pipeline.launch.watchdog import Watchdog
 from pipeline.runtime.clock import REPLAY
 from schemas.messages import StageStatus
@@ -58,6 +59,8 @@ class Outcome:
     lost: dict[str, int] = field(default_factory=dict)
     refused: dict[str, dict[str, int]] = field(default_factory=dict)
     """messages of others and input of devices, by stage and counter; no loss"""
+    notes: list[str] = field(default_factory=list)
+    """a line for each thing that the stages said last of their work: the rate of a grid, gaps, what was judged"""
     unusable: list[str] = field(default_factory=list)
     """a line for each device that sent no sample that could be used"""
     run_folder: str = ""
@@ -108,6 +111,7 @@ class Launcher:
                 sessions = {each for slot in ready for each in slot.sessions}
                 self.outcome.lost = self._watcher.losses(sessions)
                 self.outcome.refused = self._watcher.refused()
+                self.outcome.notes = note_lines(view.health for view in self._watcher.stages())
                 self.outcome.unusable = self._watcher.unusable(sessions)
         return self.outcome
 

@@ -1,4 +1,4 @@
-"""What `fantwin up` reports about a running site: stages that lose their connection or input, problems and alarms."""
+"""What `fantwin up` says of a running site: stages that lose their connection or input, problems, notes and alarms."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from dataclasses import dataclass
 from pipeline.launch.event_log import without_figures
 from pipeline.launch.site_state import OFF_THE_BUS, StageState, Word
 from pipeline.launch.site_watcher import StageView
+from pipeline.launch.stage_notes import note_lines
 from pipeline.runtime.health import LATENCY_WINDOW_S
+from schemas.messages import Health
 from schemas.units import NS_PER_S
 from scoring.alarms.current_alarms import CurrentAlarm
 
 _ALL = "all stages"
+_NOTE_AFTER_NS = 5 * NS_PER_S
+"""a note that stands for a shorter time is of a moment"""
 _UNHEARD = OFF_THE_BUS | {Word.SILENT}
 
 
@@ -36,6 +40,9 @@ class SiteReport:
         """by label"""
         self._said: dict[str, str] = {}
         """by subject: the last report, without its figures; empty: all is well"""
+        self._notes: dict[str, dict[str, int]] = {}
+        """by label: the statements of its notes, and since when each stands"""
+        self._said_notes: set[str] = set()
         self._alarms: dict[tuple[str, int], str] = {}
         """by tray and fan: what was said of its alarm last"""
 
@@ -55,6 +62,7 @@ class SiteReport:
             if state.view and state.view.alive:
                 subject = f"{state.label}: problem"
                 self._change(subject, self._problem(state.view), "the problem is resolved", name=state.label)
+                self._report_notes(state.label, state.view.health)
 
     def _problem(self, view: StageView) -> str:
         """The problem of a stage. One that only a single health reports, or that is from before the sources of the site
@@ -62,6 +70,17 @@ class SiteReport:
         before = view.previous
         is_there = before is not None and before.problem and before.t_ns >= self._started_t_ns
         return view.health.problem if is_there else ""
+
+    def _report_notes(self, label: str, health: Health) -> None:
+        """Say each statement once: what a note says first, without the figures, which change all the time."""
+        before, standing = self._notes.get(label, {}), {}
+        for line in note_lines([health]):
+            statement = without_figures(line.partition(";")[0])
+            standing[statement] = before.get(statement, health.t_ns)
+            if health.t_ns - standing[statement] >= _NOTE_AFTER_NS and statement not in self._said_notes:
+                self._said_notes.add(statement)
+                self._say(line)
+        self._notes[label] = standing
 
     def _fault(self, state: StageState, process: RunningProcess) -> str:
         """What is wrong with a stage whose process runs; empty if nothing is."""

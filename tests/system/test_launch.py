@@ -123,7 +123,9 @@ def test_visitors_change_nothing_and_ctrl_c_stops_in_order_with_everything_recor
     status = up.end(signal.SIGINT)  # while the tray is sending
     assert chain.tray and chain.tray.end() == 0
     assert status == 0, up.lines
-    assert up.output() == {
+    outcome = up.output()
+    assert [f"resampler, {TRAY}"] == [note.partition(":")[0] for note in outcome.pop("notes") if " Hz" in note]
+    assert outcome == {
         "run_folder": str(chain.folder),
         "restarts": {},
         "killed": [],

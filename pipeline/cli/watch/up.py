@@ -36,7 +36,7 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
     try:
         outcome = Launcher(settings, overrides or (), log.say).run(stop)
         if not json_output:
-            for line in refused_lines(outcome.refused):
+            for line in (*outcome.notes, *refused_lines(outcome.refused)):
                 log.say(line)
             losses = ", ".join(f"{name} {count}" for name, count in outcome.lost.items() if count)
             log.say(f"stopped; lost: {losses or 'nothing'}; files in {outcome.run_folder}")
@@ -52,7 +52,7 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
 
 def _print_json(outcome: Outcome) -> None:
     """To standard output, where somebody may read it; the exit code stands whether or not it can be written."""
-    names = ("run_folder", "restarts", "killed", "failed", "lost", "refused", "unusable")
+    names = ("run_folder", "restarts", "killed", "failed", "lost", "refused", "notes", "unusable")
     found = {name: getattr(outcome, name) for name in names}
     with suppress(OSError):
         os.write(sys.stdout.fileno(), f"{json.dumps(found)}\n".encode())

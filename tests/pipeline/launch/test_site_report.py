@@ -9,6 +9,7 @@ import pytest
 from pipeline.launch.site_report import RunningProcess, SiteReport
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import StageView
+from schemas.messages import Note
 from schemas.units import NS_PER_S
 from tests.pipeline.launch.test_site_state import CONSUMER, view
 
@@ -97,6 +98,29 @@ def test_a_problem_from_before_the_sources_started_or_of_a_moment_is_not_said(li
     assert lines == []
     hear(CONSUMER.t_ns + 5 * NS_PER_S, silent, silent)
     assert lines == ["resampler: no raw samples"]
+
+
+def test_what_a_stage_notes_of_its_work_is_said_once_when_it_has_stood_for_some_seconds(report, lines):
+    def hear(second: int, *notes: str) -> None:
+        health = replace(
+            CONSUMER, t_ns=CONSUMER.t_ns + second * NS_PER_S, notes=[Note(tray="tray1", text=each) for each in notes]
+        )
+        report.stages([replace(state("resampler"), view=view(health))], {})
+
+    for second in range(3):
+        hear(second, f"the rate of the line is being measured ({10 * second} samples so far)")
+    for second in range(3, 30):
+        judged = [f"{second:.1f} % of the fans' samples judged; not judged: {100 - second:.1f} % in gaps"] * (
+            second > 20
+        )
+        hear(second, f"grid of 10 Hz (the line sends 9.9{second % 3} samples a second); gaps: {second}", *judged)
+    assert lines == [
+        "twin_integrator, tray1: grid of 10 Hz (the line sends 9.92 samples a second); gaps: 8",
+        "twin_integrator, tray1: 26.0 % of the fans' samples judged; not judged: 74.0 % in gaps",
+    ]
+    for second in range(30, 40):
+        hear(second, "grid of 20 Hz (the line sends 19.9 samples a second); gaps: 0")
+    assert lines[2:] == ["twin_integrator, tray1: grid of 20 Hz (the line sends 19.9 samples a second); gaps: 0"]
 
 
 def test_a_stage_that_works_off_what_was_missed_during_a_restart_is_not_late(report, lines):
