@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from bench.detection.metrics import Event
 from bench.detection.plant import START_NS
+from pipeline.cli.watch.excitation import LEVELS, SHORT_LEVELS
 from schemas.messages import Array, Raw
 from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
@@ -55,6 +56,8 @@ FAULT_BEGINS = (0.1, 0.5)
 """share of its part of the day after which a fault begins"""
 FAULT_LASTS = 0.25
 """share of its part of the day"""
+SETTLED_S, SHORT_S = 8.0, 2.0
+"""how long a sweep holds its levels: until the fans have settled, and so that they never do"""
 ON_BEFORE_S, ON_AFTER_S = 10.0, 60.0
 """the fan is on for so long around the beginning of its fault"""
 
@@ -122,9 +125,21 @@ def events(faults: list[Fault]) -> list[Event]:
     ]
 
 
-def reports(of: Racks, rate_hz: float, faults: list[Fault] | None = None) -> Iterator[list[Raw]]:
-    """The samples of each rack, block by block, as its device sends them. rate_hz: one of RATES_HZ."""
-    course = _Course(of, faults or [])
+def swept_duty(t_s: float) -> float:
+    """The duty of all fans of a rack under `fantwin sweep`, from 0 to 1: its levels, held long and short in turn."""
+    into_s = t_s % (len(LEVELS) * SETTLED_S + len(SHORT_LEVELS) * SHORT_S)
+    held = int(into_s / SETTLED_S)
+    return LEVELS[held] if held < len(LEVELS) else SHORT_LEVELS[int((into_s - len(LEVELS) * SETTLED_S) / SHORT_S)]
+
+
+def reports(
+    of: Racks, rate_hz: float, faults: list[Fault] | None = None, *, is_swept: bool = False
+) -> Iterator[list[Raw]]:
+    """The samples of each rack, block by block, as its device sends them.
+
+    rate_hz: one of RATES_HZ. is_swept: under `swept_duty` instead of the thermostat.
+    """
+    course = _Course(of, faults or [], is_swept=is_swept)
     chance = np.random.default_rng([of.seed, 3, round(rate_hz)])
     rows, sent = round(of.seconds * rate_hz), 0
     while sent < rows:
@@ -137,8 +152,9 @@ def reports(of: Racks, rate_hz: float, faults: list[Fault] | None = None) -> Ite
 class _Course:
     """Fans and tachos as time goes on."""
 
-    def __init__(self, of: Racks, faults: list[Fault]) -> None:
+    def __init__(self, of: Racks, faults: list[Fault], *, is_swept: bool) -> None:
         self._of = of
+        self._is_swept = is_swept
         self._faults = faults
         self._fans = FourPinFans(of.parameters, np.random.default_rng([of.seed, 2]), RACK_FANS)
         self._tacho = CountingTacho(TACHOS * (of.columns // RACK_FANS), 0.0, 0.0, np.random.default_rng([of.seed, 4]))
@@ -159,7 +175,7 @@ class _Course:
         duty, before, after, shown_from_s, missing = (np.empty(shape) for _ in range(5))
         for row in range(shape[0]):
             start_s = self._step * STEP_S
-            duty[row] = self._of.thermostat.command(start_s)
+            duty[row] = swept_duty(start_s) if self._is_swept else self._of.thermostat.command(start_s)
             self._set_faults(start_s)
             missing[row] = self._missing
             before[row] = self._tacho.reading_rad_s

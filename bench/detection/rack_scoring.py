@@ -1,0 +1,150 @@
+"""A simulated rack as its user has it: twin by `fantwin train`, limits by `fantwin calibrate`, `replay --offline`.
+
+The functions of these commands are called, with their defaults and the options of docs/tutorial/own-fan.md. The other
+methods see the same predictions and get their limits from the same recordings.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.detection.competitors import plain_methods
+from bench.detection.methods import Calibration, Log, Method
+from bench.detection.metrics import RaisedAlarm
+from bench.detection.rack_recordings import RackData
+from pipeline.cli.twins.calibrate import calibrate
+from pipeline.cli.twins.train import train
+from pipeline.replay.offline.replay_input import open_replay_input
+from schemas.messages import Alarm, InvalidReason, Message, Prediction, Score
+
+DECLARED_PER_DAY = 1.0
+"""false alarms of a fan"""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """An alarm from raised to cleared. cleared_ns: None if it stood at the end."""
+
+    fan: int
+    raised_ns: int
+    cleared_ns: int | None
+    statistic: str
+    message: str
+    first_cause: str
+    """the most probable when causes were first reported"""
+    last_cause: str
+    """the most probable when they were last reported"""
+
+
+@dataclass
+class Judged:
+    """What all methods made of one run of a rack."""
+
+    fan_hours: float = 0.0
+    """judged by the scorer"""
+    not_judged_hours: dict[str, float] = field(default_factory=dict)
+    ours: list[Episode] = field(default_factory=list)
+    others: dict[str, list[RaisedAlarm]] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+def trained(data: RackData, rack: int, twin: Path) -> None:
+    """Write the twin of a rack, trained on its sweep and evaluated on five minutes under the thermostat."""
+    with _quietly(twin.with_suffix(".train.txt")):
+        train([data.sweep(rack)], twin, validate=data.learning("15 minutes", rack)[:1])
+
+
+def calibrated(data: RackData, rack: int, learning: str, twin: Path, output: Path) -> None:
+    """Write the twin with limits from the recordings to learn from; extrapolated where they cannot support the rate.
+
+    Raises:
+        UserError: the recordings do not suffice.
+    """
+    with _quietly(output.with_suffix(".calibrate.txt")):
+        healthy = data.learning(learning, rack)
+        calibrate(twin, healthy, DECLARED_PER_DAY, extrapolate=learning == "15 minutes", output=output)
+
+
+@contextmanager
+def _quietly(log: Path) -> Iterator[None]:
+    """What a command prints goes to a file."""
+    with log.open("w") as file, redirect_stdout(file), redirect_stderr(file):
+        yield
+
+
+def other_methods(data: RackData, rack: int, learning: str, twin: Path) -> list[Method]:
+    """The plain methods, with limits from the recordings that the twin is calibrated on."""
+    methods = plain_methods(data.rate_hz, DECLARED_PER_DAY / 24.0)
+    for method in methods:
+        if method.is_fixed:
+            continue
+        calibration = Calibration(DECLARED_PER_DAY / 24.0)
+        for path in data.learning(learning, rack):
+            scores: Any = None
+            for block in _predictions(path, twin):
+                scores = scores or method.scores(block.fans)
+                calibration.take(path.name, block, scores.take(block))
+        method.limit = calibration.limit()
+    return methods
+
+
+def _predictions(path: Path, twin: Path) -> Iterator[Prediction]:
+    with open_replay_input([path], None, (), twin) as replay_input:
+        yield from replay_input.pipeline(replay_input.trays[0].name).predictions()
+
+
+def judged(path: Path, twin: Path, run: str, methods: list[Method]) -> Judged:
+    """A recording scored as by `fantwin replay --offline`, and by other methods on the same predictions."""
+    began_s = time.monotonic()
+    found = Judged()
+    detectors: dict[str, Any] = {}
+    logs = {method.name: Log() for method in methods}
+    alarms: list[Alarm] = []
+    reasons: dict[int, int] = {}
+    period_s = 0.0
+
+    def observe(message: Message) -> None:
+        if isinstance(message, Prediction):
+            for method in methods:
+                detector = detectors.setdefault(method.name, method.detector(message.fans))
+                logs[method.name].take(run, detector.take(message).changes)
+
+    with open_replay_input([path], None, (), twin) as replay_input:
+        for replayed in replay_input.pipeline(replay_input.trays[0].name, observe=observe).run():
+            message = replayed.message
+            if isinstance(message, Alarm):
+                alarms.append(message)
+            elif isinstance(message, Score):
+                period_s = message.period_ns / 1e9
+                for reason, count in zip(*np.unique(message.invalid_reason, return_counts=True), strict=True):
+                    reasons[int(reason)] = reasons.get(int(reason), 0) + int(count)
+    hours = {InvalidReason(code).name.lower(): count * period_s / 3600 for code, count in reasons.items()}
+    found.fan_hours = hours.pop("none", 0.0)
+    found.not_judged_hours = hours
+    found.ours = episodes(alarms)
+    found.others = {name: log.alarms for name, log in logs.items()}
+    found.seconds = time.monotonic() - began_s
+    return found
+
+
+def episodes(alarms: list[Alarm]) -> list[Episode]:
+    """Alarms from raised to cleared, of one run, in the order in which they were raised."""
+    done: list[Episode] = []
+    standing: dict[int, Episode] = {}
+    for alarm in sorted(alarms, key=lambda one: one.t_ns):
+        cause = max(alarm.causes, key=lambda one: one.probability).cause if alarm.causes else ""
+        now = standing.get(alarm.fan)
+        if alarm.active:
+            if now is None:
+                now = Episode(alarm.fan, alarm.t_ns, None, alarm.statistic.name.lower(), alarm.message, "", "")
+            standing[alarm.fan] = replace(now, first_cause=now.first_cause or cause, last_cause=cause or now.last_cause)
+        elif now is not None:
+            done.append(replace(standing.pop(alarm.fan), cleared_ns=alarm.t_ns))
+    return sorted([*done, *standing.values()], key=lambda one: (one.raised_ns, one.fan))
