@@ -7,7 +7,7 @@ methods see the same predictions and get their limits from the same recordings.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from bench.detection.campaigns import calibrate as set_limits
 from bench.detection.competitors import plain_methods
-from bench.detection.methods import Calibration, Log, Method
+from bench.detection.methods import Log, Method
 from bench.detection.metrics import RaisedAlarm
 from bench.detection.rack_recordings import RackData
 from pipeline.cli.twins.calibrate import calibrate
@@ -24,6 +25,7 @@ from pipeline.cli.twins.train import train
 from pipeline.replay.offline.replay_input import open_replay_input
 from schemas.messages import Alarm, InvalidReason, Message, Prediction, Score
 
+CANNOT_TELL = "cannot_tell"
 DECLARED_PER_DAY = 1.0
 """false alarms of a fan"""
 
@@ -38,9 +40,9 @@ class Episode:
     statistic: str
     message: str
     first_cause: str
-    """the most probable when causes were first reported"""
+    """the most probable when any was first named: other than `cannot_tell`"""
     last_cause: str
-    """the most probable when they were last reported"""
+    """the most probable when causes were last reported; may be `cannot_tell`"""
 
 
 @dataclass
@@ -82,25 +84,18 @@ def _quietly(log: Path) -> Iterator[None]:
 def other_methods(data: RackData, rack: int, learning: str, twin: Path) -> list[Method]:
     """The plain methods, with limits from the recordings that the twin is calibrated on."""
     methods = plain_methods(data.rate_hz, DECLARED_PER_DAY / 24.0)
-    for method in methods:
-        if method.is_fixed:
-            continue
-        calibration = Calibration(DECLARED_PER_DAY / 24.0)
-        for path in data.learning(learning, rack):
-            scores: Any = None
-            for block in _predictions(path, twin):
-                scores = scores or method.scores(block.fans)
-                calibration.take(path.name, block, scores.take(block))
-        method.limit = calibration.limit()
+    set_limits(methods, _predictions(data.learning(learning, rack), twin), DECLARED_PER_DAY / 24.0)
     return methods
 
 
-def _predictions(path: Path, twin: Path) -> Iterator[Prediction]:
-    with open_replay_input([path], None, (), twin) as replay_input:
-        yield from replay_input.pipeline(replay_input.trays[0].name).predictions()
+def _predictions(paths: Sequence[Path], twin: Path) -> Iterator[tuple[str, Prediction]]:
+    for path in paths:
+        with open_replay_input([path], None, (), twin) as replay_input:
+            for block in replay_input.pipeline(replay_input.trays[0].name).predictions():
+                yield path.stem, block
 
 
-def judged(path: Path, twin: Path, run: str, methods: list[Method]) -> Judged:
+def judged(path: Path, twin: Path, methods: list[Method]) -> Judged:
     """A recording scored as by `fantwin replay --offline`, and by other methods on the same predictions."""
     began_s = time.monotonic()
     found = Judged()
@@ -114,7 +109,7 @@ def judged(path: Path, twin: Path, run: str, methods: list[Method]) -> Judged:
         if isinstance(message, Prediction):
             for method in methods:
                 detector = detectors.setdefault(method.name, method.detector(message.fans))
-                logs[method.name].take(run, detector.take(message).changes)
+                logs[method.name].take(path.stem, detector.take(message).changes)
 
     with open_replay_input([path], None, (), twin) as replay_input:
         for replayed in replay_input.pipeline(replay_input.trays[0].name, observe=observe).run():
@@ -144,7 +139,8 @@ def episodes(alarms: list[Alarm]) -> list[Episode]:
         if alarm.active:
             if now is None:
                 now = Episode(alarm.fan, alarm.t_ns, None, alarm.statistic.name.lower(), alarm.message, "", "")
-            standing[alarm.fan] = replace(now, first_cause=now.first_cause or cause, last_cause=cause or now.last_cause)
+            named = "" if cause == CANNOT_TELL else cause
+            standing[alarm.fan] = replace(now, first_cause=now.first_cause or named, last_cause=cause or now.last_cause)
         elif now is not None:
             done.append(replace(standing.pop(alarm.fan), cleared_ns=alarm.t_ns))
     return sorted([*done, *standing.values()], key=lambda one: (one.raised_ns, one.fan))

@@ -2,8 +2,9 @@
 
 Simulated: 200 fans that differ, days that differ, twins learned from data; limits for one false alarm of a fan in 30
 days, all set on the same healthy runs; then other healthy days, and five strengths of each kind of fault, in open loop
-and under a speed loop. Measured: the rosa rig, by the public commands, limits and twins from healthy runs alone. Every
-figure is of runs that nothing was learned from.
+and under a speed loop. Racks: simulated 4-pin fans with counting tachos under a thermostat; each rack is learned and
+judged by the documented commands, beside what its tachos can show at all. Measured: the rosa rig, by the public
+commands, limits and twins from healthy runs alone. Every figure is of runs that nothing was learned from.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ import typer
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.detection.measured import measured_tables
+from bench.detection.rack_recordings import LEARNING, RackData
+from bench.detection.rack_tables import RACK_NOTES, rack_tables
+from bench.detection.racks import RATES_HZ
 from bench.detection.simulated_tables import (
     Sizes,
     cause_rows,
@@ -33,7 +37,9 @@ from scoring.calibration.calibration import TooLittleError
 
 
 def main(
-    only: Annotated[str, typer.Option(help="simulated or measured; without it, both.")] = "",
+    only: Annotated[
+        str, typer.Option(help="simulated, measured or rack; without it, the first two: racks take hours.")
+    ] = "",
     fans: Annotated[int, typer.Option(help="Simulated fans, in trays of 50.")] = 200,
     declared_days: Annotated[float, typer.Option(help="Declared time between false alarms of a fan, in days.")] = 30.0,
     calibration_days: Annotated[float, typer.Option(help="Healthy fan-days to calibrate on.")] = 25.0,
@@ -51,17 +57,40 @@ def main(
     ] = True,
     libraries: Annotated[bool, typer.Option(help="PyOD and river as well.")] = True,
     seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
+    racks: Annotated[int, typer.Option(help="Simulated racks of four fans.")] = 50,
+    judged: Annotated[int, typer.Option(help="Only the first so many of them learn and are judged; 0 for all.")] = 0,
+    healthy_racks: Annotated[int, typer.Option(help="So many are judged without faults, too; -1 for all.")] = -1,
+    report_hz: Annotated[
+        list[float] | None, typer.Option(help="Reports of the racks a second; repeatable. Default: 2, 10 and 100.")
+    ] = None,
+    learn: Annotated[
+        list[str] | None, typer.Option(help='"15 minutes" or "three nights"; repeatable. Default: both.')
+    ] = None,
+    test_hours: Annotated[
+        float, typer.Option(help="Length of the test of a rack; a fault lasts a 24th of it, clogging grows in 180 s.")
+    ] = 24.0,
+    keep: Annotated[
+        Path | None, typer.Option(help="Folder for recordings, twins and results of racks; what is there is not made.")
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Processes that learn and judge racks.")] = 2,
     json_output: JsonOption = False,
 ) -> None:
     """Print the tables of the simulated and of the measured part."""
     began_s = time.monotonic()
     tables: dict[str, list[dict[str, Any]]] = {}
     notes: list[str] = []
-    if only != "measured":
+    if only == "rack":
+        rates, amounts = report_hz or RATES_HZ, learn or list(LEARNING)
+        with tempfile.TemporaryDirectory() as folder:
+            for rate_hz in rates:
+                data = RackData(keep or Path(folder), racks, rate_hz, 3600.0 * test_hours, seed)
+                tables |= rack_tables(data, amounts, judged or racks, healthy_racks, workers, progress)
+        notes += RACK_NOTES
+    elif only != "measured":
         sizes = Sizes(fans, declared_days, calibration_days, healthy_days, runs, fault_runs, commissioned_s, seed)
         with tempfile.TemporaryDirectory() as folder:
             _simulated(Path(folder), sizes, extrapolate, others, others and libraries, tables, notes)
-    if only != "simulated":
+    if only not in ("simulated", "rack"):
         measured, reported = measured_tables(progress, libraries=libraries)
         tables |= measured
         notes += reported
