@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -14,7 +13,6 @@ from bench.detection.rack_recordings import FAULTY, HEALTHY, RackData
 from bench.detection.rack_scoring import Judged, calibrated, judged, other_methods, trained
 
 _JUDGED = TypeAdapter(Judged)
-NICENESS = 10
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,7 @@ def campaign(
     """
     data.make(learning, progress)
     done = []
-    with ProcessPoolExecutor(workers, initializer=os.nice, initargs=(NICENESS,)) as pool:
+    with ProcessPoolExecutor(workers) as pool:
         jobs = [pool.submit(one_rack, data, rack, learning, rack < healthy_racks) for rack in range(racks)]
         for job in as_completed(jobs):
             done += job.result()

@@ -2,10 +2,10 @@
 
 This reader knows the fan perfectly, the readings that it would have given without the fault, the fault, and when it may
 begin. He does not know the phase of the pulses in each count, nor how the speed wanders. Each new count that differs by
-D from the healthy one adds D^2 / variance, the variance being resolution^2 / 6 and that of the wandering; he can tell
-once the sum is the square of a deviation that the counts of a healthy fan exceed once a day. (That is the test of Neyman
-and Pearson at a power of one half; wandering that outlasts a count makes him slower.) Of missing readings each adds its
-log likelihood ratio; he can tell once the fault is likelier by as many times as there are counts in a day.
+D from the healthy one adds D^2 / variance, the variance being resolution^2 / 6 and that of the wandering. He can tell
+once the sum is the square of a deviation that a healthy fan's counts exceed once a day. (That is the test of Neyman and
+Pearson at a power of one half; wandering that outlasts a count makes him slower.) Of missing readings each adds its log
+likelihood ratio; he can tell once the fault is likelier by as many times as there are counts in a day.
 """
 
 from __future__ import annotations

@@ -27,7 +27,11 @@ METADATA = {
 }
 SHORT_S, NIGHT_S = 300.0, 8 * 3600.0
 SWEEP, HEALTHY, FAULTY = "sweep", "healthy", "faulty"
-LEARNING = {"15 minutes": ("minutes", SHORT_S, 2), "three nights": ("night", NIGHT_S, 3)}
+LEARNING = {
+    "15 minutes": ("minutes", SHORT_S, 2),
+    "one night": ("night", NIGHT_S, 1),
+    "three nights": ("night", NIGHT_S, 3),
+}
 """name, length and number of the recordings under the thermostat, besides five minutes of a sweep"""
 SEEDS = {SWEEP: 100, "minutes": 200, "night": 300, "test": 400}
 """of the commands and chances, apart; the fans are the same in all"""

@@ -20,7 +20,7 @@ import typer
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.detection.measured import measured_tables
-from bench.detection.rack_recordings import LEARNING, RackData
+from bench.detection.rack_recordings import RackData
 from bench.detection.rack_tables import RACK_NOTES, rack_tables
 from bench.detection.racks import RATES_HZ
 from bench.detection.simulated_tables import (
@@ -64,7 +64,8 @@ def main(
         list[float] | None, typer.Option(help="Reports of the racks a second; repeatable. Default: 2, 10 and 100.")
     ] = None,
     learn: Annotated[
-        list[str] | None, typer.Option(help='"15 minutes" or "three nights"; repeatable. Default: both.')
+        list[str] | None,
+        typer.Option(help="15 minutes, one night or three nights; repeatable. Default: the first and the last."),
     ] = None,
     test_hours: Annotated[
         float, typer.Option(help="Length of the test of a rack; a fault lasts a 24th of it, clogging grows in 180 s.")
@@ -80,7 +81,7 @@ def main(
     tables: dict[str, list[dict[str, Any]]] = {}
     notes: list[str] = []
     if only == "rack":
-        rates, amounts = report_hz or RATES_HZ, learn or list(LEARNING)
+        rates, amounts = report_hz or RATES_HZ, learn or ["15 minutes", "three nights"]
         with tempfile.TemporaryDirectory() as folder:
             for rate_hz in rates:
                 data = RackData(keep or Path(folder), racks, rate_hz, 3600.0 * test_hours, seed)
