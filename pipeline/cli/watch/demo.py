@@ -215,10 +215,14 @@ def _print_report(summary: Summary, out: Path, took_s: float, console: Console) 
         f"{summary.fans} fans, {summary.samples_sent} samples of the tray sent, {summary.samples_recorded} recorded, "
         f"{summary.lost} lost, {summary.false_alarms} false alarms; "
         f"sample to score {p50} (median), {p99} (p99); "
-        f"{took_s:.0f} s in all"
+        f"{took_s:.0f} s in all",
+        soft_wrap=True,
     )
     shown, programs = (Path(os.path.relpath(path)) for path in (out, Path(sys.executable).parent))
-    console.print(f"results: {shown / 'summary.json'} and {shown / 'recording.mcap'}")
-    console.print(f"picture: {shown / 'bands.png'}; interactive: {programs / 'rerun'} {shown / 'view.rrd'}")
+    for line in (
+        f"results: {shown / 'summary.json'} and {shown / 'recording.mcap'}",
+        f"picture: {shown / 'bands.png'}; interactive: {programs / 'rerun'} {shown / 'view.rrd'}",
+    ):
+        console.print(line, markup=False, soft_wrap=True)  # to be copied
     for problem in summary.problems:
         console.print(f"[bold red]PROBLEM:[/bold red] {problem}")

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from pipeline.cli.watch.demo import _print_report
 from pipeline.cli.watch.demo_report import SETTLING_NS, summarise
 from pipeline.errors import UserError
 from pipeline.recordings.writing import RecordingWriter
@@ -168,3 +171,11 @@ def test_the_parts_of_a_run_are_counted_together(tmp_path):
 def test_without_the_report_of_the_simulated_tray_there_is_no_summary(tmp_path):
     with pytest.raises(UserError, match="no report of the simulated tray"):
         summarise(tmp_path / "truth.json", [], {})
+
+
+def test_paths_that_are_to_be_copied_are_not_broken_into_lines(tmp_path):
+    narrow = StringIO()
+    _print_report(Run(tmp_path).summary(), tmp_path, 60.0, Console(file=narrow, width=40))
+    results, picture = narrow.getvalue().splitlines()[-2:]
+    assert results.startswith("results: ") and results.endswith("recording.mcap")
+    assert picture.startswith("picture: ") and picture.endswith("view.rrd")
