@@ -39,6 +39,8 @@ STATE_COLORS = {
     "alarm": "#d62020",
     "returning": "#ee8a4a",
     "commissioning": "#7aa7d8",
+    "stopped": "#5d6b7c",
+    "starting": "#3fb0b8",
 }
 UNKNOWN_COLOR = "#a9a9a9"
 

@@ -33,6 +33,8 @@ STATE_COLORS = {
     "alarm": (224, 36, 36),
     "returning": (232, 120, 60),
     "commissioning": (90, 140, 200),
+    "stopped": (70, 82, 104),
+    "starting": (40, 160, 170),
 }
 UNKNOWN_COLOR = (110, 110, 110)
 

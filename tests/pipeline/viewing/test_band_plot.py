@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -18,7 +19,7 @@ from pipeline.recordings.writing import RecordingWriter
 from pipeline.viewing import band_plot
 from pipeline.viewing.band_plot import Fault, plot_bands, plot_recording, read_trace
 from pipeline.viewing.trace import trace_of
-from schemas.messages import Alarm, Score
+from schemas.messages import Alarm, FanState, Score
 from schemas.topics import tray_key
 from tests.support.score_data import START_NS, made_up_tray
 
@@ -28,6 +29,23 @@ FAULT = Fault("covered-inlet", 2, START_NS + 8_000_000_000, START_NS + 14_000_00
 def test_the_fans_with_alarms_and_one_healthy_fan_are_drawn(tmp_path: Path) -> None:
     scores, _ = made_up_tray(fans=5, faulty_fan=3)
     assert plot_bands(trace_of("tray1", scores, "rpm"), tmp_path / "bands.png") == [0, 3]
+
+
+def test_a_fan_that_stands_all_the_time_has_its_state_in_the_legend() -> None:
+    scores, _ = made_up_tray(seconds=1, fans=1, faulty_fan=None, gap_fan=None)
+    stopped = np.full((10, 1), FanState.STOPPED, np.uint8)
+    trace = trace_of("tray1", [replace(score, state=stopped) for score in scores], "rpm")
+    figure = band_plot._figure(trace, [0], [])
+    assert figure.legends[1].get_texts()[0].get_text() == "state: stopped"
+
+
+def test_every_state_has_a_colour_of_its_own() -> None:
+    names = {state.words for state in FanState} - {FanState.UNKNOWN.words}
+    assert set(band_plot.STATE_COLORS) == names
+    assert len({*band_plot.STATE_COLORS.values(), band_plot.UNKNOWN_COLOR}) == len(names) + 1
+    layout = pytest.importorskip("pipeline.viewing.rerun_layout", exc_type=ModuleNotFoundError)
+    assert set(layout.STATE_COLORS) == names
+    assert len({*layout.STATE_COLORS.values(), layout.UNKNOWN_COLOR}) == len(names) + 1
 
 
 def test_without_alarms_one_fan_is_drawn(tmp_path: Path) -> None:
