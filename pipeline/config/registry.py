@@ -21,12 +21,14 @@ class StageRow:
         enabled_by: what enables it where `launcher.stages` is not given. "default": always; "section": a section
             `[name]` in the configuration.
         scope: one process for the site, or one for each tray.
+        may_drop: that of its declaration, for those who count losses and would wait long for its imports.
     """
 
     name: str
     declaration: str
     enabled_by: Literal["default", "section"] = "section"
     scope: Literal["site", "tray"] = "site"
+    may_drop: bool = False
 
     def load(self) -> Any:
         """Import the stage and return its declaration."""
@@ -42,6 +44,6 @@ STAGES: dict[str, StageRow] = {
         StageRow("twin_integrator", "stages.twin_integrator:STAGE", enabled_by="default"),
         StageRow("scorer", "stages.scorer:STAGE", enabled_by="default"),
         StageRow("recorder", "stages.recorder:STAGE", enabled_by="default"),
-        StageRow("viewer", "stages.viewer:STAGE", enabled_by="default"),
+        StageRow("viewer", "stages.viewer:STAGE", enabled_by="default", may_drop=True),
     )
 }

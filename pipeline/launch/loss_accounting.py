@@ -133,7 +133,7 @@ class _Site:
 def _lost(own: Sequence[_Session], site: _Site) -> int:
     """What one stage has lost, of which these are the sessions."""
     stage = own[-1].health.stage
-    if stage in STAGES and load_stage(stage).may_drop:
+    if stage in STAGES and STAGES[stage].may_drop:
         return sum(each.health.lost for each in own)
     all_runs = _runs(own)
     within = after = 0

@@ -180,6 +180,8 @@ def load_stage(name: str) -> Stage:
     Raises:
         KeyError: no such stage.
     """
-    stage = STAGES[name].load()
+    row = STAGES[name]
+    stage = row.load()
     assert isinstance(stage, Stage)
+    assert stage.may_drop == row.may_drop, f"stage {name!r}: may_drop of its row is {row.may_drop}"
     return stage

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 
 from pipeline.launch.loss_accounting import losses
@@ -145,6 +147,16 @@ def test_a_stage_is_due_only_what_it_reads():
     scorer, elsewhere = (health("s1", "scorer", 9), replace(health("a2", "acquisition", 9), instance="other"))
     found = losses([SENT, scorer, elsewhere], {*LAUNCHED, ("scorer", 1), ("acquisition/other", 2)})
     assert not any(found.values())
+
+
+def test_counting_losses_imports_no_stage():
+    """Its imports take seconds, in which no health is heard: `fantwin status` would call all stages silent."""
+    look = (
+        "import sys; from tests.pipeline.launch.test_loss_accounting import health, losses;"
+        "losses([health('s1', 'scorer', 1), health('v1', 'viewer', 1)]);"
+        "print([name for name in sys.modules if name == 'scipy' or name.startswith('stages.')])"
+    )
+    assert subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
 def test_a_stage_that_may_drop_is_due_nothing():
