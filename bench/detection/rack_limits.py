@@ -1,11 +1,11 @@
 """What a tacho can show at all: the shortest time in which anybody who reads it could tell that a fault is there.
 
-This reader knows the fan perfectly, the readings that it would have given without the fault, the fault, and when it may
-begin. He does not know the phase of the pulses in each count, nor how the speed wanders. Each new count that differs by
-D from the healthy one adds D^2 / variance, the variance being resolution^2 / 6 and that of the wandering. He can tell
-once the sum is the square of a deviation that a healthy fan's counts exceed once a day. (That is the test of Neyman and
-Pearson at a power of one half; wandering that outlasts a count makes him slower.) Of missing readings each adds its log
-likelihood ratio; he can tell once the fault is likelier by as many times as there are counts in a day.
+This reader knows the fan perfectly, the readings that it would have given without the fault, and the fault. He does
+not know the phases of the first and the last pulse, nor how the speed wanders. He adds up by how much the newest
+counts, as many as tell most, differ from the healthy ones; the variance of the sum is resolution^2 / 6 and, for each
+count, that of the wandering. He can tell once the sum is a deviation that the counts of a healthy fan exceed once a
+day. (Wandering that outlasts a count makes him slower.) Of missing readings each adds its log likelihood ratio; he
+can tell once the fault is likelier by as many times as there are counts in a day.
 """
 
 from __future__ import annotations
@@ -51,12 +51,24 @@ def information_limit_s(
         enough = math.log(counts_a_day)
     else:
         is_new = _is_new_count(t_s, healthy_rad_s, faulty_rad_s, tacho.held_s)
-        variance = tacho.resolution_rad_s**2 / 6.0 + np.square(WANDER * healthy_rad_s)
-        gained = np.square(faulty_rad_s - healthy_rad_s) / variance
-        evidence = np.cumsum(np.where(is_new & np.isfinite(gained), gained, 0.0))
+        differences = np.where(is_new, faulty_rad_s - healthy_rad_s, 0.0)
+        wandering = np.where(is_new, np.square(WANDER * healthy_rad_s), 0.0)
+        evidence = _best_sums(np.nan_to_num(differences), np.nan_to_num(wandering), tacho.resolution_rad_s**2 / 6.0)
         enough = float(norm.isf(0.5 / counts_a_day)) ** 2
     reached = np.flatnonzero(evidence >= enough)
     return float(t_s[reached[0]]) if len(reached) else math.nan
+
+
+def _best_sums(differences: Array, wandering: Array, of_phases: float) -> Array:
+    """(n,) the square of the sum of the newest differences over its variance, for as many as make it largest."""
+    sums, variances = np.cumsum(differences), np.cumsum(wandering)
+    before, variance_before = sums - differences, variances - wandering
+    return np.array(
+        [
+            np.max(np.square(sums[row] - before[: row + 1]) / (of_phases + variances[row] - variance_before[: row + 1]))
+            for row in range(len(sums))
+        ]
+    )
 
 
 def _is_new_count(t_s: Array, healthy: Array, faulty: Array, held_s: float) -> NDArray[np.bool_]:

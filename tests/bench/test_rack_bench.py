@@ -34,10 +34,10 @@ def readings(drop_rad_s: float) -> tuple[Array, Array, Array]:
     return t_s, healthy, np.where(t_s >= 0.4, healthy - drop_rad_s, healthy)
 
 
-@pytest.mark.parametrize(("drop_rad_s", "expected_s"), [(6.0, 0.4), (5.0, 1.4), (3.6, 2.4), (0.1, math.nan)])
+@pytest.mark.parametrize(("drop_rad_s", "expected_s"), [(6.0, 0.4), (5.0, 1.4), (2.0, 3.4), (0.1, math.nan)])
 def test_the_limit_of_a_count_is_as_worked_by_hand(drop_rad_s: float, expected_s: float) -> None:
-    # Variance of a count: (2 pi / 2)^2 / 6 + (0.003 * 100)^2 = 1.735. 86,400 counts a day: 4.39 sigma, squared 19.2.
-    # 6 rad/s add 20.7 at each count, 5 rad/s 14.4, 3.6 rad/s 7.5: one, two, and three counts.
+    # Variance of the sum of n counts: (2 pi / 2)^2 / 6 + n (0.003 * 100)^2 = 1.645 + 0.09 n. 86,400 counts a day: 4.39
+    # sigma, squared 19.2. One count of 6 rad/s: 20.7; of 5 rad/s: 14.4, two 54.8; of 2 rad/s three 18.8, four 31.9.
     limit_s = information_limit_s(*readings(drop_rad_s), COUNT)
     assert limit_s == pytest.approx(expected_s, nan_ok=True)
 
