@@ -38,7 +38,7 @@ from twin.report.steady_states import static_curve
 from twin.report.timeline import broken_at, kept_samples, timeline
 from twin.runs import Run
 
-SECTIONS = ["assessment", "figures", "parameters", "fan-0", "meaning", "card"]
+SECTIONS = ["assessment", "figures", "alarms", "parameters", "fan-0", "meaning", "card"]
 TITLES = [
     "Fit and error over time",
     "Around the largest error",
@@ -189,7 +189,7 @@ def test_ids_are_unique_and_every_reference_has_its_target(folder):
     assert len(parsed.ids) == len(set(parsed.ids))
     targets = {reference[1:] for reference in parsed.references} | set(re.findall(r"url\(#([^)]*)\)", text))
     assert targets <= set(parsed.ids)
-    assert parsed.sections == ["assessment", "figures", "parameters", "fan-0", "fan-1", "meaning", "card"]
+    assert parsed.sections == ["assessment", "figures", "alarms", "parameters", "fan-0", "fan-1", "meaning", "card"]
     assert set(parsed.numbers) > {"pooled", "row-0", "row-1"}
 
 
