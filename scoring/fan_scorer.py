@@ -46,6 +46,8 @@ class ScoredBlock:
     """schemas.messages.Statistic of the detector that the score is of"""
     commissioning: Array
     """valid, and no baseline yet"""
+    judged: Array
+    """scored, or stopped or starting and judged by whether it stands or turns as commanded"""
     speed_smoothed: Array
     speed_baseline: Array
     balance_smoothed: Array
@@ -133,6 +135,7 @@ class FanScorer:
             source: any(row.source == source and row.name in self.detectors for row in self._rows)
             for source in RESIDUALS
         }
+        self._judges_rest = any(row.only_at_rest and row.name in self.detectors for row in self._rows)
         self._statistics: Array = np.array([row.statistic for row in self._rows])
         self._motion = Motion(fans)
         self._movement = Movement(fans) if skips_transients else None
@@ -352,6 +355,7 @@ class FanScorer:
             score=np.where(has_score, score, np.nan),
             statistic=np.where(has_score, self._statistics[largest], Statistic.NONE).astype(np.uint8),
             commissioning=known & ~scored_now,
+            judged=has_score | (alive & block.idle[stretch] & self._judges_rest),
             speed_smoothed=np.where(speed.scored, speed.smoothed, np.nan),
             speed_baseline=speed.baseline,
             balance_smoothed=np.where(balance.scored, balance.smoothed, np.nan),

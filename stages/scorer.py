@@ -142,6 +142,7 @@ class ScorerCore(Core):
         self._text = AlarmText(speed_unit, twin.command_unit)
         self._forgets_over_gaps = decision_rules >= DecisionRules.TIME_AND_GAPS
         self._holds = decision_rules >= DecisionRules.HOLDING
+        self._judges_rest = decision_rules >= DecisionRules.STOPPED_AND_WORN
         self._scorer = self._new_scorer()
         self._settings = ConditionSettings(
             on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),
@@ -175,8 +176,12 @@ class ScorerCore(Core):
     def _start_new(self) -> None:
         self._sigma_rad_s = np.ones(self._fans)
         self._scorer = self._new_scorer()
-        twin, advice = self._twin, Advice(self._twin.command_unit) if self._holds else None
-        self._diagnoser = Diagnoser(twin.balances, advice, twin.tachos, twin.standstill)
+        twin = self._twin
+        lowest_command = twin.standstill.turning_command if twin.standstill and self._judges_rest else 0.0
+        advice = Advice(twin.command_unit, lowest_command) if self._holds else None
+        self._diagnoser = Diagnoser(
+            twin.balances, advice, twin.tachos, twin.standstill, knows_readings=self._judges_rest
+        )
         self._wear = WearMonitor(
             self._twin.balances, self._diagnoser, self._config.wear_every_s, self._twin.command_unit
         )
@@ -204,6 +209,7 @@ class ScorerCore(Core):
                 row.name,
                 off_delay_ns=round(max(self._config.off_delay_s, detector.off_delay_s if detector else 0.0) * NS_PER_S),
                 grows_with_speed=row.source != "tacho",
+                is_certain=not row.only_at_rest and (detector is not None or not self._judges_rest),
             )
             for row, detector in zip(rows(), detectors.values(), strict=True)
         )
@@ -411,10 +417,10 @@ class ScorerCore(Core):
         states: list[Array] = []
         events: list[AlarmEvent] = []
         for rows_of, part in self._scorer.stretches(samples_of(item)):
-            valid = np.isfinite(part.score)
             was_active = self._alarms.active
+            ratio = np.where(part.judged & np.isnan(part.score), 0.0, part.score)
             state, happened = self._alarms.update(
-                item.t_ns[rows_of], item.period_ns, part.score, valid, part.ratios, speed[rows_of]
+                item.t_ns[rows_of], item.period_ns, ratio, part.judged, part.ratios, speed[rows_of]
             )
             if self._holds:
                 in_alarm = was_active | self._alarms.active | np.isin(state, IN_ALARM).any(axis=0)
@@ -435,6 +441,7 @@ class ScorerCore(Core):
             scored.balance_baseline * item.torque_balance_sigma_command,
             scored.balance_baseline_s,
             expected * item.torque_balance_sigma_command,
+            item.predicted_speed_rad_s,
         )
 
     def _feed_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:
@@ -515,7 +522,10 @@ def build(context: Context) -> BuiltStage:
 
 
 def limits_in_force(
-    config: ScorerConfig, calibration: Mapping[str, Any] | None, standstill: Standstill | None = None
+    config: ScorerConfig,
+    calibration: Mapping[str, Any] | None,
+    standstill: Standstill | None = None,
+    decision_rules: DecisionRules = CURRENT_RULES,
 ) -> Limits:
     """The limits of a twin's card, or those of a twin without calibration, with the scorer's settings applied.
 
@@ -526,24 +536,29 @@ def limits_in_force(
     """
     if calibration is None:
         limits = uncalibrated(config.alarm_sigmas, config.timing(Timing()))
-        return _with_standstill(limits, standstill).times(config.limit_factor)
-    limits = _with_standstill(Limits.model_validate(calibration), standstill)
+        return _with_standstill(limits, standstill, decision_rules).times(config.limit_factor)
+    limits = _with_standstill(Limits.model_validate(calibration), standstill, decision_rules)
     timing = config.timing(limits.timing)
     declared_rate = limits.declared_rate if timing == limits.timing else None  # it holds for the calibrated times
     return limits.model_copy(update={"timing": timing, "declared_rate": declared_rate}).times(config.limit_factor)
 
 
-def _with_standstill(limits: Limits, standstill: Standstill | None) -> Limits:
+def _with_standstill(limits: Limits, standstill: Standstill | None, decision_rules: DecisionRules) -> Limits:
     if standstill is None:
         return limits
-    settings = StandstillSettings(healthy=standstill)
-    return limits.model_copy(update={"detectors": {**limits.detectors, "standstill": settings}})
+    settings = {"standstill": StandstillSettings(healthy=standstill, watches="both")}
+    if decision_rules >= DecisionRules.STOPPED_AND_WORN:
+        settings = {
+            "standstill": StandstillSettings(healthy=standstill, watches="driven"),
+            "running_on": StandstillSettings(healthy=standstill, watches="stopped"),
+        }
+    return limits.model_copy(update={"detectors": {**limits.detectors, **settings}})
 
 
 def _healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
     again = "calibrate it again: fantwin calibrate"
     try:
-        limits = limits_in_force(context.config, twin.card.calibration, twin.card.standstill)
+        limits = limits_in_force(context.config, twin.card.calibration, twin.card.standstill, context.decision_rules)
     except ValidationError as error:
         first = error.errors()[0]
         why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"

@@ -29,6 +29,10 @@ class DecisionRules(IntEnum):
     probable causes are not listed, and a diagnosis that says nothing new is not sent."""
     FIRST_DELAY = 6
     """Times of a line begin with the smallest delay of its first second, not with that of its first sample."""
+    STOPPED_AND_WORN = 7
+    """A fan that stands as commanded is judged: its alarm keeps its data, and an alarm of a fan that turned although it
+    was stopped returns. A baseline follows no faster than healthy fans drift. The torque balance is not used at the
+    lowest speed of a driven fan. Causes account for what the tacho resolves."""
 
 
 CURRENT_RULES = max(DecisionRules)

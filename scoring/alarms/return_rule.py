@@ -29,6 +29,8 @@ class HoldingDetector:
     off_delay_ns: int
     grows_with_speed: bool
     """whether the same fault is larger at a higher speed: of a residual, not of the tacho"""
+    is_certain: bool = True
+    """whether it is in use and a fan that turns shows its return; False: it holds no alarm that it did not raise"""
 
 
 @dataclass(frozen=True)
@@ -112,8 +114,8 @@ class AlarmReturn:
             hold.ratio_per_rad_s = LARGEST
 
     def hold_by_all(self) -> None:
-        """Every detector holds the alarm: of one that a former version raised, it is not known which did."""
-        self._holds = {detector.name: _Hold(LARGEST) for detector in self._detectors}
+        """Every detector that may holds the alarm: of one that a former version raised, it is not known which did."""
+        self._holds = {detector.name: _Hold(LARGEST) for detector in self._detectors if detector.is_certain}
 
     def snapshot(self) -> dict[str, Any]:
         """The state, as JSON values."""

@@ -202,3 +202,5 @@ class DetectorRow:
     detector: type[Detector]
     comes_first: bool = False
     """above its limit it is reported before all others, however far they exceed theirs: it says what is wrong"""
+    only_at_rest: bool = False
+    """it has a ratio only while the command stops the fan"""

@@ -4,12 +4,15 @@ It needs no prediction: what commands do to healthy fans, and how long starts an
 (schemas.standstill). While a fan starts it may read as standing for three times the longest healthy start. Once it has
 turned, only lapses of its tacho explain a reading of a fan that stands. A tacho that gives no reading may not be read
 for its reach and `MISSING_S` more.
+
+There are two detectors, of fans that are driven and of fans that are stopped, so that an alarm returns by what could
+show its fault: each has no ratio (NaN) where the fan could not show that it does as commanded.
 """
 
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -35,6 +38,10 @@ class StandstillSettings(DetectorSettings):
     rule: ClassVar[LimitRule] = LimitRule.GIVEN
     healthy: Standstill = Field(description="how healthy fans stop, stand and start")
     factor: float = Field(default=1.0, gt=0, description="multiplies the times")
+    watches: Literal["driven", "stopped", "both"] = Field(
+        default="driven",
+        description="fans that are driven or stopped; both: with a ratio everywhere, as in earlier recordings",
+    )
 
     @classmethod
     def unreached(cls) -> StandstillSettings:
@@ -53,6 +60,7 @@ class StandstillDetector(Detector):
 
     def __init__(self, settings: StandstillSettings, context: DetectorContext) -> None:
         self._healthy = healthy = settings.healthy
+        self._watches = settings.watches
         reach_s = np.array([tacho.reach_s for tacho in context.tachos])
         known_start = healthy.start_s is not None
         least_s = MIN_MOVE_S + reach_s
@@ -81,9 +89,15 @@ class StandstillDetector(Detector):
         silent = count.of(drives & ~known, ~drives | known, self._silent_ns)
         ran_on = count.of(stops & turns, ~stops | (known & ~turns), self._ran_on_ns)
         limit_s = np.where(turned > 0, self._lapse_limit_s, self._start_limit_s)
-        ratios = (stood / limit_s, silent / self._missing_limit_s, ran_on / self._coast_limit_s)
-        ratio = np.maximum.reduce(ratios) / NS_PER_S
-        return np.where(ratio > 1.0, CERTAIN * ratio, ratio)
+        of_driven = np.maximum(stood / limit_s, silent / self._missing_limit_s) / NS_PER_S
+        of_stopped = ran_on / self._coast_limit_s / NS_PER_S
+        if self._watches == "both":
+            ratio = np.maximum(of_driven, of_stopped)
+            return np.where(ratio > 1.0, CERTAIN * ratio, ratio)
+        ratio, obeys = (
+            (of_driven, drives & turns) if self._watches == "driven" else (of_stopped, stops & known & ~turns)
+        )
+        return np.where(ratio > 1.0, CERTAIN * ratio, np.where(obeys, 0.0, np.nan))
 
     def reset(self, fans: Array) -> None:
         """See Detector."""

@@ -19,6 +19,7 @@ DETECTORS = (
     DetectorRow("balance_variance_growth", Statistic.BALANCE_VARIANCE_GROWTH, "balance", VarianceGrowth),
     DetectorRow("sensor", Statistic.SENSOR, "tacho", Tacho),
     DetectorRow("standstill", Statistic.STANDSTILL, "tacho", StandstillDetector, comes_first=True),
+    DetectorRow("running_on", Statistic.STANDSTILL, "tacho", StandstillDetector, comes_first=True, only_at_rest=True),
 )
 
 

@@ -36,6 +36,12 @@ STUCK_MARGIN, MIN_STUCK_S = 3.0, 2.0  # times the longest repetition of healthy 
 MISSING_MARGIN, MIN_MISSING_SHARE, MAX_MISSING_SHARE = 3.0, 0.25, 0.9  # times the largest share of healthy runs
 
 
+def moved(expected_rad_s: Array, first_rad_s: Array | float, resolution_rad_s: Array | float) -> Array:
+    """Where a healthy fan would read something else than at first, by more than its tacho resolves; all rad/s."""
+    least = np.maximum(MOVED_STEPS * resolution_rad_s, MOVED_SHARE * np.abs(first_rad_s))
+    return np.asarray(np.abs(expected_rad_s - first_rad_s) > least)
+
+
 class TachoSettings(DetectorSettings):
     """Of Sensor."""
 
@@ -103,8 +109,7 @@ class Tacho(Detector):
         if self._holds.any():
             first = np.take_along_axis(predicted_rad_s, np.maximum(changed - 1, 0), axis=0)
             first = np.where(changed == 0, self._healthy_rad_s, first)
-            least = np.maximum(MOVED_STEPS * self._resolution_rad_s, MOVED_SHARE * np.abs(first))
-            counted = same & (~self._holds | (np.abs(predicted_rad_s - first) > least))
+            counted = same & (~self._holds | moved(predicted_rad_s, first, self._resolution_rad_s))
             self._healthy_rad_s = first[-1].copy()
         total = np.cumsum(counted, axis=0) * period_ns
         at_change = np.maximum.accumulate(np.where(same, 0, total), axis=0)

@@ -28,6 +28,8 @@ class Advice:
     """Writes advice in the unit of the command; empty where the twin does not name it."""
 
     command_unit: str = ""
+    lowest_command: float = 0.0
+    """the lowest one that turns a healthy fan: none below it is advised"""
 
     def added_to(self, unclear: str, window: Window, healthy: HealthyBalance) -> str:
         """Why the cause is unclear, with what would tell."""
@@ -42,14 +44,13 @@ class Advice:
         if high <= healthy.lowest_speed_rad_s:
             if abs(now) > abs(_needed(healthy, window, MIN_SPEEDS * healthy.lowest_speed_rad_s)):
                 return f"{unclear}: at {self._of(now)} it should turn: see whether it is free to turn and has power"
-            target = _needed(healthy, window, 2.0 * MIN_SPEEDS * healthy.lowest_speed_rad_s)
+            target = max(_needed(healthy, window, 2.0 * MIN_SPEEDS * healthy.lowest_speed_rad_s), self.lowest_command)
             return f"{unclear}: it hardly turns: move the command to {self._of(target)}"
-        slower = SLOWER * low >= MIN_SPEEDS * healthy.lowest_speed_rad_s
-        target = SLOWER * low if slower else FASTER * high
-        reference = low if slower else high
-        share = _needed(healthy, window, target) / _needed(healthy, window, reference)
-        at_reference = float(np.quantile(given, QUANTILES[0] if slower else QUANTILES[1]))
-        return f"{unclear}: move the command to {self._of(at_reference * share)} for ten seconds, and back"
+        lowest, highest = (float(np.quantile(given, q)) for q in QUANTILES)
+        command = lowest * _needed(healthy, window, SLOWER * low) / _needed(healthy, window, low)
+        if SLOWER * low < MIN_SPEEDS * healthy.lowest_speed_rad_s or command < self.lowest_command:
+            command = highest * _needed(healthy, window, FASTER * high) / _needed(healthy, window, high)
+        return f"{unclear}: move the command to {self._of(command)} for ten seconds, and back"
 
     def _of(self, command: float) -> str:
         size = abs(command)

@@ -38,6 +38,7 @@ class _Block:
     offset_command: Array
     offset_s: Array
     expected_command: Array
+    expected_rad_s: Array
 
 
 class Diagnoser:
@@ -49,14 +50,18 @@ class Diagnoser:
         advice: Advice | None = ADVICE,
         tachos: Sequence[Tacho] = INSTANTANEOUS,
         standstill: Standstill | None = None,
+        *,
+        knows_readings: bool = True,
     ) -> None:
         """advice: None only to diagnose as for recordings made before there was any; see `diagnose`. standstill: None
-        where the detector of it is not used.
+        where the detector of it is not used. knows_readings: False only to diagnose as for recordings made before
+        causes accounted for what a tacho resolves.
         """
         self._healthy = healthy
         self._advice = advice
         self._tachos = tacho_of_each_fan(tachos, len(healthy))
         self._standstill = standstill
+        self._knows_readings = knows_readings
         self._blocks: deque[_Block] = deque()
         self._period_ns = 0
         self._due: dict[int, list[int]] = {}
@@ -71,18 +76,22 @@ class Diagnoser:
         offset_command: Array,
         offset_s: Array | float = math.inf,
         expected_command: Array | float = 0.0,
+        expected_rad_s: Array | float = math.nan,
     ) -> None:
         """Store a block; t_ns (n,), the others (n, fans).
 
         command: NaN where unknown. offset_command: the fan's own offset of the torque balance. offset_s: seconds of
         healthy running from which the offset is known. expected_command: the expected healthy balance at
-        this speed, apart from the offset; NaN where the speed is unknown.
+        this speed, apart from the offset; NaN where the speed is unknown. expected_rad_s: what a healthy fan would
+        read.
         """
         if period_ns != self._period_ns:
             self._blocks.clear()
             self._period_ns = period_ns
-        offset_s, expected = (np.broadcast_to(one, offset_command.shape) for one in (offset_s, expected_command))
-        self._blocks.append(_Block(t_ns, command, speed_rad_s, offset_command, offset_s, expected))
+        offset_s, expected, reading = (
+            np.broadcast_to(one, offset_command.shape) for one in (offset_s, expected_command, expected_rad_s)
+        )
+        self._blocks.append(_Block(t_ns, command, speed_rad_s, offset_command, offset_s, expected, reading))
         oldest_t_ns = int(t_ns[0]) - min(round(WINDOW_S * NS_PER_S), MAX_SAMPLES * period_ns)
         while int(self._blocks[0].t_ns[-1]) < oldest_t_ns:
             self._blocks.popleft()
@@ -111,7 +120,8 @@ class Diagnoser:
         window = self.window(fan, t_ns, self._onset_t_ns.get(fan, t_ns))
         if window is None:
             return ()
-        causes = diagnose(window, self._healthy[fan], self._advice).causes
+        tacho = self._tachos[fan] if self._knows_readings else None
+        causes = diagnose(window, self._healthy[fan], self._advice, tacho).causes
         least = FORMER_MIN_PROBABILITY if self._advice is None else min(MIN_PROBABILITY, causes[0].probability)
         return tuple(_message(cause) for cause in causes if cause.probability >= least)
 
@@ -126,7 +136,9 @@ class Diagnoser:
         window = self.window(fan, t_ns, self._onset_t_ns.get(fan, t_ns))
         if window is None or self._standstill is None:
             return ()
-        causes = standstill_causes(window, self._standstill, self._healthy[fan], self._tachos[fan])
+        causes = standstill_causes(
+            window, self._standstill, self._healthy[fan], self._tachos[fan], by_course=self._knows_readings
+        )
         return tuple(_message(cause) for cause in causes if cause.probability >= MIN_PROBABILITY)
 
     def snapshot(self) -> dict[str, Any]:
@@ -161,10 +173,11 @@ class Diagnoser:
         index = np.rint((times - times[0]) / self._period_ns).astype(int)
         if index[-1] < 1:
             return None
-        command, speed, expected = np.full((3, index[-1] + 1), np.nan)
+        command, speed, expected, reading = np.full((4, index[-1] + 1), np.nan)
         command[index] = _column(blocks, "command", fan, rows)
         speed[index] = _column(blocks, "speed_rad_s", fan, rows)
         expected[index] = _column(blocks, "expected_command", fan, rows)
+        reading[index] = _column(blocks, "expected_rad_s", fan, rows)
         for values in (command, speed):
             values[np.abs(values) > MAX_VALUE] = np.nan
         healthy, period_s = self._healthy[fan], self._period_ns / NS_PER_S
@@ -177,6 +190,7 @@ class Diagnoser:
             speed_rad_s=speed,
             onset=int(index[min(onset, len(index) - 1)]),
             expected_command=expected,
+            expected_rad_s=reading,
             fan_offset=float(_column(blocks, "offset_command", fan, rows)[-1]),
             fan_offset_std_error=std_of_one_second / math.sqrt(offset_s),
         )

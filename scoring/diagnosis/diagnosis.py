@@ -18,10 +18,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from schemas.tacho import Tacho
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.hypotheses import CAUSES, Comparison, Explanation, log_sum
 from scoring.diagnosis.regression_window import Array, HealthyBalance, RegressionWindow, Window
-from scoring.diagnosis.sensor_evidence import dropout_log_ratio, stuck_log_ratio
+from scoring.diagnosis.sensor_evidence import dropout_log_ratio, stuck_log_ratio, stuck_log_ratio_of_readings
 
 CANNOT_TELL, STUCK, DROPOUT = "cannot_tell", "sensor_stuck", "sensor_dropout"
 CANNOT_TELL_YET = "cannot tell yet"
@@ -71,11 +72,14 @@ class Diagnosis:
         return self.causes[0]
 
 
-def diagnose(window: Window, healthy: HealthyBalance, advice: Advice | None = ADVICE) -> Diagnosis:
+def diagnose(
+    window: Window, healthy: HealthyBalance, advice: Advice | None = ADVICE, tacho: Tacho | None = None
+) -> Diagnosis:
     """Diagnose one fan from its last seconds, some before the onset of the fault and all since.
 
     advice: on what would show the cause, where it is unclear; None only to diagnose as for recordings made before there
-    was any. Missing readings then counted from the onset of the alarm, not from the first of them.
+    was any. Missing readings then counted from the onset of the alarm, not from the first of them. tacho: None where
+    each sample is a reading of its own, and for recordings made before it was accounted for.
 
     About three seconds of health before the onset are enough; the samples after it decide. The diagnosis can be
     repeated as samples arrive. It takes milliseconds.
@@ -83,7 +87,11 @@ def diagnose(window: Window, healthy: HealthyBalance, advice: Advice | None = AD
     heard = np.isfinite(window.command)  # where the command is missing too, the line was silent and not the sensor
     speed, onset = window.speed_rad_s[heard], int(np.count_nonzero(heard[: window.onset]))
     regression = RegressionWindow(window, healthy)
-    stuck, repeats = stuck_log_ratio(speed, onset)
+    if tacho is None or tacho.kind == "instantaneous":
+        stuck, repeats = stuck_log_ratio(speed, onset)
+    else:
+        expected = np.broadcast_to(window.expected_rad_s, window.speed_rad_s.shape)[heard]
+        stuck, repeats = stuck_log_ratio_of_readings(speed, expected, onset, tacho, window.period_s)
     dropout_onset = onset if advice is None else _first_missing(speed, onset, window.period_s)
     dropout, missing = dropout_log_ratio(speed, dropout_onset)
     enough = len(regression.speeds_after) * window.period_s >= MIN_AFTER_ONSET_S

@@ -23,6 +23,7 @@ therefore has a column, scaled by its standard deviation.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -76,7 +77,8 @@ class Window:
 
     onset: index of the first anomalous sample, as the detector found it. fan_offset: balance of this fan when healthy,
     from commissioning, and its standard error. expected_command: (n,) healthy balance expected at each speed, apart
-    from the offset, from calibration; NaN where the speed is unknown. All in units of the command.
+    from the offset, from calibration; NaN where the speed is unknown. All in units of the command. expected_rad_s: (n,)
+    what a healthy fan would read; NaN where it is not known.
     """
 
     period_s: float
@@ -86,6 +88,7 @@ class Window:
     fan_offset: float = 0.0
     fan_offset_std_error: float = 0.0
     expected_command: Array | float = 0.0
+    expected_rad_s: Array | float = math.nan
 
 
 class RegressionWindow:

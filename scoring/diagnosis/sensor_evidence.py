@@ -3,7 +3,9 @@
 Stuck: from some sample on, each reading repeats the last exactly, up to now. A working sensor does so with the
 probability seen before (integrated out, as it is uncertain after a short time). Readings of zero count only if the
 sensor fell to zero within one sample: a rotor at standstill reads zero, too. The likelihood accounts for the free
-choice of the sample at which it stuck.
+choice of the sample at which it stuck. A tacho that shows a reading for a while repeats it, and so does one that
+counts pulses of a fan that runs evenly: of such a tacho whole readings count, and only those for which a healthy fan
+would read something else.
 
 Dropout: more readings are missing than before. All shares larger than the one before have the same prior probability
 (a binomial with its share integrated out).
@@ -14,6 +16,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import betaincc, betaln, xlog1py, xlogy
 
+from schemas.tacho import Tacho
+from scoring.detectors.tacho import moved
 from scoring.diagnosis.regression_window import Array
 
 MIN_REPEATS = 10
@@ -41,6 +45,26 @@ def stuck_log_ratio(speed_rad_s: Array, onset: int) -> tuple[float, int]:
     unseen = len(earlier) - seen + 2.0
     log_by_chance = betaln(seen + run, unseen) - betaln(seen, unseen)
     return float(-log_by_chance - np.log(len(repeats))), run
+
+
+def stuck_log_ratio_of_readings(
+    speed_rad_s: Array, expected_rad_s: Array, onset: int, tacho: Tacho, period_s: float
+) -> tuple[float, int]:
+    """As `stuck_log_ratio` for a tacho that shows each reading for a while. expected_rad_s: (n,) what it would read."""
+    changed = np.flatnonzero(np.diff(speed_rad_s) != 0.0)
+    last_change = int(changed[-1]) + 1 if changed.size else 0
+    run = len(speed_rad_s) - 1 - last_change
+    samples = max(1, round(tacho.held_s / period_s))
+    telling = np.count_nonzero(moved(expected_rad_s[last_change:], expected_rad_s[last_change], tacho.resolution_rad_s))
+    readings = telling // samples
+    if run < MIN_REPEATS or not readings or speed_rad_s[last_change] == 0.0:
+        return 0.0, 0
+    end = min(onset, last_change)
+    earlier = np.diff(speed_rad_s[: end if end >= MIN_EARLIER * samples else onset : samples]) == 0.0
+    seen = int(np.count_nonzero(earlier)) + 1.0
+    unseen = len(earlier) - seen + 2.0
+    log_by_chance = betaln(seen + readings, unseen) - betaln(seen, unseen)
+    return float(-log_by_chance - np.log(max(len(speed_rad_s) / samples, 1.0))), run
 
 
 def _fell(before_rad_s: Array) -> bool:

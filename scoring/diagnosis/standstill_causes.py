@@ -2,9 +2,9 @@
 
 A fan that loses its power coasts: from speed w its reading falls to that of a fan at rest in T log(w / w0), with the
 time constant T of healthy coasts. The reading of a blocked fan falls at once, and so does that of a fan whose tacho or
-whose whole connector is off. A tacho that averages blurs both by the time for which it holds a reading. How long the
-fall took is compared with either, as a normal likelihood; where the two are alike, as at low speeds, each cause keeps
-its prior probability. A fan that was never seen to turn under this command says nothing about the cause.
+whose whole connector is off. The course of the readings is compared with what the tacho would show of either, whenever
+the fall and the tacho's windows began. Where the data do not tell them apart, blocked and no power are about equally
+probable. A fan that was never seen to turn under this command says nothing about the cause.
 """
 
 from __future__ import annotations
@@ -20,14 +20,25 @@ from scoring.diagnosis.diagnosis import Evidence, RankedCause
 from scoring.diagnosis.regression_window import Array, HealthyBalance, Window
 from scoring.diagnosis.shown_causes import BLOCKED, NO_POWER, NO_TACHO, STILL_DRIVEN, WINDMILLING
 
-FELL_AT_ONCE = {BLOCKED: 0.5, NO_POWER: 0.05, NO_TACHO: 0.2}
+FELL_AT_ONCE = {BLOCKED: 0.4, NO_POWER: 0.04, NO_TACHO: 0.2}
 """prior probabilities of the faults after which the reading falls at once; no power: the connector is off"""
-COASTED = 0.25
+COASTED = 0.36
 """that of no power with the tacho alive"""
+FORMER_FELL_AT_ONCE, FORMER_COASTED = {BLOCKED: 0.5, NO_POWER: 0.05, NO_TACHO: 0.2}, 0.25
 NEVER_TURNED = {BLOCKED: 0.4, NO_POWER: 0.4, NO_TACHO: 0.2}
 NO_READING = {NO_TACHO: 0.8, NO_POWER: 0.15, BLOCKED: 0.05}
 RAN_ON = {STILL_DRIVEN: 0.7, WINDMILLING: 0.3}
 FALLING_SHARE = 0.85  # of the speed before: a lower reading belongs to the fall
+AT_ONCE_S = 0.03
+"""time constant of a blocked fan"""
+COAST_FACTORS = np.array([0.7, 1.0, 1.4])
+"""of the typical time constant, those of other fans and speeds"""
+LONGEST_COASTS = 1.4
+FALLS, PHASES = 60, 6
+"""how many times of the fall, and of a window of the tacho, are tried"""
+READING_ERROR = 0.1
+"""standard deviation of a reading beside its resolution, in the speed before the fall"""
+LEAST_LIKELIHOOD = 1e-6
 BLUR_S = 0.15  # of the time of a fall, beside the tacho
 COAST_SPREAD = 0.3  # standard deviation of a coast, relative to its expected time
 MIN_COAST_S = 0.1
@@ -37,9 +48,13 @@ GRID = 200  # speeds at which the balance is inverted
 
 
 def standstill_causes(
-    window: Window, healthy: Standstill, balance: HealthyBalance, tacho: Tacho
+    window: Window, healthy: Standstill, balance: HealthyBalance, tacho: Tacho, *, by_course: bool = True
 ) -> tuple[RankedCause, ...]:
-    """The causes, most probable first, from a fan's last seconds up to the present; the onset is not used."""
+    """The causes, most probable first, from a fan's last seconds up to the present; the onset is not used.
+
+    by_course: False only to diagnose as for recordings made before the course of the readings was compared, and not
+    only the duration of their fall.
+    """
     commands = window.command[np.isfinite(window.command)]
     command = float(commands[-1]) if len(commands) else math.nan
     speed = np.abs(window.speed_rad_s)
@@ -52,17 +67,71 @@ def standstill_causes(
         return _ranked(NO_READING, command, f"gives no reading although commanded to {command:.3g}")
     if not len(turning) or not _was_driven(window, int(turning[-1]), healthy, tacho):
         return _ranked(NEVER_TURNED, command, sentence)
-    fall_s, from_rad_s = _fall(window, int(turning[-1]), healthy, balance, tacho)
-    constant_s = healthy.coast_time_constant_s
-    if constant_s is None:
-        return _ranked(_sums(FELL_AT_ONCE, COASTED), command, sentence)
+    fell_at_once, coasted = (FELL_AT_ONCE, COASTED) if by_course else (FORMER_FELL_AT_ONCE, FORMER_COASTED)
+    if healthy.coast_time_constant_s is None:
+        return _ranked(_sums(fell_at_once, coasted), command, sentence)
+    likelihoods = (_by_course if by_course else _by_duration)(window, int(turning[-1]), healthy, balance, tacho)
+    likely = {cause: prior * likelihoods[0] for cause, prior in fell_at_once.items()}
+    return _ranked(_sums(likely, coasted * likelihoods[1]), command, sentence)
+
+
+def _by_course(
+    window: Window, last_turning: int, healthy: Standstill, balance: HealthyBalance, tacho: Tacho
+) -> tuple[float, float]:
+    """Likelihoods that the fan stopped at once, and that it coasted, by the course of its readings."""
+    share, level = _shares(window, last_turning, healthy, balance, tacho)
+    time_s = np.arange(len(share)) * window.period_s
+    constant_s = healthy.coast_time_constant_s or 0.0
+    before_rad_s = max(float(np.nanmax(np.abs(window.speed_rad_s[: last_turning + 1]))), healthy.standing_below_rad_s)
+    longest_s = LONGEST_COASTS * constant_s * math.log(before_rad_s / healthy.standing_below_rad_s) + tacho.reach_s
+    rows = np.flatnonzero((time_s >= time_s[last_turning] - longest_s) & np.isfinite(share))
+    readings, at_s = share[rows] / level, time_s[rows]
+    resolution = tacho.resolution_rad_s * readings[0] / max(float(np.abs(window.speed_rad_s[rows[0]])), 1e-9)
+    error = math.hypot(resolution / math.sqrt(6.0), READING_ERROR)
+    weight = min(window.period_s / tacho.held_s, 1.0) if tacho.held_s else 1.0  # of a sample: a reading is one
+    phases_s = np.linspace(0.0, tacho.held_s, PHASES, endpoint=False) if tacho.held_s else np.zeros(1)
+    at_rest_s = at_s[at_s > time_s[last_turning]]
+    falls_s = np.linspace(at_s[0], at_rest_s[0] if len(at_rest_s) else time_s[-1], FALLS)
+
+    def likelihood(constants_s: Array) -> float:
+        fall_s, phase_s, of_coast_s = (
+            each[..., np.newaxis] for each in np.meshgrid(falls_s, phases_s, constants_s, indexing="ij")
+        )
+        expected = _readings_of_a_fall(at_s, fall_s, of_coast_s, tacho, phase_s)
+        squares = np.square((readings - expected) / error).sum(axis=-1)
+        return float(np.exp(-0.5 * weight * squares).mean()) + LEAST_LIKELIHOOD
+
+    return likelihood(np.array([AT_ONCE_S])), likelihood(constant_s * COAST_FACTORS)
+
+
+def _readings_of_a_fall(at_s: Array, fall_s: Array, constant_s: Array, tacho: Tacho, phase_s: Array) -> Array:
+    """(..., n) readings of a fan that turned at a speed of 1 and comes to rest with a time constant; broadcast."""
+
+    def turned(until_s: Array) -> Array:
+        after_s = np.maximum(until_s - fall_s, 0.0)
+        return np.minimum(until_s, fall_s) + constant_s * -np.expm1(-after_s / constant_s)
+
+    shown_s = at_s - tacho.delay_s
+    if not tacho.window_s:
+        return np.exp(-np.maximum(shown_s - fall_s, 0.0) / constant_s)
+    end_s = phase_s + np.floor((shown_s - phase_s) / tacho.held_s) * tacho.held_s
+    return (turned(end_s) - turned(end_s - tacho.window_s)) / tacho.window_s
+
+
+def _by_duration(
+    window: Window, last_turning: int, healthy: Standstill, balance: HealthyBalance, tacho: Tacho
+) -> tuple[float, float]:
+    """As `_by_course`, by how long the reading took to fall to that of a fan at rest."""
+    share, level = _shares(window, last_turning, healthy, balance, tacho)
+    high = np.flatnonzero(share[: last_turning + 1] >= FALLING_SHARE * level)
+    row = int(high[-1]) if len(high) else 0
+    fall_s = (last_turning - row) * window.period_s
+    from_rad_s = float(np.nanmax(np.abs(window.speed_rad_s[row : last_turning + 1])))
     log = math.log(max(from_rad_s / healthy.standing_below_rad_s, 1.0))
-    coast_s = max(constant_s * log, MIN_COAST_S)
+    coast_s = max((healthy.coast_time_constant_s or 0.0) * log, MIN_COAST_S)
     blur_s = tacho.held_s / 2 + window.period_s + BLUR_S
     at_once = _normal(fall_s, tacho.held_s / 2, blur_s)
-    coasted = _normal(fall_s, coast_s + tacho.held_s / 2, math.hypot(blur_s, COAST_SPREAD * coast_s))
-    likely = {cause: prior * at_once for cause, prior in FELL_AT_ONCE.items()}
-    return _ranked(_sums(likely, COASTED * coasted), command, sentence)
+    return at_once, _normal(fall_s, coast_s + tacho.held_s / 2, math.hypot(blur_s, COAST_SPREAD * coast_s))
 
 
 def _was_driven(window: Window, last_turning: int, healthy: Standstill, tacho: Tacho) -> bool:
@@ -73,26 +142,21 @@ def _was_driven(window: Window, last_turning: int, healthy: Standstill, tacho: T
     return bool(len(known)) and bool(np.all(healthy.drives(known)))
 
 
-def _fall(
+def _shares(
     window: Window, last_turning: int, healthy: Standstill, balance: HealthyBalance, tacho: Tacho
-) -> tuple[float, float]:
-    """How long the reading took from that of a healthy fan to that of a fan at rest, s, and the speed it fell from.
-
-    Readings are compared with the steady speed for their command, so that a moving command is not taken for the fall.
+) -> tuple[Array, float]:
+    """(n,) readings as shares of the steady speed for their command, so that a moving command is not taken for the
+    fall; and the share of the fan before its reading fell.
     """
-    speed = np.abs(window.speed_rad_s[: last_turning + 1])
-    share = speed / np.maximum(
-        _steady_speed(window.command[: last_turning + 1], balance, speed), healthy.standing_below_rad_s
-    )
+    speed = np.abs(window.speed_rad_s)
+    turned = speed[: last_turning + 1]
+    share = speed / np.maximum(_steady_speed(window.command, balance, turned), healthy.standing_below_rad_s)
     constant_s = healthy.coast_time_constant_s or 0.0
-    longest_s = constant_s * math.log(np.nanmax(speed) / healthy.standing_below_rad_s) + tacho.reach_s
-    before = max(len(speed) - math.ceil(longest_s / window.period_s), 0)
+    longest_s = constant_s * math.log(np.nanmax(turned) / healthy.standing_below_rad_s) + tacho.reach_s
+    before = max(len(turned) - math.ceil(longest_s / window.period_s), 0)
     reference = share[max(before - round(LEVEL_S / window.period_s), 0) : before]
     reference = reference[np.isfinite(reference)]
-    level = float(np.median(reference)) if len(reference) else 1.0
-    high = np.flatnonzero(share >= FALLING_SHARE * level)
-    row = int(high[-1]) if len(high) else 0
-    return (last_turning - row) * window.period_s, float(np.nanmax(speed[row:]))
+    return share, float(np.median(reference)) if len(reference) else 1.0
 
 
 def _steady_speed(command: Array, balance: HealthyBalance, speed_rad_s: Array) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from schemas.tacho import Tacho
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnosis import Diagnosis, Evidence, RankedCause, diagnose
 from scoring.diagnosis.regression_window import FIRST_ERROR, HealthyBalance, RegressionWindow, Window, acting_command
@@ -463,6 +464,45 @@ def test_a_cause_that_cannot_be_told_comes_with_what_would_tell_it() -> None:
     assert blocked.endswith("it should turn: see whether it is free to turn and has power")
     idle = 0.02 * still
     assert "it hardly turns: move the command to" in advice_of(idle, hardly)
+
+
+def test_no_command_is_advised_below_the_lowest_that_turns_the_fan() -> None:
+    """As of a fan at its minimum: two thirds of its speed would need less than turns it."""
+    command = np.full(len(data.still_command(0)), 0.16)
+    healthy = replace(data.HEALTHY, lowest_speed_rad_s=20.0)
+    window = data.window(command, data.measured(data.speeds(command, torque=data.from_onset(command, 0.03)), 3))
+    advised = [
+        of(diagnose(window, healthy, Advice("", lowest)), "cannot_tell").sentence.split("command to ")[1].split()[0]
+        for lowest in (0.0, 0.15)
+    ]
+    assert float(advised[0]) < 0.15
+    assert float(advised[1]) > 0.16
+
+
+def counted(speed_rad_s: np.ndarray, tacho: Tacho) -> np.ndarray:
+    """(n,) readings of a tacho that counts pulses over one window after another."""
+    turned = np.floor(np.cumsum(speed_rad_s) * data.STEP_S / (tacho.resolution_rad_s * tacho.window_s))
+    rows = round(tacho.window_s / data.STEP_S)
+    counts = np.diff(turned[::rows], prepend=0.0) * tacho.resolution_rad_s
+    return np.repeat(counts, rows)[: len(speed_rad_s)]
+
+
+@pytest.mark.parametrize("is_stuck", [False, True])
+def test_a_tacho_that_counts_repeats_its_readings_and_is_stuck_only_where_the_fan_would_read_something_else(
+    is_stuck: bool,
+) -> None:
+    tacho = Tacho(kind="count", window_s=0.5)
+    levels = np.repeat([0.4, 0.7, 0.5, 0.8, 0.45, 0.6, 0.6, 0.6, 0.6, 0.6], 400)
+    if is_stuck:
+        levels[-1600:] = np.repeat([0.6, 0.8, 0.45, 0.7], 400)
+    healthy = counted(data.speeds(levels), tacho)
+    readings = healthy.copy()
+    readings[-1500:] = np.median(readings[-1700:-1500])
+    window = Window(data.STEP_S, levels, readings, onset=len(levels) - 1300, expected_rad_s=healthy)
+    found = diagnose(window, data.HEALTHY, tacho=tacho)
+    stuck = of(found, "sensor_stuck").probability
+    assert stuck > 0.9 if is_stuck else stuck == 0.0
+    assert of(diagnose(window, data.HEALTHY), "sensor_stuck").probability > 0.9, "each sample counted for a reading"
 
 
 def test_readings_that_were_missing_before_the_alarm_count() -> None:
