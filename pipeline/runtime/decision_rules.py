@@ -31,8 +31,7 @@ class DecisionRules(IntEnum):
     """Times of a line begin with the smallest delay of its first second, not with that of its first sample."""
     STOPPED_AND_WORN = 7
     """A fan that stands as commanded is judged: its alarm keeps its data, and an alarm of a fan that turned although it
-    was stopped returns. A baseline follows no faster than healthy fans drift. The torque balance is not used at the
-    lowest speed of a driven fan. Causes account for what the tacho resolves."""
+    was stopped returns. Causes account for what the tacho resolves."""
 
 
 CURRENT_RULES = max(DecisionRules)
