@@ -80,12 +80,13 @@ def _by_course(
 ) -> tuple[float, float]:
     """Likelihoods that the fan stopped at once, and that it coasted, by the course of its readings."""
     share, level = _shares(window, last_turning, healthy, balance, tacho)
-    time_s = np.arange(len(share)) * window.period_s
+    time_s: Array = np.arange(len(share)) * window.period_s
     constant_s = healthy.coast_time_constant_s or 0.0
     before_rad_s = max(float(np.nanmax(np.abs(window.speed_rad_s[: last_turning + 1]))), healthy.standing_below_rad_s)
     longest_s = LONGEST_COASTS * constant_s * math.log(before_rad_s / healthy.standing_below_rad_s) + tacho.reach_s
     rows = np.flatnonzero((time_s >= time_s[last_turning] - longest_s) & np.isfinite(share))
-    readings, at_s = share[rows] / level, time_s[rows]
+    readings: Array = share[rows] / level
+    at_s: Array = time_s[rows]
     resolution = tacho.resolution_rad_s * readings[0] / max(float(np.abs(window.speed_rad_s[rows[0]])), 1e-9)
     error = math.hypot(resolution / math.sqrt(6.0), READING_ERROR)
     weight = min(window.period_s / tacho.held_s, 1.0) if tacho.held_s else 1.0  # of a sample: a reading is one
