@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.messages import Array, FanState, InvalidReason, Prediction, Score
-from scoring.fan_scorer import ScoredBlock
+from scoring.scored_block import ScoredBlock
 
 BAND_SIGMAS = 2.0
 

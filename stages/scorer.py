@@ -15,19 +15,19 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from pydantic import Field, ValidationError
 
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
+from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, healthy_twin
 from pipeline.runtime.judged_share import JudgedShare
 from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.snapshot_store import SnapshotStore
-from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
-from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from pipeline.runtime.tray_twin import load_tray_twin, twin_path
 from schemas.blocks import select
 from schemas.messages import (
     Alarm,
@@ -40,27 +40,22 @@ from schemas.messages import (
     ScorerSnapshot,
     Transition,
 )
-from schemas.standstill import Standstill
-from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_manager import AlarmContext, AlarmManager
 from scoring.alarms.alarm_text import AlarmText
 from scoring.alarms.fan_condition import ConditionSettings
-from scoring.alarms.return_rule import HoldingDetector
+from scoring.alarms.holding import holding_detectors
 from scoring.alarms.tray_conditions import AlarmEvent
 from scoring.alarms.unscored_monitor import UnscoredMonitor
-from scoring.detectors.standstill import StandstillSettings
-from scoring.detectors.table import rows
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnoser import Diagnoser
-from scoring.diagnosis.regression_window import HealthyBalance
-from scoring.fan_scorer import HALF_LIMIT, FanScorer, ScoredBlock, joined
+from scoring.fan_scorer import HALF_LIMIT, FanScorer
 from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
-from scoring.limits import Limits, Timing, uncalibrated
 from scoring.samples import samples_of
 from scoring.score_message import score_of
+from scoring.scored_block import ScoredBlock, joined
 from scoring.snapshot_times import with_times_moved
-from scoring.wear.slow_change import WEAR_HINT
+from scoring.wear.followed import followed_fans
 from scoring.wear.wear_monitor import WearMonitor
 
 IN_ALARM = (FanState.ALARM, FanState.RETURNING)
@@ -72,54 +67,9 @@ ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
 READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_KEPT}"
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
 RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
-FOLLOWED_FAR = 0.5  # of its adaptation limit, from which on it is said how far a baseline has followed a fan
 DATA_LOST_AFTER_NS = 2 * NS_PER_S  # an active alarm is not confirmed by data after so long without a score
 SET_BACK_NS = NS_PER_S  # a snapshot further ahead of the present is of a clock that was set back since
 BACK_IN_TIME_NS = 120 * NS_PER_S  # a restarted producer catches up with less; older samples are of another recording
-
-
-class ScorerConfig(StageConfig):
-    """Section `[scorer]`. Times that are not given are those that the twin was calibrated with."""
-
-    alarm_sigmas: float = Field(
-        default=2.0, gt=0, description="limit on the smoothed speed residual of a twin without calibration, in sigma"
-    )
-    limit_factor: float = Field(
-        default=1.0, gt=0, description="multiplies all limits; above 1: fewer alarms than declared"
-    )
-    smoothing_s: float | None = Field(default=None, ge=0, description="time constant of the low-pass of residuals")
-    baseline_s: float | None = Field(default=None, gt=0, description="length of an interval of commissioning")
-    adaptation_s: float | None = Field(default=None, gt=0, description="time constant of the baseline in the long run")
-    on_delay_s: float | None = Field(default=None, ge=0, description="how long a limit must be exceeded to raise")
-    off_delay_s: float = Field(default=1.0, ge=0, description="how long a return must last at least to clear")
-    deadband: float = Field(default=0.25, ge=0, lt=1, description="share of its limit below which a return begins")
-    alarm_ratio: float = Field(default=1.5, ge=1, description="score from which a warning is an alarm")
-    latching: bool = Field(default=False, description="whether a cleared alarm stays until it is reset")
-    confirming: bool = Field(default=False, description="whether an acknowledged alarm must be confirmed, too")
-    wear_every_s: float = Field(default=600.0, gt=0, description="how often the wear of a fan is measured")
-    not_judged_s: float = Field(
-        default=10.0,
-        gt=0,
-        description="health reports a fan without a score for this long; set it above twin_integrator.warm_up_s",
-    )
-
-    def timing(self, calibrated: Timing) -> Timing:
-        """The times in force."""
-        own = {name: getattr(self, name) for name in Timing.model_fields}
-        return calibrated.model_copy(update={name: value for name, value in own.items() if value is not None})
-
-
-@dataclass(frozen=True, eq=False)
-class HealthyTwin:
-    """What the scorer knows about the twin. sha256: identifies its file."""
-
-    sha256: str
-    limits: Limits
-    balances: Sequence[HealthyBalance]
-    command_unit: str = ""
-    tachos: tuple[Tacho, ...] = INSTANTANEOUS
-    """one for all fans, or one for each"""
-    standstill: Standstill | None = None
 
 
 class ScorerCore(Core):
@@ -144,6 +94,7 @@ class ScorerCore(Core):
         self._holds = decision_rules >= DecisionRules.HOLDING
         self._judges_rest = decision_rules >= DecisionRules.STOPPED_AND_WORN
         self._scorer = self._new_scorer()
+        holding = holding_detectors(self._scorer.detectors, config.off_delay_s, judges_rest=self._judges_rest)
         self._settings = ConditionSettings(
             on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),
             off_delay_ns=round(config.off_delay_s * NS_PER_S),
@@ -153,7 +104,7 @@ class ScorerCore(Core):
             confirming=config.confirming,
             data_lost_after_ns=DATA_LOST_AFTER_NS if self._forgets_over_gaps else None,
             settling_ns=self._scorer.longest_memory_ns,
-            detectors=self._holding_detectors() if self._holds else (),
+            detectors=holding if self._holds else (),
         )
         self._unscored = UnscoredMonitor(fans, max(1, round(config.not_judged_s * NS_PER_S)))
         self._snapshot_store = snapshot_store
@@ -199,19 +150,6 @@ class ScorerCore(Core):
             tachos=self._twin.tachos,
             forgets_over_gaps=self._forgets_over_gaps,
             skips_transients=self._holds,
-        )
-
-    def _holding_detectors(self) -> tuple[HoldingDetector, ...]:
-        """What decides on the return of alarms, in the order of the table."""
-        detectors = {row.name: self._scorer.detectors.get(row.name) for row in rows()}
-        return tuple(
-            HoldingDetector(
-                row.name,
-                off_delay_ns=round(max(self._config.off_delay_s, detector.off_delay_s if detector else 0.0) * NS_PER_S),
-                grows_with_speed=row.source != "tacho",
-                is_certain=not row.only_at_rest and (detector is not None or not self._judges_rest),
-            )
-            for row, detector in zip(rows(), detectors.values(), strict=True)
         )
 
     def restore(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
@@ -290,19 +228,9 @@ class ScorerCore(Core):
 
     def notes(self) -> list[str]:
         """Which share of the samples was judged, and why the others were not; fans that change slowly."""
-        return [*self._judged_share.notes, *self._wear.notices(), *self._followed()]
-
-    def _followed(self) -> list[str]:
-        """Fans whose baseline of the speed has followed them far since commissioning, in tenths of what it may."""
-        baseline, unit = self._scorer.residuals["speed"].baseline, self._text.units
         limit = self._twin.limits.speed.baseline.adaptation_limit_sigmas
-        moved = np.where(baseline.is_set, baseline.value - baseline.commissioned, 0.0) / max(limit, 1e-9)
-        lines = []
-        for fan in np.flatnonzero(np.abs(moved) >= FOLLOWED_FAR).tolist():
-            share = f"{10 * int(10.0 * moved[fan]):+d} %"
-            most = f"{unit.shown_speed(limit * self._sigma_rad_s[fan])} {unit.speed}"
-            lines.append(f"fan {fan}: the baseline of its speed has followed it by {share} of {most}: {WEAR_HINT}")
-        return lines
+        followed = followed_fans(self._scorer.residuals["speed"].baseline, limit, self._sigma_rad_s, self._text.units)
+        return [*self._judged_share.notes, *self._wear.notices(), *followed]
 
     def problem(self) -> str:
         """What people should look at: input, snapshot, fans without a score, baselines at their limit, wear."""
@@ -504,7 +432,7 @@ def build(context: Context) -> BuiltStage:
     """
     tray = context.tray
     path = context.snapshot_folder / f"scorer-{tray.name}.snapshot" if context.snapshot_folder else None
-    twin = _healthy_twin(context, load_tray_twin(twin_path(context), tray.fans))
+    twin = healthy_twin(context, load_tray_twin(twin_path(context), tray.fans))
     store = SnapshotStore(path) if path else None
     if store:
         store.lock(f"site {context.site}")
@@ -521,59 +449,6 @@ def build(context: Context) -> BuiltStage:
     )
 
 
-def limits_in_force(
-    config: ScorerConfig,
-    calibration: Mapping[str, Any] | None,
-    standstill: Standstill | None = None,
-    decision_rules: DecisionRules = CURRENT_RULES,
-) -> Limits:
-    """The limits of a twin's card, or those of a twin without calibration, with the scorer's settings applied.
-
-    standstill: of the card; calibration does not change it.
-
-    Raises:
-        ValidationError: the calibration is not valid.
-    """
-    if calibration is None:
-        limits = uncalibrated(config.alarm_sigmas, config.timing(Timing()))
-        return _with_standstill(limits, standstill, decision_rules).times(config.limit_factor)
-    limits = _with_standstill(Limits.model_validate(calibration), standstill, decision_rules)
-    timing = config.timing(limits.timing)
-    declared_rate = limits.declared_rate if timing == limits.timing else None  # it holds for the calibrated times
-    return limits.model_copy(update={"timing": timing, "declared_rate": declared_rate}).times(config.limit_factor)
-
-
-def _with_standstill(limits: Limits, standstill: Standstill | None, decision_rules: DecisionRules) -> Limits:
-    if standstill is None:
-        return limits
-    settings = {"standstill": StandstillSettings(healthy=standstill, watches="both")}
-    if decision_rules >= DecisionRules.STOPPED_AND_WORN:
-        settings = {
-            "standstill": StandstillSettings(healthy=standstill, watches="driven"),
-            "running_on": StandstillSettings(healthy=standstill, watches="stopped"),
-        }
-    return limits.model_copy(update={"detectors": {**limits.detectors, **settings}})
-
-
-def _healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
-    again = "calibrate it again: fantwin calibrate"
-    try:
-        limits = limits_in_force(context.config, twin.card.calibration, twin.card.standstill, context.decision_rules)
-    except ValidationError as error:
-        first = error.errors()[0]
-        why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise StageError(f"{context.tray.twin}: its calibration cannot be used: {why}; {again}") from error
-    for residual in (limits.speed, limits.balance):
-        fans = len(residual.fan_offsets.offset_sigmas) if residual.fan_offsets else context.tray.fans
-        if fans != context.tray.fans:
-            raise StageError(
-                f"{context.tray.twin}: its calibration is of {fans} fans, the tray has {context.tray.fans}; {again}"
-            )
-    return HealthyTwin(
-        twin.sha256, limits, twin.healthy_balances(), twin.card.command_unit, twin.card.tacho, twin.card.standstill
-    )
-
-
 def check(context: Context) -> list[str]:
     """Why the scorer cannot run; the twin integrator reports a twin that cannot be loaded."""
     try:
@@ -581,7 +456,7 @@ def check(context: Context) -> list[str]:
     except StageError:
         return []
     try:
-        _healthy_twin(context, twin)
+        healthy_twin(context, twin)
     except StageError as error:
         return [str(error)]
     return []

@@ -31,7 +31,8 @@ class DecisionRules(IntEnum):
     """Times of a line begin with the smallest delay of its first second, not with that of its first sample."""
     STOPPED_AND_WORN = 7
     """A fan that stands as commanded is judged: its alarm keeps its data, and an alarm of a fan that turned although it
-    was stopped returns. Causes account for what the tacho resolves."""
+    was stopped returns. The longer an alarm has stood, the longer it must be gone. Causes account for what the tacho
+    resolves."""
 
 
 CURRENT_RULES = max(DecisionRules)

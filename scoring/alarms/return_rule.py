@@ -4,6 +4,9 @@ A detector holds an alarm from the sample at which it exceeds its limit. It has 
 `return_ratio` for as long as samples affect it (`Detector.off_delay_s`): until then the fault may still be in it, and a
 contact that comes and goes is good for a moment only.
 
+The longer an alarm has stood, the longer it must be gone: a twin that errs at some speed by as much as the fault costs
+hides it there for a while.
+
 Only samples that could show the fault count. A blade that is touched takes ten per cent of the speed: 200 rpm at
 2,000 rpm, which is beyond a limit of 150, and 70 rpm at 700 rpm, which is not. So the largest ratio over speed that the
 alarm has had says at which speeds it would be seen; below them the alarm stands as it is, and so it does while the
@@ -17,7 +20,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
+from schemas.units import NS_PER_S
+
 NOT_BELOW = -1
+RETURN_SHARE, LONGEST_RETURN_NS = 0.1, 60 * NS_PER_S  # of the time that a detector has held an alarm; and at most
 LARGEST = 1e300  # ratio over speed of a fault that shows at any speed
 
 
@@ -31,6 +37,8 @@ class HoldingDetector:
     """whether the same fault is larger at a higher speed: of a residual, not of the tacho"""
     is_certain: bool = True
     """whether it is in use and a fan that turns shows its return; False: it holds no alarm that it did not raise"""
+    return_share: float = RETURN_SHARE
+    """of the time for which it held the alarm, so long it must have returned; 0 in recordings of former versions"""
 
 
 @dataclass(frozen=True)
@@ -52,6 +60,9 @@ class _Hold:
     peak_rad_s: float = 0.0
     """highest speed of the last off-delay"""
     peak_age_ns: int = 0
+    age_ns: int = 0
+    held_ns: int = 0
+    """its age when it was above the ratio of return last"""
 
     def follow(self, speed_rad_s: float, period_ns: int, off_delay_ns: int) -> None:
         """Keep the highest speed."""
@@ -99,8 +110,11 @@ class AlarmReturn:
                 hold.below_ns = NOT_BELOW
             elif ratio < self._return_ratio and shows:
                 hold.below_ns = 0 if hold.below_ns == NOT_BELOW else hold.below_ns + period_ns
-            above |= ratio >= self._return_ratio
-            over &= hold.below_ns >= detector.off_delay_ns
+            hold.age_ns += period_ns
+            if ratio >= self._return_ratio:
+                above, hold.held_ns = True, hold.age_ns
+            longer_ns = min(round(detector.return_share * hold.held_ns), LONGEST_RETURN_NS)
+            over &= hold.below_ns >= max(detector.off_delay_ns, longer_ns)
         return not above, over
 
     def begin_delays_again(self) -> None:
@@ -141,6 +155,8 @@ class AlarmReturn:
                 below_ns=int(hold["below_ns"]),
                 peak_rad_s=float(hold["peak_rad_s"]),
                 peak_age_ns=int(hold["peak_age_ns"]),
+                age_ns=int(hold.get("age_ns", 0)),
+                held_ns=int(hold.get("held_ns", 0)),
             )
             for name, hold in stored.items()
             if name in used

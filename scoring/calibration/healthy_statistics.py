@@ -18,9 +18,10 @@ from scoring.calibration.windows import WindowMaxima, Windows, peaks
 from scoring.detectors.detector import DetectorRow, Signal
 from scoring.detectors.smoothed import Smoothed
 from scoring.detectors.table import calibrated_rows, rows
-from scoring.fan_scorer import RESIDUALS, FanScorer, Observation, ScoredBlock
+from scoring.fan_scorer import RESIDUALS, FanScorer
 from scoring.limits import Limits
 from scoring.samples import Samples
+from scoring.scored_block import Observation, ScoredBlock
 
 LARGEST_SIGMAS = 100.0  # larger residuals are clipped to this
 

@@ -22,9 +22,10 @@ from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import rows
 from scoring.detectors.tacho import TachoSettings
 from scoring.detectors.variance_growth import VarianceGrowthSettings
-from scoring.fan_scorer import FanScorer, ScoredBlock
+from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits, Timing
 from scoring.samples import Samples
+from scoring.scored_block import ScoredBlock
 from tests.support.healthy_residuals import autoregressive, rows_of, samples_of
 
 FANS = 3

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.decision_rules import DecisionRules
+from pipeline.runtime.healthy_twin import ScorerConfig, limits_in_force
 from pipeline.runtime.stage import Context, StageError
 from schemas.blocks import cut
 from schemas.fields import columns
@@ -35,7 +36,7 @@ from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.tacho import TachoSettings
 from scoring.detectors.variance_growth import VarianceGrowthSettings
 from scoring.limits import Timing
-from stages.scorer import STAGE, ScorerConfig, ScorerCore, limits_in_force
+from stages.scorer import STAGE, ScorerCore
 from tests.support.scored_blocks import (
     CALIBRATION,
     EPOCH_NS,

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
 from schemas.blocks import cut
 from schemas.messages import Alarm, FanState, Grid, InvalidReason, Prediction, Score, Statistic, Transition
 from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS
 from scoring.alarms.current_alarms import current_alarms
-from stages.scorer import HealthyTwin, ScorerConfig, ScorerCore, limits_in_force
+from scoring.detectors.tacho import TachoSettings
+from stages.scorer import ScorerCore
 from tests.stages.test_twin_integrator import core_of, physical_twin, run_freely
 from tests.support.scored_blocks import balance_of_a_fan
 
@@ -64,10 +66,14 @@ def seen(
     block: int = 7,
     healthy: Standstill | None = HEALTHY,
     alarm_sigmas: float = 1e6,
+    missing_share: float = 1.0,
 ) -> Seen:
-    """With alarm_sigmas as it is, only the detector of standstill can raise an alarm."""
+    """With alarm_sigmas and missing_share as they are, only the detectors of standstill can raise an alarm."""
     config = ScorerConfig(alarm_sigmas=alarm_sigmas, not_judged_s=5.0)
-    twin = HealthyTwin("t", limits_in_force(config, None, healthy), [balance_of_a_fan()], "%", INSTANTANEOUS, healthy)
+    limits = limits_in_force(config, None, healthy)
+    tacho = TachoSettings(stuck_s=1e9, missing_share=missing_share)
+    limits = limits.model_copy(update={"detectors": {**limits.detectors, "sensor": tacho}})
+    twin = HealthyTwin("t", limits, [balance_of_a_fan()], "%", INSTANTANEOUS, healthy)
     integrator, scorer = core_of(physical_twin(standstill=healthy), warm_up_s=1.0), ScorerCore(1, "rad/s", config, twin)
     messages, problems = [], set()
     valid = np.isfinite(speed)[:, np.newaxis]
@@ -214,3 +220,12 @@ def test_an_alarm_of_a_fan_that_turned_although_stopped_returns_while_it_stands(
     (cleared_s,) = found.times(Transition.CLEARED)
     assert cleared_s == pytest.approx(at_rest_s + 2.0, abs=0.2)
     assert found.at(70.0) == FanState.STOPPED
+
+
+def test_a_stop_says_nothing_about_a_loose_contact() -> None:
+    """The tacho loses 40 % of its readings; the alarm outlasts a stop of a minute."""
+    command = commands((80.0, 20.0), (80.0, 30.0), (0.0, 60.0), (80.0, 30.0))
+    lost = np.random.default_rng(5).random(len(command)) < np.where(np.arange(len(command)) * PERIOD_S > 20.0, 0.4, 0.0)
+    found = seen(command, np.where(lost, np.nan, speed_of(command)), missing_share=0.25)
+    assert len(found.times(Transition.RAISED)) == 1
+    assert found.times(Transition.CLEARED) == []

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
+from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
 from pipeline.runtime.snapshot_store import SnapshotStore
 from schemas.messages import Action, Alarm, Header, InvalidReason, Prediction, Request, Score, ScorerSnapshot
 from schemas.units import SpeedUnit
 from scoring.diagnosis.regression_window import HealthyBalance
-from stages.scorer import HealthyTwin, ScorerConfig, ScorerCore, limits_in_force
+from stages.scorer import ScorerCore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

@@ -17,6 +17,7 @@ import pytest
 from pipeline.bus.session import Bus
 from pipeline.cli.watch.alarms import OperatorAction, alarm_lines
 from pipeline.config.loading import load_config
+from pipeline.runtime.healthy_twin import ScorerConfig
 from pipeline.runtime.runner import Runner
 from pipeline.runtime.stage import BuiltStage, Core, Stage
 from schemas.codec import decode, encode, type_name
@@ -36,7 +37,6 @@ from schemas.topics import BY_NAME, tray_key
 from scoring.alarms.current_alarms import CurrentAlarm
 from scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from scoring.alarms.tray_conditions import TrayConditions
-from stages.scorer import ScorerConfig
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
 from tests.support.score_data import one_sample

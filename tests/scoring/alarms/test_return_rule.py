@@ -136,3 +136,10 @@ def test_neither_blocks_nor_a_restart_change_anything(history: list[tuple[Sample
     whole = played(history)
     assert played(history[:cut], history[cut:]) == whole
     assert played(*([sample] for sample in history)) == whole
+
+
+def test_the_longer_an_alarm_has_stood_the_longer_it_must_be_gone() -> None:
+    fan = Fan()
+    fan.play([(UP, LOW, LOW)] * 100)
+    assert fan.play([CALM] * 9 + [(UP, LOW, LOW)] + [CALM] * 10) == [], "hidden for a moment by an error of the twin"
+    assert fan.play([CALM] * 5) == [(121, Transition.CLEARED)]

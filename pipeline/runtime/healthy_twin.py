@@ -1,0 +1,120 @@
+"""Configuration of the scorer, and what it knows about the twin of its tray: limits, balances, tachos, standstill."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import Field, ValidationError
+
+from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
+from pipeline.runtime.stage import Context, StageConfig, StageError
+from pipeline.runtime.tray_twin import TrayTwin
+from schemas.standstill import Standstill
+from schemas.tacho import INSTANTANEOUS, Tacho
+from scoring.detectors.standstill import StandstillSettings
+from scoring.diagnosis.regression_window import HealthyBalance
+from scoring.limits import Limits, Timing, uncalibrated
+
+
+class ScorerConfig(StageConfig):
+    """Section `[scorer]`. Times that are not given are those that the twin was calibrated with."""
+
+    alarm_sigmas: float = Field(
+        default=2.0, gt=0, description="limit on the smoothed speed residual of a twin without calibration, in sigma"
+    )
+    limit_factor: float = Field(
+        default=1.0, gt=0, description="multiplies all limits; above 1: fewer alarms than declared"
+    )
+    smoothing_s: float | None = Field(default=None, ge=0, description="time constant of the low-pass of residuals")
+    baseline_s: float | None = Field(default=None, gt=0, description="length of an interval of commissioning")
+    adaptation_s: float | None = Field(default=None, gt=0, description="time constant of the baseline in the long run")
+    on_delay_s: float | None = Field(default=None, ge=0, description="how long a limit must be exceeded to raise")
+    off_delay_s: float = Field(default=1.0, ge=0, description="how long a return must last at least to clear")
+    deadband: float = Field(default=0.25, ge=0, lt=1, description="share of its limit below which a return begins")
+    alarm_ratio: float = Field(default=1.5, ge=1, description="score from which a warning is an alarm")
+    latching: bool = Field(default=False, description="whether a cleared alarm stays until it is reset")
+    confirming: bool = Field(default=False, description="whether an acknowledged alarm must be confirmed, too")
+    wear_every_s: float = Field(default=600.0, gt=0, description="how often the wear of a fan is measured")
+    not_judged_s: float = Field(
+        default=10.0,
+        gt=0,
+        description="health reports a fan without a score for this long; set it above twin_integrator.warm_up_s",
+    )
+
+    def timing(self, calibrated: Timing) -> Timing:
+        """The times in force."""
+        own = {name: getattr(self, name) for name in Timing.model_fields}
+        return calibrated.model_copy(update={name: value for name, value in own.items() if value is not None})
+
+
+@dataclass(frozen=True, eq=False)
+class HealthyTwin:
+    """What the scorer knows about the twin. sha256: identifies its file."""
+
+    sha256: str
+    limits: Limits
+    balances: Sequence[HealthyBalance]
+    command_unit: str = ""
+    tachos: tuple[Tacho, ...] = INSTANTANEOUS
+    """one for all fans, or one for each"""
+    standstill: Standstill | None = None
+
+
+def limits_in_force(
+    config: ScorerConfig,
+    calibration: Mapping[str, Any] | None,
+    standstill: Standstill | None = None,
+    decision_rules: DecisionRules = CURRENT_RULES,
+) -> Limits:
+    """The limits of a twin's card, or those of a twin without calibration, with the scorer's settings applied.
+
+    standstill: of the card; calibration does not change it.
+
+    Raises:
+        ValidationError: the calibration is not valid.
+    """
+    if calibration is None:
+        limits = uncalibrated(config.alarm_sigmas, config.timing(Timing()))
+        return _with_standstill(limits, standstill, decision_rules).times(config.limit_factor)
+    limits = _with_standstill(Limits.model_validate(calibration), standstill, decision_rules)
+    timing = config.timing(limits.timing)
+    declared_rate = limits.declared_rate if timing == limits.timing else None  # it holds for the calibrated times
+    return limits.model_copy(update={"timing": timing, "declared_rate": declared_rate}).times(config.limit_factor)
+
+
+def _with_standstill(limits: Limits, standstill: Standstill | None, decision_rules: DecisionRules) -> Limits:
+    if standstill is None:
+        return limits
+    settings = {"standstill": StandstillSettings(healthy=standstill, watches="both")}
+    if decision_rules >= DecisionRules.STOPPED_AND_WORN:
+        settings = {
+            "standstill": StandstillSettings(healthy=standstill, watches="driven"),
+            "running_on": StandstillSettings(healthy=standstill, watches="stopped"),
+        }
+    return limits.model_copy(update={"detectors": {**limits.detectors, **settings}})
+
+
+def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
+    """What a scorer needs to know about the twin of its tray.
+
+    Raises:
+        StageError: the twin's calibration cannot be used for this tray.
+    """
+    again = "calibrate it again: fantwin calibrate"
+    try:
+        limits = limits_in_force(context.config, twin.card.calibration, twin.card.standstill, context.decision_rules)
+    except ValidationError as error:
+        first = error.errors()[0]
+        why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise StageError(f"{context.tray.twin}: its calibration cannot be used: {why}; {again}") from error
+    for residual in (limits.speed, limits.balance):
+        fans = len(residual.fan_offsets.offset_sigmas) if residual.fan_offsets else context.tray.fans
+        if fans != context.tray.fans:
+            raise StageError(
+                f"{context.tray.twin}: its calibration is of {fans} fans, the tray has {context.tray.fans}; {again}"
+            )
+    return HealthyTwin(
+        twin.sha256, limits, twin.healthy_balances(), twin.card.command_unit, twin.card.tacho, twin.card.standstill
+    )

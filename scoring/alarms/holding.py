@@ -1,0 +1,34 @@
+"""Which detectors hold the alarms of a tray, and for how long; see scoring.alarms.return_rule."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from schemas.units import NS_PER_S
+from scoring.alarms.return_rule import RETURN_SHARE, HoldingDetector
+from scoring.detectors.detector import Detector
+from scoring.detectors.table import rows
+
+
+def holding_detectors(
+    detectors: Mapping[str, Detector], off_delay_s: float, *, judges_rest: bool = True
+) -> tuple[HoldingDetector, ...]:
+    """What decides on the return of alarms, in the order of the table.
+
+    off_delay_s: the least for all. judges_rest: False only to decide as for recordings made before fans at rest were
+    judged and the time of a return grew with that of its alarm.
+    """
+    made = []
+    for row in rows():
+        detector = detectors.get(row.name)
+        own_s = detector.off_delay_s if detector else 0.0
+        made.append(
+            HoldingDetector(
+                row.name,
+                off_delay_ns=round(max(off_delay_s, own_s) * NS_PER_S),
+                grows_with_speed=row.source != "tacho",
+                return_share=RETURN_SHARE if judges_rest else 0.0,
+                is_certain=not row.only_at_rest and (detector is not None or not judges_rest),
+            )
+        )
+    return tuple(made)

@@ -1,0 +1,63 @@
+"""The scores of a block of samples, and what calibration sees beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.messages import Array
+from scoring.detectors.detector import Signal
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScoredBlock:
+    """The scores of a block, (n, fans) each; smoothed residuals and baselines in sigma."""
+
+    score: Array
+    """NaN where nothing could be scored"""
+    statistic: Array
+    """schemas.messages.Statistic of the detector that the score is of"""
+    commissioning: Array
+    """valid, and no baseline yet"""
+    judged: Array
+    """scored, or stopped or starting and judged by whether it stands or turns as commanded"""
+    speed_smoothed: Array
+    speed_baseline: Array
+    balance_smoothed: Array
+    balance_baseline: Array
+    balance_expected: Array
+    """the expected residual at this speed, to which the baseline is added"""
+    balance_baseline_s: Array
+    """seconds of healthy data whose mean would vary as much as the baseline; 0: there is none yet"""
+    balance_commissioned: Array
+    """the baseline at the end of commissioning; NaN before"""
+    balance_at_limit: Array
+    """whether the baseline is held at the adaptation limit"""
+    speed_learned_scale: Array
+    balance_learned_scale: Array
+    """of the baseline, see Baseline.learned_scale"""
+    ratios: Array
+    """(n, rows of the table, fans) every statistic in multiples of its limit; NaN where it is not scored"""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Observation:
+    """What calibration needs about a stretch of samples, beside the scores."""
+
+    ratios: Array
+    """(rows of the table, n, fans) every statistic in multiples of its limit"""
+    persistent: dict[Signal, Array]
+    """(n, fans) of each residual, see DetectorInput"""
+    expected: dict[Signal, Array]
+    """(n, fans) the expected residual at these speeds, sigma"""
+    transient_rad_s: Array
+    """(n, fans) see scoring.detectors.motion"""
+
+
+def joined(parts: Sequence[ScoredBlock]) -> ScoredBlock:
+    """The scores of successive stretches as one block."""
+    if len(parts) == 1:
+        return parts[0]
+    return ScoredBlock(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
