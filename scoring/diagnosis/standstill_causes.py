@@ -80,7 +80,7 @@ def _by_course(
 ) -> tuple[float, float]:
     """Likelihoods that the fan stopped at once, and that it coasted, by the course of its readings."""
     share, level = _shares(window, last_turning, healthy, balance, tacho)
-    time_s: Array = np.arange(len(share)) * window.period_s
+    time_s: Array = window.period_s * np.arange(len(share), dtype=np.float64)
     constant_s = healthy.coast_time_constant_s or 0.0
     before_rad_s = max(float(np.nanmax(np.abs(window.speed_rad_s[: last_turning + 1]))), healthy.standing_below_rad_s)
     longest_s = LONGEST_COASTS * constant_s * math.log(before_rad_s / healthy.standing_below_rad_s) + tacho.reach_s
