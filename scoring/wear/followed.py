@@ -9,7 +9,7 @@ from scoring.baseline.baseline import Baseline
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.wear.slow_change import WEAR_HINT
 
-FAR = 0.5
+FOLLOWED_FAR = 0.5
 """of its adaptation limit"""
 
 
@@ -20,7 +20,7 @@ def followed_fans(baseline: Baseline, limit_sigmas: float, sigma_rad_s: Array, u
     """
     moved = np.where(baseline.is_set, baseline.value - baseline.commissioned, 0.0) / max(limit_sigmas, 1e-9)
     lines = []
-    for fan in np.flatnonzero(np.abs(moved) >= FAR).tolist():
+    for fan in np.flatnonzero(np.abs(moved) >= FOLLOWED_FAR).tolist():
         share = f"{10 * int(10.0 * moved[fan]):+d} %"
         most = f"{units.shown_speed(limit_sigmas * sigma_rad_s[fan])} {units.speed}"
         lines.append(f"fan {fan}: the baseline of its speed has followed it by {share} of {most}: {WEAR_HINT}")
