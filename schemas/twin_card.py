@@ -178,6 +178,29 @@ class BalanceCard:
 
 
 @dataclass(frozen=True, config=_CONFIG)
+class DriveCard:
+    """What the drives of fans that control their own speed make of the command. The graph contains it.
+
+    turning_command: a smaller one stops the fans. kick_s: how long the kick of a start lasts, after rest_s without
+    drive. lowest_command: for each fan; a smaller command that turns it acts as this one. The friction and the kick of
+    each fan are among the card's parameters.
+    """
+
+    turning_command: Positive
+    kick_s: Positive
+    rest_s: Positive
+    lowest_command: tuple[NotNegative, ...]
+
+    def raised(self, command: Array) -> Array:
+        """(n, fans) the commands with those on the plateau raised to its end; the torque balance is taken with them.
+
+        NaN stays NaN.
+        """
+        raised = np.maximum(command, np.array(self.lowest_command))
+        return np.where(command >= self.turning_command, raised, command)
+
+
+@dataclass(frozen=True, config=_CONFIG)
 class TwinCard:
     """Everything a reader of the file needs to know. Lists per fan are in the order of the fans.
 
@@ -189,7 +212,8 @@ class TwinCard:
     speed_range_rad_s, command_range, rate_hz: of the training data; outside them the twin extrapolates. calibration:
     of the alarms (scoring.limits), None before calibration. tacho: what the free run must pass before it is compared
     with readings, and the command before the torque balance; one for all fans, or one for each. standstill: how the
-    fans stop, stand and start; None in early cards, and where the runs do not show at which commands fans turn.
+    fans stop, stand and start; None in early cards, and where the runs do not show at which commands fans turn. drive:
+    of fans that control their own speed; None: the command acts as it is.
     """
 
     kind: str
@@ -220,6 +244,7 @@ class TwinCard:
     calibration: dict[str, Any] | None = None
     tacho: Tachos = INSTANTANEOUS
     standstill: Standstill | None = None
+    drive: DriveCard | None = None
     format_version: int = FORMAT_VERSION
 
     @model_validator(mode="after")
@@ -236,6 +261,8 @@ class TwinCard:
         if len(self.fan_numbers) != self.fans:
             raise ValueError("training.fans must name each fan, or none")
         tacho_of_each_fan(self.tacho, self.fans)
+        if self.drive is not None and len(self.drive.lowest_command) != self.fans:
+            raise ValueError("drive.lowest_command must have one value for each fan")
         if not self.command_range[0] < self.command_range[1]:
             raise ValueError("command_range must be in ascending order")
         return self

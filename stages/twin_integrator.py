@@ -94,6 +94,7 @@ class TwinIntegratorCore(Core):
             settling_s = START_TIME_CONSTANTS * (self._standstill.coast_time_constant_s or 0.0)
             self._start_up_ns = max(self._warm_up_ns, round((start_s + settling_s) * NS_PER_S))
         self._balance = _balance_of(twin, self._off_below)
+        self._drive = twin.card.drive
         self._averages = any(tacho.window_s > 0.0 for tacho in twin.tachos)
         self._averaged_command = AveragedCommand(twin.tachos, 1.0)
         self._card = [
@@ -297,12 +298,15 @@ class TwinIntegratorCore(Core):
     def _torque_balance(self, grid: Grid) -> tuple[Array, Array]:
         """The command averaged as the readings are, and the torque balance. Both (n, fans) in command units.
 
+        A command on the plateau of a drive counts as that at its end.
+
         They start again after missing samples.
         """
         restarted = (grid.invalid_reason == int(InvalidReason.CLOCK_RESTARTED)).any(axis=1)
         last_t_ns = grid.t_ns[0] if self._last_t_ns is None else self._last_t_ns
         breaks = (np.diff(grid.t_ns, prepend=last_t_ns) > self._longest_step_ns) | restarted
         known = grid.valid & np.isfinite(grid.speed_rad_s) & np.isfinite(grid.command)
+        command = grid.command if self._drive is None else self._drive.raised(grid.command)
         averaged, balance = np.empty(grid.command.shape), np.empty(grid.command.shape)
         starts = [0, *(np.flatnonzero(breaks[1:]) + 1).tolist(), len(breaks)]
         for first, last in pairwise(starts):
@@ -310,7 +314,7 @@ class TwinIntegratorCore(Core):
                 self._balance.reset()
                 self._averaged_command.reset()
             rows = slice(first, last)
-            averaged[rows] = self._averaged_command.update(grid.command[rows]) if self._averages else grid.command[rows]
+            averaged[rows] = self._averaged_command.update(command[rows]) if self._averages else command[rows]
             balance[rows] = self._balance.update(
                 self._period_ns / NS_PER_S,
                 averaged[rows],
@@ -340,7 +344,7 @@ class TwinIntegratorCore(Core):
             torque_balance_command=balance,
             torque_balance_sigma_command=self._twin.balance.sigma_command,
             reading_range_rad_s=reading_range if self._averages else nothing,
-            averaged_command=averaged_command if self._averages else nothing,
+            averaged_command=averaged_command if self._averages or self._drive is not None else nothing,
         )
 
 

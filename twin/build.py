@@ -34,11 +34,13 @@ from twin.export.onnx_export import export_onnx
 from twin.export.onnx_twin import OnnxTwin
 from twin.fitting.balance import FILTER_RATE_PER_S
 from twin.fitting.balance_fit import BalanceFit, fit_balance
+from twin.fitting.drive_fit import find_drive
 from twin.fitting.identification import Identification, identify
 from twin.fitting.model_fits import FitRequest, Trainer
 from twin.fitting.standstill import find_standstill
 from twin.fitting.training import Physics, Progress
 from twin.kinds import BOTH_INPUTS, ModelKind, find_kind
+from twin.models.drive import DRIVE_PARAMETERS
 from twin.models.model import Model
 from twin.models.physics import PARAMETER_NAMES
 from twin.runs import Array, Run, common_fans, common_tacho
@@ -46,7 +48,7 @@ from twin.runs import Array, Run, common_fans, common_tacho
 
 @dataclass(frozen=True, eq=False)
 class TrainedTwin:
-    """A trained model with its identification and validation. parameters: (fans, 4)."""
+    """A trained model with its identification and validation. parameters: (fans, 4), behind a drive (fans, 7)."""
 
     model: Model
     parameters: Array
@@ -103,9 +105,24 @@ def train_twin(
     tacho = common_tacho([*runs, *validation_runs])
     started_s = time.monotonic()
     identification = identify(runs)
+    standstill = find_standstill([*runs, *validation_runs])
+    drive = find_drive(runs, validation_runs, identification, standstill) if model_kind.knows_drives else None
+    acting, validation_acting = runs, validation_runs
+    if drive is not None:
+        acting, validation_acting = drive.driven(runs), drive.driven(validation_runs)
+        identification = identify(acting)
     fitted = model_kind.fit(
         FitRequest(
-            runs, validation_runs, identification, seed, trainer, max_iterations, network_inputs, physics, progress
+            acting,
+            validation_acting,
+            identification,
+            seed,
+            trainer,
+            max_iterations,
+            network_inputs,
+            physics,
+            progress,
+            drive,
         )
     )
     model, parameters = fitted.model, fitted.parameters
@@ -127,7 +144,11 @@ def train_twin(
             f"the {kind} model of {name!r} diverges when run freely; record more levels, or try another kind"
         )
     validation = evaluate_model(model, parameters, sigma_rad_s, judged)
-    balance = fit_balance(runs, validation_runs, identification)
+    if drive is None:
+        balance = fit_balance(runs, validation_runs, identification)
+    else:
+        balance = fit_balance(drive.raised(runs), drive.raised(validation_runs), identification)
+    settings = drive.settings if drive else np.zeros((fans, 0))
     speeds = np.concatenate([run.speed_rad_s.ravel() for run in runs])
     commands = np.concatenate([run.command.ravel() for run in runs])
     card = TwinCard(
@@ -138,13 +159,14 @@ def train_twin(
         n_state=model.state_layout.size,
         state_layout=model.state_layout,
         fixed_rate=model.fixed_rate,
-        parameter_names=PARAMETER_NAMES,
-        used_parameters=model.used_parameters,
+        parameter_names=(*PARAMETER_NAMES, *(DRIVE_PARAMETERS if drive else ())),
+        used_parameters=(*model.used_parameters, *(DRIVE_PARAMETERS if drive else ())),
         parameters=_rows(parameters),
-        identified_parameters=_rows(identification.parameters),
-        parameter_std_errors=_rows(identification.standard_errors),
+        identified_parameters=_rows(np.hstack((identification.parameters, settings))),
+        parameter_std_errors=_rows(np.hstack((identification.standard_errors, np.zeros_like(settings)))),
         parameter_interval_95=tuple(
-            tuple((float(low), float(high)) for low, high in fan) for fan in identification.interval_95
+            tuple((float(low), float(high)) for low, high in fan)
+            for fan in np.concatenate((identification.interval_95, np.stack((settings, settings), axis=-1)), axis=1)
         ),
         sigma_rad_s=healthy.sigma_rad_s,
         healthy=_healthy_card(healthy),
@@ -162,7 +184,8 @@ def train_twin(
         versions=_versions(),
         command_unit=command_unit,
         tacho=tacho[:1] if len(set(tacho)) == 1 else tacho,
-        standstill=find_standstill([*runs, *validation_runs]),
+        standstill=standstill,
+        drive=drive.card if drive else None,
     )
     return TrainedTwin(model, parameters, card, identification, validation)
 

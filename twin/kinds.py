@@ -35,7 +35,7 @@ class ModelKind:
 
     name: in cards and on the command line. title: for people. fit: from data to a model. trainers: those that can
     train it. variants: what comparisons train; without any, the kind itself. predicts: the speed, which the tacho then
-    measures, or the readings themselves.
+    measures, or the readings themselves. knows_drives: it can be put behind a drive (twin.models.drive).
     """
 
     name: str
@@ -44,22 +44,25 @@ class ModelKind:
     trainers: tuple[Trainer, ...] = ("levenberg-marquardt",)
     variants: tuple[Variant, ...] = ()
     predicts: Literal["speed", "readings"] = "speed"
+    knows_drives: bool = False
 
 
 KINDS = [
-    ModelKind(PhysicalModel.kind, "physical", fit_physical),
+    ModelKind(PhysicalModel.kind, "physical", fit_physical, knows_drives=True),
     ModelKind(Narx.kind, "NARX", fit_narx, predicts="readings"),
     ModelKind(
         NeuralOde.kind,
         "neural ODE",
         partial(fit_network_ode, units=neural_ode.UNITS, make=NeuralOde),
         trainers=("levenberg-marquardt", "adam"),
+        knows_drives=True,
     ),
     ModelKind(
         Hybrid.kind,
         "hybrid",
         partial(fit_network_ode, units=hybrid.UNITS, make=Hybrid),
         trainers=("levenberg-marquardt", "adam"),
+        knows_drives=True,
         variants=(Variant("hybrid", "hybrid [w, tau]"), Variant("hybrid-w", "hybrid [w]", network_inputs=("speed",))),
     ),
 ]

@@ -9,6 +9,7 @@ import pytest
 
 from schemas.blocks import cut
 from schemas.messages import Grid, InvalidReason
+from schemas.twin_card import DriveCard
 from tests.stages.test_twin_integrator import (
     NAN,
     PARAMETERS,
@@ -58,6 +59,19 @@ def test_additional_command_shows_in_the_balance() -> None:
 def test_predictions_carry_the_healthy_deviation_of_each_fan() -> None:
     prediction = feed(core_of(physical_twin(2)), [grid_of(stairs(5, 2))])
     assert prediction.torque_balance_sigma_command.tolist() == [SIGMA_COMMAND] * 2
+
+
+def test_the_balance_of_a_fan_whose_drive_keeps_it_on_a_plateau_is_zero() -> None:
+    given = stairs(400) + 20.0
+    raised = np.maximum(given, 50.0)
+    assert np.any(raised > given)
+    speed, _ = run_freely(np.array([[100.0, raised[0, 0]]]), raised, np.full(400, STEP_NS / 1e9))
+    drive = DriveCard(turning_command=5.0, kick_s=0.6, rest_s=2.0, lowest_command=(50.0,))
+    prediction = feed(core_of(physical_twin(drive=drive)), [grid_of(given, speed)])
+    assert np.abs(prediction.torque_balance_command[SETTLES:]).max() < 0.3
+    np.testing.assert_array_equal(prediction.averaged_command, raised)
+    np.testing.assert_array_equal(prediction.command, given)
+    assert np.abs(feed(core_of(), [grid_of(given, speed)]).torque_balance_command[SETTLES:]).max() > 5.0
 
 
 @pytest.mark.parametrize("size", [1, 7, 50])

@@ -3,7 +3,7 @@
     inputs   state (fans, n_state)         see schemas.twin_card.StateLayout
              command (n, fans)             held from sample k to k + 1
              step_s (n,)                   time from sample k to k + 1
-             parameters (fans, 4)          in the order of physics.PARAMETER_NAMES
+             parameters (fans, n)          in the order of the card's parameter_names
     outputs  speed_rad_s (n, fans)         at sample k, before command k acts
              state_out (fans, n_state)     after the last step: the next block's state
 
@@ -16,7 +16,6 @@ from onnx import checker, helper
 from schemas.twin_card import CARD_PROPERTY, TwinCard
 from twin.models.model import Model
 from twin.models.onnx_nodes import double
-from twin.models.physics import PARAMETER_NAMES
 
 OPSET = 17
 IR_VERSION = 8
@@ -33,7 +32,7 @@ def export_onnx(model: Model, card: TwinCard) -> bytes:
             double("state", ["fans", width]),
             double("command", ["n", "fans"]),
             double("step_s", ["n"]),
-            double("parameters", ["fans", len(PARAMETER_NAMES)]),
+            double("parameters", ["fans", len(card.parameter_names)]),
         ],
         [double("speed_rad_s", ["n", "fans"]), double("state_out", ["fans", width])],
         nodes.constants,

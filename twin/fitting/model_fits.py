@@ -8,11 +8,12 @@ import numpy as np
 
 from twin.evaluation.accuracy import evaluation_pieces
 from twin.fitting.cross_validation import choose_prior_std
+from twin.fitting.drive_fit import FoundDrive
 from twin.fitting.identification import Identification
 from twin.fitting.initial_weights import initial_weights
 from twin.fitting.narx_training import train_narx
 from twin.fitting.training import GRID_PRIOR_STD, Physics, Progress, data_scaling, train_network
-from twin.models.model import Model, NetworkOde
+from twin.models.model import Model, NetworkOde, OdeModel
 from twin.models.network import TanhNetwork
 from twin.models.physical import PhysicalModel
 from twin.runs import Array, Run
@@ -26,7 +27,10 @@ SILENT_NETWORK = "the network is not used: free runs with it were no better than
 
 @dataclass(frozen=True, eq=False)
 class FitRequest:
-    """Data and settings of a fit. See build.train_twin; max_iterations None: the default of the fit."""
+    """Data and settings of a fit. See build.train_twin; max_iterations None: the default of the fit.
+
+    drive: what the commands of the runs have passed already; the model is put behind it.
+    """
 
     runs: Sequence[Run]
     validation_runs: Sequence[Run]
@@ -37,11 +41,15 @@ class FitRequest:
     network_inputs: tuple[str, ...] = ("speed", "command")
     physics: Physics = "refined"
     progress: Progress | None = None
+    drive: FoundDrive | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class FittedModel:
-    """A fitted model. parameters: (fans, 4), each fan's own. physics: whether they were refined with the network."""
+    """A fitted model. parameters: each fan's own, (fans, 4), behind a drive (fans, 7).
+
+    physics: whether they were refined with the network.
+    """
 
     model: Model
     parameters: Array
@@ -53,7 +61,8 @@ class FittedModel:
 def fit_physical(request: FitRequest) -> FittedModel:
     """The identified physics as they are, with what they fail to describe as warnings."""
     found = request.identification
-    return FittedModel(PhysicalModel(), found.parameters, found.iterations, warnings=found.misfits)
+    model, parameters = _behind(request.drive, PhysicalModel(), found.parameters)
+    return FittedModel(model, parameters, found.iterations, warnings=found.misfits)
 
 
 def fit_narx(request: FitRequest) -> FittedModel:
@@ -78,13 +87,20 @@ def fit_network_ode(request: FitRequest, units: int, make: Callable[[TanhNetwork
     model, parameters, iterations = train(untrained, request, limit)
     refinable = model.has_physics and request.trainer == "levenberg-marquardt"
     silent = model.has_physics and not np.any(model.theta)
+    driven, parameters = _behind(request.drive, model, parameters)
     return FittedModel(
-        model,
+        driven,
         parameters,
         iterations,
         physics=request.physics if refinable else "fixed",
         warnings=(SILENT_NETWORK,) if silent else (),
     )
+
+
+def _behind(drive: FoundDrive | None, model: OdeModel, parameters: Array) -> tuple[OdeModel, Array]:
+    if drive is None:
+        return model, parameters
+    return model.with_drive(drive.drive), np.hstack((parameters, drive.settings))
 
 
 def _by_adam(untrained: NetworkOde, request: FitRequest, limit: int) -> tuple[NetworkOde, Array, int]:

@@ -6,6 +6,7 @@ A kind of model is one class in a file of its own in this package. twin.kinds li
 from typing import ClassVar, Protocol, Self
 
 from schemas.twin_card import NetworkCard, StateLayout
+from twin.models.drive import Drive
 from twin.models.network import TanhNetwork
 from twin.models.onnx_nodes import Nodes
 from twin.models.right_hand_side import FanEquation
@@ -24,8 +25,8 @@ class TwinModel(Protocol):
         """Free run over a block of samples.
 
         state: (fans, n_state). command: (n, fans), held. step_s: (n,) time from sample k to k + 1. parameters:
-        (fans, 4). Returns speed_rad_s (n, fans), at each sample before its command acts, and the state after the last
-        step. Two blocks with the state carried over give what one block gives.
+        (fans, 4), behind a drive (fans, 7). Returns speed_rad_s (n, fans), at each sample before its command acts, and
+        the state after the last step. Two blocks with the state carried over give what one block gives.
         """
         ...
 
@@ -66,6 +67,10 @@ class OdeModel(Model, Protocol):
 
     def with_theta(self, theta: Array) -> Self:
         """The same model with other weights."""
+        ...
+
+    def with_drive(self, drive: Drive) -> Self:
+        """The same model behind a drive; its parameters are then (fans, 7)."""
         ...
 
     def equation(self, parameters: Array) -> FanEquation:

@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 from schemas.twin_card import NetworkCard, StateLayout
+from twin.models.drive import DRIVE_LAYOUT, Drive
 from twin.models.network import TanhNetwork
 from twin.models.ode_graph import ode_graph
 from twin.models.onnx_nodes import Nodes
-from twin.models.physics import LAG
 from twin.models.right_hand_side import ODE_LAYOUT, FanEquation, advance
 from twin.runs import Array
 
@@ -18,6 +18,7 @@ class NetworkOde:
 
     network: TanhNetwork
     state_layout: StateLayout = ODE_LAYOUT
+    drive: Drive | None = None
 
     has_physics: ClassVar[bool]
     fixed_rate: ClassVar[bool] = False
@@ -36,14 +37,18 @@ class NetworkOde:
         """The same model with other weights."""
         return replace(self, network=self.network.with_theta(theta))
 
+    def with_drive(self, drive: Drive) -> Self:
+        """The same model behind a drive; its parameters are then (fans, 7)."""
+        return replace(self, drive=drive, state_layout=DRIVE_LAYOUT)
+
     def equation(self, parameters: Array) -> FanEquation:
         """w' of a batch of fans with the physical parameters (batch, 4), which enter only if the model has physics."""
         return FanEquation(parameters if self.has_physics else None, self.network)
 
     def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
         """Free run from state; see model.TwinModel."""
-        return advance(self.equation(parameters), state, command, step_s, parameters[:, LAG])
+        return advance(self.equation(parameters), state, command, step_s, parameters, self.drive)
 
     def graph(self) -> Nodes:
         """See model.Model."""
-        return ode_graph(self.network, has_physics=self.has_physics)
+        return ode_graph(self.network, has_physics=self.has_physics, drive=self.drive)

@@ -13,46 +13,49 @@ from collections.abc import Callable
 import numpy as np
 from onnx import helper
 
+from twin.models.drive import DRIVE_PARAMETERS, SMALLEST_STEP_S, Drive
 from twin.models.network import TanhNetwork
 from twin.models.onnx_nodes import Nodes, double
 from twin.models.physics import PARAMETER_NAMES
 
-SMALLEST_STEP_S = 1e-30
-"""A step of zero counts as this long, so that it is never divided by a lag of zero."""
 RK4_WEIGHTS = np.array([[1.0, 2.0, 2.0, 1.0]]) / 6.0
 
 Term = Callable[[str], str]
 """The name of a speed (1, fans) to the name of what depends on it."""
 
 
-def ode_graph(network: TanhNetwork | None, *, has_physics: bool) -> Nodes:
+def ode_graph(network: TanhNetwork | None, *, has_physics: bool, drive: Drive | None = None) -> Nodes:
     """The nodes of a model w' = physics + network, either of which may be missing."""
     block, body = Nodes(), Nodes("step/")
-    states = block.rows("state", ["speed", "lagged"], "state_rows")
-    parameters: dict[str, str] = dict(
-        zip(PARAMETER_NAMES, block.rows("parameters", list(PARAMETER_NAMES), "turned"), strict=True)
-    )
+    states = block.rows("state", ["speed", "lagged"] if drive is None else ["speed", "lagged", "charge"], "state_rows")
+    names = PARAMETER_NAMES if drive is None else PARAMETER_NAMES + DRIVE_PARAMETERS
+    parameters: dict[str, str] = dict(zip(names, block.rows("parameters", list(names), "turned"), strict=True))
     step_s = block.add("Unsqueeze", ["step_s", block.constant("step_axes", [1, 2], np.int64)], "step")
     exponent = _decay_exponent(block, step_s, parameters["lag_s"])
 
-    acting, lagged = _lag(body)
+    row: list[str | int] = [1, "fans"]
+    command, charges, charges_after = "command_k", [], []
+    if drive is not None:
+        command, charge_after = drive.nodes(body, [parameters[name] for name in DRIVE_PARAMETERS])
+        charges, charges_after = [double("charge_k", row)], [double(charge_after, row)]
+    acting, lagged = _lag(body, command)
     speed = _rk4_step(body, _acceleration(network, has_physics, block, body, parameters, acting))
     present = body.add("Identity", ["speed_k"], "speed_now")
-    row = [1, "fans"]
     one_step = helper.make_graph(
         body.nodes,
         "one_step",
         [
             double("speed_k", row),
             double("lagged_k", row),
+            *charges,
             double("command_k", ["fans"]),
             double("step_k", [1, 1]),
             double("exponent_k", row),
         ],
-        [double(speed, row), double(lagged, row), double(present, row)],
+        [double(speed, row), double(lagged, row), *charges_after, double(present, row)],
         body.constants,
     )
-    finals = ["speed_final", "lagged_final"]
+    finals = ["speed_final", "lagged_final", *(["charge_final"] if drive else [])]
     block.scan(one_step, states, ["command", step_s, exponent], finals, "speed_rows")
     block.add("Squeeze", ["speed_rows", block.constant("row_axis", [1], np.int64)], "speed_rad_s")
     block.add("Transpose", [block.add("Concat", finals, "final_rows", axis=0)], "state_out", perm=[1, 0])
@@ -67,8 +70,8 @@ def _decay_exponent(block: Nodes, step_s: str, lag_s: str) -> str:
     )
 
 
-def _lag(body: Nodes) -> tuple[str, str]:
-    """lag.effective_command for one sample: the command that acts, and the lagged one after the step.
+def _lag(body: Nodes, command: str) -> tuple[str, str]:
+    """lag.effective_command for one sample's command: the one that acts, and the lagged one after the step.
 
     Without a lag both are the command itself, to the last bit. 1 - exp(-x) loses digits where steps are much shorter
     than the lag: of sixteen digits, one for each zero of x = step / lag after the decimal point.
@@ -77,9 +80,9 @@ def _lag(body: Nodes) -> tuple[str, str]:
     decay = body.add("Exp", ["exponent_k"], "decay")
     lost = body.add("Sub", [decay, body.constant("one", 1.0)], "lost")
     mean_share = body.add("Div", [lost, "exponent_k"], "mean_share")
-    distance = body.add("Sub", ["lagged_k", "command_k"], "distance")
-    acting = body.add("Add", ["command_k", body.add("Mul", [distance, mean_share], "mean_left")], "acting")
-    lagged = body.add("Add", ["command_k", body.add("Mul", [distance, decay], "left")], "lagged_next")
+    distance = body.add("Sub", ["lagged_k", command], "distance")
+    acting = body.add("Add", [command, body.add("Mul", [distance, mean_share], "mean_left")], "acting")
+    lagged = body.add("Add", [command, body.add("Mul", [distance, decay], "left")], "lagged_next")
     return acting, lagged
 
 

@@ -5,12 +5,13 @@ d torque / d speed is alpha + 2 C_D |w|. That it is positive at both ends makes 
 speed, which is all that physics demands: C_D may come out negative where friction or a dead zone bends the curve.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
 
 from schemas.twin_card import NetworkCard, StateLayout
+from twin.models.drive import DRIVE_LAYOUT, Drive
 from twin.models.ode_graph import ode_graph
 from twin.models.onnx_nodes import Nodes
 from twin.models.physics import LAG, PARAMETER_NAMES
@@ -23,6 +24,7 @@ class PhysicalModel:
     """Physics alone. Shapes as in model.TwinModel."""
 
     state_layout: StateLayout = ODE_LAYOUT
+    drive: Drive | None = None
 
     kind: ClassVar[str] = "physical"
     fixed_rate: ClassVar[bool] = False
@@ -47,17 +49,21 @@ class PhysicalModel:
         """The same model: it has no weights."""
         return self
 
+    def with_drive(self, drive: Drive) -> Self:
+        """The same model behind a drive; its parameters are then (fans, 7)."""
+        return replace(self, drive=drive, state_layout=DRIVE_LAYOUT)
+
     def equation(self, parameters: Array) -> FanEquation:
         """w' of a batch of fans with the physical parameters (batch, 4)."""
         return FanEquation(parameters, None)
 
     def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
         """Free run from state; see model.TwinModel."""
-        return advance(self.equation(parameters), state, command, step_s, parameters[:, LAG])
+        return advance(self.equation(parameters), state, command, step_s, parameters, self.drive)
 
     def graph(self) -> Nodes:
         """See model.Model."""
-        return ode_graph(None, has_physics=True)
+        return ode_graph(None, has_physics=True, drive=self.drive)
 
 
 def physical_parameters(unknowns: Array, top_speed_rad_s: Array) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 
 from schemas.twin_card import StateLayout
 from twin.models import physics
+from twin.models.drive import Drive, drive_settings
 from twin.models.integration import free_run
 from twin.models.lag import effective_command
 from twin.models.network import TanhNetwork
@@ -20,7 +21,7 @@ ODE_LAYOUT = StateLayout(speed=1, command=1)
 
 @dataclass(frozen=True, eq=False)
 class FanEquation:
-    """The right-hand side of a batch of fans. parameters: (batch, 4) or None without physics.
+    """The right-hand side of a batch of fans. parameters: (batch, 4) or more, or None without physics.
 
     linearise gives the derivatives by the network's weights and then by J, alpha and C_D, as far as there are any.
     """
@@ -70,8 +71,18 @@ class FanEquation:
         return self.parameters
 
 
-def advance(equation: FanEquation, state: Array, command: Array, step_s: Array, lag_s: Array) -> tuple[Array, Array]:
-    """Free run from a state (fans, 2) of speed and lagged command; see model.TwinModel. lag_s: (fans,)."""
-    acting, lagged = effective_command(command, step_s[:, np.newaxis], lag_s, state[:, 1])
+def advance(
+    equation: FanEquation, state: Array, command: Array, step_s: Array, parameters: Array, drive: Drive | None
+) -> tuple[Array, Array]:
+    """Free run from a state; see model.TwinModel. parameters: (fans, 4), with a drive (fans, 7).
+
+    state: (fans, 2) speed and lagged command, with a drive also its charge.
+    """
+    charge = state[:, 2:]
+    if drive is not None:
+        share, after = drive.kick(command, step_s[:, np.newaxis], state[:, 2])
+        command = drive.effective(command, share, drive_settings(parameters))
+        charge = after[:, np.newaxis]
+    acting, lagged = effective_command(command, step_s[:, np.newaxis], parameters[:, physics.LAG], state[:, 1])
     speed_rad_s, final = free_run(equation, state[:, 0], acting, step_s)
-    return speed_rad_s, np.column_stack((final, lagged))
+    return speed_rad_s, np.column_stack((final, lagged, charge))

@@ -25,6 +25,9 @@ PARAMETER_MEANING = {
     "alpha": ("α", "viscous friction, in command s/rad"),
     "C_D": ("C_D", "drag, in command s²/rad²"),
     "lag_s": ("lag", "of the torque behind the command, s"),
+    "lowest_command": ("lowest", "lowest command that has an effect, below it the fan keeps its speed"),
+    "friction": ("friction", "of the command, does not turn the rotor"),
+    "kick_command": ("kick", "command with which the drive starts the rotor"),
 }
 
 

@@ -81,8 +81,7 @@ def settling_time_constant_s(speed_rad_s: float, parameters: Array) -> float:
     """Of one fan's physics around a speed, the lag of its drive included; infinite where the physics do not settle."""
     with np.errstate(divide="ignore"):
         mechanical_s = float(physics.time_constant_s(np.array([speed_rad_s]), parameters[np.newaxis])[0])
-    named = dict(zip(physics.PARAMETER_NAMES, parameters.tolist(), strict=True))
-    return mechanical_s + named.get("lag_s", 0.0) if mechanical_s > 0.0 else np.inf
+    return mechanical_s + float(parameters[physics.LAG]) if mechanical_s > 0.0 else np.inf
 
 
 def _holds(piece: Run, fan: int, parameters: Array, tolerance: float, top_speed_rad_s: float) -> list[Hold]:

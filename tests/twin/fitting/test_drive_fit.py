@@ -1,0 +1,51 @@
+"""The drive of fans that control their own speed is found where there is one, and nowhere else."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from schemas.tacho import Tacho
+from twin.fitting.drive_fit import FoundDrive, find_drive
+from twin.fitting.identification import identify
+from twin.fitting.standstill import find_standstill
+from twin.measurement import measurement_of
+from twin.models.drive import Drive
+from twin.models.physical import PhysicalModel
+from twin.runs import Run
+
+DRIVE = Drive(turning_command=10.0, kick_s=0.6, rest_s=2.0)
+PHYSICS = np.array([[0.35, 0.25, 5e-4, 0.0]])
+SETTINGS = np.array([[50.0, 10.0, 180.0]])
+RATE_HZ, HOLD_S = 10.0, 12.0
+
+
+def run_of(drive: Drive | None, seed: int) -> Run:
+    """Eight minutes of a counted fan whose command jumps; every fifth one stops it."""
+    rng = np.random.default_rng(seed)
+    levels = rng.choice([20.0, 30.0, 45.0, 70.0, 110.0, 160.0, 220.0, 255.0], 40)
+    levels[4::5] = 0.0
+    command = np.repeat(levels, round(HOLD_S * RATE_HZ))[:, np.newaxis]
+    t_s = np.arange(len(command)) / RATE_HZ
+    model = PhysicalModel() if drive is None else PhysicalModel().with_drive(drive)
+    parameters = PHYSICS if drive is None else np.hstack((PHYSICS, SETTINGS))
+    state = model.state_layout.initial_state(np.array([100.0]), command[0])
+    speed, _ = model.advance(state, command, np.full(len(t_s), 1.0 / RATE_HZ), parameters)
+    run = Run("made", t_s, command, speed, (Tacho(kind="count", window_s=0.5),))
+    noise = rng.normal(0.0, run.tacho[0].resolution_rad_s / np.sqrt(6.0), speed.shape)
+    return replace(run, speed_rad_s=np.maximum(measurement_of(run).of_speed(speed) + noise, 0.0))
+
+
+def found_in(drive: Drive | None) -> FoundDrive | None:
+    runs, held_out = [run_of(drive, 1)], [run_of(drive, 2)]
+    return find_drive(runs, held_out, identify(runs, with_lag=False), find_standstill([*runs, *held_out]))
+
+
+def test_plateau_friction_and_kick_are_found() -> None:
+    found = found_in(DRIVE)
+    assert found is not None
+    assert (found.drive.kick_s, found.drive.rest_s) == (DRIVE.kick_s, DRIVE.rest_s)
+    np.testing.assert_allclose(found.settings, SETTINGS, rtol=0.05, atol=1.5)
+
+
+def test_a_fan_whose_command_acts_as_it_is_gets_no_drive() -> None:
+    assert found_in(None) is None
