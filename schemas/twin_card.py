@@ -213,7 +213,9 @@ class TwinCard:
     of the alarms (scoring.limits), None before calibration. tacho: what the free run must pass before it is compared
     with readings, and the command before the torque balance; one for all fans, or one for each. standstill: how the
     fans stop, stand and start; None in early cards, and where the runs do not show at which commands fans turn. drive:
-    of fans that control their own speed; None: the command acts as it is.
+    of fans that control their own speed; None: the command acts as it is. reading_sigma_rad_s: per fan, root mean
+    square of the distance of healthy readings from those that the tachos may show of the free run, of fans that neither
+    start nor stand; empty in early cards and where tachos are instantaneous: it is sigma_rad_s there.
     """
 
     kind: str
@@ -245,6 +247,7 @@ class TwinCard:
     tacho: Tachos = INSTANTANEOUS
     standstill: Standstill | None = None
     drive: DriveCard | None = None
+    reading_sigma_rad_s: tuple[Positive, ...] = ()
     format_version: int = FORMAT_VERSION
 
     @model_validator(mode="after")
@@ -255,6 +258,8 @@ class TwinCard:
             raise ValueError("parameters must have one row for each fan, as long as parameter_names")
         if len(self.sigma_rad_s) != self.fans:
             raise ValueError("sigma_rad_s must have one value for each fan")
+        if len(self.reading_sigma_rad_s) not in (0, self.fans):
+            raise ValueError("reading_sigma_rad_s must have one value for each fan, or none")
         for name, values in self.balance.per_fan.items():
             if len(values) != self.fans:
                 raise ValueError(f"balance.{name} must have one value for each fan")
@@ -276,6 +281,11 @@ class TwinCard:
     def tacho_of_each_fan(self) -> tuple[Tacho, ...]:
         """(fans,) tachos."""
         return tacho_of_each_fan(self.tacho, self.fans)
+
+    @property
+    def scored_sigma_rad_s(self) -> tuple[float, ...]:
+        """Per fan, the healthy standard deviation of the residual that is scored at run time."""
+        return self.reading_sigma_rad_s or self.sigma_rad_s
 
     @property
     def top_speed_rad_s(self) -> float:

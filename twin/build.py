@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS
 from schemas.twin_card import (
     BalanceCard,
@@ -28,6 +29,7 @@ from twin.evaluation.accuracy import (
     evaluation_pieces,
     free_run_residuals,
 )
+from twin.evaluation.reading_range import reading_sigma_rad_s
 from twin.evaluation.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
 from twin.export.fan_rows import fan_rows, measured_as_in_card
 from twin.export.onnx_export import export_onnx
@@ -186,6 +188,7 @@ def train_twin(
         tacho=tacho[:1] if len(set(tacho)) == 1 else tacho,
         standstill=standstill,
         drive=drive.card if drive else None,
+        reading_sigma_rad_s=_reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces),
     )
     return TrainedTwin(model, parameters, card, identification, validation)
 
@@ -204,6 +207,14 @@ def evaluate(
     rows = fan_rows(loaded.card, common_fans(runs), fan_numbers)
     runs = measured_as_in_card(loaded.card, rows, runs)
     return evaluate_model(model, loaded.parameters[rows], np.array(loaded.card.sigma_rad_s)[rows], runs)
+
+
+def _reading_sigma_rad_s(
+    model: Model, parameters: Array, sigma_rad_s: Array, standstill: Standstill | None, pieces: Sequence[Run]
+) -> tuple[float, ...]:
+    if all(tacho.window_s == 0.0 for tacho in pieces[0].tacho):
+        return ()
+    return tuple(reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces).tolist())
 
 
 def _as_if_instantaneous(runs: Sequence[Run]) -> list[Run]:

@@ -86,14 +86,16 @@ def compared_readings(piece: Run) -> Array:
     return np.where(measurement_of(piece).comparable, piece.speed_rad_s, np.nan)
 
 
-def free_run_readings(model: TwinModel, parameters: Array, piece: Run) -> Array:
-    """(n, fans) readings in rad/s that the tachos are expected to show of a free run.
-
-    It follows from the measured start and the commands alone; not finite where it diverged.
-    """
+def free_run_speeds(model: TwinModel, parameters: Array, piece: Run) -> Array:
+    """(n, fans) speeds in rad/s of a free run from the measured start, driven by the commands; not finite where it
+    diverged."""
     state = _starting_state(model, parameters, piece)
-    speed_rad_s = model.advance(state, piece.command, piece.step_s, parameters)[0]
-    return measurement_of(piece).of_speed(speed_rad_s)
+    return model.advance(state, piece.command, piece.step_s, parameters)[0]
+
+
+def free_run_readings(model: TwinModel, parameters: Array, piece: Run) -> Array:
+    """(n, fans) readings in rad/s that the tachos are expected to show of free_run_speeds."""
+    return measurement_of(piece).of_speed(free_run_speeds(model, parameters, piece))
 
 
 def free_run_residuals(model: TwinModel, parameters: Array, pieces: Sequence[Run]) -> Array:
