@@ -4,8 +4,9 @@ A fan's settings are fitted along with its physics on the free run, by Levenberg
 one kick and rest after the other of two short ladders. Both enter through the command, so that the rest of the model
 maker needs to know nothing of a drive: it is given the runs with the commands that act.
 
-Most fans have no such drive. One is kept only if it lowers the free-run error of the physics over held-out runs by
-`LEAST_GAIN` or more. It is compared with friction alone, which is no drive: a hybrid learns that by itself.
+Most fans have no such drive. It is looked for where readings are of pulses, as those of 4-pin fans are, and each fan
+starts `FEWEST_STARTS` times. It is kept only if it lowers the free-run error of the physics over held-out runs by
+`LEAST_GAIN` or more, compared with friction alone, which is no drive: a hybrid learns that by itself.
 """
 
 from collections.abc import Sequence
@@ -28,6 +29,7 @@ from twin.models.recursion import linear_recursion
 from twin.models.right_hand_side import FanEquation
 from twin.runs import Array, Run
 
+FEWEST_STARTS = 3
 LEAST_GAIN = 0.1
 """a share of the free-run error"""
 KICKS_S, RESTS_S = (0.3, 0.6, 1.2), (1.0, 2.0, 4.0)
@@ -72,9 +74,12 @@ def find_drive(
 
     validation_runs: what it has to pay over; without them it is the runs themselves. plain: without a drive.
     """
-    if standstill is None or standstill.off_command is None:
+    of_pulses = all(tacho.kind != "instantaneous" for run in runs for tacho in run.tacho)
+    if not of_pulses or standstill is None or standstill.off_command is None:
         return None
     turning = (standstill.off_command + standstill.turning_command) / 2.0
+    if np.min(np.sum([_starts(run, turning) for run in runs], axis=0)) < FEWEST_STARTS:
+        return None
     try:
         learned, judged = _Runs(runs), _Runs(validation_runs or runs)
     except TwinError:
@@ -108,6 +113,12 @@ def find_drive(
     if not with_drive < (1.0 - LEAST_GAIN) ** 2 * friction_alone:
         return None
     return FoundDrive(drive, best[:, LAG:])
+
+
+def _starts(run: Run, turning_command: float) -> NDArray[np.intp]:
+    """(fans,) how often the command goes from one that stops the fan to one that turns it."""
+    is_on = run.command >= turning_command
+    return np.count_nonzero(~is_on[:-1] & is_on[1:], axis=0)
 
 
 class _Runs:

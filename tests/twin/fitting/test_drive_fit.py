@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from schemas.tacho import Tacho
+from schemas.tacho import INSTANTANEOUS, Tacho
 from twin.fitting.drive_fit import FoundDrive, find_drive
 from twin.fitting.identification import identify
 from twin.fitting.standstill import find_standstill
@@ -45,6 +45,13 @@ def test_plateau_friction_and_kick_are_found() -> None:
     assert found is not None
     assert (found.drive.kick_s, found.drive.rest_s) == (DRIVE.kick_s, DRIVE.rest_s)
     np.testing.assert_allclose(found.settings, SETTINGS, rtol=0.05, atol=1.5)
+
+
+def test_a_drive_is_looked_for_where_readings_are_of_pulses_and_starts_are_many() -> None:
+    run, standstill = run_of(DRIVE, 1), find_standstill([run_of(DRIVE, 1)])
+    plain = identify([run_of(None, 1)], with_lag=False)
+    assert find_drive([replace(run, tacho=INSTANTANEOUS)], [], plain, standstill) is None
+    assert find_drive([run.between(0.0, 3 * 5 * HOLD_S)], [], plain, standstill) is None
 
 
 def test_a_fan_whose_command_acts_as_it_is_gets_no_drive() -> None:
