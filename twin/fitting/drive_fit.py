@@ -5,8 +5,8 @@ one kick and rest after the other of two short ladders. Both enter through the c
 maker needs to know nothing of a drive: it is given the runs with the commands that act.
 
 Most fans have no such drive. It is looked for where readings are of pulses, as those of 4-pin fans are, and each fan
-starts `FEWEST_STARTS` times. It is kept only if it lowers the free-run error of the physics over held-out runs by
-`LEAST_GAIN` or more, compared with friction alone, which is no drive: a hybrid learns that by itself.
+starts, all together `FEWEST_STARTS` times. It is kept only if it lowers the free-run error of the physics over held-out
+runs by `LEAST_GAIN` or more, compared with friction alone, which is no drive: a hybrid learns that by itself.
 """
 
 from collections.abc import Sequence
@@ -78,7 +78,8 @@ def find_drive(
     if not of_pulses or standstill is None or standstill.off_command is None:
         return None
     turning = (standstill.off_command + standstill.turning_command) / 2.0
-    if np.min(np.sum([_starts(run, turning) for run in runs], axis=0)) < FEWEST_STARTS:
+    starts = np.sum([_starts(run, turning) for run in runs], axis=0)
+    if starts.min() == 0 or starts.sum() < FEWEST_STARTS:
         return None
     try:
         learned, judged = _Runs(runs), _Runs(validation_runs or runs)
