@@ -20,7 +20,7 @@ import typer
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.detection.measured import measured_tables
-from bench.detection.rack_recordings import RackData
+from bench.detection.rack_recordings import LEARNING, RackData
 from bench.detection.rack_tables import RACK_NOTES, rack_tables
 from bench.detection.racks import RATES_HZ
 from bench.detection.simulated_tables import (
@@ -82,6 +82,8 @@ def main(
     notes: list[str] = []
     if only == "rack":
         rates, amounts = report_hz or RATES_HZ, learn or ["15 minutes", "three nights"]
+        if unknown := [name for name in amounts if name not in LEARNING]:
+            raise SystemExit(f"--learn {unknown[0]!r}: give one of {', '.join(LEARNING)}")
         with tempfile.TemporaryDirectory() as folder:
             for rate_hz in rates:
                 data = RackData(keep or Path(folder), racks, rate_hz, 3600.0 * test_hours, seed)
