@@ -283,11 +283,6 @@ class TwinCard:
         return tacho_of_each_fan(self.tacho, self.fans)
 
     @property
-    def scored_sigma_rad_s(self) -> tuple[float, ...]:
-        """Per fan, the healthy standard deviation of the residual that is scored at run time."""
-        return self.reading_sigma_rad_s or self.sigma_rad_s
-
-    @property
     def top_speed_rad_s(self) -> float:
         """The highest speed in the training data, in either direction."""
         return max(map(abs, self.speed_range_rad_s))

@@ -54,7 +54,7 @@ class TrayTwin:
     """A twin's card, and what it holds for each fan of a tray. A twin of one fan serves every fan.
 
     card_json: the card as it stands in the file. sha256: of the file. sigma_rad_s: (fans,), standard deviation of the
-    healthy residual that is scored.
+    healthy residual.
     """
 
     card: TwinCard
@@ -163,7 +163,7 @@ def tray_twin(path: Path, content: bytes, fans: int | None) -> TrayTwin:
         card=card,
         card_json=card_json,
         sha256=hashlib.sha256(content).hexdigest(),
-        sigma_rad_s=for_fans(card.scored_sigma_rad_s, fans),
+        sigma_rad_s=for_fans(card.sigma_rad_s, fans),
         balance=Balance.from_card(card.balance, fans),
     )
 
