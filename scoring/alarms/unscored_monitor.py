@@ -17,7 +17,7 @@ REASONS = {
     InvalidReason.SATURATED: "saturated",
     InvalidReason.NO_SPEED: "no speed",
     InvalidReason.NO_TWIN: "the twin does not fit the grid's rate",
-    InvalidReason.CLOCK_RESTARTED: "the clock of the device keeps restarting",
+    InvalidReason.CLOCK_RESTARTED: "the clock of the device restarted",
     InvalidReason.STOPPED: "stopped by its command",
     InvalidReason.STARTING: "starting",
 }

@@ -10,6 +10,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterable
+from datetime import datetime
 from enum import StrEnum
 from typing import Annotated
 
@@ -149,21 +150,45 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
             console.print(line)
         if not found and not unjudged:
             console.print(Text("no alarms", style="green"))
-    names = {(alarm.header.producer, alarm.header.sequence, alarm.header.tray) for alarm in known}
-    while watch and not stop.is_set():
+    if watch:
+        _watch(
+            news, {_identity(alarm) for alarm in known}, watcher, config.site, stop, console, json_output=json_output
+        )
+    elif unjudged:
+        raise typer.Exit(1)
+
+
+def _watch(
+    news: queue.Queue[Alarm],
+    listed: set[tuple[str, int, str]],
+    watcher: SiteWatcher,
+    site: str,
+    stop: threading.Event,
+    console: Console,
+    *,
+    json_output: bool,
+) -> None:
+    """Print each transition that is not listed already, and when the last scorer goes or one is back."""
+    has_scorer = True
+    while not stop.is_set():
         try:
-            alarm = news.get(timeout=0.1)
+            alarm = news.get(timeout=_POLL_S)
         except queue.Empty:
+            if has_scorer != any(view.alive and view.health.stage == "scorer" for view in watcher.stages()):
+                has_scorer = not has_scorer
+                said = "a scorer is back" if has_scorer else "no scorer is alive: alarms are unknown until one is back"
+                typer.echo(f"{datetime.now():%H:%M:%S}  site {site!r}: {said}", err=True)
             continue
-        is_listed_already = (alarm.header.producer, alarm.header.sequence, alarm.header.tray) in names
-        if is_listed_already or not _counts(watcher, config.site, alarm):
+        if _identity(alarm) in listed or not _counts(watcher, site, alarm):
             continue
         if json_output:
             typer.echo(json.dumps({"transition": _word(alarm), **_alone(alarm).as_json()}))
         else:
             console.print(_transition_line(alarm))
-    if unjudged and not watch:
-        raise typer.Exit(1)
+
+
+def _identity(alarm: Alarm) -> tuple[str, int, str]:
+    return alarm.header.producer, alarm.header.sequence, alarm.header.tray
 
 
 def _slow_changes(watcher: SiteWatcher) -> list[str]:

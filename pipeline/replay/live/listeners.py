@@ -147,7 +147,8 @@ class Listeners:
         now = self._watcher.losses()
         lost = Counter({name: count - self._before.get(name, 0) for name, count in now.items()})
         for view in self._views():
-            if view.health.header.producer in self._present_at_start and not load_stage(view.health.stage).may_drop:
+            row = STAGES.get(view.health.stage)
+            if view.health.header.producer in self._present_at_start and not (row and row.may_drop):
                 for (key, of), state in input_streams(view.health).items():
                     if of == producer and key in published:
                         lost[label(view.health)] += state.first_sequence

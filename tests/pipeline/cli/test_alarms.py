@@ -255,14 +255,16 @@ def test_commands_that_come_and_go_are_no_loss_to_the_scorer(site):
 def test_watching_prints_what_happens_as_it_happens(site):
     site.raise_alarm(3)
     words = [*FANTWIN, "alarms", "--watch", "--json", *map(str, site.words)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as watching:
-        assert watching.stdout
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watching:
+        assert watching.stdout and watching.stderr
         standing = json.loads(watching.stdout.readline())["alarms"]
         assert [(a["fan"], a["active"]) for a in standing] == [(3, True)]
         site.core.ratio[3] = 0.0
         cleared = json.loads(watching.stdout.readline())
         site.ask("ack", TRAY, 3, "--operator", "Ann")
         acknowledged = json.loads(watching.stdout.readline())
+        site.end()
+        assert f"site '{SITE}': no scorer is alive: alarms are unknown until one is back" in watching.stderr.readline()
         watching.send_signal(signal.SIGINT)
         assert watching.wait(20) == 0
     assert (cleared["transition"], cleared["fan"], cleared["active"]) == ("cleared", 3, False)
