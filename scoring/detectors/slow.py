@@ -22,11 +22,18 @@ from scoring.detectors.detector import (
 from scoring.detectors.low_pass import LowPass
 
 TIME_CONSTANT_S = 60.0
+MIN_LIMIT = 0.25
 BETWEEN_RUNS_STDS = 3.0  # with too few healthy data no limit is below so many of those of healthy baselines
 
 
 class SlowSettings(SingleLimit):
     """Of Slow. limit: in healthy standard deviations of the residual."""
+
+    def scaled(self, factor: float) -> SlowSettings:
+        """See DetectorSettings. Runs of minutes show next to nothing of what changes within minutes: a limit from them
+        would be near zero.
+        """
+        return self.model_copy(update={"limit": max(self.limit * factor, MIN_LIMIT)})
 
     def cautious_factor(self, evidence: HealthyEvidence) -> float | None:
         """See DetectorSettings. Short data show too little of how a residual varies over minutes."""
