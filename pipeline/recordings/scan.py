@@ -19,6 +19,7 @@ from pipeline.recordings.records import (
     CORRUPT_DATA_ERRORS,
     MESSAGE,
     Record,
+    RecordingError,
     RecordReader,
     chunk_data,
     indexed_reader,
@@ -111,6 +112,18 @@ def scan(path: Path) -> Scan:
         RecordingError: it cannot be read, or is not an MCAP file.
     """
     found = Scan(path, RecordReader(path))
+    try:
+        footer = _read_to_footer(found)
+        found.has_index = footer is not None and found.reader.is_complete and _has_valid_summary(path, footer)
+    except OSError as error:  # it was finished, and given its name, while it was read
+        raise RecordingError(f"{path}: cannot read the recording: {error.strerror}; is it finished now?") from error
+    reader = found.reader
+    read_up_to = reader.size if found.is_ended else reader.end
+    found.discarded_bytes += reader.size - read_up_to + sum(end - start for start, end in reader.damaged_ranges)
+    return found
+
+
+def _read_to_footer(found: Scan) -> Record | None:
     scanner = _Scanner(found)
     footer: Record | None = None
     for record in found.reader:
@@ -118,11 +131,7 @@ def scan(path: Path) -> Scan:
             footer = record
         else:
             scanner.add(record)
-    reader = found.reader
-    found.has_index = footer is not None and reader.is_complete and _has_valid_summary(path, footer)
-    read_up_to = reader.size if found.is_ended else reader.end
-    found.discarded_bytes += reader.size - read_up_to + sum(end - start for start, end in reader.damaged_ranges)
-    return found
+    return footer
 
 
 class _Scanner:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +22,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from pipeline.recordings.contents import contents_of, damage_of
 from pipeline.recordings.disk import AtomicAppendFile
 from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
-from pipeline.recordings.records import RECORD, RecordReader, record_bytes
+from pipeline.recordings.records import RECORD, Record, RecordReader, record_bytes
 from pipeline.recordings.repair import recover, repair_in_place
 from pipeline.recordings.scan import scan
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
@@ -416,3 +417,18 @@ def test_a_truncated_file_from_another_writer_is_repaired_too(tmp_path, chunked,
         assert summary is not None and summary.statistics is not None
         assert summary.statistics.message_count == found.messages
         assert [m.log_time for _, _, m in reader.iter_messages()] == all_of_it[: found.messages]
+
+
+def test_a_recording_that_is_renamed_while_it_is_read_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As by the recorder that finishes it."""
+    path, read = small(tmp_path / "one.mcap"), RecordReader.__iter__
+
+    def then_renamed(reader: RecordReader) -> Iterator[Record]:
+        yield from read(reader)
+        path.rename(tmp_path / "other.mcap")
+
+    monkeypatch.setattr(RecordReader, "__iter__", then_renamed)
+    with pytest.raises(RecordingError, match="one.mcap: cannot read the recording: No such file"):
+        scan(path)

@@ -329,7 +329,7 @@ def test_slow_wear_is_followed_for_a_while_and_then_alarms(white_limits: Limits)
     assert min(first_s) > 0.5 * farthest / per_s  # not at once: the baseline follows, and lags
     baseline = scorer.residuals["speed"].baseline
     followed = np.abs(baseline.value - baseline.commissioned)
-    assert 0.2 * farthest < followed.min()
+    assert 0.1 * farthest < followed.min()  # it stays where the residual over a minute is halfway to its limit
     assert followed.max() <= farthest
 
 
