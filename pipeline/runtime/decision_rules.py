@@ -32,7 +32,7 @@ class DecisionRules(IntEnum):
     STOPPED_AND_WORN = 7
     """A fan that stands as commanded is judged: its alarm keeps its data, and an alarm of a fan that turned although it
     was stopped returns. The longer an alarm has stood, the longer it must be gone. Causes account for what the tacho
-    resolves."""
+    resolves, and one of standstill stays when the fan turns again."""
 
 
 CURRENT_RULES = max(DecisionRules)

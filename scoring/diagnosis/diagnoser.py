@@ -19,7 +19,7 @@ from scoring.detectors.deviation import summed_deviation
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnosis import ADVICE, RankedCause, diagnose
 from scoring.diagnosis.regression_window import HealthyBalance, Window
-from scoring.diagnosis.shown_causes import MIN_PROBABILITY
+from scoring.diagnosis.shown_causes import MIN_PROBABILITY, STANDSTILL_CAUSES
 from scoring.diagnosis.standstill_causes import standstill_causes
 
 WINDOW_S = 95.0
@@ -126,7 +126,13 @@ class Diagnoser:
         return tuple(_message(cause) for cause in causes if cause.probability >= least)
 
     def says_more(self, causes: Sequence[CauseMessage], than: Sequence[CauseMessage]) -> bool:
-        """Whether causes are worth a message after others: in another order, or with other probabilities."""
+        """Whether causes are worth a message after others: in another order, or with other probabilities.
+
+        A fan that did not turn and turns again has recovered: causes found from then on are of the fault's end.
+        """
+        stood, stands = (bool(each) and each[0].cause in STANDSTILL_CAUSES for each in (than, causes))
+        if self._knows_readings and stood and not stands:
+            return False
         if self._advice is None or [each.cause for each in causes] != [each.cause for each in than]:
             return True
         return any(abs(new.probability - old.probability) >= NEWS for new, old in zip(causes, than, strict=True))

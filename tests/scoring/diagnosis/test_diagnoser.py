@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from schemas.messages import Transition
+from schemas.messages import Diagnosis, Transition
 from scoring.detectors.deviation import summed_deviation
 from scoring.diagnosis.diagnoser import MAX_SAMPLES, Diagnoser
 from scoring.diagnosis.shown_causes import MIN_PROBABILITY
@@ -164,3 +164,15 @@ def test_a_silent_line_is_not_taken_for_a_tacho_that_drops_out() -> None:
     diagnosed = [alarm for alarm in alarms if alarm.transition == Transition.DIAGNOSED]
     assert diagnosed
     assert "sensor_dropout" not in {cause.cause for alarm in diagnosed for cause in alarm.causes}
+
+
+def test_a_fan_that_turns_again_keeps_the_cause_for_which_it_did_not_turn() -> None:
+    causes = {name: Diagnosis(cause=name, probability=0.6) for name in ("no_power", "blocked", "gain_down")}
+    now, before = Diagnoser([balance_of_a_fan()]), Diagnoser([balance_of_a_fan()], knows_readings=False)
+    for later, earlier, is_news in (
+        ("gain_down", "no_power", False),
+        ("no_power", "gain_down", True),
+        ("no_power", "blocked", True),
+    ):
+        assert now.says_more([causes[later]], [causes[earlier]]) == is_news
+        assert before.says_more([causes[later]], [causes[earlier]])
