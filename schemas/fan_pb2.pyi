@@ -43,8 +43,6 @@ class Statistic(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     STATISTIC_BALANCE_VARIANCE_GROWTH: _ClassVar[Statistic]
     STATISTIC_SENSOR: _ClassVar[Statistic]
     STATISTIC_STANDSTILL: _ClassVar[Statistic]
-    STATISTIC_SPEED_SLOW: _ClassVar[Statistic]
-    STATISTIC_BALANCE_SLOW: _ClassVar[Statistic]
 
 class Transition(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -122,8 +120,6 @@ STATISTIC_BALANCE_DRIFT: Statistic
 STATISTIC_BALANCE_VARIANCE_GROWTH: Statistic
 STATISTIC_SENSOR: Statistic
 STATISTIC_STANDSTILL: Statistic
-STATISTIC_SPEED_SLOW: Statistic
-STATISTIC_BALANCE_SLOW: Statistic
 TRANSITION_NONE: Transition
 TRANSITION_RAISED: Transition
 TRANSITION_SEVERITY: Transition

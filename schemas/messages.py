@@ -60,8 +60,6 @@ class Statistic(OpenEnum):
     BALANCE_VARIANCE_GROWTH = 6
     SENSOR = 7
     STANDSTILL = 8
-    SPEED_SLOW = 9
-    BALANCE_SLOW = 10
 
 
 class Transition(OpenEnum):

@@ -1,7 +1,7 @@
 """What limits find: how far the speed of a fan must drop at a constant command to raise an alarm, and how soon.
 
-At once: beyond the limit of a smoothed residual. Within a minute: also what drift and slow residual show by then, while
-the baseline follows the fan as long as every statistic is below half of its limit. A drop of the speed at a constant
+At once: beyond the limit of a smoothed residual. Within a minute: also what the drift adds up in that time, while the
+baseline follows the fan as long as every statistic is below half of its limit. A drop of the speed at a constant
 command is a shift of the torque balance by the slope of the needed command over speed, viscous + 2 drag w; the residual
 that finds the smaller drop counts. Noise is left out: a drop of this size is found about every second time so soon.
 """
@@ -15,7 +15,6 @@ import numpy as np
 
 from scoring.detectors.detector import Signal
 from scoring.detectors.drift import Drift
-from scoring.detectors.slow import TIME_CONSTANT_S, Slow
 from scoring.detectors.smoothed import Smoothed
 from scoring.detectors.table import rows
 from scoring.diagnosis.regression_window import HealthyBalance
@@ -55,7 +54,7 @@ def detectable_drops(
 
 def _drops(scorer: FanScorer, source: Signal, speed_rad_s: float, rad_s_per_sigma: float) -> tuple[float, float]:
     """The drops by one residual, at once and within a minute, rad/s."""
-    drifts, smoothed, slow_limit = [], np.inf, np.inf
+    drifts, smoothed = [], np.inf
     limits = scorer.limits.residual(source)
     unit = float(scorer.residuals[source].limit_std(np.array([speed_rad_s]))[0])
     """of the limits at this speed, sigma"""
@@ -67,25 +66,18 @@ def _drops(scorer: FanScorer, source: Signal, speed_rad_s: float, rad_s_per_sigm
             drifts.append(detector)
         elif isinstance(detector, Smoothed):
             smoothed = detector.limit_sigmas(_period_s(scorer)) / limits.mean_residual_std
-        elif isinstance(detector, Slow):
-            slow_limit = detector.limit_sigmas(_period_s(scorer)) / limits.mean_residual_std
     at_once = smoothed * unit * rad_s_per_sigma
     if not drifts or not np.isfinite(rad_s_per_sigma):
         return at_once, at_once
     timing, most = scorer.limits.timing, limits.baseline.adaptation_limit_sigmas / unit
 
     def is_found(shift: float) -> bool:
-        baseline = slow = 0.0
+        baseline = 0.0
         sums = [0.0] * len(drifts)
         for _ in range(round(MINUTE_S)):
             left = shift - baseline
             sums = [max(0.0, total + left - drift.reference_sigmas) for total, drift in zip(sums, drifts, strict=True)]
-            slow += (left - slow) / TIME_CONSTANT_S
-            ratio = max(
-                left / smoothed,
-                slow / slow_limit,
-                *(s / drift.limit_sigma_s for s, drift in zip(sums, drifts, strict=True)),
-            )
+            ratio = max(left / smoothed, *(s / drift.limit_sigma_s for s, drift in zip(sums, drifts, strict=True)))
             if ratio > 1.0:
                 return True
             if ratio <= HALF_LIMIT:

@@ -21,7 +21,6 @@ from scoring.detectors.detector import (
 from scoring.detectors.deviation import summed_deviation
 
 CAP_LIMITS = 1.05  # the sum is capped here: a long fault clears soon after it ends, and drift alone stays a warning
-MIN_LIMIT = 0.25
 MIN_CAUTIOUS_LIMIT = 2.0  # standard deviations: with too few healthy data no limit is set below this
 REFERENCE_SHARE = 0.25  # of the limit of the smoothed residual, and at least so many sigma
 DEFAULT_REFERENCE_SIGMAS = 0.5
@@ -49,10 +48,6 @@ class DriftSettings(SingleLimit):
         of_smoothed = REFERENCE_SHARE * evidence.smoothed_limit * evidence.smoothed_std
         reference = max(of_smoothed, evidence.second_mean_limit, least)
         return self.model_copy(update={"reference_sigmas": reference, "period_s": evidence.period_s})
-
-    def scaled(self, factor: float) -> DriftSettings:
-        """See DetectorSettings. Less than what a quarter of a healthy second adds up to is no limit."""
-        return self.model_copy(update={"limit": max(self.limit * factor, min(self.limit, MIN_LIMIT))})
 
     def cautious_factor(self, evidence: HealthyEvidence) -> float | None:
         """See DetectorSettings."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from schemas.messages import Statistic
 from scoring.detectors.detector import DetectorRow, LimitRule
 from scoring.detectors.drift import Drift
-from scoring.detectors.slow import Slow
 from scoring.detectors.smoothed import Smoothed
 from scoring.detectors.standstill import StandstillDetector
 from scoring.detectors.tacho import Tacho
@@ -14,11 +13,9 @@ from scoring.detectors.variance_growth import VarianceGrowth
 DETECTORS = (
     DetectorRow("speed_smoothed", Statistic.SPEED_SMOOTHED, "speed", Smoothed),
     DetectorRow("speed_drift", Statistic.SPEED_DRIFT, "speed", Drift),
-    DetectorRow("speed_slow", Statistic.SPEED_SLOW, "speed", Slow),
     DetectorRow("speed_variance_growth", Statistic.SPEED_VARIANCE_GROWTH, "speed", VarianceGrowth),
     DetectorRow("balance_smoothed", Statistic.BALANCE_SMOOTHED, "balance", Smoothed),
     DetectorRow("balance_drift", Statistic.BALANCE_DRIFT, "balance", Drift),
-    DetectorRow("balance_slow", Statistic.BALANCE_SLOW, "balance", Slow),
     DetectorRow("balance_variance_growth", Statistic.BALANCE_VARIANCE_GROWTH, "balance", VarianceGrowth),
     DetectorRow("sensor", Statistic.SENSOR, "tacho", Tacho),
     DetectorRow("standstill", Statistic.STANDSTILL, "tacho", StandstillDetector, comes_first=True),

@@ -114,7 +114,7 @@ def test_its_section_is_checked_like_any_other(tmp_path):
 
 def test_the_runner_runs_it(tmp_path, endpoint):
     config = parse(SITE + SECTION, tmp_path, f"bus.endpoint='{endpoint}'")
-    stop, ready = threading.Event(), threading.Event()
+    stop, ready, written = threading.Event(), threading.Event(), threading.Event()
     with Bus(config.bus) as bus:
 
         def on_health(_key: str, payload: bytes) -> None:
@@ -122,6 +122,8 @@ def test_the_runner_runs_it(tmp_path, endpoint):
             assert isinstance(health, Health)
             if health.status == StageStatus.OK:
                 ready.set()
+            if ("lines", 2) in {(counter.name, counter.value) for counter in health.counters}:
+                written.set()
 
         bus.subscribe(health_key("site", "alarm_log", "all"), on_health)
         runner = Runner(load_stage("alarm_log"), config, None, stop)
@@ -132,6 +134,7 @@ def test_the_runner_runs_it(tmp_path, endpoint):
         for tray in ("a", "b"):
             publisher = bus.publisher(tray_key("site", tray, "alarm"), BY_NAME["alarm"], type_name(Alarm), "scorer-1")
             publisher.put(encode(alarm(tray)))
+        assert written.wait(20)
         stop.set()
         thread.join(20)
     assert sorted((tmp_path / "alarms.txt").read_text().splitlines()) == ["a fan 1: too slow", "b fan 1: too slow"]

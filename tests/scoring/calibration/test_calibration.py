@@ -130,11 +130,10 @@ def test_extrapolated_limits_say_so_and_lie_further_out() -> None:
     far = calibrate(runs, TOP_RAD_S, Timing(), 1.0, extrapolate=True)
     assert far.declared_rate is not None
     assert far.declared_rate.extrapolated
-    left_out = {"speed_drift", "speed_slow"}  # the residual at another speed is not known from so little
-    names = [name for name in near.detectors if name not in {*left_out, "balance_slow", "sensor"}]
+    names = [name for name in near.detectors if name not in ("speed_drift", "sensor")]
     assert len(names) == 5
     assert all(limit_of(far, name) > limit_of(near, name) for name in names)
-    assert not left_out & set(far.detectors)
+    assert "speed_drift" not in far.detectors  # the residual at another speed is not known from so little
 
 
 def test_a_minute_of_one_fan_is_refused_even_with_extrapolate() -> None:
@@ -329,7 +328,7 @@ def test_slow_wear_is_followed_for_a_while_and_then_alarms(white_limits: Limits)
     assert min(first_s) > 0.5 * farthest / per_s  # not at once: the baseline follows, and lags
     baseline = scorer.residuals["speed"].baseline
     followed = np.abs(baseline.value - baseline.commissioned)
-    assert 0.1 * farthest < followed.min()  # it stays where the residual over a minute is halfway to its limit
+    assert 0.2 * farthest < followed.min()
     assert followed.max() <= farthest
 
 
