@@ -92,7 +92,7 @@ class ScorerCore(Core):
         self._text = AlarmText(speed_unit, twin.command_unit)
         self._forgets_over_gaps = decision_rules >= DecisionRules.TIME_AND_GAPS
         self._holds = decision_rules >= DecisionRules.HOLDING
-        self._judges_rest = decision_rules >= DecisionRules.STOPPED_AND_WORN
+        self._judges_rest = decision_rules >= DecisionRules.AT_REST
         self._scorer = self._new_scorer()
         holding = holding_detectors(self._scorer.detectors, config.off_delay_s, judges_rest=self._judges_rest)
         self._settings = ConditionSettings(

@@ -29,7 +29,7 @@ class DecisionRules(IntEnum):
     probable causes are not listed, and a diagnosis that says nothing new is not sent."""
     FIRST_DELAY = 6
     """Times of a line begin with the smallest delay of its first second, not with that of its first sample."""
-    STOPPED_AND_WORN = 7
+    AT_REST = 7
     """A fan that stands as commanded is judged: its alarm keeps its data, and an alarm of a fan that turned although it
     was stopped returns. The longer an alarm has stood, the longer it must be gone. Causes account for what the tacho
     resolves, and one of standstill stays when the fan turns again."""

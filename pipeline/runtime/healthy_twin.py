@@ -88,7 +88,7 @@ def _with_standstill(limits: Limits, standstill: Standstill | None, decision_rul
     if standstill is None:
         return limits
     settings = {"standstill": StandstillSettings(healthy=standstill, watches="both")}
-    if decision_rules >= DecisionRules.STOPPED_AND_WORN:
+    if decision_rules >= DecisionRules.AT_REST:
         settings = {
             "standstill": StandstillSettings(healthy=standstill, watches="driven"),
             "running_on": StandstillSettings(healthy=standstill, watches="stopped"),
