@@ -128,8 +128,10 @@ class ScorerCore(Core):
         self._sigma_rad_s = np.ones(self._fans)
         self._scorer = self._new_scorer()
         twin = self._twin
-        lowest_command = twin.standstill.turning_command if twin.standstill and self._judges_rest else 0.0
-        advice = Advice(twin.command_unit, lowest_command) if self._holds else None
+        advice = Advice(twin.command_unit) if self._holds else None
+        if self._judges_rest:
+            lowest_command = twin.standstill.turning_command if twin.standstill else 0.0
+            advice = Advice(twin.command_unit, lowest_command, twin.highest_command)
         self._diagnoser = Diagnoser(
             twin.balances, advice, twin.tachos, twin.standstill, knows_readings=self._judges_rest
         )

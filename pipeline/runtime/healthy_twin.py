@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -60,6 +61,8 @@ class HealthyTwin:
     tachos: tuple[Tacho, ...] = INSTANTANEOUS
     """one for all fans, or one for each"""
     standstill: Standstill | None = None
+    highest_command: float = math.inf
+    """that it was trained on"""
 
 
 def limits_in_force(
@@ -115,6 +118,13 @@ def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
             raise StageError(
                 f"{context.tray.twin}: its calibration is of {fans} fans, the tray has {context.tray.fans}; {again}"
             )
+    card = twin.card
     return HealthyTwin(
-        twin.sha256, limits, twin.healthy_balances(), twin.card.command_unit, twin.card.tacho, twin.card.standstill
+        twin.sha256,
+        limits,
+        twin.healthy_balances(),
+        card.command_unit,
+        card.tacho,
+        card.standstill,
+        card.command_range[1],
     )

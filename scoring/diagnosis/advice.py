@@ -30,6 +30,8 @@ class Advice:
     command_unit: str = ""
     lowest_command: float = 0.0
     """the lowest one that turns a healthy fan: none below it is advised"""
+    highest_command: float = math.inf
+    """the highest one that the twin knows: none above it is advised"""
 
     def added_to(self, unclear: str, window: Window, healthy: HealthyBalance) -> str:
         """Why the cause is unclear, with what would tell."""
@@ -45,11 +47,12 @@ class Advice:
             if abs(now) > abs(_needed(healthy, window, MIN_SPEEDS * healthy.lowest_speed_rad_s)):
                 return f"{unclear}: at {self._of(now)} it should turn: see whether it is free to turn and has power"
             target = max(_needed(healthy, window, 2.0 * MIN_SPEEDS * healthy.lowest_speed_rad_s), self.lowest_command)
-            return f"{unclear}: it hardly turns: move the command to {self._of(target)}"
+            return f"{unclear}: it hardly turns: move the command to {self._of(min(target, self.highest_command))}"
         lowest, highest = (float(np.quantile(given, q)) for q in QUANTILES)
         command = lowest * _needed(healthy, window, SLOWER * low) / _needed(healthy, window, low)
         if SLOWER * low < MIN_SPEEDS * healthy.lowest_speed_rad_s or command < self.lowest_command:
-            command = highest * _needed(healthy, window, FASTER * high) / _needed(healthy, window, high)
+            faster = highest * _needed(healthy, window, FASTER * high) / _needed(healthy, window, high)
+            command = min(faster, self.highest_command)
         return f"{unclear}: move the command to {self._of(command)} for ten seconds, and back"
 
     def _of(self, command: float) -> str:

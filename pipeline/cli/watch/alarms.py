@@ -43,6 +43,7 @@ from scoring.wear.slow_change import WEAR_HINT
 _DISCOVERY_S = 5.0  # every stage sends several health messages in this time
 _SCORES_S = 3.0  # a score of every tray arrives in this time
 _POLL_S = 0.02
+_WATCH_S = 0.2  # between two looks at the stages while no alarm comes
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 _STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 
@@ -172,7 +173,7 @@ def _watch(
     has_scorer = True
     while not stop.is_set():
         try:
-            alarm = news.get(timeout=_POLL_S)
+            alarm = news.get(timeout=_WATCH_S)
         except queue.Empty:
             if has_scorer != any(view.alive and view.health.stage == "scorer" for view in watcher.stages()):
                 has_scorer = not has_scorer

@@ -479,6 +479,16 @@ def test_no_command_is_advised_below_the_lowest_that_turns_the_fan() -> None:
     assert float(advised[1]) > 0.16
 
 
+def test_no_command_is_advised_above_the_highest_that_the_twin_knows() -> None:
+    command = np.full(len(data.still_command(0)), 0.16)
+    window = data.window(command, data.measured(data.speeds(command, torque=data.from_onset(command, 0.03)), 3))
+    healthy = replace(data.HEALTHY, lowest_speed_rad_s=20.0)
+    for highest, is_advised in ((0.17, "0.17"), (0.9, None)):
+        sentence = of(diagnose(window, healthy, Advice("", 0.15, highest)), "cannot_tell").sentence
+        advised = sentence.split("command to ")[1].split()[0]
+        assert advised == is_advised if is_advised else 0.17 < float(advised) < 0.9
+
+
 def counted(speed_rad_s: np.ndarray, tacho: Tacho) -> np.ndarray:
     """(n,) readings of a tacho that counts pulses over one window after another."""
     turned = np.floor(np.cumsum(speed_rad_s) * data.STEP_S / (tacho.resolution_rad_s * tacho.window_s))
