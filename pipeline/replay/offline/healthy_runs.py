@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
+from pipeline.recordings.length import longest_s
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
@@ -18,6 +19,9 @@ from scoring.samples import Samples, samples_of
 
 MAX_KEPT_SAMPLES = 10_000_000
 """of fans, about 80 bytes each: so many are kept between passes; with more, recordings are read again"""
+
+CLOCK_MARGIN = 1.01
+"""by which the clock of a device may be faster than that of the host"""
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,19 @@ class HealthyRuns:
                 "choose one with --set"
             )
         return first
+
+    def longest_fan_s(self) -> float:
+        """An upper bound of the time that can be scored, s, summed over fans: without scoring anything.
+
+        Raises:
+            UserError: a recording cannot be used.
+        """
+        total_s = 0.0
+        for path in self._paths:
+            with open_replay_input([path], None, self._overrides, self._twin) as replay_input:
+                fans = sum(tray.fans for tray in replay_input.trays)
+                total_s += fans * (CLOCK_MARGIN * longest_s(path, replay_input.first_sample_t_ns) + 1.0)
+        return total_s
 
     @property
     def speed_unit(self) -> SpeedUnit:

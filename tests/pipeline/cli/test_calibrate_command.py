@@ -6,13 +6,14 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import onnx
 import pytest
 
 from pipeline.cli.main import expand_variadic
 from pipeline.cli.twins.calibration_check import Check
+from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.limits import Limits, Timing
 from tests.support.fantwin_command import error_of, fantwin
@@ -152,6 +153,17 @@ def test_too_little_data_is_refused_with_the_amount_needed_and_the_twin_is_uncha
     assert "fan-hours of healthy running cannot support 1 false alarm per fan and day: that takes 72" in error
     assert "--extrapolate" in error
     assert (folder / "twin.onnx").read_bytes() == before
+
+
+def test_recordings_too_short_for_the_rate_are_refused_before_any_of_them_is_scored(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def scored(self: HealthyRuns) -> NoReturn:
+        raise AssertionError("scored")
+
+    monkeypatch.setattr(HealthyRuns, "__call__", scored)
+    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1)
+    assert error.startswith("0.068 fan-hours of healthy running cannot support 1 false alarm per fan and day")
 
 
 def test_extrapolated_limits_declare_a_target_only(folder: Path) -> None:
