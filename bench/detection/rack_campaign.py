@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 from pydantic import TypeAdapter
@@ -43,7 +44,7 @@ def campaign(
     """
     data.make(learning, progress)
     done = []
-    with ProcessPoolExecutor(workers) as pool:
+    with ProcessPoolExecutor(workers, mp_context=get_context("fork")) as pool:  # so that they see what is left out
         jobs = [pool.submit(one_rack, data, rack, learning, rack < healthy_racks) for rack in range(racks)]
         for job in as_completed(jobs):
             done += job.result()
@@ -62,7 +63,7 @@ def _of_rack(data: RackData, rack: int, learning: Sequence[str], is_healthy_judg
     if not twin.exists():
         trained(data, rack, twin)
     for name in learning:
-        limited = folder / f"twin-{name.replace(' ', '-')}.onnx"
+        limited = folder / f"twin-{data.kept_name(name)}.onnx"
         if not limited.exists():
             calibrated(data, rack, name, twin, limited)
         tests = (FAULTY, HEALTHY) if is_healthy_judged else (FAULTY,)
@@ -72,7 +73,7 @@ def _of_rack(data: RackData, rack: int, learning: Sequence[str], is_healthy_judg
 
 def _judged(data: RackData, rack: int, learning: str, test: str, twin: Path) -> Judged:
     recording = data.test(test, rack)
-    kept = recording.with_name(f"{recording.stem}-{learning.replace(' ', '-')}.json")
+    kept = recording.with_name(f"{recording.stem}-{data.kept_name(learning)}.json")
     if kept.exists():
         return _JUDGED.validate_json(kept.read_bytes())
     found = judged(recording, twin, other_methods(data, rack, learning, twin))

@@ -39,13 +39,22 @@ SEEDS = {SWEEP: 100, "minutes": 200, "night": 300, "test": 400}
 
 @dataclass(frozen=True)
 class RackData:
-    """The recordings of so many racks at one rate. test_s: length of the test, once without and once with faults."""
+    """The recordings of so many racks at one rate. test_s: length of the test, once without and once with faults.
+
+    without: mechanisms that the racks are calibrated and judged without (bench.detection.without); what is made of the
+    recordings is kept by their names.
+    """
 
     folder: Path
     count: int
     rate_hz: float
     test_s: float = DAY_S
     seed: int = 0
+    without: tuple[str, ...] = ()
+
+    def kept_name(self, learning: str) -> str:
+        """What the files are called that were made by an amount of learning."""
+        return "-without-".join((learning.replace(" ", "-"), *self.without))
 
     def sweep(self, rack: int) -> Path:
         """The recording of a rack that its twin is trained on."""

@@ -135,7 +135,7 @@ def false_alarm_rows(shown: Campaign, results: Sequence[RackResult]) -> Rows:
     rows: Rows = []
     healthy = [one.healthy for one in results if one.healthy]
     healthy_h = sum(one.fan_hours for one in healthy)
-    beside_h = sum(one.faulty.fan_hours - _in_faults_h(shown.events[one.rack]) for one in results)
+    beside_h = sum(one.faulty.fan_hours - hours_in_faults(shown.events[one.rack]) for one in results)
     for method in _methods(results):
         raised = sum(len(as_raised(one, "", method)) for one in healthy)
         counts = [beside(one.faulty, "", method, shown.events[one.rack]) for one in results]
@@ -157,7 +157,8 @@ def _rate(raised: int, hours: float) -> str:
     return str(rate(raised, hours / 24.0)) if hours > 0.0 else "-"
 
 
-def _in_faults_h(events: Iterable[Event]) -> float:
+def hours_in_faults(events: Iterable[Event]) -> float:
+    """Fan-hours in which alarms of these fans are not false."""
     return sum((one.end_ns - one.start_ns) / NS_PER_S + AFTER_S for one in events) / 3600.0
 
 

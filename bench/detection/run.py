@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,6 +33,7 @@ from bench.detection.simulated_tables import (
     prepared,
     scored_faults,
 )
+from bench.detection.without import LIST, UnknownMechanismError, list_mechanisms, mechanism, without
 from bench.printing import JsonOption, progress, show
 from scoring.calibration.calibration import TooLittleError
 
@@ -74,9 +76,23 @@ def main(
         Path | None, typer.Option(help="Folder for recordings, twins and results of racks; what is there is not made.")
     ] = None,
     workers: Annotated[int, typer.Option(help="Processes that learn and judge racks.")] = 2,
+    without_names: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--without", help="Leave a mechanism of scoring out of calibration and judging; repeatable; `list`: names."
+        ),
+    ] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Print the tables of the simulated and of the measured part."""
+    left_out = without_names or []
+    if LIST in left_out:
+        list_mechanisms()
+        return
+    try:
+        ExitStack().enter_context(without(*left_out))  # until this process ends
+    except UnknownMechanismError as error:
+        raise SystemExit(str(error)) from error
     began_s = time.monotonic()
     tables: dict[str, list[dict[str, Any]]] = {}
     notes: list[str] = []
@@ -86,7 +102,7 @@ def main(
             raise SystemExit(f"--learn {unknown[0]!r}: give one of {', '.join(LEARNING)}")
         with tempfile.TemporaryDirectory() as folder:
             for rate_hz in rates:
-                data = RackData(keep or Path(folder), racks, rate_hz, 3600.0 * test_hours, seed)
+                data = RackData(keep or Path(folder), racks, rate_hz, 3600.0 * test_hours, seed, tuple(left_out))
                 tables |= rack_tables(data, amounts, judged or racks, healthy_racks, workers, progress)
         notes += RACK_NOTES
     elif only != "measured":
@@ -97,6 +113,7 @@ def main(
         measured, reported = measured_tables(progress, libraries=libraries)
         tables |= measured
         notes += reported
+    notes += [f"without {mechanism(name).what}" for name in left_out]
     notes.append(f"all of it took {(time.monotonic() - began_s) / 60:.1f} min")
     show(tables, notes, as_json=json_output)
 
