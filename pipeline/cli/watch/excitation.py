@@ -155,8 +155,8 @@ def has_settled(t_s: Array, speed_rad_s: Array) -> bool:
     if not all(rows.any() for rows in thirds):
         return False
     before, after = (_mean(speed_rad_s[rows]) for rows in thirds)
-    noise = np.nanstd(speed_rad_s[thirds[1]], axis=0) if thirds[1].sum() > 1 else 0.0
-    largest = np.maximum(np.abs(after - _mean(speed_rad_s[:1])), _FOLLOWS * np.abs(after))
+    noise = _std(speed_rad_s[thirds[1]])
+    largest = np.maximum(np.abs(after - _first(speed_rad_s)), _FOLLOWS * np.abs(after))
     return bool(np.all((np.abs(after - before) <= _SETTLED * largest + noise / 2) | ~np.isfinite(after)))
 
 
@@ -165,8 +165,8 @@ def time_constants(t_s: Array, speed_rad_s: Array) -> Array:
     if len(t_s) < SETTLING:
         return np.full(speed_rad_s.shape[1], np.nan)
     settled = speed_rad_s[-max(1, len(t_s) // 6) :]
-    first, last = _mean(speed_rad_s[:1]), _mean(settled)
-    change, noise = last - first, np.std(settled, axis=0)
+    first, last = _first(speed_rad_s), _mean(settled)
+    change, noise = last - first, _std(settled)
     follows = np.abs(change) > np.maximum(_FOLLOWS * np.maximum(np.abs(first), np.abs(last)), _NOISE_SIGMAS * noise)
     made = np.abs(speed_rad_s - first) >= (1 - np.exp(-1)) * np.abs(change)
     return np.where(follows, t_s[np.argmax(made, axis=0)], np.nan)
@@ -175,3 +175,13 @@ def time_constants(t_s: Array, speed_rad_s: Array) -> Array:
 def _mean(speed_rad_s: Array) -> Array:
     known = np.isfinite(speed_rad_s)
     return np.where(known, speed_rad_s, 0.0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
+
+
+def _first(speed_rad_s: Array) -> Array:
+    """(fans,) the first reading of each fan; NaN where there is none."""
+    return speed_rad_s[np.argmax(np.isfinite(speed_rad_s), axis=0), np.arange(speed_rad_s.shape[1])]
+
+
+def _std(speed_rad_s: Array) -> Array:
+    """(fans,) standard deviation of the readings of each fan; NaN where there is none."""
+    return np.sqrt(_mean(np.square(speed_rad_s - _mean(speed_rad_s))))
