@@ -1,12 +1,12 @@
 """An alarm message as one line for people.
 
 The lines are part of a recording, and a replay that verifies it compares them: a changed wording makes recordings of
-earlier versions differ.
+earlier versions differ. Only the line of a republished alarm, which says no more than its flags do, is not compared.
 """
 
 from __future__ import annotations
 
-from schemas.messages import Alarm, Statistic, Transition
+from schemas.messages import Alarm, Severity, Statistic, Transition
 from schemas.units import SpeedUnit
 from scoring.alarms.alarm_flags import is_listed
 from scoring.detectors.alarm_units import AlarmUnits
@@ -61,7 +61,7 @@ class AlarmText:
         if alarm.transition in (Transition.RAISED, Transition.SEVERITY):
             return f"{fan}: {self._deviation(alarm)}{self._cause_if_known(alarm)}"
         if alarm.transition == Transition.REPUBLISHED:
-            return f"{fan}: {'still stands' if is_listed(alarm) else 'stands no longer'}"
+            return f"{fan}: {_how_it_stands(alarm)}"
         return f"{fan}: {TRANSITIONS[alarm.transition]}"
 
     def _deviation(self, alarm: Alarm) -> str:
@@ -87,6 +87,24 @@ class AlarmText:
             return first.evidence or name  # the evidence begins with the name
         evidence = f": {first.evidence}" if first.evidence else ""
         return f"{name}, {100 * first.probability:.0f} %{evidence}"
+
+
+def _how_it_stands(alarm: Alarm) -> str:
+    """Of an alarm that is over: what keeps it on the list, if anything does."""
+    if alarm.active:
+        return "still stands"
+    if not is_listed(alarm):
+        return "stands no longer"
+    kept = {
+        "not acknowledged": not alarm.acknowledged,
+        "not confirmed": not alarm.confirmed,
+        "latched": alarm.latched,
+        "shelved": bool(alarm.shelved_until_t_ns),
+        "suppressed": alarm.suppressed,
+        "out of service": alarm.out_of_service,
+    }
+    before = "no alarm" if alarm.severity == Severity.NONE else "back to normal"
+    return ", ".join((before, *(state for state, applies in kept.items() if applies)))
 
 
 def _is_against_command(alarm: Alarm) -> bool:

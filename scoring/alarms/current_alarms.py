@@ -91,8 +91,8 @@ class CurrentAlarm:
 
 
 def words_of(alarm: Alarm) -> str:
-    """The message of an alarm, for people. Of one that is over, a restarted scorer says "still stands" too while it is
-    listed: its words are part of recordings, so this says what holds it on the list."""
+    """The message of an alarm, for people. Of a republished one that is over it says what holds it on the list, with
+    local times; in older recordings its message says "still stands"."""
     if alarm.transition != Transition.REPUBLISHED or alarm.active:
         return alarm.message
     over = {"cleared", "acknowledged", "never raised"}

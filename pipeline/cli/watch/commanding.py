@@ -14,15 +14,17 @@ import numpy as np
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UserError
-from pipeline.launch.site_watcher import SiteWatcher
-from schemas.codec import encode, type_name
+from schemas.codec import CodecError, decode, encode, type_name
 from schemas.messages import Command, Header, Health
-from schemas.topics import BY_NAME, tray_key
+from schemas.topics import BY_NAME, alive_key, health_key, sessions_key, tray_key
 from schemas.units import RAD_S_PER_UNIT
 
 _T = TypeVar("_T")
 _ANSWER_S = 5.0  # acquisition answers within a quarter of a second, on a busy host within one or two
 _POLL_S = 0.01
+STAGE = "acquisition"
+MOST_SESSIONS = 64
+"""so many last healths are kept"""
 
 
 def chosen_tray(config: Config, name: str | None) -> TrayConfig:
@@ -60,7 +62,7 @@ class CommandSender:
     """Sends commands to one tray."""
 
     def __init__(self, bus: Bus, site: str, tray: str, stop: threading.Event) -> None:
-        self._watcher = SiteWatcher(bus, site)
+        self._acquisition = _Acquisition(bus, site, tray)
         self._tray = tray
         self.stop = stop
         self._producer = f"command-{tray}-{secrets.token_hex(4)}"
@@ -75,11 +77,10 @@ class CommandSender:
         Raises:
             UserError: there is none.
         """
-        name = ("acquisition", self._tray)
-        self._wait(lambda: name in self._watcher.alive() or None)
-        if self._acquisition() is None:
-            self._watcher.ask_for_health(*name)
-        self._before = self._wait(self._acquisition)
+        self._wait(lambda: self._acquisition.is_alive() or None)
+        if self._acquisition.health() is None:
+            self._acquisition.ask_for_health()
+        self._before = self._wait(self._acquisition.health)
 
     def send(self, message: Command) -> None:
         """Publish a command."""
@@ -98,13 +99,8 @@ class CommandSender:
             reason = after.problem or "it was refused"
             raise UserError(f"tray {self._tray}: acquisition could not send the command: {reason}")
 
-    def _acquisition(self) -> Health | None:
-        name = ("acquisition", self._tray)
-        views = (view for view in self._watcher.stages() if view.alive)
-        return next((view.health for view in views if (view.health.stage, view.health.instance) == name), None)
-
     def _received(self) -> Health | None:
-        health, sent = self._acquisition(), self._publisher.published
+        health, sent = self._acquisition.health(), self._publisher.published
         inputs = [each for each in health.inputs if each.producer == self._producer] if health else []
         return health if any(each.received >= sent for each in inputs) else None
 
@@ -114,6 +110,58 @@ class CommandSender:
             if time.monotonic() > until_s or self.stop.wait(_POLL_S):
                 raise UserError(f"no acquisition of tray {self._tray} received the command: is `fantwin up` running?")
         return found
+
+
+class _Acquisition:
+    """The acquisition of one tray, as it shows itself on the bus: its tokens, and its last health.
+
+    Only this much is watched, and little is imported: a command is to be answered at once.
+    """
+
+    def __init__(self, bus: Bus, site: str, tray: str) -> None:
+        self._bus = bus
+        self._alive_key = alive_key(site, STAGE, tray)
+        self._health_key = health_key(site, STAGE, tray)
+        self._lock = threading.Lock()
+        self._tokens: set[str] = set()
+        self._healths: dict[str, Health] = {}
+        """by producer, in the order heard"""
+        bus.watch_alive(self._alive_key, self._on_token)
+        bus.watch_alive(sessions_key(site, STAGE, tray), self._on_token)
+        bus.subscribe(self._health_key, self._on_health)
+
+    def is_alive(self) -> bool:
+        """Whether it is on the bus."""
+        with self._lock:
+            return self._alive_key in self._tokens
+
+    def health(self) -> Health | None:
+        """The last health of a session that is on the bus."""
+        with self._lock:
+            if self._alive_key not in self._tokens:
+                return None
+            named = {word for token in self._tokens for word in token.split("/")}
+            return next((each for producer, each in reversed(self._healths.items()) if producer in named), None)
+
+    def ask_for_health(self) -> None:
+        """Fetch the last health, instead of waiting for the next one."""
+        for key, payload in self._bus.recover(self._health_key):
+            self._on_health(key, payload)
+
+    def _on_token(self, key: str, alive: bool) -> None:
+        with self._lock:
+            (self._tokens.add if alive else self._tokens.discard)(key)
+
+    def _on_health(self, _key: str, payload: bytes) -> None:
+        try:
+            health = decode(Health, payload)
+        except CodecError:
+            return
+        with self._lock:
+            self._healths.pop(health.header.producer, None)
+            self._healths[health.header.producer] = health
+            if len(self._healths) > MOST_SESSIONS:
+                del self._healths[next(iter(self._healths))]
 
 
 def _not_sent(health: Health) -> int:

@@ -15,7 +15,7 @@ from schemas.blocks import cut
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header, decode_together
 from schemas.fields import columns
-from schemas.messages import Alarm, Array, Message, Score
+from schemas.messages import Alarm, Array, Score, Transition
 
 MAX_NAMED = 5
 """differences that are described"""
@@ -208,7 +208,7 @@ def compare_alarms(
     left = {(alarm.fan, alarm.t_ns, alarm.transition, alarm.request): alarm for alarm in recorded}
     for alarm in made:
         other = left.pop((alarm.fan, alarm.t_ns, alarm.transition, alarm.request), None)
-        if other is not None and _without_header(alarm) == _without_header(other):
+        if other is not None and _decided(alarm) == _decided(other):
             found.alarms_equal += 1
         elif limit is not None and alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
@@ -262,8 +262,10 @@ def _name_first(
     )
 
 
-def _without_header(message: Message) -> tuple[Any, ...]:
-    return tuple(getattr(message, f.name) for f in fields(message) if f.name != "header")
+def _decided(alarm: Alarm) -> tuple[Any, ...]:
+    """What is compared. The line of a republished alarm is not: it follows from the flags, and was worded otherwise."""
+    left_out = {"header", "message"} if alarm.transition == Transition.REPUBLISHED else {"header"}
+    return tuple(getattr(alarm, f.name) for f in fields(alarm) if f.name not in left_out)
 
 
 def _describe(alarm: Alarm) -> str:

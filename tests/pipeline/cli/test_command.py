@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -63,3 +65,20 @@ def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():
 )
 def test_a_command_that_the_tray_cannot_carry_out_is_refused_in_one_line(words, expected):
     assert expected in error_of("command", "-c", DEMO / "demo.toml", *words.split())
+
+
+def test_a_command_imports_nothing_that_only_watching_and_judging_need():
+    """It is to be answered at once, and most of its time is imports."""
+    code = "import sys, pipeline.cli.watch.command; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    unneeded = (
+        "scoring",
+        "stages",
+        "twin",
+        "pipeline.launch",
+        "pipeline.runtime.stage",
+        "rich",
+        "scipy",
+        "onnxruntime",
+    )
+    assert [name for name in done.stdout.split() if name.startswith(unneeded)] == []

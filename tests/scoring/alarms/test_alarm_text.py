@@ -74,12 +74,23 @@ def test_every_transition_is_one_line_that_names_the_fan(transition: Transition)
     assert reported.startswith("fan 2: ") and len(reported) > len("fan 2: ") and "\n" not in reported
 
 
-def test_a_republished_alarm_says_whether_it_is_still_listed() -> None:
-    over: dict[str, Any] = {"active": False, "acknowledged": True, "confirmed": True}
-    suppressed: dict[str, Any] = {"suppressed": True}
-    assert line(Transition.REPUBLISHED) == "fan 2: still stands"
-    assert line(Transition.REPUBLISHED, **over, **suppressed) == "fan 2: still stands"
-    assert line(Transition.REPUBLISHED, **over) == "fan 2: stands no longer"
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [
+        ({}, "still stands"),
+        ({"active": False}, "back to normal, not acknowledged"),
+        ({"active": False, "latched": True, "shelved_until_t_ns": 1},
+         "back to normal, not acknowledged, latched, shelved"),
+        ({"active": False, "acknowledged": True, "suppressed": True}, "back to normal, suppressed"),
+        ({"active": False, "acknowledged": True}, "stands no longer"),
+        ({"active": False, "acknowledged": True, "severity": Severity.NONE, "out_of_service": True},
+         "no alarm, out of service"),
+    ],
+)  # fmt: skip
+def test_a_republished_alarm_says_whether_it_is_active_and_else_what_keeps_it(
+    more: dict[str, Any], expected: str
+) -> None:
+    assert line(Transition.REPUBLISHED, **{"acknowledged": False, "confirmed": True, **more}) == f"fan 2: {expected}"
 
 
 def test_a_refusal_says_why() -> None:
