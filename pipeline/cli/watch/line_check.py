@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -29,6 +29,8 @@ FIRST_SAMPLE_S = 6.0
 FASTEST_FAN_RAD_S = 5000.0
 """48,000 rpm: a larger speed was given in another unit"""
 RATE_TOLERANCE = 0.01
+SLOWEST_S = 1.0
+"""between two samples of the slowest line that can be judged"""
 Finding = tuple[bool, str]
 """in order or not, and one line"""
 
@@ -49,7 +51,7 @@ def check_line(context: Context, config: Config, seconds: float, *, is_running: 
 
 def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str]:
     """The samples that acquisition would publish, and what it would report as its problem."""
-    settings = context.config.model_copy(update={"block_size": 1, "silence_s": min(1.0, seconds)})
+    settings = context.config.model_copy(update={"block_size": 1, "silence_s": seconds + SLOWEST_S})
     built = load_stage("acquisition").build(Context(**(vars(context) | {"config": settings})))
     core, source = built.core, built.source
     assert source is not None
@@ -68,14 +70,26 @@ def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str]:
     finally:
         source.stop()
     problem = core.problem()
-    kinds = {name: n for name, n in core.counters().items() if n and name not in _HARMLESS}
-    if not problem and kinds.get("refused_input"):
-        named = ", ".join(f"{name} {n}" for name, n in kinds.items() if name != "refused_input")
-        problem = f"{kinds['refused_input']} of the inputs cannot be used: {named}; see docs/reference/wire-protocol.md"
-    return samples, problem
+    return samples, problem or refusal(core.counters())
 
 
-_HARMLESS = {"bytes", "samples", "line_up", "line_down", "no_speed"}
+def refusal(counters: Mapping[str, int]) -> str:
+    """What of the input was refused, in one line; empty if nothing was, or only what disturbances of a line explain.
+
+    counters: of acquisition.
+    """
+    refused = counters.get("refused_input", 0)
+    of_setting = any(counters.get(name) for name in _OF_A_SETTING)
+    if not of_setting and refused <= max(1, _DISTURBED_SHARE * counters.get("samples", 0)):
+        return ""
+    named = ", ".join(f"{name} {n}" for name, n in counters.items() if n and name not in _NOT_NAMED)
+    return f"{refused} of the inputs cannot be used: {named}; see docs/reference/wire-protocol.md"
+
+
+_NOT_NAMED = {"bytes", "samples", "line_up", "line_down", "no_speed", "refused_input"}
+_OF_A_SETTING = ("absurd_command", "absurd_speed")
+_DISTURBED_SHARE = 0.01
+"""of the samples: so many lines may be cut or garbled"""
 
 
 def _from_bus(config: Config, tray: TrayConfig, seconds: float) -> tuple[list[Raw], str]:

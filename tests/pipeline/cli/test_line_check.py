@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import threading
 import tty
+from collections.abc import Iterable
+from itertools import count, repeat
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline.cli.watch.line_check import _findings, check_line
+from pipeline.cli.watch.line_check import _findings, check_line, refusal
 from pipeline.config.loading import parse_config
 from pipeline.config.models import Config
 from pipeline.runtime.stage import Context
@@ -74,20 +76,17 @@ def test_what_does_not_fit_is_one_line_that_says_what_to_do(line: dict, words: s
     assert words in problems[0]
 
 
-@pytest.mark.parametrize(
-    ("command", "speed", "words"),
-    [("117", "1200", "command 117 is outside command_min = 0 to command_max = 1"), ("0.5", "1200", None)],
-)
-def test_a_port_is_listened_to_as_acquisition_does(command: str, speed: str, words: str | None) -> None:
+def listened(sent: Iterable[tuple[float, bytes]], seconds: float) -> list:
+    """What is found of a device that sends these lines, each so many seconds after the one before."""
     master, slave = os.openpty()
     tty.setraw(slave)
     stop = threading.Event()
 
     def device() -> None:
-        clock_us = 0
-        while not stop.wait(0.02):
-            clock_us += 20_000
-            os.write(master, f"S {clock_us} {clock_us // 20_000} {command} {speed} {command} {speed}\n".encode())
+        for pause_s, line in sent:
+            if stop.wait(pause_s):
+                return
+            os.write(master, line)
 
     sender = threading.Thread(target=device)
     sender.start()
@@ -98,12 +97,22 @@ def test_a_port_is_listened_to_as_acquisition_does(command: str, speed: str, wor
             site="site", trays=config.trays, config=config.sections["acquisition"], folder=Path(), run_folder=Path(),
             started_t_ns=0,
         )  # fmt: skip
-        lines = check_line(context, config, 1.0, is_running=False)
+        return check_line(context, config, seconds, is_running=False)
     finally:
         stop.set()
         sender.join()
         os.close(slave)
         os.close(master)
+
+
+@pytest.mark.parametrize(
+    ("command", "speed", "words"),
+    [("117", "1200", "command 117 is outside command_min = 0 to command_max = 1"), ("0.5", "1200", None)],
+)
+def test_a_port_is_listened_to_as_acquisition_does(command: str, speed: str, words: str | None) -> None:
+    clock_us = count(20_000, 20_000)
+    each = (f"S {us} {us // 20_000} {command} {speed} {command} {speed}\n".encode() for us in clock_us)
+    lines = listened(zip(repeat(0.02), each, strict=False), 1.0)
     if words is None:
         assert all(ok for ok, _ in lines), lines
         assert lines[0][1].endswith("grid of 50 Hz, gaps are longer than 0.1 s")
@@ -111,3 +120,27 @@ def test_a_port_is_listened_to_as_acquisition_does(command: str, speed: str, wor
     else:
         assert [ok for ok, _ in lines] == [False]
         assert words in lines[0][1]
+
+
+@pytest.mark.parametrize(
+    ("counters", "words"),
+    [
+        ({"samples": 200}, ""),
+        ({"samples": 199, "refused_input": 1, "wrong_fan_count": 1, "lost_on_line": 3}, ""),
+        ({"samples": 19, "refused_input": 1, "truncated": 1}, ""),
+        ({"samples": 197, "refused_input": 3, "truncated": 3}, "3 of the inputs cannot be used: truncated 3; see"),
+        (
+            {"samples": 199, "refused_input": 1, "absurd_command": 1},
+            "1 of the inputs cannot be used: absurd_command 1;",
+        ),
+        ({"samples": 200, "absurd_speed": 4}, "absurd_speed 4;"),
+    ],
+)
+def test_a_line_that_was_cut_once_is_no_fault_of_the_configuration(counters: dict[str, int], words: str) -> None:
+    said = refusal(counters)
+    assert words in said if words else not said
+
+
+def test_a_line_that_is_to_send_once_a_second_is_not_silent_between_two_samples() -> None:
+    lines = listened([(0.0, b"S 0 0 0.5 100 0.5 100\n")], 1.1)
+    assert all(ok for ok, _ in lines), lines
