@@ -185,6 +185,8 @@ class Grid:
     speed_rad_s: Array = column("samples x fans", np.float64)
     valid: Array = column("samples x fans", np.bool_)
     invalid_reason: Array = column("samples x fans", InvalidReason)
+    reading_missing: Array = column("samples x fans", np.bool_, optional=True)
+    """whether the newest raw sample at that time has no reading, though the speed may be known from those around it"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -206,6 +208,8 @@ class Prediction:
     torque_balance_sigma_command: Array = column("fans", np.float64, added_later=True)
     reading_range_rad_s: Array = column("samples x fans", np.float64, optional=True)
     averaged_command: Array = column("samples x fans", np.float64, optional=True)
+    reading_missing: Array = column("samples x fans", np.bool_, optional=True)
+    """as in Grid"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

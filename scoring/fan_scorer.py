@@ -266,6 +266,7 @@ class FanScorer:
                 persistent=persistent,
                 speed_rad_s=speed_rad_s,
                 missing=block.missing[stretch],
+                reading_missing=block.reading_missing[stretch],
                 idle=block.idle[stretch],
                 command=block.command[stretch],
                 predicted_rad_s=block.predicted_rad_s[stretch],

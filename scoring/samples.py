@@ -24,7 +24,9 @@ class Samples:
     predicted_rad_s: Array
     """what a healthy fan would read; NaN without a free run"""
     missing: Array
-    """the tacho gave no reading"""
+    """the tacho gave no reading, and its speed is not known from those around it"""
+    reading_missing: Array
+    """the newest raw sample has no reading; nowhere in recordings that do not tell"""
     idle: Array
     """the command stops the fan, or it has just started: nothing is compared with the twin"""
     alive: Array
@@ -55,8 +57,15 @@ def samples_of(prediction: Prediction) -> Samples:
         predicted_rad_s=prediction.predicted_speed_rad_s,
         idle=np.isin(invalid_reason, (InvalidReason.STOPPED, InvalidReason.STARTING)),
         missing=invalid_reason == InvalidReason.NO_SPEED,
+        reading_missing=reading_missing_of(prediction),
         alive=~np.isin(invalid_reason, (InvalidReason.GAP, InvalidReason.STALE)),
     )
+
+
+def reading_missing_of(prediction: Prediction) -> Array:
+    """(n, fans) of bool: where the newest raw sample has no reading; nowhere if the message does not tell."""
+    given = prediction.reading_missing
+    return given if len(given) else np.zeros(prediction.valid.shape, np.bool_)
 
 
 def speed_residual_rad_s(prediction: Prediction) -> Array:

@@ -372,6 +372,7 @@ class ScorerCore(Core):
             scored.balance_baseline_s,
             expected * item.torque_balance_sigma_command,
             item.predicted_speed_rad_s,
+            item.reading_missing,
         )
 
     def _feed_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:

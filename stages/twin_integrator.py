@@ -345,6 +345,7 @@ class TwinIntegratorCore(Core):
             torque_balance_sigma_command=self._twin.balance.sigma_command,
             reading_range_rad_s=reading_range if self._averages else nothing,
             averaged_command=averaged_command if self._averages or self._drive is not None else nothing,
+            reading_missing=grid.reading_missing,
         )
 
 

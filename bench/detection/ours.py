@@ -26,7 +26,7 @@ from twin.export.calibrated import with_calibration
 
 NAME = "fantwin"
 COLUMNS = ("speed_rad_s", "speed_residual", "balance", "command", "predicted_rad_s")
-FLAGS = ("speed_valid", "balance_valid", "missing", "idle", "alive")
+FLAGS = ("speed_valid", "balance_valid", "missing", "reading_missing", "idle", "alive")
 
 
 class Scorer:

@@ -33,6 +33,9 @@ class DecisionRules(IntEnum):
     """A fan that stands as commanded is judged: its alarm keeps its data, and an alarm of a fan that turned although it
     was stopped returns. The longer an alarm has stood, the longer it must be gone. Causes account for what the tacho
     resolves, and one of standstill stays when the fan turns again."""
+    ONE_ALARM = 8
+    """A fault is one alarm. Missing readings are counted as they arrive: between readings that are near enough the grid
+    has a speed all the same, and hides most of those that a loose wire costs."""
 
 
 CURRENT_RULES = max(DecisionRules)

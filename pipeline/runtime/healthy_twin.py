@@ -14,7 +14,9 @@ from pipeline.runtime.stage import Context, StageConfig, StageError
 from pipeline.runtime.tray_twin import TrayTwin
 from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS, Tacho
+from scoring.detectors.missing_readings import MissingReadingsSettings
 from scoring.detectors.standstill import StandstillSettings
+from scoring.detectors.tacho import TachoSettings
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.limits import Limits, Timing, uncalibrated
 
@@ -79,12 +81,29 @@ def limits_in_force(
         ValidationError: the calibration is not valid.
     """
     if calibration is None:
-        limits = uncalibrated(config.alarm_sigmas, config.timing(Timing()))
+        limits = _with_missing_readings(
+            uncalibrated(config.alarm_sigmas, config.timing(Timing())), MissingReadingsSettings(), decision_rules
+        )
         return _with_standstill(limits, standstill, decision_rules).times(config.limit_factor)
-    limits = _with_standstill(Limits.model_validate(calibration), standstill, decision_rules)
+    limits = Limits.model_validate(calibration)
+    tacho = limits.settings_of("tacho", TachoSettings)
+    former = MissingReadingsSettings.of_former_card(tacho) if tacho else None
+    limits = _with_standstill(_with_missing_readings(limits, former, decision_rules), standstill, decision_rules)
     timing = config.timing(limits.timing)
     declared_rate = limits.declared_rate if timing == limits.timing else None  # it holds for the calibrated times
     return limits.model_copy(update={"timing": timing, "declared_rate": declared_rate}).times(config.limit_factor)
+
+
+def _with_missing_readings(
+    limits: Limits, default: MissingReadingsSettings | None, decision_rules: DecisionRules
+) -> Limits:
+    """Of a card that does not set them, with the default."""
+    detectors = {**limits.detectors}
+    if decision_rules < DecisionRules.ONE_ALARM:
+        detectors.pop("missing_readings", None)
+    elif default is not None:
+        detectors.setdefault("missing_readings", default)
+    return limits.model_copy(update={"detectors": detectors})
 
 
 def _with_standstill(limits: Limits, standstill: Standstill | None, decision_rules: DecisionRules) -> Limits:

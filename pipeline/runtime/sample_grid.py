@@ -54,6 +54,7 @@ class SampleGrid:
         self._stale_for_ns = timing.stale_for_ns
         knows_time = decision_rules >= DecisionRules.TIME_AND_GAPS
         self._marks_restarts = decision_rules >= DecisionRules.BREAKS
+        self._tells_missing = decision_rules >= DecisionRules.ONE_ALARM
         self._restarts_t_ns: deque[int] = deque()  # of first samples after restarts whose grid samples are not made yet
         self._clock = DeviceClock(knows_backlogs=knows_time)
         self._guard = LineGuard(self._clock, self._period_ns) if knows_time else None
@@ -257,7 +258,7 @@ class SampleGrid:
                 t_ns, at, speed = t_ns[known], at[known], speed[known]
         if len(t_ns):
             self._in_gap = False
-            self._append(t_ns, samples.command.take(at, axis=0), speed, NO_SPEED)
+            self._append(t_ns, samples.command.take(at, axis=0), speed, NO_SPEED, ~has.take(at, axis=0))
         return not waits
 
     def _fill_gap(self, until_t_ns: int) -> None:
@@ -266,7 +267,8 @@ class SampleGrid:
         shape = (len(t_ns), self._fans)
         reason = np.where(t_ns - self._held.t_ns[0] <= self._watermark_ns, GAP, STALE)
         self._count_gap(len(t_ns))
-        self._append(t_ns, np.broadcast_to(self._held.command[0], shape), np.full(shape, np.nan), reason[:, np.newaxis])
+        command, nothing = np.broadcast_to(self._held.command[0], shape), np.zeros(shape, np.bool_)
+        self._append(t_ns, command, np.full(shape, np.nan), reason[:, np.newaxis], nothing)
 
     def _count_gap(self, samples: int) -> None:
         self._counts["gaps"] += not self._in_gap
@@ -276,7 +278,9 @@ class SampleGrid:
     def _grid_times(self, until_t_ns: int) -> Array:
         return np.arange(self._next_t_ns, until_t_ns + 1, self._period_ns)
 
-    def _append(self, t_ns: Array, command: Array, speed: Array, reason: Array | np.uint8) -> None:
+    def _append(
+        self, t_ns: Array, command: Array, speed: Array, reason: Array | np.uint8, reading_missing: Array
+    ) -> None:
         """Append grid samples, at least one; `reason` is the invalid_reason of those without a speed."""
         valid = np.isfinite(speed)
         invalid_reason = np.zeros(speed.shape, np.uint8)
@@ -293,6 +297,7 @@ class SampleGrid:
             speed_rad_s=speed,
             valid=valid,
             invalid_reason=invalid_reason,
+            reading_missing=reading_missing if self._tells_missing else np.zeros(0, np.bool_),
         )
         self._pending.append(grid)
         self._pending_rows += len(t_ns)

@@ -28,7 +28,7 @@ def holding_detectors(
                 off_delay_ns=round(max(off_delay_s, own_s) * NS_PER_S),
                 grows_with_speed=row.source != "tacho",
                 return_share=RETURN_SHARE if judges_rest else 0.0,
-                is_certain=not row.only_at_rest and (detector is not None or not judges_rest),
+                is_certain=not row.only_at_rest and (detector is not None or not (judges_rest or row.came_later)),
             )
         )
     return tuple(made)

@@ -35,24 +35,31 @@ class Cusum:
         shift = np.where(valid, z, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
         gains = np.array((shift - self._reference, -shift - self._reference)) * (period_s * ONE)
         gains = np.where(valid, np.rint(gains), 0.0).astype(np.int64)  # (2, n, fans)
-        totals = self.sums[:, np.newaxis] + np.cumsum(gains, axis=1)
-        sums = totals - np.minimum(np.minimum.accumulate(totals, axis=1), 0)
-        if self._cap is not None:
-            above = (sums > self._cap).any(axis=1)
-            if above.any():
-                for side, fan in np.argwhere(above).tolist():
-                    sums[side, :, fan] = self._with_cap(gains[side, :, fan], int(self.sums[side, fan]), self._cap)
+        sums = np.stack([bounded_sums(own, before, self._cap) for own, before in zip(gains, self.sums, strict=True)])
         self.sums = sums[:, -1].copy()
         return sums.max(axis=0) / ONE
 
-    @staticmethod
-    def _with_cap(gains: Array, total: int, cap: int) -> list[int]:
-        sums = []
-        for gain in gains.tolist():
-            total += gain
-            if total < 0:
-                total = 0
-            elif total > cap:
-                total = cap
-            sums.append(total)
-        return sums
+
+def bounded_sums(gains: Array, before: Array, cap: int | None) -> Array:
+    """(n, fans) the sum after each sample, not below zero and not above the cap; all integers.
+
+    gains: (n, fans). before: (fans,) the sums before the first. cap: None for none.
+    """
+    totals = before + np.cumsum(gains, axis=0)
+    sums = totals - np.minimum(np.minimum.accumulate(totals, axis=0), 0)
+    if cap is not None:
+        for fan in np.flatnonzero((sums > cap).any(axis=0)).tolist():
+            sums[:, fan] = _capped(gains[:, fan], int(before[fan]), cap)
+    return sums
+
+
+def _capped(gains: Array, total: int, cap: int) -> list[int]:
+    sums = []
+    for gain in gains.tolist():
+        total += gain
+        if total < 0:
+            total = 0
+        elif total > cap:
+            total = cap
+        sums.append(total)
+    return sums

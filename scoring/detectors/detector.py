@@ -141,7 +141,9 @@ class DetectorInput:
     speed_rad_s: Array
     """the readings of the tacho, NaN where there is none"""
     missing: Array
-    """the tacho gave no reading"""
+    """the tacho gave no reading, and its speed is not known from those around it"""
+    reading_missing: Array
+    """the newest raw sample has no reading"""
     idle: Array
     """the command stops the fan, or it has just started"""
     command: Array
@@ -204,3 +206,5 @@ class DetectorRow:
     """above its limit it is reported before all others, however far they exceed theirs: it says what is wrong"""
     only_at_rest: bool = False
     """it has a ratio only while the command stops the fan"""
+    came_later: bool = False
+    """recordings of before DecisionRules.ONE_ALARM do not have it"""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from schemas.messages import Statistic
 from scoring.detectors.detector import DetectorRow, LimitRule
 from scoring.detectors.drift import Drift
+from scoring.detectors.missing_readings import MissingReadings
 from scoring.detectors.smoothed import Smoothed
 from scoring.detectors.standstill import StandstillDetector
 from scoring.detectors.tacho import Tacho
@@ -18,6 +19,7 @@ DETECTORS = (
     DetectorRow("balance_drift", Statistic.BALANCE_DRIFT, "balance", Drift),
     DetectorRow("balance_variance_growth", Statistic.BALANCE_VARIANCE_GROWTH, "balance", VarianceGrowth),
     DetectorRow("sensor", Statistic.SENSOR, "tacho", Tacho),
+    DetectorRow("missing_readings", Statistic.SENSOR, "tacho", MissingReadings, came_later=True),
     DetectorRow("standstill", Statistic.STANDSTILL, "tacho", StandstillDetector, comes_first=True),
     DetectorRow("running_on", Statistic.STANDSTILL, "tacho", StandstillDetector, comes_first=True, only_at_rest=True),
 )

@@ -30,6 +30,9 @@ FORMER_MIN_PROBABILITY = 0.005
 NEWS = 0.1  # a change of a probability that is worth a message
 
 
+_NOT_KNOWN = np.zeros(0, np.bool_)
+
+
 @dataclass(frozen=True, eq=False)
 class _Block:
     t_ns: Array
@@ -39,6 +42,8 @@ class _Block:
     offset_s: Array
     expected_command: Array
     expected_rad_s: Array
+    reading_missing: Array
+    """(n, fans) of bool; empty where the line does not tell"""
 
 
 class Diagnoser:
@@ -77,13 +82,14 @@ class Diagnoser:
         offset_s: Array | float = math.inf,
         expected_command: Array | float = 0.0,
         expected_rad_s: Array | float = math.nan,
+        reading_missing: Array = _NOT_KNOWN,
     ) -> None:
         """Store a block; t_ns (n,), the others (n, fans).
 
         command: NaN where unknown. offset_command: the fan's own offset of the torque balance. offset_s: seconds of
         healthy running from which the offset is known. expected_command: the expected healthy balance at
         this speed, apart from the offset; NaN where the speed is unknown. expected_rad_s: what a healthy fan would
-        read.
+        read. reading_missing: where the newest raw sample had no reading; empty where the line does not tell.
         """
         if period_ns != self._period_ns:
             self._blocks.clear()
@@ -91,7 +97,9 @@ class Diagnoser:
         offset_s, expected, reading = (
             np.broadcast_to(one, offset_command.shape) for one in (offset_s, expected_command, expected_rad_s)
         )
-        self._blocks.append(_Block(t_ns, command, speed_rad_s, offset_command, offset_s, expected, reading))
+        self._blocks.append(
+            _Block(t_ns, command, speed_rad_s, offset_command, offset_s, expected, reading, reading_missing)
+        )
         oldest_t_ns = int(t_ns[0]) - min(round(WINDOW_S * NS_PER_S), MAX_SAMPLES * period_ns)
         while int(self._blocks[0].t_ns[-1]) < oldest_t_ns:
             self._blocks.popleft()
@@ -186,6 +194,10 @@ class Diagnoser:
         reading[index] = _column(blocks, "expected_rad_s", fan, rows)
         for values in (command, speed):
             values[np.abs(values) > MAX_VALUE] = np.nan
+        lacks = None
+        if any(len(block.reading_missing) for block in blocks):
+            lacks = np.zeros(index[-1] + 1, np.bool_)
+            lacks[index] = np.concatenate([_lacks(block)[:, fan] for block in blocks])[rows]
         healthy, period_s = self._healthy[fan], self._period_ns / NS_PER_S
         std_of_one_second = healthy.sigma_command * summed_deviation(healthy.autocorrelation_time_s, period_s)
         offset_s = max(_column(blocks, "offset_s", fan, rows)[-1], period_s)
@@ -197,6 +209,7 @@ class Diagnoser:
             onset=int(index[min(onset, len(index) - 1)]),
             expected_command=expected,
             expected_rad_s=reading,
+            reading_missing=lacks,
             fan_offset=float(_column(blocks, "offset_command", fan, rows)[-1]),
             fan_offset_std_error=std_of_one_second / math.sqrt(offset_s),
         )
@@ -204,6 +217,10 @@ class Diagnoser:
 
 def _column(blocks: Sequence[_Block], name: str, fan: int, rows: Array) -> Array:
     return np.concatenate([getattr(block, name)[:, fan] for block in blocks])[rows]
+
+
+def _lacks(block: _Block) -> Array:
+    return block.reading_missing if len(block.reading_missing) else ~np.isfinite(block.speed_rad_s)
 
 
 def _message(cause: RankedCause) -> CauseMessage:

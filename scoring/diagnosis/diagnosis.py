@@ -17,12 +17,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.tacho import Tacho
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.hypotheses import CAUSES, Comparison, Explanation, log_sum
 from scoring.diagnosis.regression_window import Array, HealthyBalance, RegressionWindow, Window
-from scoring.diagnosis.sensor_evidence import dropout_log_ratio, stuck_log_ratio, stuck_log_ratio_of_readings
+from scoring.diagnosis.sensor_evidence import (
+    MAX_HEALTHY_MISSING,
+    dropout_log_ratio,
+    stuck_log_ratio,
+    stuck_log_ratio_of_readings,
+)
 
 CANNOT_TELL, STUCK, DROPOUT = "cannot_tell", "sensor_stuck", "sensor_dropout"
 CANNOT_TELL_YET = "cannot tell yet"
@@ -92,8 +98,11 @@ def diagnose(
     else:
         expected = np.broadcast_to(window.expected_rad_s, window.speed_rad_s.shape)[heard]
         stuck, repeats = stuck_log_ratio_of_readings(speed, expected, onset, tacho, window.period_s)
-    dropout_onset = onset if advice is None else _first_missing(speed, onset, window.period_s)
-    dropout, missing = dropout_log_ratio(speed, dropout_onset)
+    lacks = ~np.isfinite(speed) if window.reading_missing is None else window.reading_missing[heard]
+    dropout_onset = onset if advice is None else _first_missing(lacks, onset, window.period_s)
+    if window.reading_missing is not None:
+        dropout_onset = _most_probable_onset(lacks, dropout_onset, onset)
+    dropout, missing = dropout_log_ratio(lacks, dropout_onset)
     enough = len(regression.speeds_after) * window.period_s >= MIN_AFTER_ONSET_S
     if enough:
         comparison = Comparison(regression, healthy)
@@ -140,11 +149,21 @@ def _of_stuck(repeats: int, period_s: float) -> tuple[Evidence | None, str]:
     return found, f"the last {repeats} readings are all the same, for {repeats * period_s:.2g} s"
 
 
-def _first_missing(speed_rad_s: Array, onset: int, period_s: float) -> int:
+def _first_missing(lacks: NDArray[np.bool_], onset: int, period_s: float) -> int:
     """Since when readings are missing: the first missing one of the last seconds before the onset, or the onset."""
     first = max(0, onset - round(DROPOUT_BEFORE_ONSET_S / period_s))
-    missing = np.flatnonzero(~np.isfinite(speed_rad_s[first:onset]))
+    missing = np.flatnonzero(lacks[first:onset])
     return first + int(missing[0]) if len(missing) else onset
+
+
+def _most_probable_onset(lacks: NDArray[np.bool_], first: int, onset: int) -> int:
+    """The missing reading, not before the first and not after the onset, from which on most more are missing than of a
+    good line: a healthy one of seconds before does not count."""
+    missing = first + np.flatnonzero(lacks[first:onset])
+    if not len(missing):
+        return onset
+    excess = np.cumsum(lacks - MAX_HEALTHY_MISSING)
+    return int(missing[np.argmin((excess - lacks)[missing])])
 
 
 def _of_dropout(missing: float, seconds: float) -> tuple[Evidence | None, str]:

@@ -78,7 +78,8 @@ class Window:
     onset: index of the first anomalous sample, as the detector found it. fan_offset: balance of this fan when healthy,
     from commissioning, and its standard error. expected_command: (n,) healthy balance expected at each speed, apart
     from the offset, from calibration; NaN where the speed is unknown. All in units of the command. expected_rad_s: (n,)
-    what a healthy fan would read; NaN where it is not known.
+    what a healthy fan would read; NaN where it is not known. reading_missing: (n,) where the line gave no reading,
+    though its speed may be known from readings around it; None: where it is not known.
     """
 
     period_s: float
@@ -89,6 +90,7 @@ class Window:
     fan_offset_std_error: float = 0.0
     expected_command: Array | float = 0.0
     expected_rad_s: Array | float = math.nan
+    reading_missing: NDArray[np.bool_] | None = None
 
 
 class RegressionWindow:

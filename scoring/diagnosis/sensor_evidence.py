@@ -14,6 +14,7 @@ Dropout: more readings are missing than before. All shares larger than the one b
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import betaincc, betaln, xlog1py, xlogy
 
 from schemas.tacho import Tacho
@@ -73,9 +74,8 @@ def _fell(before_rad_s: Array) -> bool:
     return last.size > 1 and bool(last.min() > MIN_FALL * np.abs(np.diff(last)).max())
 
 
-def dropout_log_ratio(speed_rad_s: Array, onset: int) -> tuple[float, float]:
-    """Log ratio for a sensor that drops out, and the share of readings missing since the onset. speed: (n,)."""
-    missing = ~np.isfinite(speed_rad_s)
+def dropout_log_ratio(missing: NDArray[np.bool_], onset: int) -> tuple[float, float]:
+    """Log ratio for a sensor that drops out, and the share of readings missing since the onset. missing: (n,)."""
     before, after = missing[:onset], missing[onset:]
     n, m = len(after), int(np.count_nonzero(after))
     if m == 0:

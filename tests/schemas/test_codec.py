@@ -244,6 +244,7 @@ def grid_of(samples: int) -> Grid:
         speed_rad_s=speed,
         valid=invalid_reason == 0,
         invalid_reason=invalid_reason,
+        reading_missing=np.isnan(speed),
     )
 
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import join
 from schemas.messages import Grid, Header, InvalidReason, Raw
 from schemas.tacho import Tacho
@@ -55,7 +56,7 @@ def split(message: Raw, size: int) -> Iterable[Raw]:
 
 def joined(grids: Iterable[Grid]) -> Grid:
     grids = list(grids)
-    names = ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason")
+    names = ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing")
     columns: dict[str, Any] = {name: np.concatenate([getattr(grid, name) for grid in grids]) for name in names}
     return Grid(fans=grids[0].fans, period_ns=grids[0].period_ns, **columns)
 
@@ -67,7 +68,7 @@ def run(messages: Iterable[Raw], fans: int = 1, **config: float) -> tuple[Grid, 
 
 
 def assert_same(a: Grid, b: Grid) -> None:
-    for name in ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason"):
+    for name in ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 
@@ -236,6 +237,14 @@ def test_a_missing_reading_of_one_fan_is_interpolated_and_the_others_are_untouch
     grid, _ = run([raw(at(0.0, 0.01, 0.02, 0.03), speed, fans=2)], fans=2)
     np.testing.assert_allclose(grid.speed_rad_s, [[0, 10], [1, 20], [2, 30], [3, 40]])
     assert grid.valid.all()
+    assert grid.reading_missing.tolist() == [[False, False], [False, True], [False, True], [False, False]]
+
+
+def test_the_grid_of_an_earlier_recording_does_not_tell_which_readings_were_missing() -> None:
+    core = ResamplerCore(1, FIXED, decision_rules=DecisionRules.AT_REST)
+    grid = joined([*core.step(raw(at(0.0, 0.01, 0.02), np.array([1.0, NAN, 2.0]))), *core.close()])
+    assert grid.valid.all()
+    assert not len(grid.reading_missing)
 
 
 def test_a_reading_missing_for_longer_than_the_limit_is_marked_as_missing() -> None:

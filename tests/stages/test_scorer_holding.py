@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
-from schemas.messages import InvalidReason, Prediction, Statistic, Transition
+from schemas.blocks import join
+from schemas.messages import InvalidReason, Prediction, Raw, Statistic, Transition
+from stages.resampler import ResamplerConfig, ResamplerCore
 from stages.scorer import ScorerCore
-from tests.support.scored_blocks import CALIBRATION, SIGMA, Floats, core_of, feed, prediction_of
+from tests.support.scored_blocks import (
+    CALIBRATION,
+    EPOCH_NS,
+    NEEDED,
+    SIGMA,
+    TWIN_SPEED,
+    Floats,
+    core_of,
+    feed,
+    prediction_of,
+    snapshot_of,
+)
 
 PERIOD_NS = 100_000_000
 SECOND = 10
 FORMER = DecisionRules.BREAKS
 MISSING_SHARE = {"sensor": {"stuck_s": 20.0, "missing_share": 0.25}}
 SLOW_TIMES = {"smoothing_s": 0.2, "baseline_s": 1.0, "adaptation_s": 60.0, "on_delay_s": 0.1}
+SETTINGS = [(CURRENT_RULES, 0.005), (CURRENT_RULES, None)]  # calibrated, and a card of before
 CARD = CALIBRATION | {"detectors": CALIBRATION["detectors"] | MISSING_SHARE, "timing": SLOW_TIMES}
 
 
@@ -40,6 +56,52 @@ def prediction(residual: Floats, first: int = 0, speed: Floats | float = 300.0) 
 def raised_and_cleared(core: ScorerCore, item: Prediction) -> list[Transition]:
     _, alarms = feed(core, [item])
     return [a.transition for a in alarms if a.transition in (Transition.RAISED, Transition.CLEARED)]
+
+
+def on_the_grid(rules: DecisionRules, missing: Floats) -> Prediction:
+    """A healthy fan, of whose raw samples, ten a second, these shares have no reading, as the resampler shows it."""
+    samples = len(missing)
+    speed = TWIN_SPEED + noise(samples, seed=3)
+    speed[np.random.default_rng(5).random(samples) < missing] = np.nan
+    t_ns = EPOCH_NS + PERIOD_NS * np.arange(samples)
+    raw = Raw(fans=1, host_receive_t_ns=t_ns, command=np.full(speed.shape, NEEDED), speed_rad_s=speed)
+    resampler = ResamplerCore(1, ResamplerConfig(rate_hz=10.0), decision_rules=rules)
+    grid = join([*resampler.step(raw), *resampler.close()])
+    made = prediction_of(grid.speed_rad_s - TWIN_SPEED, grid.valid, period_ns=PERIOD_NS)
+    assert np.array_equal(made.t_ns, grid.t_ns)
+    return replace(made, invalid_reason=grid.invalid_reason, reading_missing=grid.reading_missing)
+
+
+@pytest.mark.parametrize(("rules", "healthy"), [(FORMER, 0.005), (DecisionRules.AT_REST, 0.005), *SETTINGS])
+def test_a_loose_wire_is_one_alarm_though_the_grid_bridges_its_missing_readings(
+    rules: DecisionRules, healthy: float | None
+) -> None:
+    time_s = np.arange(460 * SECOND) / SECOND
+    item = on_the_grid(rules, np.where(time_s < 60, 0.002, np.where(time_s < 360, 0.35, 0.002)))
+    own = {"missing_readings": {"healthy_share": healthy}} if healthy else {}
+    card = CARD | {"detectors": CARD["detectors"] | own}
+    core = core_of(calibration=card, decision_rules=rules)
+    feed(core, [prediction(noise(30 * SECOND, seed=9), first=-30 * SECOND)])
+    _, alarms = feed(core, [item])
+    found = [alarm for alarm in alarms if alarm.transition in (Transition.RAISED, Transition.CLEARED)]
+    after_s = [(alarm.t_ns - EPOCH_NS) / 1e9 - 60.0 for alarm in found]
+    if rules < DecisionRules.ONE_ALARM:
+        assert after_s[0] > 10.0
+        assert len(found) > 2
+        return
+    assert [alarm.transition for alarm in found] == [Transition.RAISED, Transition.CLEARED]
+    assert found[0].statistic == Statistic.SENSOR
+    assert 0.0 < after_s[0] < (3.0 if healthy else 6.0)
+    assert 330.0 < after_s[1] < 360.0
+    assert re.search(r"; a tacho that drops out, \d+ %: [34]\d % of the readings of the last ", found[0].message)
+
+
+def test_a_scorer_continues_with_a_snapshot_of_before_missing_readings_were_counted() -> None:
+    earlier = snapshot_of(core_after_commissioning(DecisionRules.AT_REST))
+    assert "missing_readings" not in earlier.state_json
+    core = core_of(calibration=CARD)
+    core.restore(earlier)
+    assert not any("snapshots" in name for name in core.counters())
 
 
 @pytest.mark.parametrize("rules", [FORMER, CURRENT_RULES])

@@ -46,6 +46,7 @@ def samples_of(speed: Array, balance: Array, first: int = 0, period_ns: int = ST
         command=np.full(speed.shape, 50.0),
         predicted_rad_s=np.full(speed.shape, 100.0),
         missing=np.zeros(speed.shape, np.bool_),
+        reading_missing=np.zeros(speed.shape, np.bool_),
         idle=np.zeros(speed.shape, np.bool_),
         alive=np.ones(speed.shape, np.bool_),
     )

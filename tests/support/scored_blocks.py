@@ -76,7 +76,9 @@ def core_of(
 ) -> ScorerCore:
     """Without a calibration: limits on the speed residual alone, 2 SIGMA."""
     settings = ScorerConfig.model_validate(config)
-    twin = HealthyTwin(sha256, limits_in_force(settings, calibration), [balance_of_a_fan()] * fans, "%")
+    twin = HealthyTwin(
+        sha256, limits_in_force(settings, calibration, None, decision_rules), [balance_of_a_fan()] * fans, "%"
+    )
     return ScorerCore(fans, unit, settings, twin, snapshot_store, decision_rules)
 
 

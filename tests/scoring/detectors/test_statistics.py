@@ -17,6 +17,7 @@ from scoring.detectors.cusum import LARGEST_SIGMAS, ONE, Cusum
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput
 from scoring.detectors.drift import Drift, DriftSettings
 from scoring.detectors.low_pass import LowPass
+from scoring.detectors.missing_readings import MissingReadings, MissingReadingsSettings
 from scoring.detectors.smoothed import Smoothed, SmoothedSettings
 from scoring.detectors.tacho import Tacho, TachoSettings
 from scoring.detectors.variance_growth import VarianceGrowth, VarianceGrowthSettings
@@ -53,6 +54,7 @@ def block_of(
         persistent=residual,
         speed_rad_s=residual if speed is None else speed,
         missing=np.zeros(valid.shape, np.bool_) if missing is None else missing,
+        reading_missing=np.zeros(valid.shape, np.bool_) if missing is None else missing,
         idle=np.zeros(valid.shape, np.bool_),
         command=np.ones(valid.shape),
         predicted_rad_s=residual,
@@ -95,7 +97,15 @@ def of_sensor() -> Update:
     return lambda x, valid: readings(sensor, np.round(np.where(valid, x, np.nan)), ~valid, np.isfinite(x))
 
 
-@pytest.mark.parametrize("make", [of_low_pass, of_cusum, of_smoothed, of_drift, of_variance_growth, of_sensor])
+def of_missing_readings() -> Update:
+    detector = MissingReadings(MissingReadingsSettings(healthy_share=0.01), context())
+    return lambda x, valid: detector.update(block_of(x, valid, missing=~(x > 0.0)))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [of_low_pass, of_cusum, of_smoothed, of_drift, of_variance_growth, of_sensor, of_missing_readings],
+)
 @settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 10_000), cuts=st.lists(st.integers(1, 119), max_size=8), share=st.sampled_from([0.0, 0.1, 0.9])
