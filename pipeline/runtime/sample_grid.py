@@ -54,7 +54,7 @@ class SampleGrid:
         self._stale_for_ns = timing.stale_for_ns
         knows_time = decision_rules >= DecisionRules.TIME_AND_GAPS
         self._marks_restarts = decision_rules >= DecisionRules.BREAKS
-        self._tells_missing = decision_rules >= DecisionRules.ONE_ALARM
+        self._marks_missing = decision_rules >= DecisionRules.ONE_ALARM
         self._restarts_t_ns: deque[int] = deque()  # of first samples after restarts whose grid samples are not made yet
         self._clock = DeviceClock(knows_backlogs=knows_time)
         self._guard = LineGuard(self._clock, self._period_ns) if knows_time else None
@@ -297,7 +297,7 @@ class SampleGrid:
             speed_rad_s=speed,
             valid=valid,
             invalid_reason=invalid_reason,
-            reading_missing=reading_missing if self._tells_missing else np.zeros(0, np.bool_),
+            reading_missing=reading_missing if self._marks_missing else np.zeros(0, np.bool_),
         )
         self._pending.append(grid)
         self._pending_rows += len(t_ns)
