@@ -157,6 +157,7 @@ _WHAT_DETECTORS = {
     "balance_drift": "the detector of small shifts of the torque balance that stay (CUSUM)",
     "balance_variance_growth": "the detector of an unsteady torque balance",
     "sensor": "the detector of readings that repeat or are missing",
+    "missing_readings": "the detector of single missing readings, of a loose wire (CUSUM)",
     "standstill": "the detector of fans that stand although they are driven",
     "running_on": "the detector of fans that turn although they are stopped",
 }

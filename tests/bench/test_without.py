@@ -187,7 +187,8 @@ def probe_of(mechanism: Mechanism) -> Callable[[], Hashable]:
         place.startswith(("scoring.calibration", "scoring.detectors.drift:DriftSettings")) for place in places
     )
     is_calibrated = of_limits or mechanism.name.partition("-")[2] in ("smoothed", "drift", "variance-growth")
-    return PROBES.get(mechanism.name, limits if is_calibrated or mechanism.name == "sensor" else decisions)
+    of_tacho = mechanism.name in ("sensor", "missing-readings")
+    return PROBES.get(mechanism.name, limits if is_calibrated or of_tacho else decisions)
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
