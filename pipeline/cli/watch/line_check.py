@@ -51,7 +51,7 @@ def check_line(context: Context, config: Config, seconds: float, *, is_running: 
 
 def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str]:
     """The samples that acquisition would publish, and what it would report as its problem."""
-    settings = context.config.model_copy(update={"block_size": 1, "silence_s": seconds + SLOWEST_S})
+    settings = listening_settings(context.config, seconds)
     built = load_stage("acquisition").build(Context(**(vars(context) | {"config": settings})))
     core, source = built.core, built.source
     assert source is not None
@@ -71,6 +71,11 @@ def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str]:
         source.stop()
     problem = core.problem()
     return samples, problem or refusal(core.counters())
+
+
+def listening_settings(config: Any, seconds: float) -> Any:
+    """`[acquisition]` while a line is listened to: it is silent after the pause between two samples of the slowest."""
+    return config.model_copy(update={"block_size": 1, "silence_s": seconds + SLOWEST_S})
 
 
 def refusal(counters: Mapping[str, int]) -> str:

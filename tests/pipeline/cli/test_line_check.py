@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli.watch.line_check import _findings, check_line, refusal
+from pipeline.cli.watch.line_check import _findings, check_line, listening_settings, refusal
 from pipeline.config.loading import parse_config
 from pipeline.config.models import Config
 from pipeline.runtime.stage import Context
@@ -141,6 +141,7 @@ def test_a_line_that_was_cut_once_is_no_fault_of_the_configuration(counters: dic
     assert words in said if words else not said
 
 
-def test_a_line_that_is_to_send_once_a_second_is_not_silent_between_two_samples() -> None:
-    lines = listened([(0.0, b"S 0 0 0.5 100 0.5 100\n")], 1.1)
-    assert all(ok for ok, _ in lines), lines
+def test_a_line_that_sends_once_a_second_is_not_silent_between_two_samples() -> None:
+    settings = listening_settings(config_of().sections["acquisition"], 2.0)
+    assert settings.silence_s >= 2.0 + 1.0
+    assert settings.block_size == 1
