@@ -63,22 +63,29 @@ class FanScorer:
         for_calibration: bool = False,
         forgets_over_gaps: bool = True,
         skips_transients: bool = True,
+        allows_for_counts: bool = True,
     ) -> None:
         """for_calibration: keep what calibration needs, for `observed`; statistics then grow beyond their limits.
 
         forgets_over_gaps: False only to decide as for recordings made before statistics started again after gaps.
         skips_transients: False only to decide as for recordings made before fans that moved were not commissioned.
+        allows_for_counts: False only to decide as for recordings made before readings of a tacho that counts were
+        allowed to be unsteady while the fan changes its speed, and to repeat where a healthy fan would read the same.
         """
         self.limits = limits
         self.residuals = {source: Residual(fans, source, limits) for source in RESIDUALS}
         contexts = {
             source: residual.context(fans, capped=not for_calibration) for source, residual in self.residuals.items()
         }
+        of_each_fan = tacho_of_each_fan(tachos, fans)
+        self._counts = np.array([allows_for_counts and tacho.held_s > 0.0 for tacho in of_each_fan])
+        """(fans,) whose readings go up and down in steps as the speed changes"""
         of_tacho = DetectorContext(
             fans=fans,
             smoothing_s=limits.timing.smoothing_s,
             capped=not for_calibration,
-            tachos=tacho_of_each_fan(tachos, fans),
+            tachos=of_each_fan,
+            allows_for_counts=allows_for_counts,
         )
         self._rows = rows()
         self.detectors: dict[str, Detector] = {
@@ -272,8 +279,8 @@ class FanScorer:
                 predicted_rad_s=block.predicted_rad_s[stretch],
             )
             for source, valid, standardised, persistent in (
-                ("speed", speed.scored, speed.standardised, speed.persistent),
-                ("balance", balance.scored, balance.standardised, balance.persistent),
+                ("speed", speed.scored, self._unsteadiness(speed), speed.persistent),
+                ("balance", balance.scored, self._unsteadiness(balance), balance.persistent),
                 ("tacho", alive, _NOTHING, _NOTHING),
             )
         }
@@ -329,6 +336,10 @@ class FanScorer:
             balance_learned_scale=np.broadcast_to(baseline.learned_scale, alive.shape),
             ratios=every_ratio.swapaxes(0, 1),
         )
+
+    def _unsteadiness(self, of: _ScoredResidual) -> Array:
+        """(n, fans) the residual in standard deviations; of a tacho that counts, in those of this motion."""
+        return np.where(self._counts, of.persistent, of.standardised) if self._counts.any() else of.standardised
 
     def _score_residual(
         self, source: Signal, values: Array, valid: Array, speed_rad_s: Array, transient_rad_s: Array, period_s: float

@@ -93,6 +93,7 @@ class ScorerCore(Core):
         self._forgets_over_gaps = decision_rules >= DecisionRules.TIME_AND_GAPS
         self._holds = decision_rules >= DecisionRules.HOLDING
         self._judges_rest = decision_rules >= DecisionRules.AT_REST
+        self._allows_for_counts = decision_rules >= DecisionRules.ONE_ALARM
         self._scorer = self._new_scorer()
         holding = holding_detectors(self._scorer.detectors, config.off_delay_s, judges_rest=self._judges_rest)
         self._settings = ConditionSettings(
@@ -152,6 +153,7 @@ class ScorerCore(Core):
             tachos=self._twin.tachos,
             forgets_over_gaps=self._forgets_over_gaps,
             skips_transients=self._holds,
+            allows_for_counts=self._allows_for_counts,
         )
 
     def restore(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:

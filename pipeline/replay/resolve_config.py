@@ -11,7 +11,7 @@ from pipeline.config.loading import load_config, parse_config
 from pipeline.config.models import Config
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
-from pipeline.runtime.decision_rules import FORMER_GRID, DecisionRules
+from pipeline.runtime.decision_rules import FORMER_DEFAULTS, DecisionRules
 from schemas.envelope import Envelope
 
 
@@ -69,14 +69,22 @@ def recorded_rules(file: Path, metadata: RecordingMetadata) -> DecisionRules:
 
 
 def _former_defaults(file: Path, metadata: RecordingMetadata) -> list[str]:
-    """Overrides that give an older recording the grid it was recorded with, where its configuration says nothing."""
-    if recorded_rules(file, metadata) >= DecisionRules.RATE_OF_LINE:
-        return []
+    """Overrides that give an older recording the defaults it was recorded with, where its configuration says
+    nothing.
+    """
+    rules = recorded_rules(file, metadata)
     try:
-        given = tomllib.loads(metadata.attachments[CONFIGURATION].decode(errors="replace")).get("resampler", {})
+        given = tomllib.loads(metadata.attachments[CONFIGURATION].decode(errors="replace"))
     except ValueError:  # reported where it is parsed
         return []
-    return [f"resampler.{key}={value}" for key, value in FORMER_GRID.items() if key not in given]
+    return [
+        f"{section}.{key}={value}"
+        for since, sections in FORMER_DEFAULTS.items()
+        if rules < since
+        for section, defaults in sections.items()
+        for key, value in defaults.items()
+        if key not in given.get(section, {})
+    ]
 
 
 def _parsed(file: Path, metadata: RecordingMetadata, overrides: Iterable[str], stages: Iterable[str]) -> Config:

@@ -22,7 +22,7 @@ class DecisionRules(IntEnum):
     """The twin starts again where the grid does not continue: with another session of the resampler, another segment of
     the clock of the device, or a gap in which the command has moved."""
     RATE_OF_LINE = 4
-    """Times of the grid that are not configured follow from the line. Before they were those of `FORMER_GRID`."""
+    """Times of the grid that are not configured follow from the line. Before they were those of `FORMER_DEFAULTS`."""
     HOLDING = 5
     """An alarm returns by the detectors that exceeded, each after its own off-delay, and only where its fault would
     show; meanwhile the fan's baselines stay. Baselines are not commissioned from a fan that changes its speed. Less
@@ -34,10 +34,17 @@ class DecisionRules(IntEnum):
     was stopped returns. The longer an alarm has stood, the longer it must be gone. Causes account for what the tacho
     resolves, and one of standstill stays when the fan turns again."""
     ONE_ALARM = 8
-    """A fault is one alarm. Missing readings are counted as they arrive: between readings that are near enough the grid
-    has a speed all the same, and hides most of those that a loose wire costs."""
+    """A fault is one alarm. It begins to return below half of its limit and not below three quarters, and for ten
+    seconds at least and not for one. Missing readings are counted as they arrive: between readings that are near enough
+    the grid has a speed all the same, and hides most of those that a loose wire costs. Readings of a tacho that counts
+    may be unsteady while the fan changes its speed, and repeat where a healthy fan would read the same."""
 
 
 CURRENT_RULES = max(DecisionRules)
-FORMER_GRID = {"rate_hz": 100.0, "gap_limit_s": 0.1, "watermark_s": 0.5, "stale_for_s": 5.0}
-"""settings of `[resampler]` where a configuration of before RATE_OF_LINE says nothing"""
+FORMER_DEFAULTS = {
+    DecisionRules.RATE_OF_LINE: {
+        "resampler": {"rate_hz": 100.0, "gap_limit_s": 0.1, "watermark_s": 0.5, "stale_for_s": 5.0}
+    },
+    DecisionRules.ONE_ALARM: {"scorer": {"deadband": 0.25, "off_delay_s": 1.0}},
+}
+"""before each version, the settings of a section where a configuration says nothing"""

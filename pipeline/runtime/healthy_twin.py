@@ -34,8 +34,8 @@ class ScorerConfig(StageConfig):
     baseline_s: float | None = Field(default=None, gt=0, description="length of an interval of commissioning")
     adaptation_s: float | None = Field(default=None, gt=0, description="time constant of the baseline in the long run")
     on_delay_s: float | None = Field(default=None, ge=0, description="how long a limit must be exceeded to raise")
-    off_delay_s: float = Field(default=1.0, ge=0, description="how long a return must last at least to clear")
-    deadband: float = Field(default=0.25, ge=0, lt=1, description="share of its limit below which a return begins")
+    off_delay_s: float = Field(default=10.0, ge=0, description="how long a return must last at least to clear")
+    deadband: float = Field(default=0.5, ge=0, lt=1, description="share of its limit below which a return begins")
     alarm_ratio: float = Field(default=1.5, ge=1, description="score from which a warning is an alarm")
     latching: bool = Field(default=False, description="whether a cleared alarm stays until it is reset")
     confirming: bool = Field(default=False, description="whether an acknowledged alarm must be confirmed, too")
@@ -132,8 +132,8 @@ def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
         why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise StageError(f"{context.tray.twin}: its calibration cannot be used: {why}; {again}") from error
     for residual in (limits.speed, limits.balance):
-        fans = len(residual.fan_offsets.offset_sigmas) if residual.fan_offsets else context.tray.fans
-        if fans != context.tray.fans:
+        fans = residual.known_fans
+        if fans not in (None, context.tray.fans):
             raise StageError(
                 f"{context.tray.twin}: its calibration is of {fans} fans, the tray has {context.tray.fans}; {again}"
             )

@@ -10,14 +10,17 @@ end of the confidence interval of the extrapolated tail.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
+from scipy.stats import chi2
 
 from schemas.messages import Array
 from scoring.baseline.fan_offsets import fan_offsets
 from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.calibration.alarm_rate import rate_interval
+from scoring.calibration.fan_spread import INDEPENDENT_S, fan_spread
 from scoring.calibration.healthy_statistics import HealthyStatistics, Runs, healthy_statistics, truncate_runs
 from scoring.calibration.healthy_variation import (
     UNLIMITED,
@@ -46,6 +49,7 @@ MAX_ALARM_SHARE = 0.25  # share of the windows: with more of them the limits wou
 MIN_LEVEL = 0.1 / UNREACHED
 SECONDS_QUANTILE = 0.999  # quantile of one-second means: a shift that is exceeded more often is not a drift
 SEEN_WINDOWS = 50.0  # with an alarm, to count how often statistics alarm together
+CONFIDENCE = 0.95
 ROUNDING = 1e-9
 
 
@@ -149,7 +153,10 @@ def _with_variation(
     return _each(
         limits,
         lambda residual, source: residual.model_copy(
-            update={"persistent_std": persistent_std(residual, seen.moments[source], top_speed_rad_s)}
+            update={
+                "persistent_std": persistent_std(residual, seen.moments[source], top_speed_rad_s),
+                "fan_spread": fan_spread(seen.moments[source].fan_squares),
+            }
         ),
     )
 
@@ -202,10 +209,21 @@ def _smoothed_std(limits: Limits, source: Signal, found: HealthyStatistics) -> f
 
 
 def _cautious(limits: Limits, found: HealthyStatistics) -> Limits:
-    """Limits where the running is too short to set them by rarity; see DetectorSettings.cautious_factor."""
+    """Limits where the running is too short to set them by rarity; see DetectorSettings.cautious_factor.
+
+    They are multiples of a standard deviation that few independent errors of the twin have shown, and so those of the
+    upper end of its confidence interval.
+    """
+    independent = max(found.fan_s / INDEPENDENT_S, 1.0)
+    unknown = math.sqrt(independent / float(chi2.ppf(1.0 - CONFIDENCE, independent)))
     used = [row for row in calibrated_rows() if row.name in limits.detectors]
     factors = {row.name: limits.detectors[row.name].cautious_factor(_evidence(row, limits, found)) for row in used}
-    limits = limits.scaled({row.name: factors.get(row.name) or 1.0 for row in calibrated_rows()})
+    limits = limits.scaled(
+        {
+            row.name: (factors.get(row.name) or 1.0) * (1.0 if row.source == "tacho" else unknown)
+            for row in calibrated_rows()
+        }
+    )
     detectors = {
         row.name: limits.detectors[row.name].cautious(_evidence(row, limits, found))
         for row in used

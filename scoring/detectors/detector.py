@@ -121,6 +121,8 @@ class DetectorContext:
     """mean over speeds of the standard deviation of the healthy residual, sigma"""
     tachos: tuple[Tacho, ...] = ()
     """of each fan; only for detectors of the tacho"""
+    allows_for_counts: bool = True
+    """False only to decide as for recordings made before FanScorer did"""
     capped: bool = True
     """False: statistics may grow without bound, for calibration to see how far"""
 

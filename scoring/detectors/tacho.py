@@ -2,8 +2,9 @@
 
 A stuck tacho repeats its last value. A healthy one may do so for a while; calibration measures for how long. A tacho
 that counts or holds its readings repeats them for as long as the fan runs evenly. Of such a tacho only samples count at
-which a healthy fan would read something else, because its speed has changed by more than the tacho resolves. Missing
-readings are limited by their share. While the command stops the fan, and while it starts, neither is judged.
+which a healthy fan would read something else, because its speed has changed by more than the tacho resolves, and is now
+away from the reading by half of that or more. Missing readings are limited by their share. While the command stops the
+fan, and while it starts, neither is judged.
 """
 
 from __future__ import annotations
@@ -32,13 +33,18 @@ from scoring.detectors.low_pass import LowPass
 MISSING_TIME_CONSTANT_S = 2.0
 LOOSE_S = 30.0  # a loose contact comes and goes: after so long without a failure it is taken to be good again
 MOVED_STEPS, MOVED_SHARE = 3.0, 0.1  # of the resolution, and of the speed: less may be noise, or an error of the twin
+AWAY = 0.5  # of that: a reading that is nearer to what a healthy fan would read says that the tacho works
 STUCK_MARGIN, MIN_STUCK_S = 3.0, 2.0  # times the longest repetition of healthy runs
 MISSING_MARGIN, MIN_MISSING_SHARE, MAX_MISSING_SHARE = 3.0, 0.25, 0.9  # times the largest share of healthy runs
 
 
-def moved(expected_rad_s: Array, first_rad_s: Array | float, resolution_rad_s: Array | float) -> Array:
-    """Where a healthy fan would read something else than at first, by more than its tacho resolves; all rad/s."""
-    least = np.maximum(MOVED_STEPS * resolution_rad_s, MOVED_SHARE * np.abs(first_rad_s))
+def moved(
+    expected_rad_s: Array, first_rad_s: Array | float, resolution_rad_s: Array | float, share: float = 1.0
+) -> Array:
+    """Where a healthy fan would read something else than at first, by more than its tacho resolves, or than a share of
+    that; all rad/s.
+    """
+    least = share * np.maximum(MOVED_STEPS * resolution_rad_s, MOVED_SHARE * np.abs(first_rad_s))
     return np.asarray(np.abs(expected_rad_s - first_rad_s) > least)
 
 
@@ -83,6 +89,7 @@ class Tacho(Detector):
         """(fans,) what a healthy fan would have read when the reading began to repeat"""
         self._holds = np.array([tacho.kind != "instantaneous" for tacho in context.tachos])
         self._resolution_rad_s = np.array([tacho.resolution_rad_s for tacho in context.tachos])
+        self._must_be_away = context.allows_for_counts
         self._missing = LowPass(context.fans, MISSING_TIME_CONSTANT_S)
         self._longest_s = self._largest_share = 0.0
 
@@ -109,7 +116,10 @@ class Tacho(Detector):
         if self._holds.any():
             first = np.take_along_axis(predicted_rad_s, np.maximum(changed - 1, 0), axis=0)
             first = np.where(changed == 0, self._healthy_rad_s, first)
-            counted = same & (~self._holds | moved(predicted_rad_s, first, self._resolution_rad_s))
+            elsewhere = moved(predicted_rad_s, first, self._resolution_rad_s)
+            if self._must_be_away:
+                elsewhere &= moved(predicted_rad_s, speed_rad_s, self._resolution_rad_s, AWAY)
+            counted = same & (~self._holds | elsewhere)
             self._healthy_rad_s = first[-1].copy()
         total = np.cumsum(counted, axis=0) * period_ns
         at_change = np.maximum.accumulate(np.where(same, 0, total), axis=0)

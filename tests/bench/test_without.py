@@ -120,9 +120,10 @@ def faulty() -> Prediction:
 
 def judged(limits: Limits) -> Hashable:
     """All that a scorer says about the faulty run."""
-    every = limits_in_force(ScorerConfig(), limits.model_dump(), STANDSTILL)
+    config = ScorerConfig(off_delay_s=1.0, deadband=0.25)
+    every = limits_in_force(config, limits.model_dump(), STANDSTILL)
     balances = [balance_of_a_fan()] * FANS
-    core = ScorerCore(FANS, "rpm", ScorerConfig(), HealthyTwin("", every, balances, "", (TACHO,) * FANS, STANDSTILL))
+    core = ScorerCore(FANS, "rpm", config, HealthyTwin("", every, balances, "", (TACHO,) * FANS, STANDSTILL))
     said: list[Hashable] = []
     with patch.object(Diagnoser, "diagnose", return_value=()):  # which takes most of the time
         messages = core.step(faulty())

@@ -101,7 +101,7 @@ def test_an_excursion_one_sample_too_short_raises_nothing_and_is_counted() -> No
 
 
 def test_an_alarm_clears_below_the_deadband_at_the_end_of_the_off_delay() -> None:
-    residual = np.array([9.0] * 6 + [7.0] * 10 + [5.0] * 12)
+    residual = np.array([9.0] * 6 + [5.0] * 10 + [3.0] * 12)
     assert states(unsmoothed(), residual.tolist())[5:] == [ALARM] * 11 + [RETURNING] * 10 + [NORMAL] * 2
     _, (raised, cleared) = feed(unsmoothed(), [prediction_of(residual)])
     assert (cleared.transition, cleared.active, samples(cleared.t_ns)) == (Transition.CLEARED, False, 26)
@@ -458,7 +458,15 @@ def test_blocks_of_any_size_are_judged_the_same_to_the_bit(
 
 def test_the_synthetic_predictions_raise_and_clear_alarms_and_are_diagnosed() -> None:
     rules = DecisionRules.BREAKS  # since then alarms return after longer than these samples last
-    core = core_of(3, calibration=LIVELY, baseline_s=0.1, on_delay_s=0.03, off_delay_s=0.05, decision_rules=rules)
+    core = core_of(
+        3,
+        calibration=LIVELY,
+        baseline_s=0.1,
+        on_delay_s=0.03,
+        off_delay_s=0.05,
+        deadband=0.25,
+        decision_rules=rules,
+    )
     with np.errstate(all="ignore"):
         _, alarms = feed(core, [eventful_prediction(seed=1, samples=2000, change_s=0.0)])
     assert min(core.counters()[name] for name in ("alarms_raised", "alarms_cleared", "excursions_too_short")) > 1

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
+from pipeline.runtime.decision_rules import CURRENT_RULES, FORMER_DEFAULTS, DecisionRules
 from schemas.blocks import join
 from schemas.messages import InvalidReason, Prediction, Raw, Statistic, Transition
 from stages.resampler import ResamplerConfig, ResamplerCore
@@ -37,7 +37,13 @@ CARD = CALIBRATION | {"detectors": CALIBRATION["detectors"] | MISSING_SHARE, "ti
 
 
 def core_after_commissioning(rules: DecisionRules) -> ScorerCore:
-    core = core_of(calibration=CARD, decision_rules=rules)
+    returning = FORMER_DEFAULTS[DecisionRules.ONE_ALARM]["scorer"]
+    core = core_of(
+        calibration=CARD,
+        decision_rules=rules,
+        off_delay_s=returning["off_delay_s"],
+        deadband=returning["deadband"],
+    )
     feed(core, [prediction(noise(30 * SECOND, seed=9), first=-30 * SECOND)])
     return core
 

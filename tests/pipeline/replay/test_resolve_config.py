@@ -12,6 +12,7 @@ from pipeline.recordings.reading import read_metadata
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from pipeline.replay.resolve_config import attached_config, resolve_config, trays_of
+from pipeline.runtime.healthy_twin import ScorerConfig
 from schemas.topics import tray_key
 from stages.resampler import ResamplerConfig
 from tests.support.replay_data import START_NS, raw_of
@@ -83,3 +84,15 @@ def test_an_older_recording_keeps_the_grid_it_was_recorded_with(tmp_path, rules,
     assert isinstance(section, ResamplerConfig)
     assert (section.rate_hz, section.gap_limit_s, section.block_size) == (rate_hz, gap_limit_s, 512)
     assert section.stale_for_s == (5.0 if rate_hz else None)
+
+
+@pytest.mark.parametrize(("rules", "off_delay_s", "deadband"), [("7", 1.0, 0.3), ("8", 10.0, 0.3)])
+def test_alarms_of_an_older_recording_return_as_they_did(tmp_path, rules, off_delay_s, deadband):
+    toml = f"{TOML}[scorer]\ndeadband = 0.3\n"
+    metadata = {"trays": "tray1", "decision_rules": rules}
+    path = recording(tmp_path / "r.mcap", metadata, {"configuration.toml": toml.encode()})
+    found = attached_config(path, read_metadata(path), ("scorer",))
+    assert found
+    section = found.sections["scorer"]
+    assert isinstance(section, ScorerConfig)
+    assert (section.off_delay_s, section.deadband) == (off_delay_s, deadband)

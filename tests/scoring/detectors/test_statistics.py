@@ -293,3 +293,18 @@ def test_a_tacho_that_counts_is_stuck_only_where_a_healthy_one_would_read_someth
     np.testing.assert_allclose(stuck_s[200:300, 0], STEP_S * np.arange(1, 101))
     np.testing.assert_allclose(stuck_s[300:, 0], 1.0)
     np.testing.assert_allclose(stuck_s[:, 1], STEP_S * np.arange(400), err_msg="each reading is one of its own")
+
+
+def test_a_reading_that_a_healthy_fan_would_give_is_not_stuck_though_the_twin_came_from_elsewhere() -> None:
+    tacho = TachoKind(kind="count", window_s=1.0)
+    settled = np.full((300, 1), 100.0 + tacho.resolution_rad_s)
+    settled[:100] = 100.0 - 4.0 * tacho.resolution_rad_s  # the free run still settles
+    speed = np.full((300, 1), 100.0)
+    block = replace(block_of(speed, np.ones(speed.shape, np.bool_)), predicted_rad_s=settled)
+
+    def longest(*, allows: bool) -> float:
+        of = DetectorContext(fans=1, smoothing_s=0.2, tachos=(tacho,), allows_for_counts=allows)
+        return float(Tacho(TachoSettings(stuck_s=0.5), of).update(block).max())
+
+    assert longest(allows=True) == 0.0
+    assert longest(allows=False) > 1.0

@@ -81,7 +81,7 @@ def burst(
 
 
 def core() -> ScorerCore:
-    return core_of(2, calibration=CALIBRATION)
+    return core_of(2, calibration=CALIBRATION, off_delay_s=1.0)
 
 
 def core_for_days() -> ScorerCore:
