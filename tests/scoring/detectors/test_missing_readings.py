@@ -91,7 +91,7 @@ def test_an_interruption_counts_as_one_reading_however_long_it_is() -> None:
 
 def test_a_silent_line_and_a_fan_at_rest_miss_nothing() -> None:
     missing = by_chance(0.5, 200, 2, 7)
-    valid, idle = np.ones((2, *missing.shape), np.bool_)
+    valid, idle = (np.ones(missing.shape, np.bool_) for _ in range(2))
     valid[:, 0] = idle[:, 0] = False
     healthy = detector_of(MissingReadingsSettings(healthy_share=0.005), 2)
     assert ratios(healthy, missing, valid, idle).max() == 0.0
