@@ -85,8 +85,7 @@ class Limits(_Entry):
 
         def part(of: HealthyResidual) -> HealthyResidual:
             offsets = of.fan_offsets.of(fans) if of.fan_offsets and fans is not None else None
-            spread = of.fan_spread.of(fans) if of.fan_spread and fans is not None else None
-            return of.model_copy(update={"fan_offsets": offsets, "fan_spread": spread})
+            return of.model_copy(update={"fan_offsets": offsets})
 
         return self.model_copy(update={"speed": part(self.speed), "balance": part(self.balance)})
 

@@ -31,13 +31,8 @@ class Residual:
         offsets = healthy.fan_offsets
         self._fan_offsets = np.array(offsets.offset_sigmas).T if offsets else np.zeros((1, fans))
         """(speeds, fans)"""
-        if healthy.known_fans not in (None, fans):
-            raise ValueError(f"limits of {healthy.known_fans} fans for {fans}")
-        spread = healthy.fan_spread
-        self._fan_std, self._fan_persistent_std = (
-            (np.array(spread.residual), np.array(spread.persistent)) if spread else (1.0, 1.0)
-        )
-        """(fans,) or common to all"""
+        if self._fan_offsets.shape[1] != fans:
+            raise ValueError(f"limits of {self._fan_offsets.shape[1]} fans for {fans}")
         self._healthy = healthy
         self._smoothing_s = limits.timing.smoothing_s
         smoothed, drift = limits.settings_of(source, SmoothedSettings), limits.settings_of(source, DriftSettings)
@@ -139,9 +134,8 @@ class Residual:
     def _residual_std(self, speed_rad_s: Array, valid: Array) -> Array | float:
         healthy = self._healthy
         if len(healthy.speeds_rad_s) == 1:
-            return healthy.residual_std[0] * self._fan_std
-        at_speed = np.interp(np.abs(speed_rad_s), healthy.speeds_rad_s, healthy.residual_std)
-        return np.where(valid, at_speed * self._fan_std, 1.0)
+            return healthy.residual_std[0]
+        return np.where(valid, np.interp(np.abs(speed_rad_s), healthy.speeds_rad_s, healthy.residual_std), 1.0)
 
     def _persistent_std(
         self,
@@ -151,13 +145,12 @@ class Residual:
         valid: Array,
         learned_scale: Array | None = None,
     ) -> Array | float:
-        """Of the low-frequency residual, relative to its median: by speed, fan, motion, and an uncertain baseline."""
+        """Of the low-frequency residual, relative to its median: by speed, by motion, and by an uncertain baseline."""
         healthy = self._healthy
         relative: Array | float = healthy.persistent_std[0]
         if len(healthy.persistent_std) > 1:
             at_speed = np.interp(np.abs(speed_rad_s), healthy.speeds_rad_s, healthy.persistent_std)
             relative = np.where(valid, at_speed, 1.0)
-        relative = relative * self._fan_persistent_std
         if healthy.transient_scale_rad_s is not None:
             relative = relative * np.sqrt(1.0 + np.square(transient_rad_s / healthy.transient_scale_rad_s))
         if healthy.baseline.rms_sigmas > 0.0:

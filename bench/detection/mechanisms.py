@@ -221,11 +221,6 @@ MECHANISMS: Sequence[Mechanism] = (
         ((f"{_CALIBRATION}:fan_offsets", _returning(None)),),
     ),
     Mechanism(
-        "fan-spread",
-        "each fan has a factor on the standard deviations of all",
-        ((f"{_CALIBRATION}:fan_spread", _returning(None)),),
-    ),
-    Mechanism(
         "counts-in-motion",
         "readings of a tacho that counts may be unsteady while the fan changes its speed",
         (("scoring.fan_scorer:FanScorer._unsteadiness", lambda _: lambda _scorer, of: of.standardised),),

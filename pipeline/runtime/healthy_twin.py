@@ -132,8 +132,8 @@ def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
         why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise StageError(f"{context.tray.twin}: its calibration cannot be used: {why}; {again}") from error
     for residual in (limits.speed, limits.balance):
-        fans = residual.known_fans
-        if fans not in (None, context.tray.fans):
+        fans = len(residual.fan_offsets.offset_sigmas) if residual.fan_offsets else context.tray.fans
+        if fans != context.tray.fans:
             raise StageError(
                 f"{context.tray.twin}: its calibration is of {fans} fans, the tray has {context.tray.fans}; {again}"
             )

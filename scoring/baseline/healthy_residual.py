@@ -28,29 +28,6 @@ class FanOffsets(BaseModel):
         return self.model_copy(update={"offset_sigmas": tuple(self.offset_sigmas[fan] for fan in fans)})
 
 
-class FanSpread(BaseModel):
-    """How much more or less the residual of each fan varies than that of all."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    residual: tuple[float, ...] = Field(min_length=1, description="(fans,) factor on residual_std")
-    persistent: tuple[float, ...] = Field(min_length=1, description="(fans,) further factor on persistent_std")
-
-    @model_validator(mode="after")
-    def _consistent(self) -> FanSpread:
-        if len(self.residual) != len(self.persistent):
-            raise ValueError("residual and persistent must be of one length")
-        if min(*self.residual, *self.persistent) <= 0:
-            raise ValueError("residual and persistent must be above zero")
-        return self
-
-    def of(self, fans: range) -> FanSpread:
-        """The factors of some of the fans."""
-        return FanSpread(
-            residual=tuple(self.residual[fan] for fan in fans), persistent=tuple(self.persistent[fan] for fan in fans)
-        )
-
-
 class HealthyResidual(BaseModel):
     """One residual of healthy fans. Sigma is that of the twin's card, of each fan."""
 
@@ -58,9 +35,6 @@ class HealthyResidual(BaseModel):
 
     fan_offsets: FanOffsets | None = Field(
         default=None, description="mean residual of each fan; null where the twin does not know its fans one by one"
-    )
-    fan_spread: FanSpread | None = Field(
-        default=None, description="factors of each fan; null where the twin does not know its fans one by one"
     )
     speeds_rad_s: tuple[float, ...] = Field(
         default=(0.0,), description="speeds of the next three entries, rising; values between are interpolated"
@@ -84,13 +58,6 @@ class HealthyResidual(BaseModel):
     baseline: BaselineSettings = Field(default=BaselineSettings(), description="of the fan's own offset")
 
     @property
-    def known_fans(self) -> int | None:
-        """How many fans are known one by one; None where none is."""
-        if self.fan_offsets is not None:
-            return len(self.fan_offsets.offset_sigmas)
-        return len(self.fan_spread.residual) if self.fan_spread else None
-
-    @property
     def mean_residual_std(self) -> float:
         """Mean of residual_std over its speeds."""
         return sum(self.residual_std) / len(self.residual_std)
@@ -98,8 +65,6 @@ class HealthyResidual(BaseModel):
     @model_validator(mode="after")
     def _consistent(self) -> HealthyResidual:
         knots = len(self.speeds_rad_s)
-        if self.fan_spread and len(self.fan_spread.residual) != self.known_fans:
-            raise ValueError("fan_spread and fan_offsets must be of as many fans")
         if not knots == len(self.expected_residual_sigmas) == len(self.residual_std) > 0:
             raise ValueError("speeds_rad_s, expected_residual_sigmas and residual_std must be of one length")
         if len(self.persistent_std) not in (1, knots):

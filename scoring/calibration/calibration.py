@@ -20,7 +20,6 @@ from schemas.messages import Array
 from scoring.baseline.fan_offsets import fan_offsets
 from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.calibration.alarm_rate import rate_interval
-from scoring.calibration.fan_spread import INDEPENDENT_S, fan_spread
 from scoring.calibration.healthy_statistics import HealthyStatistics, Runs, healthy_statistics, truncate_runs
 from scoring.calibration.healthy_variation import (
     UNLIMITED,
@@ -50,6 +49,7 @@ MIN_LEVEL = 0.1 / UNREACHED
 SECONDS_QUANTILE = 0.999  # quantile of one-second means: a shift that is exceeded more often is not a drift
 SEEN_WINDOWS = 50.0  # with an alarm, to count how often statistics alarm together
 CONFIDENCE = 0.95
+INDEPENDENT_S = 60.0  # so far apart, errors of a twin are taken to be independent: commands are held for a while
 ROUNDING = 1e-9
 
 
@@ -112,7 +112,7 @@ def calibrate(
     is_long = found.fan_s > VARIATION_FAN_S
     part = truncate_runs(runs, len(found.maxima), VARIATION_FAN_S) if is_long else runs
     limits = _with_variation(part, limits, found, crossover_speed_rad_s)
-    limits = _with_rough_limits(part, limits, target / len(calibrated_rows()), top_speed_rad_s)
+    limits = _with_rough_limits(part, limits, target / len(_rows_by_rarity()), top_speed_rad_s)
     found = healthy_statistics(runs, limits, top_speed_rad_s)
     factors = _factors(found, target)
     limits = limits.scaled(dict(zip((row.name for row in calibrated_rows()), factors.tolist(), strict=True)))
@@ -153,10 +153,7 @@ def _with_variation(
     return _each(
         limits,
         lambda residual, source: residual.model_copy(
-            update={
-                "persistent_std": persistent_std(residual, seen.moments[source], top_speed_rad_s),
-                "fan_spread": fan_spread(seen.moments[source].fan_squares),
-            }
+            update={"persistent_std": persistent_std(residual, seen.moments[source], top_speed_rad_s)}
         ),
     )
 
@@ -253,9 +250,9 @@ def _each(limits: Limits, change: Callable[[HealthyResidual, Signal], HealthyRes
 
 def _factors(found: HealthyStatistics, target: float) -> Array:
     """(rows of the table,) factors on the limits, with which a share `target` of the windows has an alarm."""
-    count = len(calibrated_rows())
+    count = len(_rows_by_rarity())
     often = min(max(target, SEEN_WINDOWS / found.windows), MAX_ALARM_SHARE)
-    at = np.array([_level(found, number, often / count) for number in range(count)])
+    at = np.array([_level(found, number, often / count) for number in range(len(calibrated_rows()))])
     together = np.concatenate([peaks(_score(run, at)).ravel() for run in found.maxima])
     passed = float((together[np.isfinite(together)] > 1.0).mean())
     independent = min(
@@ -274,9 +271,7 @@ def _with_alarms_at_most(found: HealthyStatistics, factors: Array, allowed: int)
     The limit that raises most alarms is increased beyond a few excursions at a time.
     """
     factors = factors.copy()
-    by_rarity = [
-        number for number, row in enumerate(calibrated_rows()) if row.detector.settings.rule is not LimitRule.FIXED
-    ]
+    by_rarity = _rows_by_rarity()
     while True:
         too_many = sum(int((peaks(_score(run, factors)) > 1.0).sum()) for run in found.maxima) - allowed
         excursions = {
@@ -287,8 +282,13 @@ def _with_alarms_at_most(found: HealthyStatistics, factors: Array, allowed: int)
         most = max(by_rarity, key=lambda number: len(beyond[number]))
         if too_many <= 0 or not len(beyond[most]):
             return factors
-        at_once = min(max(too_many // len(calibrated_rows()), 1), len(beyond[most]))
+        at_once = min(max(too_many // len(by_rarity), 1), len(beyond[most]))
         factors[most] *= beyond[most][at_once - 1] * (1.0 + ROUNDING)
+
+
+def _rows_by_rarity() -> list[int]:
+    """The numbers of the calibrated rows whose limits share the declared rate."""
+    return [number for number, row in enumerate(calibrated_rows()) if row.detector.settings.rule is not LimitRule.FIXED]
 
 
 def _level(found: HealthyStatistics, row: int, share: float) -> float:

@@ -13,7 +13,6 @@ from schemas.messages import Array
 from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.units import NS_PER_S
 from scoring.baseline.fan_offsets import Cells
-from scoring.calibration.fan_spread import FanSquares
 from scoring.calibration.residual_moments import MOTION_BINS, SPEED_BINS, ResidualMoments, octaves
 from scoring.calibration.windows import WindowMaxima, Windows, peaks
 from scoring.detectors.detector import DetectorRow, Signal
@@ -138,8 +137,6 @@ class _RunStatistics:
         self._seconds = {source: _SecondMeans() for source in RESIDUALS}
         self._standardised_seconds = {source: _SecondMeans() for source in RESIDUALS}
         self._cells = {source: np.zeros((2, run.fans, SPEED_BINS)) for source in RESIDUALS}
-        self._squares = {source: np.zeros((3, run.fans)) for source in RESIDUALS}
-        """counts, and the sums of FanSquares"""
 
     def add(self, block: Samples) -> None:
         """Score a block."""
@@ -178,15 +175,12 @@ class _RunStatistics:
             if row.source == source:
                 found.ratio_sums[row.name] += float(ratios[number][use].sum())
                 if row.detector is Smoothed:
-                    squares = np.square(ratios[number])
-                    moments.smoothed_by_speed += _sums(bins[use].astype(int), SPEED_BINS, squares[use])
-                    self._squares[source][2] += squares.sum(axis=0, where=use)
+                    squares = np.square(ratios[number][use])
+                    moments.smoothed_by_speed += _sums(bins[use].astype(int), SPEED_BINS, squares)
         expected = np.concatenate([one.expected[source] for one in seen])
         shift = np.clip(np.where(use, residual - expected - baseline, np.nan), -LARGEST_SIGMAS, LARGEST_SIGMAS)
         _add_shift(moments, self._cells[source], shift, bins, self._seconds[source].of(shift, found.period_s))
         persistent = np.concatenate([one.persistent[source] for one in seen])
-        self._squares[source][0] += use.sum(axis=0)
-        self._squares[source][1] += np.square(persistent).sum(axis=0, where=use)
         means = self._standardised_seconds[source].of(np.where(use, persistent, np.nan), found.period_s)
         moments.standardised_octaves += octaves(np.square(means))
         motions = np.square(transient_rad_s[use])
@@ -208,11 +202,6 @@ class _RunStatistics:
             moments.total += total.sum(axis=0)
             if self._run.known_as is not None:
                 moments.cells.append(Cells(self._run.known_as, count, total))
-                samples, residual, persistent = self._squares[source]
-                seconds = samples * found.period_s
-                moments.fan_squares.append(
-                    FanSquares(self._run.known_as, seconds, residual * found.period_s, persistent * found.period_s)
-                )
             moments.baselines.append(baseline.commissioned[settled if settled.any() else baseline.is_set])
 
 

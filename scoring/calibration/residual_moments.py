@@ -9,7 +9,6 @@ import numpy as np
 
 from schemas.messages import Array
 from scoring.baseline.fan_offsets import Cells
-from scoring.calibration.fan_spread import FanSquares
 
 SPEED_BINS = 24
 MOTION_BINS = 12  # each twice as far as the one before; the last begins at the top speed
@@ -30,8 +29,6 @@ class ResidualMoments:
     square: Array = _zeros(SPEED_BINS)
     cells: list[Cells] = field(default_factory=list)
     """of each run with fans that the twin knows"""
-    fan_squares: list[FanSquares] = field(default_factory=list)
-    """the same, with the statistics that were scored"""
     baselines: list[Array] = field(default_factory=list)
     """commissioned baselines of the fans of each run"""
     seconds: int = 0

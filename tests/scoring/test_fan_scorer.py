@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from schemas.messages import Statistic
 from schemas.tacho import Tacho
-from scoring.baseline.healthy_residual import FanSpread, HealthyResidual
+from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.baseline.settings import BaselineSettings
 from scoring.baseline.speed_scaling import speed_scaling
 from scoring.detectors.detector import DetectorSettings
@@ -329,18 +329,6 @@ def test_an_offset_scales_with_the_speed_as_the_physics_say() -> None:
     )
     found = speed_scaling(settings, speed, np.ones_like(speed, np.bool_))
     np.testing.assert_allclose(found, off / off[0, 2])
-
-
-def test_the_limit_of_a_fan_is_as_far_as_its_residual_varies() -> None:
-    spread = FanSpread(residual=(1.0, 2.0, 1.0), persistent=(1.0, 1.0, 2.0))
-    limits = LIMITS.model_copy(update={"speed": RESIDUAL.model_copy(update={"fan_spread": spread})})
-    block = white(3000)
-    shifted = replace(block, speed_residual=block.speed_residual + 3.0 * (np.arange(3000) >= 2900)[:, np.newaxis])
-    common, own = (FanScorer(FANS, of).update(shifted).ratios[-1, 0] for of in (LIMITS, limits))
-    assert own == pytest.approx(common / (1.0, 2.0, 2.0), rel=0.05)
-    at, learned = np.full(FANS, 100.0), np.ones(FANS)
-    shown = FanScorer(FANS, limits).limit_at("speed", at, Statistic.SPEED_SMOOTHED, 0.01, learned)
-    assert shown == pytest.approx(shown[0] * np.array((1.0, 2.0, 2.0)))
 
 
 def test_a_tacho_that_counts_is_not_unsteady_while_its_fan_changes_its_speed() -> None:
