@@ -49,7 +49,7 @@ MIN_LEVEL = 0.1 / UNREACHED
 SECONDS_QUANTILE = 0.999  # quantile of one-second means: a shift that is exceeded more often is not a drift
 SEEN_WINDOWS = 50.0  # with an alarm, to count how often statistics alarm together
 CONFIDENCE = 0.95
-INDEPENDENT_S = 60.0  # so far apart, errors of a twin are taken to be independent: commands are held for a while
+INDEPENDENT_S = 20.0  # so far apart, errors of a twin are taken to be independent: commands are held for a while
 ROUNDING = 1e-9
 
 
@@ -217,7 +217,7 @@ def _cautious(limits: Limits, found: HealthyStatistics) -> Limits:
     factors = {row.name: limits.detectors[row.name].cautious_factor(_evidence(row, limits, found)) for row in used}
     limits = limits.scaled(
         {
-            row.name: (factors.get(row.name) or 1.0) * (1.0 if row.source == "tacho" else unknown)
+            row.name: max(factors.get(row.name) or 1.0, 1.0 if row.source == "tacho" else unknown)
             for row in calibrated_rows()
         }
     )
