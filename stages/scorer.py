@@ -95,10 +95,11 @@ class ScorerCore(Core):
         self._judges_rest = decision_rules >= DecisionRules.AT_REST
         self._allows_for_counts = decision_rules >= DecisionRules.ONE_ALARM
         self._scorer = self._new_scorer()
-        holding = holding_detectors(self._scorer.detectors, config.off_delay_s, judges_rest=self._judges_rest)
+        off_delay_s = config.least_off_delay_s(twin.tachos)
+        holding = holding_detectors(self._scorer.detectors, off_delay_s, judges_rest=self._judges_rest)
         self._settings = ConditionSettings(
             on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),
-            off_delay_ns=round(config.off_delay_s * NS_PER_S),
+            off_delay_ns=round(off_delay_s * NS_PER_S),
             return_ratio=1.0 - config.deadband,
             alarm_ratio=config.alarm_ratio,
             latching=config.latching,

@@ -34,10 +34,11 @@ class DecisionRules(IntEnum):
     was stopped returns. The longer an alarm has stood, the longer it must be gone. Causes account for what the tacho
     resolves, and one of standstill stays when the fan turns again."""
     ONE_ALARM = 8
-    """A fault is one alarm. It begins to return below half of its limit and not below three quarters, and for ten
-    seconds at least and not for one. Missing readings are counted as they arrive: between readings that are near enough
-    the grid has a speed all the same, and hides most of those that a loose wire costs. Readings of a tacho that counts
-    may be unsteady while the fan changes its speed, and repeat where a healthy fan would read the same."""
+    """A fault is one alarm. It begins to return below half of its limit and not below three quarters; of a tacho that
+    counts it lasts ten counts at least, and not a second. Missing readings are counted as they arrive: between readings
+    that are near enough the grid has a speed all the same, and hides most of those that a loose wire costs. Readings of
+    a tacho that counts may be unsteady while the fan changes its speed, and repeat where a healthy fan would read the
+    same."""
 
 
 CURRENT_RULES = max(DecisionRules)

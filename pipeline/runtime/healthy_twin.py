@@ -20,6 +20,8 @@ from scoring.detectors.tacho import TachoSettings
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.limits import Limits, Timing, uncalibrated
 
+LEAST_OFF_DELAY_S, OFF_DELAY_COUNTS = 1.0, 10.0
+
 
 class ScorerConfig(StageConfig):
     """Section `[scorer]`. Times that are not given are those that the twin was calibrated with."""
@@ -34,7 +36,11 @@ class ScorerConfig(StageConfig):
     baseline_s: float | None = Field(default=None, gt=0, description="length of an interval of commissioning")
     adaptation_s: float | None = Field(default=None, gt=0, description="time constant of the baseline in the long run")
     on_delay_s: float | None = Field(default=None, ge=0, description="how long a limit must be exceeded to raise")
-    off_delay_s: float = Field(default=10.0, ge=0, description="how long a return must last at least to clear")
+    off_delay_s: float | None = Field(
+        default=None,
+        ge=0,
+        description="how long a return must last at least to clear; default: 1 s, of a tacho that counts ten counts",
+    )
     deadband: float = Field(default=0.5, ge=0, lt=1, description="share of its limit below which a return begins")
     alarm_ratio: float = Field(default=1.5, ge=1, description="score from which a warning is an alarm")
     latching: bool = Field(default=False, description="whether a cleared alarm stays until it is reset")
@@ -50,6 +56,12 @@ class ScorerConfig(StageConfig):
         """The times in force."""
         own = {name: getattr(self, name) for name in Timing.model_fields}
         return calibrated.model_copy(update={name: value for name, value in own.items() if value is not None})
+
+    def least_off_delay_s(self, tachos: Sequence[Tacho]) -> float:
+        """`off_delay_s`, of these tachos where it is not given."""
+        if self.off_delay_s is not None:
+            return self.off_delay_s
+        return max([LEAST_OFF_DELAY_S, *(OFF_DELAY_COUNTS * tacho.held_s for tacho in tachos)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -138,7 +138,7 @@ def judged(limits: Limits) -> Hashable:
 @cache
 def far_limits() -> Limits:
     """Limits that only faults reach, of the decision as it is."""
-    return limits_of(3, 60.0, 3000.0).times(2.0)
+    return limits_of(3, 60.0, 3000.0).times(2.5)
 
 
 def is_changed(probe: Callable[[], Hashable], name: str) -> bool:

@@ -218,7 +218,7 @@ def test_an_alarm_of_a_fan_that_turned_although_stopped_returns_while_it_stands(
     found = seen(command, speed, block=block)
     at_rest_s = float(np.flatnonzero((speed < HEALTHY.standing_below_rad_s) & (driven == 0.0))[0]) * PERIOD_S
     (cleared_s,) = found.times(Transition.CLEARED)
-    assert cleared_s == pytest.approx(at_rest_s + 10.0, abs=0.2)
+    assert cleared_s == pytest.approx(at_rest_s + 2.0, abs=0.2)
     assert found.at(70.0) == FanState.STOPPED
 
 
