@@ -89,30 +89,31 @@ def main(
     if LIST in left_out:
         list_mechanisms()
         return
-    try:
-        ExitStack().enter_context(without(*left_out))  # until this process ends
-    except UnknownMechanismError as error:
-        raise SystemExit(str(error)) from error
     began_s = time.monotonic()
     tables: dict[str, list[dict[str, Any]]] = {}
     notes: list[str] = []
-    if only == "rack":
-        rates, amounts = report_hz or RATES_HZ, learn or ["15 minutes", "three nights"]
-        if unknown := [name for name in amounts if name not in LEARNING]:
-            raise SystemExit(f"--learn {unknown[0]!r}: give one of {', '.join(LEARNING)}")
-        with tempfile.TemporaryDirectory() as folder:
-            for rate_hz in rates:
-                data = RackData(keep or Path(folder), racks, rate_hz, 3600.0 * test_hours, seed, tuple(left_out))
-                tables |= rack_tables(data, amounts, judged or racks, healthy_racks, workers, progress)
-        notes += RACK_NOTES
-    elif only != "measured":
-        sizes = Sizes(fans, declared_days, calibration_days, healthy_days, runs, fault_runs, commissioned_s, seed)
-        with tempfile.TemporaryDirectory() as folder:
-            _simulated(Path(folder), sizes, extrapolate, others, others and libraries, tables, notes)
-    if only not in ("simulated", "rack"):
-        measured, reported = measured_tables(progress, libraries=libraries)
-        tables |= measured
-        notes += reported
+    with ExitStack() as left:
+        try:
+            left.enter_context(without(*left_out))
+        except UnknownMechanismError as error:
+            raise SystemExit(str(error)) from error
+        if only == "rack":
+            rates, amounts = report_hz or RATES_HZ, learn or ["15 minutes", "three nights"]
+            if unknown := [name for name in amounts if name not in LEARNING]:
+                raise SystemExit(f"--learn {unknown[0]!r}: give one of {', '.join(LEARNING)}")
+            with tempfile.TemporaryDirectory() as folder:
+                for rate_hz in rates:
+                    data = RackData(keep or Path(folder), racks, rate_hz, 3600.0 * test_hours, seed, tuple(left_out))
+                    tables |= rack_tables(data, amounts, judged or racks, healthy_racks, workers, progress)
+            notes += RACK_NOTES
+        elif only != "measured":
+            sizes = Sizes(fans, declared_days, calibration_days, healthy_days, runs, fault_runs, commissioned_s, seed)
+            with tempfile.TemporaryDirectory() as folder:
+                _simulated(Path(folder), sizes, extrapolate, others, others and libraries, tables, notes)
+        if only not in ("simulated", "rack"):
+            measured, reported = measured_tables(progress, libraries=libraries)
+            tables |= measured
+            notes += reported
     notes += [f"without {mechanism(name).what}" for name in left_out]
     notes.append(f"all of it took {(time.monotonic() - began_s) / 60:.1f} min")
     show(tables, notes, as_json=json_output)

@@ -64,6 +64,17 @@ class TooLittleError(Exception):
         """the lowest rate that can be declared with this running"""
 
 
+def supports(fan_s: float, false_alarms_per_day: float) -> bool:
+    """Whether so much healthy running, summed over fans, can support a rate to be declared."""
+    return fan_s >= NEEDED_ALARMS * DAY_S / false_alarms_per_day
+
+
+def too_little(fan_s: float, false_alarms_per_day: float) -> TooLittleError:
+    """That so much healthy running cannot support the rate."""
+    needed_hours = NEEDED_ALARMS * 24.0 / false_alarms_per_day
+    return TooLittleError(fan_s / 3600, needed_hours, NEEDED_ALARMS * DAY_S / max(fan_s, 1.0))
+
+
 class FragmentedError(Exception):
     """A residual was never scored for a whole second, so nothing is known about how it varies from second to second."""
 
@@ -100,10 +111,9 @@ def calibrate(
         timing=timing,
     )
     found = healthy_statistics(runs, limits, top_speed_rad_s)
-    needed_s = NEEDED_ALARMS * DAY_S / false_alarms_per_day
-    is_enough = found.fan_s >= needed_s
+    is_enough = supports(found.fan_s, false_alarms_per_day)
     if found.windows < MIN_WINDOWS or not (is_enough or extrapolate):
-        raise TooLittleError(found.fan_s / 3600, needed_s / 3600, NEEDED_ALARMS * DAY_S / max(found.fan_s, 1.0))
+        raise too_little(found.fan_s, false_alarms_per_day)
     for source, moments in found.moments.items():
         if moments.count.sum() and not moments.seconds:
             raise FragmentedError(source, float(moments.count.sum()) * found.period_s)

@@ -6,6 +6,7 @@ it: scores, limits, calibration, snapshots and alarm texts use the table.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -122,7 +123,7 @@ class DetectorContext:
     tachos: tuple[Tacho, ...] = ()
     """of each fan; only for detectors of the tacho"""
     allows_for_counts: bool = True
-    """False only to decide as for recordings made before FanScorer did"""
+    """see FanScorer"""
     capped: bool = True
     """False: statistics may grow without bound, for calibration to see how far"""
 
@@ -179,10 +180,10 @@ class Detector(ColumnState):
         """How long the statistic must stay low for its alarm to be over: as long as the fault may still be in it."""
         return self.memory_s
 
-    @abstractmethod
     def limit_sigmas(self, period_s: float) -> float:
         """The smallest constant shift of the residual that the statistic ends up reporting, sigma; inf: it reports
-        none."""
+        none, as where it watches something else."""
+        return math.inf
 
     def observed(self) -> dict[str, float]:
         """The largest values so far, by name, from which the rule FIXED may set a limit."""

@@ -116,10 +116,6 @@ class MissingReadings(Detector):
         """See Detector. A wire that costs a tenth of the readings is found in less at ten readings a second."""
         return LOOSE_S
 
-    def limit_sigmas(self, period_s: float) -> float:
-        """It does not watch a residual."""
-        return math.inf
-
     def observed(self) -> dict[str, float]:
         """See Detector."""
         return {"missing_share": float((self._interruptions / np.maximum(self._readings, MIN_READINGS)).max())}

@@ -11,7 +11,6 @@ show its fault: each has no ratio (NaN) where the fan could not show that it doe
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -113,10 +112,6 @@ class StandstillDetector(Detector):
     def off_delay_s(self) -> float:
         """See Detector."""
         return OFF_DELAY_S
-
-    def limit_sigmas(self, period_s: float) -> float:
-        """It does not watch a residual."""
-        return math.inf
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""

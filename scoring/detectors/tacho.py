@@ -9,7 +9,6 @@ fan, and while it starts, neither is judged.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -141,10 +140,6 @@ class Tacho(Detector):
     def off_delay_s(self) -> float:
         """See Detector."""
         return LOOSE_S
-
-    def limit_sigmas(self, period_s: float) -> float:
-        """It does not watch a residual."""
-        return math.inf
 
     def observed(self) -> dict[str, float]:
         """See Detector."""

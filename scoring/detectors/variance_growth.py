@@ -6,8 +6,6 @@ without changing the mean of the residual.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from pydantic import Field, model_validator
 
@@ -85,10 +83,6 @@ class VarianceGrowth(Detector):
     def memory_s(self) -> float:
         """See Detector."""
         return max(self._mean.memory_s, self._square.memory_s)
-
-    def limit_sigmas(self, period_s: float) -> float:
-        """A constant shift does not raise the variance."""
-        return math.inf
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+from bench.detection import run
 from bench.detection.mechanisms import MECHANISMS, Mechanism
 from bench.detection.without import NOTHING, UnknownMechanismError, owner_of, without
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
@@ -19,6 +22,7 @@ from schemas.tacho import Tacho
 from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.diagnosis.diagnoser import Diagnoser
+from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits, Timing
 from scoring.samples import samples_of
 from stages.scorer import ScorerCore
@@ -214,3 +218,19 @@ def test_afterwards_everything_is_as_before() -> None:
             vars(owner)[attribute] is not value for (owner, attribute), value in zip(places, before, strict=True)
         )
     assert all(vars(owner)[attribute] is value for (owner, attribute), value in zip(places, before, strict=True))
+
+
+def test_the_bench_does_without_it_for_as_long_as_tables_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[object] = []
+
+    def tables(*_args: object, **_options: object) -> tuple[dict[str, Any], list[str]]:
+        gc.collect()
+        seen.append(FanScorer.learn_nothing)
+        return {}, []
+
+    whole = FanScorer.learn_nothing
+    monkeypatch.setattr(run, "measured_tables", tables)
+    for names in (None, ["no-learning-in-alarm"]):
+        run.main(only="measured", without_names=names)
+    assert seen[0] is whole and seen[1] is not whole
+    assert FanScorer.learn_nothing is whole

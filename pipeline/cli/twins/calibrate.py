@@ -23,7 +23,7 @@ from pipeline.errors import UserError
 from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
-from scoring.calibration.calibration import DAY_S, NEEDED_ALARMS, FragmentedError, TooLittleError
+from scoring.calibration.calibration import FragmentedError, TooLittleError, supports, too_little
 from scoring.calibration.calibration import calibrate as find_limits
 from scoring.calibration.healthy_statistics import MixedRatesError
 from scoring.detectors.table import calibrated_rows
@@ -123,8 +123,9 @@ def _calibrated(
         runs = HealthyRuns(healthy, twin, overrides, show)
         timing = runs.timing()
         try:
-            if not extrapolate:
-                _refuse_too_short(runs.longest_fan_s(), per_day)
+            longest_fan_s = runs.longest_fan_s()  # however much of it can be scored
+            if not extrapolate and not supports(longest_fan_s, per_day):
+                raise too_little(longest_fan_s, per_day)
             limits = find_limits(runs, top_speed_rad_s, timing, per_day, seed, extrapolate, known.bend_rad_s)
         except TooLittleError as error:
             raise UserError(_too_little(error, per_day)) from error
@@ -142,13 +143,6 @@ def _calibrated(
         }
     )
     return limits.model_copy(update={"declared_rate": declared_rate}), warning, runs.speed_unit
-
-
-def _refuse_too_short(longest_fan_s: float, per_day: float) -> None:
-    """Refuse recordings that are too short for the rate however much of them can be scored."""
-    needed_s = NEEDED_ALARMS * DAY_S / per_day
-    if longest_fan_s < needed_s:
-        raise TooLittleError(longest_fan_s / 3600, needed_s / 3600, NEEDED_ALARMS * DAY_S / longest_fan_s)
 
 
 def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path], overrides: list[str]) -> None:
