@@ -10,13 +10,12 @@ Baselines stay.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from schemas.messages import Array, Statistic
+from schemas.messages import Array
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
 from scoring.baseline.movement import Movement
@@ -28,27 +27,14 @@ from scoring.detectors.table import rows
 from scoring.former_snapshot_keys import current_fan_scorer
 from scoring.gaps import Gaps
 from scoring.limits import Limits
-from scoring.residual import Residual
+from scoring.piece import Piece
+from scoring.residual import Residual, ScoredResidual
 from scoring.samples import Samples
-from scoring.scored_block import Observation, ScoredBlock, joined
+from scoring.scored_block import Observation, ScoredBlock
 
 HALF_LIMIT = 0.5  # once a fan is commissioned, baselines learn only below this score
 RESIDUALS: tuple[Signal, ...] = ("speed", "balance")
 INPUTS: tuple[Signal, ...] = (*RESIDUALS, "tacho")
-
-
-@dataclass(frozen=True, eq=False)
-class _ScoredResidual:
-    """One residual in a stretch of samples, (n, fans) each. scored: valid, and with a baseline."""
-
-    valid: Array
-    scored: Array
-    smoothed: Array
-    baseline: Array
-    expected: Array
-    commissioned: Array
-    standardised: Array
-    persistent: Array
 
 
 class FanScorer:
@@ -73,7 +59,7 @@ class FanScorer:
         allowed to be unsteady while the fan changes its speed, and to repeat where a healthy fan would read the same.
         """
         self.limits = limits
-        self.residuals = {source: Residual(fans, source, limits) for source in RESIDUALS}
+        self.residuals: dict[Signal, Residual] = {source: Residual(fans, source, limits) for source in RESIDUALS}
         contexts = {
             source: residual.context(fans, capped=not for_calibration) for source, residual in self.residuals.items()
         }
@@ -94,12 +80,13 @@ class FanScorer:
             if row.name in limits.detectors
         }
         """the detectors that have a limit, by name"""
-        self._is_scored = {
-            source: any(row.source == source and row.name in self.detectors for row in self._rows)
+        self._in_use: list[Signal] = [
+            source
             for source in RESIDUALS
-        }
+            if any(row.source == source and row.name in self.detectors for row in self._rows)
+        ]
+        """residuals with detectors"""
         self._judges_rest = any(row.only_at_rest and row.name in self.detectors for row in self._rows)
-        self._statistics: Array = np.array([row.statistic for row in self._rows])
         self._motion = Motion(fans)
         self._movement = Movement(fans) if skips_transients else None
         self._gaps = Gaps(len(INPUTS), fans) if forgets_over_gaps else None
@@ -117,33 +104,47 @@ class FanScorer:
     @property
     def held_baselines(self) -> Array:
         """(fans,) whether a baseline of a scored residual is held at its adaptation limit."""
-        at_limit = [self.residuals[source].baseline.is_at_limit for source in RESIDUALS if self._is_scored[source]]
+        at_limit = [self.residuals[source].baseline.is_at_limit for source in self._in_use]
         return np.any(at_limit, axis=0)
 
     def update(self, block: Samples) -> ScoredBlock:
         """Score a block of at least one sample."""
-        return joined([scored for _, scored in self.stretches(block)])
+        scores, stretches = self.stretches(block)
+        for _ in stretches:
+            pass
+        return scores
 
-    def stretches(self, block: Samples) -> Iterator[tuple[slice, ScoredBlock]]:
-        """Score a block of at least one sample in stretches within one interval of the baselines: the rows of each, and
-        their scores. Between them the caller may decide what the interval is worth, see `learn_nothing`.
+    def stretches(self, block: Samples) -> tuple[ScoredBlock, Iterator[slice]]:
+        """Score a block of at least one sample in stretches within one interval of the baselines.
+
+        Returns the scores, and the rows of each stretch. Going on to the next stretch fills in its `score`, `judged`
+        and `ratios`; all is filled in at the end. Between them the caller may decide what the interval is worth, see
+        `learn_nothing`.
         """
+        scores = ScoredBlock.empty(len(block.t_ns), len(self._rows), block.alive.shape[1])
+        return scores, self._each_stretch(block, scores)
+
+    def _each_stretch(self, block: Samples, scores: ScoredBlock) -> Iterator[slice]:
         if self.origin_t_ns is None:
             self.origin_t_ns = int(block.t_ns[0])
         intervals = (block.t_ns - self.origin_t_ns) // self._interval_ns
         missing_ns = self._missing_ns(block)
         after_gap: Array = np.any(missing_ns > self._shortest_memory_ns, axis=(1, 2))
-        cuts = np.flatnonzero((np.diff(intervals) != 0) | after_gap[1:]) + 1
-        edges = [0, *cuts.tolist(), len(intervals)]
-        for first, last in pairwise(edges):
-            number = int(intervals[first])
-            if number != self._interval:
-                self._end_interval(block.period_ns)
-                self._interval = number
+        for first, last in _parts(after_gap[1:]):
             if after_gap[first]:
                 self._forget(missing_ns[first])
-            stretch = slice(first, last)
-            yield stretch, self._score(block, stretch)
+            piece = self._piece(block.rows(slice(first, last)), scores.rows(slice(first, last)))
+            numbers = intervals[first:last]
+            for begin, end in _parts(np.diff(numbers) != 0):
+                number = int(numbers[begin])
+                if number != self._interval:
+                    self._end_interval(block.period_ns)
+                    self._interval = number
+                self._score(piece, slice(begin, end))
+                yield slice(first + begin, first + end)
+            piece.complete(self._in_use, self.limits.timing.baseline_s)
+            if self._observations is not None:
+                self._observations.append(piece.observation())
 
     def learn_nothing(self, fans: Array) -> None:
         """The baselines of some fans, (fans,) of bool, learn nothing from the present interval: those with an alarm. A
@@ -250,118 +251,66 @@ class FanScorer:
             if fans.any():
                 reset(fans)
 
-    def _score(self, block: Samples, stretch: slice) -> ScoredBlock:
-        """Score samples of one interval."""
-        speed_rad_s, alive = block.speed_rad_s[stretch], block.alive[stretch]
-        period_s = block.period_ns / NS_PER_S
+    def _piece(self, samples: Samples, scores: ScoredBlock) -> Piece:
+        """What follows from samples without the baselines. scores: of these samples, not filled in yet."""
+        speed_rad_s, period_s = samples.speed_rad_s, samples.period_ns / NS_PER_S
         motion_rad_s = self._motion.update(speed_rad_s, period_s)
         transient_rad_s = np.abs(motion_rad_s)
-        if self._movement:
-            self._movement.add(motion_rad_s, speed_rad_s)
+        values = {"speed": samples.speed_residual, "balance": samples.balance}
+        valid = {"speed": samples.speed_valid, "balance": samples.balance_valid}
+        piece = Piece(
+            samples=samples,
+            transient_rad_s=transient_rad_s,
+            movement=self._movement.samples(motion_rad_s, speed_rad_s) if self._movement else None,
+            residuals={
+                source: residual.samples(values[source], valid[source], speed_rad_s, transient_rad_s, period_s)
+                for source, residual in self.residuals.items()
+            },
+            table=self._rows,
+            ratios=np.full((len(self._rows), *speed_rad_s.shape), np.nan),
+            at_rest=samples.idle & self._judges_rest,
+            scored={source: [] for source in RESIDUALS},
+            scores=scores,
+        )
+        self._detect("tacho", piece.given(samples.alive), piece.ratios)
+        return piece
 
-        def residual(source: Signal, values: Array, valid: Array) -> _ScoredResidual:
-            return self._score_residual(source, values[stretch], valid[stretch], speed_rad_s, transient_rad_s, period_s)
+    def _detect(self, source: Signal, given: DetectorInput, ratios: Array) -> None:
+        """Write the ratios of the detectors of one input into (rows of the table, n, fans), where it is valid."""
+        for number, row in enumerate(self._rows):
+            if row.source == source and row.name in self.detectors:
+                np.copyto(ratios[number], self.detectors[row.name].update(given), where=given.valid)
 
-        speed = residual("speed", block.speed_residual, block.speed_valid)
-        balance = residual("balance", block.balance, block.balance_valid)
-        inputs = {
-            source: DetectorInput(
-                period_ns=block.period_ns,
-                period_s=period_s,
-                valid=valid,
-                standardised=standardised,
-                persistent=persistent,
-                speed_rad_s=speed_rad_s,
-                missing=block.missing[stretch],
-                reading_missing=block.reading_missing[stretch],
-                idle=block.idle[stretch],
-                command=block.command[stretch],
-                predicted_rad_s=block.predicted_rad_s[stretch],
-            )
-            for source, valid, standardised, persistent in (
-                ("speed", speed.scored, self._unsteadiness(speed), speed.persistent),
-                ("balance", balance.scored, self._unsteadiness(balance), balance.persistent),
-                ("tacho", alive, _NOTHING, _NOTHING),
-            )
-        }
-        ratios = np.full((len(self._rows), *speed_rad_s.shape), np.nan)
-        for number, row in enumerate(self._rows):
-            if row.name in self.detectors:
-                np.copyto(
-                    ratios[number],
-                    self.detectors[row.name].update(inputs[row.source]),
-                    where=inputs[row.source].valid,
-                )
-        every_ratio, ratios = ratios, np.where(np.isnan(ratios), 0.0, ratios)
-        if self._judges_rest:  # of a fan at rest only the detectors of standstill say anything
-            for number, row in enumerate(self._rows):
-                if row.source == "tacho" and not row.comes_first:
-                    every_ratio[number][block.idle[stretch]] = np.nan
-        if self._observations is not None:
-            persistent: dict[Signal, Array] = {"speed": speed.persistent, "balance": balance.persistent}
-            expected: dict[Signal, Array] = {"speed": speed.expected, "balance": balance.expected}
-            self._observations.append(
-                Observation(ratios=ratios, persistent=persistent, expected=expected, transient_rad_s=transient_rad_s)
-            )
-        largest = ratios.argmax(axis=0)
-        for number, row in enumerate(self._rows):
-            if row.comes_first:
-                largest = np.where(ratios[number] > 1.0, number, largest)
-        score = ratios.max(axis=0)
+    def _score(self, piece: Piece, stretch: slice) -> None:
+        """Score samples of one interval."""
+        if self._movement and piece.movement is not None:
+            self._movement.add(piece.movement[:, stretch])
+        samples, scores, ratios = piece.samples, piece.scores, piece.ratios[:, stretch]
+        alive, at_rest = samples.alive[stretch], piece.at_rest[stretch]
+        scored_now = np.zeros(alive.shape, np.bool_)
+        for source, residual in self.residuals.items():
+            of = residual.score(piece.residuals[source].rows(stretch), piece.period_s)
+            given = piece.given(of.scored, stretch, self._unsteadiness(of), of.persistent)
+            self._detect(source, given, ratios)
+            piece.scored[source].append(of)
+            if source in self._in_use:
+                scored_now |= of.scored
+        score = np.fmax.reduce(ratios, axis=0, initial=0.0)
         highest = score.max(axis=0)
         self._below_half_limit &= highest <= HALF_LIMIT
         self._within_limit &= highest <= 1.0
-        scored_now, known = np.zeros(alive.shape, np.bool_), np.zeros(alive.shape, np.bool_)
-        for source, of in (("speed", speed), ("balance", balance)):
-            if self._is_scored[source]:
-                scored_now |= of.scored
-                known |= of.valid
         has_score = scored_now | (alive & (score > 1.0))
-        baseline = self.residuals["balance"].baseline
-        baseline_s = baseline.independent_intervals * self.limits.timing.baseline_s
-        return ScoredBlock(
-            score=np.where(has_score, score, np.nan),
-            statistic=np.where(has_score, self._statistics[largest], Statistic.NONE).astype(np.uint8),
-            commissioning=known & ~scored_now,
-            judged=has_score | (alive & block.idle[stretch] & self._judges_rest),
-            speed_smoothed=np.where(speed.scored, speed.smoothed, np.nan),
-            speed_baseline=speed.baseline,
-            balance_smoothed=np.where(balance.scored, balance.smoothed, np.nan),
-            balance_baseline=balance.baseline,
-            balance_expected=balance.expected,
-            balance_baseline_s=np.broadcast_to(baseline_s, alive.shape),
-            balance_commissioned=np.where(baseline.is_commissioning, np.nan, balance.commissioned),
-            balance_at_limit=np.broadcast_to(baseline.is_at_limit, alive.shape),
-            speed_learned_scale=np.broadcast_to(self.residuals["speed"].baseline.learned_scale, alive.shape),
-            balance_learned_scale=np.broadcast_to(baseline.learned_scale, alive.shape),
-            ratios=every_ratio.swapaxes(0, 1),
-        )
+        scores.score[stretch] = np.where(has_score, score, np.nan)
+        scores.judged[stretch] = has_score | (alive & at_rest)
+        scores.ratios[stretch] = ratios.swapaxes(0, 1)
+        if at_rest.any():
+            for number, row in enumerate(self._rows):
+                if row.source == "tacho" and not row.comes_first:
+                    scores.ratios[stretch, number][at_rest] = np.nan
 
-    def _unsteadiness(self, of: _ScoredResidual) -> Array:
+    def _unsteadiness(self, of: ScoredResidual) -> Array:
         """(n, fans) the residual in standard deviations; of a tacho that counts, in those of this motion."""
         return np.where(self._counts, of.persistent, of.standardised) if self._counts.any() else of.standardised
-
-    def _score_residual(
-        self, source: Signal, values: Array, valid: Array, speed_rad_s: Array, transient_rad_s: Array, period_s: float
-    ) -> _ScoredResidual:
-        residual = self.residuals[source]
-        expected = residual.expected(speed_rad_s)
-        scaling = residual.scaling(speed_rad_s, valid)
-        baseline = residual.baseline.value * scaling
-        residual.learn(values - expected, scaling, speed_rad_s, valid, period_s)
-        scored = valid & residual.baseline.is_set
-        shift = values - expected - baseline
-        standardised, persistent = residual.standardise(shift, scaling, speed_rad_s, transient_rad_s, scored, period_s)
-        return _ScoredResidual(
-            valid=valid,
-            scored=scored,
-            smoothed=residual.smooth(shift, scored, period_s),
-            baseline=baseline,
-            expected=expected,
-            commissioned=residual.baseline.commissioned * scaling,
-            standardised=standardised,
-            persistent=persistent,
-        )
 
     def snapshot(self) -> dict[str, Any]:
         """The state as JSON can hold it."""
@@ -410,4 +359,7 @@ class FanScorer:
         self._interval = int(state["interval"])
 
 
-_NOTHING = np.zeros((0, 0))  # the tacho has no residual
+def _parts(ends: Array) -> Iterator[tuple[int, int]]:
+    """The first row of each part and the one after its last; ends: (n - 1,) whether a part ends after a row."""
+    edges = [0, *(np.flatnonzero(ends) + 1).tolist(), len(ends) + 1]
+    return pairwise(edges)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,66 @@ from scoring.limits import Limits
 CLIP_LIMITS = 2.0  # residuals are clipped to this many limits of the smoothed one: one outlier raises no alarm
 MIN_CLIP_STDS = 5.0
 LARGEST_SIGMAS = 1e6  # so that sums and squares stay finite
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualSamples:
+    """A residual at some samples, (n, fans) each, and all that follows from it without the baselines."""
+
+    valid: Array
+    residual: Array
+    """less the expected one, sigma"""
+    expected: Array
+    """the mean healthy residual at these speeds, sigma"""
+    scaling: Array
+    """the baseline at these speeds, relative to that at the reference speed"""
+    std: Array
+    """standard deviation of the healthy residual, sigma"""
+    low_frequency_std: Array
+    """of its low frequencies at this speed and in this motion, relative to their median"""
+    clip: float
+    """how far samples count, standard deviations"""
+    reach: Array
+    """how far from the baseline they are learned, sigma"""
+
+    def rows(self, rows: slice) -> ResidualSamples:
+        """Some of the samples."""
+        return ResidualSamples(
+            self.valid[rows],
+            self.residual[rows],
+            self.expected[rows],
+            self.scaling[rows],
+            self.std[rows],
+            self.low_frequency_std[rows],
+            self.clip,
+            self.reach[rows],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredResidual:
+    """A residual less its baseline, and the baseline, (n, fans) each."""
+
+    scored: Array
+    """valid, and with a baseline"""
+    standardised: Array
+    persistent: Array
+    """see DetectorInput"""
+    smoothed: Array
+    """the low-passed residual less its baseline, sigma, as displayed; NaN where not scored"""
+    baseline: Array
+    """at this speed, sigma"""
+    commissioned: Array
+    """the same at the end of commissioning; NaN before"""
+    independent_intervals: Array
+    at_limit: Array
+    learned_scale: Array
+    """see Baseline"""
+
+    @classmethod
+    def joined(cls, parts: Sequence[ScoredResidual]) -> ScoredResidual:
+        """That of successive samples."""
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
 
 
 class Residual:
@@ -52,8 +113,52 @@ class Residual:
             capped=capped,
         )
 
-    def expected(self, speed_rad_s: Array) -> Array:
-        """(n, fans) the mean healthy residual at these speeds (n, fans), in sigma of each fan."""
+    def samples(
+        self, values: Array, valid: Array, speed_rad_s: Array, transient_rad_s: Array, period_s: float
+    ) -> ResidualSamples:
+        """What of samples does not depend on the baselines. All (n, fans); values: the residual, sigma."""
+        expected, scaling = self._expected(speed_rad_s), speed_scaling(self._healthy.baseline, speed_rad_s, valid)
+        std, clip = self._residual_std(speed_rad_s, valid), self._clip(period_s)
+        return ResidualSamples(
+            valid=valid,
+            residual=values - expected,
+            expected=expected,
+            scaling=scaling,
+            std=std,
+            low_frequency_std=self._low_frequency_std(speed_rad_s, transient_rad_s, valid),
+            clip=clip,
+            reach=self._healthy.baseline.commissioning_limit_sigmas * scaling + clip * std,
+        )
+
+    def score(self, of: ResidualSamples, period_s: float) -> ScoredResidual:
+        """Compare samples of one interval with the baseline, and add them to what it learns from the interval.
+
+        Samples far from the baseline are clipped, so that one outlier does not move it.
+        """
+        baseline, shape = self.baseline, of.valid.shape
+        at_speed, scored, learned_scale = (
+            baseline.value * of.scaling,
+            of.valid & baseline.is_set,
+            baseline.learned_scale,
+        )
+        learned = np.where(of.valid, of.residual, at_speed).clip(at_speed - of.reach, at_speed + of.reach)
+        baseline.add(learned, of.valid, of.scaling)
+        shift = np.where(scored, of.residual - at_speed, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
+        standardised = shift / of.std
+        persistent = standardised / self._persistent_std(of.low_frequency_std, of.scaling, learned_scale)
+        return ScoredResidual(
+            scored=scored,
+            standardised=standardised.clip(-of.clip, of.clip),
+            persistent=persistent.clip(-of.clip, of.clip),
+            smoothed=np.where(scored, self._low_pass.update(shift, scored, period_s), np.nan),
+            baseline=at_speed,
+            commissioned=np.where(baseline.is_commissioning, np.nan, baseline.commissioned * of.scaling),
+            independent_intervals=np.full(shape, baseline.independent_intervals),
+            at_limit=np.full(shape, baseline.is_at_limit),
+            learned_scale=np.full(shape, learned_scale),
+        )
+
+    def _expected(self, speed_rad_s: Array) -> Array:
         healthy, speed = self._healthy, np.where(np.isnan(speed_rad_s), 0.0, np.abs(speed_rad_s))
         expected = np.interp(speed, healthy.speeds_rad_s, healthy.expected_residual_sigmas)
         return expected if healthy.fan_offsets is None else expected + self._fan_offset(healthy.fan_offsets, speed)
@@ -67,37 +172,6 @@ class Residual:
         low = self._fan_offsets[before, column]
         return low + (place - before) * (self._fan_offsets[np.minimum(before + 1, last), column] - low)
 
-    def scaling(self, speed_rad_s: Array, valid: Array) -> Array:
-        """(n, fans) the baseline at these speeds, relative to that at the reference speed."""
-        return speed_scaling(self._healthy.baseline, speed_rad_s, valid)
-
-    def learn(self, residual: Array, scaling: Array, speed_rad_s: Array, valid: Array, period_s: float) -> None:
-        """Add samples to the interval of the baseline. All (n, fans); residual: less the expected one, sigma.
-
-        Samples far from the baseline are clipped, so that one outlier does not move it.
-        """
-        limit = self._healthy.baseline.commissioning_limit_sigmas
-        reach = limit * scaling + self._clip(period_s) * self._residual_std(speed_rad_s, valid)
-        centre = self.baseline.value * scaling
-        clipped = np.where(valid, residual, centre).clip(centre - reach, centre + reach)
-        self.baseline.add(clipped, valid, scaling)
-
-    def smooth(self, shift: Array, valid: Array, period_s: float) -> Array:
-        """(n, fans) the low-passed residual less its baseline, sigma, as displayed."""
-        return self._low_pass.update(_finite(shift, valid), valid, period_s)
-
-    def standardise(
-        self, shift: Array, scaling: Array, speed_rad_s: Array, transient_rad_s: Array, valid: Array, period_s: float
-    ) -> tuple[Array, Array]:
-        """The residual in healthy standard deviations, and in those of its low frequencies; see DetectorInput.
-
-        All (n, fans). shift: the residual less the expected one and the baseline, sigma.
-        """
-        clip = self._clip(period_s)
-        standardised = _finite(shift, valid) / self._residual_std(speed_rad_s, valid)
-        persistent = standardised / self._persistent_std(scaling, speed_rad_s, transient_rad_s, valid)
-        return standardised.clip(-clip, clip), persistent.clip(-clip, clip)
-
     def limit_std(self, speed_rad_s: Array, learned_scale: Array | None = None) -> Array:
         """(fans,) what limits of a constant residual are relative to at these constant speeds (fans,), sigma.
 
@@ -105,9 +179,13 @@ class Residual:
         """
         speed, still = speed_rad_s[np.newaxis], np.zeros((1, len(speed_rad_s)))
         valid = np.isfinite(speed)
-        scaling = self.scaling(speed, valid)
-        relative = self._residual_std(speed, valid) * self._persistent_std(scaling, speed, still, valid, learned_scale)
-        return np.broadcast_to(relative, speed.shape)[0]
+        scaling = speed_scaling(self._healthy.baseline, speed, valid)
+        low_frequency_std = self._low_frequency_std(speed, still, valid)
+        uncertain = np.where(valid, scaling, 0.0)
+        learned = self.baseline.learned_scale if learned_scale is None else learned_scale
+        relative = self._persistent_std(low_frequency_std, uncertain, learned)
+        std: Array = self._residual_std(speed, valid) * relative
+        return std[0]
 
     @property
     def memory_s(self) -> float:
@@ -131,34 +209,25 @@ class Residual:
         deviation = smoothed_deviation(self._smoothing_s, self._healthy.autocorrelation_time_s, period_s)
         return max(MIN_CLIP_STDS, CLIP_LIMITS * deviation * self._smoothed_limit)
 
-    def _residual_std(self, speed_rad_s: Array, valid: Array) -> Array | float:
+    def _residual_std(self, speed_rad_s: Array, valid: Array) -> Array:
         healthy = self._healthy
         if len(healthy.speeds_rad_s) == 1:
-            return healthy.residual_std[0]
+            return np.full(speed_rad_s.shape, healthy.residual_std[0])
         return np.where(valid, np.interp(np.abs(speed_rad_s), healthy.speeds_rad_s, healthy.residual_std), 1.0)
 
-    def _persistent_std(
-        self,
-        scaling: Array,
-        speed_rad_s: Array,
-        transient_rad_s: Array,
-        valid: Array,
-        learned_scale: Array | None = None,
-    ) -> Array | float:
-        """Of the low-frequency residual, relative to its median: by speed, by motion, and by an uncertain baseline."""
+    def _low_frequency_std(self, speed_rad_s: Array, transient_rad_s: Array, valid: Array) -> Array:
+        """Of the low-frequency residual, relative to its median: by speed, and by motion."""
         healthy = self._healthy
-        relative: Array | float = healthy.persistent_std[0]
+        relative: Array = np.full(speed_rad_s.shape, healthy.persistent_std[0])
         if len(healthy.persistent_std) > 1:
             at_speed = np.interp(np.abs(speed_rad_s), healthy.speeds_rad_s, healthy.persistent_std)
             relative = np.where(valid, at_speed, 1.0)
         if healthy.transient_scale_rad_s is not None:
             relative = relative * np.sqrt(1.0 + np.square(transient_rad_s / healthy.transient_scale_rad_s))
-        if healthy.baseline.rms_sigmas > 0.0:
-            # so that an unknown offset stays within the reference value of the drift
-            uncertainty = np.where(valid, self.baseline.offset_uncertainty(scaling, learned_scale), 0.0)
-            relative = relative + uncertainty / self._reference_sigmas
         return relative
 
-
-def _finite(shift: Array, valid: Array) -> Array:
-    return np.where(valid, shift, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
+    def _persistent_std(self, low_frequency_std: Array, scaling: Array, learned_scale: Array) -> Array:
+        """The same with an uncertain baseline: an unknown offset stays within the reference value of the drift."""
+        if self._healthy.baseline.rms_sigmas <= 0.0:
+            return low_frequency_std
+        return low_frequency_std + self.baseline.offset_uncertainty(scaling, learned_scale) / self._reference_sigmas

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -31,6 +31,11 @@ class Samples:
     """the command stops the fan, or it has just started: nothing is compared with the twin"""
     alive: Array
     """samples arrived on the line"""
+
+    def rows(self, rows: slice) -> Samples:
+        """Some of the samples."""
+        columns = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "period_ns"}
+        return Samples(period_ns=self.period_ns, **{name: column[rows] for name, column in columns.items()})
 
 
 def samples_of(prediction: Prediction) -> Samples:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,10 +40,21 @@ class ScoredBlock:
     ratios: Array
     """(n, rows of the table, fans) every statistic in multiples of its limit; NaN where it is not scored"""
 
+    @classmethod
+    def empty(cls, n: int, rows: int, fans: int) -> ScoredBlock:
+        """To be filled, with any values."""
+        flags, shape = ("commissioning", "judged", "balance_at_limit"), (n, fans)
+        columns = {name: np.empty(shape, np.bool_ if name in flags else np.float64) for name in cls.__annotations__}
+        return cls(**columns | {"statistic": np.empty(shape, np.uint8), "ratios": np.empty((n, rows, fans))})
+
+    def rows(self, rows: slice) -> ScoredBlock:
+        """A part of the block; writing to it writes to the block."""
+        return ScoredBlock(**{name: column[rows] for name, column in vars(self).items()})
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Observation:
-    """What calibration needs about a stretch of samples, beside the scores."""
+    """What calibration needs about some samples, beside the scores."""
 
     ratios: Array
     """(rows of the table, n, fans) every statistic in multiples of its limit"""
@@ -54,10 +64,3 @@ class Observation:
     """(n, fans) the expected residual at these speeds, sigma"""
     transient_rad_s: Array
     """(n, fans) see scoring.detectors.motion"""
-
-
-def joined(parts: Sequence[ScoredBlock]) -> ScoredBlock:
-    """The scores of successive stretches as one block."""
-    if len(parts) == 1:
-        return parts[0]
-    return ScoredBlock(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})

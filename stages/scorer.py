@@ -53,7 +53,7 @@ from scoring.fan_scorer import HALF_LIMIT, FanScorer
 from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
 from scoring.samples import samples_of
 from scoring.score_message import score_of
-from scoring.scored_block import ScoredBlock, joined
+from scoring.scored_block import ScoredBlock
 from scoring.snapshot_times import with_times_moved
 from scoring.wear.followed import followed_fans
 from scoring.wear.wear_monitor import WearMonitor
@@ -346,22 +346,21 @@ class ScorerCore(Core):
     def _decide(self, item: Prediction) -> tuple[ScoredBlock, Array, list[AlarmEvent]]:
         """The scores, the states (n, fans) and the alarms' events. While an alarm is active, baselines stay."""
         speed = np.where(np.isfinite(item.predicted_speed_rad_s), item.predicted_speed_rad_s, item.measured_speed_rad_s)
-        parts: list[ScoredBlock] = []
-        states: list[Array] = []
         events: list[AlarmEvent] = []
-        for rows_of, part in self._scorer.stretches(samples_of(item)):
+        scored, stretches = self._scorer.stretches(samples_of(item))
+        state = np.empty(scored.score.shape, np.uint8)
+        for rows in stretches:
             was_active = self._alarms.active
-            ratio = np.where(part.judged & np.isnan(part.score), 0.0, part.score)
-            state, happened = self._alarms.update(
-                item.t_ns[rows_of], item.period_ns, ratio, part.judged, part.ratios, speed[rows_of]
+            score, judged = scored.score[rows], scored.judged[rows]
+            ratio = np.where(judged & np.isnan(score), 0.0, score)
+            state[rows], happened = self._alarms.update(
+                item.t_ns[rows], item.period_ns, ratio, judged, scored.ratios[rows], speed[rows]
             )
             if self._holds:
-                in_alarm = was_active | self._alarms.active | np.isin(state, IN_ALARM).any(axis=0)
+                in_alarm = was_active | self._alarms.active | np.isin(state[rows], IN_ALARM).any(axis=0)
                 self._scorer.learn_nothing(in_alarm)
-            parts.append(part)
-            states.append(state)
-            events += [replace(event, row=event.row + rows_of.start) for event in happened]
-        return joined(parts), np.concatenate(states), events
+            events += [replace(event, row=event.row + rows.start) for event in happened]
+        return scored, state, events
 
     def _feed_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
         unknown = np.isin(item.invalid_reason, (InvalidReason.GAP, InvalidReason.STALE))

@@ -96,13 +96,12 @@ class Baseline(ColumnState):
         total = np.maximum(weights.sum(axis=0), MIN_INFORMATION)
         return np.sqrt((weights * self.interval_information).sum(axis=0) / total)
 
-    def offset_uncertainty(self, scaling: Array, learned_scale: Array | None = None) -> Array:
+    def offset_uncertainty(self, scaling: Array, learned_scale: Array) -> Array:
         """(n, fans) how far the fan's offset at a scaling (n, fans) may be from the scaled baseline, sigma.
 
-        learned_scale: (fans,) of an earlier interval; None: the present one.
+        learned_scale: (fans,) of the baseline, now or in an earlier interval.
         """
-        learned = self.learned_scale if learned_scale is None else learned_scale
-        return OFFSET_RANGE_RMS * self._settings.rms_sigmas * np.maximum(scaling - learned, 0.0)
+        return OFFSET_RANGE_RMS * self._settings.rms_sigmas * np.maximum(scaling - learned_scale, 0.0)
 
     def restart(self, fans: Array) -> None:
         """Commission some fans again, (fans,) of bool."""

@@ -26,10 +26,16 @@ class Movement(ColumnState):
         self._speeds = np.zeros(fans, np.int64)
         self._moving_intervals = np.zeros(fans, np.int64)
 
-    def add(self, motion_rad_s: Array, speed_rad_s: Array) -> None:
-        """Take samples, (n, fans) each; speeds may be NaN, where the motion is 0."""
-        self._motions += _fixed(motion_rad_s).sum(axis=0)
-        self._speeds += _fixed(np.abs(np.nan_to_num(speed_rad_s))).sum(axis=0)
+    @staticmethod
+    def samples(motion_rad_s: Array, speed_rad_s: Array) -> Array:
+        """(2, n, fans) of samples (n, fans), to be added; speeds may be NaN, where the motion is 0."""
+        return np.stack((_fixed(motion_rad_s), _fixed(np.abs(np.nan_to_num(speed_rad_s)))))
+
+    def add(self, samples: Array) -> None:
+        """Add samples, see `samples`, to the interval."""
+        motions, speeds = samples.sum(axis=1)
+        self._motions += motions
+        self._speeds += speeds
 
     def end_interval(self, commissioning: Array) -> Array:
         """End the interval. Returns (fans,) whether fans are not to be commissioned from it, because they moved.

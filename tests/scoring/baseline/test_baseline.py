@@ -191,8 +191,10 @@ def test_an_offset_is_certain_at_the_scaling_where_it_was_learned() -> None:
         for seed in range(COMMISSIONING_INTERVALS):
             baseline.add(*_with(EVERY, scaled(np.full(SAMPLES, level), seed, 0.2)))
             baseline.end_interval(SAMPLES, GOOD, GOOD)
-        np.testing.assert_allclose(baseline.offset_uncertainty(np.ones((1, 2))), unknown, atol=1e-6)
-        assert (baseline.offset_uncertainty(np.full((1, 2), 0.1)) == 0.0).all()
+        np.testing.assert_allclose(
+            baseline.offset_uncertainty(np.ones((1, 2)), baseline.learned_scale), unknown, atol=1e-6
+        )
+        assert (baseline.offset_uncertainty(np.full((1, 2), 0.1), baseline.learned_scale) == 0.0).all()
 
 
 def test_intervals_with_more_information_replace_those_with_little() -> None:

@@ -1,0 +1,102 @@
+"""Samples without a gap between them while they are scored.
+
+What does not depend on the baselines is found for the whole piece at once. The rest is scored in stretches, each within
+one interval of the baselines: what they learn from one stretch counts in the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.messages import Array, Statistic
+from schemas.units import NS_PER_S
+from scoring.detectors.detector import DetectorInput, DetectorRow, Signal
+from scoring.residual import ResidualSamples, ScoredResidual
+from scoring.samples import Samples
+from scoring.scored_block import Observation, ScoredBlock
+
+NOTHING = np.zeros((0, 0))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Piece:
+    """A piece, and its scores so far."""
+
+    samples: Samples
+    table: Sequence[DetectorRow]
+    transient_rad_s: Array
+    """(n, fans) see scoring.detectors.motion"""
+    movement: Array | None
+    """see Movement.samples; None where it does not count"""
+    residuals: dict[Signal, ResidualSamples]
+    ratios: Array
+    """(rows of the table, n, fans) every statistic in multiples of its limit; NaN where there is none"""
+    at_rest: Array
+    """(n, fans) where only the detectors of standstill say anything"""
+    scored: dict[Signal, list[ScoredResidual]]
+    """of each residual, in stretches"""
+    scores: ScoredBlock
+    """score, judged and ratios are those of the stretches so far; the others are there when it is complete"""
+
+    @property
+    def period_s(self) -> float:
+        """Sampling period."""
+        return self.samples.period_ns / NS_PER_S
+
+    def given(
+        self, valid: Array, rows: slice = slice(None), standardised: Array = NOTHING, persistent: Array = NOTHING
+    ) -> DetectorInput:
+        """What detectors are given of some rows; the tacho has no residual."""
+        samples = self.samples
+        return DetectorInput(
+            period_ns=samples.period_ns,
+            period_s=self.period_s,
+            valid=valid,
+            standardised=standardised,
+            persistent=persistent,
+            speed_rad_s=samples.speed_rad_s[rows],
+            missing=samples.missing[rows],
+            reading_missing=samples.reading_missing[rows],
+            idle=samples.idle[rows],
+            command=samples.command[rows],
+            predicted_rad_s=samples.predicted_rad_s[rows],
+        )
+
+    def complete(self, in_use: Sequence[Signal], baseline_s: float) -> None:
+        """Fill in the other scores. in_use: residuals with detectors. baseline_s: an interval of the baselines."""
+        scores, ratios = self.scores, self._known_ratios
+        largest = ratios.argmax(axis=0)
+        for number, row in enumerate(self.table):
+            if row.comes_first:
+                largest = np.where(ratios[number] > 1.0, number, largest)
+        statistics = np.array([row.statistic for row in self.table])
+        scores.statistic[:] = np.where(np.isnan(scores.score), Statistic.NONE, statistics[largest])
+        speed, balance = (ScoredResidual.joined(self.scored[source]) for source in ("speed", "balance"))
+        known = np.any([self.residuals[source].valid for source in in_use], axis=0)
+        scored = np.any(
+            [of.scored for source, of in (("speed", speed), ("balance", balance)) if source in in_use], axis=0
+        )
+        scores.commissioning[:] = known & ~scored
+        scores.speed_smoothed[:], scores.speed_baseline[:] = speed.smoothed, speed.baseline
+        scores.speed_learned_scale[:] = speed.learned_scale
+        scores.balance_smoothed[:], scores.balance_baseline[:] = balance.smoothed, balance.baseline
+        scores.balance_learned_scale[:] = balance.learned_scale
+        scores.balance_expected[:] = self.residuals["balance"].expected
+        scores.balance_baseline_s[:] = balance.independent_intervals * baseline_s
+        scores.balance_commissioned[:], scores.balance_at_limit[:] = balance.commissioned, balance.at_limit
+
+    def observation(self) -> Observation:
+        """What calibration needs about it."""
+        return Observation(
+            ratios=self._known_ratios,
+            persistent={source: np.concatenate([of.persistent for of in each]) for source, each in self.scored.items()},
+            expected={source: of.expected for source, of in self.residuals.items()},
+            transient_rad_s=self.transient_rad_s,
+        )
+
+    @property
+    def _known_ratios(self) -> Array:
+        return np.where(np.isnan(self.ratios), 0.0, self.ratios)
