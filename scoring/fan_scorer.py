@@ -80,11 +80,16 @@ class FanScorer:
             if row.name in limits.detectors
         }
         """the detectors that have a limit, by name"""
-        self._in_use: list[Signal] = [
-            source
-            for source in RESIDUALS
-            if any(row.source == source and row.name in self.detectors for row in self._rows)
-        ]
+        self._detectors_of: dict[Signal, list[tuple[int, Detector]]] = {
+            source: [
+                (number, self.detectors[row.name])
+                for number, row in enumerate(self._rows)
+                if row.source == source and row.name in self.detectors
+            ]
+            for source in INPUTS
+        }
+        """the detectors of each input, and their places in the table"""
+        self._in_use: list[Signal] = [source for source in RESIDUALS if self._detectors_of[source]]
         """residuals with detectors"""
         self._judges_rest = any(row.only_at_rest and row.name in self.detectors for row in self._rows)
         self._motion = Motion(fans)
@@ -142,16 +147,15 @@ class FanScorer:
                     self._interval = number
                 self._score(piece, slice(begin, end))
                 yield slice(first + begin, first + end)
-            piece.complete(self._in_use, self.limits.timing.baseline_s)
-            if self._observations is not None:
-                self._observations.append(piece.observation())
+            self._complete(piece)
 
     def learn_nothing(self, fans: Array) -> None:
         """The baselines of some fans, (fans,) of bool, learn nothing from the present interval: those with an alarm. A
         fan without a baseline gets one.
         """
-        has_one = np.any([self.residuals[source].baseline.is_set for source in RESIDUALS], axis=0)
-        self._below_half_limit[fans & has_one] = self._within_limit[fans & has_one] = False
+        if fans.any():
+            has_one = np.any([self.residuals[source].baseline.is_set for source in RESIDUALS], axis=0)
+            self._below_half_limit[fans & has_one] = self._within_limit[fans & has_one] = False
 
     def observed(self) -> list[Observation]:
         """Observations since the last call, in the order of their samples; only if `for_calibration`."""
@@ -217,12 +221,8 @@ class FanScorer:
         expected = self._interval_ns // period_ns
         commissioning = np.any([self.residuals[source].baseline.is_commissioning for source in RESIDUALS], axis=0)
         moving = self._movement.end_interval(commissioning) if self._movement else None
-        for source, residual in self.residuals.items():
-            first = residual.baseline.end_interval(expected, self._within_limit, self._below_half_limit, moving)
-            residual.reset(first)
-            for row in self._rows:
-                if row.source == source and row.name in self.detectors:
-                    self.detectors[row.name].reset(first)
+        for residual in self.residuals.values():
+            residual.baseline.end_interval(expected, self._within_limit, self._below_half_limit, moving)
         self._below_half_limit[:] = self._within_limit[:] = True
 
     def _memories_ns(self) -> list[tuple[int, Callable[[Array], None], int]]:
@@ -277,9 +277,8 @@ class FanScorer:
 
     def _detect(self, source: Signal, given: DetectorInput, ratios: Array) -> None:
         """Write the ratios of the detectors of one input into (rows of the table, n, fans), where it is valid."""
-        for number, row in enumerate(self._rows):
-            if row.source == source and row.name in self.detectors:
-                np.copyto(ratios[number], self.detectors[row.name].update(given), where=given.valid)
+        for number, detector in self._detectors_of[source]:
+            np.copyto(ratios[number], detector.update(given), where=given.valid)
 
     def _score(self, piece: Piece, stretch: slice) -> None:
         """Score samples of one interval."""
@@ -289,7 +288,7 @@ class FanScorer:
         alive, at_rest = samples.alive[stretch], piece.at_rest[stretch]
         scored_now = np.zeros(alive.shape, np.bool_)
         for source, residual in self.residuals.items():
-            of = residual.score(piece.residuals[source].rows(stretch), piece.period_s)
+            of = residual.score(piece.residuals[source].rows(stretch))
             given = piece.given(of.scored, stretch, self._unsteadiness(of), of.persistent)
             self._detect(source, given, ratios)
             piece.scored[source].append(of)
@@ -307,6 +306,17 @@ class FanScorer:
             for number, row in enumerate(self._rows):
                 if row.source == "tacho" and not row.comes_first:
                     scores.ratios[stretch, number][at_rest] = np.nan
+
+    def _complete(self, piece: Piece) -> None:
+        scored: dict[Signal, ScoredResidual] = {
+            source: ScoredResidual.joined(parts) for source, parts in piece.scored.items()
+        }
+        smoothed: dict[Signal, Array] = {
+            source: self.residuals[source].smooth(of, piece.period_s) for source, of in scored.items()
+        }
+        piece.complete(scored, smoothed, self._in_use, self.limits.timing.baseline_s)
+        if self._observations is not None:
+            self._observations.append(piece.observation(scored))
 
     def _unsteadiness(self, of: ScoredResidual) -> Array:
         """(n, fans) the residual in standard deviations; of a tacho that counts, in those of this motion."""

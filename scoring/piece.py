@@ -6,7 +6,7 @@ one interval of the baselines: what they learn from one stretch counts in the ne
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,8 +65,18 @@ class Piece:
             predicted_rad_s=samples.predicted_rad_s[rows],
         )
 
-    def complete(self, in_use: Sequence[Signal], baseline_s: float) -> None:
-        """Fill in the other scores. in_use: residuals with detectors. baseline_s: an interval of the baselines."""
+    def complete(
+        self,
+        scored: Mapping[Signal, ScoredResidual],
+        smoothed: Mapping[Signal, Array],
+        in_use: Sequence[Signal],
+        baseline_s: float,
+    ) -> None:
+        """Fill in the scores that nothing else depends on.
+
+        scored: of all stretches. smoothed: see Residual.smooth. in_use: residuals with detectors. baseline_s: the
+        interval of the baselines.
+        """
         scores, ratios = self.scores, self._known_ratios
         largest = ratios.argmax(axis=0)
         for number, row in enumerate(self.table):
@@ -74,25 +84,23 @@ class Piece:
                 largest = np.where(ratios[number] > 1.0, number, largest)
         statistics = np.array([row.statistic for row in self.table])
         scores.statistic[:] = np.where(np.isnan(scores.score), Statistic.NONE, statistics[largest])
-        speed, balance = (ScoredResidual.joined(self.scored[source]) for source in ("speed", "balance"))
         known = np.any([self.residuals[source].valid for source in in_use], axis=0)
-        scored = np.any(
-            [of.scored for source, of in (("speed", speed), ("balance", balance)) if source in in_use], axis=0
-        )
-        scores.commissioning[:] = known & ~scored
-        scores.speed_smoothed[:], scores.speed_baseline[:] = speed.smoothed, speed.baseline
+        scored_now = np.any([scored[source].scored for source in in_use], axis=0)
+        speed, balance = scored["speed"], scored["balance"]
+        scores.commissioning[:] = known & ~scored_now
+        scores.speed_smoothed[:], scores.speed_baseline[:] = smoothed["speed"], speed.baseline
         scores.speed_learned_scale[:] = speed.learned_scale
-        scores.balance_smoothed[:], scores.balance_baseline[:] = balance.smoothed, balance.baseline
+        scores.balance_smoothed[:], scores.balance_baseline[:] = smoothed["balance"], balance.baseline
         scores.balance_learned_scale[:] = balance.learned_scale
         scores.balance_expected[:] = self.residuals["balance"].expected
         scores.balance_baseline_s[:] = balance.independent_intervals * baseline_s
         scores.balance_commissioned[:], scores.balance_at_limit[:] = balance.commissioned, balance.at_limit
 
-    def observation(self) -> Observation:
+    def observation(self, scored: Mapping[Signal, ScoredResidual]) -> Observation:
         """What calibration needs about it."""
         return Observation(
             ratios=self._known_ratios,
-            persistent={source: np.concatenate([of.persistent for of in each]) for source, each in self.scored.items()},
+            persistent={source: of.persistent for source, of in scored.items()},
             expected={source: of.expected for source, of in self.residuals.items()},
             transient_rad_s=self.transient_rad_s,
         )

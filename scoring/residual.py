@@ -67,8 +67,8 @@ class ScoredResidual:
     standardised: Array
     persistent: Array
     """see DetectorInput"""
-    smoothed: Array
-    """the low-passed residual less its baseline, sigma, as displayed; NaN where not scored"""
+    shift: Array
+    """the residual less the expected one and the baseline, sigma; 0 where not scored"""
     baseline: Array
     """at this speed, sigma"""
     commissioned: Array
@@ -130,7 +130,7 @@ class Residual:
             reach=self._healthy.baseline.commissioning_limit_sigmas * scaling + clip * std,
         )
 
-    def score(self, of: ResidualSamples, period_s: float) -> ScoredResidual:
+    def score(self, of: ResidualSamples) -> ScoredResidual:
         """Compare samples of one interval with the baseline, and add them to what it learns from the interval.
 
         Samples far from the baseline are clipped, so that one outlier does not move it.
@@ -150,13 +150,17 @@ class Residual:
             scored=scored,
             standardised=standardised.clip(-of.clip, of.clip),
             persistent=persistent.clip(-of.clip, of.clip),
-            smoothed=np.where(scored, self._low_pass.update(shift, scored, period_s), np.nan),
+            shift=shift,
             baseline=at_speed,
             commissioned=np.where(baseline.is_commissioning, np.nan, baseline.commissioned * of.scaling),
             independent_intervals=np.full(shape, baseline.independent_intervals),
             at_limit=np.full(shape, baseline.is_at_limit),
             learned_scale=np.full(shape, learned_scale),
         )
+
+    def smooth(self, of: ScoredResidual, period_s: float) -> Array:
+        """(n, fans) the low-passed residual less its baseline, sigma, as displayed; NaN where not scored."""
+        return np.where(of.scored, self._low_pass.update(of.shift, of.scored, period_s), np.nan)
 
     def _expected(self, speed_rad_s: Array) -> Array:
         healthy, speed = self._healthy, np.where(np.isnan(speed_rad_s), 0.0, np.abs(speed_rad_s))

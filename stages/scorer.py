@@ -58,7 +58,6 @@ from scoring.snapshot_times import with_times_moved
 from scoring.wear.followed import followed_fans
 from scoring.wear.wear_monitor import WearMonitor
 
-IN_ALARM = (FanState.ALARM, FanState.RETURNING)
 SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
 SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
 NEW_START = "baselines, alarms and wear start from the beginning"
@@ -357,8 +356,8 @@ class ScorerCore(Core):
                 item.t_ns[rows], item.period_ns, ratio, judged, scored.ratios[rows], speed[rows]
             )
             if self._holds:
-                in_alarm = was_active | self._alarms.active | np.isin(state[rows], IN_ALARM).any(axis=0)
-                self._scorer.learn_nothing(in_alarm)
+                in_alarm = (state[rows] == FanState.ALARM) | (state[rows] == FanState.RETURNING)
+                self._scorer.learn_nothing(was_active | self._alarms.active | in_alarm.any(axis=0))
             events += [replace(event, row=event.row + rows.start) for event in happened]
         return scored, state, events
 

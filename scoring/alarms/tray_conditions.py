@@ -73,7 +73,7 @@ class TrayConditions:
         ratios (n, detectors, fans) and speed_rad_s (n, fans): see ReturnEvidence; where detectors decide on the return.
         """
         by_detector = bool(self._settings.detectors)
-        state = np.where(valid, NORMAL, UNKNOWN).astype(np.uint8)
+        state = np.where(valid, np.uint8(NORMAL), np.uint8(UNKNOWN))
         events: list[AlarmEvent] = []
         too_short = 0
         busy = self._not_normal | ((ratio > 1) & valid).any(axis=0)
@@ -103,8 +103,8 @@ class TrayConditions:
                 events += [AlarmEvent(row, fan, *transition) for transition in transitions]
                 too_short += before == SUSPECT and condition.fan_state == NORMAL
             self._refresh(fan)
-        last_rows = np.where(valid.any(axis=0), len(t_ns) - 1 - valid[::-1].argmax(axis=0), -1)
-        self._last_valid_t_ns = np.where(last_rows >= 0, t_ns[last_rows], self._last_valid_t_ns)
+        last_valid_t_ns = np.where(valid, t_ns[:, np.newaxis], NEVER_NS).max(axis=0)
+        self._last_valid_t_ns = np.maximum(last_valid_t_ns, self._last_valid_t_ns)
         events.sort(key=lambda event: (event.row, event.fan))
         return BlockResult(state, events, too_short)
 

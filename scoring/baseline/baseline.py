@@ -19,6 +19,9 @@ uncertainty.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from schemas.messages import Array
@@ -61,9 +64,10 @@ class Baseline(ColumnState):
         """mean square of the scaling in each of these intervals"""
         self.total_information = np.zeros(fans)
         """(fans,) of all good intervals, each counted as one at most"""
-        self._sums = np.zeros(fans, np.int64)
-        self._scaling_squares = np.zeros(fans, np.int64)
-        self._squares = np.zeros(fans, np.int64)
+        self.learned_scale = np.zeros(fans)
+        """(fans,) weighted root-mean-square scaling of the intervals that are kept"""
+        self._sums = np.zeros((3, fans), np.int64)
+        """over the present interval, of the residual times the scaling, and of the squares of both; in fixed point"""
         self._counts = np.zeros(fans, np.int64)
 
     @property
@@ -89,13 +93,6 @@ class Baseline(ColumnState):
         in_the_long_run = 2.0 * self._adaptation_intervals - 1.0
         return np.minimum(self.total_information, in_the_long_run)
 
-    @property
-    def learned_scale(self) -> Array:
-        """(fans,) weighted root-mean-square scaling of the learned intervals."""
-        weights = np.square(self.interval_information)
-        total = np.maximum(weights.sum(axis=0), MIN_INFORMATION)
-        return np.sqrt((weights * self.interval_information).sum(axis=0) / total)
-
     def offset_uncertainty(self, scaling: Array, learned_scale: Array) -> Array:
         """(n, fans) how far the fan's offset at a scaling (n, fans) may be from the scaled baseline, sigma.
 
@@ -108,44 +105,41 @@ class Baseline(ColumnState):
         for column in self.columns().values():
             column[..., fans] = 0
         self.interval_means[:, fans] = np.nan
+        self._find_learned_scale()
 
     def add(self, residual: Array, valid: Array, scaling: Array | float = 1.0) -> None:
         """Take samples of the present interval, (n, fans) each; residual in sigma, scaling finite."""
         known = np.where(valid, residual, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
-        self._sums += np.rint(known * scaling * FIXED_POINT_ONE).astype(np.int64).sum(axis=0)
-        squares = np.rint(np.where(valid, scaling * scaling, 0.0) * FIXED_POINT_ONE)
-        self._scaling_squares += squares.astype(np.int64).sum(axis=0)
-        self._squares += np.rint(known * known * FIXED_POINT_ONE).astype(np.int64).sum(axis=0)
+        products = np.array((known * scaling, np.where(valid, scaling * scaling, 0.0), known * known))
+        self._sums += np.rint(products * FIXED_POINT_ONE).astype(np.int64).sum(axis=1)
         self._counts += valid.sum(axis=0)
 
     def end_interval(
         self, samples: int, within_limit: Array, below_half_limit: Array, moving: Array | None = None
-    ) -> Array:
-        """End the present interval of so many samples. Returns which fans have just got their first baseline.
+    ) -> None:
+        """End the present interval of so many samples.
 
         within_limit, below_half_limit: (fans,) whether every statistic stayed there during the interval. moving:
         (fans,) whether the fan moved, so that only its first baseline may come from the interval
         (scoring.baseline.movement); None: no fan.
         """
-        counts = np.maximum(self._counts, 1)
-        information = self._scaling_squares / counts / FIXED_POINT_ONE
-        product = self._sums / counts / FIXED_POINT_ONE
+        counts, is_set, commissioning = np.maximum(self._counts, 1), self.is_set, self.is_commissioning
+        product, information, square = self._sums / counts / FIXED_POINT_ONE
         mean = product / np.maximum(information + self._settings.ridge, MIN_INFORMATION)
-        explained = product * product / np.maximum(information, MIN_INFORMATION)
-        deviation = np.sqrt(np.maximum(self._squares / counts / FIXED_POINT_ONE - explained, 0.0))
         seen = (self._counts >= MIN_VALID_SHARE * samples) & (self._counts > 0)
-        unsteady = seen & ~self.is_set & (deviation > MAX_STEADY_STD * self._residual_std)
-        unsteady &= self.unsteady_intervals < MAX_UNSTEADY_INTERVALS
-        self.unsteady_intervals += unsteady
-        good = seen & ~unsteady & np.where(self.is_commissioning, within_limit, below_half_limit)
-        first = good & (self.intervals == 0)
+        good = seen & np.where(commissioning, within_limit, below_half_limit)
+        if not is_set.all():
+            explained = product * product / np.maximum(information, MIN_INFORMATION)
+            deviation = np.sqrt(np.maximum(square - explained, 0.0))
+            unsteady = seen & ~is_set & (deviation > MAX_STEADY_STD * self._residual_std)
+            unsteady &= self.unsteady_intervals < MAX_UNSTEADY_INTERVALS
+            self.unsteady_intervals += unsteady
+            good &= ~unsteady
         if moving is not None:
-            good &= first | ~(moving & self.is_commissioning)
+            good &= ~(moving & commissioning & is_set)
         self._learn(mean, information, good)
         self.intervals += good
-        for column in (self._sums, self._scaling_squares, self._squares, self._counts):
-            column[:] = 0
-        return first
+        self._sums[:] = self._counts[:] = 0
 
     def _learn(self, mean: Array, information: Array, good: Array) -> None:
         """Move the baselines of fans with a good interval. All (fans,)."""
@@ -155,21 +149,24 @@ class Baseline(ColumnState):
         counted = np.minimum(information, 1.0)
         self.total_information += np.where(good, counted, 0.0)
         gain = counted / np.maximum(np.minimum(self.total_information, self._adaptation_intervals), MIN_INFORMATION)
-        scale_before = self.learned_scale
-        self._keep(mean, information, commissioning | faster)
-        kept = np.maximum(np.square(self.interval_information).sum(axis=0), MIN_INFORMATION)
-        gain = np.where(faster, np.maximum(gain, np.square(information) / kept), gain)
+        moved: Array | float = 0.0
+        kept = commissioning | faster
+        if kept.any():
+            scale_before = self.learned_scale
+            self._keep(mean, information, kept)
+            weight = np.maximum(np.square(self.interval_information).sum(axis=0), MIN_INFORMATION)
+            gain = np.where(faster, np.maximum(gain, np.square(information) / weight), gain)
+            learned = np.maximum(self.learned_scale - scale_before, 0.0)
+            moved = np.where(faster, OFFSET_RANGE_RMS * settings.rms_sigmas * learned, 0.0)
         value = np.where(good, self.value + gain * (mean - self.value), self.value)
         if commissioning.any():
             weights = np.square(self.interval_information[:, commissioning])
             median = _weighted_median(self.interval_means[:, commissioning], weights)
             limit = settings.commissioning_limit_sigmas
             value[commissioning] = np.clip(median, -limit, limit)
-        learned = np.maximum(self.learned_scale - scale_before, 0.0)
-        moved = np.where(faster, OFFSET_RANGE_RMS * settings.rms_sigmas * learned, 0.0)
-        commissioned = np.clip(value, self.commissioned - moved, self.commissioned + moved)
+        commissioned = value.clip(self.commissioned - moved, self.commissioned + moved)
         limit = settings.adaptation_limit_sigmas
-        held = np.clip(value, commissioned - limit, commissioned + limit)
+        held = value.clip(commissioned - limit, commissioned + limit)
         self.value = np.where(commissioning, value, held)
         self.commissioned = np.where(commissioning, self.value, commissioned)
 
@@ -178,6 +175,17 @@ class Baseline(ColumnState):
         least, each = self.interval_information.argmin(axis=0), np.flatnonzero(fans)
         self.interval_means[least[each], each] = mean[each]
         self.interval_information[least[each], each] = information[each]
+        self._find_learned_scale()
+
+    def _find_learned_scale(self) -> None:
+        weights = np.square(self.interval_information)
+        total = np.maximum(weights.sum(axis=0), MIN_INFORMATION)
+        self.learned_scale = np.sqrt((weights * self.interval_information).sum(axis=0) / total)
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """See ColumnState."""
+        super().restore(state)
+        self._find_learned_scale()
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
@@ -189,9 +197,9 @@ class Baseline(ColumnState):
             "interval_means": self.interval_means,
             "interval_information": self.interval_information,
             "total_information": self.total_information,
-            "sums": self._sums,
-            "scaling_squares": self._scaling_squares,
-            "squares": self._squares,
+            "sums": self._sums[0],
+            "scaling_squares": self._sums[1],
+            "squares": self._sums[2],
             "counts": self._counts,
         }
 

@@ -14,6 +14,7 @@ from schemas.messages import Array
 
 ONE = 1 << 24  # fixed-point value of one sigma second
 LARGEST_SIGMAS = 1e4  # larger residuals are clipped to this
+BOTH_SIDES = np.array([[1.0], [-1.0]])
 
 
 class Cusum:
@@ -33,11 +34,11 @@ class Cusum:
     def update(self, z: Array, valid: Array, period_s: float) -> Array:
         """Take a block, (n, fans) each; invalid samples leave the sums as they are. Returns max(C+, C-)."""
         shift = np.where(valid, z, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
-        gains = np.array((shift - self._reference, -shift - self._reference)) * (period_s * ONE)
-        gains = np.where(valid, np.rint(gains), 0.0).astype(np.int64)  # (2, n, fans)
-        sums = np.stack([bounded_sums(own, before, self._cap) for own, before in zip(gains, self.sums, strict=True)])
-        self.sums = sums[:, -1].copy()
-        return sums.max(axis=0) / ONE
+        gains = (shift[:, np.newaxis] * BOTH_SIDES - self._reference) * (period_s * ONE)  # (n, 2, fans)
+        gains = np.where(valid[:, np.newaxis], np.rint(gains), 0.0).astype(np.int64)
+        sums = bounded_sums(gains.reshape(len(z), -1), self.sums.ravel(), self._cap).reshape(gains.shape)
+        self.sums = sums[-1].copy()
+        return sums.max(axis=1) / ONE
 
 
 def bounded_sums(gains: Array, before: Array, cap: int | None) -> Array:
@@ -45,9 +46,9 @@ def bounded_sums(gains: Array, before: Array, cap: int | None) -> Array:
 
     gains: (n, fans). before: (fans,) the sums before the first. cap: None for none.
     """
-    totals = before + np.cumsum(gains, axis=0)
+    totals = before + gains.cumsum(axis=0)
     sums = totals - np.minimum(np.minimum.accumulate(totals, axis=0), 0)
-    if cap is not None:
+    if cap is not None and (sums > cap).any():
         for fan in np.flatnonzero((sums > cap).any(axis=0)).tolist():
             sums[:, fan] = _capped(gains[:, fan], int(before[fan]), cap)
     return sums
