@@ -219,7 +219,8 @@ class FanScorer:
 
     def _end_interval(self, period_ns: int) -> None:
         expected = self._interval_ns // period_ns
-        commissioning = np.any([self.residuals[source].baseline.is_commissioning for source in RESIDUALS], axis=0)
+        speed, balance = (self.residuals[source].baseline for source in RESIDUALS)
+        commissioning = speed.is_commissioning | balance.is_commissioning
         moving = self._movement.end_interval(commissioning) if self._movement else None
         for residual in self.residuals.values():
             residual.baseline.end_interval(expected, self._within_limit, self._below_half_limit, moving)

@@ -84,8 +84,10 @@ class Piece:
                 largest = np.where(ratios[number] > 1.0, number, largest)
         statistics = np.array([row.statistic for row in self.table])
         scores.statistic[:] = np.where(np.isnan(scores.score), Statistic.NONE, statistics[largest])
-        known = np.any([self.residuals[source].valid for source in in_use], axis=0)
-        scored_now = np.any([scored[source].scored for source in in_use], axis=0)
+        known, scored_now = np.zeros((2, *scores.score.shape), np.bool_)
+        for source in in_use:
+            known |= self.residuals[source].valid
+            scored_now |= scored[source].scored
         speed, balance = scored["speed"], scored["balance"]
         scores.commissioning[:] = known & ~scored_now
         scores.speed_smoothed[:], scores.speed_baseline[:] = smoothed["speed"], speed.baseline

@@ -81,6 +81,8 @@ class ScoredResidual:
     @classmethod
     def joined(cls, parts: Sequence[ScoredResidual]) -> ScoredResidual:
         """That of successive samples."""
+        if len(parts) == 1:
+            return parts[0]
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
 
 

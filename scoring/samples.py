@@ -49,7 +49,7 @@ def samples_of(prediction: Prediction) -> Samples:
     with np.errstate(all="ignore"):
         speed_residual = residual / prediction.sigma_rad_s
         balance = balance / prediction.torque_balance_sigma_command
-    balance_counts = np.isin(invalid_reason, (InvalidReason.NONE, InvalidReason.WARMING_UP, InvalidReason.OUT_OF_RANGE))
+    balance_counts = among(invalid_reason, InvalidReason.NONE, InvalidReason.WARMING_UP, InvalidReason.OUT_OF_RANGE)
     return Samples(
         t_ns=prediction.t_ns,
         period_ns=prediction.period_ns,
@@ -60,11 +60,19 @@ def samples_of(prediction: Prediction) -> Samples:
         balance_valid=balance_counts & np.isfinite(balance),
         command=prediction.command,
         predicted_rad_s=prediction.predicted_speed_rad_s,
-        idle=np.isin(invalid_reason, (InvalidReason.STOPPED, InvalidReason.STARTING)),
+        idle=among(invalid_reason, InvalidReason.STOPPED, InvalidReason.STARTING),
         missing=invalid_reason == InvalidReason.NO_SPEED,
         reading_missing=reading_missing_of(prediction),
-        alive=~np.isin(invalid_reason, (InvalidReason.GAP, InvalidReason.STALE)),
+        alive=~among(invalid_reason, InvalidReason.GAP, InvalidReason.STALE),
     )
+
+
+def among(values: Array, first: int, *others: int) -> Array:
+    """Where values are one of these; of small blocks faster than np.isin by several times."""
+    found: Array = values == first
+    for other in others:
+        found |= values == other
+    return found
 
 
 def reading_missing_of(prediction: Prediction) -> Array:

@@ -43,9 +43,24 @@ class ScoredBlock:
     @classmethod
     def empty(cls, n: int, rows: int, fans: int) -> ScoredBlock:
         """To be filled, with any values."""
-        flags, shape = ("commissioning", "judged", "balance_at_limit"), (n, fans)
-        columns = {name: np.empty(shape, np.bool_ if name in flags else np.float64) for name in cls.__annotations__}
-        return cls(**columns | {"statistic": np.empty(shape, np.uint8), "ratios": np.empty((n, rows, fans))})
+        shape = (n, fans)
+        return cls(
+            score=np.empty(shape),
+            statistic=np.empty(shape, np.uint8),
+            commissioning=np.empty(shape, np.bool_),
+            judged=np.empty(shape, np.bool_),
+            speed_smoothed=np.empty(shape),
+            speed_baseline=np.empty(shape),
+            balance_smoothed=np.empty(shape),
+            balance_baseline=np.empty(shape),
+            balance_expected=np.empty(shape),
+            balance_baseline_s=np.empty(shape),
+            balance_commissioned=np.empty(shape),
+            balance_at_limit=np.empty(shape, np.bool_),
+            speed_learned_scale=np.empty(shape),
+            balance_learned_scale=np.empty(shape),
+            ratios=np.empty((n, rows, fans)),
+        )
 
     def rows(self, rows: slice) -> ScoredBlock:
         """A part of the block; writing to it writes to the block."""

@@ -51,7 +51,7 @@ from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.fan_scorer import HALF_LIMIT, FanScorer
 from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
-from scoring.samples import samples_of
+from scoring.samples import among, samples_of
 from scoring.score_message import score_of
 from scoring.scored_block import ScoredBlock
 from scoring.snapshot_times import with_times_moved
@@ -356,13 +356,13 @@ class ScorerCore(Core):
                 item.t_ns[rows], item.period_ns, ratio, judged, scored.ratios[rows], speed[rows]
             )
             if self._holds:
-                in_alarm = (state[rows] == FanState.ALARM) | (state[rows] == FanState.RETURNING)
-                self._scorer.learn_nothing(was_active | self._alarms.active | in_alarm.any(axis=0))
+                in_alarm = among(state[rows], FanState.ALARM, FanState.RETURNING).any(axis=0)
+                self._scorer.learn_nothing(was_active | self._alarms.active | in_alarm)
             events += [replace(event, row=event.row + rows.start) for event in happened]
         return scored, state, events
 
     def _feed_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
-        unknown = np.isin(item.invalid_reason, (InvalidReason.GAP, InvalidReason.STALE))
+        unknown = among(item.invalid_reason, InvalidReason.GAP, InvalidReason.STALE)
         expected = np.where(np.isfinite(item.measured_speed_rad_s), scored.balance_expected, np.nan)
         self._diagnoser.take(
             item.t_ns,

@@ -29,7 +29,8 @@ class Movement(ColumnState):
     @staticmethod
     def samples(motion_rad_s: Array, speed_rad_s: Array) -> Array:
         """(2, n, fans) of samples (n, fans), to be added; speeds may be NaN, where the motion is 0."""
-        return np.stack((_fixed(motion_rad_s), _fixed(np.abs(np.nan_to_num(speed_rad_s)))))
+        speed_rad_s = np.where(np.isnan(speed_rad_s), 0.0, np.abs(speed_rad_s))
+        return _fixed(np.array((motion_rad_s, speed_rad_s)))
 
     def add(self, samples: Array) -> None:
         """Add samples, see `samples`, to the interval."""

@@ -72,9 +72,8 @@ class StandstillDetector(Detector):
         self._missing_limit_s: Array = settings.factor * (reach_s + MISSING_S)
         coast_limit_s = np.maximum(MARGIN * (healthy.coast_s or 0.0), least_s)
         self._coast_limit_s = settings.factor * coast_limit_s if healthy.coast_s is not None else np.inf + reach_s
-        self._driven_ns, self._turned_ns, self._stood_ns, self._silent_ns, self._ran_on_ns = np.zeros(
-            (5, context.fans), np.int64
-        )
+        self._lasted_ns = np.zeros((5, context.fans), np.int64)
+        """for how long the fan has been driven, turned, stood, given no reading, and turned although it is stopped"""
 
     def update(self, block: DetectorInput) -> Array:
         """See Detector."""
@@ -82,11 +81,19 @@ class StandstillDetector(Detector):
         drives, stops = healthy.drives(block.command), healthy.stops(block.command, speed)
         known, turns = np.isfinite(speed), healthy.turns(speed)
         count = _Durations(valid, block.period_ns)
-        driven = count.of(drives, ~drives, self._driven_ns)
-        turned = count.of(drives & turns & (driven >= self._started_ns), ~drives, self._turned_ns)
-        stood = count.of(drives & known & ~turns, ~drives | turns, self._stood_ns)
-        silent = count.of(drives & ~known, ~drives | known, self._silent_ns)
-        ran_on = count.of(stops & turns, ~stops | (known & ~turns), self._ran_on_ns)
+        driven = count.of(drives, ~drives, self._lasted_ns[0])
+        turned, stood, silent, ran_on = count.of(
+            np.array(
+                (
+                    drives & turns & (driven >= self._started_ns),
+                    drives & known & ~turns,
+                    drives & ~known,
+                    stops & turns,
+                )
+            ),
+            np.array((~drives, ~drives | turns, ~drives | known, ~stops | (known & ~turns))),
+            self._lasted_ns[1:],
+        )
         limit_s = np.where(turned > 0, self._lapse_limit_s, self._start_limit_s)
         of_driven = np.maximum(stood / limit_s, silent / self._missing_limit_s) / NS_PER_S
         of_stopped = ran_on / self._coast_limit_s / NS_PER_S
@@ -100,8 +107,7 @@ class StandstillDetector(Detector):
 
     def reset(self, fans: Array) -> None:
         """See Detector."""
-        for column in self.columns().values():
-            column[fans] = 0
+        self._lasted_ns[:, fans] = 0
 
     @property
     def memory_s(self) -> float:
@@ -115,13 +121,8 @@ class StandstillDetector(Detector):
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
-        return {
-            "driven_ns": self._driven_ns,
-            "turned_ns": self._turned_ns,
-            "stood_ns": self._stood_ns,
-            "silent_ns": self._silent_ns,
-            "ran_on_ns": self._ran_on_ns,
-        }
+        names = ("driven_ns", "turned_ns", "stood_ns", "silent_ns", "ran_on_ns")
+        return dict(zip(names, self._lasted_ns, strict=True))
 
     @classmethod
     def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
@@ -137,13 +138,14 @@ class _Durations:
         self._period_ns = period_ns
 
     def of(self, grows: Array, ends: Array, before_ns: Array) -> Array:
-        """(n, fans) ns: it grows with samples of `grows`, and begins again with those of `ends`; both (n, fans).
+        """(..., n, fans) ns: it grows with samples of `grows`, and begins again with those of `ends`; both as many.
 
-        before_ns: (fans,) after the last block, and after this one when it returns.
+        before_ns: (..., fans) after the last block, and after this one when it returns.
         """
-        grown: Array = np.cumsum(grows & self._valid, axis=0) * self._period_ns
+        grown: Array = (grows & self._valid).cumsum(axis=-2) * self._period_ns
         ended = ends & self._valid
-        at_end = np.maximum.accumulate(np.where(ended, grown, 0), axis=0)
-        duration = grown - at_end + np.where(np.logical_or.accumulate(ended, axis=0), 0, before_ns)
-        before_ns[:] = duration[-1]
+        at_end = np.maximum.accumulate(np.where(ended, grown, 0), axis=-2)
+        has_ended = np.logical_or.accumulate(ended, axis=-2)
+        duration = grown - at_end + np.where(has_ended, 0, before_ns[..., np.newaxis, :])
+        before_ns[:] = duration[..., -1, :]
         return duration
