@@ -8,6 +8,10 @@ import numpy as np
 
 from schemas.messages import Array, InvalidReason, Prediction
 
+BALANCE_COUNTS = tuple(map(int, (InvalidReason.NONE, InvalidReason.WARMING_UP, InvalidReason.OUT_OF_RANGE)))
+IDLE = tuple(map(int, (InvalidReason.STOPPED, InvalidReason.STARTING)))
+NOT_ARRIVED = tuple(map(int, (InvalidReason.GAP, InvalidReason.STALE)))
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Samples:
@@ -49,7 +53,7 @@ def samples_of(prediction: Prediction) -> Samples:
     with np.errstate(all="ignore"):
         speed_residual = residual / prediction.sigma_rad_s
         balance = balance / prediction.torque_balance_sigma_command
-    balance_counts = among(invalid_reason, InvalidReason.NONE, InvalidReason.WARMING_UP, InvalidReason.OUT_OF_RANGE)
+    balance_counts = among(invalid_reason, *BALANCE_COUNTS)
     return Samples(
         t_ns=prediction.t_ns,
         period_ns=prediction.period_ns,
@@ -60,11 +64,16 @@ def samples_of(prediction: Prediction) -> Samples:
         balance_valid=balance_counts & np.isfinite(balance),
         command=prediction.command,
         predicted_rad_s=prediction.predicted_speed_rad_s,
-        idle=among(invalid_reason, InvalidReason.STOPPED, InvalidReason.STARTING),
+        idle=among(invalid_reason, *IDLE),
         missing=invalid_reason == InvalidReason.NO_SPEED,
         reading_missing=reading_missing_of(prediction),
-        alive=~among(invalid_reason, InvalidReason.GAP, InvalidReason.STALE),
+        alive=arrived(invalid_reason),
     )
+
+
+def arrived(invalid_reason: Array) -> Array:
+    """Where samples arrived on the line."""
+    return ~among(invalid_reason, *NOT_ARRIVED)
 
 
 def among(values: Array, first: int, *others: int) -> Array:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -155,14 +154,8 @@ def filter_rows(keep: float, rows: Array, state: Array) -> tuple[Array, Array]:
     # a process that only shows alarms never filters, and this import takes longer than all its others
     from scipy.signal import lfilter  # noqa: PLC0415
 
-    made: Any = lfilter(*_coefficients(keep), rows, axis=0, zi=state)
+    made: Any = lfilter([1.0 - keep], [1.0, -keep], rows, axis=0, zi=state)
     return made[0], made[1]
-
-
-@cache
-def _coefficients(keep: float) -> tuple[Array, Array]:
-    """Of inputs and outputs, as arrays: `lfilter` spends much of a short block's time on making them from lists."""
-    return np.array((1.0 - keep, 0.0)), np.array((1.0, -keep))
 
 
 def stretches(flags: Array) -> Sequence[slice]:

@@ -33,7 +33,6 @@ from schemas.messages import (
     Alarm,
     Array,
     FanState,
-    InvalidReason,
     Prediction,
     Request,
     Score,
@@ -43,7 +42,7 @@ from schemas.messages import (
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.alarms.alarm_manager import AlarmContext, AlarmManager
 from scoring.alarms.alarm_text import AlarmText
-from scoring.alarms.fan_condition import ConditionSettings
+from scoring.alarms.fan_condition import ALARM, RETURNING, ConditionSettings
 from scoring.alarms.holding import holding_detectors
 from scoring.alarms.tray_conditions import AlarmEvent
 from scoring.alarms.unscored_monitor import UnscoredMonitor
@@ -51,7 +50,7 @@ from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.fan_scorer import HALF_LIMIT, FanScorer
 from scoring.former_snapshot_keys import FORMER_SCORER_KEYS, current_keys
-from scoring.samples import among, samples_of
+from scoring.samples import among, arrived, samples_of
 from scoring.score_message import score_of
 from scoring.scored_block import ScoredBlock
 from scoring.snapshot_times import with_times_moved
@@ -356,18 +355,18 @@ class ScorerCore(Core):
                 item.t_ns[rows], item.period_ns, ratio, judged, scored.ratios[rows], speed[rows]
             )
             if self._holds:
-                in_alarm = among(state[rows], FanState.ALARM, FanState.RETURNING).any(axis=0)
+                in_alarm = among(state[rows], ALARM, RETURNING).any(axis=0)
                 self._scorer.learn_nothing(was_active | self._alarms.active | in_alarm)
             events += [replace(event, row=event.row + rows.start) for event in happened]
         return scored, state, events
 
     def _feed_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
-        unknown = among(item.invalid_reason, InvalidReason.GAP, InvalidReason.STALE)
+        command = item.averaged_command if len(item.averaged_command) else item.command
         expected = np.where(np.isfinite(item.measured_speed_rad_s), scored.balance_expected, np.nan)
         self._diagnoser.take(
             item.t_ns,
             item.period_ns,
-            np.where(unknown, np.nan, item.averaged_command if len(item.averaged_command) else item.command),
+            np.where(arrived(item.invalid_reason), command, np.nan),
             item.measured_speed_rad_s,
             scored.balance_baseline * item.torque_balance_sigma_command,
             scored.balance_baseline_s,
