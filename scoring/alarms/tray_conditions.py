@@ -77,7 +77,8 @@ class TrayConditions:
         events: list[AlarmEvent] = []
         too_short = 0
         busy = self._not_normal | ((ratio > 1) & valid).any(axis=0)
-        for fan in np.flatnonzero(busy | (self._shelved_until_t_ns <= t_ns[-1])).tolist():
+        unshelved = self._shelved_until_t_ns <= t_ns[-1]
+        for fan in np.flatnonzero(busy | unshelved).tolist():
             condition = self._conditions[fan]
             rows = np.flatnonzero(valid[:, fan]) if busy[fan] else np.zeros(0, np.intp)
             evidence: dict[int, ReturnEvidence] = {}
@@ -88,10 +89,9 @@ class TrayConditions:
             steps = [(row, _SAMPLE) for row in rows.tolist()]
             if busy[fan]:
                 steps += [(row, _DATA_LOST) for row in self._data_lost_rows(fan, t_ns, rows)]
-            steps.append((int(np.searchsorted(t_ns, self._shelved_until_t_ns[fan])), _UNSHELVE))
+            if unshelved[fan]:
+                steps.append((int(np.searchsorted(t_ns, self._shelved_until_t_ns[fan])), _UNSHELVE))
             for row, step in sorted(steps):
-                if row == len(t_ns):
-                    break
                 before = condition.fan_state
                 if step == _DATA_LOST:
                     transitions = condition.lose_data()
@@ -112,6 +112,8 @@ class TrayConditions:
         """At which rows a fan has been without a valid sample for too long; rows: those with one."""
         limit_ns = self._settings.data_lost_after_ns
         if limit_ns is None or self._last_valid_t_ns[fan] == NEVER_NS:
+            return []
+        if t_ns[-1] - self._last_valid_t_ns[fan] <= limit_ns:
             return []
         since_t_ns = np.concatenate((self._last_valid_t_ns[fan : fan + 1], t_ns[rows]))
         lost = np.searchsorted(t_ns, since_t_ns + limit_ns, side="right")

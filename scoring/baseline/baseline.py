@@ -126,7 +126,7 @@ class Baseline(ColumnState):
         counts, is_set, commissioning = np.maximum(self._counts, 1), self.is_set, self.is_commissioning
         product, information, square = self._sums / counts / FIXED_POINT_ONE
         mean = product / np.maximum(information + self._settings.ridge, MIN_INFORMATION)
-        seen = (self._counts >= MIN_VALID_SHARE * samples) & (self._counts > 0)
+        seen = self._counts >= max(MIN_VALID_SHARE * samples, 1)
         good = seen & np.where(commissioning, within_limit, below_half_limit)
         if not is_set.all():
             explained = product * product / np.maximum(information, MIN_INFORMATION)
