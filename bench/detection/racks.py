@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bench.detection.metrics import Event
 from bench.detection.plant import START_NS
-from pipeline.cli.watch.excitation import LEVELS, SHORT_LEVELS
+from pipeline.cli.watch.excitation import LEVELS, SHORT_LEVELS, levels_of
 from schemas.messages import Array, Raw
 from schemas.tacho import Tacho
 from schemas.units import NS_PER_S
@@ -125,11 +125,14 @@ def events(faults: list[Fault]) -> list[Event]:
     ]
 
 
-def swept_duty(t_s: float) -> float:
-    """The duty of all fans of a rack under `fantwin sweep`, from 0 to 1: its levels, held long and short in turn."""
+def swept_duty(t_s: float) -> Array:
+    """(RACK_FANS,) of a rack under `fantwin sweep`, from 0 to 1: its levels, held long and short in turn."""
     into_s = t_s % (len(LEVELS) * SETTLED_S + len(SHORT_LEVELS) * SHORT_S)
     held = int(into_s / SETTLED_S)
-    return LEVELS[held] if held < len(LEVELS) else SHORT_LEVELS[int((into_s - len(LEVELS) * SETTLED_S) / SHORT_S)]
+    levels, step = LEVELS, held
+    if held >= len(LEVELS):
+        levels, step = SHORT_LEVELS, int((into_s - len(LEVELS) * SETTLED_S) / SHORT_S)
+    return np.array([levels_of(levels, fan)[step] for fan in range(RACK_FANS)])
 
 
 def reports(
@@ -175,7 +178,8 @@ class _Course:
         duty, before, after, shown_from_s, missing = (np.empty(shape) for _ in range(5))
         for row in range(shape[0]):
             start_s = self._step * STEP_S
-            duty[row] = swept_duty(start_s) if self._is_swept else self._of.thermostat.command(start_s)
+            swept = self._is_swept
+            duty[row] = np.resize(swept_duty(start_s), shape[1]) if swept else self._of.thermostat.command(start_s)
             self._set_faults(start_s)
             missing[row] = self._missing
             before[row] = self._tacho.reading_rad_s

@@ -30,6 +30,15 @@ _NOISE_SIGMAS = 5.0  # a smaller change may be noise
 _TOLERANCE = 0.02  # of the range: a device rounds its commands
 
 
+def levels_of(levels: Sequence[float], place: int) -> tuple[float, ...]:
+    """The levels in the order of a fan, by its place among those that are moved: each begins a step later.
+
+    High and low levels alternate, so the load of the fans' supply hardly changes with the speed of any one of them.
+    """
+    first = place % len(levels)
+    return (*levels[first:], *levels[:first])
+
+
 class Observed(NamedTuple):
     """Samples since a moment. t_s: (n,), since that moment. command, speed_rad_s: (n, fans)."""
 
@@ -81,23 +90,25 @@ class Excitation:
         slowest_s = np.nanmax([*time_constants_s.values(), SHORTEST_S / SETTLING])
         steps = list(self._steps(float(slowest_s)))
         left_s = sum(hold_s for _, hold_s in steps)
-        for number, (command, hold_s) in enumerate(steps, 1):
-            self.progress(f"step {number} of {len(steps)}: command {command:g} for {hold_s:.1f} s, {left_s:.0f} s left")
-            self.line.send(dict.fromkeys(self.fans, command))
+        for number, (commands, hold_s) in enumerate(steps, 1):
+            shown = f"{min(commands):g}" if len(set(commands)) == 1 else f"{min(commands):g} to {max(commands):g}"
+            self.progress(f"step {number} of {len(steps)}: command {shown} for {hold_s:.1f} s, {left_s:.0f} s left")
+            self.line.send(dict(zip(self.fans, commands, strict=True)))
             self._wait(hold_s)
-            self._check_obeyed(command)
+            self._check_obeyed(np.array(commands))
             left_s -= hold_s
         return time_constants_s
 
-    def _steps(self, slowest_s: float) -> Iterator[tuple[float, float]]:
-        """Command and duration, s, of each step."""
+    def _steps(self, slowest_s: float) -> Iterator[tuple[list[float], float]]:
+        """Commands of the fans and duration, s, of each step."""
         long_s = min(max(SETTLING * slowest_s, SHORTEST_S), LONGEST_S)
         short_s = min(max(slowest_s, SHORTEST_S), LONGEST_S)
         for number in range(self.rounds):
             order = -1 if number % 2 else 1
             for levels, hold_s in ((LEVELS, long_s), (SHORT_LEVELS, short_s)):
-                for level in levels[::order]:
-                    yield self.low + level * (self.high - self.low), hold_s
+                of_each_fan = (levels_of(levels[::order], place) for place in range(len(self.fans)))
+                for of_fans in zip(*of_each_fan, strict=True):
+                    yield [self.low + level * (self.high - self.low) for level in of_fans], hold_s
 
     def _time_constants(self) -> dict[int, float]:
         """The longer one of each fan, of a step up and one down over the whole range."""
@@ -127,7 +138,7 @@ class Excitation:
             seen = self.line.observed()
             if waited_s >= SHORTEST_PROBE_S and has_settled(seen.t_s, seen.speed_rad_s[:, self.fans]):
                 break
-        self._check_obeyed(command)
+        self._check_obeyed(np.full(len(self.fans), command))
         seen = self.line.observed()
         return time_constants(seen.t_s, seen.speed_rad_s[:, self.fans])
 
@@ -135,15 +146,17 @@ class Excitation:
         if self.line.wait(seconds):
             raise StoppedError
 
-    def _check_obeyed(self, command: float) -> None:
+    def _check_obeyed(self, commands: Array) -> None:
         applied = self.line.observed().command
         if not len(applied):
             raise UserError("no sample arrives any more: see acquisition in `fantwin status`")
-        wrong = np.abs(applied[-1, self.fans] - command) > _TOLERANCE * (self.high - self.low)
+        wrong = np.abs(applied[-1, self.fans] - commands) > _TOLERANCE * (self.high - self.low)
         if wrong.any():
-            fan = self.fans[int(np.argmax(wrong))]
+            place = int(np.argmax(wrong))
+            fan = self.fans[place]
             raise UserError(
-                f"fan {fan} has command {applied[-1, fan]:g} and not {command:g}: something else sets it; stop that"
+                f"fan {fan} has command {applied[-1, fan]:g} and not {commands[place]:g}: something else sets it; "
+                "stop that"
             )
 
 

@@ -32,7 +32,7 @@ _FIRST_SAMPLE_S = 5.0
 def sweep(
     config: ConfigOption = DEFAULT_CONFIG,
     tray: Annotated[str | None, typer.Option(help="The tray; required if there are several.")] = None,
-    fans: Annotated[str, typer.Option(metavar="all|N,N,...", help="The fans that are moved, together.")] = "all",
+    fans: Annotated[str, typer.Option(metavar="all|N,N,...", help="The fans that are moved.")] = "all",
     low: Annotated[float | None, typer.Option(help="Lowest command; without it command_min of the tray.")] = None,
     high: Annotated[float | None, typer.Option(help="Highest command; without it command_max of the tray.")] = None,
     safe: Annotated[
@@ -45,7 +45,8 @@ def sweep(
 ) -> None:
     """Move the commands of all fans over their range while `fantwin up` records: levels up and down, long and short.
 
-    Two steps over the whole range show the time constants of the fans; each level then lasts five of the longest. At
+    Two steps over the whole range show the time constants of the fans; each level then lasts five of the longest. Each
+    fan has the levels in another order, so that the load of their supply is not that of any one of them. At
     the end, after Ctrl-C and after an error the fans get a safe command. Nothing else may set the commands meanwhile.
 
     Example: fantwin sweep -c fantwin.toml --fans all --low 0.2

@@ -88,6 +88,17 @@ def test_all_levels_of_the_range_are_passed_and_none_outside() -> None:
     assert len(set(np.round(values, 3))) >= 15
 
 
+@pytest.mark.parametrize("fans", [2, 3, 4, 5, 6, 7, 8])
+def test_the_load_of_all_fans_does_not_follow_any_one_of_them(fans: int) -> None:
+    line = FirstOrderFans([0.5] * fans)
+    swept(line)
+    commands = np.array([[sent[fan] for fan in range(fans)] for _, sent in line.sent[3:]])
+    for levels, rows in ((LEVELS, slice(len(LEVELS))), (SHORT_LEVELS, slice(len(LEVELS), None))):
+        for of_fan in commands[rows].T:
+            assert sorted(of_fan) == pytest.approx(sorted(0.2 + 0.8 * level for level in levels))
+        assert commands[rows].mean(axis=1).std() < 0.6 * commands[rows, 0].std()
+
+
 def test_ctrl_c_ends_it_at_once() -> None:
     line = FirstOrderFans([1.0], stop_after_s=20.0)
     with pytest.raises(StoppedError):
