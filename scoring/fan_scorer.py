@@ -166,7 +166,7 @@ class FanScorer:
     def recommission(self, fans: Array) -> None:
         """Learn new baselines for some fans, (fans,) of bool."""
         for residual in self.residuals.values():
-            residual.baseline.restart(fans)
+            residual.restart(fans)
             residual.reset(fans)
         for detector in self.detectors.values():
             detector.reset(fans)
@@ -223,7 +223,7 @@ class FanScorer:
         commissioning = speed.is_commissioning | balance.is_commissioning
         moving = self._movement.end_interval(commissioning) if self._movement else None
         for residual in self.residuals.values():
-            residual.baseline.end_interval(expected, self._within_limit, self._below_half_limit, moving)
+            residual.end_interval(expected, self._within_limit, self._below_half_limit, moving)
         self._below_half_limit[:] = self._within_limit[:] = True
 
     def _memories_ns(self) -> list[tuple[int, Callable[[Array], None], int]]:
@@ -258,13 +258,16 @@ class FanScorer:
         motion_rad_s = self._motion.update(speed_rad_s, period_s)
         transient_rad_s = np.abs(motion_rad_s)
         values = {"speed": samples.speed_residual, "balance": samples.balance}
+        sigma = {"speed": samples.speed_sigma_rad_s, "balance": samples.balance_sigma}
         valid = {"speed": samples.speed_valid, "balance": samples.balance_valid}
         piece = Piece(
             samples=samples,
             transient_rad_s=transient_rad_s,
             movement=self._movement.samples(motion_rad_s, speed_rad_s) if self._movement else None,
             residuals={
-                source: residual.samples(values[source], valid[source], speed_rad_s, transient_rad_s, period_s)
+                source: residual.samples(
+                    values[source], sigma[source], valid[source], speed_rad_s, transient_rad_s, period_s
+                )
                 for source, residual in self.residuals.items()
             },
             table=self._rows,

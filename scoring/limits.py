@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny, ValidationErr
 from pydantic_core import PydanticCustomError
 
 from scoring.baseline.healthy_residual import HealthyResidual
+from scoring.baseline.shared_offset import LEAST_FANS
 from scoring.detectors.detector import DetectorSettings, Signal
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import rows
@@ -21,6 +22,7 @@ from scoring.former_limits import FORMER_FORMAT_VERSION, upgraded
 
 FORMAT_VERSION = 2
 NEVER_S = 1e9
+ADAPTATION_BESIDE_OTHERS_S = 300.0
 Settings = TypeVar("Settings", bound=DetectorSettings)
 
 
@@ -35,6 +37,13 @@ class Timing(_Entry):
     baseline_s: float = Field(default=1.0, gt=0, description="length of an interval that a baseline is learned from")
     adaptation_s: float = Field(default=60.0, gt=0, description="time constant of the baseline in the long run")
     on_delay_s: float = Field(default=0.1, ge=0, description="how long a limit must be exceeded to raise an alarm")
+
+
+def default_timing(fans: int) -> Timing:
+    """Of a tray of so many fans. What they share is followed apart (scoring.baseline.shared_offset); the rest of a
+    healthy offset changes slowly, and a baseline that followed faster would follow a fan that clogs.
+    """
+    return Timing(adaptation_s=ADAPTATION_BESIDE_OTHERS_S) if fans >= LEAST_FANS else Timing()
 
 
 class DeclaredRate(_Entry):

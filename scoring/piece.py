@@ -94,6 +94,7 @@ class Piece:
         scores.speed_learned_scale[:] = speed.learned_scale
         scores.balance_smoothed[:], scores.balance_baseline[:] = smoothed["balance"], balance.baseline
         scores.balance_learned_scale[:] = balance.learned_scale
+        scores.balance_shared[:] = balance.shared
         scores.balance_expected[:] = self.residuals["balance"].expected
         scores.balance_baseline_s[:] = balance.independent_intervals * baseline_s
         scores.balance_commissioned[:], scores.balance_at_limit[:] = balance.commissioned, balance.at_limit

@@ -11,6 +11,7 @@ import numpy as np
 from schemas.messages import Array
 from scoring.baseline.baseline import Baseline
 from scoring.baseline.healthy_residual import FanOffsets
+from scoring.baseline.shared_offset import LEAST_FANS, SharedOffset
 from scoring.baseline.speed_scaling import speed_scaling
 from scoring.detectors.detector import DetectorContext, Signal
 from scoring.detectors.deviation import smoothed_deviation
@@ -43,6 +44,8 @@ class ResidualSamples:
     """how far samples count, standard deviations"""
     reach: Array
     """how far from the baseline they are learned, sigma"""
+    speed_sigmas: Array
+    """the speed over sigma, with its sign: a shared offset is in proportion to it"""
 
     def rows(self, rows: slice) -> ResidualSamples:
         """Some of the samples."""
@@ -55,6 +58,7 @@ class ResidualSamples:
             self.low_frequency_std[rows],
             self.clip,
             self.reach[rows],
+            self.speed_sigmas[rows],
         )
 
 
@@ -70,7 +74,9 @@ class ScoredResidual:
     shift: Array
     """the residual less the expected one and the baseline, sigma; 0 where not scored"""
     baseline: Array
-    """at this speed, sigma"""
+    """at this speed, sigma, with what the fans share"""
+    shared: Array
+    """that part of it"""
     commissioned: Array
     """the same at the end of commissioning; NaN before"""
     independent_intervals: Array
@@ -103,6 +109,10 @@ class Residual:
         self._reference_sigmas = drift.reference_sigmas if drift else DEFAULT_REFERENCE_SIGMAS
         intervals = max(limits.timing.adaptation_s / limits.timing.baseline_s, 1.0)
         self.baseline = Baseline(fans, healthy.baseline, intervals, healthy.mean_residual_std)
+        self._shared = None
+        if healthy.shared_limit and fans >= LEAST_FANS:
+            timing, std = limits.timing, healthy.mean_residual_std
+            self._shared = SharedOffset(fans, healthy.shared_limit, timing.baseline_s, timing.adaptation_s, std)
         self._low_pass = LowPass(fans, self._smoothing_s)
 
     def context(self, fans: int, *, capped: bool) -> DetectorContext:
@@ -116,9 +126,17 @@ class Residual:
         )
 
     def samples(
-        self, values: Array, valid: Array, speed_rad_s: Array, transient_rad_s: Array, period_s: float
+        self,
+        values: Array,
+        sigma: Array,
+        valid: Array,
+        speed_rad_s: Array,
+        transient_rad_s: Array,
+        period_s: float,
     ) -> ResidualSamples:
-        """What of samples does not depend on the baselines. All (n, fans); values: the residual, sigma."""
+        """What of samples does not depend on the baselines. All (n, fans); values: the residual, sigma; sigma: in the
+        unit of the residual.
+        """
         expected, scaling = self._expected(speed_rad_s), speed_scaling(self._healthy.baseline, speed_rad_s, valid)
         std, clip = self._residual_std(speed_rad_s, valid), self._clip(period_s)
         return ResidualSamples(
@@ -130,6 +148,9 @@ class Residual:
             low_frequency_std=self._low_frequency_std(speed_rad_s, transient_rad_s, valid),
             clip=clip,
             reach=self._healthy.baseline.commissioning_limit_sigmas * scaling + clip * std,
+            speed_sigmas=np.divide(speed_rad_s, sigma, out=np.zeros(valid.shape), where=valid).clip(
+                -LARGEST_SIGMAS, LARGEST_SIGMAS
+            ),
         )
 
     def score(self, of: ResidualSamples) -> ScoredResidual:
@@ -138,14 +159,16 @@ class Residual:
         Samples far from the baseline are clipped, so that one outlier does not move it.
         """
         baseline, shape = self.baseline, of.valid.shape
-        at_speed, scored, learned_scale = (
-            baseline.value * of.scaling,
-            of.valid & baseline.is_set,
-            baseline.learned_scale,
-        )
-        learned = np.where(of.valid, of.residual, at_speed).clip(at_speed - of.reach, at_speed + of.reach)
+        own, scored, learned_scale = baseline.value * of.scaling, of.valid & baseline.is_set, baseline.learned_scale
+        shared, residual = np.zeros(shape), of.residual
+        if self._shared:
+            shared = self._shared.at(of.speed_sigmas)
+            residual = residual - shared
+            commissioned = baseline.commissioned * of.scaling
+            self._shared.add(of.residual - commissioned, of.speed_sigmas, scored & ~baseline.is_commissioning)
+        learned = np.where(of.valid, residual, own).clip(own - of.reach, own + of.reach)
         baseline.add(learned, of.valid, of.scaling)
-        shift = np.where(scored, of.residual - at_speed, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
+        shift = np.where(scored, residual - own, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
         standardised = shift / of.std
         persistent = standardised / self._persistent_std(of.low_frequency_std, of.scaling, learned_scale)
         return ScoredResidual(
@@ -153,12 +176,26 @@ class Residual:
             standardised=standardised.clip(-of.clip, of.clip),
             persistent=persistent.clip(-of.clip, of.clip),
             shift=shift,
-            baseline=at_speed,
+            baseline=own + shared,
+            shared=shared,
             commissioned=np.where(baseline.is_commissioning, np.nan, baseline.commissioned * of.scaling),
             independent_intervals=np.full(shape, baseline.independent_intervals),
             at_limit=np.full(shape, baseline.is_at_limit),
             learned_scale=np.full(shape, learned_scale),
         )
+
+    def end_interval(self, samples: int, within_limit: Array, below_half_limit: Array, moving: Array | None) -> None:
+        """End the interval; see Baseline.end_interval."""
+        if self._shared:
+            alone = self._shared.end_interval(samples, below_half_limit, moving)
+            below_half_limit = below_half_limit & ~alone
+        self.baseline.end_interval(samples, within_limit, below_half_limit, moving)
+
+    def restart(self, fans: Array) -> None:
+        """Commission some fans again, (fans,) of bool."""
+        self.baseline.restart(fans)
+        if self._shared:
+            self._shared.restart(fans)
 
     def smooth(self, of: ScoredResidual, period_s: float) -> Array:
         """(n, fans) the low-passed residual less its baseline, sigma, as displayed; NaN where not scored."""
@@ -204,12 +241,18 @@ class Residual:
 
     def snapshot(self) -> dict[str, Any]:
         """The state as JSON can hold it."""
-        return {"baseline": self.baseline.snapshot(), "low_pass": self._low_pass.snapshot()}
+        return {
+            "baseline": self.baseline.snapshot(),
+            "low_pass": self._low_pass.snapshot(),
+            **({"shared": self._shared.snapshot()} if self._shared else {}),
+        }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a snapshot. Raises as ColumnState.restore does."""
         self.baseline.restore(state["baseline"])
         self._low_pass.restore(state["low_pass"])
+        if self._shared and "shared" in state:
+            self._shared.restore(state["shared"])
 
     def _clip(self, period_s: float) -> float:
         deviation = smoothed_deviation(self._smoothing_s, self._healthy.autocorrelation_time_s, period_s)

@@ -22,8 +22,12 @@ class Samples:
     speed_rad_s: Array
     speed_residual: Array
     speed_valid: Array
+    speed_sigma_rad_s: Array
+    """the sigma of the speed residual"""
     balance: Array
     balance_valid: Array
+    balance_sigma: Array
+    """that of the torque balance, in the unit of the command"""
     command: Array
     predicted_rad_s: Array
     """what a healthy fan would read; NaN without a free run"""
@@ -60,8 +64,10 @@ def samples_of(prediction: Prediction) -> Samples:
         speed_rad_s=prediction.measured_speed_rad_s,
         speed_residual=speed_residual,
         speed_valid=prediction.valid & np.isfinite(speed_residual),
+        speed_sigma_rad_s=np.broadcast_to(prediction.sigma_rad_s, residual.shape),
         balance=balance,
         balance_valid=balance_counts & np.isfinite(balance),
+        balance_sigma=np.broadcast_to(prediction.torque_balance_sigma_command, residual.shape),
         command=prediction.command,
         predicted_rad_s=prediction.predicted_speed_rad_s,
         idle=among(invalid_reason, *IDLE),

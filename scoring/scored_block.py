@@ -30,6 +30,8 @@ class ScoredBlock:
     """the expected residual at this speed, to which the baseline is added"""
     balance_baseline_s: Array
     """seconds of healthy data whose mean would vary as much as the baseline; 0: there is none yet"""
+    balance_shared: Array
+    """what of the baseline the fans of the tray have in common"""
     balance_commissioned: Array
     """the baseline at the end of commissioning; NaN before"""
     balance_at_limit: Array
@@ -55,6 +57,7 @@ class ScoredBlock:
             balance_baseline=np.empty(shape),
             balance_expected=np.empty(shape),
             balance_baseline_s=np.empty(shape),
+            balance_shared=np.empty(shape),
             balance_commissioned=np.empty(shape),
             balance_at_limit=np.empty(shape, np.bool_),
             speed_learned_scale=np.empty(shape),

@@ -385,6 +385,7 @@ class ScorerCore(Core):
             eligible=(scored.score < HALF_LIMIT) & normal & known,
             disturbed=(scored.score >= HALF_LIMIT) | ~(normal | (state == FanState.UNKNOWN)),
             commissioned_command=scored.balance_commissioned * sigma_command,
+            shared_command=scored.balance_shared * sigma_command,
             held=scored.balance_at_limit,
             limit_command=self._scorer.persistent_limit_sigmas("balance", period_s) * sigma_command,
         )

@@ -77,7 +77,8 @@ def calibrated_twin(
         runs.append(HealthyRun(path.stem, fans, blocks, range(fans) if known.fans > 1 else None, known.card.tacho))
     timing = HealthyRuns(recordings, twin, (), lambda _: None).timing()
     top_speed_rad_s = known.card.top_speed_rad_s
-    limits = calibrate(lambda: runs, top_speed_rad_s, timing, alarms_per_day, 0, extrapolate, known.bend_rad_s)
+    bend_rad_s, has_drive = known.bend_rad_s, known.card.drive is not None
+    limits = calibrate(lambda: runs, top_speed_rad_s, timing, alarms_per_day, 0, extrapolate, bend_rad_s, has_drive)
     output.write_bytes(with_calibration(twin.read_bytes(), json.loads(limits.model_dump_json())))
 
 

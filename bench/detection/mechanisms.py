@@ -60,16 +60,16 @@ def _no_mean(over_speed: Any) -> Any:
 
 
 def _level_over_speed(_: Any) -> Any:
-    return lambda _runs, _limits, found, _crossover: (found, {source: {} for source in RESIDUALS})
+    return lambda _runs, _limits, found, _crossover, **_has_drive: (found, {source: {} for source in RESIDUALS})
 
 
 def _no_crossover(over_speed: Any) -> Any:
-    return lambda runs, limits, found, _: over_speed(runs, limits, found, None)
+    return lambda runs, limits, found, _, **has_drive: over_speed(runs, limits, found, None, **has_drive)
 
 
 def _no_ridge(over_speed: Any) -> Any:
-    def unshrunk(*args: Any) -> Any:
-        found, settings = over_speed(*args)
+    def unshrunk(*args: Any, **has_drive: bool) -> Any:
+        found, settings = over_speed(*args, **has_drive)
         return found, {s: {**of, "ridge": 0.0} if "ridge" in of else of for s, of in settings.items()}
 
     return unshrunk
@@ -264,6 +264,11 @@ MECHANISMS: Sequence[Mechanism] = (
         "faster-adaptation",
         "baselines adapt faster to speeds above those that they were learned at",
         ((f"{_BASELINE}:FASTER_INFORMATION", _by(1e300)),),
+    ),
+    Mechanism(
+        "shared-offset",
+        "what the fans of a tray have in common is subtracted",
+        ((f"{_CALIBRATION}:_with_shared", _first_argument),),
     ),
     Mechanism(
         "adaptation",

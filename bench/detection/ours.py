@@ -20,12 +20,20 @@ from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.messages import Alarm, Array, Prediction, Score
 from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import HealthyRun
-from scoring.limits import Limits, Timing
+from scoring.limits import Limits, default_timing
 from scoring.samples import Samples, samples_of
 from twin.export.calibrated import with_calibration
 
 NAME = "fantwin"
-COLUMNS = ("speed_rad_s", "speed_residual", "balance", "command", "predicted_rad_s")
+COLUMNS = (
+    "speed_rad_s",
+    "speed_residual",
+    "speed_sigma_rad_s",
+    "balance",
+    "balance_sigma",
+    "command",
+    "predicted_rad_s",
+)
 FLAGS = ("speed_valid", "balance_valid", "missing", "reading_missing", "idle", "alive")
 
 
@@ -112,7 +120,7 @@ def calibrated_twins(
     limits = calibrate(
         healthy,
         max(twin.card.top_speed_rad_s for twin in known),
-        Timing(),
+        default_timing(min(run.fans for run in healthy())),
         alarms_per_day,
         extrapolate=extrapolate,
         crossover_speed_rad_s=float(np.median(bends)) if len(bends) == len(known) else None,

@@ -55,6 +55,12 @@ class HealthyResidual(BaseModel):
         "that at constant speed; null: motion does not change it",
     )
     autocorrelation_time_s: float = Field(default=0.0, ge=0, description="of the residual; 0: white")
+    shared_limit: float = Field(
+        default=0.0,
+        ge=0,
+        description="largest offset that the fans of a tray may share without an alarm, for each rad/s of their speed, "
+        "in the unit of the residual; 0: none",
+    )
     baseline: BaselineSettings = Field(default=BaselineSettings(), description="of the fan's own offset")
 
     @property

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -19,6 +20,7 @@ from scipy.stats import chi2
 from schemas.messages import Array
 from scoring.baseline.fan_offsets import fan_offsets
 from scoring.baseline.healthy_residual import HealthyResidual
+from scoring.baseline.shared_offset import LEAST_FANS
 from scoring.calibration.alarm_rate import rate_interval
 from scoring.calibration.healthy_statistics import HealthyStatistics, Runs, healthy_statistics, truncate_runs
 from scoring.calibration.healthy_variation import (
@@ -46,10 +48,12 @@ MIN_WINDOWS = 6
 WINDOWS_OF_BLOCK = 6  # a minute
 MAX_ALARM_SHARE = 0.25  # share of the windows: with more of them the limits would be within the noise
 MIN_LEVEL = 0.1 / UNREACHED
-SECONDS_QUANTILE = 0.999  # quantile of one-second means: a shift that is exceeded more often is not a drift
+MEANS_QUANTILE = 0.999  # of means over a second or ten counts: a shift that is exceeded more often is not a drift
 SEEN_WINDOWS = 50.0  # with an alarm, to count how often statistics alarm together
 CONFIDENCE = 0.95
-INDEPENDENT_S = 20.0  # so far apart, errors of a twin are taken to be independent: commands are held for a while
+VISITED_S = 20.0  # a fan that turned at a speed for so long has shown the error of its twin there
+SHARED_SHARE = 0.03  # of the speed, or of the command: as the air of a room and a supply vary
+LEAST_VISITED = 8  # limits beyond those of so few would find nothing
 ROUNDING = 1e-9
 
 
@@ -93,10 +97,12 @@ def calibrate(
     seed: int = 0,
     extrapolate: bool = False,
     crossover_speed_rad_s: float | None = None,
+    has_drive: bool = False,
 ) -> Limits:
     """Limits with a declared number of false alarms per fan and day.
 
     crossover_speed_rad_s: viscous / (2 drag) of the fans, see scoring.baseline.speed_scaling; None: not known.
+    has_drive: the fans have a drive of their own, see twin.models.drive.
 
     Raises:
         TooLittleError: the runs are too short for the rate, and extrapolate is not set; or too short for any limit.
@@ -119,9 +125,10 @@ def calibrate(
             raise FragmentedError(source, float(moments.count.sum()) * found.period_s)
     target = min(false_alarms_per_day / DAY_S * found.fan_s / found.windows, MAX_ALARM_SHARE)
     limits = _with(limits, LimitRule.FIXED, lambda row, settings: settings.fixed(found.observed[row.name]))
+    limits = _with_shared(limits, found)
     is_long = found.fan_s > VARIATION_FAN_S
     part = truncate_runs(runs, len(found.maxima), VARIATION_FAN_S) if is_long else runs
-    limits = _with_variation(part, limits, found, crossover_speed_rad_s)
+    limits = _with_variation(part, limits, found, crossover_speed_rad_s, has_drive=has_drive)
     limits = _with_rough_limits(part, limits, target / len(_rows_by_rarity()), top_speed_rad_s)
     found = healthy_statistics(runs, limits, top_speed_rad_s)
     factors = _factors(found, target)
@@ -138,8 +145,17 @@ def calibrate(
     return Limits.model_validate(limits.model_copy(update={"declared_rate": rate}).model_dump())
 
 
+def _with_shared(limits: Limits, found: HealthyStatistics) -> Limits:
+    """Limits that allow for what fans of one tray share, where there are several."""
+    if not any(run.statistics.shape[2] >= LEAST_FANS for run in found.maxima):
+        return limits
+    command_of_speed = found.command_sum / max(found.speed_sum_rad_s, 1e-9)
+    most: dict[Signal, float] = {"speed": SHARED_SHARE, "balance": SHARED_SHARE * command_of_speed}
+    return _each(limits, lambda residual, source: residual.model_copy(update={"shared_limit": most[source]}))
+
+
 def _with_variation(
-    runs: Runs, limits: Limits, found: HealthyStatistics, crossover_speed_rad_s: float | None
+    runs: Runs, limits: Limits, found: HealthyStatistics, crossover_speed_rad_s: float | None, *, has_drive: bool
 ) -> Limits:
     """Limits with the variation of the residuals. found: of all runs, with limits that nothing reaches.
 
@@ -148,13 +164,14 @@ def _with_variation(
     top_speed_rad_s, moments = found.top_speed_rad_s, found.moments
     offsets = {s: fan_offsets(moments[s].cells, found.centres_rad_s, found.period_s) for s in RESIDUALS}
     limits = _each(limits, lambda residual, s: residual.model_copy(update={"fan_offsets": offsets[s]}))
-    if found.fan_s > VARIATION_FAN_S or any(offsets.values()):
+    if found.fan_s > VARIATION_FAN_S or any(offsets.values()) or limits.speed.shared_limit:
         found = healthy_statistics(runs, limits, top_speed_rad_s)
-    found, baselines = baselines_over_speed(runs, limits, found, crossover_speed_rad_s)
+    found, baselines = baselines_over_speed(runs, limits, found, crossover_speed_rad_s, has_drive=has_drive)
 
     def varying(_: HealthyResidual, source: Signal) -> HealthyResidual:
         residual = variation(found, source) or HealthyResidual(baseline=UNLIMITED)
-        return with_baseline(residual, baselines[source]).model_copy(update={"fan_offsets": offsets[source]})
+        kept = {"fan_offsets": offsets[source], "shared_limit": limits.residual(source).shared_limit}
+        return with_baseline(residual, baselines[source]).model_copy(update=kept)
 
     missing = [source for source in RESIDUALS if not found.moments[source].count.sum()]
     used = {row.name: limits.detectors[row.name] for row in calibrated_rows() if row.source not in missing}
@@ -204,7 +221,8 @@ def _evidence(row: DetectorRow, limits: Limits, found: HealthyStatistics) -> Hea
         mean_ratio=found.mean_ratio(row),
         smoothed_std=_smoothed_std(limits, row.source, found),
         smoothed_limit=smoothed.limit if smoothed else 0.0,
-        second_mean_limit=moments.second_mean_quantile(SECONDS_QUANTILE),
+        mean_limit=moments.mean_quantile(MEANS_QUANTILE),
+        count_std=found.count_sigmas / residual.mean_residual_std if row.source == "speed" else 0.0,
         between_runs_std=between_runs_std(moments, residual),
         # the friction of a day shifts the balance equally at all speeds, but not the speed
         offset_unknown_at_other_speeds=row.source == "speed" and residual.baseline.speed_exponent == 0,
@@ -218,10 +236,11 @@ def _smoothed_std(limits: Limits, source: Signal, found: HealthyStatistics) -> f
 def _cautious(limits: Limits, found: HealthyStatistics) -> Limits:
     """Limits where the running is too short to set them by rarity; see DetectorSettings.cautious_factor.
 
-    They are multiples of a standard deviation that few independent errors of the twin have shown, and so those of the
-    upper end of its confidence interval.
+    They are multiples of a standard deviation that few independent errors of the twin have shown, one for each speed of
+    a fan, and so those of the upper end of its confidence interval.
     """
-    independent = max(found.fan_s / INDEPENDENT_S, 1.0)
+    visited = sum(int((seconds >= VISITED_S).sum()) for seconds in found.visited_s.values())
+    independent = max(visited, LEAST_VISITED)
     unknown = math.sqrt(independent / float(chi2.ppf(1.0 - CONFIDENCE, independent)))
     used = [row for row in calibrated_rows() if row.name in limits.detectors]
     factors = {row.name: limits.detectors[row.name].cautious_factor(_evidence(row, limits, found)) for row in used}
@@ -232,7 +251,9 @@ def _cautious(limits: Limits, found: HealthyStatistics) -> Limits:
         }
     )
     detectors = {
-        row.name: limits.detectors[row.name].cautious(_evidence(row, limits, found))
+        row.name: limits.detectors[row.name].cautious(
+            replace(_evidence(row, limits, found), unknown_factor=1.0 if row.source == "tacho" else unknown)
+        )
         for row in used
         if factors[row.name] is not None
     }

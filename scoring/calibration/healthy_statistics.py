@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -10,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from schemas.messages import Array
-from schemas.tacho import INSTANTANEOUS, Tacho
+from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
 from scoring.baseline.fan_offsets import Cells
 from scoring.calibration.residual_moments import MOTION_BINS, SPEED_BINS, ResidualMoments, octaves
@@ -23,6 +24,7 @@ from scoring.limits import Limits
 from scoring.samples import Samples
 from scoring.scored_block import Observation, ScoredBlock
 
+COUNTS_OF_A_MEAN = 10  # so many of a tacho say as much about a shift as a second of a tacho that does not count
 LARGEST_SIGMAS = 100.0  # larger residuals are clipped to this
 
 
@@ -68,8 +70,14 @@ class HealthyStatistics:
     """of each detector of a residual, the sum of its statistic in its limit"""
     fan_s: float = 0.0
     """time that was scored, summed over fans"""
+    visited_s: dict[int, Array] = field(default_factory=dict)
+    """by the number of a fan in the twin or else in its tray, (SPEED_BINS,) how long it was scored at a speed"""
     speed_sum_rad_s: float = 0.0
     """over the samples that were scored"""
+    command_sum: float = 0.0
+    """the same of the commands, without their signs"""
+    count_sigmas: float = 0.0
+    """largest standard deviation of a reading of a tacho that counts, from the phases of its pulses, sigma"""
     observed: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
     """of each detector, see Detector.observed"""
 
@@ -134,8 +142,13 @@ class _RunStatistics:
         self._scorer = FanScorer(run.fans, limits, for_calibration=True, tachos=run.tachos)
         self._rows = [rows().index(row) for row in calibrated_rows()]
         self._windows = Windows(run.fans, len(calibrated_rows()), limits.timing.on_delay_s)
-        self._seconds = {source: _SecondMeans() for source in RESIDUALS}
-        self._standardised_seconds = {source: _SecondMeans() for source in RESIDUALS}
+        tachos = tacho_of_each_fan(run.tachos, run.fans)
+        self._count_std_rad_s = np.array([tacho.resolution_rad_s for tacho in tachos]) / math.sqrt(6.0)
+        self._seconds = {source: _Means(1.0) for source in RESIDUALS}
+        counts_s = COUNTS_OF_A_MEAN * max(tacho.held_s for tacho in tachos)
+        self._standardised_means = {
+            source: _Means(counts_s, 0.5) if counts_s > 1.0 else _Means(1.0) for source in RESIDUALS
+        }
         self._cells = {source: np.zeros((2, run.fans, SPEED_BINS)) for source in RESIDUALS}
 
     def add(self, block: Samples) -> None:
@@ -144,6 +157,9 @@ class _RunStatistics:
         seen = self._scorer.observed()
         ratios = np.concatenate([one.ratios[self._rows] for one in seen], axis=1)
         has_score = np.isfinite(scored.score)
+        count_sigmas = np.where(block.speed_valid, self._count_std_rad_s / block.speed_sigma_rad_s, 0.0)
+        found.count_sigmas = max(found.count_sigmas, float(count_sigmas.max()))
+        found.command_sum += float(np.nansum(np.abs(block.command), where=has_score))
         self._windows.add(block.t_ns, block.period_ns, ratios, has_score)
         found.fan_s += float(has_score.sum()) * found.period_s
         found.speed_sum_rad_s += float(np.nansum(np.abs(block.speed_rad_s), where=has_score))
@@ -181,7 +197,7 @@ class _RunStatistics:
         shift = np.clip(np.where(use, residual - expected - baseline, np.nan), -LARGEST_SIGMAS, LARGEST_SIGMAS)
         _add_shift(moments, self._cells[source], shift, bins, self._seconds[source].of(shift, found.period_s))
         persistent = np.concatenate([one.persistent[source] for one in seen])
-        means = self._standardised_seconds[source].of(np.where(use, persistent, np.nan), found.period_s)
+        means = self._standardised_means[source].of(np.where(use, persistent, np.nan), found.period_s)
         moments.standardised_octaves += octaves(np.square(means))
         motions = np.square(transient_rad_s[use])
         moments.by_motion += _sums(moving[use], MOTION_BINS, motions, np.square(smoothed[use]))
@@ -194,6 +210,9 @@ class _RunStatistics:
             largest = found.observed[name]
             for key, value in detector.observed().items():
                 largest[key] = max(largest.get(key, 0.0), value)
+        at_speed_s = np.maximum(*(self._cells[source][0] for source in RESIDUALS)) * found.period_s
+        for fan, seconds in zip(self._run.known_as or range(self._run.fans), at_speed_s, strict=True):
+            found.visited_s[fan] = found.visited_s.get(fan, 0.0) + seconds
         for source, moments in found.moments.items():
             baseline = self._scorer.residuals[source].baseline
             settled = baseline.is_set & ~baseline.is_commissioning
@@ -223,20 +242,25 @@ def _add_shift(moments: ResidualMoments, cells: Array, shift: Array, bins: Array
     moments.second_octaves += octaves(squares)
 
 
-class _SecondMeans:
-    """Means over whole seconds of one residual of one run, however its samples are cut into blocks."""
+class _Means:
+    """Means of one residual of one run over a time, however its samples are cut into blocks."""
 
-    def __init__(self) -> None:
+    def __init__(self, over_s: float, least_share: float = 1.0) -> None:
+        """least_share: so many of its samples must be finite."""
+        self._over_s, self._least_share = over_s, least_share
         self._rest: Array | None = None
 
     def of(self, shift: Array, period_s: float) -> Array:
-        """(m,) finite means that are complete now; shift: (n, fans)."""
-        second = max(1, round(1.0 / period_s))
+        """(m,) means that are complete now, and of enough samples; shift: (n, fans)."""
+        rows = max(1, round(self._over_s / period_s))
         samples = shift if self._rest is None else np.concatenate((self._rest, shift))
-        whole = len(samples) // second * second
+        whole = len(samples) // rows * rows
         self._rest = samples[whole:].copy()
-        means = samples[:whole].reshape(-1, second, samples.shape[1]).mean(axis=1)
-        return means[np.isfinite(means)]
+        each = samples[:whole].reshape(-1, rows, samples.shape[1])
+        known = np.isfinite(each)
+        counts = known.sum(axis=1)
+        enough = counts >= self._least_share * rows
+        return np.where(known, each, 0.0).sum(axis=1)[enough] / counts[enough]
 
 
 def truncate_runs(runs: Runs, count: int, fan_s: float) -> Runs:

@@ -33,18 +33,20 @@ UNLIMITED = BaselineSettings(commissioning_limit_sigmas=UNREACHED, adaptation_li
 
 
 def baselines_over_speed(
-    runs: Runs, limits: Limits, found: HealthyStatistics, crossover_speed_rad_s: float | None
+    runs: Runs, limits: Limits, found: HealthyStatistics, crossover_speed_rad_s: float | None, *, has_drive: bool
 ) -> tuple[HealthyStatistics, dict[Signal, dict[str, Any]]]:
     """Whether the offset of a fan changes with its speed, for each residual.
 
-    It does if subtracting such a baseline leaves less variation over the runs. With few runs, which say little about
-    the differences between days, it is assumed not to.
+    It does if subtracting such a baseline leaves less variation over the runs. Few runs say little about the
+    differences between days: then it is assumed not to, but for fans with a drive of their own. What changes such a fan
+    (its air, its supply, its bearing) takes a share of its speed.
 
     crossover_speed_rad_s: see BaselineSettings; None if it is not known.
 
     Returns the statistics with the chosen baselines, and the BaselineSettings that these change.
     """
-    if len(found.maxima) < MIN_RUNS:
+    are_few = len(found.maxima) < MIN_RUNS
+    if are_few and not has_drive:
         return found, {source: {} for source in RESIDUALS}
     common = {"ridge": INITIAL_RIDGE, "reference_speed_rad_s": max(found.mean_speed_rad_s, 1e-9)}
     exponent = SPEED_EXPONENT if crossover_speed_rad_s else SPEED_EXPONENT - 1
@@ -52,19 +54,21 @@ def baselines_over_speed(
         "speed": {"speed_exponent": exponent, "crossover_speed_rad_s": crossover_speed_rad_s, **common},
         "balance": {"speed_exponent": SPEED_EXPONENT, **common},
     }
+    if are_few:
+        settings = {source: {"speed_exponent": 1, **common} for source in RESIDUALS}
     following = {source: with_baseline(limits.residual(source), settings[source]) for source in RESIDUALS}
     other = healthy_statistics(runs, limits.model_copy(update=following), found.top_speed_rad_s)
     for source in RESIDUALS:
-        if (
-            other.moments[source].mean_second_square()
-            < MAX_REMAINING_SQUARE * found.moments[source].mean_second_square()
-        ):
-            found.moments[source] = moments = other.moments[source]
-            of_baselines = float(np.square(np.concatenate(moments.baselines)).mean())
-            ridge = min(moments.typical_second_square() / max(of_baselines, 1e-12), MAX_RIDGE)
-            settings[source] |= {"ridge": ridge, "rms_sigmas": math.sqrt(of_baselines)}
-        else:
+        moments = other.moments[source]
+        remaining_square = moments.mean_second_square()
+        if not are_few and remaining_square >= MAX_REMAINING_SQUARE * found.moments[source].mean_second_square():
             settings[source] = {}
+            continue
+        found.moments[source] = moments
+        of_baselines = float(np.square(np.concatenate(moments.baselines)).mean()) if moments.count.sum() else 0.0
+        settings[source]["rms_sigmas"] = math.sqrt(of_baselines)
+        if not are_few:
+            settings[source]["ridge"] = min(moments.typical_second_square() / max(of_baselines, 1e-12), MAX_RIDGE)
     return found, settings
 
 

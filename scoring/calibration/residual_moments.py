@@ -42,7 +42,7 @@ class ResidualMoments:
     second_octaves: Array = _zeros(OCTAVE_PARTS)
     """histogram of the squares of one-second means, by parts of an octave below the largest square"""
     standardised_octaves: Array = _zeros(OCTAVE_PARTS)
-    """the same of the standardised residual"""
+    """the same of the standardised residual; of tachos that count, of means over ten counts"""
 
     def mean_second_square(self) -> float:
         """Mean square of the one-second means: what baselines leave."""
@@ -52,8 +52,8 @@ class ResidualMoments:
         """The same by the median, as if normal: transients, which are rare and large, do not affect it."""
         return _quantile(self.second_octaves, 0.5) / MEDIAN_OF_SQUARE
 
-    def second_mean_quantile(self, share: float) -> float:
-        """The value that a share of the one-second means of the standardised residual does not exceed."""
+    def mean_quantile(self, share: float) -> float:
+        """The value that a share of the means of the standardised residual does not exceed."""
         return math.sqrt(_quantile(self.standardised_octaves, share))
 
 

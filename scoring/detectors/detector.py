@@ -46,8 +46,12 @@ class HealthyEvidence:
     """standard deviation of the low-passed standardised residual"""
     smoothed_limit: float = 0.0
     """limit of the low-passed residual, in these standard deviations"""
-    second_mean_limit: float = 0.0
-    """99.9 % quantile of the means of the standardised residual over one second, in sigma"""
+    mean_limit: float = 0.0
+    """99.9 % quantile of the means of the standardised residual over a second; of tachos that count, over ten counts"""
+    count_std: float = 0.0
+    """of tachos that count: the error of a reading, as the phases of its pulses have it, in that of the residual"""
+    unknown_factor: float = 1.0
+    """by how much the standard deviation of so few healthy data may be too small"""
     between_runs_std: float = 0.0
     """standard deviation of the commissioned baselines, in that of the residual"""
     offset_unknown_at_other_speeds: bool = False

@@ -43,10 +43,10 @@ class DriftSettings(SingleLimit):
         return cls(limit=UNREACHED, period_s=1.0)
 
     def prepared(self, evidence: HealthyEvidence) -> DriftSettings:
-        """The reference value is above the one-second means of healthy residuals, and above their typical offsets."""
+        """The reference value is above the short means of healthy residuals, and above their typical offsets."""
         least = max(REFERENCE_SHARE, evidence.between_runs_std)
         of_smoothed = REFERENCE_SHARE * evidence.smoothed_limit * evidence.smoothed_std
-        reference = max(of_smoothed, evidence.second_mean_limit, least)
+        reference = max(of_smoothed, evidence.mean_limit, least)
         return self.model_copy(update={"reference_sigmas": reference, "period_s": evidence.period_s})
 
     def cautious_factor(self, evidence: HealthyEvidence) -> float | None:
@@ -54,6 +54,11 @@ class DriftSettings(SingleLimit):
         if evidence.offset_unknown_at_other_speeds:
             return None
         return max(MIN_CAUTIOUS_LIMIT / self.limit, 1.0)
+
+    def cautious(self, evidence: HealthyEvidence) -> DriftSettings:
+        """With too few data nothing adds up that a tacho hardly shows: the twin has learned from its readings."""
+        reference = max(self.reference_sigmas * evidence.unknown_factor, MIN_CAUTIOUS_LIMIT * evidence.count_std)
+        return self.model_copy(update={"reference_sigmas": reference})
 
 
 class Drift(Detector):

@@ -74,13 +74,15 @@ class WearMonitor:
         eligible: Array,
         disturbed: Array,
         commissioned_command: Array,
+        shared_command: Array,
         held: Array,
         limit_command: Array,
     ) -> None:
         """Process a block that the diagnoser has taken; (n, fans) each but t_ns, (n,), and limit_command, (fans,).
 
         eligible: a point may be taken at this sample. disturbed: this sample must not be within the window of a point.
-        commissioned_command: baseline of the balance at the end of commissioning, NaN before. held: the baseline is at
+        commissioned_command: baseline of the balance at the end of commissioning, NaN before. shared_command: what of
+        the present one the fans of the tray have in common, which is no wear of one of them. held: the baseline is at
         its bound, so that its value says nothing about wear. limit_command: the alarm comes at this distance from the
         commissioned baseline.
         """
@@ -93,7 +95,8 @@ class WearMonitor:
             commissioned = np.isfinite(commissioned_command[row])
             for fan in np.flatnonzero(eligible[row] & undisturbed & commissioned).tolist():
                 due = slot > self._fans[fan].slot
-                if due and self._add_point(fan, at_ns, float(commissioned_command[row, fan]), bool(held[row, fan])):
+                of_fan = (float(of[row, fan]) for of in (commissioned_command, shared_command))
+                if due and self._add_point(fan, at_ns, *of_fan, held=bool(held[row, fan])):
                     self._fans[fan].slot = slot
                     self._fans[fan].evaluate(at_ns, float(limit_command[fan]))
         self._last_attempt = int(attempts[-1])
@@ -168,7 +171,7 @@ class WearMonitor:
         """(fans,) time of the last disturbed sample of each fan, up to the end of these rows."""
         return np.where(disturbed, t_ns[:, np.newaxis], self._disturbed_t_ns).max(axis=0)
 
-    def _add_point(self, fan: int, at_ns: int, commissioned: float, held: bool) -> bool:
+    def _add_point(self, fan: int, at_ns: int, commissioned: float, shared: float, *, held: bool) -> bool:
         """Add a point for each parameter; False where the last seconds are too few for it, or too slow."""
         window = self._diagnoser.window(fan, at_ns, at_ns, WINDOW_S)
         if window is None:
@@ -176,7 +179,7 @@ class WearMonitor:
         drifts = parameter_shifts(replace(window, fan_offset=commissioned), self._healthy[fan])
         points = {drift.parameter: (drift.change, drift.std_error) for drift in drifts}
         if points and not held:
-            points["balance"] = window.fan_offset - commissioned, window.fan_offset_std_error
+            points["balance"] = window.fan_offset - shared - commissioned, window.fan_offset_std_error
         for parameter, (change, std_error) in points.items():
             if max(abs(change), std_error) < MAX_CHANGE:
                 self._fans[fan].series[parameter].add(at_ns, change, std_error)

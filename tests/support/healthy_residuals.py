@@ -41,7 +41,9 @@ def samples_of(speed: Array, balance: Array, first: int = 0, period_ns: int = ST
         speed_rad_s=np.repeat(turning[:, np.newaxis], speed.shape[1], axis=1),
         speed_residual=speed,
         speed_valid=np.isfinite(speed),
+        speed_sigma_rad_s=np.full(speed.shape, 1e4),  # so coarse that nothing counts as shared by the fans
         balance=balance,
+        balance_sigma=np.full(speed.shape, 1e4),
         balance_valid=np.isfinite(balance),
         command=np.full(speed.shape, 50.0),
         predicted_rad_s=np.full(speed.shape, 100.0),

@@ -126,7 +126,16 @@ def _calibrated(
             longest_fan_s = runs.longest_fan_s()  # however much of it can be scored
             if not extrapolate and not supports(longest_fan_s, per_day):
                 raise too_little(longest_fan_s, per_day)
-            limits = find_limits(runs, top_speed_rad_s, timing, per_day, seed, extrapolate, known.bend_rad_s)
+            limits = find_limits(
+                runs,
+                top_speed_rad_s,
+                timing,
+                per_day,
+                seed,
+                extrapolate,
+                known.bend_rad_s,
+                known.card.drive is not None,
+            )
         except TooLittleError as error:
             raise UserError(_too_little(error, per_day)) from error
         except MixedRatesError as error:

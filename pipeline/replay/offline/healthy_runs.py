@@ -14,7 +14,7 @@ from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
 from schemas.units import SpeedUnit
 from scoring.calibration.healthy_statistics import HealthyRun
-from scoring.limits import Timing
+from scoring.limits import Timing, default_timing
 from scoring.samples import Samples, samples_of
 
 MAX_KEPT_SAMPLES = 10_000_000
@@ -80,11 +80,15 @@ class HealthyRuns:
         Raises:
             UserError: a recording cannot be used, or the times are not the same in all.
         """
-        found: dict[Timing, Path] = {}
+        scorers: dict[Path, Any] = {}
+        fans: list[int] = []
         for path in self._paths:
             with open_replay_input([path], None, self._overrides, self._twin) as replay_input:
-                scorer: Any = replay_input.config.sections["scorer"]
-                found.setdefault(scorer.timing(Timing()), path)
+                scorers[path] = replay_input.config.sections["scorer"]
+                fans += [tray.fans for tray in replay_input.trays]
+        found: dict[Timing, Path] = {}
+        for path, scorer in scorers.items():
+            found.setdefault(scorer.timing(default_timing(min(fans))), path)
         first, *others = found
         for other in others:
             names = [name for name in Timing.model_fields if getattr(first, name) != getattr(other, name)]

@@ -1,0 +1,157 @@
+"""Limits of trays of fans that count their pulses: what they share, and what little data can say about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from schemas.messages import Array
+from schemas.tacho import INSTANTANEOUS, Tacho
+from scoring.calibration.calibration import SHARED_SHARE, calibrate
+from scoring.calibration.healthy_statistics import HealthyRun, Runs
+from scoring.detectors.drift import DriftSettings
+from scoring.limits import Limits, Timing, default_timing
+from scoring.samples import Samples
+from tests.support.healthy_residuals import Raised, alarms_of, autoregressive, in_blocks, samples_of
+
+PERIOD_NS = 100_000_000
+SIGMA_RAD_S = 2.0
+SPEED_RAD_S = 100.0
+FANS = 4
+SHARED_LIMIT_SIGMAS = SHARED_SHARE * SPEED_RAD_S / SIGMA_RAD_S
+
+
+def tray(seed: int, seconds: float, shift_sigmas: Array | float = 0.0) -> Samples:
+    """White residuals of fans that hold about one speed, with a shift (n, fans) of the speed residual."""
+    samples = round(seconds * 10)
+    speed, balance = autoregressive(samples, FANS, 0.0, seed), autoregressive(samples, FANS, 0.0, seed + 1)
+    made = samples_of(speed + shift_sigmas, balance, period_ns=PERIOD_NS)
+    sigma = np.full(speed.shape, SIGMA_RAD_S)
+    return replace(made, speed_sigma_rad_s=sigma, balance_sigma=sigma)
+
+
+def healthy(runs: int, seconds: float, tachos: tuple[Tacho, ...] = INSTANTANEOUS) -> Runs:
+    def each() -> Iterator[HealthyRun]:
+        for run in range(runs):
+            yield HealthyRun(f"run {run}", FANS, in_blocks(tray(10 * run, seconds)), tachos=tachos)
+
+    return each
+
+
+@pytest.fixture(scope="module")
+def limits() -> Limits:
+    return calibrate(healthy(3, 600.0), 200.0, default_timing(FANS), 40.0)
+
+
+def shifted(limits: Limits, size_sigmas: float, fans: list[int]) -> list[Raised]:
+    """Alarms in three minutes, when the residuals of some fans move by so much in the second one."""
+    ramp = np.clip(np.arange(1800) / 600.0 - 1.0, 0.0, 1.0)[:, np.newaxis]
+    return alarms_of(limits, in_blocks(tray(77, 180.0, size_sigmas * ramp * np.isin(np.arange(FANS), fans))), FANS)
+
+
+def test_what_all_fans_share_raises_no_alarm_and_the_same_of_one_fan_does(limits: Limits) -> None:
+    size = 0.6 * SHARED_LIMIT_SIGMAS
+    assert shifted(limits, size, []) == shifted(limits, size, [0, 1, 2, 3]) == []
+    assert {alarm.fan for alarm in shifted(limits, size, [2])} == {2}
+
+
+def test_more_than_weather_raises_an_alarm_of_every_fan(limits: Limits) -> None:
+    assert {alarm.fan for alarm in shifted(limits, 3.0 * SHARED_LIMIT_SIGMAS, [0, 1, 2, 3])} == {0, 1, 2, 3}
+
+
+def test_baselines_of_a_fan_beside_others_follow_slowly() -> None:
+    assert default_timing(1) == Timing()
+    assert default_timing(2).adaptation_s > 3.0 * Timing().adaptation_s
+
+
+def test_a_fan_alone_shares_nothing() -> None:
+    def alone() -> Iterator[HealthyRun]:
+        for _, _, blocks, *_ in healthy(3, 300.0)():
+            of_one = [
+                replace(block, **{n: v[:, :1] for n, v in vars(block).items() if np.ndim(v) == 2}) for block in blocks
+            ]
+            yield HealthyRun("alone", 1, of_one)
+
+    found = calibrate(alone, 200.0, Timing(), 600.0, extrapolate=True)
+    assert (found.speed.shared_limit, found.balance.shared_limit) == (0.0, 0.0)
+
+
+def test_few_runs_of_fans_with_a_drive_are_off_by_a_share_of_their_speed() -> None:
+    plain, driven = (
+        calibrate(healthy(2, 120.0), 200.0, default_timing(FANS), 1.0, extrapolate=True, has_drive=has_drive)
+        for has_drive in (False, True)
+    )
+    assert (plain.speed.baseline.speed_exponent, driven.speed.baseline.speed_exponent) == (0, 1)
+    assert "speed_drift" not in plain.detectors
+    assert "speed_drift" in driven.detectors
+
+
+def test_weather_that_fans_share_does_not_look_like_offsets_that_go_with_the_speed() -> None:
+    def each() -> Iterator[HealthyRun]:
+        for run in range(4):
+            rng = np.random.default_rng(run)
+            speed_rad_s = np.repeat(rng.uniform(40.0, 180.0, (30, FANS)), 100, axis=0)
+            made = tray(10 * run, 300.0)
+            weather = 0.02 * np.sin(np.arange(3000) / 300.0)[:, np.newaxis] * speed_rad_s / SIGMA_RAD_S
+            of_day = rng.normal(size=FANS)
+            yield HealthyRun(
+                f"run {run}",
+                FANS,
+                in_blocks(
+                    replace(
+                        made,
+                        speed_residual=made.speed_residual + weather + of_day,
+                        speed_rad_s=speed_rad_s + 1e-6 * made.speed_rad_s,
+                    )
+                ),
+            )
+
+    found = calibrate(each, 200.0, default_timing(FANS), 60.0)
+    assert found.speed.baseline.speed_exponent == 0
+    assert found.speed.mean_residual_std < 1.1
+
+
+def test_a_counting_tacho_with_gaps_is_calibrated_all_the_same() -> None:
+    def each() -> Iterator[HealthyRun]:
+        for name, fans, blocks, *_ in healthy(2, 120.0)():
+            gaps = [
+                replace(b, speed_valid=b.speed_valid & ((b.t_ns // PERIOD_NS) % 90 != 0)[:, np.newaxis]) for b in blocks
+            ]
+            yield HealthyRun(name, fans, gaps, tachos=(Tacho(kind="count", pulses=2, window_s=1.0),))
+
+    found = calibrate(each, 200.0, default_timing(FANS), 1.0, extrapolate=True, has_drive=True)
+    assert "speed_drift" in found.detectors
+
+
+def test_with_few_data_nothing_adds_up_that_a_tacho_hardly_shows() -> None:
+    counts = Tacho(kind="count", pulses=2, window_s=0.1)
+
+    def reference(tachos: tuple[Tacho, ...]) -> float:
+        found = calibrate(healthy(2, 120.0, tachos), 200.0, default_timing(FANS), 1.0, extrapolate=True, has_drive=True)
+        drift = found.settings_of("speed", DriftSettings)
+        assert drift
+        return drift.reference_sigmas * found.speed.mean_residual_std
+
+    least = 2.0 * counts.resolution_rad_s / np.sqrt(6.0) / SIGMA_RAD_S
+    assert reference(INSTANTANEOUS) < 0.5 * least
+    assert reference((counts,)) == pytest.approx(least, rel=0.01)
+
+
+def test_the_fewer_speeds_were_seen_the_wider_are_the_limits() -> None:
+    def at(speeds_rad_s: list[float]) -> Runs:
+        def each() -> Iterator[HealthyRun]:
+            for number, block in enumerate([tray(5, 240.0)]):
+                rows = np.arange(len(block.t_ns)) * len(speeds_rad_s) // len(block.t_ns)
+                speed = np.array(speeds_rad_s)[rows][:, np.newaxis] + 1e-3 * block.speed_rad_s
+                yield HealthyRun(f"run {number}", FANS, in_blocks(replace(block, speed_rad_s=speed)))
+
+        return each
+
+    few, many = (
+        calibrate(at(speeds), 200.0, Timing(), 1.0, extrapolate=True).detectors["speed_smoothed"]
+        for speeds in ([100.0], [30.0, 50.0, 70.0, 90.0, 110.0, 130.0, 150.0, 170.0])
+    )
+    assert few.limit > 1.3 * many.limit  # type: ignore[attr-defined]
