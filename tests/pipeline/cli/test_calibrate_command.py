@@ -15,7 +15,7 @@ from pipeline.cli.main import expand_variadic
 from pipeline.cli.twins.calibration_check import Check
 from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.runtime.tray_twin import load_tray_twin
-from scoring.limits import Limits, Timing
+from scoring.limits import Limits, default_timing
 from tests.support.fantwin_command import error_of, fantwin
 
 FANS = 2
@@ -299,7 +299,8 @@ def test_limits_are_found_for_the_times_that_the_scorer_is_set_to(folder: Path, 
     result = calibrate(folder, "-o", output, "--set", "scorer.smoothing_s=1.0")
     assert result.exit_code == 0, result.output
     slow, default = (Limits.model_validate(load_tray_twin(twin).card.calibration) for twin in (output, calibrated))
-    assert (default.timing, slow.timing) == (Timing(), Timing(smoothing_s=1.0))
+    of_tray = default_timing(2)
+    assert (default.timing, slow.timing) == (of_tray, of_tray.model_copy(update={"smoothing_s": 1.0}))
     assert slow.detectors["speed_smoothed"] != default.detectors["speed_smoothed"]
 
 
