@@ -111,8 +111,14 @@ class Residual:
         self.baseline = Baseline(fans, healthy.baseline, intervals, healthy.mean_residual_std)
         self._shared = None
         if healthy.shared_limit and fans >= LEAST_FANS:
-            timing, std = limits.timing, healthy.mean_residual_std
-            self._shared = SharedOffset(fans, healthy.shared_limit, timing.baseline_s, timing.adaptation_s, std)
+            self._shared = SharedOffset(
+                fans,
+                limit=healthy.shared_limit,
+                residual_std=healthy.mean_residual_std,
+                interval_s=limits.timing.baseline_s,
+                adaptation_s=limits.timing.adaptation_s,
+                reach_sigmas=healthy.baseline.adaptation_limit_sigmas,
+            )
         self._low_pass = LowPass(fans, self._smoothing_s)
 
     def context(self, fans: int, *, capped: bool) -> DetectorContext:
@@ -179,7 +185,7 @@ class Residual:
             baseline=own + shared,
             shared=shared,
             commissioned=np.where(baseline.is_commissioning, np.nan, baseline.commissioned * of.scaling),
-            independent_intervals=np.full(shape, baseline.independent_intervals),
+            independent_intervals=np.full(shape, self._independent_intervals),
             at_limit=np.full(shape, baseline.is_at_limit),
             learned_scale=np.full(shape, learned_scale),
         )
@@ -187,7 +193,8 @@ class Residual:
     def end_interval(self, samples: int, within_limit: Array, below_half_limit: Array, moving: Array | None) -> None:
         """End the interval; see Baseline.end_interval."""
         if self._shared:
-            alone = self._shared.end_interval(samples, below_half_limit, moving)
+            commissioned = self.baseline.is_set & ~self.baseline.is_commissioning
+            alone = self._shared.end_interval(samples, commissioned, below_half_limit, moving)
             below_half_limit = below_half_limit & ~alone
         self.baseline.end_interval(samples, within_limit, below_half_limit, moving)
 
@@ -196,6 +203,14 @@ class Residual:
         self.baseline.restart(fans)
         if self._shared:
             self._shared.restart(fans)
+
+    @property
+    def _independent_intervals(self) -> Array:
+        """(fans,) the number of independent intervals whose mean would vary as much as baseline and shared part do."""
+        own = self.baseline.independent_intervals
+        if self._shared is None:
+            return own
+        return own * self._shared.independent_intervals / (own + self._shared.independent_intervals)
 
     def smooth(self, of: ScoredResidual, period_s: float) -> Array:
         """(n, fans) the low-passed residual less its baseline, sigma, as displayed; NaN where not scored."""

@@ -159,7 +159,7 @@ class _RunStatistics:
         has_score = np.isfinite(scored.score)
         count_sigmas = np.where(block.speed_valid, self._count_std_rad_s / block.speed_sigma_rad_s, 0.0)
         found.count_sigmas = max(found.count_sigmas, float(count_sigmas.max()))
-        found.command_sum += float(np.nansum(np.abs(block.command), where=has_score))
+        found.command_sum += float(np.nansum(np.abs(block.command), where=has_score & np.isfinite(block.speed_rad_s)))
         self._windows.add(block.t_ns, block.period_ns, ratios, has_score)
         found.fan_s += float(has_score.sum()) * found.period_s
         found.speed_sum_rad_s += float(np.nansum(np.abs(block.speed_rad_s), where=has_score))

@@ -49,7 +49,7 @@ class HealthyEvidence:
     mean_limit: float = 0.0
     """99.9 % quantile of the means of the standardised residual over a second; of tachos that count, over ten counts"""
     count_std: float = 0.0
-    """of tachos that count: the error of a reading, as the phases of its pulses have it, in that of the residual"""
+    """of tachos that count: the error of a reading from the phases of its pulses, in that of the residual"""
     unknown_factor: float = 1.0
     """by how much the standard deviation of so few healthy data may be too small"""
     between_runs_std: float = 0.0

@@ -31,7 +31,7 @@ _TOLERANCE = 0.02  # of the range: a device rounds its commands
 
 
 def levels_of(levels: Sequence[float], place: int) -> tuple[float, ...]:
-    """The levels in the order of a fan, by its place among those that are moved: each begins a step later.
+    """The levels in the order of a fan, by its place among those that are moved: each begins one level further on.
 
     High and low levels alternate, so the load of the fans' supply hardly changes with the speed of any one of them.
     """

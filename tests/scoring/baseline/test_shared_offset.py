@@ -8,11 +8,22 @@ from scoring.baseline.shared_offset import SharedOffset
 
 SAMPLES = 10
 ALL = np.ones(8, np.bool_)
-LIMIT, ADAPTATION_S = 0.03, 300.0
+LIMIT, ADAPTATION_S, REACH_SIGMAS = 0.03, 300.0, 1.2
 
 
 def shared_offset(fans: int) -> SharedOffset:
-    return SharedOffset(fans, LIMIT, 1.0, ADAPTATION_S, residual_std=1e-3)  # hardly drawn towards zero
+    return of_residual_std(fans, 1e-3)  # hardly drawn towards zero
+
+
+def of_residual_std(fans: int, residual_std: float) -> SharedOffset:
+    return SharedOffset(
+        fans,
+        limit=LIMIT,
+        residual_std=residual_std,
+        interval_s=1.0,
+        adaptation_s=ADAPTATION_S,
+        reach_sigmas=REACH_SIGMAS,
+    )
 
 
 def settled(offsets: list[float], *, valid: list[bool] | None = None, moving: list[bool] | None = None) -> float:
@@ -20,7 +31,9 @@ def settled(offsets: list[float], *, valid: list[bool] | None = None, moving: li
     shared = shared_offset(len(offsets))
     for _ in range(60):
         _take(shared, np.array(offsets), np.array(valid or [True] * len(offsets)))
-        shared.end_interval(SAMPLES, ALL[: len(offsets)], None if moving is None else np.array(moving))
+        shared.end_interval(
+            SAMPLES, ALL[: len(offsets)], ALL[: len(offsets)], None if moving is None else np.array(moving)
+        )
     return float(shared.at(np.full((1, 1), 50.0))[0, 0])
 
 
@@ -60,21 +73,21 @@ def test_a_fan_that_becomes_faulty_leaves_the_other_as_it_was() -> None:
     shared = shared_offset(2)
     for _ in range(60):
         _take(shared, np.array([1.0, 1.2]), ALL[:2])
-        shared.end_interval(SAMPLES, ALL[:2], None)
+        shared.end_interval(SAMPLES, ALL[:2], ALL[:2], None)
     before = shared.at(np.full((1, 1), 50.0))[0, 0]
     for _ in range(60):
         _take(shared, np.array([1.0, -9.0]), ALL[:2])
-        shared.end_interval(SAMPLES, ALL[:2], None)
+        shared.end_interval(SAMPLES, ALL[:2], ALL[:2], None)
     assert before == pytest.approx(1.0, abs=0.01)
     assert shared.at(np.full((1, 1), 50.0))[0, 0] == pytest.approx(before, abs=0.01)
 
 
 def test_errors_at_low_speed_are_not_taken_for_a_share_of_a_high_one() -> None:
     low, high = 10.0, 100.0
-    shared = SharedOffset(4, LIMIT, 1.0, ADAPTATION_S, residual_std=1.0)
+    shared = of_residual_std(4, 1.0)
     for _ in range(60):
         shared.add(np.full((SAMPLES, 4), -0.5), np.full((SAMPLES, 4), low), np.ones((SAMPLES, 4), np.bool_))
-        shared.end_interval(SAMPLES, ALL[:4], None)
+        shared.end_interval(SAMPLES, ALL[:4], ALL[:4], None)
     assert abs(shared.at(np.full((1, 1), high))[0, 0]) < 0.5  # and not -5
 
 
@@ -82,20 +95,35 @@ def test_a_fan_alone_is_followed_slowly_in_place_of_its_baseline_and_only_while_
     shared, one, first = shared_offset(3), np.full((1, 1), 50.0), np.array([True, False, False])
     for _ in range(round(ADAPTATION_S)):
         _take(shared, np.full(3, 1.0), first)
-        assert shared.end_interval(SAMPLES, ALL[:3], None).tolist() == [True, False, False]
+        assert shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None).tolist() == [True, False, False]
     followed = shared.at(one)[0, 0]
     assert followed == pytest.approx(1.0 - np.exp(-1.0), abs=0.01)
     for _ in range(100):
         _take(shared, np.full(3, 1.0), first)
-        shared.end_interval(SAMPLES, ~ALL[:3], None)
+        shared.end_interval(SAMPLES, ALL[:3], ~ALL[:3], None)
     assert shared.at(one)[0, 0] == followed
     _take(shared, np.full(3, 1.0), ALL[:3])
-    assert not shared.end_interval(SAMPLES, ALL[:3], None).any()
+    assert not shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None).any()
     assert shared.at(one)[0, 0] > followed + 0.03  # with others at once
     shared.restart(first)
     assert shared.at(one)[0, 0] > followed
     shared.restart(ALL[:3])
     assert shared.at(one)[0, 0] == 0.0
+
+
+def test_a_fan_alone_is_followed_no_further_than_its_baseline_would_be() -> None:
+    shared = shared_offset(3)
+    for _ in range(round(10 * ADAPTATION_S)):
+        _take(shared, np.full(3, -9.0), np.array([True, False, False]))
+        shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None)
+    assert shared.at(np.full((1, 1), 50.0))[0, 0] == pytest.approx(-REACH_SIGMAS)
+
+
+def test_the_only_fan_of_a_tray_with_several_channels_keeps_its_own_baseline() -> None:
+    shared, only = shared_offset(3), np.array([True, False, False])
+    _take(shared, np.full(3, -1.0), only)
+    assert not shared.end_interval(SAMPLES, only, ALL[:3], None).any()
+    assert shared.at(np.full((1, 1), 50.0))[0, 0] == 0.0
 
 
 def test_turning_backwards_is_slowed_by_the_same_air() -> None:
@@ -104,17 +132,17 @@ def test_turning_backwards_is_slowed_by_the_same_air() -> None:
         shared.add(
             np.tile([-1.0, 1.0], (SAMPLES, 1)), np.tile([50.0, -50.0], (SAMPLES, 1)), np.ones((SAMPLES, 2), bool)
         )
-        shared.end_interval(SAMPLES, ALL[:2], None)
+        shared.end_interval(SAMPLES, ALL[:2], ALL[:2], None)
     np.testing.assert_allclose(shared.at(np.array([[50.0, -50.0]])), [[-1.0, 1.0]], atol=0.01)
 
 
 def test_it_continues_from_a_snapshot() -> None:
     before, after = shared_offset(3), shared_offset(3)
     _take(before, np.full(3, 1.0), np.ones(3, np.bool_))
-    before.end_interval(SAMPLES, ALL[:3], None)
+    before.end_interval(SAMPLES, ALL[:3], ALL[:3], None)
     _take(before, np.full(3, 1.0), np.ones(3, np.bool_))
     after.restore(before.snapshot())
     for shared in (before, after):
-        shared.end_interval(SAMPLES, ALL[:3], None)
+        shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None)
     np.testing.assert_array_equal(before.at(np.ones((1, 1))), after.at(np.ones((1, 1))))
     assert before.at(np.ones((1, 1)))[0, 0] > 0.0
