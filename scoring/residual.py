@@ -182,7 +182,7 @@ class Residual:
             standardised=standardised.clip(-of.clip, of.clip),
             persistent=persistent.clip(-of.clip, of.clip),
             shift=shift,
-            baseline=own + shared,
+            baseline=own + shared if self._shared else own,  # a sum would make -0.0 of older recordings 0.0
             shared=shared,
             commissioned=np.where(baseline.is_commissioning, np.nan, baseline.commissioned * of.scaling),
             independent_intervals=np.full(shape, self._independent_intervals),
