@@ -13,6 +13,7 @@ from schemas.tacho import INSTANTANEOUS, Tacho
 from scoring.calibration.calibration import SHARED_SHARE, calibrate
 from scoring.calibration.healthy_statistics import HealthyRun, Runs
 from scoring.detectors.drift import DriftSettings
+from scoring.detectors.smoothed import SmoothedSettings
 from scoring.limits import Limits, Timing, default_timing
 from scoring.samples import Samples
 from tests.support.healthy_residuals import Raised, alarms_of, autoregressive, in_blocks, samples_of
@@ -151,7 +152,9 @@ def test_the_fewer_speeds_were_seen_the_wider_are_the_limits() -> None:
         return each
 
     few, many = (
-        calibrate(at(speeds), 200.0, Timing(), 1.0, extrapolate=True).detectors["speed_smoothed"]
+        calibrate(at(speeds), 200.0, Timing(), 1.0, extrapolate=True).settings_of("speed", SmoothedSettings)
         for speeds in ([100.0], [30.0, 50.0, 70.0, 90.0, 110.0, 130.0, 150.0, 170.0])
     )
-    assert few.limit > 1.3 * many.limit  # type: ignore[attr-defined]
+    assert few
+    assert many
+    assert few.limit > 1.3 * many.limit
