@@ -13,6 +13,7 @@ from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
 from schemas.units import SpeedUnit
+from scoring.baseline.shared_offset import LEAST_FANS
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.limits import Timing, default_timing
 from scoring.samples import Samples, samples_of
@@ -78,17 +79,19 @@ class HealthyRuns:
         """The times of the scorer in the configuration of the recordings, with the overrides applied.
 
         Raises:
-            UserError: a recording cannot be used, or the times are not the same in all.
+            UserError: a recording cannot be used; the times are not the same in all; or some trays have one fan and
+                others several.
         """
         scorers: dict[Path, Any] = {}
-        fans: list[int] = []
+        trays: list[RecordedTray] = []
         for path in self._paths:
             with open_replay_input([path], None, self._overrides, self._twin) as replay_input:
                 scorers[path] = replay_input.config.sections["scorer"]
-                fans += [tray.fans for tray in replay_input.trays]
+                trays += [RecordedTray(path, tray.name, tray.fans) for tray in replay_input.trays]
+        _refuse_one_fan_among_several(trays)
         found: dict[Timing, Path] = {}
         for path, scorer in scorers.items():
-            found.setdefault(scorer.timing(default_timing(min(fans))), path)
+            found.setdefault(scorer.timing(default_timing(trays[0].fans)), path)
         first, *others = found
         for other in others:
             names = [name for name in Timing.model_fields if getattr(first, name) != getattr(other, name)]
@@ -126,6 +129,22 @@ class HealthyRuns:
             for tray in replay_input.trays:
                 name = tray.name
                 yield RecordedTray(path, name, tray.fans), map(samples_of, replay_input.pipeline(name).predictions())
+
+
+def _refuse_one_fan_among_several(trays: Sequence[RecordedTray]) -> None:
+    """What fans of a tray share is followed apart, and their baselines follow slowly: limits hold with it or without.
+
+    Raises:
+        UserError: some trays have one fan and others several.
+    """
+    alone = next((tray for tray in trays if tray.fans < LEAST_FANS), None)
+    beside_others = next((tray for tray in trays if tray.fans >= LEAST_FANS), None)
+    if alone and beside_others:
+        raise UserError(
+            f"{alone.path} has a tray of one fan and {beside_others.path} one of {beside_others.fans}, and limits hold "
+            "for one kind of tray, since fans beside others are compared with them: calibrate twice, and write one of "
+            "the twins to another file with -o"
+        )
 
 
 class _KeptRuns:

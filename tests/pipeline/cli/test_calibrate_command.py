@@ -343,3 +343,16 @@ def test_recordings_with_grids_of_different_rates_are_refused_by_name(folder: Pa
     error = error_of("calibrate", twin, folder / "healthy.mcap", slow, "--false-alarms-per-day", PER_DAY)
     assert f"healthy.mcap and {slow} have grids of different rates, 100 Hz and 50 Hz" in error
     assert "\n" not in error
+
+
+def test_a_fan_alone_and_fans_beside_others_are_not_calibrated_together(folder: Path) -> None:
+    """What several share is followed apart, with slower baselines: limits hold for one of both."""
+    alone, healthy, twin = folder / "alone.mcap", folder / "healthy.mcap", folder / "twin-of-one.onnx"
+    simulated(alone, 4, 20, "--fans", 1)
+    result = fantwin("train", alone, "--model", "physical", "-o", twin)
+    assert result.exit_code == 0, result.output
+    for recordings in ((healthy, alone), (alone, healthy)):
+        error = error_of("calibrate", twin, *recordings, "--false-alarms-per-day", PER_DAY)
+        assert f"{alone} has a tray of one fan and {healthy} one of 2" in error
+        assert "calibrate twice, and write one of the twins to another file with -o" in error
+        assert "\n" not in error
