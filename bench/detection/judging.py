@@ -16,12 +16,12 @@ import numpy as np
 
 from bench.detection.rack_scoring import Episode, episodes
 from pipeline.replay.offline.healthy_runs import HealthyRuns
+from pipeline.replay.offline.limits_of_twin import find_limits
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.runtime.stage import Core
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.messages import Alarm, Array, Prediction, Score
 from schemas.units import NS_PER_S
-from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.samples import samples_of
 from twin.export.calibrated import with_calibration
@@ -76,9 +76,7 @@ def calibrated_twin(
         fans = blocks[0].speed_rad_s.shape[1]
         runs.append(HealthyRun(path.stem, fans, blocks, range(fans) if known.fans > 1 else None, known.card.tacho))
     timing = HealthyRuns(recordings, twin, (), lambda _: None).timing()
-    top_speed_rad_s = known.card.top_speed_rad_s
-    bend_rad_s, has_drive = known.bend_rad_s, known.card.drive is not None
-    limits = calibrate(lambda: runs, top_speed_rad_s, timing, alarms_per_day, 0, extrapolate, bend_rad_s, has_drive)
+    limits = find_limits([known], lambda: runs, timing, alarms_per_day, extrapolate=extrapolate)
     output.write_bytes(with_calibration(twin.read_bytes(), json.loads(limits.model_dump_json())))
 
 

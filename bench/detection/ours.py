@@ -15,10 +15,10 @@ import numpy as np
 from bench.detection.methods import AlarmChange, MethodOutput
 from bench.detection.plant import BLOCK, STEP_NS, TRAY_FANS
 from bench.detection.simulated import tray_number
+from pipeline.replay.offline.limits_of_twin import find_limits
 from pipeline.runtime.stage import Core
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.messages import Alarm, Array, Prediction, Score
-from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.limits import Limits, default_timing
 from scoring.samples import Samples, samples_of
@@ -116,15 +116,8 @@ def calibrated_twins(
     """
     given = list(twins)
     known = [load_tray_twin(path) for path in given]
-    bends = [twin.bend_rad_s for twin in known if twin.bend_rad_s is not None]
-    limits = calibrate(
-        healthy,
-        max(twin.card.top_speed_rad_s for twin in known),
-        default_timing(min(run.fans for run in healthy())),
-        alarms_per_day,
-        extrapolate=extrapolate,
-        crossover_speed_rad_s=float(np.median(bends)) if len(bends) == len(known) else None,
-    )
+    timing = default_timing(min(run.fans for run in healthy()))
+    limits = find_limits(known, healthy, timing, alarms_per_day, extrapolate=extrapolate)
     made = []
     for number, path in enumerate(given):
         made.append(path.with_name(f"calibrated-{path.name}"))

@@ -21,10 +21,10 @@ from pipeline.cli.twins.outlier_run_check import outlier_warning
 from pipeline.cli.twins.training_data import sha256_of, twin_errors
 from pipeline.errors import UserError
 from pipeline.replay.offline.healthy_runs import HealthyRuns
+from pipeline.replay.offline.limits_of_twin import find_limits
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
 from scoring.calibration.calibration import FragmentedError, TooLittleError, supports, too_little
-from scoring.calibration.calibration import calibrate as find_limits
 from scoring.calibration.healthy_statistics import MixedRatesError
 from scoring.detectors.table import calibrated_rows
 from scoring.limits import Limits, Timing
@@ -126,16 +126,7 @@ def _calibrated(
             longest_fan_s = runs.longest_fan_s()  # however much of it can be scored
             if not extrapolate and not supports(longest_fan_s, per_day):
                 raise too_little(longest_fan_s, per_day)
-            limits = find_limits(
-                runs,
-                top_speed_rad_s,
-                timing,
-                per_day,
-                seed,
-                extrapolate,
-                known.bend_rad_s,
-                known.card.drive is not None,
-            )
+            limits = find_limits([known], runs, timing, per_day, seed=seed, extrapolate=extrapolate)
         except TooLittleError as error:
             raise UserError(_too_little(error, per_day)) from error
         except MixedRatesError as error:

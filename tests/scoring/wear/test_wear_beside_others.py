@@ -21,15 +21,16 @@ from tests.support.scored_blocks import (
 )
 
 FANS = 3
-PERIOD_NS, PER_S = 100_000_000, 10
-SECONDS, RAMP_S = 160, (10, 100)
+PERIOD_NS, PER_S = 200_000_000, 5
+SECONDS, RAMP_S = 200, (10, 130)
 CHANGE_SIGMAS = 0.8
 BESIDE_OTHERS: Mapping[str, Any] = CALIBRATION | {
     "balance": {
         "shared_limit": 3.0 * CHANGE_SIGMAS * SIGMA_COMMAND / TWIN_SPEED,
         "residual_std": [0.4],
         "baseline": {"commissioning_limit_sigmas": 3.0, "adaptation_limit_sigmas": 2.0},
-    }
+    },
+    "detectors": CALIBRATION["detectors"] | {"balance_drift": {"limit": 60.0, "period_s": 0.2}},  # the ramp is no fault
 }
 
 

@@ -1,0 +1,39 @@
+"""Limits of a twin from healthy running, with what its card says about its fans: the one way into calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.runtime.tray_twin import TrayTwin
+from scoring.calibration.calibration import calibrate
+from scoring.calibration.healthy_statistics import Runs
+from scoring.limits import Limits, Timing
+
+
+def find_limits(
+    twins: Sequence[TrayTwin],
+    runs: Runs,
+    timing: Timing,
+    false_alarms_per_day: float,
+    *,
+    seed: int = 0,
+    extrapolate: bool = False,
+) -> Limits:
+    """Limits with a declared number of false alarms per fan and day, common to twins of one kind of fan.
+
+    Raises: as `calibrate`.
+    """
+    bends_rad_s = [twin.bend_rad_s for twin in twins]
+    known_rad_s = [bend_rad_s for bend_rad_s in bends_rad_s if bend_rad_s is not None]
+    return calibrate(
+        runs,
+        max(twin.card.top_speed_rad_s for twin in twins),
+        timing,
+        false_alarms_per_day,
+        seed,
+        extrapolate,
+        crossover_speed_rad_s=float(np.median(known_rad_s)) if len(known_rad_s) == len(bends_rad_s) else None,
+        has_drive=all(twin.card.drive is not None for twin in twins),
+    )

@@ -1,0 +1,45 @@
+"""pipeline.replay.offline.limits_of_twin: calibration is told what the cards say about the fans."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from pipeline.replay.offline import limits_of_twin
+from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
+from schemas.twin_card import DriveCard
+from scoring.limits import Timing
+from tests.support.twin_files import write_twin
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> TrayTwin:
+    return load_tray_twin(write_twin(tmp_path_factory.mktemp("twin") / "twin.onnx", fans=2))
+
+
+def with_a_drive(twin: TrayTwin) -> TrayTwin:
+    drive = DriveCard(turning_command=5.0, kick_s=1.0, rest_s=2.0, lowest_command=(20.0,) * twin.fans)
+    return replace(twin, card=replace(twin.card, drive=drive))
+
+
+def test_calibration_knows_top_speed_bend_and_drive_of_all_twins(
+    plain: TrayTwin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[dict[str, Any]] = []
+
+    def seen(_runs: Any, top_speed_rad_s: float, *_: Any, **more: Any) -> None:
+        given.append({"top": top_speed_rad_s, **more})
+
+    monkeypatch.setattr(limits_of_twin, "calibrate", seen)
+    faster = replace(plain, card=replace(plain.card, speed_range_rad_s=(0.0, 700.0)))
+    for twins in ([plain], [with_a_drive(plain)], [with_a_drive(plain), faster]):
+        limits_of_twin.find_limits(twins, lambda: iter(()), Timing(), 1.0)
+    bend_rad_s = plain.bend_rad_s
+    assert bend_rad_s
+    assert given == [
+        {"top": 500.0, "crossover_speed_rad_s": bend_rad_s, "has_drive": False},
+        {"top": 500.0, "crossover_speed_rad_s": bend_rad_s, "has_drive": True},
+        {"top": 700.0, "crossover_speed_rad_s": bend_rad_s, "has_drive": False},
+    ]
