@@ -77,12 +77,12 @@ def speed_style(unit: SpeedUnit, width: float) -> rr.Measurements:
 def log_styles(recording: rr.RecordingStream, tray: TrayLayout) -> None:
     """Log the static names, colours and widths of every series of a tray."""
     for fan in tray.fans:
-        deviation = rr.Measurements.from_fields(names="deviation in alarm", colors=RED, widths=0.0)
+        deviation = rr.Measurements.from_fields(names="area in alarm", colors=RED, widths=0.0)
         recording.log(fan_path(tray.name, fan, "speed"), speed_style(tray.speed_unit, LINE_WIDTH), static=True)
         recording.log(fan_path(tray.name, fan, "deviation"), deviation, static=True)
         recording.log(
             fan_path(tray.name, fan, "outside"),
-            rr.SeriesPoints(names="outside the band", colors=RED, marker_sizes=2.0),
+            rr.SeriesPoints(names="dots outside band", colors=RED, marker_sizes=2.0),
             static=True,
         )
         recording.log(
