@@ -31,9 +31,10 @@ import scipy.signal  # noqa: F401  the torque balance loads it on first use: not
 from pydantic import Field
 
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
-from pipeline.runtime.free_run import NEVER_NS, FreeRun, FreeRunInputs
+from pipeline.runtime.free_run import FreeRun, FreeRunInputs
 from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
+from pipeline.runtime.starting_fans import StartingFans
 from pipeline.runtime.twin_file import TwinFile, load_twin
 from schemas.blocks import select
 from schemas.messages import Array, Grid, InvalidReason, ModelCard, Prediction
@@ -48,7 +49,6 @@ LONGEST_BRIDGE = (
 )  # grid samples; above half a second at 100 kHz a new start is faster than running through the loss
 LARGEST_MOVE_S = 0.01  # times the width of the training range: a move of the command times the gap in which it was held
 HIGHEST_SPEED = 1.5  # times the top training speed: the balance is used up to there
-START_TIME_CONSTANTS = 5.0  # of a fan that slows down: how long the start kick of its drive lasts
 RATE_TOLERANCE = 0.01  # a card holds the measured rate
 
 
@@ -84,15 +84,9 @@ class TwinIntegratorCore(Core):
         self._standstill = twin.card.standstill
         self._off_below = twin.off_below if self._standstill is None else _off_below(twin, self._standstill)
         self._run = FreeRun(twin, config.start_samples)
-        self._starting = np.zeros(twin.fans, np.bool_)
-        """(fans,) stopped by the command before, and no free run has settled since"""
-        self._stopped_t_ns = np.full(twin.fans, NEVER_NS)
-        """(fans,) when the command stopped the fan last"""
-        self._start_up_ns = self._warm_up_ns
+        self._starting: StartingFans | None = None
         if self._standstill is not None:
-            start_s = (self._standstill.start_s or 0.0) + reach_s
-            settling_s = START_TIME_CONSTANTS * (self._standstill.coast_time_constant_s or 0.0)
-            self._start_up_ns = max(self._warm_up_ns, round((start_s + settling_s) * NS_PER_S))
+            self._starting = StartingFans(twin.fans, self._standstill, self._warm_up_ns, reach_s)
         self._balance = _balance_of(twin, self._off_below)
         self._drive = twin.card.drive
         self._averages = any(tacho.window_s > 0.0 for tacho in twin.tachos)
@@ -200,37 +194,21 @@ class TwinIntegratorCore(Core):
         beyond = np.isfinite(grid.command) & ~in_range  # where it is unknown, the free run uses the last known command
         since_t_ns = np.maximum(started_t_ns, self._run.last_out_of_range(grid.t_ns, beyond))
         warm = running & (grid.t_ns[:, np.newaxis] - since_t_ns >= self._warm_up_ns)
-        if self._standstill is not None:
-            warm &= grid.t_ns[:, np.newaxis] - self._last_stopped(grid.t_ns, inputs.stopped) >= self._start_up_ns
+        if self._starting is not None:
+            warm &= self._starting.has_started_up(grid.t_ns, inputs.stopped)
         settled = warm | (running & ~in_range)
         in_range &= np.isfinite(predicted) | ~running
         self._counts["not_predicted_out_of_range"] += int((settled & ~in_range).sum())
         invalid_reason = np.where(settled, InvalidReason.OUT_OF_RANGE, InvalidReason.WARMING_UP)
         invalid_reason = np.where(settled & in_range, InvalidReason.NONE, invalid_reason)
         judged = grid.valid
-        if self._standstill is not None:
-            starting = self._is_starting(inputs.stopped, warm)
+        if self._starting is not None:
+            starting = self._starting.is_starting(inputs.stopped, warm)
             invalid_reason = np.where(starting, InvalidReason.STARTING, invalid_reason)
             invalid_reason = np.where(inputs.stopped, InvalidReason.STOPPED, invalid_reason)
             judged = judged | ((inputs.stopped | starting) & (grid.invalid_reason == InvalidReason.NO_SPEED))
         invalid_reason = np.where(judged, invalid_reason, grid.invalid_reason).astype(np.uint8)
         return self._prediction(grid, predicted, reading_range, invalid_reason)
-
-    def _last_stopped(self, t_ns: Array, stopped: Array) -> Array:
-        """(n, fans) ns: when the command stopped the fan last."""
-        last = np.maximum.accumulate(np.where(stopped, t_ns[:, np.newaxis], NEVER_NS), axis=0)
-        last = np.maximum(last, self._stopped_t_ns)
-        self._stopped_t_ns = last[-1].copy()
-        return last
-
-    def _is_starting(self, stopped: Array, warm: Array) -> Array:
-        """(n, fans) whether no free run has become warm since the command stopped the fan."""
-        row = np.arange(1, len(stopped) + 1)[:, np.newaxis]
-        last_stopped = np.maximum.accumulate(np.where(stopped, row, 0), axis=0)
-        last_warm = np.maximum.accumulate(np.where(warm, row, 0), axis=0)
-        starting: Array = np.where((last_stopped == 0) & (last_warm == 0), self._starting, last_stopped > last_warm)
-        self._starting = starting[-1].copy()
-        return starting
 
     def _inputs(self, grid: Grid) -> FreeRunInputs:
         held_before = self._run.held_command

@@ -348,12 +348,12 @@ MECHANISMS: Sequence[Mechanism] = (
     Mechanism(
         "return-by-detector",
         "detectors that raised an alarm decide on its return, not the largest ratio of all; the next three go with it",
-        (("stages.scorer:holding_detectors", _returning(())),),
+        (("pipeline.runtime.tray_scorer:holding_detectors", _returning(())),),
     ),
     Mechanism(
         "return-off-delay",
         "an alarm returns after the memory of its detectors, not after the same delay for all",
-        (("stages.scorer:holding_detectors", _off_delay_of_all),),
+        (("pipeline.runtime.tray_scorer:holding_detectors", _off_delay_of_all),),
     ),
     Mechanism(
         "return-growth",

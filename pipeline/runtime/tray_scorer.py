@@ -1,0 +1,186 @@
+"""How one tray is scored: a block of predictions in, its scores and the messages on alarms out.
+
+Four things are kept apart: the *statistics* on two residuals (scoring.fan_scorer), their *limits* (scoring.limits, from
+the twin's card), the *state* of each alarm after OPC UA Part 9 (scoring.alarms.tray_conditions), and its *diagnosis*
+(scoring.diagnosis.diagnosis). They are built and connected here, with slow wear (scoring.wear) beside them.
+See docs/explanation/deciding.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.runtime.decision_rules import DecisionRules
+from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig
+from schemas.messages import Alarm, Array, FanState, Prediction, Score
+from schemas.units import NS_PER_S
+from scoring.alarms.alarm_manager import AlarmContext, AlarmManager
+from scoring.alarms.alarm_text import AlarmText
+from scoring.alarms.fan_condition import ALARM, RETURNING, ConditionSettings
+from scoring.alarms.holding import holding_detectors
+from scoring.alarms.tray_conditions import AlarmEvent
+from scoring.diagnosis.advice import Advice
+from scoring.diagnosis.diagnoser import Diagnoser
+from scoring.fan_scorer import HALF_LIMIT, FanScorer
+from scoring.samples import among, arrived, samples_of
+from scoring.score_message import score_of
+from scoring.scored_block import ScoredBlock
+from scoring.wear.followed import followed_fans
+from scoring.wear.wear_monitor import WearMonitor
+
+DATA_LOST_AFTER_NS = 2 * NS_PER_S  # an active alarm is not confirmed by data after so long without a score
+
+
+class TrayScorer:
+    """The scores, alarms and wear of one tray's fans."""
+
+    def __init__(
+        self, fans: int, text: AlarmText, config: ScorerConfig, twin: HealthyTwin, decision_rules: DecisionRules
+    ) -> None:
+        """From the beginning: no fan is commissioned, and none has an alarm."""
+        forgets_over_gaps = decision_rules >= DecisionRules.TIME_AND_GAPS
+        judges_rest = decision_rules >= DecisionRules.AT_REST
+        self._holds = decision_rules >= DecisionRules.HOLDING
+        self._twin = twin
+        self._text = text
+        self._sigma_rad_s = np.ones(fans)
+        self.fan_scorer = FanScorer(
+            fans,
+            twin.limits,
+            tachos=twin.tachos,
+            forgets_over_gaps=forgets_over_gaps,
+            skips_transients=self._holds,
+            allows_for_counts=decision_rules >= DecisionRules.ONE_ALARM,
+        )
+        advice = Advice(twin.command_unit) if self._holds else None
+        if judges_rest:
+            lowest_command = twin.standstill.turning_command if twin.standstill else 0.0
+            advice = Advice(twin.command_unit, lowest_command, twin.highest_command)
+        self._diagnoser = Diagnoser(twin.balances, advice, twin.tachos, twin.standstill, knows_readings=judges_rest)
+        self.wear = WearMonitor(twin.balances, self._diagnoser, config.wear_every_s, twin.command_unit)
+        off_delay_s = config.least_off_delay_s(twin.tachos)
+        holding = holding_detectors(self.fan_scorer.detectors, off_delay_s, judges_rest=judges_rest)
+        settings = ConditionSettings(
+            on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),
+            off_delay_ns=round(off_delay_s * NS_PER_S),
+            return_ratio=1.0 - config.deadband,
+            alarm_ratio=config.alarm_ratio,
+            latching=config.latching,
+            confirming=config.confirming,
+            data_lost_after_ns=DATA_LOST_AFTER_NS if forgets_over_gaps else None,
+            settling_ns=self.fan_scorer.longest_memory_ns,
+            detectors=holding if self._holds else (),
+        )
+        self.alarms = AlarmManager(fans, settings, self._diagnoser, text)
+
+    def score(self, item: Prediction) -> tuple[Score, list[Alarm]]:
+        """The score of a block of new samples, and the messages on alarms."""
+        self._sigma_rad_s = item.sigma_rad_s
+        scored, state, events = self._decide(item)
+        self._feed_diagnoser(item, scored)
+        score = score_of(item, scored, state)
+        self._feed_wear(item, scored, state)
+        sigma_rad_s, sigma_command = item.sigma_rad_s, item.torque_balance_sigma_command
+
+        def limits(row: int, fan: int) -> tuple[float, float]:
+            of_speed, of_balance = self._limits_at(item, scored, row, int(scored.statistic[row, fan]))
+            return float((of_speed * sigma_rad_s)[fan]), float((of_balance * sigma_command)[fan])
+
+        context = AlarmContext(balance_command=scored.balance_smoothed * sigma_command, limits=limits)
+        return score, self.alarms.emit(events, score, context)
+
+    @property
+    def followed(self) -> list[str]:
+        """A line for each fan whose baseline has followed it far."""
+        limit = self._twin.limits.speed.baseline.adaptation_limit_sigmas
+        return followed_fans(self.fan_scorer.residuals["speed"].baseline, limit, self._sigma_rad_s, self._text.units)
+
+    def recommission(self, fans: Array, t_ns: int) -> None:
+        """Commission some fans again, (fans,) of bool, after the sample at t_ns."""
+        self.fan_scorer.recommission(fans)
+        self.wear.forget(fans, t_ns)
+
+    def snapshot(self) -> dict[str, Any]:
+        """The state to continue from, as JSON values."""
+        return {
+            "scorer": self.fan_scorer.snapshot(),
+            "alarms": self.alarms.snapshot(),
+            "wear": self.wear.snapshot(),
+        }
+
+    def restore_baselines(self, state: Mapping[str, Any]) -> None:
+        """Restore what was learned, of a snapshot of the same twin: all but the alarms.
+
+        Raises:
+            ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError: it cannot be read. Then
+                a part may have been restored.
+        """
+        if "wear" in state:
+            self.wear.restore(state["wear"])
+        self.fan_scorer.restore(state["scorer"])
+
+    def _limits_at(
+        self, item: Prediction, scored: ScoredBlock, row: int, statistic: int
+    ) -> tuple[Array | float, Array | float]:
+        """How far both residuals may be from their baselines, by the alarm's statistic; (fans,) or for all, sigma."""
+        period_s = item.period_ns / NS_PER_S
+        if not self._holds:
+            return self.fan_scorer.limit_sigmas("speed", period_s), self.fan_scorer.limit_sigmas("balance", period_s)
+        speed = item.measured_speed_rad_s[row]
+        return (
+            self.fan_scorer.limit_at("speed", speed, statistic, period_s, scored.speed_learned_scale[row]),
+            self.fan_scorer.limit_at("balance", speed, statistic, period_s, scored.balance_learned_scale[row]),
+        )
+
+    def _decide(self, item: Prediction) -> tuple[ScoredBlock, Array, list[AlarmEvent]]:
+        """The scores, the states (n, fans) and the alarms' events. While an alarm is active, baselines stay."""
+        speed = np.where(np.isfinite(item.predicted_speed_rad_s), item.predicted_speed_rad_s, item.measured_speed_rad_s)
+        events: list[AlarmEvent] = []
+        scored, stretches = self.fan_scorer.stretches(samples_of(item))
+        state = np.empty(scored.score.shape, np.uint8)
+        for rows in stretches:
+            was_active = self.alarms.active
+            score, judged = scored.score[rows], scored.judged[rows]
+            ratio = np.where(judged & np.isnan(score), 0.0, score)
+            state[rows], happened = self.alarms.update(
+                item.t_ns[rows], item.period_ns, ratio, judged, scored.ratios[rows], speed[rows]
+            )
+            if self._holds:
+                in_alarm = among(state[rows], ALARM, RETURNING).any(axis=0)
+                self.fan_scorer.learn_nothing(was_active | self.alarms.active | in_alarm)
+            events += [replace(event, row=event.row + rows.start) for event in happened]
+        return scored, state, events
+
+    def _feed_diagnoser(self, item: Prediction, scored: ScoredBlock) -> None:
+        command = item.averaged_command if len(item.averaged_command) else item.command
+        expected = np.where(np.isfinite(item.measured_speed_rad_s), scored.balance_expected, np.nan)
+        self._diagnoser.take(
+            item.t_ns,
+            item.period_ns,
+            np.where(arrived(item.invalid_reason), command, np.nan),
+            item.measured_speed_rad_s,
+            scored.balance_baseline * item.torque_balance_sigma_command,
+            scored.balance_baseline_s,
+            expected * item.torque_balance_sigma_command,
+            item.predicted_speed_rad_s,
+            item.reading_missing,
+        )
+
+    def _feed_wear(self, item: Prediction, scored: ScoredBlock, state: Array) -> None:
+        assert self.fan_scorer.origin_t_ns is not None
+        sigma_command, known = item.torque_balance_sigma_command, np.isfinite(item.torque_balance_command)
+        normal, period_s = state == FanState.NORMAL, item.period_ns / NS_PER_S
+        self.wear.update(
+            item.t_ns,
+            self.fan_scorer.origin_t_ns,
+            eligible=(scored.score < HALF_LIMIT) & normal & known,
+            disturbed=(scored.score >= HALF_LIMIT) | ~(normal | (state == FanState.UNKNOWN)),
+            commissioned_command=scored.balance_commissioned * sigma_command,
+            shared_command=scored.balance_shared * sigma_command,
+            held=scored.balance_at_limit,
+            limit_command=self.fan_scorer.persistent_limit_sigmas("balance", period_s) * sigma_command,
+        )
