@@ -1,4 +1,4 @@
-"""pipeline.replay.offline.limits_of_twin: calibration is told what the cards say about the fans."""
+"""pipeline.replay.offline.limits_of_twin: calibration gets what the cards say about the fans."""
 
 from __future__ import annotations
 
