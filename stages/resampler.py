@@ -103,7 +103,7 @@ class ResamplerCore(Core):
         self._tachos = tacho_of_each_fan(tachos, fans)
         self._config = config
         self._decision_rules = decision_rules
-        self._line = LineRate()
+        self._line = LineRate(knows_losses=decision_rules >= DecisionRules.LOSSES_OF_LINE)
         self._line_hz: float | None = None
         """as found; None: not yet, or not asked for"""
         self._waiting: list[Raw] = []

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from schemas.messages import Raw
+from schemas.messages import Array, Raw
 from schemas.units import NS_PER_S
 
 RATES_HZ = (1, 2, 5, 10, 20, 25, 50, 100)
@@ -29,6 +29,10 @@ LONGEST_WAIT_US = 5_000_000  # after this MIN_SAMPLES are enough: a slow line mu
 ENOUGH_SAMPLES = 26
 SHORTEST_WAIT_US = 1_000_000  # a host that stalls delivers the samples of a tenth of a second at once
 MAX_SAMPLES = 2000
+MOST_PERIODS = 5  # a longer pause says nothing about the period
+MIN_USED_SHARE = 0.5  # of the steps
+MOST_UNEVEN = 0.15  # mean distance of steps from whole periods, in periods; a quarter where there is no period
+LEAST_RECEIVED_US = 30_000  # a shorter step between times of receipt may be that of the host
 UINT32 = 1 << 32
 
 
@@ -111,7 +115,7 @@ class SampleTimes:
 
     def add_time(self, us: int) -> None:
         """Add the time of one sample."""
-        times_us, has_clock = self._times_us, self._source is not None and self._source[1]
+        times_us, has_clock = self._times_us, self._has_clock
         if not times_us:
             times_us.append(us)
             return
@@ -123,6 +127,10 @@ class SampleTimes:
             times_us.append(us)
         elif step_us > 0 or not has_clock:  # samples that are read together have one time of receipt
             times_us.append(times_us[-1] + step_us)
+
+    @property
+    def _has_clock(self) -> bool:
+        return self._source is not None and self._source[1]
 
     @property
     def count(self) -> int:
@@ -143,6 +151,35 @@ class SampleTimes:
         median_us = float(np.median(spans_us)) / steps if len(spans_us) else 0.0
         return 1e6 / median_us if median_us > 0.0 else math.inf
 
+    @property
+    def sent_hz(self) -> float:
+        """Samples a second that the device sends, however many of them are lost: a loss makes a step of two periods or
+        more. `line_hz` where the steps are no such multiples.
+        """
+        period_us = common_period_us(np.diff(np.array(self._times_us, np.int64)))
+        if period_us is None or not (self._has_clock or period_us >= LEAST_RECEIVED_US):
+            return self.line_hz
+        return max(self.line_hz, 1e6 / period_us)
+
+
+def common_period_us(steps_us: Array) -> float | None:
+    """The period of which steps are multiples, most of them small ones; None if there is none, or too few steps.
+
+    It begins with the shorter steps, and is the mean over all that are at most a few periods long.
+    """
+    if len(steps_us) < MIN_SAMPLES - 1 or not steps_us.all():  # some were read together
+        return None
+    period_us = float(np.median(steps_us[steps_us <= 1.5 * np.quantile(steps_us, 0.25)]))
+    periods, used = np.rint(steps_us / period_us), np.ones(len(steps_us), np.bool_)
+    for _ in range(3):
+        used = (periods >= 1) & (periods <= MOST_PERIODS)
+        if used.mean() < MIN_USED_SHARE:
+            return None
+        period_us = float(steps_us[used].sum() / periods[used].sum())
+        periods = np.rint(steps_us / period_us)
+    uneven = np.abs(steps_us / period_us - periods)[used].mean()
+    return period_us if uneven <= MOST_UNEVEN else None
+
 
 class LineRate:
     """Measures the rate of a line from its first samples.
@@ -150,7 +187,9 @@ class LineRate:
     The result depends on the samples only, and not on how they are divided into messages.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, knows_losses: bool = True) -> None:
+        """knows_losses: False only for the rates of recordings of former versions."""
+        self._knows_losses = knows_losses
         self._times = SampleTimes(MAX_SAMPLES)
         self._seen = 0
         self._first_t_ns = self._last_t_ns = 0
@@ -194,5 +233,5 @@ class LineRate:
 
     @property
     def line_hz(self) -> float:
-        """Samples a second."""
-        return self._times.line_hz
+        """Samples a second that the device sends."""
+        return self._times.sent_hz if self._knows_losses else self._times.line_hz

@@ -39,6 +39,9 @@ class DecisionRules(IntEnum):
     that are near enough the grid has a speed all the same, and hides most of those that a loose wire costs. Readings of
     a tacho that counts may be unsteady while the fan changes its speed, and repeat where a healthy fan would read the
     same."""
+    LOSSES_OF_LINE = 9
+    """The rate of a line is that at which its device sends, also if samples are lost while it is measured. Before, it
+    was that at which they arrived."""
 
 
 CURRENT_RULES = max(DecisionRules)

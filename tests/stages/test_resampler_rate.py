@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.devices.line_rate import RATES_HZ, grid_rate_hz
+from pipeline.runtime.decision_rules import DecisionRules
 from schemas.blocks import join
 from schemas.messages import Array, Grid, Header, InvalidReason, Raw
 from schemas.units import NS_PER_S
@@ -113,6 +114,48 @@ def test_a_restarted_resampler_comes_to_the_same_rate_wherever_it_begins() -> No
         starts = range(0, len(messages) // 2, max(1, len(messages) // 20))
         periods = {grid_of(messages[start:])[0].period_ns for start in starts}
         assert periods == {NS_PER_S // grid_rate_hz(line_hz)}, line_hz
+
+
+def refused_at_first(line_hz: float, how: str) -> Array:
+    """Times of a line of 20 s, of which samples of the first six are refused."""
+    line_s = times(line_hz, 20, 0.1)
+    kept = {
+        "half of them": np.random.default_rng(6).random(len(line_s)) < 0.5,
+        "while the device reboots": line_s % 1.5 < 0.35,
+    }[how]
+    return line_s[kept | (line_s > 6.0)]
+
+
+@pytest.mark.parametrize(
+    ("line_hz", "clock", "how"),
+    [
+        (10, False, "half of them"),
+        (25, False, "half of them"),
+        (100, True, "half of them"),
+        (10, False, "while the device reboots"),
+    ],
+)
+def test_a_line_whose_first_samples_are_refused_gets_the_grid_that_it_sends(
+    line_hz: int, clock: bool, how: str
+) -> None:
+    messages = samples(refused_at_first(line_hz, how), clock=clock)
+    grid, core = grid_of(messages)
+    assert (grid.period_ns, core.problem()) == (NS_PER_S // line_hz, "")
+
+
+def test_a_recording_of_before_losses_of_the_line_were_known_keeps_its_grid() -> None:
+    core = ResamplerCore(1, ResamplerConfig(), decision_rules=DecisionRules.ONE_ALARM)
+    messages = samples(refused_at_first(10, "half of them"), clock=False)
+    grid = join([grid for message in messages for grid in core.step(message)])
+    assert grid.period_ns == NS_PER_S // 5
+
+
+@pytest.mark.parametrize("uneven", ["by chance", "read every 40 ms"])
+def test_a_line_without_a_period_gets_the_rate_at_which_samples_arrive(uneven: str) -> None:
+    steps_s = np.random.default_rng(7).exponential(0.1, 300)
+    line_s = {"by chance": np.cumsum(steps_s), "read every 40 ms": np.floor(times(64, 5) / 0.04) * 0.04}[uneven]
+    grid, _ = grid_of(samples(line_s, clock=False))
+    assert grid.period_ns == NS_PER_S // {"by chance": 10, "read every 40 ms": 50}[uneven]
 
 
 @pytest.mark.parametrize("lost_share", [0.05, 0.15])

@@ -147,7 +147,7 @@ def _rate(times: SampleTimes, config: Config, twin: TrayTwin | None) -> Finding:
         return True, apart
     if settings.rate_hz is None and is_too_slow(line_hz):
         return False, f"{apart}: too slow to be judged; let the device send at least 1 a second"
-    timing: GridTiming = settings.timing(settings.rate_hz or grid_rate_hz(line_hz))
+    timing: GridTiming = settings.timing(settings.rate_hz or grid_rate_hz(times.sent_hz))
     if leaves_gaps(line_hz, timing):
         limit = f"resampler.gap_limit_s = {timing.gap_limit_ns / NS_PER_S:g}"
         return (
