@@ -158,3 +158,20 @@ def test_the_fewer_speeds_were_seen_the_wider_are_the_limits() -> None:
     assert few
     assert many
     assert few.limit > 1.3 * many.limit
+
+
+def test_a_speed_that_was_quiet_for_some_minutes_gets_no_narrow_limits_from_few_data() -> None:
+    def two_speeds() -> Iterator[HealthyRun]:
+        block = tray(6, 300.0)
+        slow = np.arange(len(block.t_ns)) < len(block.t_ns) // 2
+        speed = np.where(slow, 60.0, 140.0)[:, np.newaxis] + 1e-3 * block.speed_rad_s
+        residual = np.where(slow, 1.0, 0.3)[:, np.newaxis] * block.speed_residual
+        yield HealthyRun("one", FANS, in_blocks(replace(block, speed_rad_s=speed, speed_residual=residual)))
+
+    def stds(per_day: float, *, extrapolate: bool) -> tuple[float, ...]:
+        return calibrate(two_speeds, 200.0, Timing(), per_day, extrapolate=extrapolate).speed.residual_std
+
+    slow, quiet = stds(600.0, extrapolate=False)
+    assert quiet == pytest.approx(0.3 * slow, rel=0.1)
+    cautious = stds(1.0, extrapolate=True)
+    assert cautious == (slow, (slow + quiet) / 2)
