@@ -239,7 +239,7 @@ def _cautious(limits: Limits, found: HealthyStatistics) -> Limits:
     They are multiples of a standard deviation that few independent errors of the twin have shown, one for each speed of
     a fan, and so those of the upper end of its confidence interval.
     """
-    limits = _each(limits, lambda residual, _: _nowhere_quieter(residual))
+    limits = _each(limits, lambda residual, _: _not_below_mean(residual))
     visited = sum(int((seconds >= VISITED_S).sum()) for seconds in found.visited_s.values())
     independent = max(visited, LEAST_VISITED)
     unknown = math.sqrt(independent / float(chi2.ppf(1.0 - CONFIDENCE, independent)))
@@ -261,7 +261,7 @@ def _cautious(limits: Limits, found: HealthyStatistics) -> Limits:
     return limits.model_copy(update={"detectors": detectors})
 
 
-def _nowhere_quieter(residual: HealthyResidual) -> HealthyResidual:
+def _not_below_mean(residual: HealthyResidual) -> HealthyResidual:
     """A few minutes at a speed may happen to be quiet: no standard deviation is below the mean over the speeds."""
     least = residual.mean_residual_std
     return residual.model_copy(update={"residual_std": tuple(max(std, least) for std in residual.residual_std)})

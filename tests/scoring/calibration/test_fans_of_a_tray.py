@@ -171,7 +171,7 @@ def test_a_speed_that_was_quiet_for_some_minutes_gets_no_narrow_limits_from_few_
     def stds(per_day: float, *, extrapolate: bool) -> tuple[float, ...]:
         return calibrate(two_speeds, 200.0, Timing(), per_day, extrapolate=extrapolate).speed.residual_std
 
-    slow, quiet = stds(600.0, extrapolate=False)
-    assert quiet == pytest.approx(0.3 * slow, rel=0.1)
+    slow, fast = stds(600.0, extrapolate=False)
+    assert fast == pytest.approx(0.3 * slow, rel=0.1)
     cautious = stds(1.0, extrapolate=True)
-    assert cautious == (slow, (slow + quiet) / 2)
+    assert cautious == (slow, (slow + fast) / 2)
