@@ -97,11 +97,14 @@ def feedback_share(pieces: Sequence[Run], fan: int) -> float:
 
     The noise of the sample at which the command was given counts only where the command moves against it. The other
     sign is a speed measured a little later than its command. pieces: without gaps.
+
+    Of a tacho that counts, one sample of each count is looked at: those between repeat it, and a prediction from them
+    leaves the next count as noise, which the command has caused.
     """
-    long_enough = [piece for piece in pieces if piece.samples > 4 * LAGS]
-    if not long_enough:
+    signals = [_of_each_count(piece, fan) for piece in pieces]
+    signals = [(command, speed_rad_s) for command, speed_rad_s in signals if len(command) > 4 * LAGS]
+    if not signals:
         return 0.0
-    signals = [(piece.command[:, fan], piece.speed_rad_s[:, fan]) for piece in long_enough]
     predictors = [_predictors(command, speed_rad_s) for command, speed_rad_s in signals]
     noise = np.split(
         _residual(np.concatenate(predictors), np.concatenate([speed_rad_s[LAGS:] for _, speed_rad_s in signals]))[0],
@@ -130,6 +133,12 @@ def feedback_share(pieces: Sequence[Run], fan: int) -> float:
         return 0.0
     probability = f_distribution.sf((explained / extra) / (unexplained / free), extra, free)
     return share if probability < FALSE_ALARM_PROBABILITY else 0.0
+
+
+def _of_each_count(piece: Run, fan: int) -> tuple[Array, Array]:
+    """(n,) commands and speeds, as far apart as the readings of the tacho change."""
+    every = max(1, round(piece.tacho[fan].held_s / piece.median_period_s))
+    return piece.command[::every, fan], piece.speed_rad_s[::every, fan]
 
 
 def _poor_excitation(pieces: Sequence[Run], fan: int) -> list[str]:

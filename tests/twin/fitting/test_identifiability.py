@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from schemas.tacho import Tacho
 from tests.support import fan_data
 from tests.support.fan_data import published_run, rough_run
 from twin.fitting.identifiability import feedback_share, identifiability_warnings
@@ -286,3 +287,32 @@ def test_motors_in_open_loop_are_not_reported_as_controlled(measured_data) -> No
         lines = warnings_of(run)
         assert not has_line_with(lines, "closed loop"), run.name
         assert not has_line_with(lines, "cannot be distinguished"), run.name
+
+
+def counted(gain_per_rad_s: float) -> Run:
+    """Ten minutes of a fan at 100 Hz that is read by counts over a second, under a thermostat ten times a second.
+
+    A disturbance moves the speed, which a controller counters with this gain.
+    """
+    rng, tacho = np.random.default_rng(4), Tacho(kind="count", window_s=1.0)
+    commands, readings, speed, reading, count = [], [], 100.0, 100.0, []
+    wanted = warm = disturbed = 0.0
+    for k in range(60_000):
+        if k % 2000 == 0:
+            wanted = rng.uniform(-40.0, 40.0)
+        if k % 10 == 0:
+            warm += 0.02 * (wanted - warm) + 0.02 * rng.normal()
+        command = 100.0 + warm - gain_per_rad_s * (reading - 100.0 - warm)
+        disturbed += 0.3 * rng.normal() - 0.005 * disturbed
+        speed += 0.01 * (command + disturbed - speed)
+        count.append(speed)
+        if len(count) == 100:
+            reading, count = tacho.resolution_rad_s * np.rint(np.mean(count) / tacho.resolution_rad_s), []
+        commands.append([command])
+        readings.append([reading])
+    return Run("counted", 0.01 * np.arange(60_000.0), np.array(commands), np.array(readings), (tacho,))
+
+
+def test_a_loop_through_a_tacho_that_counts_is_noticed_and_none_where_there_is_none() -> None:
+    assert feedback_share([counted(0.5)], 0) > 0.2
+    assert feedback_share([counted(0.0)], 0) == 0.0
