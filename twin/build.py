@@ -40,11 +40,12 @@ from twin.fitting.drive_fit import find_drive
 from twin.fitting.identification import Identification, identify
 from twin.fitting.model_fits import FitRequest, Trainer
 from twin.fitting.standstill import find_standstill
-from twin.fitting.training import Physics, Progress
+from twin.fitting.training import Physics
 from twin.kinds import BOTH_INPUTS, ModelKind, find_kind
 from twin.models.drive import DRIVE_PARAMETERS
 from twin.models.model import Model
 from twin.models.physics import PARAMETER_NAMES
+from twin.progress import Progress, unreported, within
 from twin.runs import Array, Run, common_fans, common_tacho
 
 
@@ -84,7 +85,7 @@ def train_twin(
     data: Sequence[DataCard] = (),
     validation_data: Sequence[DataCard] = (),
     created: datetime | None = None,
-    progress: Progress | None = None,
+    progress: Progress = unreported,
 ) -> TrainedTwin:
     """Build a twin of healthy runs.
 
@@ -106,13 +107,13 @@ def train_twin(
         runs, validation_runs = _as_if_instantaneous(runs), _as_if_instantaneous(validation_runs)
     tacho = common_tacho([*runs, *validation_runs])
     started_s = time.monotonic()
-    identification = identify(runs)
+    identification = identify(runs, progress=progress)
     standstill = find_standstill([*runs, *validation_runs])
-    drive = find_drive(runs, validation_runs, identification, standstill) if model_kind.knows_drives else None
+    drive = find_drive(runs, validation_runs, identification, standstill, progress) if model_kind.knows_drives else None
     acting, validation_acting = runs, validation_runs
     if drive is not None:
         acting, validation_acting = drive.driven(runs), drive.driven(validation_runs)
-        identification = identify(acting)
+        identification = identify(acting, progress=within("behind the drive", progress))
     fitted = model_kind.fit(
         FitRequest(
             acting,
@@ -131,6 +132,7 @@ def train_twin(
     duration_s = time.monotonic() - started_s
     identification = replace(identification, warnings=(*identification.warnings, *fitted.warnings))
     judged = validation_runs or runs
+    progress("evaluation", 0, 0, np.nan)
     pieces = evaluation_pieces(judged)
     healthy = healthy_residual(free_run_residuals(model, parameters, pieces), pieces)
     sigma_rad_s = np.array(healthy.sigma_rad_s)
@@ -146,6 +148,7 @@ def train_twin(
             f"the {kind} model of {name!r} diverges when run freely; record more levels, or try another kind"
         )
     validation = evaluate_model(model, parameters, sigma_rad_s, judged)
+    progress("torque balance", 0, 0, np.nan)
     if drive is None:
         balance = fit_balance(runs, validation_runs, identification)
     else:

@@ -11,9 +11,9 @@ from twin.build import TrainedTwin, evaluate, train_twin
 from twin.errors import TwinError
 from twin.evaluation.accuracy import Evaluation, evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
 from twin.export.fan_rows import measured_as_in_card
-from twin.fitting.training import Progress
 from twin.kinds import KINDS, Variant
 from twin.models.physics import LAG, PARAMETER_NAMES
+from twin.progress import Progress, unreported
 from twin.runs import Run
 
 Source = Literal["test", "held-out", "training"]
@@ -86,7 +86,7 @@ def contend(
     fan_numbers: Sequence[int] | None = None,
     data: Sequence[DataCard] = (),
     validation_data: Sequence[DataCard] = (),
-    progress: Progress | None = None,
+    progress: Progress = unreported,
 ) -> Contender:
     """Train one candidate and evaluate it. Arguments as of build.train_twin; test_runs take no part in training.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,9 +14,21 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
     from pipeline.cli.twins.training_data import TrainingData
-    from twin.fitting.training import Progress as ProgressCallback
+    from twin.progress import Progress as ProgressCallback
 
 LINE_PERIOD_S = 5.0
+EXIT_INTERRUPTED = 130
+"""as of a program that SIGINT ends"""
+
+
+@contextmanager
+def interruptible(outcome: str) -> Iterator[None]:
+    """Around work whose result is written at its end: Ctrl-C ends the command with one line, which says the outcome."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted: {outcome}", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
 @contextmanager
@@ -32,41 +45,52 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def training_progress(training_data: TrainingData) -> Iterator[Callable[[str], ProgressCallback]]:
-    """Around trainings; yields a function that starts the display of one by its name and returns its progress callback.
+    """Around identification and training; yields a function that starts the display of one by its name and returns its
+    progress callback.
 
-    Bars disappear at the end. Lines appear when a training begins and every LINE_PERIOD_S.
+    Bars disappear at the end. Lines appear when a part of the work begins and every LINE_PERIOD_S.
     """
     console = Console(stderr=True)
 
     def error(rmse_rad_s: float) -> str:
-        return f"free-run rmse {rmse_rad_s / training_data.rad_s_per_unit:.4g} {training_data.speed_unit}"
+        if math.isnan(rmse_rad_s):
+            return ""
+        return f", free-run rmse {rmse_rad_s / training_data.rad_s_per_unit:.4g} {training_data.speed_unit}"
 
     def start_lines(name: str) -> ProgressCallback:
         prefix = f"{name}: " if name else ""
-        typer.echo(f"{prefix}identifying", err=True)
-        started_s = shown_s = time.monotonic()
+        started_s, shown_s, shown_part = time.monotonic(), -math.inf, ""
 
-        def show(done: int, at_most: int, rmse_rad_s: float) -> None:
-            nonlocal shown_s
+        def show(part: str, done: int, at_most: int, rmse_rad_s: float) -> None:
+            nonlocal shown_s, shown_part
             now_s = time.monotonic()
-            if now_s - shown_s >= LINE_PERIOD_S:
-                shown_s = now_s
-                typer.echo(f"{prefix}{done}/{at_most}, {error(rmse_rad_s)}, {now_s - started_s:.0f} s", err=True)
+            if part != shown_part or now_s - shown_s >= LINE_PERIOD_S:
+                shown_s, shown_part = now_s, part
+                count = f" {done}/{at_most}" if at_most else ""
+                typer.echo(f"{prefix}{part}{count}{error(rmse_rad_s)}, {now_s - started_s:.0f} s", err=True)
 
         return show
 
     if not console.is_terminal:
         yield start_lines
         return
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[count]}"))
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bars:
 
         def start_bar(name: str) -> ProgressCallback:
             prefix = f"{name}: " if name else ""
-            task = bars.add_task(f"{prefix}identifying", total=None)
+            shown_part = ""
 
-            def show(done: int, at_most: int, rmse_rad_s: float) -> None:
-                bars.update(task, completed=done, total=at_most, description=prefix + error(rmse_rad_s))
+            def show(part: str, done: int, at_most: int, rmse_rad_s: float) -> None:
+                nonlocal shown_part
+                count = f"{done}/{at_most}" if at_most else ""
+                description = f"{prefix}{part}{error(rmse_rad_s)}"
+                if part != shown_part:  # each has a bar of its own
+                    shown_part = part
+                    for task in bars.task_ids:
+                        bars.remove_task(task)
+                    bars.add_task(description, total=at_most or None, count=count)
+                bars.update(bars.task_ids[0], completed=done, description=description, count=count)
 
             return show
 

@@ -15,8 +15,9 @@ import numpy as np
 from twin.errors import TwinError
 from twin.evaluation.accuracy import evaluation_pieces, free_run_residuals
 from twin.fitting.identification import identify
-from twin.fitting.training import GRID_PRIOR_STD, Physics, Progress, train_network
+from twin.fitting.training import GRID_PRIOR_STD, Physics, train_network
 from twin.models.model import NetworkOde
+from twin.progress import Progress, unreported, within
 from twin.runs import Array, Run
 
 PRIOR_STDS = (0.1 * GRID_PRIOR_STD, GRID_PRIOR_STD)
@@ -25,7 +26,7 @@ ITERATIONS = 25
 
 
 def choose_prior_std(
-    model: NetworkOde, runs: Sequence[Run], *, seed: int, physics: Physics, progress: Progress | None = None
+    model: NetworkOde, runs: Sequence[Run], *, seed: int, physics: Physics, progress: Progress = unreported
 ) -> float:
     """The prior standard deviation for training.train_network.
 
@@ -40,8 +41,9 @@ def choose_prior_std(
     losses: list[list[float]] = [[] for _ in prior_stds]
     for fold in range(folds):
         left_out, rest = list(runs[fold::folds]), [run for k, run in enumerate(runs) if k % folds != fold]
+        of_fold = within(f"cross-validation {fold + 1} of {folds}", progress)
         try:
-            identification = identify(rest)
+            identification = identify(rest, progress=of_fold)
         except TwinError:
             # The remaining runs do not excite every fan: this choice cannot be fitted.
             return GRID_PRIOR_STD
@@ -55,7 +57,7 @@ def choose_prior_std(
                 seed=seed,
                 physics=physics,
                 prior_std=prior_std,
-                progress=progress,
+                progress=within(f"network {index + 1} of {len(prior_stds)}", of_fold),
             )
             losses[index] += [_loss(trained, parameters, run) for run in left_out]
     return prior_stds[simplest_of_the_best(np.array(losses))]

@@ -11,7 +11,8 @@ runs together: held-out ones may hold no start and no command of the plateau, an
 no chance.
 """
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +30,7 @@ from twin.models.physical import fitted_unknowns, parameters_by_unknowns, physic
 from twin.models.physics import LAG
 from twin.models.recursion import linear_recursion
 from twin.models.right_hand_side import FanEquation
+from twin.progress import Progress, unreported
 from twin.runs import Array, Run
 
 FEWEST_STARTS = 3
@@ -36,6 +38,7 @@ LEAST_GAIN = 0.07
 """a share of the free-run error"""
 KICKS_S, RESTS_S = (0.3, 0.6, 1.2), (1.0, 2.0, 4.0)
 FIRST_ITERATIONS, MORE_ITERATIONS = 12, 5
+ITERATIONS = 2 * FIRST_ITERATIONS + (len(KICKS_S) + len(RESTS_S) - 2) * MORE_ITERATIONS
 FIRST_DAMPING, DAMPING_DOWN, DAMPING_UP = 1e-3, 3.0, 4.0
 FIRST_PLATEAU, FIRST_KICK = 0.05, 0.5
 """shares of the range of commands above the lowest that turns the fans"""
@@ -70,7 +73,11 @@ class FoundDrive:
 
 
 def find_drive(
-    runs: Sequence[Run], validation_runs: Sequence[Run], plain: Identification, standstill: Standstill | None
+    runs: Sequence[Run],
+    validation_runs: Sequence[Run],
+    plain: Identification,
+    standstill: Standstill | None,
+    progress: Progress = unreported,
 ) -> FoundDrive | None:
     """The drive of the fans, or None where they have none, or it does not pay.
 
@@ -88,19 +95,28 @@ def find_drive(
     except TwinError:
         return None
     highest = max(float(run.command.max()) for run in runs)
+    count = itertools.count(1)
+
+    def iteration_done() -> None:
+        progress("drive of the fans", next(count), ITERATIONS, np.nan)
+
     start = np.zeros((len(plain.parameters), UNKNOWNS))
     start[:, :LAG] = fitted_unknowns(plain.parameters, plain.top_speed_rad_s)[:, :LAG]
     without = np.arange(UNKNOWNS) < LAG
     without[FRICTION] = True
     drive = Drive(turning, KICKS_S[1], RESTS_S[1])
     never = replace(drive, rest_s=np.inf)
-    of_friction = _Problem(learned, never, plain.top_speed_rad_s, highest).fit(start, without, FIRST_ITERATIONS)
+    of_friction = _Problem(learned, never, plain.top_speed_rad_s, highest).fit(
+        start, without, FIRST_ITERATIONS, iteration_done
+    )
     start = of_friction.copy()
     # A plateau below all commands would have no effect, and so no derivative.
     start[:, LOWEST] = standstill.turning_command + FIRST_PLATEAU * (highest - standstill.turning_command)
     start[:, KICK] = turning + FIRST_KICK * (highest - turning)
     everything = np.ones(UNKNOWNS, np.bool_)
-    best = _Problem(learned, drive, plain.top_speed_rad_s, highest).fit(start, everything, FIRST_ITERATIONS)
+    best = _Problem(learned, drive, plain.top_speed_rad_s, highest).fit(
+        start, everything, FIRST_ITERATIONS, iteration_done
+    )
     loss = _Problem(learned, drive, plain.top_speed_rad_s, highest).mean_square(best)
     for name, ladder in (("kick_s", KICKS_S), ("rest_s", RESTS_S)):
         for value in ladder:
@@ -108,7 +124,7 @@ def find_drive(
                 continue
             other = replace(drive, **{name: value})
             problem = _Problem(learned, other, plain.top_speed_rad_s, highest)
-            unknowns = problem.fit(best, everything, MORE_ITERATIONS)
+            unknowns = problem.fit(best, everything, MORE_ITERATIONS, iteration_done)
             if (of_other := problem.mean_square(unknowns)) < loss:
                 best, loss, drive = unknowns, of_other, other
     with_drive = _Problem(judged, drive, plain.top_speed_rad_s, highest).mean_square(best)
@@ -153,7 +169,9 @@ class _Problem:
         self._initial = self._data.starting_speed_rad_s()
         self._guess = self._data.interpolated_speed_rad_s()
 
-    def fit(self, unknowns: Array, free: NDArray[np.bool_], iterations: int) -> Array:
+    def fit(
+        self, unknowns: Array, free: NDArray[np.bool_], iterations: int, iteration_done: Callable[[], None]
+    ) -> Array:
         """The unknowns after so many steps, each fan for itself, that lower the pseudo-Huber loss of its residual."""
         residual, speed = self._residual(unknowns)
         scale = robust_scale(residual, self._data)
@@ -175,6 +193,7 @@ class _Problem:
             unknowns = np.where(better[:, np.newaxis], trial, unknowns)
             residual, speed = np.where(column, of_trial, residual), np.where(column, trial_speed, speed)
             cost = np.where(better, trial_cost, cost)
+            iteration_done()
         return unknowns
 
     def mean_square(self, unknowns: Array) -> float:

@@ -30,7 +30,7 @@ from scipy.stats import t as student_t
 
 from twin.errors import TwinError
 from twin.fitting.filtering import filtered_regression
-from twin.fitting.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, fit_free_run
+from twin.fitting.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, Unknowns, fit_free_run
 from twin.fitting.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings, misfit_warnings
 from twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
 from twin.measurement import with_measured_command
@@ -39,6 +39,7 @@ from twin.models.integration import free_run
 from twin.models.physical import PhysicalModel, fitted_unknowns, parameters_by_unknowns, physical_parameters
 from twin.models.physics import LAG, PARAMETER_NAMES
 from twin.models.right_hand_side import FanEquation
+from twin.progress import Progress, unreported
 from twin.runs import Array, Run, common_fans
 
 LAMBDA_LADDER = 9
@@ -86,7 +87,7 @@ class Identification:
         return np.stack((self.parameters - reach, self.parameters + reach), axis=-1)
 
 
-def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
+def identify(runs: Sequence[Run], *, with_lag: bool = True, progress: Progress = unreported) -> Identification:
     """Identify every fan of the runs. Raises TwinError when the data do not determine the parameters.
 
     with_lag: false holds the lag at zero, which is the published model.
@@ -96,14 +97,14 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
     for fan in range(fans):
         require_excitation(pieces, fan)
     top_speed = np.array([_top_speed_rad_s(_pooled(pieces, fan)[1]) for fan in range(fans)])
-    start, lambda_per_s = _filtered_start(pieces, top_speed)
+    start, lambda_per_s = _filtered_start(pieces, top_speed, progress)
     speed = np.array([np.nanmedian(_pooled(pieces, fan)[1]) for fan in range(fans)])
     longest_s = float(np.max(_positive(physics.time_constant_s(speed, start), pieces)))
     step_s = min(piece.median_period_s for piece in pieces)
     trajectories = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, STRETCH_TIME_CONSTANTS))
     free = np.tile(ALL_FREE, (fans, 1))
     free[:, LAG] = with_lag
-    fit, covariance, freedom = _refine(start, free, top_speed, trajectories)
+    fit, covariance, freedom = _refine(start, free, top_speed, trajectories, "identification", progress)
     lag_s = physical_parameters(fit.point.unknowns.physics, top_speed)[:, LAG]
     unseen = free[:, LAG] & (lag_s <= LAG_IN_STANDARD_ERRORS * np.sqrt(covariance[:, LAG, LAG]))
     iterations = fit.iterations
@@ -111,10 +112,12 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True) -> Identification:
         free[:, LAG] &= ~unseen
         without = physical_parameters(fit.point.unknowns.physics, top_speed)
         without[unseen, LAG] = 0.0
-        fit, covariance, freedom = _refine(without, free, top_speed, trajectories, start)
+        part = "identification without lag"
+        fit, covariance, freedom = _refine(without, free, top_speed, trajectories, part, progress, start)
         iterations += fit.iterations
     parameters = physical_parameters(fit.point.unknowns.physics, top_speed)
     rmse_rad_s = _rmse_rad_s(fit, trajectories, fans)
+    progress("identification: checks", 0, 0, np.nan)
     return Identification(
         parameters=parameters,
         covariance=covariance,
@@ -156,17 +159,20 @@ def require_excitation(runs: Sequence[Run], fan: int) -> None:
         raise TwinError(f"fan {fan}: the speed never changes while the command does; check the sensor or the column")
 
 
-def _filtered_start(pieces: Sequence[Run], top_speed_rad_s: Array) -> tuple[Array, Array]:
+def _filtered_start(pieces: Sequence[Run], top_speed_rad_s: Array, progress: Progress) -> tuple[Array, Array]:
     """(fans, 4) parameters and (fans,) lambda: the largest rung that is nearly the best."""
     fans = len(top_speed_rad_s)
     longest_s = max(piece.duration_s for piece in pieces)
     step_s = min(piece.median_period_s for piece in pieces)
     ladder = np.geomspace(4.0 / longest_s, 0.5 / step_s, LAMBDA_LADDER)
     alike = [with_measured_command(piece) for piece in pieces]
-    candidates = np.array([[filtering_operator(alike, fan, rung) for fan in range(fans)] for rung in ladder])
     trajectories = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, 1.0))
-    candidates = np.array([_stable(candidate, top_speed_rad_s) for candidate in candidates])
-    errors = np.array([_free_run_errors(candidate, trajectories) for candidate in candidates])
+    candidates, errors = np.zeros((len(ladder), fans, len(PARAMETER_NAMES))), np.zeros((len(ladder), fans))
+    for rung, lambda_per_s in enumerate(ladder):
+        progress("identification: first estimate", rung, len(ladder), np.nan)
+        filtered = np.array([filtering_operator(alike, fan, lambda_per_s) for fan in range(fans)])
+        candidates[rung] = _stable(filtered, top_speed_rad_s)
+        errors[rung] = _free_run_errors(candidates[rung], trajectories)
     smallest = errors.min(axis=0)
     for fan in np.flatnonzero(~np.isfinite(smallest)):
         raise TwinError(f"fan {fan}: the speed does not follow the command; check which columns are command and speed")
@@ -196,9 +202,16 @@ def _refine(
     free: NDArray[np.bool_],
     top_speed_rad_s: Array,
     trajectories: Trajectories,
+    part: str,
+    progress: Progress,
     anchor: Array | None = None,
 ) -> tuple[FreeRunFit, Array, Array]:
-    """The fit of the free run from parameters (fans, 4), and what _covariance says of it."""
+    """The fit of the free run from parameters (fans, 4), and what _covariance says of it. part: its name in reports."""
+
+    def iteration_done(iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
+        progress(part, iteration, MAX_ITERATIONS, rmse_rad_s)
+        return False
+
     fans = len(start)
     start_physics = fitted_unknowns(start, top_speed_rad_s)
     pull = inertia_anchor(np.count_nonzero(trajectories.compared) / fans)
@@ -211,6 +224,7 @@ def _refine(
         free=free,
         prior=prior,
         max_iterations=MAX_ITERATIONS,
+        iteration_done=iteration_done,
     )
     return fit, *_covariance(fit, free, top_speed_rad_s, trajectories, prior)
 

@@ -12,10 +12,11 @@ from twin.fitting.drive_fit import FoundDrive
 from twin.fitting.identification import Identification
 from twin.fitting.initial_weights import initial_weights
 from twin.fitting.narx_training import train_narx
-from twin.fitting.training import GRID_PRIOR_STD, Physics, Progress, data_scaling, train_network
+from twin.fitting.training import GRID_PRIOR_STD, Physics, data_scaling, train_network
 from twin.models.model import Model, NetworkOde, OdeModel
 from twin.models.network import TanhNetwork
 from twin.models.physical import PhysicalModel
+from twin.progress import Progress, unreported
 from twin.runs import Array, Run
 
 Trainer = Literal["levenberg-marquardt", "adam"]
@@ -40,7 +41,7 @@ class FitRequest:
     max_iterations: int | None = None
     network_inputs: tuple[str, ...] = ("speed", "command")
     physics: Physics = "refined"
-    progress: Progress | None = None
+    progress: Progress = unreported
     drive: FoundDrive | None = None
 
 

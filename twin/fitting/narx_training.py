@@ -28,10 +28,10 @@ from twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pool
 from twin.fitting.narx_fit import OutputErrorFit
 from twin.fitting.narx_stability import forgets_its_start
 from twin.fitting.narx_start import lag_scale, starting_weights
-from twin.fitting.training import Progress
 from twin.models.narx import Narx
 from twin.models.network import Scaling
 from twin.models.physics import PARAMETER_NAMES
+from twin.progress import Progress, unreported
 from twin.runs import STARTING_SAMPLES, Array, Run
 
 MAX_SAMPLES, DRAWN_STRETCHES = 16_000, 16
@@ -52,7 +52,7 @@ def train_narx(
     *,
     seed: int,
     max_iterations: int,
-    progress: Progress | None = None,
+    progress: Progress = unreported,
 ) -> tuple[Narx, int]:
     """The trained network and the iterations taken. validation_runs: held out of the fit, they choose the prior.
 
@@ -148,14 +148,13 @@ class _Count:
     """Counts the iterations of all fits together."""
 
     max_iterations: int
-    progress: Progress | None
+    progress: Progress
     iterations: int = 0
 
     def iteration_done(self, rmse_rad_s: float) -> None:
         """See narx_fit.IterationDone."""
         self.iterations += 1
-        if self.progress is not None:
-            self.progress(self.iterations, self.max_iterations, rmse_rad_s)
+        self.progress("training", self.iterations, self.max_iterations, rmse_rad_s)
 
 
 def _relax_prior(folds: Sequence[_Fold], count: _Count, max_iterations: int) -> list[tuple[float, Array]]:

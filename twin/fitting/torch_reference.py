@@ -12,11 +12,12 @@ import torch
 from twin.errors import TwinError
 from twin.evaluation.accuracy import evaluation_pieces
 from twin.fitting.identification import Identification
-from twin.fitting.training import SHORT_STRETCH_TIME_CONSTANTS, Progress
+from twin.fitting.training import SHORT_STRETCH_TIME_CONSTANTS
 from twin.fitting.trajectories import cut_into_trajectories, stretch_samples
 from twin.models.lag import effective_command
 from twin.models.model import NetworkOde
 from twin.models.physics import LAG
+from twin.progress import Progress, unreported
 from twin.runs import Array, Run
 
 LEARNING_RATE = 1e-3
@@ -65,7 +66,7 @@ def train_adam(
     identification: Identification,
     *,
     max_iterations: int,
-    progress: Progress | None = None,
+    progress: Progress = unreported,
 ) -> tuple[NetworkOde, int]:
     """Train from the model's weights on stretches of ten time constants; returns the best iterate, and max_iterations.
 
@@ -97,8 +98,8 @@ def train_adam(
             best, best_loss = theta.detach().numpy().copy(), float(loss.detach())
         loss.backward()
         optimiser.step()
-        if progress is not None:
-            progress(iteration, max_iterations, float((error.detach().square().sum() / measured.sum()).sqrt()))
+        rmse_rad_s = float((error.detach().square().sum() / measured.sum()).sqrt())
+        progress("training", iteration, max_iterations, rmse_rad_s)
     return model.with_theta(best), max_iterations
 
 

@@ -13,7 +13,7 @@ the training runs where none are given. The best one is kept. The untrained netw
 physics) is a candidate. Training stops when held-out runs no longer improve.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -22,6 +22,7 @@ import numpy as np
 from twin.evaluation.accuracy import evaluation_pieces
 from twin.fitting.free_run_fit import (
     NONE_FREE,
+    FreeRunFit,
     FreeRunProblem,
     NetworkPrior,
     Point,
@@ -37,10 +38,9 @@ from twin.models.model import NetworkOde
 from twin.models.network import Scaling
 from twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
 from twin.models.physics import LAG, PARAMETER_NAMES
+from twin.progress import Progress, unreported
 from twin.runs import Array, Run
 
-Progress = Callable[[int, int, float], None]
-"""Called with iterations done, iterations at most, and the present free-run rmse in rad/s."""
 Physics = Literal["fixed", "refined"]
 
 SHORT_STRETCH_TIME_CONSTANTS = 10.0
@@ -78,12 +78,13 @@ def train_network(
     seed: int = 0,
     physics: Physics = "refined",
     prior_std: float = GRID_PRIOR_STD,
-    progress: Progress | None = None,
+    progress: Progress = unreported,
 ) -> tuple[NetworkOde, Array, int]:
     """Train the model's network. Returns the trained model, the parameters (fans, 4) and the iterations taken.
 
-    max_iterations: of the start that is continued; those of all starts come before. physics: "refined" fits J, alpha,
-    C_D and the lag of each fan along with the network; "fixed" leaves them as they were identified, as published.
+    max_iterations: of the start that is continued; those of all starts come before and are not counted. physics:
+    "refined" fits J, alpha, C_D and the lag of each fan along with the network; "fixed" leaves them as they were
+    identified, as published.
     prior_std: how far the network's acceleration may be from the physics where there are no data, in units of its scale
     (twin.fitting.cross_validation chooses it). Zero: the weights stay zero.
     """
@@ -99,15 +100,19 @@ def train_network(
     free[:, LAG] &= identification.parameters[:, LAG] > 0.0
     pull = inertia_anchor(sum(piece.samples for piece in pieces))
     prior = Prior(PRIOR_PRECISION, pull, start_physics, _network_prior(model, identification, prior_std))
-    in_all = STARTS * START_ITERATIONS + max_iterations
     untrained = Unknowns(np.zeros_like(model.network.theta), start_physics, np.zeros(0))
     best_run = _BestFreeRun(
-        model, untrained, validation_runs or runs, bool(validation_runs), top_speed, in_all, progress
+        model, untrained, validation_runs or runs, bool(validation_runs), top_speed, max_iterations, progress
     )
 
     stretches = cut_into_trajectories(pieces, short)
     few = stretches.thinned(START_SAMPLES)
-    starts = []
+    starts: list[FreeRunFit] = []
+
+    def start_iteration_done(iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
+        progress("starting weights", START_ITERATIONS * len(starts) + iteration, STARTS * START_ITERATIONS, rmse_rad_s)
+        return False
+
     for theta in initial_weights(model, pieces, identification, np.random.default_rng(seed), STARTS):
         fit = fit_free_run(
             model.with_theta(theta),
@@ -117,13 +122,11 @@ def train_network(
             free=np.zeros_like(free),
             prior=prior,
             max_iterations=START_ITERATIONS,
-            iteration_done=best_run.start_iteration_done,
+            iteration_done=start_iteration_done,
         )
-        best_run.stage_done(fit.iterations)
         starts.append(fit)
     best = min(starts, key=lambda fit: fit.rmse_rad_s if np.isfinite(fit.rmse_rad_s) else np.inf).point.unknowns
     best_run.consider(best)
-    tried = best_run.iterations
     for data, share, estimate in (
         (stretches, SHORT_SHARE, True),
         (cut_into_trajectories(pieces, practical_samples(pieces, MAX_SAMPLES)), 1.0, False),
@@ -135,7 +138,7 @@ def train_network(
             data,
             free=free,
             prior=prior,
-            max_iterations=max(round(share * max_iterations) + tried - best_run.iterations, 1),
+            max_iterations=round(share * max_iterations) - best_run.iterations,
             tolerance=TOLERANCE,
             estimate_initial_speed=estimate,
             iteration_done=best_run.iteration_done,
@@ -171,7 +174,7 @@ class _BestFreeRun:
         held_out: bool,
         top_speed_rad_s: Array,
         max_iterations: int,
-        progress: Progress | None,
+        progress: Progress,
     ) -> None:
         pieces = evaluation_pieces(runs)
         whole = max(piece.samples for piece in pieces)
@@ -195,15 +198,9 @@ class _BestFreeRun:
         else:
             self.stalled_iterations += 1
 
-    def start_iteration_done(self, iteration: int, unknowns: Unknowns, rmse_rad_s: float) -> bool:
-        """Report a step of one of the starts; never stops it."""
-        if self.progress is not None:
-            self.progress(self.iterations + iteration, self.max_iterations, rmse_rad_s)
-        return False
-
     def iteration_done(self, iteration: int, unknowns: Unknowns, rmse_rad_s: float) -> bool:
         """See free_run_fit.IterationDone."""
-        self.start_iteration_done(iteration, unknowns, rmse_rad_s)
+        self.progress("training", self.iterations + iteration, self.max_iterations, rmse_rad_s)
         self.consider(unknowns)
         return self.held_out and self.stalled_iterations >= MAX_STALLED_ITERATIONS
 

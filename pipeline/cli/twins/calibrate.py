@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.cli.options import JsonOption, SetOption
-from pipeline.cli.progress import working
+from pipeline.cli.progress import interruptible, working
 from pipeline.cli.twins.calibration_check import check_declared_rate
 from pipeline.cli.twins.drops_found import drop_lines, drops_found
 from pipeline.cli.twins.outlier_run_check import outlier_warning
@@ -87,9 +87,10 @@ def calibrate(
     if healthy:
         if false_alarms_per_day is None:
             raise UserError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
-        limits, warning, speed_unit = _calibrated(
-            twin, healthy, false_alarms_per_day, extrapolate, overrides or [], seed
-        )
+        with interruptible("nothing was written"):
+            limits, warning, speed_unit = _calibrated(
+                twin, healthy, false_alarms_per_day, extrapolate, overrides or [], seed
+            )
         output = output or twin
         _write(twin, output, limits)
         result = {"twin": str(output), "calibration": json.loads(limits.model_dump_json())}

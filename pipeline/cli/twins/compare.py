@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipeline.cli.options import JsonOption
-from pipeline.cli.progress import training_progress
+from pipeline.cli.progress import interruptible, training_progress
 from pipeline.cli.twins.figures import figures_in, shown
 from pipeline.cli.twins.training_data import (
     FansOption,
@@ -83,7 +83,8 @@ def compare(
 
     Example: fantwin compare healthy-1.mcap healthy-2.mcap --validate healthy-3.mcap --test healthy-4.mcap -o twins
     """
-    with twin_errors():
+    not_compared = f"no comparison; the twins that were finished are in {output}" if output else "no comparison"
+    with interruptible(not_compared), twin_errors():
         from twin.comparison import best, contend, source_of  # noqa: PLC0415  loads twin only when it is needed
 
         chosen = _chosen(model)

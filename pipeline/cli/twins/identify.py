@@ -12,9 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.cli.options import JsonOption
-from pipeline.cli.progress import working
+from pipeline.cli.progress import training_progress
 from pipeline.cli.twins.training_data import (
-    TACHO_ADVICE,
     FansOption,
     FromOption,
     RecordingsArgument,
@@ -23,6 +22,7 @@ from pipeline.cli.twins.training_data import (
     TrayOption,
     WindowOption,
     read_training_data,
+    show_hints,
     twin_errors,
 )
 
@@ -58,21 +58,21 @@ def identify(
         from twin.fitting.identification import identify as identify_fans  # noqa: PLC0415  loads twin only when it is needed
 
         training_data = read_training_data(recordings, tray, fans, from_s, to_s, window_s)
-        samples = sum(run.samples for run in training_data.runs)
-        with working(f"identifying {training_data.runs[0].fans} fan(s) from {samples:,} samples each"):
-            found = identify_fans(training_data.runs)
-    result = as_json(found, training_data)
+        hints = training_data.tacho_hints()
+        if not json_output:
+            show_hints(hints)
+        with training_progress(training_data) as start:
+            found = identify_fans(training_data.runs, progress=start(""))
+    result = as_json(found, training_data, hints)
     if json_output:
         typer.echo(json.dumps(result))
         return
     Console().print(_table(result))
     for warning in result["warnings"]:
         typer.secho(f"warning: {warning}", fg=typer.colors.YELLOW, err=True)
-    for hint in result["hints"]:
-        typer.secho(f"hint: {hint}; {TACHO_ADVICE}", fg=typer.colors.YELLOW, err=True)
 
 
-def as_json(found: Identification, training_data: TrainingData) -> dict[str, Any]:
+def as_json(found: Identification, training_data: TrainingData, hints: list[str]) -> dict[str, Any]:
     """The result as JSON fields; None where a figure is undefined.
 
     Rows and columns of covariance and correlation are in the order of `parameters`; those of a lag that was not found
@@ -100,7 +100,7 @@ def as_json(found: Identification, training_data: TrainingData) -> dict[str, Any
         "speed_unit": training_data.speed_unit,
         "iterations": found.iterations,
         "warnings": training_data.with_fan_numbers([*found.warnings, *found.misfits]),
-        "hints": training_data.tacho_hints(),
+        "hints": hints,
     }
 
 

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 import typer
 
 from pipeline.cli.options import JsonOption
-from pipeline.cli.progress import training_progress
+from pipeline.cli.progress import interruptible, training_progress
 from pipeline.cli.twins.figures import figures_in, sentence, shown
 from pipeline.cli.twins.training_data import (
-    TACHO_ADVICE,
     FansOption,
     FromOption,
     RecordingsArgument,
@@ -25,6 +24,7 @@ from pipeline.cli.twins.training_data import (
     data_cards,
     read_held_out,
     read_training_data,
+    show_hints,
     twin_errors,
 )
 
@@ -72,9 +72,12 @@ def train(
     The width of the band is the free-run error over --validate. Without --validate it is the error over the training
     data, which is too optimistic.
 
+    Ctrl-C ends training without a twin, with exit code 130.
+
     Example: fantwin train healthy-1.mcap healthy-2.mcap --validate healthy-3.mcap --model hybrid -o TWIN.onnx
     """
-    with twin_errors():
+    not_written = "no twin was written; --iterations N ends after N iterations and writes one"
+    with interruptible(not_written), twin_errors():
         from twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
         from twin.kinds import find_kind  # noqa: PLC0415
 
@@ -86,6 +89,9 @@ def train(
             if validate
             else None
         )
+        hints = training_data.tacho_hints()
+        if not json_output:
+            show_hints(hints)
         with training_progress(training_data) as start:
             trained = train_twin(
                 training_data.runs,
@@ -104,7 +110,7 @@ def train(
                 progress=start(""),
             )
         trained.save(output)
-    result = as_json(trained, training_data, output)
+    result = as_json(trained, training_data, output, hints)
     if json_output:
         typer.echo(json.dumps(result))
         return
@@ -113,8 +119,6 @@ def train(
     typer.echo(f"  {balance_sentence(result)}")
     for warning in result["warnings"]:
         typer.echo(warning, err=True)
-    for hint in result["hints"]:
-        typer.echo(f"hint: {hint}; {TACHO_ADVICE}", err=True)
 
 
 def balance_sentence(result: dict[str, Any]) -> str:
@@ -127,7 +131,7 @@ def balance_sentence(result: dict[str, Any]) -> str:
     return f"torque balance: healthy sigma {sigmas} {unit}; coefficients of {sources}"
 
 
-def as_json(trained: TrainedTwin, training_data: TrainingData, output: Path) -> dict[str, Any]:
+def as_json(trained: TrainedTwin, training_data: TrainingData, output: Path, hints: list[str]) -> dict[str, Any]:
     """The result as JSON fields; figures in the recordings' own units."""
     card = trained.card
     return {
@@ -145,5 +149,5 @@ def as_json(trained: TrainedTwin, training_data: TrainingData, output: Path) -> 
         "iterations": card.training.iterations,
         "duration_s": card.training.duration_s,
         "warnings": training_data.with_fan_numbers(trained.identification.warnings),
-        "hints": training_data.tacho_hints(),
+        "hints": hints,
     }

@@ -43,6 +43,9 @@ WindowOption: TypeAlias = Annotated[
 FansOption: TypeAlias = Annotated[str | None, typer.Option(help="Only these fans, counted from 0, e.g. 0,2.")]
 
 TACHO_ADVICE = "see `tacho` in [[tray]], or --window for recordings that do not say"
+TACHO_CONSEQUENCE = (
+    "hint: without it the delay of the tacho is taken for inertia, and what follows, warnings too, may come from that"
+)
 MANY_OUTLIERS = 0.001
 _EXTRA_MODULES = ("jinja2", "matplotlib", "onnx", "scipy", "torch")
 
@@ -126,6 +129,14 @@ def read_training_data(
         if share > MANY_OUTLIERS
     )
     return TrainingData([run for run, _ in cleaned], recorded, unit, numbers, outliers)
+
+
+def show_hints(hints: Sequence[str]) -> None:
+    """Say on stderr, before the work, what the declared tachos may spoil."""
+    for hint in hints:
+        typer.secho(f"hint: {hint}; {TACHO_ADVICE}", fg=typer.colors.YELLOW, err=True)
+    if hints:
+        typer.secho(TACHO_CONSEQUENCE, fg=typer.colors.YELLOW, err=True)
 
 
 def counting_tachos(windows_s: Sequence[float]) -> tuple[Tacho, ...]:

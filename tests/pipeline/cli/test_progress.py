@@ -1,9 +1,11 @@
 """Progress on stderr while a command works without a terminal."""
 
+import math
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
 import pytest
+import typer
 
 from pipeline.cli import progress
 
@@ -13,21 +15,25 @@ if TYPE_CHECKING:
 TRAINING_DATA = cast("TrainingData", SimpleNamespace(rad_s_per_unit=0.1, speed_unit="rpm"))
 
 
-def test_without_a_terminal_a_line_reports_training_progress_every_few_seconds(monkeypatch, capsys) -> None:
+def test_without_a_terminal_a_line_reports_each_part_and_then_its_progress_every_few_seconds(
+    monkeypatch, capsys
+) -> None:
     now_s = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now_s[0])
     with progress.training_progress(TRAINING_DATA) as start:
         report = start("hybrid")
         for iteration in range(1, 14):
             now_s[0] += 1.0
-            report(iteration, 60, 0.5)
-        start("NARX")
+            report("training", iteration, 60, 0.5)
+        report("evaluation", 0, 0, math.nan)
+        start("NARX")("identification", 1, 9, math.nan)
     output = capsys.readouterr()
     assert output.err.splitlines() == [
-        "hybrid: identifying",
-        "hybrid: 5/60, free-run rmse 5 rpm, 5 s",
-        "hybrid: 10/60, free-run rmse 5 rpm, 10 s",
-        "NARX: identifying",
+        "hybrid: training 1/60, free-run rmse 5 rpm, 1 s",
+        "hybrid: training 6/60, free-run rmse 5 rpm, 6 s",
+        "hybrid: training 11/60, free-run rmse 5 rpm, 11 s",
+        "hybrid: evaluation, 13 s",
+        "NARX: identification 1/9, 0 s",
     ]
     assert output.out == ""
 
@@ -36,3 +42,10 @@ def test_without_a_terminal_work_is_reported_once(capsys: pytest.CaptureFixture[
     with progress.working("drawing page.html"):
         pass
     assert capsys.readouterr().err == "drawing page.html\n"
+
+
+def test_ctrl_c_ends_with_one_line_and_its_own_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit) as ended, progress.interruptible("no twin was written"):
+        raise KeyboardInterrupt
+    assert ended.value.exit_code == 130
+    assert capsys.readouterr().err == "interrupted: no twin was written\n"

@@ -11,6 +11,7 @@ from twin.fitting.standstill import find_standstill
 from twin.measurement import measurement_of
 from twin.models.drive import Drive
 from twin.models.physical import PhysicalModel
+from twin.progress import Progress, unreported
 from twin.runs import Run
 
 DRIVE = Drive(turning_command=10.0, kick_s=0.6, rest_s=2.0)
@@ -35,16 +36,18 @@ def run_of(drive: Drive | None, seed: int) -> Run:
     return replace(run, speed_rad_s=np.maximum(measurement_of(run).of_speed(speed) + noise, 0.0))
 
 
-def found_in(drive: Drive | None) -> FoundDrive | None:
+def found_in(drive: Drive | None, progress: Progress = unreported) -> FoundDrive | None:
     runs, held_out = [run_of(drive, 1)], [run_of(drive, 2)]
-    return find_drive(runs, held_out, identify(runs, with_lag=False), find_standstill([*runs, *held_out]))
+    return find_drive(runs, held_out, identify(runs, with_lag=False), find_standstill([*runs, *held_out]), progress)
 
 
 def test_plateau_friction_and_kick_are_found() -> None:
-    found = found_in(DRIVE)
+    reported: list[tuple[int, int]] = []
+    found = found_in(DRIVE, lambda _part, done, at_most, _rmse: reported.append((done, at_most)))
     assert found is not None
     assert (found.drive.kick_s, found.drive.rest_s) == (DRIVE.kick_s, DRIVE.rest_s)
     np.testing.assert_allclose(found.settings, SETTINGS, rtol=0.05, atol=1.5)
+    assert reported == [(done, len(reported)) for done in range(1, len(reported) + 1)]
 
 
 def test_a_drive_is_looked_for_where_readings_are_of_pulses_and_starts_are_many() -> None:

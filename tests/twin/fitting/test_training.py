@@ -133,14 +133,39 @@ def test_the_same_seed_gives_the_same_model_and_another_seed_another(rough) -> N
     assert not np.array_equal(weights(4), weights(5))
 
 
-def test_progress_is_reported_after_every_accepted_step(rough) -> None:
-    reported: list[tuple[int, int, float]] = []
+def test_progress_is_reported_of_each_part_of_the_work(rough) -> None:
+    reported: dict[str, list[tuple[int, int, float]]] = {}
     short = rough[1].between(0.0, 10.0)
-    train_twin([short], [], "hybrid", name="x", max_iterations=5, progress=lambda *values: reported.append(values))
-    done = [values[0] for values in reported]
-    assert done == sorted(set(done))
-    assert done[-1] <= reported[-1][1]
-    assert all(rmse > 0.0 for _, _, rmse in reported)
+    trained = train_twin(
+        [short],
+        [],
+        "hybrid",
+        name="x",
+        max_iterations=5,
+        progress=lambda part, *values: reported.setdefault(part, []).append(values),
+    )
+    assert list(reported) == [
+        "identification: first estimate",
+        "identification",
+        "identification without lag",
+        "identification: checks",
+        "starting weights",
+        "training",
+        "evaluation",
+        "torque balance",
+    ]
+    for part in reported.values():
+        done = [values[0] for values in part]
+        assert done == sorted(set(done))
+        assert done[-1] <= part[-1][1]
+    assert {at_most for _, at_most, _ in reported["training"]} == {5}, "as many as asked for"
+    assert trained.card.training.iterations <= 5
+    assert all(rmse > 0.0 for part in ("identification", "starting weights", "training") for *_, rmse in reported[part])
+
+
+def test_a_single_iteration_is_one(rough) -> None:
+    twin = train_twin([rough[1].between(0.0, 10.0)], [], "hybrid", name="x", max_iterations=1)
+    assert twin.card.training.iterations == 1
 
 
 def test_adam_lowers_the_free_run_error_from_the_physics_on(rough) -> None:
@@ -152,7 +177,7 @@ def test_adam_lowers_the_free_run_error_from_the_physics_on(rough) -> None:
     theta[-11:] = 0.0
     reported: list[float] = []
     start = Hybrid(network.with_theta(theta))
-    train_adam(start, [short], found, max_iterations=15, progress=lambda _done, _total, rmse: reported.append(rmse))
+    train_adam(start, [short], found, max_iterations=15, progress=lambda *values: reported.append(values[-1]))
     assert reported[-1] < 0.97 * reported[0]
 
 

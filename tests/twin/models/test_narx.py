@@ -195,13 +195,13 @@ def test_missing_speeds_and_outliers_hardly_matter(published: tuple[Run, Narx]) 
 
 @pytest.mark.slow
 def test_training_with_held_out_runs_reports_its_progress() -> None:
-    reported: list[tuple[int, int, float]] = []
+    reported: list[tuple[str, int, int, float]] = []
     run, held_out = fan_data.published_run(7, 12.0, fans=2), fan_data.published_run(8, 10.0, fans=2)
     model, iterations = train_narx(
         [run], [held_out], SCALING, seed=0, max_iterations=12, progress=lambda *values: reported.append(values)
     )
-    assert [done for done, _, _ in reported] == list(range(1, iterations + 1))
-    assert all(total == 12 and rmse > 0.0 for _, total, rmse in reported)
+    assert [done for _, done, _, _ in reported] == list(range(1, iterations + 1))
+    assert all(total == 12 and rmse > 0.0 for _, _, total, rmse in reported)
     assert free_run_rmse_rad_s(model, held_out) < 1.3 * fan_data.NOISE_RAD_S
 
 
