@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from pipeline.launch.event_log import without_figures
-from pipeline.launch.site_state import OFF_THE_BUS, StageState, Word
+from pipeline.launch.site_state import OFF_THE_BUS, WHY_SILENT, StageState, Word
 from pipeline.launch.site_watcher import StageView
 from pipeline.launch.stage_notes import note_lines
 from pipeline.runtime.health import LATENCY_WINDOW_S
@@ -89,7 +89,7 @@ class SiteReport:
         if process.is_at_work:
             where = f"process {process.process_id} works, but is not heard at {self._endpoint}"
             return f"the connection to the bus is lost: {where}"
-        return "silent: it hangs or is blocked"
+        return f"silent: {WHY_SILENT}"
 
     def _is_catching_up(self, state: StageState) -> bool:
         """Whether a stage has been late for no longer than its latencies reach back: after a restart, it and the stages

@@ -19,13 +19,14 @@ from pipeline.launch.watchdog import START_LIMIT_S
 from pipeline.runtime.clock import REPLAY
 from schemas.messages import Health, StageStatus
 from schemas.streams import input_streams, output_streams
-from schemas.topics import key_in_words
+from schemas.topics import HEALTH_CHUNK, key_in_words
 from schemas.units import NS_PER_S
 
 SILENT_AFTER_S = 5.0
 """without a health, which every stage sends once a second"""
 STARVED_AFTER_S = 5.0
-LATE_MS = 5000.0
+LATE_AFTER_S = 5.0
+WHY_SILENT = "it hangs, is blocked or gets no time of the processor"
 
 
 class Word(StrEnum):
@@ -94,7 +95,7 @@ def stage_states(
         if view is not None:
             states.append(_state_of(view, views, is_expected=True))
         elif name in alive:
-            why = "on the bus, but sends no health: it is still starting, hangs or is blocked"
+            why = f"on the bus, but sends no health: it is still starting, or {WHY_SILENT}"
             states.append(StageState(row.label, Word.SILENT, why, None, is_expected=True))
         elif not (is_replayed and STAGES[row.stage].scope == "tray"):  # the replay plays what it would send
             states.append(StageState(row.label, Word.MISSING, "not seen on the bus", None, is_expected=True))
@@ -113,21 +114,40 @@ def _judged(view: StageView, views: Sequence[StageView]) -> tuple[Word, str]:
         return Word.STOPPED, "stopped in order"
     if not view.alive and not is_starting:
         return Word.GONE, f"left the bus without stopping; last heard {view.age_s:.0f} s ago"
+    behind_s = _behind_s(view)
+    before = f"; before, it was {behind_s:.0f} s behind" if behind_s > LATE_AFTER_S else ""
     if view.age_s > (START_LIMIT_S if is_starting else SILENT_AFTER_S):
-        return Word.SILENT, f"no health for {view.age_s:.0f} s: it hangs or is blocked"
-    return _state_of_work(health, views)
+        return Word.SILENT, f"no health for {view.age_s:.0f} s: {WHY_SILENT}{before}"
+    return _state_of_work(view, views)
 
 
-def _state_of_work(health: Health, views: Sequence[StageView]) -> tuple[Word, str]:
+def _state_of_work(view: StageView, views: Sequence[StageView]) -> tuple[Word, str]:
     """The state of a stage that is heard."""
+    health = view.health
     if starving := _starving(health, views):
         return Word.STARVED, starving
-    if health.latency_p50_ms > LATE_MS and health.status != StageStatus.STARTING:  # it catches up
-        return Word.LATE, f"its outputs are {health.latency_p50_ms / 1e3:.0f} s old when they are sent"
+    if health.status != StageStatus.STARTING:  # it catches up
+        if (behind_s := _behind_s(view)) > LATE_AFTER_S:
+            return Word.LATE, f"it is {behind_s:.0f} s behind: it processes what it received {behind_s:.0f} s ago"
+        if (age_s := health.latency_p50_ms / 1e3) > LATE_AFTER_S:
+            return Word.LATE, f"its outputs are {age_s:.0f} s old when they are sent"
     if health.waiting_for and health.status == StageStatus.OK:
         return Word.WAITING, waiting_text(health)
     words = {StageStatus.STARTING: Word.STARTING, StageStatus.OK: Word.OK, StageStatus.DEGRADED: Word.DEGRADED}
     return words.get(health.status, Word.DEGRADED), ""
+
+
+def _behind_s(view: StageView) -> float:
+    """How long what a stage has processed since the health before had waited for it, s; 0 if there was nothing."""
+    health, before = view.health, view.previous
+    if before is None or _processed(health) <= _processed(before):
+        return 0.0
+    return (health.t_ns - health.newest_input_t_ns) / NS_PER_S
+
+
+def _processed(health: Health) -> int:
+    """Messages, without the health of other stages: it is no work."""
+    return sum(each.received for each in health.inputs if each.key.split("/")[2:3] != [HEALTH_CHUNK])
 
 
 def waiting_text(health: Health) -> str:

@@ -17,7 +17,7 @@ _MAX_LATENCIES = 2000
 LATENCY_WINDOW_S = 10.0
 """latencies are those of the outputs of this long"""
 AWAITED_AFTER_NS = 2 * NS_PER_S
-"""a stage waits for a main input when nothing of it has arrived for this long"""
+"""a stage waits for a main input when it has had nothing of it to process for this long"""
 
 
 class HealthBuilder:
@@ -36,14 +36,14 @@ class HealthBuilder:
         self._latencies_ms: deque[tuple[float, float]] = deque(maxlen=_MAX_LATENCIES)
         """with the time at which each was measured, of a monotonic clock in s"""
         self._main_input_t_ns = dict.fromkeys(main_keys, started_t_ns)
-        """by key: when its last message was received"""
+        """by key: when its last message was processed, which a stage that is behind has had for a while"""
         self._newest_input_t_ns = self._newest_output_t_ns = 0
 
-    def add_input(self, key: str, received_t_ns: int) -> None:
-        """A message or an item of the source has been received; key: empty for a source."""
+    def add_input(self, key: str, received_t_ns: int, now_ns: int) -> None:
+        """A message or an item of the source is processed now, and was received before; key: empty for a source."""
         self._newest_input_t_ns = received_t_ns
         if key in self._main_input_t_ns:
-            self._main_input_t_ns[key] = received_t_ns
+            self._main_input_t_ns[key] = now_ns
 
     def add_output(self, message: Message, sent_t_ns: int, now_ns: int | None) -> None:
         """An output has been sent. Its latency is the age of its newest sample at `now_ns`, if the time is known."""

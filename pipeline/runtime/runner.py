@@ -304,7 +304,8 @@ class Runner:
 
     def _handle(self, item: Item) -> None:
         if isinstance(item, FromSource):
-            self._health.add_input("", HOST_CLOCK.now_ns())
+            now_ns = HOST_CLOCK.now_ns()
+            self._health.add_input("", now_ns, now_ns)
             core = self._parts[item.core].core
             self._call(item.core, lambda: core.step(item.item))
         elif isinstance(item, Recovered):
@@ -324,7 +325,7 @@ class Runner:
                 if not self._clock.update(envelope.message):
                     self._counts["refused_clocks"] += 1
             else:
-                self._health.add_input(envelope.key, envelope.received_t_ns)
+                self._health.add_input(envelope.key, envelope.received_t_ns, HOST_CLOCK.now_ns())
                 self._due += self._tracker.accept(envelope)
 
     def _handle_recovered(self, item: Recovered) -> None:

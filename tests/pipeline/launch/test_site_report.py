@@ -55,7 +55,10 @@ def test_row_01_a_stage_that_hangs_is_said_once_and_that_it_works_again(report, 
     for word in (Word.SILENT, Word.SILENT, Word.GONE, Word.MISSING):
         report.stages([state("resampler", word), state("scorer")], hangs)
     report.stages([state("resampler"), state("scorer")], IDS)
-    assert lines == ["resampler: silent: it hangs or is blocked", "resampler: at work again"]
+    assert lines == [
+        "resampler: silent: it hangs, is blocked or gets no time of the processor",
+        "resampler: at work again",
+    ]
 
 
 def test_row_01_a_stage_that_starves_is_said_until_it_works_again(report, lines):

@@ -65,7 +65,7 @@ def test_row_01_a_stage_that_sends_no_health_any_more_is_silent():
     state = states(view(CONSUMER, age_s=6.0))["twin_integrator"]
     assert (state.word, state.detail, state.is_fault) == (
         Word.SILENT,
-        "no health for 6 s: it hangs or is blocked",
+        "no health for 6 s: it hangs, is blocked or gets no time of the processor",
         True,
     )
 
@@ -94,6 +94,29 @@ def test_row_01_a_stage_with_a_latency_of_many_seconds_is_late():
     assert (state.word, state.detail) == (Word.LATE, "its outputs are 47 s old when they are sent")
     starting = replace(CONSUMER, latency_p50_ms=47_000.0, status=StageStatus.STARTING)
     assert states(view(starting))["twin_integrator"].word == Word.STARTING, "it works off what it missed"
+
+
+def behind(seconds: float, *, processed: int) -> StageView:
+    """The consumer with a full inbox, and what it has processed since the health before."""
+    health = replace(CONSUMER, newest_input_t_ns=NOW_NS - round(seconds * NS_PER_S))
+    other = replace(health.inputs[0], key="fantwin/s/health/resampler/all", received=90)
+    now = replace(health, inputs=(*health.inputs, other))
+    before = replace(health.inputs[0], received=health.inputs[0].received - processed)
+    return StageView(now, replace(health, inputs=(before,), t_ns=NOW_NS - NS_PER_S), alive=True, age_s=0.5)
+
+
+def test_row_01_a_stage_that_works_on_old_input_is_behind_and_not_starved():
+    producer = view(PRODUCER, published_before=850)
+    found = states(producer, behind(19.0, processed=25))["twin_integrator"]
+    assert (found.word, found.detail) == (Word.LATE, "it is 19 s behind: it processes what it received 19 s ago")
+    assert states(producer, behind(4.0, processed=25))["twin_integrator"].word == Word.OK
+    idle = states(view(PRODUCER, published_before=800), behind(19.0, processed=0))["twin_integrator"]
+    assert idle.word == Word.OK, "the health of others is no input that it is behind with"
+
+
+def test_row_01_a_stage_that_was_behind_when_it_was_last_heard_may_be_at_work():
+    silent = replace(behind(19.0, processed=25), age_s=6.0)
+    assert states(silent)["twin_integrator"].detail.endswith("processor; before, it was 19 s behind")
 
 
 def test_row_16_a_stage_that_left_the_bus_without_stopping_is_gone():

@@ -24,16 +24,23 @@ def test_row_01_a_main_input_without_a_message_for_two_seconds_is_waited_for(bui
     assert health(builder, START_NS + AWAITED_AFTER_NS).waiting_for == ()
     late_ns = START_NS + AWAITED_AFTER_NS + 1
     assert health(builder, late_ns).waiting_for == (AwaitedInput(key=KEY, since_t_ns=START_NS),)
-    builder.add_input("fantwin/s/tray1/request", late_ns)  # not the main input
+    builder.add_input("fantwin/s/tray1/request", late_ns, late_ns)  # not the main input
     assert health(builder, late_ns).waiting_for != ()
-    builder.add_input(KEY, late_ns)
+    builder.add_input(KEY, late_ns, late_ns)
     assert health(builder, late_ns).waiting_for == ()
+
+
+def test_a_stage_that_is_behind_waits_for_nothing(builder):
+    now_ns = START_NS + 60 * AWAITED_AFTER_NS
+    builder.add_input(KEY, START_NS, now_ns)
+    found = health(builder, now_ns)
+    assert (found.waiting_for, found.newest_input_t_ns) == ((), START_NS)
 
 
 def test_row_01_the_times_of_the_newest_input_and_output_are_given(builder):
     empty = health(builder, START_NS)
     assert (empty.newest_input_t_ns, empty.newest_output_t_ns) == (0, 0)
-    builder.add_input(KEY, START_NS + 5)
+    builder.add_input(KEY, START_NS + 5, START_NS + 5)
     builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS + 7, None)
     found = health(builder, START_NS + 9)
     assert (found.newest_input_t_ns, found.newest_output_t_ns) == (START_NS + 5, START_NS + 7)
