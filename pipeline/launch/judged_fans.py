@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.bus.session import Bus
 from pipeline.config.models import TrayConfig
 from pipeline.config.registry import STAGES
+from pipeline.launch.event_log import without_figures
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import CodecError, decode
@@ -136,6 +137,39 @@ class JudgedFans:
                     why = REASONS.get(InvalidReason(reason), InvalidReason(reason).words)
                     found.append(Unjudged(tray.name, () if len(of_reason) == tray.fans else of_reason, why))
         return found
+
+
+class JudgedChanges:
+    """What has changed since the fans that are not judged were listed."""
+
+    def __init__(self, listed: Sequence[Unjudged]) -> None:
+        self._known = _by_tray(listed)
+
+    def lines(self, unjudged: Sequence[Unjudged]) -> list[str]:
+        """Of each tray where other fans are not judged, or for another reason: these fans, or that none is left."""
+        before, self._known = self._known, _by_tray(unjudged)
+        changed = [
+            tray
+            for tray in dict.fromkeys((*before, *self._known))
+            if _meaning(before.get(tray, [])) != _meaning(self._known.get(tray, []))
+        ]
+        return [
+            line
+            for tray in changed
+            for line in [each.line() for each in self._known.get(tray, [])] or [f"{tray}: every fan is judged now"]
+        ]
+
+
+def _by_tray(unjudged: Sequence[Unjudged]) -> dict[str, list[Unjudged]]:
+    found: dict[str, list[Unjudged]] = {}
+    for each in unjudged:
+        found.setdefault(each.tray, []).append(each)
+    return found
+
+
+def _meaning(unjudged: Sequence[Unjudged]) -> list[tuple[tuple[int, ...], str]]:
+    """Without the figures of the reasons, which change all the time."""
+    return [(each.fans, without_figures(each.why)) for each in unjudged]
 
 
 def _why_no_scores(tray: str, states: Sequence[StageState]) -> str:

@@ -24,7 +24,7 @@ from pipeline.cli.watch.request import ask
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
 from pipeline.errors import UserError
-from pipeline.launch.judged_fans import JudgedFans, Unjudged
+from pipeline.launch.judged_fans import JudgedChanges, JudgedFans, Unjudged
 from pipeline.launch.processes import process_list
 from pipeline.launch.site_state import site_states
 from pipeline.launch.site_watcher import SiteWatcher
@@ -152,9 +152,13 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
         if not found and not unjudged:
             console.print(Text("no alarms", style="green"))
     if watch:
-        _watch(
-            news, {_identity(alarm) for alarm in known}, watcher, config.site, stop, console, json_output=json_output
-        )
+        changes = JudgedChanges(unjudged)
+
+        def judged_changes() -> list[str]:
+            return changes.lines(judged.unjudged(site_states(watcher, process_list(config))))
+
+        listed = {_identity(alarm) for alarm in known}
+        _watch(news, listed, watcher, config.site, judged_changes, stop, console, json_output=json_output)
     elif unjudged:
         raise typer.Exit(1)
 
@@ -164,12 +168,14 @@ def _watch(
     listed: set[tuple[str, int, str]],
     watcher: SiteWatcher,
     site: str,
+    judged_changes: Callable[[], list[str]],
     stop: threading.Event,
     console: Console,
     *,
     json_output: bool,
 ) -> None:
-    """Print each transition that is not listed already, and when the last scorer goes or one is back."""
+    """Print each transition that is not listed already, which fans are judged now and were not, or the other way round,
+    and when the last scorer goes or one is back."""
     has_scorer = True
     while not stop.is_set():
         try:
@@ -179,6 +185,8 @@ def _watch(
                 has_scorer = not has_scorer
                 said = "a scorer is back" if has_scorer else "no scorer is alive: alarms are unknown until one is back"
                 typer.echo(f"{datetime.now():%H:%M:%S}  site {site!r}: {said}", err=True)
+            for line in judged_changes() if has_scorer else ():
+                typer.echo(f"{datetime.now():%H:%M:%S}  {line}", err=True)
             continue
         if _identity(alarm) in listed or not _counts(watcher, site, alarm):
             continue

@@ -252,6 +252,18 @@ def test_commands_that_come_and_go_are_no_loss_to_the_scorer(site):
     assert [line.received for line in site.last.inputs] == [1] * 4
 
 
+def test_watching_says_when_fans_are_judged_that_were_not(site):
+    site.core.not_judged = (InvalidReason.NO_SPEED,) * FANS
+    words = [*FANTWIN, "alarms", "--watch", *map(str, site.words)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watching:
+        assert watching.stdout and watching.stderr
+        assert watching.stdout.readline() == f"{TRAY}: no fan is judged: no speed\n"
+        site.core.not_judged = ()
+        assert watching.stderr.readline().endswith(f"  {TRAY}: every fan is judged now\n")
+        watching.send_signal(signal.SIGINT)
+        assert watching.wait(20) == 0
+
+
 def test_watching_prints_what_happens_as_it_happens(site):
     site.raise_alarm(3)
     words = [*FANTWIN, "alarms", "--watch", "--json", *map(str, site.words)]

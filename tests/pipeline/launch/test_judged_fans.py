@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from pipeline.config.models import TrayConfig
-from pipeline.launch.judged_fans import JUDGED_WITHIN_S, JudgedFans
+from pipeline.launch.judged_fans import JUDGED_WITHIN_S, JudgedChanges, JudgedFans, Unjudged
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import encode
@@ -112,3 +112,14 @@ def test_a_fan_that_its_command_stops_is_judged_and_said_to_be_stopped(listener)
     assert listener.judged.at_rest()[1].as_json() == {"tray": "a", "fans": [3], "state": "starting"}
     listener.now_s += 2 * JUDGED_WITHIN_S
     assert listener.judged.at_rest() == []
+
+
+def test_changes_are_of_fans_and_reasons_and_not_of_figures():
+    changes = JudgedChanges([Unjudged("a", (), "scorer: waits for 3 s"), Unjudged("b", (1,), "no speed")])
+    assert changes.lines([Unjudged("a", (), "scorer: waits for 4 s"), Unjudged("b", (1,), "no speed")]) == []
+    assert changes.lines([Unjudged("b", (2,), "no speed")]) == [
+        "a: every fan is judged now",
+        "b: fan 2 not judged: no speed",
+    ]
+    assert changes.lines([]) == ["b: every fan is judged now"]
+    assert changes.lines([]) == []
