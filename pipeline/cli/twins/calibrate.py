@@ -18,7 +18,7 @@ from pipeline.cli.progress import interruptible, working
 from pipeline.cli.twins.calibration_check import check_declared_rate
 from pipeline.cli.twins.drops_found import drop_lines, drops_found
 from pipeline.cli.twins.outlier_run_check import outlier_warning
-from pipeline.cli.twins.training_data import sha256_of, twin_errors
+from pipeline.cli.twins.training_data import FromOption, ToOption, sha256_of, twin_errors
 from pipeline.errors import UserError
 from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.replay.offline.limits_of_twin import find_limits
@@ -43,6 +43,8 @@ def calibrate(
     false_alarms_per_day: Annotated[
         float | None, typer.Option(help="The rate to declare: false alarms per fan and day.", min=1e-6, max=8640)
     ] = None,
+    from_s: FromOption = 0.0,
+    to_s: ToOption = math.inf,
     verify: Annotated[
         list[Path] | None,
         typer.Option(
@@ -80,6 +82,7 @@ def calibrate(
     _refuse_wrong_arguments(twin, healthy or [], verify or [], overrides or [])
     if not healthy:
         finding = {"--false-alarms-per-day": false_alarms_per_day, "--extrapolate": extrapolate, "--output": output}
+        finding |= {"--from": from_s > 0.0, "--to": to_s < math.inf}
         _refuse_without_healthy([name for name, value in finding.items() if value])
     if output and (output.is_dir() or not output.parent.is_dir()):  # before an hour of scoring
         raise UserError(f"{output}: cannot write the twin: name a file in an existing folder")
@@ -89,7 +92,7 @@ def calibrate(
             raise UserError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
         with interruptible("nothing was written"):
             limits, warning, speed_unit = _calibrated(
-                twin, healthy, false_alarms_per_day, extrapolate, overrides or [], seed
+                twin, healthy, (from_s, to_s), false_alarms_per_day, extrapolate, overrides or [], seed
             )
         output = output or twin
         _write(twin, output, limits)
@@ -113,7 +116,13 @@ def calibrate(
 
 
 def _calibrated(
-    twin: Path, healthy: list[Path], per_day: float, extrapolate: bool, overrides: list[str], seed: int
+    twin: Path,
+    healthy: list[Path],
+    part_s: tuple[float, float],
+    per_day: float,
+    extrapolate: bool,
+    overrides: list[str],
+    seed: int,
 ) -> tuple[Limits, str, SpeedUnit]:
     """The limits, a warning about the recordings, empty if there is none, and the unit of speeds in the first."""
     known = load_tray_twin(twin)
@@ -121,7 +130,7 @@ def _calibrated(
     if top_speed_rad_s <= 0.0:
         raise UserError(f"{twin}: its training data have no speed above zero (speed_range_rad_s): train it again")
     with working("scoring healthy recordings") as show:
-        runs = HealthyRuns(healthy, twin, overrides, show)
+        runs = HealthyRuns(healthy, twin, overrides, show, *part_s)
         timing = runs.timing()
         try:
             longest_fan_s = runs.longest_fan_s()  # however much of it can be scored

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,11 +36,19 @@ class RecordedTray:
 
 
 class HealthyRuns:
-    """Recordings, each processed from its start as a live tray is; they can be gone through several times."""
+    """Recordings or parts of them, processed like a live tray; they can be gone through several times."""
 
     def __init__(
-        self, paths: Sequence[Path], twin: Path, overrides: Sequence[str], progress: Callable[[str], None]
+        self,
+        paths: Sequence[Path],
+        twin: Path,
+        overrides: Sequence[str],
+        progress: Callable[[str], None],
+        from_s: float = 0.0,
+        to_s: float = math.inf,
     ) -> None:
+        """from_s, to_s: the part of each recording, in seconds since the first sample of the tray."""
+        self._from_s, self._to_s = from_s, to_s
         self._paths = paths
         self._twin = twin
         self._overrides = overrides
@@ -105,13 +114,17 @@ class HealthyRuns:
         """An upper bound of the time that can be scored, s, summed over fans: without scoring anything.
 
         Raises:
-            UserError: a recording cannot be used.
+            UserError: a recording cannot be used, or ends before the part of it that is wanted.
         """
         total_s = 0.0
         for path in self._paths:
             with open_replay_input([path], None, self._overrides, self._twin) as replay_input:
                 fans = sum(tray.fans for tray in replay_input.trays)
-                total_s += fans * (CLOCK_MARGIN * longest_s(path, replay_input.first_sample_t_ns) + 1.0)
+                recorded_s = CLOCK_MARGIN * longest_s(path, replay_input.first_sample_t_ns) + 1.0
+            part_s = min(recorded_s, self._to_s) - self._from_s
+            if part_s <= 0.0:
+                raise UserError(f"{path}: no samples from {self._from_s:g} s to {self._to_s:g} s; see --from and --to")
+            total_s += fans * part_s
         return total_s
 
     @property
@@ -125,7 +138,8 @@ class HealthyRuns:
             return replay_input.trays[0].speed_unit
 
     def _of(self, path: Path) -> Iterator[tuple[RecordedTray, Iterator[Samples]]]:
-        with open_replay_input([path], None, self._overrides, self._twin) as replay_input:
+        part_s = self._from_s, self._to_s
+        with open_replay_input([path], None, self._overrides, self._twin, *part_s) as replay_input:
             for tray in replay_input.trays:
                 name = tray.name
                 yield RecordedTray(path, name, tray.fans), map(samples_of, replay_input.pipeline(name).predictions())

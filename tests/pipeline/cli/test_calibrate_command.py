@@ -179,6 +179,22 @@ def test_extrapolated_limits_declare_a_target_only(folder: Path) -> None:
     assert rate.extrapolated
 
 
+def test_only_the_wanted_part_of_each_recording_is_used(folder: Path) -> None:
+    def fan_hours(*part: object) -> float:
+        result = calibrate(folder, *part, "--extrapolate", "-o", folder / "part.onnx", "--json")
+        assert result.exit_code == 0, result.output
+        return json.loads(result.stdout)["calibration"]["declared_rate"]["fan_hours"]
+
+    whole, part = fan_hours(), fan_hours("--from", 20, "--to", 90)
+    assert whole - part == pytest.approx(FANS * (120 - 70) / 3600, rel=0.05), "commissioning is repeated in each"
+    error = error_of(
+        "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1, "--from", 500
+    )
+    assert error.endswith("healthy.mcap: no samples from 500 s to inf s; see --from and --to")
+    verified = "--verify", folder / "other.mcap"
+    assert error_of("calibrate", folder / "twin.onnx", "--to", 9, *verified).startswith("--to needs recordings")
+
+
 def test_the_declared_rate_is_kept_on_other_healthy_recordings(folder: Path, calibrated: Path) -> None:
     result = fantwin("calibrate", calibrated, "--verify", folder / "other.mcap")
     assert result.exit_code == 0, result.output
