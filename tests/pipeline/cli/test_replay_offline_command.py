@@ -15,9 +15,9 @@ from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Alarm, InvalidReason, Raw
 from schemas.units import NS_PER_S
-from tests.pipeline.replay.test_offline import changed
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.killed_site import Site
+from tests.support.offline_replay import changed
 from tests.support.running_chain import fantwin as fantwin_process
 from tests.support.twin_files import write_twin
 

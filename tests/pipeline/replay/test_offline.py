@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,86 +12,16 @@ from hypothesis import strategies as st
 from mcap.records import Attachment
 
 from pipeline.recordings.metadata import CONFIGURATION
-from pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from pipeline.recordings.reading import RecordingError
 from pipeline.recordings.records import RecordReader
-from pipeline.recordings.writing import RecordingWriter
 from pipeline.replay.offline.alarm_episodes import episodes
 from pipeline.replay.offline.replay_input import open_replay_input
-from pipeline.replay.offline.rescoring import RescoredTray, rescore
-from pipeline.replay.offline.verify import CannotCompareError, Comparison
-from schemas import fan_pb2
+from pipeline.replay.offline.rescoring import rescore
 from schemas.messages import Action, Alarm, FanState, Score, Transition
 from schemas.units import NS_PER_S
 from tests.support.killed_site import CHAIN, Site
+from tests.support.offline_replay import alarms_of, changed, made_equal, recorded, verified
 from tests.support.twin_files import write_twin
-
-
-def verified(*paths: Path) -> RescoredTray:
-    with open_replay_input(paths, None, (), None) as replay_input:
-        (tray,) = rescore(replay_input, None, verify=True)
-    assert tray.comparison
-    return tray
-
-
-def made_equal(tray: RescoredTray) -> int:
-    """How many samples were equal; none may differ."""
-    found = tray.comparison
-    assert found and found.is_equal, found
-    return found.equal
-
-
-def verified_in_part(*paths: Path) -> Comparison:
-    """The comparison of a recording that lacks something: what can be compared is equal."""
-    found = verified(*paths).comparison
-    assert found and found.is_equal and found.equal and found.not_comparable, found
-    return found
-
-
-def recorded(path: Path, topic: str) -> list[Any]:
-    return [entry.message for entry in read_recording(path, (topic,))]
-
-
-def changed(path: Path, out: Path, change) -> Path:
-    """A copy whose messages have gone through `change(entry) -> message or None`."""
-    head = read_metadata(path)
-    with RecordingWriter(out, head.metadata, head.attachments) as writer:
-        for entry in read_recording(path):
-            message = change(entry)
-            if message is not None:
-                writer.add_message(entry.key, message, entry.received_t_ns)
-    return out
-
-
-def recording_of(folder: Path, seed: int, *samples: int, killed: str = "", calibrated: bool = False) -> Path:
-    """A recording of so many samples, with a stage killed after each number of them but the last."""
-    site = Site(folder, seed, calibrated=calibrated)
-    for number, count in enumerate(samples):
-        if number:
-            site.kill(killed)
-        site.run(count)
-    return site.finished()
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Long enough for alarms to be raised and cleared."""
-    return recording_of(tmp_path_factory.mktemp("undisturbed"), 1, 600)
-
-
-@pytest.fixture(scope="module")
-def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return recording_of(tmp_path_factory.mktemp("short"), 3, 300)
-
-
-@pytest.fixture(scope="module")
-def integrator_killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return recording_of(tmp_path_factory.mktemp("integrator"), 4, 150, 150, killed="twin_integrator")
-
-
-@pytest.fixture(scope="module")
-def scorer_killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scorer is killed while an alarm is active, and continues from its snapshot."""
-    return recording_of(tmp_path_factory.mktemp("scorer"), 1, 215, 100, killed="scorer", calibrated=True)
 
 
 def test_a_run_that_nothing_disturbed_is_decided_the_same(undisturbed):
@@ -150,10 +78,6 @@ def test_a_replay_decides_the_same_after_any_kills_and_requests(
     assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
 
 
-def alarms_of(path: Path) -> list[Alarm]:
-    return recorded(path, "alarm")
-
-
 @pytest.mark.parametrize("block_size", [1, 4])
 def test_requests_of_operators_are_replayed_at_the_same_samples(tmp_path, block_size):
     site = Site(tmp_path, 1, block_size, calibrated=True)
@@ -205,31 +129,6 @@ def test_a_restarted_scorer_continues_from_its_snapshot_and_so_does_a_replay(tmp
     assert len(raised) == 1 and raised[0].t_ns == first.raised_ns, "one alarm, over the restart"
 
 
-def test_row_14_a_session_cannot_be_reproduced_without_the_snapshot_it_began_with(scorer_killed, tmp_path):
-
-    def forgotten(entry):
-        return None if entry.topic == "snapshot" else entry.message
-
-    path = changed(scorer_killed, tmp_path / "forgotten.mcap", forgotten)
-    found = verified_in_part(path)
-    assert found.equal >= 214
-    (reason,) = found.reasons
-    assert re.fullmatch("tray1: the first messages of scorer-.* were not recorded", reason)
-
-
-def test_row_14_a_scorer_restarted_in_a_pause_of_the_recorder_still_needs_its_earlier_input(tmp_path):
-    site = Site(tmp_path, 1, calibrated=True)
-    site.run(210)
-    site.records = False
-    site.run(20)
-    site.records = True
-    site.kill("scorer")
-    site.run(100)
-    found = verified_in_part(site.finished())
-    assert found.equal >= 209
-    assert any("lacks 20 raw messages that were scored" in reason for reason in found.reasons)
-
-
 def test_with_other_limits_a_session_continues_from_the_replayed_state_of_the_one_before(scorer_killed):
     with open_replay_input([scorer_killed], None, ("scorer.limit_factor=1000",), None) as replay_input:
         (tray,) = rescore(replay_input, None, verify=False)
@@ -244,187 +143,6 @@ def test_with_another_twin_a_restart_costs_no_commissioning(scorer_killed, tmp_p
         (tray,) = rescore(replay_input, None, verify=False)
     assert tray.plan.restarts == 1
     assert tray.counts["snapshots_of_another_twin"] == 0
-
-
-@pytest.mark.parametrize(("lacks", "is_planned"), [("command", False), ("torque_balance_command", True)])
-def test_a_recording_of_another_version_is_judged_from_its_raw_samples(short, lacks, is_planned):
-    with open_replay_input([short], None, (), None) as replay_input:
-        envelopes = list(replay_input.envelopes("tray1", ("grid", "prediction", "score", "raw")))
-        old = [p if p.topic != "prediction" else replace(p, payload=_without(lacks, p.payload)) for p in envelopes]
-        replay_input.envelopes = lambda tray, topics: (p for p in old if p.topic in topics)  # type: ignore[method-assign]
-        plan, _, _ = replay_input.read_plan("tray1")
-        (tray,) = rescore(replay_input, None, verify=False)
-    assert (plan is not None) == is_planned
-    assert tray.scored > 200
-
-
-def _without(column: str, payload: bytes) -> bytes:
-    prediction = fan_pb2.Prediction.FromString(payload)
-    prediction.ClearField(column)
-    return prediction.SerializeToString()
-
-
-def test_row_14_scores_before_raw_messages_that_the_recorder_never_got_are_compared(tmp_path):
-    site = Site(tmp_path, seed=3)
-    site.run(150)
-    site.records = False
-    site.run(3)
-    site.records = True
-    site.run(150)
-    found = verified_in_part(site.finished())
-    assert found.equal >= 149
-    (reason,) = found.reasons
-    assert re.fullmatch("tray1: after .*Z: the recording lacks 3 raw messages that were scored", reason)
-
-
-def without_raw(path: Path, out: Path, first: int, last: int) -> Path:
-    """A copy that holds only the raw messages from `first` to before `last`."""
-
-    def without(entry):
-        return entry.message if entry.topic != "raw" or first <= entry.message.header.sequence < last else None
-
-    return changed(path, out, without)
-
-
-def test_row_14_without_the_first_raw_messages_nothing_is_compared(short, tmp_path):
-    with pytest.raises(CannotCompareError, match="lacks 10 raw messages"):
-        verified(without_raw(short, tmp_path / "without.mcap", 10, 10**9))
-
-
-def test_row_14_scores_before_raw_messages_that_are_missing_at_the_end_are_compared(short, tmp_path):
-    found = verified_in_part(without_raw(short, tmp_path / "without.mcap", 0, 280))
-    assert found.equal >= 275
-    assert "lacks 20 raw messages" in found.reasons[0]
-
-
-def test_row_14_the_last_raw_message_of_a_killed_acquisition_may_have_reached_the_resampler_only(tmp_path):
-    site = Site(tmp_path, seed=4)
-    site.run(150)
-    killed, last = site.source.producer, site.source.published["raw"] - 1
-    site.restart_source()
-    site.kill("resampler")
-    site.run(100)
-
-    def without(entry):
-        header = entry.message.header
-        is_last = entry.topic == "raw" and (header.producer, header.sequence) == (killed, last)
-        return None if is_last else entry.message
-
-    found = verified_in_part(changed(site.finished(), tmp_path / "without.mcap", without))
-    assert found.equal >= 148
-    assert found.not_comparable
-    assert "lacks 1 raw messages" in found.reasons[0]
-
-
-@pytest.mark.parametrize("stage", ["resampler", "twin_integrator", "scorer"])
-def test_row_14_a_session_that_fell_into_a_pause_of_the_recorder_leaves_the_rest_comparable(tmp_path, stage):
-    site = Site(tmp_path, seed=4)
-    site.run(150)
-    site.records = False
-    site.run(20)
-    site.kill(stage)  # the session that follows is recorded nowhere
-    site.run(20)
-    site.kill(stage)
-    site.run(5)
-    site.records = True
-    site.run(100)
-    found = verified_in_part(site.finished())
-    assert found.equal >= 149
-    assert found.not_comparable >= 90
-    assert found.reasons
-
-
-@pytest.mark.parametrize("stage", ["resampler", "twin_integrator", "scorer"])
-def test_row_14_a_session_without_any_recorded_output_leaves_the_rest_comparable(tmp_path, stage):
-    site = Site(tmp_path, seed=4)
-    site.run(150)
-    site.kill(stage)
-    producer = site.stages[stage].producer
-    site.run(20)
-    site.kill(stage)
-    site.run(100)
-
-    def without(entry):
-        return None if entry.message.header.producer == producer else entry.message
-
-    found = verified(changed(site.finished(), tmp_path / "without.mcap", without)).comparison
-    assert found and found.is_equal and found.equal >= 149, found
-    assert bool(found.not_comparable) == bool(found.reasons)
-
-
-def test_a_recording_without_raw_samples_is_never_equal(short, tmp_path):
-    no_raw = changed(short, tmp_path / "no.mcap", lambda e: None if e.topic == "raw" else e.message)
-    with pytest.raises(RecordingError, match="no raw samples"):
-        verified(no_raw)
-
-
-def test_messages_of_a_killed_stage_that_the_recorder_never_got_are_made_again(tmp_path):
-    site = Site(tmp_path, seed=4)
-    site.run(150)
-    integrator = site.stages["twin_integrator"].producer
-    sent = site.stages["twin_integrator"].published["prediction"]
-    site.kill("twin_integrator")
-    site.run(150)
-
-    def lost(entry):
-        header = entry.message.header
-        is_last = entry.topic == "prediction" and header.producer == integrator and header.sequence >= sent - 3
-        return None if is_last else entry.message
-
-    path = changed(site.finished(), tmp_path / "lost.mcap", lost)
-    assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
-
-
-def test_an_alarm_after_the_last_recorded_score_is_no_difference(undisturbed, tmp_path):
-    raised = recorded(undisturbed, "alarm")[0]
-
-    def until_then(entry):
-        if entry.topic in ("grid", "prediction", "score"):
-            return entry.message if entry.message.t_ns[0] <= raised.t_ns else None
-        return None if entry.topic == "alarm" else entry.message
-
-    found = verified(changed(undisturbed, tmp_path / "cut.mcap", until_then)).comparison
-    assert found and found.is_equal and found.alarms_not_recorded > 0 and found.not_recorded > 0
-
-
-def test_grids_of_a_session_that_are_nowhere_leave_nothing_to_compare(short, tmp_path):
-    no_grid = changed(short, tmp_path / "no.mcap", lambda e: None if e.topic == "grid" else e.message)
-    with pytest.raises(CannotCompareError, match="nothing to compare with"):
-        verified(no_grid)
-    with open_replay_input([no_grid], None, (), None) as replay_input:
-        (tray,) = rescore(replay_input, None, verify=False)
-    assert tray.scored > 200
-
-
-def test_samples_that_never_reached_the_resampler_are_not_invented(tmp_path):
-    site = Site(tmp_path, seed=5, block_size=10)
-    site.run(205)
-    site.loses(3)
-    site.run(300)
-    path = site.finished()
-    assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
-
-
-def test_an_undecodable_alarm_costs_that_alarm_only(undisturbed):
-    alarms = recorded(undisturbed, "alarm")
-    with open_replay_input([undisturbed], None, (), None) as replay_input:
-        envelopes = list(replay_input.envelopes("tray1", ("grid", "prediction", "score", "alarm")))
-        first = next(n for n, envelope in enumerate(envelopes) if envelope.topic == "alarm")
-        envelopes[first] = replace(envelopes[first], payload=b"\xff\xff")
-        replay_input.envelopes = lambda tray, topics: iter(envelopes)  # type: ignore[method-assign]
-        plan, found, _ = replay_input.read_plan("tray1")
-    assert plan and len(found) == len(alarms) - 1
-    assert "cannot be decoded: 1" in next(iter(replay_input.damage.values()))
-
-
-@pytest.mark.parametrize("topic", ["grid", "prediction"])
-def test_a_recording_that_lacks_intermediate_messages_is_still_compared(integrator_killed, tmp_path, topic):
-    holes = changed(
-        integrator_killed,
-        tmp_path / "holes.mcap",
-        lambda entry: None if entry.topic == topic and 80 <= entry.message.header.sequence < 90 else entry.message,
-    )
-    assert made_equal(verified(holes)) > 290
 
 
 def test_one_bit_is_found_and_named(short, tmp_path):
@@ -463,23 +181,6 @@ def test_scores_that_no_stage_made_are_found(short, tmp_path):
 
     found = verified(changed(short, tmp_path / "later.mcap", later)).comparison
     assert found and found.not_made == 1 and found.not_recorded == 1
-
-
-def test_a_recording_without_scores_cannot_be_compared(short, tmp_path):
-    raw = changed(short, tmp_path / "raw.mcap", lambda entry: entry.message if entry.topic == "raw" else None)
-    with pytest.raises(CannotCompareError, match="nothing to compare with"):
-        verified(raw)
-
-
-def test_a_part_from_the_middle_cannot_be_compared_and_the_reason_is_shown(short, tmp_path):
-    half = 150
-
-    def second_half(entry):
-        return entry.message if entry.message.header.sequence >= half else None
-
-    part = changed(short, tmp_path / "part.mcap", second_half)
-    with pytest.raises(CannotCompareError, match="the parts before it"):
-        verified(part)
 
 
 def test_parts_that_overlap_are_one_recording(tmp_path):
@@ -568,15 +269,6 @@ def test_a_snapshot_in_an_older_recording_is_restored_and_its_replay_is_equal():
     }
     assert operators == {0: (True, False, False), 1: (False, True, False), 2: (True, False, True)}
     assert not tray.counts["snapshots_of_another_twin"] and not tray.counts["snapshots_not_understood"]
-
-
-@pytest.mark.parametrize("recording", ["integrator_killed", "scorer_killed", "undisturbed"])
-def test_a_recording_that_lacks_nothing_is_compared_to_its_end(recording, request):
-    with open_replay_input([request.getfixturevalue(recording)], None, (), None) as replay_input:
-        plan, _, _ = replay_input.read_plan("tray1")
-    assert (
-        plan and [session.limit for sessions in plan.sessions.values() for session in sessions if session.limit] == []
-    )
 
 
 def test_row_13_after_a_step_of_the_clock_the_samples_that_are_counted_are_those_that_are_compared(tmp_path):

@@ -13,10 +13,8 @@ from pipeline.runtime.tracked_streams import Request
 from schemas.codec import encode, type_name
 from schemas.messages import Grid, Header, Health, Output, Raw, StageStatus
 from schemas.topics import BY_NAME, health_key, tray_key
-from tests.pipeline.runtime.test_runner import TRAY_A, Bench, config, raw, toy
 from tests.pipeline.runtime.test_sequence_tracker import KEY, health, packet, sequences
-
-__all__ = ["config"]  # a fixture
+from tests.support.toy_stage import TRAY_A, Bench, raw, toy
 
 
 class RealProducer:

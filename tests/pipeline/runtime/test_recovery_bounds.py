@@ -21,11 +21,9 @@ from pipeline.runtime.tracked_streams import MOST_HEALTH_PRODUCERS, MOST_PRODUCE
 from schemas.codec import encode, type_name
 from schemas.messages import Grid, Header, Raw
 from schemas.topics import BY_NAME, health_key, tray_key
-from tests.pipeline.runtime.test_runner import TRAY_A, Bench, config, raw, toy
 from tests.pipeline.runtime.test_sequence_tracker import KEY, health, packet, sequences
 from tests.support.running_chain import eventually
-
-__all__ = ["config"]  # a fixture
+from tests.support.toy_stage import TRAY_A, Bench, raw, toy
 
 
 def test_row_11_live_data_does_not_wait_for_a_producer_that_never_answers(config):

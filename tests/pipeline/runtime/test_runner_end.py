@@ -20,10 +20,8 @@ from pipeline.runtime.stage import BuiltStage, Context, Stage
 from schemas.codec import decode
 from schemas.messages import Health, Message, StageStatus
 from schemas.topics import health_key, tray_key
-from tests.pipeline.runtime.test_runner import TRAY_A, TRAY_B, Bench, Burst, Passer, config, raw, toy
 from tests.support.running_chain import eventually
-
-__all__ = ["config"]  # a fixture
+from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, raw, toy
 
 
 class Ended:

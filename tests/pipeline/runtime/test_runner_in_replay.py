@@ -12,10 +12,8 @@ from pipeline.runtime.stage import BuiltStage, Context
 from schemas.codec import encode, type_name
 from schemas.messages import Clock, Command, Grid, Header, Health, Message, StageStatus
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
-from tests.pipeline.runtime.test_runner import TRAY_A, TRAY_B, Bench, Burst, Passer, config, toy
 from tests.support.running_chain import eventually
-
-__all__ = ["config"]  # a fixture
+from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, toy
 
 
 class Ticker(Passer):

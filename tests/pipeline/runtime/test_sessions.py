@@ -18,10 +18,8 @@ from pipeline.runtime.stage import BuiltStage, StageError
 from schemas.codec import encode, type_name
 from schemas.messages import Alarm, Grid, Header, Raw, Severity
 from schemas.topics import BY_NAME, alive_key, sessions_key, tray_key
-from tests.pipeline.runtime.test_runner import TRAY_A, Bench, Passer, config, raw, toy
 from tests.support.running_chain import eventually
-
-__all__ = ["config"]  # a fixture
+from tests.support.toy_stage import TRAY_A, Bench, Passer, raw, toy
 
 FIRST = Session("acquisition", TRAY_A, 100, "acquisition-a-1111", "board", 4711)
 SECOND = Session("acquisition", TRAY_A, 200, "acquisition-a-2222", "rack", 4712)

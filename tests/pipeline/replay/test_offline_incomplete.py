@@ -1,0 +1,249 @@
+"""Offline replay of recordings that lack something: what is there is compared, and what is missing is named."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline.recordings.reading import RecordingError
+from pipeline.replay.offline.replay_input import open_replay_input
+from pipeline.replay.offline.rescoring import rescore
+from pipeline.replay.offline.verify import CannotCompareError
+from schemas import fan_pb2
+from tests.support.killed_site import Site
+from tests.support.offline_replay import changed, made_equal, recorded, verified, verified_in_part
+
+
+def test_row_14_a_session_cannot_be_reproduced_without_the_snapshot_it_began_with(scorer_killed, tmp_path):
+
+    def forgotten(entry):
+        return None if entry.topic == "snapshot" else entry.message
+
+    path = changed(scorer_killed, tmp_path / "forgotten.mcap", forgotten)
+    found = verified_in_part(path)
+    assert found.equal >= 214
+    (reason,) = found.reasons
+    assert re.fullmatch("tray1: the first messages of scorer-.* were not recorded", reason)
+
+
+def test_row_14_a_scorer_restarted_in_a_pause_of_the_recorder_still_needs_its_earlier_input(tmp_path):
+    site = Site(tmp_path, 1, calibrated=True)
+    site.run(210)
+    site.records = False
+    site.run(20)
+    site.records = True
+    site.kill("scorer")
+    site.run(100)
+    found = verified_in_part(site.finished())
+    assert found.equal >= 209
+    assert any("lacks 20 raw messages that were scored" in reason for reason in found.reasons)
+
+
+@pytest.mark.parametrize(("lacks", "is_planned"), [("command", False), ("torque_balance_command", True)])
+def test_a_recording_of_another_version_is_judged_from_its_raw_samples(short, lacks, is_planned):
+    with open_replay_input([short], None, (), None) as replay_input:
+        envelopes = list(replay_input.envelopes("tray1", ("grid", "prediction", "score", "raw")))
+        old = [p if p.topic != "prediction" else replace(p, payload=_without(lacks, p.payload)) for p in envelopes]
+        replay_input.envelopes = lambda tray, topics: (p for p in old if p.topic in topics)  # type: ignore[method-assign]
+        plan, _, _ = replay_input.read_plan("tray1")
+        (tray,) = rescore(replay_input, None, verify=False)
+    assert (plan is not None) == is_planned
+    assert tray.scored > 200
+
+
+def _without(column: str, payload: bytes) -> bytes:
+    prediction = fan_pb2.Prediction.FromString(payload)
+    prediction.ClearField(column)
+    return prediction.SerializeToString()
+
+
+def test_row_14_scores_before_raw_messages_that_the_recorder_never_got_are_compared(tmp_path):
+    site = Site(tmp_path, seed=3)
+    site.run(150)
+    site.records = False
+    site.run(3)
+    site.records = True
+    site.run(150)
+    found = verified_in_part(site.finished())
+    assert found.equal >= 149
+    (reason,) = found.reasons
+    assert re.fullmatch("tray1: after .*Z: the recording lacks 3 raw messages that were scored", reason)
+
+
+def without_raw(path: Path, out: Path, first: int, last: int) -> Path:
+    """A copy that holds only the raw messages from `first` to before `last`."""
+
+    def without(entry):
+        return entry.message if entry.topic != "raw" or first <= entry.message.header.sequence < last else None
+
+    return changed(path, out, without)
+
+
+def test_row_14_without_the_first_raw_messages_nothing_is_compared(short, tmp_path):
+    with pytest.raises(CannotCompareError, match="lacks 10 raw messages"):
+        verified(without_raw(short, tmp_path / "without.mcap", 10, 10**9))
+
+
+def test_row_14_scores_before_raw_messages_that_are_missing_at_the_end_are_compared(short, tmp_path):
+    found = verified_in_part(without_raw(short, tmp_path / "without.mcap", 0, 280))
+    assert found.equal >= 275
+    assert "lacks 20 raw messages" in found.reasons[0]
+
+
+def test_row_14_the_last_raw_message_of_a_killed_acquisition_may_have_reached_the_resampler_only(tmp_path):
+    site = Site(tmp_path, seed=4)
+    site.run(150)
+    killed, last = site.source.producer, site.source.published["raw"] - 1
+    site.restart_source()
+    site.kill("resampler")
+    site.run(100)
+
+    def without(entry):
+        header = entry.message.header
+        is_last = entry.topic == "raw" and (header.producer, header.sequence) == (killed, last)
+        return None if is_last else entry.message
+
+    found = verified_in_part(changed(site.finished(), tmp_path / "without.mcap", without))
+    assert found.equal >= 148
+    assert found.not_comparable
+    assert "lacks 1 raw messages" in found.reasons[0]
+
+
+@pytest.mark.parametrize("stage", ["resampler", "twin_integrator", "scorer"])
+def test_row_14_a_session_that_fell_into_a_pause_of_the_recorder_leaves_the_rest_comparable(tmp_path, stage):
+    site = Site(tmp_path, seed=4)
+    site.run(150)
+    site.records = False
+    site.run(20)
+    site.kill(stage)  # the session that follows is recorded nowhere
+    site.run(20)
+    site.kill(stage)
+    site.run(5)
+    site.records = True
+    site.run(100)
+    found = verified_in_part(site.finished())
+    assert found.equal >= 149
+    assert found.not_comparable >= 90
+    assert found.reasons
+
+
+@pytest.mark.parametrize("stage", ["resampler", "twin_integrator", "scorer"])
+def test_row_14_a_session_without_any_recorded_output_leaves_the_rest_comparable(tmp_path, stage):
+    site = Site(tmp_path, seed=4)
+    site.run(150)
+    site.kill(stage)
+    producer = site.stages[stage].producer
+    site.run(20)
+    site.kill(stage)
+    site.run(100)
+
+    def without(entry):
+        return None if entry.message.header.producer == producer else entry.message
+
+    found = verified(changed(site.finished(), tmp_path / "without.mcap", without)).comparison
+    assert found and found.is_equal and found.equal >= 149, found
+    assert bool(found.not_comparable) == bool(found.reasons)
+
+
+def test_a_recording_without_raw_samples_is_never_equal(short, tmp_path):
+    no_raw = changed(short, tmp_path / "no.mcap", lambda e: None if e.topic == "raw" else e.message)
+    with pytest.raises(RecordingError, match="no raw samples"):
+        verified(no_raw)
+
+
+def test_messages_of_a_killed_stage_that_the_recorder_never_got_are_made_again(tmp_path):
+    site = Site(tmp_path, seed=4)
+    site.run(150)
+    integrator = site.stages["twin_integrator"].producer
+    sent = site.stages["twin_integrator"].published["prediction"]
+    site.kill("twin_integrator")
+    site.run(150)
+
+    def lost(entry):
+        header = entry.message.header
+        is_last = entry.topic == "prediction" and header.producer == integrator and header.sequence >= sent - 3
+        return None if is_last else entry.message
+
+    path = changed(site.finished(), tmp_path / "lost.mcap", lost)
+    assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
+
+
+def test_an_alarm_after_the_last_recorded_score_is_no_difference(undisturbed, tmp_path):
+    raised = recorded(undisturbed, "alarm")[0]
+
+    def until_then(entry):
+        if entry.topic in ("grid", "prediction", "score"):
+            return entry.message if entry.message.t_ns[0] <= raised.t_ns else None
+        return None if entry.topic == "alarm" else entry.message
+
+    found = verified(changed(undisturbed, tmp_path / "cut.mcap", until_then)).comparison
+    assert found and found.is_equal and found.alarms_not_recorded > 0 and found.not_recorded > 0
+
+
+def test_grids_of_a_session_that_are_nowhere_leave_nothing_to_compare(short, tmp_path):
+    no_grid = changed(short, tmp_path / "no.mcap", lambda e: None if e.topic == "grid" else e.message)
+    with pytest.raises(CannotCompareError, match="nothing to compare with"):
+        verified(no_grid)
+    with open_replay_input([no_grid], None, (), None) as replay_input:
+        (tray,) = rescore(replay_input, None, verify=False)
+    assert tray.scored > 200
+
+
+def test_samples_that_never_reached_the_resampler_are_not_invented(tmp_path):
+    site = Site(tmp_path, seed=5, block_size=10)
+    site.run(205)
+    site.loses(3)
+    site.run(300)
+    path = site.finished()
+    assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
+
+
+def test_an_undecodable_alarm_costs_that_alarm_only(undisturbed):
+    alarms = recorded(undisturbed, "alarm")
+    with open_replay_input([undisturbed], None, (), None) as replay_input:
+        envelopes = list(replay_input.envelopes("tray1", ("grid", "prediction", "score", "alarm")))
+        first = next(n for n, envelope in enumerate(envelopes) if envelope.topic == "alarm")
+        envelopes[first] = replace(envelopes[first], payload=b"\xff\xff")
+        replay_input.envelopes = lambda tray, topics: iter(envelopes)  # type: ignore[method-assign]
+        plan, found, _ = replay_input.read_plan("tray1")
+    assert plan and len(found) == len(alarms) - 1
+    assert "cannot be decoded: 1" in next(iter(replay_input.damage.values()))
+
+
+@pytest.mark.parametrize("topic", ["grid", "prediction"])
+def test_a_recording_that_lacks_intermediate_messages_is_still_compared(integrator_killed, tmp_path, topic):
+    holes = changed(
+        integrator_killed,
+        tmp_path / "holes.mcap",
+        lambda entry: None if entry.topic == topic and 80 <= entry.message.header.sequence < 90 else entry.message,
+    )
+    assert made_equal(verified(holes)) > 290
+
+
+def test_a_recording_without_scores_cannot_be_compared(short, tmp_path):
+    raw = changed(short, tmp_path / "raw.mcap", lambda entry: entry.message if entry.topic == "raw" else None)
+    with pytest.raises(CannotCompareError, match="nothing to compare with"):
+        verified(raw)
+
+
+def test_a_part_from_the_middle_cannot_be_compared_and_the_reason_is_shown(short, tmp_path):
+    half = 150
+
+    def second_half(entry):
+        return entry.message if entry.message.header.sequence >= half else None
+
+    part = changed(short, tmp_path / "part.mcap", second_half)
+    with pytest.raises(CannotCompareError, match="the parts before it"):
+        verified(part)
+
+
+@pytest.mark.parametrize("recording", ["integrator_killed", "scorer_killed", "undisturbed"])
+def test_a_recording_that_lacks_nothing_is_compared_to_its_end(recording, request):
+    with open_replay_input([request.getfixturevalue(recording)], None, (), None) as replay_input:
+        plan, _, _ = replay_input.read_plan("tray1")
+    assert (
+        plan and [session.limit for sessions in plan.sessions.values() for session in sessions if session.limit] == []
+    )

@@ -1,0 +1,193 @@
+"""The cores and sources of a stage: one for each tray or for all, and those that crash."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import pytest
+
+from pipeline.runtime.inbox import INBOX_SIZE
+from pipeline.runtime.runner import Runner
+from pipeline.runtime.stage import BuiltStage, Context, Core, StageError
+from schemas.messages import Grid, Header, Message, StageStatus
+from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, raw, toy
+
+
+def test_each_tray_has_its_own_core_and_sequence(config):
+    bench = Bench(toy(), config)
+    bench.feed(TRAY_A, 1)
+    bench.feed(TRAY_B, 2)
+    got = {(g.header.tray, g.header.sequence) for g in (bench.next(Grid), bench.next(Grid))}
+    bench.end()
+    assert got == {(TRAY_A, 0), (TRAY_B, 0)}
+
+
+def test_items_a_source_delivers_while_stopping_are_processed_before_the_end(config):
+    items = [raw(t_ns) for t_ns in range(50)]
+    stage = toy(lambda _context: BuiltStage(Passer(), Burst(items)), name="acquisition")
+    bench = Bench(stage, config, TRAY_A)
+    last = bench.end()
+    grids = []
+    while not bench.heard.empty():
+        grids += [m.t_ns.tolist() for _, m in [bench.heard.get()] if isinstance(m, Grid)]
+    assert grids == [[t] for t in range(50)] + [[-1]]
+    assert last.status == StageStatus.STOPPED
+    assert last.outputs[0].published == 51
+
+
+def test_the_last_health_of_a_stage_that_crashed_says_why(config):
+    class Broken(Passer):
+        def step(self, item: Any) -> Sequence[Message]:
+            raise ZeroDivisionError("on purpose")
+
+    bench = Bench(toy(lambda _context: BuiltStage(Broken())), config)
+    bench.feed(TRAY_A, 1)
+    last = bench.health_with(lambda health: "crashed" in health.problem)
+    bench.thread.join(20)
+    bench.bus.close()
+    assert bench.crashes
+    assert last.status == StageStatus.DEGRADED
+    assert "ZeroDivisionError: on purpose" in last.problem
+
+
+class CrashesOnce(Passer):
+    """Like a scorer: it keeps a snapshot (in `saved`) that `close` updates. Crashes on the sample `crash_t_ns`."""
+
+    saved: ClassVar[dict[str, int]] = {}
+
+    def __init__(self, tray: str, crash_t_ns: int) -> None:
+        super().__init__()
+        self.tray, self.crash_t_ns = tray, crash_t_ns
+        self.last_t_ns = self.saved.get(tray, 0)
+        self.aborted = False
+
+    def step(self, item: Any) -> Sequence[Message]:
+        t_ns = int(item.host_receive_t_ns[0])
+        if t_ns <= self.last_t_ns:
+            return []
+        self.last_t_ns = t_ns  # the state advances before all of it is processed
+        if t_ns == self.crash_t_ns:
+            raise ZeroDivisionError("on purpose")
+        return super().step(item)
+
+    def close(self) -> Sequence[Message]:
+        self.saved[self.tray] = self.last_t_ns
+        return super().close()
+
+    def abort(self) -> None:
+        self.aborted = True
+
+
+def test_a_crashed_core_saves_and_publishes_nothing_and_its_successor_gets_the_message_again(config):
+    CrashesOnce.saved.clear()
+    cores: dict[str, CrashesOnce] = {}
+
+    def build(context: Context, crash_t_ns: int = 2) -> BuiltStage:
+        cores[context.tray.name] = CrashesOnce(context.tray.name, crash_t_ns)
+        return BuiltStage(cores[context.tray.name])
+
+    bench = Bench(toy(build), config)
+    bench.feed(TRAY_B, 1)
+    bench.feed(TRAY_A, 1)
+    bench.feed(TRAY_A, 2)
+    crash = bench.health_with(lambda health: "crashed" in health.problem)
+    bench.thread.join(20)
+    crashed, saved = cores[TRAY_A], dict(CrashesOnce.saved)
+    stop = threading.Event()
+    successor = Runner(toy(lambda context: build(context, crash_t_ns=-1)), config, None, stop)
+    stop.set()
+    last = successor.run()  # it catches up before it looks at `stop`
+    bench.bus.close()
+    assert crashed.aborted
+    assert saved == {TRAY_B: 1}, "only the core of the other tray was closed"
+    assert {output.key.split("/")[2]: output.published for output in crash.outputs} == {TRAY_A: 1, TRAY_B: 2}
+    assert CrashesOnce.saved == {TRAY_A: 2, TRAY_B: 1}
+    assert {output.key.split("/")[2]: output.published for output in last.outputs} == {TRAY_A: 3, TRAY_B: 0}
+
+
+class OfAllTrays(Core):
+    """One core for all trays that publishes from `step`, `tick` and `close`."""
+
+    def __init__(self, tray: str = TRAY_B) -> None:
+        self.header = Header("", 0, tray)
+        self.seen = 0
+        self.due: list[Grid] = []
+
+    def grid(self, t_ns: int) -> Grid:
+        passer = Passer()
+        passer.fans = 1
+        return replace(passer.grid([t_ns]), header=self.header)
+
+    def step(self, item: Any) -> Sequence[Message]:
+        self.due.append(self.grid(200))
+        return [replace(self.grid(100), header=Header("", 0, ""))]
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        due, self.due = self.due, []
+        return due
+
+    def close(self) -> Sequence[Message]:
+        return [self.grid(300)]
+
+
+def test_a_core_of_all_trays_publishes_from_tick_and_close_for_the_tray_in_the_header(config):
+    bench = Bench(toy(lambda _context: BuiltStage(OfAllTrays()), core_per_tray=False), config)
+    bench.feed(TRAY_A, 1)
+    grids = [bench.next(Grid), bench.next(Grid)]
+    bench.stop.set()
+    grids.append(bench.next(Grid))
+    bench.end()
+    assert [(grid.header.tray, grid.t_ns.tolist()) for grid in grids] == [
+        (TRAY_A, [100]),
+        (TRAY_B, [200]),
+        (TRAY_B, [300]),
+    ]
+
+
+def test_an_output_without_a_tray_is_refused_in_one_line(config):
+    stop = threading.Event()
+    stop.set()
+    runner = Runner(toy(lambda _context: BuiltStage(OfAllTrays("")), core_per_tray=False), config, None, stop)
+    with pytest.raises(StageError, match="'resampler' serves all trays and returned a grid without one: set header"):
+        runner.run()
+
+
+def test_an_output_that_is_not_declared_is_refused_in_one_line(config):
+    stop = threading.Event()
+    stop.set()
+    runner = Runner(toy(lambda _context: BuiltStage(OfAllTrays()), core_per_tray=False, writes=()), config, None, stop)
+    with pytest.raises(StageError, match="message of topic 'grid': add it to `writes` of its declaration"):
+        runner.run()
+
+
+def test_sources_in_one_process_for_all_trays_feed_each_the_core_of_its_tray(config):
+    def build(context: Context) -> BuiltStage:
+        return BuiltStage(Passer(), Burst([raw(1 if context.tray.name == TRAY_A else 2)]))
+
+    bench = Bench(toy(build, reads=()), config)
+    bench.end()
+    grids = []
+    while not bench.heard.empty():
+        grids += [(m.header.tray, m.t_ns.tolist()) for _, m in [bench.heard.get()] if isinstance(m, Grid)]
+    assert sorted(grids) == [(TRAY_A, [-1]), (TRAY_A, [1]), (TRAY_B, [-1]), (TRAY_B, [2])]
+
+
+def test_a_stage_that_crashes_with_a_full_inbox_leaves_the_bus_at_once(config):
+    fed = threading.Event()
+
+    class BrokenLater(Passer):
+        def step(self, item: Any) -> Sequence[Message]:
+            fed.wait(20)
+            raise ZeroDivisionError("on purpose")
+
+    bench = Bench(toy(lambda _context: BuiltStage(BrokenLater())), config)
+    for t_ns in range(INBOX_SIZE + 500):
+        bench.feed(TRAY_A, t_ns)
+    fed.set()
+    bench.thread.join(20)
+    bench.bus.close()
+    assert not bench.thread.is_alive()
+    assert str(bench.crashes[0]) == "on purpose"  # and not that the bus could not be closed

@@ -1,0 +1,64 @@
+"""Offline replays of recordings that a test makes or changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pipeline.recordings.reading import read_metadata, read_recording
+from pipeline.recordings.writing import RecordingWriter
+from pipeline.replay.offline.replay_input import open_replay_input
+from pipeline.replay.offline.rescoring import RescoredTray, rescore
+from pipeline.replay.offline.verify import Comparison
+from schemas.messages import Alarm
+from tests.support.killed_site import Site
+
+
+def verified(*paths: Path) -> RescoredTray:
+    with open_replay_input(paths, None, (), None) as replay_input:
+        (tray,) = rescore(replay_input, None, verify=True)
+    assert tray.comparison
+    return tray
+
+
+def made_equal(tray: RescoredTray) -> int:
+    """How many samples were equal; none may differ."""
+    found = tray.comparison
+    assert found and found.is_equal, found
+    return found.equal
+
+
+def verified_in_part(*paths: Path) -> Comparison:
+    """The comparison of a recording that lacks something: what can be compared is equal."""
+    found = verified(*paths).comparison
+    assert found and found.is_equal and found.equal and found.not_comparable, found
+    return found
+
+
+def recorded(path: Path, topic: str) -> list[Any]:
+    return [entry.message for entry in read_recording(path, (topic,))]
+
+
+def changed(path: Path, out: Path, change) -> Path:
+    """A copy whose messages have gone through `change(entry) -> message or None`."""
+    head = read_metadata(path)
+    with RecordingWriter(out, head.metadata, head.attachments) as writer:
+        for entry in read_recording(path):
+            message = change(entry)
+            if message is not None:
+                writer.add_message(entry.key, message, entry.received_t_ns)
+    return out
+
+
+def recording_of(folder: Path, seed: int, *samples: int, killed: str = "", calibrated: bool = False) -> Path:
+    """A recording of so many samples, with a stage killed after each number of them but the last."""
+    site = Site(folder, seed, calibrated=calibrated)
+    for number, count in enumerate(samples):
+        if number:
+            site.kill(killed)
+        site.run(count)
+    return site.finished()
+
+
+def alarms_of(path: Path) -> list[Alarm]:
+    return recorded(path, "alarm")

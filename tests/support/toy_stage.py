@@ -1,0 +1,132 @@
+"""A stage that a test declares, run by a runner on a bus of its own."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.bus.session import Bus
+from pipeline.runtime.runner import Runner
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
+from schemas.codec import decode, encode, type_name
+from schemas.messages import Grid, Header, Health, Message, Raw, StageStatus
+from schemas.topics import BY_NAME, health_key, tray_key
+
+TRAY_A, TRAY_B = "a", "b"
+
+
+class ToyConfig(StageConfig):
+    """Nothing to configure."""
+
+
+class Passer(Core):
+    """Returns a Grid for each Raw, and one more at the end, so that a test sees that `close` was called."""
+
+    def __init__(self) -> None:
+        self.fans = 0
+
+    def step(self, item: Any) -> Sequence[Message]:
+        self.fans = item.fans
+        return [self.grid(item.host_receive_t_ns)] if isinstance(item, Raw) else []
+
+    def close(self) -> Sequence[Message]:
+        return [self.grid(np.array([-1]))] if self.fans else []
+
+    def counters(self):
+        return {"lost_on_purpose": 2, "seen": 5}
+
+    def problem(self) -> str:
+        return ""
+
+    def grid(self, t_ns: Any) -> Grid:
+        t_ns = np.asarray(t_ns)
+        column = np.zeros((len(t_ns), self.fans))
+        states = {"valid": column == 0, "invalid_reason": column.astype(np.uint8)}
+        return Grid(fans=self.fans, period_ns=1, t_ns=t_ns, command=column, speed_rad_s=column, **states)
+
+
+class Silent(Passer):
+    """Returns nothing."""
+
+    def step(self, item: Any) -> Sequence[Message]:
+        return []
+
+
+class Burst:
+    """A source that delivers its items while it is being stopped: the hardest moment."""
+
+    def __init__(self, items: Sequence[Any]) -> None:
+        self.items = items
+
+    def start(self, deliver: Callable[[Any], None]) -> None:
+        self.deliver = deliver
+
+    def stop(self) -> None:
+        for item in self.items:
+            self.deliver(item)
+
+
+def toy(build: Callable[[Context], BuiltStage] = lambda _context: BuiltStage(Passer()), **declared: Any) -> Stage:
+    defaults = {"name": "resampler", "about": "", "reads": ("raw",), "writes": ("grid",), "config": ToyConfig}
+    return Stage(**{**defaults, **declared}, build=build)
+
+
+def raw(t_ns: int) -> Raw:
+    return Raw(fans=1, host_receive_t_ns=np.array([t_ns]), command=np.zeros((1, 1)), speed_rad_s=np.zeros((1, 1)))
+
+
+class Bench:
+    """A stage running in a thread, and a second session on the bus that feeds it and listens."""
+
+    def __init__(self, stage: Stage, config, tray: str | None = None) -> None:
+        self.stop = threading.Event()
+        self.heard: queue.Queue[tuple[str, Message]] = queue.Queue()
+        self.bus = Bus(config.bus)
+        self.bus.subscribe(tray_key("s", "*", "grid"), self._hear(Grid))
+        self.bus.subscribe(health_key("s", "*", "*"), self._hear(Health))
+        self.publisher = {
+            name: self.bus.publisher(tray_key("s", name, "raw"), BY_NAME["raw"], type_name(Raw), "feeder")
+            for name in (TRAY_A, TRAY_B)
+        }
+        self.runner = Runner(stage, config, tray, self.stop)
+        self.last: list[Health] = []
+        self.crashes: list[ZeroDivisionError] = []
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+        self.health_with(lambda health: health.status == StageStatus.OK)
+
+    def _run(self) -> None:
+        try:
+            self.last.append(self.runner.run())
+        except ZeroDivisionError as crash:
+            self.crashes.append(crash)
+
+    def _hear(self, kind: type[Message]) -> Callable[[str, bytes], None]:
+        return lambda key, payload: self.heard.put((key, decode(kind, payload)))
+
+    def feed(self, tray: str, t_ns: int) -> None:
+        publisher = self.publisher[tray]
+        publisher.put(encode(replace(raw(t_ns), header=Header("feeder", publisher.published, tray))))
+
+    def next(self, kind: type[Message]) -> Any:
+        while True:
+            _, message = self.heard.get(timeout=20)
+            if isinstance(message, kind):
+                return message
+
+    def health_with(self, fits: Callable[[Health], bool]) -> Health:
+        while True:
+            health = self.next(Health)
+            if fits(health):
+                return health
+
+    def end(self) -> Health:
+        self.stop.set()
+        self.thread.join(20)
+        self.bus.close()
+        return self.last[0]
