@@ -44,7 +44,7 @@ FansOption: TypeAlias = Annotated[str | None, typer.Option(help="Only these fans
 
 TACHO_ADVICE = "see `tacho` in [[tray]], or --window for recordings that do not say"
 TACHO_CONSEQUENCE = (
-    "hint: without it the delay of the tacho is taken for inertia, and what follows, warnings too, may come from that"
+    "hint: if so, the delay of the tacho is taken for inertia, and what follows, warnings too, may come from that"
 )
 MANY_OUTLIERS = 0.001
 _EXTRA_MODULES = ("jinja2", "matplotlib", "onnx", "scipy", "torch")
