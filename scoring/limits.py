@@ -94,7 +94,9 @@ class Limits(_Entry):
 
         def part(of: HealthyResidual) -> HealthyResidual:
             offsets = of.fan_offsets.of(fans) if of.fan_offsets and fans is not None else None
-            return of.model_copy(update={"fan_offsets": offsets})
+            stds = of.low_frequency_std_of_fans
+            known = tuple(stds[fan] for fan in fans) if stds and fans is not None else ()
+            return of.model_copy(update={"fan_offsets": offsets, "low_frequency_std_of_fans": known})
 
         return self.model_copy(update={"speed": part(self.speed), "balance": part(self.balance)})
 

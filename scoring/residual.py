@@ -280,7 +280,7 @@ class Residual:
         return np.where(valid, np.interp(np.abs(speed_rad_s), healthy.speeds_rad_s, healthy.residual_std), 1.0)
 
     def _low_frequency_std(self, speed_rad_s: Array, transient_rad_s: Array, valid: Array) -> Array:
-        """Of the low-frequency residual, relative to its median: by speed, and by motion."""
+        """Of the low-frequency residual, relative to its median: by speed, by motion, and by fan."""
         healthy = self._healthy
         relative: Array = np.full(speed_rad_s.shape, healthy.persistent_std[0])
         if len(healthy.persistent_std) > 1:
@@ -288,6 +288,8 @@ class Residual:
             relative = np.where(valid, at_speed, 1.0)
         if healthy.transient_scale_rad_s is not None:
             relative = relative * np.sqrt(1.0 + np.square(transient_rad_s / healthy.transient_scale_rad_s))
+        if healthy.low_frequency_std_of_fans:
+            relative = relative * np.array(healthy.low_frequency_std_of_fans)
         return relative
 
     def _persistent_std(self, low_frequency_std: Array, scaling: Array, learned_scale: Array) -> Array:

@@ -95,6 +95,14 @@ class TrayTwin:
             return None
         return float(np.median(viscous / (2.0 * drag)))
 
+    @property
+    def full_speed_rad_s(self) -> Array:
+        """(fans,) the speed at which the highest command of training holds each fan; NaN where none does."""
+        viscous, drag = self.balance.viscous, self.balance.drag
+        left = self.card.command_range[1] - self.balance.friction
+        with np.errstate(all="ignore"):
+            return 2.0 * left / (viscous + np.sqrt(np.square(viscous) + 4.0 * drag * left))
+
     def healthy_balances(self) -> list[HealthyBalance]:
         """The balance of each fan, for diagnosis."""
         # Imported here: it loads scipy, which a process that only runs the twin does not need.

@@ -48,6 +48,11 @@ class HealthyResidual(BaseModel):
         description="standard deviation of the low-frequency residual at each speed, relative to its median over "
         "speeds, at least 1; one value for all speeds, or one a speed",
     )
+    low_frequency_std_of_fans: tuple[float, ...] = Field(
+        default=(),
+        description="standard deviation of the low-frequency residual of each fan, relative to what its sigma says, at "
+        "least 1; empty: 1",
+    )
     transient_scale_rad_s: float | None = Field(
         default=None,
         gt=0,
@@ -77,6 +82,6 @@ class HealthyResidual(BaseModel):
             raise ValueError("persistent_std must have one value, or one for each of speeds_rad_s")
         if list(self.speeds_rad_s) != sorted(set(self.speeds_rad_s)):
             raise ValueError("speeds_rad_s must be in strictly ascending order")
-        if min(*self.residual_std, *self.persistent_std) <= 0:
-            raise ValueError("residual_std and persistent_std must be above zero")
+        if min(*self.residual_std, *self.persistent_std, *self.low_frequency_std_of_fans) <= 0:
+            raise ValueError("standard deviations must be above zero")
         return self

@@ -11,8 +11,9 @@ end of the confidence interval of the extrapolated tail.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from scipy.stats import chi2
@@ -98,11 +99,13 @@ def calibrate(
     extrapolate: bool = False,
     crossover_speed_rad_s: float | None = None,
     has_drive: bool = False,
+    sigma_shares: Mapping[Signal, Array] = MappingProxyType({}),
 ) -> Limits:
     """Limits with a declared number of false alarms per fan and day.
 
     crossover_speed_rad_s: viscous / (2 drag) of the fans, see scoring.baseline.speed_scaling; None: not known.
     has_drive: the fans have a drive of their own, see twin.models.drive.
+    sigma_shares: (fans,) the sigmas of fans that the twin knows one by one, relative to what is the same for all.
 
     Raises:
         TooLittleError: the runs are too short for the rate, and extrapolate is not set; or too short for any limit.
@@ -134,7 +137,7 @@ def calibrate(
     factors = _factors(found, target)
     limits = limits.scaled(dict(zip((row.name for row in calibrated_rows()), factors.tolist(), strict=True)))
     if not is_enough:
-        limits = _cautious(limits, found)
+        limits = _cautious(limits, found, sigma_shares)
     rate = DeclaredRate(
         false_alarms_per_day=false_alarms_per_day,
         interval_95=_interval(found, factors, seed),
@@ -233,13 +236,13 @@ def _smoothed_std(limits: Limits, source: Signal, found: HealthyStatistics) -> f
     return smoothed_deviation(limits.timing.smoothing_s, limits.residual(source).autocorrelation_time_s, found.period_s)
 
 
-def _cautious(limits: Limits, found: HealthyStatistics) -> Limits:
+def _cautious(limits: Limits, found: HealthyStatistics, sigma_shares: Mapping[Signal, Array]) -> Limits:
     """Limits where the running is too short to set them by rarity; see DetectorSettings.cautious_factor.
 
     They are multiples of a standard deviation that few independent errors of the twin have shown, one for each speed of
     a fan, and so those of the upper end of its confidence interval.
     """
-    limits = _each(limits, lambda residual, _: _not_below_mean(residual))
+    limits = _each(limits, lambda residual, source: _not_below_mean(residual, sigma_shares.get(source)))
     visited = sum(int((seconds >= VISITED_S).sum()) for seconds in found.visited_s.values())
     independent = max(visited, LEAST_VISITED)
     unknown = math.sqrt(independent / float(chi2.ppf(1.0 - CONFIDENCE, independent)))
@@ -261,10 +264,22 @@ def _cautious(limits: Limits, found: HealthyStatistics) -> Limits:
     return limits.model_copy(update={"detectors": detectors})
 
 
-def _not_below_mean(residual: HealthyResidual) -> HealthyResidual:
-    """A few minutes at a speed may happen to be quiet: no standard deviation is below the mean over the speeds."""
-    least = residual.mean_residual_std
-    return residual.model_copy(update={"residual_std": tuple(max(std, least) for std in residual.residual_std)})
+def _not_below_mean(residual: HealthyResidual, sigma_shares: Array | None) -> HealthyResidual:
+    """A few minutes at a speed may happen to be quiet: no standard deviation is below the mean over the speeds.
+
+    And a fan whose tacho has little noise has a small sigma, but its twin, air and supply err as those of the others:
+    no low-frequency standard deviation is below the root mean square over the fans.
+    """
+    least, of_fans = residual.mean_residual_std, ()
+    if sigma_shares is not None and len(known := sigma_shares[np.isfinite(sigma_shares)]):
+        with np.errstate(invalid="ignore"):
+            of_fans = np.nan_to_num(np.sqrt(np.mean(np.square(known))) / sigma_shares, nan=1.0).clip(1.0, None)
+    return residual.model_copy(
+        update={
+            "residual_std": tuple(max(std, least) for std in residual.residual_std),
+            "low_frequency_std_of_fans": tuple(np.round(of_fans, 4).tolist()),
+        }
+    )
 
 
 def _with(

@@ -40,8 +40,8 @@ class DetectableDrop:
 def detectable_drops(
     limits: Limits, sigma_rad_s: float, balance: HealthyBalance, speeds_rad_s: Sequence[float]
 ) -> list[DetectableDrop]:
-    """The drops at some speeds, of a fan with this sigma and balance."""
-    scorer = FanScorer(1, limits.of(None))
+    """The drops at some speeds, of a fan with this sigma and balance. limits: of this fan alone."""
+    scorer = FanScorer(1, limits)
     found = []
     for speed in speeds_rad_s:
         slope = balance.viscous + 2.0 * balance.drag * speed

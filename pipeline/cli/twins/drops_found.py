@@ -38,8 +38,8 @@ def drops_found(path: Path, rad_s_per_unit: float) -> list[Drop]:
     limits, rad_s = Limits.model_validate(twin.card.calibration), rad_s_per_unit
     speeds = [share * twin.card.top_speed_rad_s for share in SHARES]
     of_fans = [
-        detectable_drops(limits, float(sigma), balance, speeds)
-        for sigma, balance in zip(twin.sigma_rad_s, twin.healthy_balances(), strict=True)
+        detectable_drops(limits.of(range(fan, fan + 1)), float(twin.sigma_rad_s[fan]), balance, speeds)
+        for fan, balance in enumerate(twin.healthy_balances())
     ]
     widest = [
         (speed, max(drop.at_once_rad_s for drop in drops), max(drop.within_a_minute_rad_s for drop in drops))

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.runtime.tray_twin import TrayTwin
+from schemas.messages import Array
 from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import Runs
+from scoring.detectors.detector import Signal
 from scoring.limits import Limits, Timing
 
 
@@ -36,4 +38,10 @@ def find_limits(
         extrapolate,
         crossover_speed_rad_s=float(np.median(known_rad_s)) if len(known_rad_s) == len(bends_rad_s) else None,
         has_drive=all(twin.card.drive is not None for twin in twins),
+        sigma_shares=_sigma_shares(twins[0]) if len(twins) == 1 else {},
     )
+
+
+def _sigma_shares(twin: TrayTwin) -> dict[Signal, Array]:
+    """(fans,) the sigma of each fan, of the speed relative to its full speed."""
+    return {"speed": twin.sigma_rad_s / twin.full_speed_rad_s, "balance": twin.balance.sigma_command}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline.replay.offline import limits_of_twin
@@ -29,7 +30,7 @@ def test_calibration_knows_top_speed_bend_and_drive_of_all_twins(
 ) -> None:
     given: list[dict[str, Any]] = []
 
-    def seen(_runs: Any, top_speed_rad_s: float, *_: Any, **more: Any) -> None:
+    def seen(_runs: Any, top_speed_rad_s: float, *_: Any, sigma_shares: Any, **more: Any) -> None:
         given.append({"top": top_speed_rad_s, **more})
 
     monkeypatch.setattr(limits_of_twin, "calibrate", seen)
@@ -43,3 +44,29 @@ def test_calibration_knows_top_speed_bend_and_drive_of_all_twins(
         {"top": 500.0, "crossover_speed_rad_s": bend_rad_s, "has_drive": True},
         {"top": 700.0, "crossover_speed_rad_s": bend_rad_s, "has_drive": False},
     ]
+
+
+def test_calibration_knows_the_sigma_of_each_fan_relative_to_its_full_speed(
+    plain: TrayTwin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[dict[str, Any]] = []
+    monkeypatch.setattr(limits_of_twin, "calibrate", lambda *_, **more: given.append(more["sigma_shares"]))
+    balance = replace(
+        plain.balance,
+        friction=np.array([0.0, 0.2]),
+        viscous=np.array([0.002, 0.0]),
+        drag=np.array([0.0, 0.8e-4]),
+        sigma_command=np.array([0.01, 0.02]),
+    )
+    twin = replace(
+        plain,
+        card=replace(plain.card, command_range=(0.0, 1.0)),
+        balance=balance,
+        sigma_rad_s=np.array([5.0, 1.0]),
+    )
+    assert twin.full_speed_rad_s == pytest.approx([500.0, 100.0])
+    for twins in ([twin], [twin, twin]):
+        limits_of_twin.find_limits(twins, lambda: iter(()), Timing(), 1.0)
+    assert given[0]["speed"] == pytest.approx([0.01, 0.01])
+    assert given[0]["balance"].tolist() == [0.01, 0.02]
+    assert given[1] == {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from schemas.messages import Array
 from schemas.tacho import INSTANTANEOUS, Tacho
 from scoring.calibration.calibration import SHARED_SHARE, calibrate
 from scoring.calibration.healthy_statistics import HealthyRun, Runs
+from scoring.detectors.detector import Signal
 from scoring.detectors.drift import DriftSettings
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.limits import Limits, Timing, default_timing
@@ -175,3 +177,25 @@ def test_a_speed_that_was_quiet_for_some_minutes_gets_no_narrow_limits_from_few_
     assert fast == pytest.approx(0.3 * slow, rel=0.1)
     cautious = stds(1.0, extrapolate=True)
     assert cautious == (slow, (slow + fast) / 2)
+
+
+def test_a_fan_with_little_noise_gets_no_narrower_limits_on_what_lasts_from_few_data() -> None:
+    shares: dict[Signal, Array] = {"speed": np.array([0.01, 0.02, 0.02, 0.03]), "balance": np.full(FANS, 0.02)}
+
+    def found(per_day: float, *, extrapolate: bool) -> Limits:
+        each = healthy(2, 300.0)
+        return calibrate(each, 200.0, Timing(), per_day, extrapolate=extrapolate, sigma_shares=shares)
+
+    enough, few = found(600.0, extrapolate=False), found(1.0, extrapolate=True)
+    assert enough.speed.low_frequency_std_of_fans == ()
+    mean = math.sqrt((0.01**2 + 0.02**2 + 0.02**2 + 0.03**2) / 4)
+    wider = [mean / 0.01, mean / 0.02, mean / 0.02, 1.0]
+    assert few.speed.low_frequency_std_of_fans == pytest.approx(wider, abs=1e-4)
+    assert few.balance.low_frequency_std_of_fans == (1.0,) * FANS
+    assert few.of(range(2, 4)).speed.low_frequency_std_of_fans == pytest.approx(wider[2:], abs=1e-4)
+    assert few.of(None).speed.low_frequency_std_of_fans == ()
+
+    plain = few.model_copy(update={"speed": few.speed.model_copy(update={"low_frequency_std_of_fans": ()})})
+    size = next(size for size in np.arange(1.0, 20.0, 0.2) if {alarm.fan for alarm in shifted(plain, size, [0, 3])})
+    assert {alarm.fan for alarm in shifted(few, 1.3 * size, [0, 3])} == {3}
+    assert {alarm.fan for alarm in shifted(few, 1.3 * wider[0] * size, [0, 3])} == {0, 3}
