@@ -331,6 +331,16 @@ MECHANISMS: Sequence[Mechanism] = (
         ((f"{_CALIBRATION}:_cautious", _first_argument),),
     ),
     Mechanism(
+        "mean-over-speeds",
+        "from few data no healthy standard deviation is below the mean over the speeds",
+        ((f"{_CALIBRATION}:_not_below_mean_over_speeds", _first_argument),),
+    ),
+    Mechanism(
+        "mean-over-fans",
+        "from few data limits on slow deviations are not narrower for a fan with little noise",
+        ((f"{_CALIBRATION}:_not_below_mean_over_fans", _first_argument),),
+    ),
+    Mechanism(
         "tail-margin",
         "a limit beyond all healthy values is the upper end of its confidence interval",
         (

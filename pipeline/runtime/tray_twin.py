@@ -97,11 +97,14 @@ class TrayTwin:
 
     @property
     def full_speed_rad_s(self) -> Array:
-        """(fans,) the speed at which the highest command of training holds each fan; NaN where none does."""
+        """(fans,) the speed at which the highest command of training holds each fan, by its torque balance; where that
+        gives none, the top speed of training.
+        """
         viscous, drag = self.balance.viscous, self.balance.drag
         left = self.card.command_range[1] - self.balance.friction
         with np.errstate(all="ignore"):
-            return 2.0 * left / (viscous + np.sqrt(np.square(viscous) + 4.0 * drag * left))
+            speed = 2.0 * left / (viscous + np.sqrt(np.square(viscous) + 4.0 * drag * left))
+        return np.where(np.isfinite(speed) & (speed > 0.0), speed, self.card.top_speed_rad_s)
 
     def healthy_balances(self) -> list[HealthyBalance]:
         """The balance of each fan, for diagnosis."""

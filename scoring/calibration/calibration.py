@@ -242,7 +242,9 @@ def _cautious(limits: Limits, found: HealthyStatistics, sigma_shares: Mapping[Si
     They are multiples of a standard deviation that few independent errors of the twin have shown, one for each speed of
     a fan, and so those of the upper end of its confidence interval.
     """
-    limits = _each(limits, lambda residual, source: _not_below_mean(residual, sigma_shares.get(source)))
+    limits = _each(limits, lambda residual, _: _not_below_mean_over_speeds(residual))
+    if sigma_shares:
+        limits = _each(limits, lambda residual, source: _not_below_mean_over_fans(residual, sigma_shares[source]))
     visited = sum(int((seconds >= VISITED_S).sum()) for seconds in found.visited_s.values())
     independent = max(visited, LEAST_VISITED)
     unknown = math.sqrt(independent / float(chi2.ppf(1.0 - CONFIDENCE, independent)))
@@ -264,22 +266,18 @@ def _cautious(limits: Limits, found: HealthyStatistics, sigma_shares: Mapping[Si
     return limits.model_copy(update={"detectors": detectors})
 
 
-def _not_below_mean(residual: HealthyResidual, sigma_shares: Array | None) -> HealthyResidual:
-    """A few minutes at a speed may happen to be quiet: no standard deviation is below the mean over the speeds.
+def _not_below_mean_over_speeds(residual: HealthyResidual) -> HealthyResidual:
+    """A few minutes at a speed may happen to be quiet: no standard deviation is below the mean over the speeds."""
+    least = residual.mean_residual_std
+    return residual.model_copy(update={"residual_std": tuple(max(std, least) for std in residual.residual_std)})
 
-    And a fan whose tacho has little noise has a small sigma, but its twin, air and supply err as those of the others:
+
+def _not_below_mean_over_fans(residual: HealthyResidual, sigma_shares: Array) -> HealthyResidual:
+    """A fan whose tacho has little noise has a small sigma, but its twin, air and supply err as those of the others:
     no low-frequency standard deviation is below the root mean square over the fans.
     """
-    least, of_fans = residual.mean_residual_std, ()
-    if sigma_shares is not None and len(known := sigma_shares[np.isfinite(sigma_shares)]):
-        with np.errstate(invalid="ignore"):
-            of_fans = np.nan_to_num(np.sqrt(np.mean(np.square(known))) / sigma_shares, nan=1.0).clip(1.0, None)
-    return residual.model_copy(
-        update={
-            "residual_std": tuple(max(std, least) for std in residual.residual_std),
-            "low_frequency_std_of_fans": tuple(np.round(of_fans, 4).tolist()),
-        }
-    )
+    relative = (math.sqrt(np.mean(np.square(sigma_shares))) / sigma_shares).clip(1.0, None)
+    return residual.model_copy(update={"low_frequency_std_of_fans": tuple(np.round(relative, 4).tolist())})
 
 
 def _with(

@@ -21,8 +21,9 @@ from schemas.standstill import Standstill
 from schemas.tacho import Tacho
 from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import HealthyRun
+from scoring.detectors.detector import Signal
 from scoring.diagnosis.diagnoser import Diagnoser
-from scoring.fan_scorer import FanScorer
+from scoring.fan_scorer import RESIDUALS, FanScorer
 from scoring.limits import Limits, Timing
 from scoring.samples import samples_of
 from stages.scorer import ScorerCore
@@ -98,7 +99,8 @@ def limits_of(
     runs: int, seconds: float, per_day: float, *, extrapolate: bool = False, is_one_worse: bool = False
 ) -> Limits:
     every = healthy(runs, seconds, is_one_worse=is_one_worse)
-    return calibrate(lambda: every, TOP_RAD_S, TIMING, per_day, 0, extrapolate, 100.0)
+    shares: dict[Signal, Array] = {source: np.linspace(0.01, 0.03, FANS) for source in RESIDUALS}
+    return calibrate(lambda: every, TOP_RAD_S, TIMING, per_day, 0, extrapolate, 100.0, sigma_shares=shares)
 
 
 @cache
@@ -181,6 +183,8 @@ PROBES: dict[str, Callable[[], Hashable]] = {
     "fan-offsets": limits_of_many_runs,
     "worst-fan": limits_with_one_worse,
     "cautious": extrapolated_limits,
+    "mean-over-speeds": extrapolated_limits,
+    "mean-over-fans": extrapolated_limits,
     "tail-margin": extrapolated_limits,
 }
 

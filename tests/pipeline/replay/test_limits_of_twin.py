@@ -65,6 +65,8 @@ def test_calibration_knows_the_sigma_of_each_fan_relative_to_its_full_speed(
         sigma_rad_s=np.array([5.0, 1.0]),
     )
     assert twin.full_speed_rad_s == pytest.approx([500.0, 100.0])
+    without_drag = replace(balance, viscous=np.array([0.002, 0.0]), drag=np.zeros(2))
+    assert replace(twin, balance=without_drag).full_speed_rad_s == pytest.approx([500.0, twin.card.top_speed_rad_s])
     for twins in ([twin], [twin, twin]):
         limits_of_twin.find_limits(twins, lambda: iter(()), Timing(), 1.0)
     assert given[0]["speed"] == pytest.approx([0.01, 0.01])
