@@ -42,6 +42,9 @@ class DecisionRules(IntEnum):
     LOSSES_OF_LINE = 9
     """The rate of a line is that at which its device sends, also if samples are lost while it is measured. Before, it
     was that at which they arrived."""
+    FALLS = 10
+    """The causes of a fan that slows down include those of one that comes to rest. Before, they were named once it
+    stood."""
 
 
 CURRENT_RULES = max(DecisionRules)

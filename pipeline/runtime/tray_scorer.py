@@ -60,7 +60,14 @@ class TrayScorer:
         if judges_rest:
             lowest_command = twin.standstill.turning_command if twin.standstill else 0.0
             advice = Advice(twin.command_unit, lowest_command, twin.highest_command)
-        self._diagnoser = Diagnoser(twin.balances, advice, twin.tachos, twin.standstill, knows_readings=judges_rest)
+        self._diagnoser = Diagnoser(
+            twin.balances,
+            advice,
+            twin.tachos,
+            twin.standstill,
+            knows_readings=judges_rest,
+            knows_falls=decision_rules >= DecisionRules.FALLS,
+        )
         self.wear = WearMonitor(twin.balances, self._diagnoser, config.wear_every_s, twin.command_unit)
         off_delay_s = config.least_off_delay_s(twin.tachos)
         holding = holding_detectors(self.fan_scorer.detectors, off_delay_s, judges_rest=judges_rest)

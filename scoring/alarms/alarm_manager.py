@@ -28,7 +28,7 @@ from scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from scoring.alarms.tray_conditions import AlarmEvent, TrayConditions
 from scoring.detectors.table import row_of
 from scoring.diagnosis.diagnoser import Diagnoser
-from scoring.diagnosis.shown_causes import STANDSTILL_CAUSES
+from scoring.diagnosis.shown_causes import is_of_standstill
 from scoring.former_snapshot_keys import FORMER_ALARM_KEYS, current_keys
 
 PERSISTING_SHARE = (
@@ -144,7 +144,7 @@ class AlarmManager:
         Later starts of a fan that does not turn say less about the cause than the moment at which it came to rest.
         """
         last = self._next_message(fan)
-        return last.active and not any(each.cause in STANDSTILL_CAUSES for each in last.causes)
+        return last.active and not any(is_of_standstill(each) for each in last.causes)
 
     def _persists(self, row: int, fan: int, score: Score, context: AlarmContext) -> bool:
         """Whether the fault of the last message persists; otherwise a diagnosis would include its end."""

@@ -112,4 +112,4 @@ def _is_against_command(alarm: Alarm) -> bool:
 
 
 def _likely(alarm: Alarm) -> str:
-    return ", ".join(f"{STANDSTILL_CAUSES[each.cause]} {100 * each.probability:.0f} %" for each in alarm.causes)
+    return ", ".join(f"{CAUSES.get(each.cause, each.cause)} {100 * each.probability:.0f} %" for each in alarm.causes)

@@ -19,8 +19,8 @@ from scoring.detectors.deviation import summed_deviation
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnosis import ADVICE, RankedCause, diagnose
 from scoring.diagnosis.regression_window import HealthyBalance, Window
-from scoring.diagnosis.shown_causes import MIN_PROBABILITY, STANDSTILL_CAUSES
-from scoring.diagnosis.standstill_causes import standstill_causes
+from scoring.diagnosis.shown_causes import MIN_PROBABILITY, is_of_standstill
+from scoring.diagnosis.standstill_causes import coming_to_rest, standstill_causes
 
 WINDOW_S = 95.0
 AGAIN_AFTER_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # after the raise; the last window still contains some health
@@ -57,16 +57,19 @@ class Diagnoser:
         standstill: Standstill | None = None,
         *,
         knows_readings: bool = True,
+        knows_falls: bool = True,
     ) -> None:
         """advice: None only to diagnose as for recordings made before there was any; see `diagnose`. standstill: None
         where the detector of it is not used. knows_readings: False only to diagnose as for recordings made before
-        causes accounted for what a tacho resolves.
+        causes accounted for what a tacho resolves; knows_falls: before a fan that slows down was compared with one that
+        comes to rest.
         """
         self._healthy = healthy
         self._advice = advice
         self._tachos = tacho_of_each_fan(tachos, len(healthy))
         self._standstill = standstill
         self._knows_readings = knows_readings
+        self._knows_falls = knows_falls
         self._blocks: deque[_Block] = deque()
         self._period_ns = 0
         self._due: dict[int, list[int]] = {}
@@ -130,6 +133,9 @@ class Diagnoser:
             return ()
         tacho = self._tachos[fan] if self._knows_readings else None
         causes = diagnose(window, self._healthy[fan], self._advice, tacho).causes
+        if self._knows_falls and self._standstill is not None:
+            rest = coming_to_rest(window, self._standstill, self._healthy[fan], self._tachos[fan])
+            causes = rest.beside(causes) if rest else causes
         least = FORMER_MIN_PROBABILITY if self._advice is None else min(MIN_PROBABILITY, causes[0].probability)
         return tuple(_message(cause) for cause in causes if cause.probability >= least)
 
@@ -138,10 +144,10 @@ class Diagnoser:
 
         A fan that did not turn and turns again has recovered: causes found from then on are of the fault's end.
         """
-        stood, stands = (bool(each) and each[0].cause in STANDSTILL_CAUSES for each in (than, causes))
+        stood, stands = (bool(each) and is_of_standstill(each[0]) for each in (than, causes))
         if self._knows_readings and stood and not stands:
             return False
-        if self._advice is None or [each.cause for each in causes] != [each.cause for each in than]:
+        if self._advice is None or stands != stood or [each.cause for each in causes] != [each.cause for each in than]:
             return True
         return any(abs(new.probability - old.probability) >= NEWS for new, old in zip(causes, than, strict=True))
 

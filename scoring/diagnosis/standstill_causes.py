@@ -5,20 +5,25 @@ time constant T of healthy coasts. The reading of a blocked fan falls at once, a
 whose whole connector is off. The course of the readings is compared with what the tacho would show of either, whenever
 the fall and the tacho's windows began. Where the data do not tell them apart, blocked and no power are about equally
 probable. A fan that was never seen to turn under this command says nothing about the cause.
+
+Before it stands, its readings may as well be of a fan that slows down to another speed: of all such speeds, as fast as
+a fan coasts or at once. How probable that is belongs to the causes of a fan that turns.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtr
 
 from schemas.standstill import Standstill
 from schemas.tacho import Tacho
-from scoring.diagnosis.diagnosis import Evidence, RankedCause
+from scoring.diagnosis.diagnosis import CANNOT_TELL, CANNOT_TELL_YET, Evidence, RankedCause
 from scoring.diagnosis.regression_window import Array, HealthyBalance, Window
-from scoring.diagnosis.shown_causes import BLOCKED, NO_POWER, NO_TACHO, STILL_DRIVEN, WINDMILLING
+from scoring.diagnosis.shown_causes import BLOCKED, FALLING, NO_POWER, NO_TACHO, STILL_DRIVEN, WINDMILLING
 
 FELL_AT_ONCE = {BLOCKED: 0.4, NO_POWER: 0.04, NO_TACHO: 0.2}
 """prior probabilities of the faults after which the reading falls at once; no power: the connector is off"""
@@ -39,6 +44,14 @@ FALLS, PHASES = 60, 6
 READING_ERROR = 0.1
 """standard deviation of a reading beside its resolution, in the speed before the fall"""
 LEAST_LIKELIHOOD = 1e-6
+COMES_TO_REST = 0.5
+"""prior probability that a fan whose reading falls comes to rest, and does not slow down to another speed"""
+SAME_ERROR_S = 0.2
+"""a coast is not quite exponential: readings within this time of a fan that still turns are off alike"""
+SAMPLES_OF_AN_ERROR = 4
+LOSS_STD = 0.25
+"""prior standard deviation of the share of its speed that a fan loses if it slows down"""
+UNCLEAR = f"{CANNOT_TELL_YET}: it slows down, and more is known when it stands or turns evenly"
 BLUR_S = 0.15  # of the time of a fall, beside the tacho
 COAST_SPREAD = 0.3  # standard deviation of a coast, relative to its expected time
 MIN_COAST_S = 0.1
@@ -57,52 +70,160 @@ def standstill_causes(
     """
     commands = window.command[np.isfinite(window.command)]
     command = float(commands[-1]) if len(commands) else math.nan
-    speed = np.abs(window.speed_rad_s)
+    given, speed = _of_command(command), np.abs(window.speed_rad_s)
     if not command >= healthy.turning_command:
-        return _ranked(RAN_ON, command, f"turns although the command of {command:.3g} stops it")
+        return _ranked(RAN_ON, given, f"turns although the command of {command:.3g} stops it")
     turning = np.flatnonzero(healthy.turns(speed))
     recent = speed[-math.ceil((tacho.reach_s + RECENT_S) / window.period_s) :]
     sentence = f"does not turn although commanded to {command:.3g}"
     if np.isnan(recent).mean() > 0.5:
-        return _ranked(NO_READING, command, f"gives no reading although commanded to {command:.3g}")
+        return _ranked(NO_READING, given, f"gives no reading although commanded to {command:.3g}")
     if not len(turning) or not _was_driven(window, int(turning[-1]), healthy, tacho):
-        return _ranked(NEVER_TURNED, command, sentence)
+        return _ranked(NEVER_TURNED, given, sentence)
     fell_at_once, coasted = (FELL_AT_ONCE, COASTED) if by_course else (FORMER_FELL_AT_ONCE, FORMER_COASTED)
     if healthy.coast_time_constant_s is None:
-        return _ranked(_sums(fell_at_once, coasted), command, sentence)
+        return _ranked(_sums(fell_at_once, coasted), given, sentence)
     likelihoods = (_by_course if by_course else _by_duration)(window, int(turning[-1]), healthy, balance, tacho)
     likely = {cause: prior * likelihoods[0] for cause, prior in fell_at_once.items()}
-    return _ranked(_sums(likely, coasted * likelihoods[1]), command, sentence)
+    return _ranked(_sums(likely, coasted * likelihoods[1]), given, sentence)
+
+
+@dataclass(frozen=True)
+class ComingToRest:
+    """How probable it is that a fan comes to rest, and why it would; the causes' probabilities add up to one."""
+
+    probability: float
+    causes: tuple[RankedCause, ...]
+
+    def beside(self, of_turning: tuple[RankedCause, ...]) -> tuple[RankedCause, ...]:
+        """These causes and those that `diagnose` found, which are of a fan that does not come to rest."""
+        unclear = next(each for each in of_turning if each.cause == CANNOT_TELL)
+        named = [each for each in of_turning if each is not unclear]
+        share = (1.0 - self.probability) / (max(each.probability for each in named) + unclear.probability)
+        causes = [replace(each, probability=each.probability * share) for each in named]
+        causes += [replace(each, probability=each.probability * self.probability) for each in self.causes]
+        highest = max(each.probability for each in causes)
+        sentence = unclear.sentence if self.probability < 0.5 else UNCLEAR
+        causes.append(replace(unclear, probability=1.0 - highest, sentence=sentence))
+        total = sum(each.probability for each in causes)
+        causes = [replace(each, probability=each.probability / total) for each in causes]
+        return tuple(sorted(causes, key=lambda cause: -cause.probability))
+
+
+def coming_to_rest(window: Window, healthy: Standstill, balance: HealthyBalance, tacho: Tacho) -> ComingToRest | None:
+    """Of a fan that is driven and whose reading has fallen; None where it has not, or nothing is known of coasts."""
+    command, speed = float(window.command[-1]), np.abs(window.speed_rad_s)
+    turning = np.flatnonzero(healthy.turns(speed))
+    if healthy.coast_time_constant_s is None or not command >= healthy.turning_command or not np.isfinite(speed[-1]):
+        return None
+    if not len(turning) or not _was_driven(window, int(turning[-1]), healthy, tacho):
+        return None
+    fall = _Fall.of(window, int(turning[-1]), healthy, balance, tacho, SAME_ERROR_S)
+    left = float(fall.readings[-1])  # not finite where the fan stood before
+    if not left < FALLING_SHARE or speed[-1] >= FALLING_SHARE * fall.highest_rad_s:
+        return None
+    at_once, coasting = (fall.likelihood(constants_s) for constants_s in fall.constants_s)
+    lowest = healthy.standing_below_rad_s / fall.highest_rad_s
+    slowing = fall.likelihood_of_slowing(np.concatenate(fall.constants_s), lowest) + LEAST_LIKELIHOOD
+    weights = _sums({cause: prior * at_once for cause, prior in FELL_AT_ONCE.items()}, COASTED * coasting)
+    stops = COMES_TO_REST * sum(weights.values())
+    if not stops > 0.0:
+        return None
+    sentence = f"slows down to {100 * left:.0f} % of its speed although commanded to {command:.3g}"
+    evidence = Evidence(FALLING, left - 1.0, left - 1.0, left - 1.0, "relative")
+    return ComingToRest(stops / (stops + (1.0 - COMES_TO_REST) * slowing), _ranked(weights, evidence, sentence))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fall:
+    """The readings of a fan around the time when it began to fall, as shares of the speed before."""
+
+    at_s: Array
+    readings: Array
+    falls_s: Array
+    """times at which the fall may have begun"""
+    phases_s: Array
+    """times at which the windows of the tacho may have begun"""
+    error: float
+    """standard deviation of a reading"""
+    weight: float
+    """of a sample: a reading counts once"""
+    highest_rad_s: float
+    constants_s: tuple[Array, Array]
+    """possible time constants of a fan that stops at once, and of one that coasts"""
+    tacho: Tacho
+
+    @staticmethod
+    def of(
+        window: Window,
+        last_turning: int,
+        healthy: Standstill,
+        balance: HealthyBalance,
+        tacho: Tacho,
+        same_error_s: float = 0.0,
+    ) -> _Fall:
+        """same_error_s: readings within this time count as one, and few of them are used."""
+        share, level = _shares(window, last_turning, healthy, balance, tacho)
+        time_s: Array = window.period_s * np.arange(len(share), dtype=np.float64)
+        constant_s = healthy.coast_time_constant_s or 0.0
+        turned = np.abs(window.speed_rad_s[: last_turning + 1])
+        before_rad_s = max(float(np.nanmax(turned)), healthy.standing_below_rad_s)
+        longest_s = LONGEST_COASTS * constant_s * math.log(before_rad_s / healthy.standing_below_rad_s) + tacho.reach_s
+        rows = np.flatnonzero((time_s >= time_s[last_turning] - longest_s) & np.isfinite(share))
+        every = max(1, round(same_error_s / SAMPLES_OF_AN_ERROR / window.period_s))
+        rows = rows[(len(rows) - 1) % every :: every]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            readings: Array = share[rows] / level
+        at_s: Array = time_s[rows]
+        resolution = tacho.resolution_rad_s * readings[0] / max(float(np.abs(window.speed_rad_s[rows[0]])), 1e-9)
+        at_rest_s = at_s[at_s > time_s[last_turning]]
+        reading_s = max(tacho.held_s, same_error_s)
+        return _Fall(
+            at_s=at_s,
+            readings=readings,
+            falls_s=np.linspace(at_s[0], at_rest_s[0] if len(at_rest_s) else time_s[-1], FALLS),
+            phases_s=np.linspace(0.0, tacho.held_s, PHASES, endpoint=False) if tacho.held_s else np.zeros(1),
+            error=math.hypot(resolution / math.sqrt(6.0), READING_ERROR),
+            weight=min(every * window.period_s / reading_s, 1.0) if reading_s else 1.0,
+            highest_rad_s=float(np.abs(window.speed_rad_s[rows]).max()),
+            constants_s=(np.array([AT_ONCE_S]), constant_s * COAST_FACTORS),
+            tacho=tacho,
+        )
+
+    def likelihood(self, constants_s: Array) -> float:
+        """That the fan comes to rest with one of these time constants."""
+        squares = np.square((self.readings - self._expected(constants_s)) / self.error).sum(axis=-1)
+        return float(np.exp(-0.5 * self.weight * squares).mean())
+
+    def likelihood_of_slowing(self, constants_s: Array, lowest: float) -> float:
+        """That it slows down to a share of its speed, from the lowest to 1. The share that it loses has a normal prior,
+        as the sizes of the faults of a fan that turns (scoring.diagnosis.hypotheses), so that the integral has a closed
+        form.
+        """
+        expected = self._expected(constants_s)
+        rest, by_share = (self.readings - expected) / self.error, (1.0 - expected) / self.error
+        information = self.weight * np.square(by_share).sum(axis=-1) + LOSS_STD**-2
+        share = (self.weight * (rest * by_share).sum(axis=-1) + LOSS_STD**-2) / information
+        squares = self.weight * np.square(rest).sum(axis=-1) + LOSS_STD**-2 - information * np.square(share)
+        width = 1.0 / np.sqrt(information)
+        mass = width * _mass(lowest, share, width) / (LOSS_STD * _mass(lowest, 1.0, LOSS_STD))
+        return float((np.exp(-0.5 * squares) * mass).mean())
+
+    def _expected(self, constants_s: Array) -> Array:
+        """(falls, phases, constants, n) readings of a fan that comes to rest."""
+        fall_s, phase_s, constant_s = (
+            each[..., np.newaxis] for each in np.meshgrid(self.falls_s, self.phases_s, constants_s, indexing="ij")
+        )
+        return _readings_of_a_fall(self.at_s, fall_s, constant_s, self.tacho, phase_s)
 
 
 def _by_course(
     window: Window, last_turning: int, healthy: Standstill, balance: HealthyBalance, tacho: Tacho
 ) -> tuple[float, float]:
     """Likelihoods that the fan stopped at once, and that it coasted, by the course of its readings."""
-    share, level = _shares(window, last_turning, healthy, balance, tacho)
-    time_s: Array = window.period_s * np.arange(len(share), dtype=np.float64)
-    constant_s = healthy.coast_time_constant_s or 0.0
-    before_rad_s = max(float(np.nanmax(np.abs(window.speed_rad_s[: last_turning + 1]))), healthy.standing_below_rad_s)
-    longest_s = LONGEST_COASTS * constant_s * math.log(before_rad_s / healthy.standing_below_rad_s) + tacho.reach_s
-    rows = np.flatnonzero((time_s >= time_s[last_turning] - longest_s) & np.isfinite(share))
-    readings: Array = share[rows] / level
-    at_s: Array = time_s[rows]
-    resolution = tacho.resolution_rad_s * readings[0] / max(float(np.abs(window.speed_rad_s[rows[0]])), 1e-9)
-    error = math.hypot(resolution / math.sqrt(6.0), READING_ERROR)
-    weight = min(window.period_s / tacho.held_s, 1.0) if tacho.held_s else 1.0  # of a sample: a reading is one
-    phases_s = np.linspace(0.0, tacho.held_s, PHASES, endpoint=False) if tacho.held_s else np.zeros(1)
-    at_rest_s = at_s[at_s > time_s[last_turning]]
-    falls_s = np.linspace(at_s[0], at_rest_s[0] if len(at_rest_s) else time_s[-1], FALLS)
-
-    def likelihood(constants_s: Array) -> float:
-        fall_s, phase_s, of_coast_s = (
-            each[..., np.newaxis] for each in np.meshgrid(falls_s, phases_s, constants_s, indexing="ij")
-        )
-        expected = _readings_of_a_fall(at_s, fall_s, of_coast_s, tacho, phase_s)
-        squares = np.square((readings - expected) / error).sum(axis=-1)
-        return float(np.exp(-0.5 * weight * squares).mean()) + LEAST_LIKELIHOOD
-
-    return likelihood(np.array([AT_ONCE_S])), likelihood(constant_s * COAST_FACTORS)
+    fall = _Fall.of(window, last_turning, healthy, balance, tacho)
+    at_once, coasting = (fall.likelihood(constants_s) + LEAST_LIKELIHOOD for constants_s in fall.constants_s)
+    return at_once, coasting
 
 
 def _readings_of_a_fall(at_s: Array, fall_s: Array, constant_s: Array, tacho: Tacho, phase_s: Array) -> Array:
@@ -167,6 +288,11 @@ def _steady_speed(command: Array, balance: HealthyBalance, speed_rad_s: Array) -
     return np.interp(command, np.maximum.accumulate(needed), speeds)
 
 
+def _mass(lowest: float, mean: Array | float, width: Array | float) -> Array:
+    """Probability that a normally distributed share is from the lowest to 1."""
+    return ndtr((1.0 - mean) / width) - ndtr((lowest - mean) / width)
+
+
 def _normal(value: float, mean: float, deviation: float) -> float:
     return math.exp(-0.5 * ((value - mean) / deviation) ** 2) / deviation + 1e-6
 
@@ -175,8 +301,11 @@ def _sums(causes: Mapping[str, float], no_power: float) -> dict[str, float]:
     return {**causes, NO_POWER: causes[NO_POWER] + no_power}
 
 
-def _ranked(weights: Mapping[str, float], command: float, sentence: str) -> tuple[RankedCause, ...]:
+def _of_command(command: float) -> Evidence | None:
+    return Evidence("command", command, command, command, "command") if math.isfinite(command) else None
+
+
+def _ranked(weights: Mapping[str, float], evidence: Evidence | None, sentence: str) -> tuple[RankedCause, ...]:
     total = sum(weights.values())
-    evidence = Evidence("command", command, command, command, "command") if math.isfinite(command) else None
     causes = [RankedCause(cause, weight / total, evidence, sentence) for cause, weight in weights.items()]
     return tuple(sorted(causes, key=lambda cause: -cause.probability))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
 from schemas.blocks import cut
 from schemas.messages import Alarm, FanState, Grid, InvalidReason, Prediction, Score, Statistic, Transition
@@ -67,6 +68,7 @@ def seen(
     healthy: Standstill | None = HEALTHY,
     alarm_sigmas: float = 1e6,
     missing_share: float = 1.0,
+    decision_rules: DecisionRules = CURRENT_RULES,
 ) -> Seen:
     """With alarm_sigmas and missing_share as they are, only the detectors of standstill can raise an alarm."""
     config = ScorerConfig(alarm_sigmas=alarm_sigmas, not_judged_s=5.0)
@@ -74,7 +76,10 @@ def seen(
     tacho = TachoSettings(stuck_s=1e9, missing_share=missing_share)
     limits = limits.model_copy(update={"detectors": {**limits.detectors, "sensor": tacho}})
     twin = HealthyTwin("t", limits, [balance_of_a_fan()], "%", INSTANTANEOUS, healthy)
-    integrator, scorer = core_of(physical_twin(standstill=healthy), warm_up_s=1.0), ScorerCore(1, "rad/s", config, twin)
+    integrator, scorer = (
+        core_of(physical_twin(standstill=healthy), warm_up_s=1.0),
+        ScorerCore(1, "rad/s", config, twin, decision_rules=decision_rules),
+    )
     messages, problems = [], set()
     valid = np.isfinite(speed)[:, np.newaxis]
     grid = Grid(
@@ -155,18 +160,32 @@ def test_a_fan_without_power_coasts_and_that_tells_it_from_a_blocked_one() -> No
     assert raised.causes[0].probability > 0.8
 
 
-def test_the_cause_is_said_at_once_when_a_fan_with_an_alarm_comes_to_rest() -> None:
+def test_no_power_is_named_while_the_fan_coasts_and_again_at_once_when_it_comes_to_rest() -> None:
     command = commands((80.0, 40.0))
     driven = command.copy()
     driven[round(20.0 / PERIOD_S) :] = 0.0
     speed = speed_of(driven)
     found = seen(command, speed, alarm_sigmas=5.0)
-    raised, *later = found.alarms
-    assert raised.statistic == Statistic.SPEED_SMOOTHED
+    named = [alarm for alarm in found.alarms if alarm.causes and alarm.causes[0].cause != "cannot_tell"]
+    assert {alarm.causes[0].cause for alarm in named} == {"no_power"}
+    assert named[0].message.startswith("fan 0: slows down to 20 % of its speed although commanded to 80: no power")
+    assert named[0].t_ns < EPOCH_NS + 21.5e9
     at_rest_s = float(np.flatnonzero((speed < HEALTHY.standing_below_rad_s) & (command > driven))[0]) * PERIOD_S
-    first = next(alarm for alarm in later if alarm.causes and alarm.causes[0].cause == "no_power")
-    assert at_rest_s + 0.4 < (first.t_ns - EPOCH_NS) / 1e9 < at_rest_s + 0.7
-    assert first.message.startswith("fan 0: does not turn although commanded to 80: no power")
+    stands = next(alarm for alarm in named if "does not turn although commanded to 80: no power" in alarm.message)
+    assert at_rest_s + 0.4 < (stands.t_ns - EPOCH_NS) / 1e9 < at_rest_s + 0.7
+
+    former = seen(command, speed, alarm_sigmas=5.0, decision_rules=DecisionRules.LOSSES_OF_LINE)
+    assert not any("slows down" in alarm.message for alarm in former.alarms), "a recording of before keeps its causes"
+    assert [alarm.message for alarm in former.alarms if alarm.t_ns == stands.t_ns] == [stands.message]
+
+
+def test_a_weak_drive_is_not_taken_for_no_power() -> None:
+    command = commands((80.0, 40.0))
+    driven = command.copy()
+    driven[round(20.0 / PERIOD_S) :] = 40.0
+    found = seen(command, speed_of(driven), alarm_sigmas=5.0)
+    first = [alarm.causes[0].cause for alarm in found.alarms if alarm.causes]
+    assert set(first) == {"cannot_tell", "gain_down"}
 
 
 @pytest.mark.parametrize(("reading", "causes"), [(0.0, ["blocked", "no_power", "no_tacho"]), (np.nan, ["no_tacho"])])

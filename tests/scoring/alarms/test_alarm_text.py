@@ -64,6 +64,13 @@ def test_the_first_cause_is_named_with_its_probability_and_evidence_where_there_
     assert line(Transition.DIAGNOSED) == "fan 2: cause unknown"
 
 
+def test_causes_of_a_fan_that_comes_to_rest_are_named_beside_those_of_one_that_turns() -> None:
+    no_power = Diagnosis(cause="no_power", probability=0.5, evidence="slows down to 40 % of its speed")
+    weak = Diagnosis(cause="gain_down", probability=0.2)
+    found = line(Transition.DIAGNOSED, causes=(no_power, weak))
+    assert found == "fan 2: slows down to 40 % of its speed: no power 50 %, less drive (supply, driver) 20 %"
+
+
 def test_every_cause_that_can_be_found_has_words() -> None:
     assert set(CAUSES) == {cause.name for cause in HYPOTHESES} | {CANNOT_TELL, STUCK, DROPOUT} | set(STANDSTILL_CAUSES)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from schemas.messages import Diagnosis, Transition
 from scoring.detectors.deviation import summed_deviation
 from scoring.diagnosis.diagnoser import MAX_SAMPLES, Diagnoser
-from scoring.diagnosis.shown_causes import MIN_PROBABILITY
+from scoring.diagnosis.shown_causes import FALLING, MIN_PROBABILITY
 from tests.support.scored_blocks import (
     CALIBRATION,
     NEEDED,
@@ -176,3 +176,12 @@ def test_a_fan_that_turns_again_keeps_the_cause_for_which_it_did_not_turn() -> N
     ):
         assert now.says_more([causes[later]], [causes[earlier]]) == is_news
         assert before.says_more([causes[later]], [causes[earlier]])
+
+
+def test_a_cause_named_while_a_fan_slowed_down_may_be_wrong_and_is_confirmed_when_it_stands() -> None:
+    falling, standing = (Diagnosis(cause="no_power", probability=0.9, parameter=each) for each in (FALLING, "command"))
+    weak = Diagnosis(cause="gain_down", probability=0.9)
+    diagnoser = Diagnoser([balance_of_a_fan()])
+    assert diagnoser.says_more([standing], [falling])
+    assert diagnoser.says_more([weak], [falling]), "it slowed down to another speed"
+    assert not diagnoser.says_more([weak], [standing]), "it turns again"
