@@ -69,6 +69,8 @@ def find_tacho(t_s: Array, speed_rad_s: Array) -> TachoEvidence | None:
         return None
     step_s = float(np.median(np.diff(t_s)))
     change_s = _change_s(t_s, changed, step_s)
+    if change_s is None and not _could_count(speed, changed, resolution, step_s):
+        return None
     window_s = 2.0 * math.pi / (USUAL_PULSES * resolution)
     update_s = change_s if change_s is not None else window_s
     pulses = USUAL_PULSES
@@ -130,6 +132,13 @@ def _resolution_rad_s(speed: Array, changed: NDArray[np.intp]) -> float | None:
         if samples[off <= PRINTED_RAD_S].sum() >= NEARLY_ALL * len(speed):
             return resolution
     return None
+
+
+def _could_count(speed: Array, changed: NDArray[np.intp], resolution: float, step_s: float) -> bool:
+    """Whether readings that may change with each sample move no further than the pulses between two samples."""
+    pulses = USUAL_PULSES / (2.0 * math.pi) * float(np.abs(speed).max()) * step_s
+    moves = np.abs(speed[changed] - speed[changed - 1]) / resolution
+    return bool(np.mean(moves <= pulses + 1.5) >= NEARLY_ALL)
 
 
 def _change_s(t_s: Array, changed: NDArray[np.intp], step_s: float) -> float | None:

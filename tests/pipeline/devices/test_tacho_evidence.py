@@ -58,6 +58,14 @@ def test_speeds_that_are_merely_printed_in_rpm_or_noisy_or_constant_speak_for_no
     assert find_tacho(t_s, np.full_like(t_s, np.nan)) is None
 
 
+def test_noisy_readings_in_coarse_steps_that_no_count_could_make_speak_for_nothing() -> None:
+    """A line that sends half rad/s, 100 times a second: as multiples of 4.77 rpm, of a count over 6.3 s."""
+    t_s, printed = readings(Tacho(), 100.0)
+    noisy = printed + np.random.default_rng(3).normal(0.0, 4.0, len(t_s))
+    assert find_tacho(t_s, 0.5 * np.rint(noisy / 0.5)) is None
+    assert find_tacho(*readings(Tacho(kind="count", window_s=1.0, update_s=0.01), 100.0)) is not None
+
+
 def test_a_hint_names_the_fans_the_evidence_in_numbers_and_what_is_declared() -> None:
     t_s, slow = readings(Tacho(kind="count", window_s=1.0), 10.0)
     _, fast = readings(Tacho(kind="count", window_s=0.5), 10.0)
