@@ -13,9 +13,9 @@ from pipeline.recordings.contents import contents_of
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.scan import scan
 from stages.recorder import ROOM_TO_RESUME, STAGE, Recorder
-from tests.pipeline.recordings.test_recordings import raw
 from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, envelope
 from tests.support.small_disk import SIZE_BYTES, mount, unmount
+from tests.support.written_recordings import raw
 
 STREAM = (RAW_KEY, "acquisition-1")
 

@@ -17,8 +17,8 @@ from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Counter, Header, Health, Input, ModelCard, Note, StageStatus
 from schemas.topics import health_key, tray_key
 from tests.pipeline.recordings.test_parts import part, parts_in
-from tests.pipeline.recordings.test_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
 
 METADATA = {"site": "plant", "trays": "tray1", "fans.tray1": "2", "speed_unit.tray1": "rpm", "made_by": "fantwin"}
 SECOND_NS = 1_000_000_000

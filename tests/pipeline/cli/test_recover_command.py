@@ -14,9 +14,9 @@ from pipeline.recordings.repair import repair_in_place
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Health, Output, StageStatus
 from schemas.topics import health_key
-from tests.pipeline.recordings.test_recordings import RAW_KEY, raw
 from tests.pipeline.recordings.test_repair import chunk_ends, read_by_others, small
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.written_recordings import RAW_KEY, raw
 
 
 @pytest.fixture

@@ -14,8 +14,9 @@ from pipeline.recordings.reading import RecordingError, read_metadata, read_reco
 from pipeline.recordings.records import RecordReader
 from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.recordings.writing import RecordingWriter
-from tests.pipeline.recordings.test_recordings import RAW_KEY, disk_of, kill_a_recorder, raw, sequences, write
+from tests.support.failing_writers import disk_of, kill_a_recorder
 from tests.support.small_disk import unmount
+from tests.support.written_recordings import RAW_KEY, raw, sequences, write
 
 STREAM = (RAW_KEY, "acquisition-1")
 

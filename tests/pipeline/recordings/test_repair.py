@@ -27,7 +27,8 @@ from pipeline.recordings.repair import recover, repair_in_place
 from pipeline.recordings.scan import scan
 from pipeline.recordings.sequence_ledger import SequenceLedger, StreamCounts
 from pipeline.recordings.writing import RecordingWriter
-from tests.pipeline.recordings.test_recordings import ALARM_KEY, RAW_KEY, alarm, disk_of, raw, write
+from tests.support.failing_writers import disk_of
+from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
 
 STREAM = (RAW_KEY, "acquisition-1")
 NO_CHECK = [HealthCheck.function_scoped_fixture]

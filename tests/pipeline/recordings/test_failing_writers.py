@@ -1,0 +1,212 @@
+"""Recordings whose writer is killed, fails, or has a disk that is full or refuses: what is in the file is counted."""
+
+import errno
+import os
+import resource
+from itertools import count
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import MCAP0_MAGIC
+from mcap_protobuf.decoder import DecoderFactory
+
+from pipeline.recordings import writing
+from pipeline.recordings.contents import contents_of
+from pipeline.recordings.disk import AtomicAppendFile, DiskError
+from pipeline.recordings.reading import RecordingError, read_recording
+from pipeline.recordings.records import ACTIVE_SUFFIX
+from pipeline.recordings.sequence_ledger import StreamCounts, counts_from_metadata
+from pipeline.recordings.writing import CHUNK_BYTES, RecordingWriter
+from tests.support.failing_writers import disk_of, kill_a_recorder
+from tests.support.written_recordings import RAW_KEY, raw, sequences
+
+
+def test_all_that_was_flushed_survives_kill_9(tmp_path):
+    path = tmp_path / "r.mcap"
+    kill_a_recorder(path, flushed=25)
+    active = path.with_name(path.name + ACTIVE_SUFFIX)
+    reading = read_recording(active)
+    assert [e.message.header.sequence for e in reading] == list(range(25))
+    assert reading.truncated
+    assert "it is truncated" in reading.damage
+
+
+def test_a_recording_that_is_being_written_is_not_touched(tmp_path):
+    path = tmp_path / "r.mcap"
+    with RecordingWriter(path, {}) as first:
+        first.add_message(RAW_KEY, raw(0), 0)
+        with pytest.raises(RecordingError, match="another recorder is writing it"):
+            RecordingWriter(path, {})
+    assert sequences(path) == [0]
+
+
+def test_an_exception_while_writing_leaves_no_file(tmp_path):
+    with pytest.raises(ZeroDivisionError), RecordingWriter(tmp_path / "r.mcap", {}) as writer:
+        writer.add_message(RAW_KEY, raw(0), 0)
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_messages_counted_as_written_are_in_the_file(tmp_path):
+    writer = RecordingWriter(tmp_path / "r.mcap", {})
+    active = tmp_path / f"r.mcap{ACTIVE_SUFFIX}"
+    for sequence in range(600):
+        writer.add_message(RAW_KEY, raw(sequence), sequence)
+        if sequence % 50 == 0:
+            assert len(sequences(active)) >= writer.written["raw"]
+            assert writer.written["raw"] + len(writer.pending) == sequence + 1
+    writer.flush()
+    assert (writer.written["raw"], len(writer.pending)) == (600, 0)
+    writer.finish()
+
+
+def test_a_flush_syncs_the_file_once_and_its_name_is_synced_too(tmp_path, monkeypatch):
+    synced = []
+    monkeypatch.setattr(os, "fdatasync", lambda descriptor: synced.append(os.fstat(descriptor).st_size))
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(Path(f"/proc/self/fd/{descriptor}").readlink()))
+    writer = RecordingWriter(tmp_path / "r.mcap", {})
+    assert synced == [tmp_path]
+    writer.add_message(RAW_KEY, raw(0), 0)
+    writer.flush()
+    writer.flush()
+    assert synced == [tmp_path, writer.size], "once, as long as there is nothing new"
+    writer.finish()
+    assert synced[2:] == [(tmp_path / "r.mcap").stat().st_size, tmp_path]
+
+
+@pytest.mark.parametrize("for_ever", [False, True])
+def test_a_failed_sync_is_reported_and_the_file_ends_readable(tmp_path, monkeypatch, for_ever):
+    writer = RecordingWriter(tmp_path / "r.mcap", {})
+    for sequence in range(500):
+        writer.add_message(RAW_KEY, raw(sequence), sequence)
+    writer.flush()
+    sync, failures = os.fdatasync, count()
+
+    def fail(descriptor: int) -> None:
+        if for_ever or next(failures) == 0:
+            raise OSError(errno.EIO, "Input/output error")
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fdatasync", fail)
+    for sequence in range(500, 1001):
+        writer.add_message(RAW_KEY, raw(sequence), sequence)
+    with pytest.raises(DiskError, match="r.mcap: cannot be written any more: Input/output error; it ends here"):
+        writer.flush()
+    reading = read_recording(tmp_path / "r.mcap")
+    assert [envelope.message.header.sequence for envelope in reading] == list(range(500)), "what was on the disk before"
+    assert [pending.message.header.sequence for pending in writer.pending] == list(range(500, 1001))
+    assert (writer.written["raw"], contents_of(writer.path).streams[RAW_KEY, "acquisition-1"].messages) == (500, 500)
+    assert reading.damage == ""
+    with (tmp_path / "r.mcap").open("rb") as file:
+        assert (make_reader(file).get_summary() is None) == for_ever
+    assert (tmp_path / "r.mcap").read_bytes().count(MCAP0_MAGIC) == 2, "one beginning, one end"
+
+
+def test_a_writer_that_is_never_flushed_uses_bounded_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(writing, "UNSYNCED_BYTES", 2 * CHUNK_BYTES)
+    with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
+        for sequence in range(2000):
+            writer.add_message(RAW_KEY, raw(sequence), sequence)
+            assert sum(len(pending.payload) for pending in writer.pending) < 4 * CHUNK_BYTES
+
+
+def test_a_write_that_the_disk_refuses_leaves_the_file_as_it_was(tmp_path):
+    file = AtomicAppendFile(tmp_path / "file")
+    with disk_of(1000):
+        file.write(b"a" * 900)
+        with pytest.raises(OSError, match="File too large"):
+            file.write(b"b" * 900)
+        file.write(b"c" * 50)
+    file.close()
+    assert (tmp_path / "file").read_bytes() == b"a" * 900 + b"c" * 50
+
+
+@pytest.mark.parametrize("size", [3 * CHUNK_BYTES, 3 * CHUNK_BYTES + 1234, 200_000])
+def test_a_full_disk_ends_the_file_after_the_last_intact_chunk(tmp_path, size):
+    path = tmp_path / "r.mcap"
+    writer = RecordingWriter(path, {})
+    written = 0
+    with disk_of(size), pytest.raises(RecordingError, match="File too large; it ends here and is readable"):
+        for written in count():
+            writer.add_message(RAW_KEY, raw(written), written)
+    assert writer.written["raw"] > 0
+    unwritten = [pending.message.header.sequence for pending in writer.pending]
+    assert unwritten == list(range(writer.written["raw"], written + 1))
+    reading = read_recording(path)
+    assert [e.message.header.sequence for e in reading] == list(range(writer.written["raw"]))
+    assert reading.damage == ""
+    with path.open("rb") as file:
+        messages = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+    assert len(messages) == writer.written["raw"]
+
+
+def test_without_room_for_an_index_the_file_is_still_readable(tmp_path):
+    path = tmp_path / "r.mcap"
+    writer = RecordingWriter(path, {})
+    with pytest.raises(RecordingError, match="it ends here and is readable"):
+        for sequence in count():
+            writer.add_message(RAW_KEY, raw(sequence), sequence)
+            if writer.written["raw"] > 500:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (writer.size + 100, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    reading = read_recording(path)
+    assert [e.message.header.sequence for e in reading] == list(range(writer.written["raw"]))
+    assert reading.damage == ""
+    with path.open("rb") as file:
+        assert make_reader(file).get_summary() is None
+
+
+def test_the_ledger_is_in_the_file(tmp_path):
+    path = tmp_path / "r.mcap"
+    with RecordingWriter(path, {}) as writer:
+        for sequence in (3, 4, 7):
+            writer.add_message(RAW_KEY, raw(sequence), 1000 + sequence)
+    with path.open("rb") as file:
+        records = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+    assert counts_from_metadata(records["fantwin.ledger"]) == {
+        (RAW_KEY, "acquisition-1"): StreamCounts(
+            3, 2, 0, first_sequence=3, last_sequence=7, first_ns=1003, last_ns=1007
+        )
+    }
+
+
+def test_a_ledger_that_is_refused_at_first_is_in_the_index_once(tmp_path, monkeypatch):
+    writer = RecordingWriter(tmp_path / "r.mcap", {})
+    writer.add_message(RAW_KEY, raw(0), 0)
+    writer.flush()
+    write_whole, refusals = AtomicAppendFile.write, iter([OSError(errno.ENOSPC, "No space left on device")])
+
+    def refuse_once(file: AtomicAppendFile, data: bytes) -> None:
+        for error in refusals:
+            raise error
+        write_whole(file, data)
+
+    monkeypatch.setattr(AtomicAppendFile, "write", refuse_once)
+    with pytest.raises(DiskError):
+        writer.finish()
+    with (tmp_path / "r.mcap").open("rb") as file:
+        names = [record.name for record in make_reader(file).iter_metadata()]
+    assert names == ["fantwin", "fantwin.ledger"]
+
+
+def test_a_disk_that_is_full_from_the_start_is_reported_in_one_line(tmp_path):
+    with disk_of(20), pytest.raises(RecordingError, match=r"r\.mcap: cannot be written: File too large; name another"):
+        RecordingWriter(tmp_path / "r.mcap", {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_refuses_even_to_remove_the_unfinished_file_raises_the_first_error(tmp_path, monkeypatch):
+    def read_only(*_: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(AtomicAppendFile, "write", read_only)
+    monkeypatch.setattr(Path, "unlink", read_only)
+    with pytest.raises(DiskError, match="r.mcap: cannot be written: Read-only file system"):
+        RecordingWriter(tmp_path / "r.mcap", {})
+
+
+def test_a_folder_that_cannot_be_made_is_reported_in_one_line(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(RecordingError, match=r"cannot be written: (Not a directory|File exists)"):
+        RecordingWriter(tmp_path / "file" / "r.mcap", {})

@@ -1,0 +1,57 @@
+"""Recordings written for tests: messages whose numbers do not compress, and what is read back of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.recordings.reading import read_recording
+from pipeline.recordings.writing import RecordingWriter
+from schemas.messages import Alarm, Array, Header, Raw, Severity
+from schemas.topics import tray_key
+
+RAW_KEY = tray_key("plant", "tray1", "raw")
+ALARM_KEY = tray_key("plant", "tray1", "alarm")
+
+
+def noise(shape: tuple[int, ...], seed: int) -> Array:
+    """Numbers that do not compress, so that sizes are as on a real disk."""
+    return np.random.default_rng(seed).normal(size=shape)
+
+
+def raw(sequence: int, samples: int = 10, fans: int = 2) -> Raw:
+    return Raw(
+        header=Header("acquisition-1", sequence, "tray1"),
+        fans=fans,
+        host_receive_t_ns=np.arange(samples) + sequence * samples,
+        command=noise((samples, fans), sequence),
+        speed_rad_s=noise((samples, fans), sequence + 1),
+    )
+
+
+def alarm(sequence: int) -> Alarm:
+    return Alarm(
+        header=Header("scorer-1", sequence, "tray1"),
+        fan=1,
+        active=True,
+        severity=Severity.ALARM,
+        t_ns=7,
+        onset_t_ns=5,
+        residual_rad_s=3.0,
+        limit_rad_s=2.0,
+        message="fan 1 is slower than its twin",
+    )
+
+
+def write(path: Path, messages: int, **options: Any) -> Path:
+    with RecordingWriter(path, {"site": "plant"}, {"configuration.toml": b"site = 'plant'"}, **options) as writer:
+        for sequence in range(messages):
+            writer.add_message(RAW_KEY, raw(sequence), 1000 + sequence)
+        writer.add_message(ALARM_KEY, alarm(0), 5000)
+    return writer.path
+
+
+def sequences(path: Path) -> list[int]:
+    return [envelope.message.header.sequence for envelope in read_recording(path, topics=("raw",))]
