@@ -49,7 +49,9 @@ def main(
     runs: Annotated[
         int, typer.Option(help="Number of healthy runs that these fan-days are divided into, each on its own day.")
     ] = 8,
-    fault_runs: Annotated[int, typer.Option(help="Runs with a fault of every fan.")] = 20,
+    fault_runs: Annotated[
+        int, typer.Option(help="As many faults as so many runs have fans; in a run, one fan in five has one.")
+    ] = 20,
     commissioned_s: Annotated[
         float, typer.Option(help="Faults begin this long after the start of a run, or up to half a minute later.")
     ] = 60.0,
