@@ -205,6 +205,11 @@ class Residual:
             self._shared.restart(fans)
 
     @property
+    def shared_offset(self) -> float:
+        """What the fans share now, for each rad/s of their speed, in the unit of the residual."""
+        return self._shared.value if self._shared else 0.0
+
+    @property
     def _independent_intervals(self) -> Array:
         """(fans,) the number of independent intervals whose mean would vary as much as baseline and shared part do."""
         own = self.baseline.independent_intervals

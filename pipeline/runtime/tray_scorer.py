@@ -29,7 +29,7 @@ from scoring.fan_scorer import HALF_LIMIT, FanScorer
 from scoring.samples import among, arrived, samples_of
 from scoring.score_message import score_of
 from scoring.scored_block import ScoredBlock
-from scoring.wear.followed import followed_fans
+from scoring.wear.followed import followed_fans, shared_by_all
 from scoring.wear.wear_monitor import WearMonitor
 
 DATA_LOST_AFTER_NS = 2 * NS_PER_S  # an active alarm is not confirmed by data after so long without a score
@@ -102,9 +102,11 @@ class TrayScorer:
 
     @property
     def followed(self) -> list[str]:
-        """A line for each fan whose baseline has followed it far."""
-        limit = self._twin.limits.speed.baseline.adaptation_limit_sigmas
-        return followed_fans(self.fan_scorer.residuals["speed"].baseline, limit, self._sigma_rad_s, self._text.units)
+        """A line for what most fans share, if it is much, and for each fan whose baseline has followed it far."""
+        healthy, residual = self._twin.limits.speed, self.fan_scorer.residuals["speed"]
+        limit, units = healthy.baseline.adaptation_limit_sigmas, self._text.units
+        of_each = followed_fans(residual.baseline, limit, self._sigma_rad_s, units)
+        return [*shared_by_all(residual.shared_offset, healthy.shared_limit), *of_each]
 
     def recommission(self, fans: Array, t_ns: int) -> None:
         """Commission some fans again, (fans,) of bool, after the sample at t_ns."""

@@ -55,6 +55,11 @@ class SharedOffset(ColumnState):
         self._counts = np.zeros(fans, np.int64)
 
     @property
+    def value(self) -> float:
+        """The present offset for each rad/s, the unit of the residual."""
+        return float(self._value[0])
+
+    @property
     def independent_intervals(self) -> float:
         """The number of independent intervals of a fan whose mean would vary as much."""
         return (2.0 / self._gain - 1.0) * len(self._counts)

@@ -1,4 +1,4 @@
-"""Which fans the baseline has followed far: a notice, long before it is held at its limit."""
+"""Which fans the baseline has followed far, and what all share: notices, long before a limit is reached."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from scoring.wear.slow_change import WEAR_HINT
 
 FOLLOWED_FAR = 0.5
 """of its adaptation limit"""
+SHARED_FAR = 0.75
+"""of its limit; the air of a room and a supply make up half of it by themselves"""
 
 
 def followed_fans(baseline: Baseline, limit_sigmas: float, sigma_rad_s: Array, units: AlarmUnits) -> list[str]:
@@ -25,3 +27,15 @@ def followed_fans(baseline: Baseline, limit_sigmas: float, sigma_rad_s: Array, u
         most = f"{units.shown_speed(limit_sigmas * sigma_rad_s[fan])} {units.speed}"
         lines.append(f"fan {fan}: the baseline of its speed has followed it by {share} of {most}: {WEAR_HINT}")
     return lines
+
+
+def shared_by_all(share: float, limit: float) -> list[str]:
+    """A line where most fans of a tray have changed alike by this share of their speed, in tenths of its limit."""
+    if not limit or abs(share) < SHARED_FAR * limit:
+        return []
+    shown = 10.0 * limit * int(10.0 * abs(share) / limit)
+    direction = "slower" if share < 0.0 else "faster"
+    return [
+        f"most fans turn {shown:.1f} % {direction} than when they were commissioned: the air, the supply, or a "
+        f"filter before all; beyond {100 * limit:.1f} % each raises an alarm"
+    ]
