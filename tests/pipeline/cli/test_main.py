@@ -6,6 +6,7 @@ import ast
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -37,6 +38,12 @@ def test_every_command_has_an_example_and_prints_json_if_asked(command):
     text = help_of(command)
     assert f"Example: fantwin {command}" in " ".join(text.split())
     assert "--json" in text
+
+
+def test_the_version_is_that_of_the_project():
+    result = CliRunner().invoke(command_line.app, ["--version"])
+    declared = tomllib.loads((README.parent / "pyproject.toml").read_text())["project"]["version"]
+    assert (result.exit_code, result.output) == (0, f"fantwin {declared}\n")
 
 
 def test_help_lists_every_command_and_the_exit_codes():
