@@ -329,12 +329,15 @@ class Runner:
                 self._due += self._tracker.accept(envelope)
 
     def _handle_recovered(self, item: Recovered) -> None:
-        decoded = (self._decode(key, payload, HOST_CLOCK.now_ns()) for key, payload in item.answer.messages)
+        now_ns = HOST_CLOCK.now_ns()
+        decoded = (self._decode(key, payload, now_ns) for key, payload in item.answer.messages)
         envelopes = [e for e in decoded if e is not None and e.message.header.producer != self.producer]
         if self._recovery.is_catch_up(item.request):
             due = self._tracker.accept_kept(envelopes)
         else:
             due = self._tracker.answer(item.request, Found(envelopes, item.answer.published))
+        for key in dict.fromkeys(envelope.key for envelope in due if envelope.topic != "health"):
+            self._health.add_input(key, now_ns, now_ns)
         self._due += due
         self._recovery.finish(item)
 

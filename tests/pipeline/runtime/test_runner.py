@@ -16,6 +16,7 @@ from schemas.codec import encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Command, Grid, Header, Health, InputPosition, Message, Output, Raw, StageStatus
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from schemas.units import NS_PER_S
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, Silent, raw, toy
 
@@ -211,6 +212,17 @@ def test_a_stage_that_may_drop_recovers_messages_published_on_change(config):
     inputs = bench.health_with(lambda health: len(health.inputs) == 2).inputs
     bench.end()
     assert {line.key.split("/")[-1]: line.received for line in inputs} == {"command": 2, "raw": 1}
+
+
+def test_a_stage_is_not_behind_with_messages_that_it_had_missed_and_recovered(config):
+    """Its live inputs may have been silent for hours."""
+    with Bus(config.bus) as before:
+        publisher = before.publisher(tray_key("s", TRAY_A, "raw"), BY_NAME["raw"], type_name(Raw), "x")
+        publisher.put(encode(replace(raw(1), header=Header("x", 0, TRAY_A))))
+        bench = Bench(toy(lambda _context: BuiltStage(Silent())), config)
+        health = bench.health_with(lambda health: sum(line.received for line in health.inputs) == 1)
+        bench.end()
+    assert 0 <= health.t_ns - health.newest_input_t_ns < 60 * NS_PER_S
 
 
 def test_a_stage_that_may_drop_discards_its_oldest_items_and_counts_them(config):
