@@ -206,8 +206,8 @@ class Residual:
 
     @property
     def shared_offset(self) -> float:
-        """What the fans share now, for each rad/s of their speed, in the unit of the residual."""
-        return self._shared.value if self._shared else 0.0
+        """What the fans shared when last compared, for each rad/s of their speed, in the unit of the residual."""
+        return self._shared.compared if self._shared else 0.0
 
     @property
     def _independent_intervals(self) -> Array:

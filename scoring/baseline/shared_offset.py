@@ -55,9 +55,11 @@ class SharedOffset(ColumnState):
         self._counts = np.zeros(fans, np.int64)
 
     @property
-    def value(self) -> float:
-        """The present offset for each rad/s, the unit of the residual."""
-        return float(self._value[0])
+    def compared(self) -> float:
+        """The offset when fans were last compared, for each rad/s, in the unit of the residual: what only one fan that
+        turned alone has added since is not shared.
+        """
+        return float(self._compared[0])
 
     @property
     def independent_intervals(self) -> float:

@@ -37,5 +37,5 @@ def shared_by_all(share: float, limit: float) -> list[str]:
     direction = "slower" if share < 0.0 else "faster"
     return [
         f"most fans turn {shown:.1f} % {direction} than when they were commissioned: the air, the supply, or a "
-        f"filter before all; beyond {100 * limit:.1f} % each raises an alarm"
+        f"filter in front of them all; beyond {100 * limit:.1f} % every fan raises an alarm"
     ]
