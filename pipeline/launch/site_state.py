@@ -26,7 +26,7 @@ SILENT_AFTER_S = 5.0
 """without a health, which every stage sends once a second"""
 STARVED_AFTER_S = 5.0
 LATE_AFTER_S = 5.0
-WHY_SILENT = "it hangs, is blocked or gets no time of the processor"
+WHY_SILENT = "it hangs, is blocked or gets no processor time"
 
 
 class Word(StrEnum):

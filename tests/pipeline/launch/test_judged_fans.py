@@ -83,13 +83,11 @@ def test_row_01_without_scores_the_first_stage_that_does_not_work_is_the_reason(
     listener.score("b")
     listener.now_s += JUDGED_WITHIN_S
     listener.score("b")
-    twin = state(
-        "twin_integrator", Word.SILENT, "no health for 6 s: it hangs, is blocked or gets no time of the processor"
-    )
+    twin = state("twin_integrator", Word.SILENT, "no health for 6 s: it hangs, is blocked or gets no processor time")
     others = [state("acquisition/a", Word.OK), state("acquisition/b", Word.SILENT, "of another tray")]
     after = [state("scorer", Word.STARVED, "later"), state("recorder", Word.SILENT, "not on the way")]
     assert listener.lines(*others, twin, *after) == [
-        "a: no fan is judged: twin_integrator: no health for 6 s: it hangs, is blocked or gets no time of the processor"
+        "a: no fan is judged: twin_integrator: no health for 6 s: it hangs, is blocked or gets no processor time"
     ]
     assert listener.lines(after[1]) == ["a: no fan is judged: no score arrives"]
 

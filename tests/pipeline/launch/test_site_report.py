@@ -56,7 +56,7 @@ def test_row_01_a_stage_that_hangs_is_said_once_and_that_it_works_again(report, 
         report.stages([state("resampler", word), state("scorer")], hangs)
     report.stages([state("resampler"), state("scorer")], IDS)
     assert lines == [
-        "resampler: silent: it hangs, is blocked or gets no time of the processor",
+        "resampler: silent: it hangs, is blocked or gets no processor time",
         "resampler: at work again",
     ]
 

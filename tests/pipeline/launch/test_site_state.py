@@ -65,7 +65,7 @@ def test_row_01_a_stage_that_sends_no_health_any_more_is_silent():
     state = states(view(CONSUMER, age_s=6.0))["twin_integrator"]
     assert (state.word, state.detail, state.is_fault) == (
         Word.SILENT,
-        "no health for 6 s: it hangs, is blocked or gets no time of the processor",
+        "no health for 6 s: it hangs, is blocked or gets no processor time",
         True,
     )
 
@@ -116,7 +116,7 @@ def test_row_01_a_stage_that_works_on_old_input_is_behind_and_not_starved():
 
 def test_row_01_a_stage_that_was_behind_when_it_was_last_heard_may_be_at_work():
     silent = replace(behind(19.0, processed=25), age_s=6.0)
-    assert states(silent)["twin_integrator"].detail.endswith("processor; before, it was 19 s behind")
+    assert states(silent)["twin_integrator"].detail.endswith("processor time; before, it was 19 s behind")
 
 
 def test_row_16_a_stage_that_left_the_bus_without_stopping_is_gone():
