@@ -145,6 +145,8 @@ def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
         raise StageError(f"{context.tray.twin}: its calibration cannot be used: {why}; {again}") from error
     for residual in (limits.speed, limits.balance):
         fans = len(residual.fan_offsets.offset_sigmas) if residual.fan_offsets else context.tray.fans
+        if len(residual.low_frequency_std_of_fans) not in (0, twin.card.fans):
+            fans = len(residual.low_frequency_std_of_fans)
         if fans != context.tray.fans:
             raise StageError(
                 f"{context.tray.twin}: its calibration is of {fans} fans, the tray has {context.tray.fans}; {again}"

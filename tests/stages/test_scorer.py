@@ -337,6 +337,17 @@ def test_a_calibration_of_another_number_of_fans_is_reported_in_one_line(tmp_pat
         STAGE.build(context)
 
 
+def test_standard_deviations_of_another_number_of_fans_are_reported_in_one_line(tmp_path: Path) -> None:
+    def problems(stds: list[float]) -> Sequence[str]:
+        return STAGE.check(
+            context_of(tmp_path, calibration=CALIBRATION | {"speed": {"low_frequency_std_of_fans": stds}})
+        )
+
+    assert problems([1.0]) == [], "of the only fan of a twin that serves every fan"
+    (problem,) = problems([1.0, 1.5, 1.0])
+    assert "its calibration is of 3 fans, the tray has 2; calibrate it again" in problem
+
+
 # requests
 
 
