@@ -56,7 +56,7 @@ def main(
     runs: Annotated[int, typer.Option(help="Healthy runs; from 12 on calibration learns offsets of fans.")] = 12,
     calibration_days: Annotated[float, typer.Option(help="Healthy fan-days to calibrate on, simulated.")] = 0.25,
     declared_days: Annotated[float, typer.Option(help="Declared time between false alarms, simulated.")] = 30.0,
-    fault_runs: Annotated[int, typer.Option(help="Runs with a fault of every simulated fan.")] = 4,
+    fault_runs: Annotated[int, typer.Option(help="Faults of every simulated fan, each in a run of its own.")] = 4,
     racks: Annotated[int, typer.Option(help="Racks that are judged.")] = 4,
     rack_data: Annotated[
         Path | None, typer.Option(help="The --keep of a bench of racks, to use its recordings; else made in --keep.")

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from bench.detection.campaigns import Watch, everyday, predictions, watched
-from bench.detection.faulty import Campaign, campaign
+from bench.detection.faulty import FAULTY_ONE_IN, Campaign, campaign
 from bench.detection.judging import (
     calibrated_twin,
     judged,
@@ -91,7 +91,7 @@ class SimulatedPart:
         fleet = trained_fleet(folder, sizes.fans, sizes.seed, progress)
         faulty: dict[str, list[Prediction]] = {}
         shown = self._campaign(fleet)
-        progress(f"faults: {len(shown.events)} in {sizes.fault_runs} runs of {shown.seconds:.0f} s")
+        progress(f"faults: {len(shown.events)} in {FAULTY_ONE_IN * sizes.fault_runs} runs of {shown.seconds:.0f} s")
         for run, block in predictions(fleet, shown.plant, shown.seconds, progress):
             faulty.setdefault(run, []).append(block)
         for run, blocks in faulty.items():

@@ -50,7 +50,7 @@ def main(
         int, typer.Option(help="Number of healthy runs that these fan-days are divided into, each on its own day.")
     ] = 8,
     fault_runs: Annotated[
-        int, typer.Option(help="As many faults as so many runs have fans; in a run, one fan in five has one.")
+        int, typer.Option(help="Faults of every fan, each in a run of its own, in which one fan in five has one.")
     ] = 20,
     commissioned_s: Annotated[
         float, typer.Option(help="Faults begin this long after the start of a run, or up to half a minute later.")

@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.detection.campaigns import Healthy, Watch, calibrate, everyday, predictions, watched
 from bench.detection.competitors import plain_methods
-from bench.detection.faulty import Campaign, Cell, campaign
+from bench.detection.faulty import FAULTY_ONE_IN, Campaign, Cell, campaign
 from bench.detection.libraries import library_methods
 from bench.detection.methods import Calibration, Method
 from bench.detection.metrics import (
@@ -181,7 +181,7 @@ class Faulty:
 def scored_faults(bench: Bench, sizes: Sizes, progress: Progress) -> Faulty:
     """Score faulty runs by all methods."""
     shown = campaign(bench.fleet, sizes.fault_runs, sizes.commissioned_s, sizes.seed + 4000)
-    progress(f"faults: {len(shown.events)} in {sizes.fault_runs} runs of {shown.seconds:.0f} s")
+    progress(f"faults: {len(shown.events)} in {FAULTY_ONE_IN * sizes.fault_runs} runs of {shown.seconds:.0f} s")
     stream = predictions(bench.fleet, shown.plant, shown.seconds, progress)
     return Faulty(shown, watched(bench.watches(keep_scores=True), stream))
 
