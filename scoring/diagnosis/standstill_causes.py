@@ -172,10 +172,10 @@ class _Fall:
         rows = np.flatnonzero((time_s >= time_s[last_turning] - longest_s) & np.isfinite(share))
         every = max(1, round(same_error_s / SAMPLES_OF_AN_ERROR / window.period_s))
         rows = rows[(len(rows) - 1) % every :: every]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            readings: Array = share[rows] / level
         at_s: Array = time_s[rows]
-        resolution = tacho.resolution_rad_s * readings[0] / max(float(np.abs(window.speed_rad_s[rows[0]])), 1e-9)
+        with np.errstate(divide="ignore", invalid="ignore"):  # a fan that stood before has a level of 0
+            readings: Array = share[rows] / level
+            resolution = tacho.resolution_rad_s * readings[0] / max(float(np.abs(window.speed_rad_s[rows[0]])), 1e-9)
         at_rest_s = at_s[at_s > time_s[last_turning]]
         reading_s = max(tacho.held_s, same_error_s)
         return _Fall(

@@ -130,6 +130,7 @@ def test_a_fan_that_slows_down_to_another_speed_has_the_causes_of_one_that_turns
     assert set(first_after(duty, window_s, slowed, 8.0)) == {"gain_down"}
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("before", "after", "coast_s"),
     [(HIGH, 0.0, 1.25), (HIGH, HIGH, None), (0.0, HIGH, 1.25)],
@@ -141,7 +142,8 @@ def test_a_fan_may_slow_down_without_coming_to_rest_by_a_fault(before: float, af
     command = np.where(number < 320, before, after)
     speed = np.where(number < 320, 200.0 * (before > 0.0), np.where(number < 380, 200.0, 60.0))
     window = Window(PERIOD_S, command, speed, onset=380)
-    assert coming_to_rest(window, healthy, BALANCE, Tacho(kind="count", window_s=0.5)) is None
+    for tacho in (Tacho(kind="count", window_s=0.5), Tacho()):
+        assert coming_to_rest(window, healthy, BALANCE, tacho) is None
 
 
 def test_where_the_readings_do_not_tell_neither_is_ruled_out() -> None:
