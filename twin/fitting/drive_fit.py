@@ -38,7 +38,7 @@ LEAST_GAIN = 0.07
 """a share of the free-run error"""
 KICKS_S, RESTS_S = (0.3, 0.6, 1.2), (1.0, 2.0, 4.0)
 FIRST_ITERATIONS, MORE_ITERATIONS = 12, 5
-ITERATIONS = 2 * FIRST_ITERATIONS + (len(KICKS_S) + len(RESTS_S) - 2) * MORE_ITERATIONS
+MOST_ITERATIONS = 2 * FIRST_ITERATIONS + (len(KICKS_S) + len(RESTS_S)) * MORE_ITERATIONS
 FIRST_DAMPING, DAMPING_DOWN, DAMPING_UP = 1e-3, 3.0, 4.0
 FIRST_PLATEAU, FIRST_KICK = 0.05, 0.5
 """shares of the range of commands above the lowest that turns the fans"""
@@ -98,7 +98,7 @@ def find_drive(
     count = itertools.count(1)
 
     def iteration_done() -> None:
-        progress("drive of the fans", next(count), ITERATIONS, np.nan)
+        progress("drive of the fans", next(count), MOST_ITERATIONS, np.nan)
 
     start = np.zeros((len(plain.parameters), UNKNOWNS))
     start[:, :LAG] = fitted_unknowns(plain.parameters, plain.top_speed_rad_s)[:, :LAG]

@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from schemas.tacho import INSTANTANEOUS, Tacho
-from twin.fitting.drive_fit import FoundDrive, find_drive
+from twin.fitting.drive_fit import MOST_ITERATIONS, FoundDrive, find_drive
 from twin.fitting.identification import identify
 from twin.fitting.standstill import find_standstill
 from twin.measurement import measurement_of
@@ -41,13 +42,17 @@ def found_in(drive: Drive | None, progress: Progress = unreported) -> FoundDrive
     return find_drive(runs, held_out, identify(runs, with_lag=False), find_standstill([*runs, *held_out]), progress)
 
 
-def test_plateau_friction_and_kick_are_found() -> None:
+@pytest.mark.parametrize("kick_s", [0.3, 0.6])
+def test_plateau_friction_and_kick_are_found(kick_s: float) -> None:
     reported: list[tuple[int, int]] = []
-    found = found_in(DRIVE, lambda _part, done, at_most, _rmse: reported.append((done, at_most)))
+    drive = replace(DRIVE, kick_s=kick_s)
+    found = found_in(drive, lambda _part, done, at_most, _rmse: reported.append((done, at_most)))
     assert found is not None
-    assert (found.drive.kick_s, found.drive.rest_s) == (DRIVE.kick_s, DRIVE.rest_s)
+    assert found.drive == drive
     np.testing.assert_allclose(found.settings, SETTINGS, rtol=0.05, atol=1.5)
-    assert reported == [(done, len(reported)) for done in range(1, len(reported) + 1)]
+    assert [done for done, _ in reported] == list(range(1, len(reported) + 1))
+    assert {at_most for _, at_most in reported} == {MOST_ITERATIONS}
+    assert len(reported) <= MOST_ITERATIONS
 
 
 def test_a_drive_is_looked_for_where_readings_are_of_pulses_and_starts_are_many() -> None:
