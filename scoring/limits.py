@@ -56,7 +56,9 @@ class DeclaredRate(_Entry):
     extrapolated: bool = Field(description="limits are extrapolated beyond the healthy data; the rate is a target only")
     fan_hours: float = Field(gt=0, description="length of the healthy runs, summed over fans")
     runs: int = Field(ge=1, description="number of runs")
-    data: tuple[dict[str, Any], ...] = Field(default=(), description="the recordings: name and SHA-256")
+    data: tuple[dict[str, Any], ...] = Field(
+        default=(), description="the recordings: name and SHA-256, and from_s, to_s of a part"
+    )
     created: str = Field(default="", description="when, ISO 8601")
 
 

@@ -80,7 +80,8 @@ class SimulatedPart:
     def name(self) -> str:
         """See Part."""
         of = self.sizes
-        return f"simulated-{of.fans}-{of.runs}-{of.calibration_days:g}-{of.declared_days:g}-{of.fault_runs}-{of.seed}"
+        faults = f"{of.fault_runs}x{FAULTY_ONE_IN}"
+        return f"simulated-{of.fans}-{of.runs}-{of.calibration_days:g}-{of.declared_days:g}-{faults}-{of.seed}"
 
     def prepare(self, folder: Path, progress: Progress) -> None:
         """See Part."""

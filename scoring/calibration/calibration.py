@@ -54,6 +54,7 @@ SEEN_WINDOWS = 50.0  # with an alarm, to count how often statistics alarm togeth
 CONFIDENCE = 0.95
 VISITED_S = 20.0  # a fan that turned at a speed for so long has shown the error of its twin there
 SHARED_SHARE = 0.03  # of the speed, or of the command: as the air of a room and a supply vary
+ALIKE = 3.0  # times the median sigma of the fans
 LEAST_VISITED = 8  # limits beyond those of so few would find nothing
 ROUNDING = 1e-9
 
@@ -274,9 +275,11 @@ def _not_below_mean_over_speeds(residual: HealthyResidual) -> HealthyResidual:
 
 def _not_below_mean_over_fans(residual: HealthyResidual, sigma_shares: Array) -> HealthyResidual:
     """A fan whose tacho has little noise has a small sigma, but its twin, air and supply err as those of the others:
-    no low-frequency standard deviation is below the root mean square over the fans.
+    no low-frequency standard deviation is below the root mean square over the fans. A fan far noisier than most is no
+    measure for them.
     """
-    relative = (math.sqrt(np.mean(np.square(sigma_shares))) / sigma_shares).clip(1.0, None)
+    alike = sigma_shares[sigma_shares <= ALIKE * np.median(sigma_shares)]
+    relative = (math.sqrt(np.mean(np.square(alike))) / sigma_shares).clip(1.0, None)
     return residual.model_copy(update={"low_frequency_std_of_fans": tuple(np.round(relative, 4).tolist())})
 
 

@@ -73,7 +73,7 @@ def calibrate(
     as frequent as declared. If the data cannot support the rate, the command refuses and says how much is needed.
     Without calibration only the speed band raises alarms.
 
-    Exit codes: 0 success; 1 error; 3 --verify found more false alarms than declared.
+    Exit codes: 0 success; 1 error; 3 --verify found more false alarms than declared; 130 Ctrl-C.
 
     Example: fantwin calibrate TWIN.onnx healthy-1.mcap healthy-2.mcap --false-alarms-per-day 1
 
@@ -148,11 +148,17 @@ def _calibrated(
     assert limits.declared_rate
     declared_rate = limits.declared_rate.model_copy(
         update={
-            "data": tuple({"name": path.name, "sha256": sha256_of(path)} for path in healthy),
+            "data": tuple({"name": path.name, "sha256": sha256_of(path), **_part(*part_s)} for path in healthy),
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         }
     )
     return limits.model_copy(update={"declared_rate": declared_rate}), warning, runs.speed_unit
+
+
+def _part(from_s: float, to_s: float) -> dict[str, float]:
+    """The part of each recording, for the card; empty for the whole."""
+    wanted = {"from_s": from_s} if from_s > 0.0 else {}
+    return wanted | ({"to_s": to_s} if to_s < math.inf else {})
 
 
 def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path], overrides: list[str]) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.cli.options import JsonOption
-from pipeline.cli.progress import training_progress
+from pipeline.cli.progress import interruptible, training_progress
 from pipeline.cli.twins.training_data import (
     FansOption,
     FromOption,
@@ -54,7 +54,7 @@ def identify(
 
     Example: fantwin identify REC.mcap --json
     """
-    with twin_errors():
+    with interruptible("nothing was identified"), twin_errors():
         from twin.fitting.identification import identify as identify_fans  # noqa: PLC0415  loads twin only when it is needed
 
         training_data = read_training_data(recordings, tray, fans, from_s, to_s, window_s)

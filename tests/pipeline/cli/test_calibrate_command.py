@@ -180,13 +180,17 @@ def test_extrapolated_limits_declare_a_target_only(folder: Path) -> None:
 
 
 def test_only_the_wanted_part_of_each_recording_is_used(folder: Path) -> None:
-    def fan_hours(*part: object) -> float:
+    def learned(*part: object) -> dict[str, Any]:
         result = calibrate(folder, *part, "--extrapolate", "-o", folder / "part.onnx", "--json")
         assert result.exit_code == 0, result.output
-        return json.loads(result.stdout)["calibration"]["declared_rate"]["fan_hours"]
+        return json.loads(result.stdout)["calibration"]["declared_rate"]
 
-    whole, part = fan_hours(), fan_hours("--from", 20, "--to", 90)
-    assert whole - part == pytest.approx(FANS * (120 - 70) / 3600, rel=0.05), "commissioning is repeated in each"
+    whole, part = learned(), learned("--from", 20, "--to", 90)
+    assert set(whole["data"][0]) == {"name", "sha256"}
+    assert (part["data"][0]["from_s"], part["data"][0]["to_s"]) == (20.0, 90.0)
+    assert whole["fan_hours"] - part["fan_hours"] == pytest.approx(FANS * (120 - 70) / 3600, rel=0.05), (
+        "commissioning is repeated in each"
+    )
     error = error_of(
         "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1, "--from", 500
     )

@@ -195,6 +195,10 @@ def test_a_fan_with_little_noise_gets_no_narrower_limits_on_what_lasts_from_few_
     assert few.of(range(2, 4)).speed.low_frequency_std_of_fans == pytest.approx(wider[2:], abs=1e-4)
     assert few.of(None).speed.low_frequency_std_of_fans == ()
 
+    shares["balance"] = np.array([0.01, 0.01, 0.02, 0.2])
+    beside_a_noisy_one = found(1.0, extrapolate=True).balance.low_frequency_std_of_fans
+    assert beside_a_noisy_one == pytest.approx([math.sqrt(2.0), math.sqrt(2.0), 1.0, 1.0], abs=1e-4)
+
     plain = few.model_copy(update={"speed": few.speed.model_copy(update={"low_frequency_std_of_fans": ()})})
     size = next(size for size in np.arange(1.0, 20.0, 0.2) if {alarm.fan for alarm in shifted(plain, size, [0, 3])})
     assert {alarm.fan for alarm in shifted(few, 1.3 * size, [0, 3])} == {3}
