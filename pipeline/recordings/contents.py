@@ -12,7 +12,7 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 from mcap.summary import Summary
 
-from pipeline.recordings.disk import not_being_written
+from pipeline.recordings.disk import is_being_written
 from pipeline.recordings.reading import METADATA_NAME
 from pipeline.recordings.records import CORRUPT_DATA_ERRORS, MESSAGE, chunk_at, indexed_reader, records_in
 from pipeline.recordings.scan import Scan, scan
@@ -89,19 +89,9 @@ def contents_of(path: Path) -> Contents:
         found = None
     if found:
         return found
-    is_written = _is_being_written(path)
+    is_written = is_being_written(path)
     contents = _by_scan(scan(path))
     return replace(contents, damage=(STILL_WRITTEN,)) if is_written else contents
-
-
-def _is_being_written(path: Path) -> bool:
-    try:
-        with not_being_written(path):
-            return False
-    except BlockingIOError:
-        return True
-    except OSError:  # reading the file reports it
-        return False
 
 
 def continuity(parts: Sequence[Contents]) -> list[str]:

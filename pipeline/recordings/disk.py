@@ -145,6 +145,17 @@ def not_being_written(path: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
+def is_being_written(path: Path) -> bool:
+    """Whether another process is writing the file. False if it cannot be opened: reading it reports that."""
+    try:
+        with not_being_written(path):
+            return False
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+
+
 def sync_folder(folder: Path) -> None:
     """Flush a folder to the disk: its file names then survive a power cut. OSError if that fails."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

@@ -13,6 +13,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Metadata
 
+from pipeline.recordings.disk import is_being_written
 from pipeline.recordings.records import (
     CORRUPT_DATA_ERRORS,
     MESSAGE,
@@ -46,7 +47,9 @@ class Reading:
     topics: Collection[str] | None
     tray: str | None
     truncated: bool = field(default=False, init=False)
-    """the file has no end: its recorder was killed, or lost power"""
+    """the file has no end: its recorder was killed, or lost power, or still writes it"""
+    being_written: bool = field(default=False, init=False)
+    """a recorder was writing the file when the iteration began"""
     damaged_chunks: int = field(default=0, init=False)
     undecodable: int = field(default=0, init=False)
     """messages that do not have the type of their channel"""
@@ -55,7 +58,8 @@ class Reading:
     def damage(self) -> str:
         """One line about what could not be read; empty if nothing is missing."""
         found = (
-            ("it is truncated, as after a crash; read up to that point", self.truncated),
+            ("it is still being written; read up to its last flush", self.truncated and self.being_written),
+            ("it is truncated, as after a crash; read up to that point", self.truncated and not self.being_written),
             (f"damaged chunks left out: {self.damaged_chunks}", self.damaged_chunks),
             (f"messages left out that cannot be decoded: {self.undecodable}", self.undecodable),
         )
@@ -76,6 +80,7 @@ class Reading:
     def undecoded(self) -> Iterator[Envelope]:
         """The messages as bytes; `Envelope.message` decodes one, and may raise CodecError."""
         self.truncated, self.damaged_chunks = False, 0
+        self.being_written = is_being_written(self.path)
         channels: dict[int, tuple[str, str]] = {}
         corrupt = 0
         reader = RecordReader(self.path)

@@ -9,6 +9,7 @@ from mcap.opcode import Opcode
 
 from pipeline.recordings.reading import read_recording
 from pipeline.recordings.records import RECORD, RecordReader
+from pipeline.recordings.writing import RecordingWriter
 from schemas.codec import encode
 from schemas.messages import newest_t_ns
 
@@ -36,6 +37,19 @@ def test_a_truncated_file_is_read_up_to_its_end_and_reported(tmp_path):
     found = list(reading.undecoded())
     assert 0 < len(found) < len(list(read_recording(GOLDEN, ("score",)).undecoded()))
     assert "it is truncated" in reading.damage
+
+
+def test_a_file_that_is_still_being_written_is_no_crash(tmp_path):
+    with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
+        for envelope in read_recording(GOLDEN, ("raw",)).undecoded():
+            writer.add_message(envelope.key, envelope.message, envelope.received_t_ns)
+        writer.flush()
+        reading = read_recording(tmp_path / "r.mcap.active")
+        assert list(reading.undecoded())
+        assert reading.damage == f"{tmp_path}/r.mcap.active: it is still being written; read up to its last flush"
+    whole = read_recording(tmp_path / "r.mcap")
+    assert list(whole.undecoded())
+    assert not whole.damage
 
 
 @pytest.mark.parametrize("what", ["content", "length"])
