@@ -28,8 +28,10 @@ if TYPE_CHECKING:
 RecordingsArgument: TypeAlias = Annotated[
     list[Path], typer.Argument(metavar="REC.mcap...", help="Recordings; each counts its seconds from its own start.")
 ]
-FromOption: TypeAlias = Annotated[float, typer.Option("--from", help="Use each recording from this second on.")]
-ToOption: TypeAlias = Annotated[float, typer.Option("--to", help="Use each recording up to this second.")]
+FromOption: TypeAlias = Annotated[
+    float, typer.Option("--from", min=0.0, help="Use each recording from this second on.")
+]
+ToOption: TypeAlias = Annotated[float, typer.Option("--to", min=0.0, help="Use each recording up to this second.")]
 TrayOption: TypeAlias = Annotated[str | None, typer.Option(help="Which tray, where a recording has several.")]
 WindowOption: TypeAlias = Annotated[
     list[float] | None,

@@ -195,6 +195,9 @@ def test_only_the_wanted_part_of_each_recording_is_used(folder: Path) -> None:
         "calibrate", folder / "twin.onnx", folder / "healthy.mcap", "--false-alarms-per-day", 1, "--from", 500
     )
     assert error.endswith("healthy.mcap: no samples from 500 s to inf s; see --from and --to")
+    negative = calibrate(folder, "--from", -5, "-o", folder / "part.onnx")
+    assert negative.exit_code == 2
+    assert "--from" in negative.stderr
     verified = "--verify", folder / "other.mcap"
     assert error_of("calibrate", folder / "twin.onnx", "--to", 9, *verified).startswith("--to needs recordings")
 
