@@ -2,10 +2,8 @@
 
 import json
 import re
-import resource
 import sys
 import tracemalloc
-from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -21,6 +19,7 @@ from pipeline.recordings.writing import RecordingWriter
 from schemas.codec import proto_type
 from schemas.messages import MESSAGE_TYPES, FanState, Health, ModelCard, Raw, Statistic
 from tests.pipeline.recordings.test_arrays import GOLDEN, alarm, raw, write
+from tests.support.failing_writers import disk_of
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.score_data import START_NS, made_up_tray
 
@@ -44,17 +43,6 @@ def table(path: Path) -> pd.DataFrame:
 
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
-
-
-@contextmanager
-def disk_of(size: int):
-    """Files of this process cannot grow beyond `size` bytes."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.parametrize("form", FORMS)
