@@ -97,7 +97,8 @@ class TrainingCard:
     """How the twin was trained.
 
     physics: whether they were refined together with the network. duration_s: duration of the training. fans: the fan
-    numbers in the recordings, in the order of the card's lists; empty in early cards.
+    numbers in the recordings, in the order of the card's lists; empty in early cards. networks: how many were trained;
+    the twin is the mean of those that ended about as well as the best. iterations: of all of them.
     """
 
     trainer: str
@@ -107,6 +108,7 @@ class TrainingCard:
     duration_s: float
     data: tuple[DataCard, ...]
     fans: tuple[int, ...] = ()
+    networks: Count = 1
 
 
 @dataclass(frozen=True, config=_CONFIG)

@@ -40,7 +40,7 @@ from twin.fitting.drive_fit import find_drive
 from twin.fitting.identification import Identification, identify
 from twin.fitting.model_fits import FitRequest, Trainer
 from twin.fitting.standstill import find_standstill
-from twin.fitting.training import Physics
+from twin.fitting.training import MOST_NETWORKS, Physics
 from twin.kinds import BOTH_INPUTS, ModelKind, find_kind
 from twin.models.drive import DRIVE_PARAMETERS
 from twin.models.model import Model
@@ -80,6 +80,7 @@ def train_twin(
     max_iterations: int | None = None,
     network_inputs: tuple[str, ...] = BOTH_INPUTS,
     physics: Physics = "refined",
+    networks: int = 1,
     command_unit: str = "",
     fan_numbers: Sequence[int] | None = None,
     data: Sequence[DataCard] = (),
@@ -92,7 +93,8 @@ def train_twin(
     validation_runs: held out of the fit; they choose the best weights and give the healthy sigmas and the card's
     figures. If empty, the training runs are used instead, and the card says so. network_inputs: of the hybrid's and
     neural ODE's network. physics: whether a hybrid's physics are refined along with its network, or stay as they were
-    identified. trainer "adam" keeps them as identified, and keeps the weights with the smallest training error.
+    identified. networks: how many are trained and averaged, 1 to MOST_NETWORKS. trainer "adam" trains one, keeps the
+    physics as identified, and keeps the weights with the smallest training error.
     fan_numbers (what the recordings call the runs' fans; default: counted from 0), command_unit, data and
     validation_data (the files that the runs are from) and created (default: now) go into the card. The same seed and
     runs give the same model.
@@ -101,6 +103,7 @@ def train_twin(
     """
     model_kind = find_kind(kind)
     _require_trainer(model_kind, trainer)
+    _require_networks(model_kind, trainer, networks)
     fans = common_fans([*runs, *validation_runs])
     numbers = tuple(range(fans) if fan_numbers is None else fan_numbers)
     if model_kind.predicts == "readings":
@@ -126,6 +129,7 @@ def train_twin(
             physics,
             progress,
             drive,
+            networks,
         )
     )
     model, parameters = fitted.model, fitted.parameters
@@ -181,7 +185,7 @@ def train_twin(
         rate_hz=1.0 / float(np.median(np.concatenate([np.diff(run.t_s) for run in runs]))),
         network=model.network_card,
         training=TrainingCard(
-            trainer, fitted.physics, seed, fitted.iterations, round(duration_s, 3), tuple(data), numbers
+            trainer, fitted.physics, seed, fitted.iterations, round(duration_s, 3), tuple(data), numbers, networks
         ),
         validation=_validation_card(
             validation.pooled, "held-out" if validation_runs else "training", tuple(validation_data)
@@ -230,6 +234,16 @@ def _require_trainer(kind: ModelKind, trainer: str) -> None:
         raise TwinError(f"trainer {trainer!r} is unknown; use one of {', '.join(get_args(Trainer))}")
     if trainer not in kind.trainers:
         raise TwinError(f"trainer {trainer!r} cannot train the {kind.name} model; use {' or '.join(kind.trainers)}")
+
+
+def _require_networks(kind: ModelKind, trainer: str, networks: int) -> None:
+    if not 1 <= networks <= MOST_NETWORKS:
+        raise TwinError(f"{networks} networks cannot be averaged; ask for 1 to {MOST_NETWORKS}")
+    if networks > 1 and not (kind.averages_networks and trainer == "levenberg-marquardt"):
+        raise TwinError(
+            f"several networks cannot be averaged with model {kind.name} and trainer {trainer}; use the hybrid or the "
+            "neural ODE, with trainer levenberg-marquardt"
+        )
 
 
 def _healthy_card(healthy: HealthyResidual) -> HealthyCard:

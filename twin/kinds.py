@@ -36,6 +36,7 @@ class ModelKind:
     name: in cards and on the command line. title: for people. fit: from data to a model. trainers: those that can
     train it. variants: what comparisons train; without any, the kind itself. predicts: the speed, which the tacho then
     measures, or the readings themselves. knows_drives: it can be put behind a drive (twin.models.drive).
+    averages_networks: it can be the mean of several trainings (twin.fitting.mean_model).
     """
 
     name: str
@@ -45,6 +46,7 @@ class ModelKind:
     variants: tuple[Variant, ...] = ()
     predicts: Literal["speed", "readings"] = "speed"
     knows_drives: bool = False
+    averages_networks: bool = False
 
 
 KINDS = [
@@ -56,6 +58,7 @@ KINDS = [
         partial(fit_network_ode, units=neural_ode.UNITS, make=NeuralOde),
         trainers=("levenberg-marquardt", "adam"),
         knows_drives=True,
+        averages_networks=True,
     ),
     ModelKind(
         Hybrid.kind,
@@ -63,6 +66,7 @@ KINDS = [
         partial(fit_network_ode, units=hybrid.UNITS, make=Hybrid),
         trainers=("levenberg-marquardt", "adam"),
         knows_drives=True,
+        averages_networks=True,
         variants=(Variant("hybrid", "hybrid [w, tau]"), Variant("hybrid-w", "hybrid [w]", network_inputs=("speed",))),
     ),
 ]

@@ -57,7 +57,7 @@ def choose_prior_std(
                 seed=seed,
                 physics=physics,
                 prior_std=prior_std,
-                progress=within(f"network {index + 1} of {len(prior_stds)}", of_fold),
+                progress=within(f"choice {index + 1} of {len(prior_stds)}", of_fold),
             )
             losses[index] += [_loss(trained, parameters, run) for run in left_out]
     return prior_stds[simplest_of_the_best(np.array(losses))]

@@ -30,7 +30,8 @@ SILENT_NETWORK = "the network is not used: free runs with it were no better than
 class FitRequest:
     """Data and settings of a fit. See build.train_twin; max_iterations None: the default of the fit.
 
-    drive: what the commands of the runs have passed already; the model is put behind it.
+    drive: what the commands of the runs have passed already; the model is put behind it. networks: see
+    training.train_network.
     """
 
     runs: Sequence[Run]
@@ -43,6 +44,7 @@ class FitRequest:
     physics: Physics = "refined"
     progress: Progress = unreported
     drive: FoundDrive | None = None
+    networks: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,5 +135,6 @@ def _by_levenberg_marquardt(untrained: NetworkOde, request: FitRequest, limit: i
         seed=request.seed,
         physics=request.physics,
         prior_std=prior_std,
+        networks=request.networks,
         progress=request.progress,
     )

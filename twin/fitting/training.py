@@ -8,6 +8,9 @@ iterations instead of thousands, because the model is small enough for second-or
 2. The same until it no longer improves.
 3. The free run itself, over stretches as long as practical, from their measured speeds.
 
+Where several networks are asked for, as many of the best starts go on, each by itself, and the model is the mean of
+those that end about as well as the best (twin.fitting.mean_model): then hardly anything depends on the seed.
+
 Every iterate is evaluated as it would be used: by its free run from the measured start, over the held-out runs, or over
 the training runs where none are given. The best one is kept. The untrained network (all weights zero: for a hybrid, its
 physics) is a candidate. Training stops when held-out runs no longer improve.
@@ -32,21 +35,25 @@ from twin.fitting.free_run_fit import (
     robust_scale,
 )
 from twin.fitting.identification import Identification, inertia_anchor
-from twin.fitting.initial_weights import initial_weights
+from twin.fitting.initial_weights import PLACEMENTS, initial_weights
+from twin.fitting.mean_model import mean_model
 from twin.fitting.trajectories import MAX_SAMPLES, cut_into_trajectories, practical_samples, stretch_samples
 from twin.models.model import NetworkOde
 from twin.models.network import Scaling
 from twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
 from twin.models.physics import LAG, PARAMETER_NAMES
-from twin.progress import Progress, unreported
+from twin.progress import Progress, unreported, within
 from twin.runs import Array, Run
 
 Physics = Literal["fixed", "refined"]
 
 SHORT_STRETCH_TIME_CONSTANTS = 10.0
-STARTS, START_ITERATIONS, START_SAMPLES = 4, 5, 30_000
+STARTS_OF_NETWORK, START_ITERATIONS, START_SAMPLES = 4, 5, 30_000
+MOST_NETWORKS = PLACEMENTS // STARTS_OF_NETWORK
 SHORT_SHARE = 0.75
 TOLERANCE = 1e-4
+ABOUT_AS_WELL = 1.03
+"""a network whose free run has a larger loss, relative to that of the best one, is left out of the mean"""
 MAX_STALLED_ITERATIONS = 10
 # Weights have a prior standard deviation of ten in scaled units: too wide to matter where there are data.
 PRIOR_PRECISION = 0.01
@@ -78,74 +85,128 @@ def train_network(
     seed: int = 0,
     physics: Physics = "refined",
     prior_std: float = GRID_PRIOR_STD,
+    networks: int = 1,
     progress: Progress = unreported,
 ) -> tuple[NetworkOde, Array, int]:
     """Train the model's network. Returns the trained model, the parameters (fans, 4) and the iterations taken.
 
-    max_iterations: of the start that is continued; those of all starts come before and are not counted. physics:
+    max_iterations: of each network; those of the starts come before and are not counted. physics:
     "refined" fits J, alpha, C_D and the lag of each fan along with the network; "fixed" leaves them as they were
     identified, as published.
     prior_std: how far the network's acceleration may be from the physics where there are no data, in units of its scale
     (twin.fitting.cross_validation chooses it). Zero: the weights stay zero.
+    networks: how many are trained; the model is the mean of those that end about as well as the best.
     """
     if prior_std == 0.0:
         return model.with_theta(np.zeros_like(model.network.theta)), identification.parameters, 0
-    pieces = evaluation_pieces(runs)
-    period_s = min(piece.median_period_s for piece in pieces)
-    short = stretch_samples(float(identification.time_constant_s.max()), period_s, SHORT_STRETCH_TIME_CONSTANTS)
-    top_speed = identification.top_speed_rad_s
-    start_physics = fitted_unknowns(identification.parameters, top_speed)
-    free = np.full(start_physics.shape, physics == "refined")
-    # A lag that identification has not found stays out of the model.
-    free[:, LAG] &= identification.parameters[:, LAG] > 0.0
-    pull = inertia_anchor(sum(piece.samples for piece in pieces))
-    prior = Prior(PRIOR_PRECISION, pull, start_physics, _network_prior(model, identification, prior_std))
-    untrained = Unknowns(np.zeros_like(model.network.theta), start_physics, np.zeros(0))
-    best_run = _BestFreeRun(
-        model, untrained, validation_runs or runs, bool(validation_runs), top_speed, max_iterations, progress
-    )
+    training = _Training(model, runs, validation_runs, identification, physics, prior_std)
+    starts = training.starts(np.random.default_rng(seed), STARTS_OF_NETWORK * networks, progress)
+    trained = [
+        training.continued(start, max_iterations, _numbered(progress, number, networks))
+        for number, start in enumerate(starts[:networks])
+    ]
+    least = min(one.best_loss for one in trained)
+    kept = [training.model_of(one.best) for one in trained if one.best_loss <= ABOUT_AS_WELL * least]
+    return *mean_model(kept), sum(one.iterations for one in trained)
 
-    stretches = cut_into_trajectories(pieces, short)
-    few = stretches.thinned(START_SAMPLES)
-    starts: list[FreeRunFit] = []
 
-    def start_iteration_done(iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
-        progress("starting weights", START_ITERATIONS * len(starts) + iteration, STARTS * START_ITERATIONS, rmse_rad_s)
-        return False
+def _numbered(progress: Progress, number: int, count: int) -> Progress:
+    return within(f"network {number + 1} of {count}", progress) if count > 1 else progress
 
-    for theta in initial_weights(model, pieces, identification, np.random.default_rng(seed), STARTS):
-        fit = fit_free_run(
-            model.with_theta(theta),
-            start_physics,
-            top_speed,
-            few,
-            free=np.zeros_like(free),
-            prior=prior,
-            max_iterations=START_ITERATIONS,
-            iteration_done=start_iteration_done,
+
+class _Training:
+    """What all trainings of a model have in common: the data, the priors, and how long stretches are."""
+
+    def __init__(
+        self,
+        model: NetworkOde,
+        runs: Sequence[Run],
+        validation_runs: Sequence[Run],
+        identification: Identification,
+        physics: Physics,
+        prior_std: float,
+    ) -> None:
+        self._model = model
+        self._pieces = evaluation_pieces(runs)
+        self._judged_runs, self._held_out = validation_runs or runs, bool(validation_runs)
+        self._identification = identification
+        self._top_speed_rad_s = identification.top_speed_rad_s
+        period_s = min(piece.median_period_s for piece in self._pieces)
+        short = stretch_samples(float(identification.time_constant_s.max()), period_s, SHORT_STRETCH_TIME_CONSTANTS)
+        self._stretches = cut_into_trajectories(self._pieces, short)
+        self._physics = fitted_unknowns(identification.parameters, self._top_speed_rad_s)
+        self._free = np.full(self._physics.shape, physics == "refined")
+        # A lag that identification has not found stays out of the model.
+        self._free[:, LAG] &= identification.parameters[:, LAG] > 0.0
+        pull = inertia_anchor(sum(piece.samples for piece in self._pieces))
+        self._prior = Prior(PRIOR_PRECISION, pull, self._physics, _network_prior(model, identification, prior_std))
+
+    def starts(self, rng: np.random.Generator, count: int, progress: Progress) -> list[Unknowns]:
+        """So many of them, each after a few steps with the physics as identified, best first."""
+        few = self._stretches.thinned(START_SAMPLES)
+        fits: list[FreeRunFit] = []
+
+        def iteration_done(iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
+            done = START_ITERATIONS * len(fits) + iteration
+            progress("starting weights", done, START_ITERATIONS * count, rmse_rad_s)
+            return False
+
+        for theta in initial_weights(self._model, self._pieces, self._identification, rng, count):
+            fit = fit_free_run(
+                self._model.with_theta(theta),
+                self._physics,
+                self._top_speed_rad_s,
+                few,
+                free=np.zeros_like(self._free),
+                prior=self._prior,
+                max_iterations=START_ITERATIONS,
+                iteration_done=iteration_done,
+            )
+            fits.append(fit)
+        ranked = sorted(fits, key=lambda fit: fit.rmse_rad_s if np.isfinite(fit.rmse_rad_s) else np.inf)
+        return [fit.point.unknowns for fit in ranked]
+
+    def continued(self, start: Unknowns, max_iterations: int, progress: Progress) -> "_BestFreeRun":
+        """A training from a start to its end."""
+        best_run = self._best_free_run(max_iterations, progress)
+        best_run.consider(start)
+        best = start
+        for data, share, estimate in (
+            (self._stretches, SHORT_SHARE, True),
+            (cut_into_trajectories(self._pieces, practical_samples(self._pieces, MAX_SAMPLES)), 1.0, False),
+        ):
+            fit = fit_free_run(
+                self._model.with_theta(best.weights),
+                best.physics,
+                self._top_speed_rad_s,
+                data,
+                free=self._free,
+                prior=self._prior,
+                max_iterations=round(share * max_iterations) - best_run.iterations,
+                tolerance=TOLERANCE,
+                estimate_initial_speed=estimate,
+                iteration_done=best_run.iteration_done,
+            )
+            best_run.stage_done(fit.iterations)
+            best = best_run.best
+        return best_run
+
+    def model_of(self, unknowns: Unknowns) -> tuple[NetworkOde, Array]:
+        """The model of these unknowns, and the parameters (fans, 4)."""
+        parameters = physical_parameters(unknowns.physics, self._top_speed_rad_s)
+        return self._model.with_theta(unknowns.weights), parameters
+
+    def _best_free_run(self, max_iterations: int, progress: Progress) -> "_BestFreeRun":
+        untrained = Unknowns(np.zeros_like(self._model.network.theta), self._physics, np.zeros(0))
+        return _BestFreeRun(
+            self._model,
+            untrained,
+            self._judged_runs,
+            self._held_out,
+            self._top_speed_rad_s,
+            max_iterations,
+            progress,
         )
-        starts.append(fit)
-    best = min(starts, key=lambda fit: fit.rmse_rad_s if np.isfinite(fit.rmse_rad_s) else np.inf).point.unknowns
-    best_run.consider(best)
-    for data, share, estimate in (
-        (stretches, SHORT_SHARE, True),
-        (cut_into_trajectories(pieces, practical_samples(pieces, MAX_SAMPLES)), 1.0, False),
-    ):
-        fit = fit_free_run(
-            model.with_theta(best.weights),
-            best.physics,
-            top_speed,
-            data,
-            free=free,
-            prior=prior,
-            max_iterations=round(share * max_iterations) - best_run.iterations,
-            tolerance=TOLERANCE,
-            estimate_initial_speed=estimate,
-            iteration_done=best_run.iteration_done,
-        )
-        best_run.stage_done(fit.iterations)
-        best = best_run.best
-    return model.with_theta(best.weights), physical_parameters(best.physics, top_speed), best_run.iterations
 
 
 def _network_prior(model: NetworkOde, identification: Identification, prior_std: float) -> NetworkPrior:

@@ -87,3 +87,7 @@ class NetworkOde(OdeModel, Protocol):
     def network(self) -> TanhNetwork:
         """Its network."""
         ...
+
+    def with_network(self, network: TanhNetwork) -> Self:
+        """The same model with another network."""
+        ...

@@ -35,7 +35,11 @@ class NetworkOde:
 
     def with_theta(self, theta: Array) -> Self:
         """The same model with other weights."""
-        return replace(self, network=self.network.with_theta(theta))
+        return self.with_network(self.network.with_theta(theta))
+
+    def with_network(self, network: TanhNetwork) -> Self:
+        """The same model with another network."""
+        return replace(self, network=network)
 
     def with_drive(self, drive: Drive) -> Self:
         """The same model behind a drive; its parameters are then (fans, 7)."""

@@ -56,7 +56,7 @@ def train(
     seed: Annotated[int, typer.Option(help="The same seed and recordings give the same twin.")] = 0,
     trainer: Annotated[Trainer, typer.Option(help="adam is the published one.")] = "levenberg-marquardt",
     iterations: Annotated[
-        int | None, typer.Option(min=1, help="Maximum iterations. Default: depends on the trainer.")
+        int | None, typer.Option(min=1, help="Maximum iterations of each network. Default: depends on the trainer.")
     ] = None,
     network_inputs: Annotated[
         NetworkInputs, typer.Option(help="Inputs of the network (hybrid, neural ODE).")
@@ -64,6 +64,12 @@ def train(
     physics: Annotated[
         Physics, typer.Option(help="Hybrid: physics refined with the network, or fixed as identified.")
     ] = "refined",
+    networks: Annotated[
+        int,
+        typer.Option(
+            min=1, max=6, help="Networks to train and average (hybrid, neural ODE), for as many times the time."
+        ),
+    ] = 1,
     command_unit: Annotated[str, typer.Option(help="Unit of the command, for the card, e.g. %.")] = "",
     json_output: JsonOption = False,
 ) -> None:
@@ -76,7 +82,7 @@ def train(
 
     Example: fantwin train healthy-1.mcap healthy-2.mcap --validate healthy-3.mcap --model hybrid -o TWIN.onnx
     """
-    not_written = "no twin was written; --iterations N ends after N iterations and writes one"
+    not_written = "no twin was written; --iterations N ends after N iterations of each network and writes one"
     with interruptible(not_written), twin_errors():
         from twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
         from twin.kinds import find_kind  # noqa: PLC0415
@@ -103,6 +109,7 @@ def train(
                 max_iterations=iterations,
                 network_inputs=tuple(network_inputs.split(",")),
                 physics=physics,
+                networks=networks,
                 command_unit=command_unit,
                 fan_numbers=training_data.fans,
                 data=data_cards(training_data),

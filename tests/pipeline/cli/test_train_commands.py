@@ -116,10 +116,13 @@ def test_identify_shows_a_row_for_each_fan(folder):
     assert [row[0] for row in rows if row and row[0].isdigit()] == ["0", "1"]
 
 
-@pytest.mark.parametrize("model", ["physical", "narx", "neural-ode", "hybrid"])
-def test_each_model_is_trained_and_its_file_evaluates_to_the_printed_figures(folder, tmp_path, model):
+@pytest.mark.parametrize(
+    ("model", "networks"), [("physical", 1), ("narx", 1), ("neural-ode", 1), ("hybrid", 1), ("hybrid", 2)]
+)
+def test_each_model_is_trained_and_its_file_evaluates_to_the_printed_figures(folder, tmp_path, model, networks):
     file = tmp_path / "twin.onnx"
-    arguments = ("--model", model, "--validate", folder / "held-out.mcap", "--iterations", "2", "--json")
+    arguments = ("--model", model, "--validate", folder / "held-out.mcap", "--iterations", 2, "--json")
+    arguments += ("--networks", networks)
     result = json.loads(fantwin("train", folder / "healthy.mcap", "--to", 15, *arguments, "-o", file).stdout)
     assert (result["model"], result["twin"], result["evaluated_on"], result["fans"]) == (
         model,
@@ -131,6 +134,12 @@ def test_each_model_is_trained_and_its_file_evaluates_to_the_printed_figures(fol
     for figure in ("rmse", "max_error", "r2", "one_step_rmse", "coverage_2_sigma"):
         assert evaluated[figure] == pytest.approx(result[figure], rel=1e-4), figure
     assert evaluated["samples"] == 4000
+    assert OnnxTwin(file).card.training.networks == networks
+
+
+def test_several_networks_are_refused_where_there_is_one_result(folder, tmp_path):
+    error = error_of("train", folder / "healthy.mcap", "--model", "narx", "--networks", 2, "-o", tmp_path / "t.onnx")
+    assert "several networks cannot be averaged with model narx" in error
 
 
 def test_the_error_of_a_good_twin_is_the_noise(folder, twin):

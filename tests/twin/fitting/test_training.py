@@ -6,6 +6,7 @@ import pytest
 from tests.support import fan_data
 from twin.build import TrainedTwin, evaluate, train_twin
 from twin.errors import TwinError
+from twin.fitting import training
 from twin.fitting.identification import identify
 from twin.fitting.outliers import without_outliers
 from twin.fitting.torch_reference import train_adam
@@ -48,6 +49,25 @@ def test_any_seed_finds_the_way_to_the_noise(rough) -> None:
         for seed in range(3)
     ]
     assert max(errors) < 1.02, errors
+
+
+def test_the_mean_of_several_networks_hardly_depends_on_the_seed(rough) -> None:
+    short = rough[0].between(0.0, 25.0)
+    twins = [train_twin([short], [], "hybrid", name="x", seed=seed, max_iterations=25, networks=4) for seed in range(3)]
+    errors = [times_noise(twin, rough[2]) for twin in twins]
+    assert max(errors) < 1.03 * min(errors), "that of a single network differs by 5 %"
+    assert all(twin.card.training.networks == 4 for twin in twins)
+    assert all(20 <= twin.card.network.units <= 40 for twin in twins)
+
+
+def test_a_network_that_ends_worse_is_left_out_of_the_mean(rough, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = rough[1].between(0.0, 10.0)
+
+    def units(least_loss: float) -> int:
+        monkeypatch.setattr(training, "ABOUT_AS_WELL", least_loss)
+        return train_twin([run], [], "hybrid", name="x", max_iterations=2, networks=3).card.network.units
+
+    assert (units(1.0), units(1e9)) == (10, 30)
 
 
 def test_fixed_physics_stay_as_identified_and_refined_ones_move(rough) -> None:
@@ -142,15 +162,17 @@ def test_progress_is_reported_of_each_part_of_the_work(rough) -> None:
         "hybrid",
         name="x",
         max_iterations=5,
+        networks=2,
         progress=lambda part, *values: reported.setdefault(part, []).append(values),
     )
+    trainings = ["network 1 of 2: training", "network 2 of 2: training"]
     assert list(reported) == [
         "identification: first estimate",
         "identification",
         "identification without lag",
         "identification: checks",
         "starting weights",
-        "training",
+        *trainings,
         "evaluation",
         "torque balance",
     ]
@@ -158,9 +180,10 @@ def test_progress_is_reported_of_each_part_of_the_work(rough) -> None:
         done = [values[0] for values in part]
         assert done == sorted(set(done))
         assert done[-1] <= part[-1][1]
-    assert {at_most for _, at_most, _ in reported["training"]} == {5}, "as many as asked for"
-    assert trained.card.training.iterations <= 5
-    assert all(rmse > 0.0 for part in ("identification", "starting weights", "training") for *_, rmse in reported[part])
+    asked_for = {at_most for training in trainings for _, at_most, _ in reported[training]}
+    assert asked_for == {5}, "as many as asked for"
+    assert trained.card.training.iterations <= 2 * 5
+    assert all(rmse > 0.0 for part in ("identification", "starting weights", *trainings) for *_, rmse in reported[part])
 
 
 def test_a_single_iteration_is_one(rough) -> None:
@@ -187,6 +210,9 @@ def test_adam_lowers_the_free_run_error_from_the_physics_on(rough) -> None:
         ({"kind": "oracle"}, "kind 'oracle' is unknown; use one of physical, narx"),
         ({"kind": "narx", "trainer": "adam"}, "cannot train the narx model"),
         ({"kind": "hybrid", "trainer": "luck"}, "trainer 'luck' is unknown"),
+        ({"kind": "narx", "networks": 2}, "several networks cannot be averaged with model narx"),
+        ({"kind": "hybrid", "trainer": "adam", "networks": 2}, "and trainer adam; use the hybrid"),
+        ({"kind": "hybrid", "networks": 7}, "7 networks cannot be averaged; ask for 1 to 6"),
     ],
 )
 def test_an_impossible_request_is_refused_in_one_line(rough, options: dict, words: str) -> None:
