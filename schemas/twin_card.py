@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
+from schemas.model_uncertainty import ModelUncertainty
 from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 
@@ -218,6 +219,8 @@ class TwinCard:
     of fans that control their own speed; None: the command acts as it is. reading_sigma_rad_s: per fan, root mean
     square of the distance of healthy readings from those that the tachos may show of the free run, of fans that neither
     start nor stand; empty in early cards and where tachos are instantaneous: it is sigma_rad_s there.
+    model_uncertainty: how far the twin itself may be wrong at each speed and command, for the fans together; of hybrids
+    whose network is used, None in early cards.
     """
 
     kind: str
@@ -250,6 +253,7 @@ class TwinCard:
     standstill: Standstill | None = None
     drive: DriveCard | None = None
     reading_sigma_rad_s: tuple[Positive, ...] = ()
+    model_uncertainty: ModelUncertainty | None = None
     format_version: int = FORMAT_VERSION
 
     @model_validator(mode="after")

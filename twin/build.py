@@ -39,10 +39,12 @@ from twin.fitting.balance_fit import BalanceFit, fit_balance
 from twin.fitting.drive_fit import find_drive
 from twin.fitting.identification import Identification, identify
 from twin.fitting.model_fits import FitRequest, Trainer
+from twin.fitting.model_uncertainty import model_uncertainty
 from twin.fitting.standstill import find_standstill
 from twin.fitting.training import MOST_NETWORKS, Physics
 from twin.kinds import BOTH_INPUTS, ModelKind, find_kind
 from twin.models.drive import DRIVE_PARAMETERS
+from twin.models.hybrid import Hybrid
 from twin.models.model import Model
 from twin.models.physics import PARAMETER_NAMES
 from twin.progress import Progress, unreported, within
@@ -196,6 +198,17 @@ def train_twin(
         standstill=standstill,
         drive=drive.card if drive else None,
         reading_sigma_rad_s=_reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces),
+        model_uncertainty=(
+            model_uncertainty(
+                model,
+                parameters[:, : len(PARAMETER_NAMES)],
+                drive.raised(runs) if drive else runs,
+                acting,
+                identification,
+            )
+            if isinstance(model, Hybrid) and np.any(model.theta)
+            else None
+        ),
     )
     return TrainedTwin(model, parameters, card, identification, validation)
 

@@ -51,11 +51,20 @@ def splits() -> list[Split]:
         return [split for load in (_esc_test, _imrclab, _rosa, _undcmotor, _cigan_bldc) for split in load(Path(folder))]
 
 
+def esc_test() -> list[Run]:
+    """The run of esc_test with the duty as its command."""
+    with tempfile.TemporaryDirectory() as folder:
+        return _esc_test_runs(Path(folder), "Duty")
+
+
+def _esc_test_runs(folder: Path, command: str) -> list[Run]:
+    return _imported(_file("esc_test/f40_steps_5-2.csv"), folder, "Timestamp", None, [command], ["RPM:rpm"])
+
+
 def _esc_test(folder: Path) -> list[Split]:
     made = []
     for name, command in (("duty", "Duty"), ("motor volts", "Motor Volts")):
-        table = _file("esc_test/f40_steps_5-2.csv")
-        runs = _imported(table, folder, "Timestamp", None, [command], ["RPM:rpm"])
+        runs = _esc_test_runs(folder, command)
         # Two stairs up and the largest step down; the rest climbs to the same top and steps down to half of that.
         made.append(
             _by_time(

@@ -1,7 +1,7 @@
 """What a report says, in numbers: a twin run freely over recordings, fan by fan."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,9 +42,9 @@ class Parameter:
 class FanContent:
     """One fan. Arrays (n,) are in rad/s or command units, over all pieces one after the other.
 
-    column: of the runs. number: as the recording counts fans. predicted_rad_s: the readings expected of the free
-    run, NaN where it diverged. error_rad_s: measured minus that, NaN where nothing is compared, infinite where the free
-    run diverged.
+    column: of the runs. raised_command: with a drive, the command or the end of its plateau. number: as the recording
+    counts fans. predicted_rad_s: the readings expected of the free run, NaN where it diverged. error_rad_s: measured
+    minus that, NaN where nothing is compared, infinite where the free run diverged.
     """
 
     column: int
@@ -52,6 +52,7 @@ class FanContent:
     figures: Figures
     sigma_rad_s: float
     command: Array
+    raised_command: Array
     measured_rad_s: Array
     predicted_rad_s: Array
     error_rad_s: Array
@@ -107,6 +108,10 @@ def report_content(
     command, measured = (
         np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("command", "speed_rad_s")
     )
+    raised = command
+    if drive := twin.card.drive:
+        of_rows = tuple(drive.lowest_command[row] for row in rows)
+        raised = replace(drive, lowest_command=of_rows).raised(command)
     predicted = np.concatenate([free_run_readings(twin, parameters, piece) for piece in pieces])
     predicted[~np.isfinite(predicted)] = np.nan
     compared = np.concatenate([compared_readings(piece) for piece in pieces])
@@ -127,6 +132,7 @@ def report_content(
                 figures=evaluation.per_fan[fan],
                 sigma_rad_s=float(sigma_rad_s[fan]),
                 command=command[:, fan],
+                raised_command=raised[:, fan],
                 measured_rad_s=measured[:, fan],
                 predicted_rad_s=predicted[:, fan],
                 error_rad_s=error[:, fan],

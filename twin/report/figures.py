@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+from schemas.model_uncertainty import ModelUncertainty
 from twin.report.content import Content, FanContent
 from twin.report.steady_states import StaticCurve
 from twin.report.timeline import broken_at, kept_samples
@@ -37,6 +38,8 @@ WIDE_IN, NARROW_IN, SMALL_IN = (11.5, 5.4), (4.2, 6.0), (4.0, 2.9)
 WIDE_COLUMNS, NARROW_COLUMNS = 500, 200
 MOST_TICKS = 5
 AROUND_PEAK_SAMPLES = 300
+MOST_MARKS = 500
+CONTOURS = 8
 HISTOGRAM_SIGMAS = 5.0
 HISTOGRAM_BINS = 50
 LONG_DECIMALS = re.compile(r"(\.\d\d)\d+")
@@ -150,6 +153,33 @@ def static_curve(content: Content, fan: FanContent, curve: StaticCurve) -> str:
         axes.set_ylabel(f"speed ({content.unit.name})")
         _legend_above(axes, 2)
         return _svg(figure, f"fan{fan.number}-static", "Steady speed over command")
+
+
+def what_is_known(content: Content, fan: FanContent, uncertainty: ModelUncertainty) -> str:
+    """How far the twin itself may be wrong over speed and command, and where the recordings were."""
+    each, unit = content.unit.rad_s, content.card.command_unit
+    speeds = np.array(uncertainty.speeds_rad_s) / each
+    std = np.array(uncertainty.std_rad_s) / each
+    kept = slice(None, None, max(1, len(fan.command) // MOST_MARKS))
+    with _small_figure() as (figure, axes):
+        filled = axes.contourf(uncertainty.commands, speeds, std, levels=CONTOURS, cmap="Greens", vmin=0.0)
+        axes.plot(
+            fan.raised_command[kept], fan.measured_rad_s[kept] / each, ".", ms=1.5, color=COMMAND, label="measured"
+        )
+        figure.colorbar(filled, ax=axes, label=f"standard deviation ({content.unit.name})")
+        sigma = fan.sigma_rad_s / each
+        if std.min() < sigma < std.max():
+            axes.contour(uncertainty.commands, speeds, std, levels=[sigma], colors=OUTSIDE, linewidths=1.0)
+            axes.plot([], [], color=OUTSIDE, lw=1.0, label="as large as σ")
+        if content.card.command_range[0] >= 0.0:
+            axes.set_xlim(left=0.0)
+        if content.card.speed_range_rad_s[0] >= 0.0:
+            axes.set_ylim(bottom=0.0)
+        axes.grid(visible=False)
+        axes.set_xlabel(f"command ({unit})" if unit else "command")
+        axes.set_ylabel(f"speed ({content.unit.name})")
+        _legend_above(axes, 2)
+        return _svg(figure, f"fan{fan.number}-known", "How far the twin may be wrong over speed and command")
 
 
 def error_over_speed(content: Content, fan: FanContent) -> str:

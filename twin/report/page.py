@@ -127,6 +127,24 @@ def fan_figures(content: Content, fan: FanContent) -> list[Figure]:
             "Points off the zero line are speeds at which the twin is biased; long bars speeds of large scatter.",
             figures.error_over_speed(content, fan),
         ),
+        *_what_is_known(content, fan),
+    ]
+
+
+def _what_is_known(content: Content, fan: FanContent) -> list[Figure]:
+    known = content.card.model_uncertainty
+    if known is None:
+        return []
+    std_rad_s = known.at(fan.predicted_rad_s, fan.raised_command)
+    beyond = std_rad_s[np.isfinite(std_rad_s)] > fan.sigma_rad_s
+    share = f" So are {100.0 * beyond.mean():.3g} % of the samples here." if beyond.size else ""
+    return [
+        Figure(
+            "What the twin knows",
+            "How far the twin itself may be wrong, because of what it has not seen in training. Outside of the red "
+            f"line that is more than the healthy sigma: record there and train again to rely on it.{share}",
+            figures.what_is_known(content, fan, known),
+        )
     ]
 
 

@@ -22,7 +22,7 @@ from simulation.published_fan import published_fan
 from simulation.tacho import NoisyTacho
 from tests.pipeline.cli.test_train_commands import record
 from tests.support.browser import seen_in_browser
-from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run
+from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run, rough_run
 from tests.support.fantwin_command import error_of, fantwin
 from twin.export.onnx_twin import OnnxTwin
 from twin.fitting.identification import identify
@@ -48,6 +48,7 @@ TITLES = [
     "Static curve",
     "Error over speed",
 ]
+TITLES_OF_HYBRID = [*TITLES, "What the twin knows"]
 FIGURES = (
     "over_time",
     "around_the_largest_error",
@@ -56,10 +57,12 @@ FIGURES = (
     "cross_correlation",
     "static_curve",
     "error_over_speed",
+    "what_is_known",
 )
 """the functions that draw them"""
 COLUMNS = ["rmse", "sigma", "max_error", "r2", "coverage_2_sigma", "one_step_rmse", "samples", "rmse_in_sigma"]
 RAD_S = SpeedUnit("rad/s", 1.0)
+CORNERS = {"speeds_rad_s": (0.0, 100.0), "commands": (0.0, 300.0)}
 SMALLEST_TEXT_UNITS = 8.5 * 0.88
 """Height of the smallest text of a figure in the units of its viewBox (points)."""
 
@@ -125,6 +128,15 @@ def page(folder: Path) -> str:
 @pytest.fixture(scope="module")
 def evaluated(folder: Path) -> dict[str, Any]:
     return json.loads(fantwin("evaluate", folder / "healthy.onnx", folder / "held-out.mcap", "--json").stdout)
+
+
+@pytest.fixture(scope="module")
+def hybrid(folder: Path) -> OnnxTwin:
+    """A twin whose card says what it knows: it uses its network."""
+    record(folder / "rough.mcap", rough_run(1, 30.0))
+    made = fantwin("train", folder / "rough.mcap", "--iterations", 10, "-o", folder / "hybrid.onnx")
+    assert made.exit_code == 0, made.output
+    return OnnxTwin(folder / "hybrid.onnx")
 
 
 @pytest.fixture(scope="module")
@@ -432,12 +444,12 @@ def test_a_missing_extra_is_reported_with_what_to_install(folder, tmp_path, comm
 
 
 @pytest.mark.parametrize("width_px", [390, 1280])
-def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(page, tmp_path, width_px):
-    seen = seen_in_browser(page, width_px, tmp_path)
+def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(hybrid, tmp_path, width_px):
+    seen = seen_in_browser(report_page(content_of(hybrid, rough_run(2, 30.0))), width_px, tmp_path)
     assert seen["needs"] <= seen["width"] <= width_px
     assert seen["fetched"] == []
     assert seen["background"] == "rgb(255, 255, 255)"
-    assert [figure["title"] for figure in seen["figures"]] == TITLES
+    assert [figure["title"] for figure in seen["figures"]] == TITLES_OF_HYBRID
     for figure in seen["figures"]:
         ((left, top, width, height),) = [svg["box"] for svg in figure["svgs"]]
         _, caption_top, _, caption_height = figure["caption"]
@@ -456,3 +468,16 @@ def test_on_a_desk_no_table_has_to_be_scrolled(wide_page, tmp_path, width_px):
     seen = seen_in_browser(wide_page, width_px, tmp_path)
     for (_, _, width, _), needed in zip(seen["tables"], seen["needed"], strict=True):
         assert needed <= np.ceil(width)
+
+
+def test_what_the_twin_knows_is_drawn_where_its_card_says_it(twin, hybrid, monkeypatch):
+    assert content_of(twin, published_run(2, 10.0)).card.model_uncertainty is None
+    content = content_of(hybrid, rough_run(2, 10.0))
+    known = content.card.model_uncertainty
+    assert known is not None
+    assert figures.OUTSIDE in figures.what_is_known(content, content.fans[0], known)
+    page = report_page(content)
+    assert [title for title in TITLES_OF_HYBRID if title in page] == TITLES_OF_HYBRID
+    assert page.count("<svg ") == len(TITLES_OF_HYBRID) + 1
+    everywhere = replace(known, std_rad_s=((0.1, 0.2), (0.1, 0.2)), **CORNERS)
+    assert figures.OUTSIDE not in figures.what_is_known(content, content.fans[0], everywhere), "no line where none is"
