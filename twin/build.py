@@ -44,8 +44,8 @@ from twin.fitting.standstill import find_standstill
 from twin.fitting.training import MOST_NETWORKS, Physics
 from twin.kinds import BOTH_INPUTS, ModelKind, find_kind
 from twin.models.drive import DRIVE_PARAMETERS
-from twin.models.hybrid import Hybrid
 from twin.models.model import Model
+from twin.models.network_ode import NetworkOde
 from twin.models.physics import PARAMETER_NAMES
 from twin.progress import Progress, unreported, within
 from twin.runs import Array, Run, common_fans, common_tacho
@@ -206,7 +206,7 @@ def train_twin(
                 acting,
                 identification,
             )
-            if isinstance(model, Hybrid) and np.any(model.theta)
+            if isinstance(model, NetworkOde) and model.has_physics and np.any(model.theta)
             else None
         ),
     )

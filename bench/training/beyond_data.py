@@ -20,6 +20,7 @@ from bench.training.rough_table import DUTY_RANGE, simulated_plant
 from simulation.published_fan import random_stairs
 from twin.build import TrainedTwin, train_twin
 from twin.evaluation.accuracy import compared_readings, evaluation_pieces, free_run_readings
+from twin.evaluation.own_error import own_error_rad_s
 from twin.runs import Run
 
 SHARE = 0.75
@@ -86,7 +87,9 @@ def _judged(twin: TrainedTwin, runs: Sequence[Run], trained_to: float, unit_rad_
         error = compared_readings(piece) - predicted
         kept = np.isfinite(error) & (piece.command > trained_to)
         errors.append(error[kept])
-        own.append((uncertainty.at(predicted, piece.command) if uncertainty else np.zeros_like(error))[kept])
+        own.append(
+            (own_error_rad_s(uncertainty, predicted, piece.command) if uncertainty else np.zeros_like(error))[kept]
+        )
     error, own_rad_s = np.concatenate(errors), np.concatenate(own)
     return {
         "rmse": float(np.sqrt(np.mean(error**2))) / unit_rad_s,

@@ -65,10 +65,7 @@ def train(
         Physics, typer.Option(help="Hybrid: physics refined with the network, or fixed as identified.")
     ] = "refined",
     networks: Annotated[
-        int,
-        typer.Option(
-            min=1, max=6, help="Networks to train and average (hybrid, neural ODE), for as many times the time."
-        ),
+        int, typer.Option(help="Networks to train and average (hybrid, neural ODE), for as many times the time.")
     ] = 1,
     command_unit: Annotated[str, typer.Option(help="Unit of the command, for the card, e.g. %.")] = "",
     json_output: JsonOption = False,

@@ -140,6 +140,7 @@ def test_each_model_is_trained_and_its_file_evaluates_to_the_printed_figures(fol
 def test_several_networks_are_refused_where_there_is_one_result(folder, tmp_path):
     error = error_of("train", folder / "healthy.mcap", "--model", "narx", "--networks", 2, "-o", tmp_path / "t.onnx")
     assert "several networks cannot be averaged with model narx" in error
+    assert "ask for 1 to 6" in error_of("train", folder / "healthy.mcap", "--networks", 0, "-o", tmp_path / "t.onnx")
 
 
 def test_the_error_of_a_good_twin_is_the_noise(folder, twin):

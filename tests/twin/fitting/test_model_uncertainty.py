@@ -8,6 +8,7 @@ from tests.support import fan_data
 from tests.twin.fitting.test_drive_fit import DRIVE, run_of
 from twin.build import TrainedTwin, train_twin
 from twin.evaluation.accuracy import compared_readings, free_run_readings
+from twin.evaluation.own_error import own_error_rad_s
 from twin.fitting.identification import identify
 from twin.fitting.model_uncertainty import model_uncertainty, variance_of_independent
 from twin.models.physical import PhysicalModel
@@ -29,7 +30,7 @@ def known(twin: TrainedTwin) -> ModelUncertainty:
 def along(twin: TrainedTwin, run: Run) -> tuple[Array, Array]:
     """(n,) the error of the free run, and what it may be, of one fan."""
     predicted = free_run_readings(twin.model, twin.parameters, run)
-    return (compared_readings(run) - predicted)[:, 0], known(twin).at(predicted, run.command)[:, 0]
+    return (compared_readings(run) - predicted)[:, 0], own_error_rad_s(known(twin), predicted, run.command)[:, 0]
 
 
 def test_beyond_its_data_it_says_how_wrong_a_twin_may_be_and_within_them_that_it_is_right(upper) -> None:
@@ -52,7 +53,9 @@ def test_more_data_leave_less_open() -> None:
     assert short is not None
     assert long is not None
     speed_rad_s = np.nan_to_num(run.speed_rad_s)
-    short_rad_s, long_rad_s = (np.quantile(each.at(speed_rad_s, run.command), 0.9) for each in (short, long))
+    short_rad_s, long_rad_s = (
+        np.quantile(own_error_rad_s(each, speed_rad_s, run.command), 0.9) for each in (short, long)
+    )
     assert long_rad_s < 0.6 * short_rad_s
 
 
