@@ -50,6 +50,7 @@ class FanScorer:
         forgets_over_gaps: bool = True,
         skips_transients: bool = True,
         allows_for_counts: bool = True,
+        moves_with_twin: bool = True,
     ) -> None:
         """for_calibration: keep what calibration needs, for `observed`; statistics then grow beyond their limits.
 
@@ -57,6 +58,8 @@ class FanScorer:
         skips_transients: False only to decide as for recordings made before fans that moved were not commissioned.
         allows_for_counts: False only to decide as for recordings made before readings of a tacho that counts were
         allowed to be unsteady while the fan changes its speed, and to repeat where a healthy fan would read the same.
+        moves_with_twin: False only to decide as for recordings made when limits widened as the readings changed, and
+        not as the twin's speed does.
         """
         self.limits = limits
         self.residuals: dict[Signal, Residual] = {source: Residual(fans, source, limits) for source in RESIDUALS}
@@ -92,7 +95,8 @@ class FanScorer:
         self._in_use: list[Signal] = [source for source in RESIDUALS if self._detectors_of[source]]
         """residuals with detectors"""
         self._judges_rest = any(row.only_at_rest and row.name in self.detectors for row in self._rows)
-        self._motion = Motion(fans)
+        self._moves_with_twin = moves_with_twin
+        self._motion = Motion(fans, max(tacho.held_s for tacho in of_each_fan) if moves_with_twin else 0.0)
         self._movement = Movement(fans) if skips_transients else None
         self._gaps = Gaps(len(INPUTS), fans) if forgets_over_gaps else None
         self._memories = self._memories_ns()
@@ -255,7 +259,7 @@ class FanScorer:
     def _piece(self, samples: Samples, scores: ScoredBlock) -> Piece:
         """What follows from samples without the baselines. scores: of these samples, not filled in yet."""
         speed_rad_s, period_s = samples.speed_rad_s, samples.period_ns / NS_PER_S
-        motion_rad_s = self._motion.update(speed_rad_s, period_s)
+        motion_rad_s = self._motion.update(self._moving_rad_s(samples), period_s)
         transient_rad_s = np.abs(motion_rad_s)
         values = {"speed": samples.speed_residual, "balance": samples.balance}
         sigma = {"speed": samples.speed_sigma_rad_s, "balance": samples.balance_sigma}
@@ -278,6 +282,12 @@ class FanScorer:
         )
         self._detect("tacho", piece.given(samples.alive), piece.ratios)
         return piece
+
+    def _moving_rad_s(self, samples: Samples) -> Array:
+        """(n, fans) the speed whose changes widen the limits: that of a healthy fan, where a free run predicts it."""
+        if not self._moves_with_twin:
+            return samples.speed_rad_s
+        return np.where(np.isfinite(samples.predicted_rad_s), samples.predicted_rad_s, samples.speed_rad_s)
 
     def _detect(self, source: Signal, given: DetectorInput, ratios: Array) -> None:
         """Write the ratios of the detectors of one input into (rows of the table, n, fans), where it is valid."""

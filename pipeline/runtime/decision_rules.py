@@ -45,6 +45,8 @@ class DecisionRules(IntEnum):
     FALLS = 10
     """The causes of a fan that slows down include those of one that comes to rest. Before, they were named once it
     stood."""
+    MOTION_OF_TWIN = 11
+    """Limits widen while the twin's speed changes. Before, they did while the readings changed, also by a fault."""
 
 
 CURRENT_RULES = max(DecisionRules)

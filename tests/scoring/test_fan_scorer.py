@@ -337,7 +337,12 @@ def test_a_tacho_that_counts_is_not_unsteady_while_its_fan_changes_its_speed() -
     block = white(4000)
     rising = np.clip(np.arange(4000) - 2000, 0, 600)[:, np.newaxis] * 0.05
     steps = 4.0 * np.sign(np.sin(np.arange(4000) / 8.0))[:, np.newaxis] * (rising > 4.0) * (rising < 30.0)
-    seen = replace(block, speed_residual=block.speed_residual + steps, speed_rad_s=block.speed_rad_s + rising)
+    seen = replace(
+        block,
+        speed_residual=block.speed_residual + steps,
+        speed_rad_s=block.speed_rad_s + rising,
+        predicted_rad_s=block.predicted_rad_s + rising,
+    )
     row = [one.name for one in rows()].index("speed_variance_growth")
 
     def largest(tacho: Tacho) -> float:
@@ -345,3 +350,22 @@ def test_a_tacho_that_counts_is_not_unsteady_while_its_fan_changes_its_speed() -
 
     assert largest(Tacho()) > 1.0
     assert largest(Tacho(kind="count", window_s=1.0)) < 1.0
+
+
+def test_limits_widen_while_the_twin_changes_its_speed_and_not_while_a_fault_does() -> None:
+    moving = RESIDUAL.model_copy(update={"transient_scale_rad_s": 1.0})
+    limits = LIMITS.model_copy(update={"speed": moving})
+    still = white(3000)
+    falling = -np.clip(np.arange(3000) - 2000, 0, 200)[:, np.newaxis] * 0.2
+    faulty = replace(still, speed_residual=still.speed_residual + falling, speed_rad_s=still.speed_rad_s + falling)
+    commanded = replace(faulty, predicted_rad_s=still.predicted_rad_s + falling)
+    row = [one.name for one in rows()].index("speed_smoothed")
+
+    def ratio(samples: Samples, *, moves_with_twin: bool = True) -> float:
+        scorer = FanScorer(FANS, limits, moves_with_twin=moves_with_twin)
+        return float(scorer.update(samples).ratios[2100, row].min())
+
+    not_widened = ratio(replace(faulty, speed_rad_s=still.speed_rad_s))
+    assert ratio(faulty) == not_widened
+    assert ratio(commanded) < 0.5 * not_widened
+    assert ratio(faulty, moves_with_twin=False) < 0.5 * not_widened
