@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 from schemas.standstill import Standstill
 from schemas.twin_card import DriveCard
 from twin.errors import TwinError
-from twin.fitting.free_run_fit import HUBER_DELTA, robust_scale
+from twin.fitting.free_run_fit import HUBER_DELTA
 from twin.fitting.identification import Identification
+from twin.fitting.reading_errors import reliability, robust_scale
 from twin.fitting.trajectories import MAX_SAMPLES, Trajectories, cut_into_trajectories, practical_samples
 from twin.models.drive import DRIVE_PARAMETERS, Drive
 from twin.models.integration import free_run, rk4_step_derivatives
 from twin.models.physical import fitted_unknowns, parameters_by_unknowns, physical_parameters
-from twin.models.physics import LAG
+from twin.models.physics import LAG, PARAMETER_NAMES
 from twin.models.recursion import linear_recursion
 from twin.models.right_hand_side import FanEquation
 from twin.progress import Progress, unreported
@@ -44,6 +45,7 @@ FIRST_PLATEAU, FIRST_KICK = 0.05, 0.5
 """shares of the range of commands above the lowest that turns the fans"""
 LOWEST, FRICTION, KICK = (LAG + index for index in range(len(DRIVE_PARAMETERS)))
 UNKNOWNS = LAG + len(DRIVE_PARAMETERS)
+INERTIA = PARAMETER_NAMES.index("J")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +133,13 @@ def find_drive(
     friction_alone = _Problem(judged, never, plain.top_speed_rad_s, highest).mean_square(of_friction)
     if not with_drive < (1.0 - LEAST_GAIN) ** 2 * friction_alone:
         return None
-    return FoundDrive(drive, best[:, LAG:])
+    # Inertia and kick show while the speed changes, when readings say little of the rest.
+    by_reliability = _Problem(learned, drive, plain.top_speed_rad_s, highest)
+    by_reliability.weight_like(best)
+    steady = everything.copy()
+    steady[[INERTIA, KICK]] = False
+    final = by_reliability.fit(best, steady, MORE_ITERATIONS, iteration_done)
+    return FoundDrive(drive, final[:, LAG:])
 
 
 def _starts(run: Run, turning_command: float) -> NDArray[np.intp]:
@@ -162,6 +170,7 @@ class _Problem:
 
     def __init__(self, runs: _Runs, drive: Drive, top_speed_rad_s: Array, highest_command: float) -> None:
         self._data, self._drive = runs.data, drive
+        self._reliability = np.ones(self._data.command.shape)
         self._share = runs.kick(drive)
         self._top_speed_rad_s = top_speed_rad_s
         self._fans = len(top_speed_rad_s)
@@ -196,18 +205,23 @@ class _Problem:
             iteration_done()
         return unknowns
 
+    def weight_like(self, unknowns: Array) -> None:
+        """Let readings count by their reliability in the free run of these unknowns."""
+        self._reliability = reliability(*self._residual(unknowns), self._data)
+
     def mean_square(self, unknowns: Array) -> float:
         """Mean square of the residual of all fans, (rad/s)^2."""
         residual, _ = self._residual(unknowns)
         return float(np.sum(residual**2) / np.count_nonzero(self._data.compared))
 
     def _residual(self, unknowns: Array) -> tuple[Array, Array]:
-        """(n, batch) readings minus those expected, 0 where nothing is compared, and the speeds of the free run."""
+        """(n, batch) weighted readings less those expected, 0 where nothing is compared; and the free run's speeds."""
         data = self._data
         equation, command = self._equation(unknowns)
         speed, _ = free_run(equation, self._initial, command, data.step_s, self._guess)
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.where(data.compared, data.speed_rad_s - data.measurement.of_speed(speed), 0.0), speed
+            error = data.speed_rad_s - data.measurement.of_speed(speed)
+            return np.where(data.compared, self._reliability * error, 0.0), speed
 
     def _equation(self, unknowns: Array) -> tuple[FanEquation, Array]:
         fan = self._data.fan
@@ -235,7 +249,8 @@ class _Problem:
         forcing = np.zeros((*command.shape, UNKNOWNS))
         forcing[1:, :, :LAG] = np.einsum("nbp,bpq->nbq", by_physics, chain)
         forcing[1:, :, LAG:] = by_command[..., np.newaxis] * by_settings[:-1]
-        sensitivity = data.measurement.of_speed(linear_recursion(by_speed, forcing)).transpose(1, 0, 2)
+        readings = data.measurement.of_speed(linear_recursion(by_speed, forcing))
+        sensitivity = (readings * self._reliability[..., np.newaxis]).transpose(1, 0, 2)
         weight = np.where(data.compared, 1.0 / np.hypot(1.0, residual / (HUBER_DELTA * scale[fan])), 0.0)
         weighted = sensitivity * weight.T[..., np.newaxis]
         squares, gradient = np.zeros((self._fans, UNKNOWNS, UNKNOWNS)), np.zeros((self._fans, UNKNOWNS))

@@ -1,8 +1,8 @@
 """Levenberg-Marquardt on the free-run error, with exact sensitivities.
 
-Minimises the sum of a pseudo-Huber loss of (reading - that of the free run) / scale over every sample that is compared.
-What the tachos are expected to show of a free run is linear in it (twin.measurement), and so in its sensitivities. The
-unknowns are
+Minimises the sum of a pseudo-Huber loss of (reading - that of the free run) / scale over every sample that is compared;
+if asked, the more reliable a reading is, the more it counts (twin.fitting.reading_errors). What the tachos are expected
+to show of a free run is linear in it (twin.measurement), and so in its sensitivities. The unknowns are
 
     the weights of a network, shared by all fans,
     each fan's own physics (twin.models.physical: ln J, two ln dampings, lag), and
@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.fitting.reading_errors import counts, reliability, robust_scale
 from twin.fitting.trajectories import Trajectories
 from twin.models.integration import free_run, free_run_sensitivities
 from twin.models.lag import effective_command, effective_command_by_lag
@@ -36,7 +37,6 @@ from twin.runs import Array
 Flags = NDArray[np.bool_]
 
 HUBER_DELTA = 3.0
-NORMAL_90_PERCENT = 1.645
 SCALE_ROUNDS = 2
 MAX_CHUNK_NUMBERS = 4_000_000
 DAMPING_DOWN, DAMPING_UP = 3.0, 4.0
@@ -44,6 +44,7 @@ FIRST_DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e9
 HELD = 1e12
 
 ALL_FREE = np.ones(len(PARAMETER_NAMES), dtype=bool)
+OF_STEADY_SPEEDS = np.array([name in ("alpha", "C_D") for name in PARAMETER_NAMES])
 NONE_FREE = np.zeros(len(PARAMETER_NAMES), dtype=bool)
 
 
@@ -97,8 +98,8 @@ class NetworkPrior:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A candidate: its free run and the residual of its readings (n, batch), zero where nothing is compared, and its
-    cost (fans,) without the prior."""
+    """A candidate: its free run and the residual of its readings (n, batch), each times its reliability and zero where
+    nothing is compared, and its cost (fans,) without the prior."""
 
     unknowns: Unknowns
     speed_rad_s: Array
@@ -108,11 +109,11 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class FreeRunFit:
-    """The solution. rmse_rad_s over all samples. scale_rad_s: (fans,)."""
+    """The solution. rmse_rad_s over all samples. error_rad_s: (n, batch), zero where nothing is compared."""
 
     point: Point
     rmse_rad_s: float
-    scale_rad_s: Array
+    error_rad_s: Array
     iterations: int
 
 
@@ -131,26 +132,32 @@ def fit_free_run(
     max_iterations: int,
     tolerance: float = 1e-5,
     estimate_initial_speed: bool = True,
+    by_reliability: bool = False,
     iteration_done: IterationDone | None = None,
 ) -> FreeRunFit:
     """Fit the weights of the model, where it has any, starting from its own, and the free ones of the physics unknowns.
 
     physics: (fans, 4) to start from. top_speed_rad_s: (fans,). free: (4,) or (fans, 4).
     estimate_initial_speed: otherwise the first measured speeds are used, as in operation; an unstable equilibrium
-    then cannot be hidden by an initial speed that happens to lie on it. It stops when a step lowers the cost by
-    less than tolerance, relative, or when none lowers it.
+    then cannot be hidden by an initial speed that happens to lie on it. by_reliability: readings count by how reliable
+    they are in the free run to start from; inertia and lag are held, for what shows them then counts little. It stops
+    when a step lowers the cost by less than tolerance, relative, or when none lowers it.
     """
     problem = FreeRunProblem(model, trajectories, top_speed_rad_s, free, prior, estimate_initial_speed)
     start = Unknowns(model.theta, physics, trajectories.starting_speed_rad_s())
     point = problem.evaluate(start, trajectories.interpolated_speed_rad_s())
     iteration = 0
+    if by_reliability and counts(trajectories):
+        problem.free = problem.free & OF_STEADY_SPEEDS
+        problem.weight_like(point)
+        point = problem.evaluate(start, point.speed_rad_s)
     for _ in range(SCALE_ROUNDS):
         problem.scale_rad_s = robust_scale(point.residual, trajectories)
         point = problem.evaluate(point.unknowns, point.speed_rad_s)
         point, iteration, stopped = _descend(problem, point, iteration, max_iterations, tolerance, iteration_done)
         if stopped:
             break
-    return FreeRunFit(point, problem.rmse_rad_s(point), problem.scale_rad_s, iteration)
+    return FreeRunFit(point, problem.rmse_rad_s(point), point.residual / problem.reliability, iteration)
 
 
 def _descend(
@@ -208,6 +215,7 @@ class FreeRunProblem:
         self.groups = 1 if self.weights else self.fans
         self.group_of_fan = np.zeros(self.fans, dtype=np.intp) if self.weights else np.arange(self.fans)
         self.scale_rad_s = np.ones(self.fans)
+        self.reliability = np.ones(trajectories.command.shape)
 
     def evaluate(self, unknowns: Unknowns, guess_rad_s: Array) -> Point:
         """The free run of these unknowns. guess_rad_s: (n, batch), speeds nearby."""
@@ -217,11 +225,17 @@ class FreeRunProblem:
         speed, _ = free_run(equation, unknowns.initial_speed_rad_s, command, data.step_s, guess)
         scale = self.scale_rad_s[data.fan]
         with np.errstate(over="ignore", invalid="ignore"):
-            residual = np.where(data.compared, data.speed_rad_s - data.measurement.of_speed(speed), 0.0)
+            error = data.speed_rad_s - data.measurement.of_speed(speed)
+            residual = np.where(data.compared, self.reliability * error, 0.0)
             loss = HUBER_DELTA**2 * (np.hypot(1.0, residual / (HUBER_DELTA * scale)) - 1.0)
             cost = np.bincount(data.fan, loss.sum(axis=0), self.fans).astype(np.float64)
         cost[~np.isfinite(cost)] = np.inf
         return Point(unknowns, speed, residual, cost)
+
+    def weight_like(self, point: Point) -> None:
+        """Let readings count by their reliability in the free run of this candidate."""
+        error_rad_s = point.residual / self.reliability
+        self.reliability = reliability(error_rad_s, point.speed_rad_s, self.trajectories)
 
     def equation(self, unknowns: Unknowns, part: slice) -> tuple[FanEquation, Array]:
         """The equation of some trajectories, and the command that acts on them (n, batch)."""
@@ -272,7 +286,9 @@ class FreeRunProblem:
         return np.where(data.compared[:, part], 1.0 / np.hypot(1.0, scaled / HUBER_DELTA), 0.0)
 
     def sensitivities(self, point: Point, part: slice) -> Array:
-        """(n, batch, M) derivatives of the free run's readings by weights, physics unknowns and initial speed."""
+        """(n, batch, M) derivatives of the free run's readings by weights, physics unknowns and initial speed, each
+        times its reliability.
+        """
         data = self.trajectories
         fan, step_s = data.fan[part], data.step_s[:, part]
         parameters = self.parameters(point.unknowns)[fan]
@@ -286,7 +302,7 @@ class FreeRunProblem:
         chain = parameters_by_unknowns(point.unknowns.physics, self.top_speed_rad_s)[fan]
         by_own = np.einsum("nbp,bpq->nbq", by_parameters, chain)
         sensitivities = np.concatenate((raw[..., : self.weights], by_own, raw[..., -1:]), axis=-1)
-        return data.measurement.of_speed(sensitivities, part)
+        return data.measurement.of_speed(sensitivities, part) * self.reliability[:, part, np.newaxis]
 
     def step(self, point: Point, squares: Array, gradient: Array, damping: Array) -> Unknowns:
         """The damped Gauss-Newton step: initial speeds eliminated first, then each fan's physics, then the weights."""
@@ -370,25 +386,7 @@ class FreeRunProblem:
         )
 
     def rmse_rad_s(self, point: Point) -> float:
-        """Root mean square of the residual over all samples that are compared."""
+        """Root mean square of the errors of all samples that are compared, whatever their reliability."""
+        compared = self.trajectories.compared
         with np.errstate(over="ignore"):
-            return float(np.sqrt(np.sum(point.residual**2) / np.count_nonzero(self.trajectories.compared)))
-
-
-def robust_scale(residual: Array, trajectories: Trajectories) -> Array:
-    """(fans,) standard deviation of a normal residual with the same 90th percentile of magnitude.
-
-    One sample in ten may be an outlier. Never below a millionth of the fan's speed range, nor above that range, which
-    it is where the free run diverged.
-    """
-    fans = int(trajectories.fan.max()) + 1
-    scale = np.ones(fans)
-    for fan in np.unique(trajectories.fan):
-        columns = trajectories.fan == fan
-        compared = trajectories.compared[:, columns]
-        magnitude = np.abs(residual[:, columns][compared])
-        span = float(np.ptp(trajectories.speed_rad_s[:, columns][compared]))
-        # A magnitude beyond the range carries no information and may be infinite.
-        robust_std = float(np.quantile(np.fmin(magnitude, span), 0.9)) / NORMAL_90_PERCENT
-        scale[fan] = max(robust_std, 1e-6 * span, np.finfo(float).tiny)
-    return scale
+            return float(np.sqrt(np.sum((point.residual / self.reliability) ** 2) / np.count_nonzero(compared)))

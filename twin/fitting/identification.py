@@ -21,7 +21,7 @@ Annals of Statistics 9 (1981).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -30,8 +30,16 @@ from scipy.stats import t as student_t
 
 from twin.errors import TwinError
 from twin.fitting.filtering import filtered_regression
-from twin.fitting.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, Unknowns, fit_free_run
+from twin.fitting.free_run_fit import (
+    ALL_FREE,
+    FreeRunFit,
+    FreeRunProblem,
+    Prior,
+    Unknowns,
+    fit_free_run,
+)
 from twin.fitting.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings, misfit_warnings
+from twin.fitting.reading_errors import counts, robust_scale
 from twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
 from twin.measurement import with_measured_command
 from twin.models import physics
@@ -226,6 +234,18 @@ def _refine(
         max_iterations=MAX_ITERATIONS,
         iteration_done=iteration_done,
     )
+    if counts(trajectories):
+        weighted = fit_free_run(
+            PhysicalModel(),
+            fit.point.unknowns.physics,
+            top_speed_rad_s,
+            trajectories,
+            free=free,
+            prior=prior,
+            max_iterations=MAX_ITERATIONS,
+            by_reliability=True,
+        )
+        fit = replace(weighted, iterations=fit.iterations + weighted.iterations)
     return fit, *_covariance(fit, free, top_speed_rad_s, trajectories, prior)
 
 
@@ -247,10 +267,10 @@ def _covariance(
     chi-square with that variance has 3 (sum d_b^2)^2 / sum d_b^4 of them (Satterthwaite, Biometrics Bulletin 2, 1946).
     """
     problem = FreeRunProblem(PhysicalModel(), trajectories, top_speed_rad_s, free, prior)
-    problem.scale_rad_s = fit.scale_rad_s
+    problem.scale_rad_s = robust_scale(fit.error_rad_s, trajectories)
     everything = slice(None)
     sensitivity = problem.sensitivities(fit.point, everything)
-    weight = problem.sample_weights(fit.point.residual, everything)
+    weight = problem.sample_weights(fit.error_rad_s, everything)
     by_initial = sensitivity[:, :, -1:]
     weighted_initial = weight[:, :, np.newaxis] * by_initial
     overlap = np.sum(weighted_initial * sensitivity[:, :, :-1], axis=0) / np.sum(weighted_initial * by_initial, axis=0)
@@ -262,7 +282,7 @@ def _covariance(
         columns, known = trajectories.fan == fan, np.flatnonzero(free[fan])
         # Stretches one after the other, so that a block is a piece of time.
         slopes = slopes_of_all[:, columns].transpose(1, 0, 2).reshape(-1, len(PARAMETER_NAMES))[:, known]
-        weights, residual = weight[:, columns].T.ravel(), fit.point.residual[:, columns].T.ravel()
+        weights, residual = weight[:, columns].T.ravel(), fit.error_rad_s[:, columns].T.ravel()
         # Padding and missing samples hold no information: blocks are shares of the measured samples.
         counted = weights > 0.0
         slopes, weights, residual = slopes[counted], weights[counted], residual[counted]
@@ -286,7 +306,7 @@ def _covariance(
 
 def _rmse_rad_s(fit: FreeRunFit, trajectories: Trajectories, fans: int) -> Array:
     """(fans,) root mean square of the free-run residual."""
-    squares = np.bincount(trajectories.fan, np.sum(fit.point.residual**2, axis=0), fans)
+    squares = np.bincount(trajectories.fan, np.sum(fit.error_rad_s**2, axis=0), fans)
     return np.sqrt(squares / np.bincount(trajectories.fan, trajectories.compared.sum(axis=0), fans))
 
 

@@ -32,11 +32,11 @@ from twin.fitting.free_run_fit import (
     Prior,
     Unknowns,
     fit_free_run,
-    robust_scale,
 )
 from twin.fitting.identification import Identification, inertia_anchor
 from twin.fitting.initial_weights import PLACEMENTS, initial_weights
 from twin.fitting.mean_model import mean_model
+from twin.fitting.reading_errors import counts, robust_scale
 from twin.fitting.trajectories import MAX_SAMPLES, cut_into_trajectories, practical_samples, stretch_samples
 from twin.models.model import NetworkOde
 from twin.models.network import Scaling
@@ -185,6 +185,7 @@ class _Training:
                 max_iterations=round(share * max_iterations) - best_run.iterations,
                 tolerance=TOLERANCE,
                 estimate_initial_speed=estimate,
+                by_reliability=True,
                 iteration_done=best_run.iteration_done,
             )
             best_run.stage_done(fit.iterations)
@@ -247,6 +248,8 @@ class _BestFreeRun:
         self.progress = progress
         self.iterations = 0
         self.guess_rad_s = self.data.interpolated_speed_rad_s()
+        if counts(self.data):
+            self.problem.weight_like(self._free_run(untrained))
         self.problem.scale_rad_s = robust_scale(self._free_run(untrained).residual, self.data)
         self.best, self.best_loss = untrained, float(self._free_run(untrained).cost.sum())
         self.stalled_iterations = 0
