@@ -20,7 +20,7 @@ from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
 from scoring.baseline.movement import Movement
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Signal
-from scoring.detectors.motion import Motion
+from scoring.detectors.motion import HealthyMotion, Motion
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.state import restore_column
 from scoring.detectors.table import rows
@@ -50,7 +50,7 @@ class FanScorer:
         forgets_over_gaps: bool = True,
         skips_transients: bool = True,
         allows_for_counts: bool = True,
-        moves_with_twin: bool = True,
+        limits_motion: bool = True,
     ) -> None:
         """for_calibration: keep what calibration needs, for `observed`; statistics then grow beyond their limits.
 
@@ -58,8 +58,7 @@ class FanScorer:
         skips_transients: False only to decide as for recordings made before fans that moved were not commissioned.
         allows_for_counts: False only to decide as for recordings made before readings of a tacho that counts were
         allowed to be unsteady while the fan changes its speed, and to repeat where a healthy fan would read the same.
-        moves_with_twin: False only to decide as for recordings made when limits widened as the readings changed, and
-        not as the twin's speed does.
+        limits_motion: False only to decide as for recordings made when limits widened with any motion of the readings.
         """
         self.limits = limits
         self.residuals: dict[Signal, Residual] = {source: Residual(fans, source, limits) for source in RESIDUALS}
@@ -95,8 +94,8 @@ class FanScorer:
         self._in_use: list[Signal] = [source for source in RESIDUALS if self._detectors_of[source]]
         """residuals with detectors"""
         self._judges_rest = any(row.only_at_rest and row.name in self.detectors for row in self._rows)
-        self._moves_with_twin = moves_with_twin
-        self._motion = Motion(fans, max(tacho.held_s for tacho in of_each_fan) if moves_with_twin else 0.0)
+        self._motion = Motion(fans)
+        self._healthy_motion = HealthyMotion(fans) if limits_motion else None
         self._movement = Movement(fans) if skips_transients else None
         self._gaps = Gaps(len(INPUTS), fans) if forgets_over_gaps else None
         self._memories = self._memories_ns()
@@ -240,6 +239,8 @@ class FanScorer:
         for source in RESIDUALS:
             forgotten.append((source, self.residuals[source].reset, self.residuals[source].memory_s))
         forgotten.append(("tacho", self._motion.reset, self._motion.memory_s))
+        if self._healthy_motion:
+            forgotten.append(("tacho", self._healthy_motion.reset, self._healthy_motion.memory_s))
         return [(INPUTS.index(source), reset, round(memory_s * NS_PER_S)) for source, reset, memory_s in forgotten]
 
     def _missing_ns(self, block: Samples) -> Array:
@@ -259,8 +260,11 @@ class FanScorer:
     def _piece(self, samples: Samples, scores: ScoredBlock) -> Piece:
         """What follows from samples without the baselines. scores: of these samples, not filled in yet."""
         speed_rad_s, period_s = samples.speed_rad_s, samples.period_ns / NS_PER_S
-        motion_rad_s = self._motion.update(self._moving_rad_s(samples), period_s)
+        motion_rad_s = self._motion.update(speed_rad_s, period_s)
         transient_rad_s = np.abs(motion_rad_s)
+        if self._healthy_motion:
+            healthy_rad_s = self._healthy_motion.update(samples.command, samples.predicted_rad_s, period_s)
+            transient_rad_s = np.minimum(transient_rad_s, healthy_rad_s)
         values = {"speed": samples.speed_residual, "balance": samples.balance}
         sigma = {"speed": samples.speed_sigma_rad_s, "balance": samples.balance_sigma}
         valid = {"speed": samples.speed_valid, "balance": samples.balance_valid}
@@ -282,12 +286,6 @@ class FanScorer:
         )
         self._detect("tacho", piece.given(samples.alive), piece.ratios)
         return piece
-
-    def _moving_rad_s(self, samples: Samples) -> Array:
-        """(n, fans) the speed whose changes widen the limits: that of a healthy fan, where a free run predicts it."""
-        if not self._moves_with_twin:
-            return samples.speed_rad_s
-        return np.where(np.isfinite(samples.predicted_rad_s), samples.predicted_rad_s, samples.speed_rad_s)
 
     def _detect(self, source: Signal, given: DetectorInput, ratios: Array) -> None:
         """Write the ratios of the detectors of one input into (rows of the table, n, fans), where it is valid."""
@@ -344,6 +342,7 @@ class FanScorer:
             "below_half_limit": self._below_half_limit.tolist(),
             "within_limit": self._within_limit.tolist(),
             "motion": self._motion.snapshot(),
+            **({"healthy_motion": self._healthy_motion.snapshot()} if self._healthy_motion else {}),
             **({"movement": self._movement.snapshot()} if self._movement else {}),
             **({"gaps": self._gaps.snapshot()} if self._gaps else {}),
             "detectors": {name: detector.snapshot() for name, detector in self.detectors.items()},
@@ -369,6 +368,8 @@ class FanScorer:
         for flags, name in ((self._below_half_limit, "below_half_limit"), (self._within_limit, "within_limit")):
             restore_column(flags, name, state[name])
         self._motion.restore(state["motion"])
+        if self._healthy_motion and "healthy_motion" in state:
+            self._healthy_motion.restore(state["healthy_motion"])
         if self._movement and "movement" in state:
             self._movement.restore(state["movement"])
         if self._gaps and "gaps" in state:

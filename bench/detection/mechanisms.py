@@ -203,7 +203,20 @@ MECHANISMS: Sequence[Mechanism] = (
     Mechanism(
         "motion",
         "limits are wider while the speed changes",
-        ((f"{_VARIATION}:_transient_scale_rad_s", _returning(None)),),
+        (
+            (f"{_VARIATION}:_transient_scale_rad_s", _returning(None)),
+            (f"{_CALIBRATION}:_widened_in_motion", _first_argument),
+        ),
+    ),
+    Mechanism(
+        "healthy-motion",
+        "they are so only as far as a healthy fan may move, not while a fault stops it",
+        (("scoring.detectors.motion:HealthyMotion.update", _returning(math.inf)),),
+    ),
+    Mechanism(
+        "least-time-error",
+        "with few data they are so as if the twin were off by 0.2 s and half a period",
+        ((f"{_CALIBRATION}:_widened_in_motion", _first_argument),),
     ),
     Mechanism(
         "expected-residual",

@@ -45,8 +45,9 @@ class DecisionRules(IntEnum):
     FALLS = 10
     """The causes of a fan that slows down include those of one that comes to rest. Before, they were named once it
     stood."""
-    MOTION_OF_TWIN = 11
-    """Limits widen while the twin's speed changes. Before, they did while the readings changed, also by a fault."""
+    HEALTHY_MOTION = 11
+    """Limits widen while readings change, as far as those of a healthy fan may. Before, they did with any change, also
+    by a fault."""
 
 
 CURRENT_RULES = max(DecisionRules)

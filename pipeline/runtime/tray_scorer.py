@@ -55,7 +55,7 @@ class TrayScorer:
             forgets_over_gaps=forgets_over_gaps,
             skips_transients=self._holds,
             allows_for_counts=decision_rules >= DecisionRules.ONE_ALARM,
-            moves_with_twin=decision_rules >= DecisionRules.MOTION_OF_TWIN,
+            limits_motion=decision_rules >= DecisionRules.HEALTHY_MOTION,
         )
         advice = Advice(twin.command_unit) if self._holds else None
         if judges_rest:

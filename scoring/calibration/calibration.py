@@ -51,6 +51,9 @@ MAX_ALARM_SHARE = 0.25  # share of the windows: with more of them the limits wou
 MIN_LEVEL = 0.1 / UNREACHED
 MEANS_QUANTILE = 0.999  # of means over a second or ten counts: a shift that is exceeded more often is not a drift
 SEEN_WINDOWS = 50.0  # with an alarm, to count how often statistics alarm together
+MIN_TIME_ERROR_S = (
+    0.2  # of a twin while a fan changes its speed, standard deviation; three nights of racks show as much
+)
 CONFIDENCE = 0.95
 VISITED_S = 20.0  # a fan that turned at a speed for so long has shown the error of its twin there
 SHARED_SHARE = 0.03  # of the speed, or of the command: as the air of a room and a supply vary
@@ -101,12 +104,14 @@ def calibrate(
     crossover_speed_rad_s: float | None = None,
     has_drive: bool = False,
     sigma_shares: Mapping[Signal, Array] = MappingProxyType({}),
+    sigma_rad_s: float | None = None,
 ) -> Limits:
     """Limits with a declared number of false alarms per fan and day.
 
     crossover_speed_rad_s: viscous / (2 drag) of the fans, see scoring.baseline.speed_scaling; None: not known.
     has_drive: the fans have a drive of their own, see twin.models.drive.
     sigma_shares: (fans,) the sigmas of fans that the twin knows one by one, relative to what is the same for all.
+    sigma_rad_s: of the speed, the mean over the fans; None: not known.
 
     Raises:
         TooLittleError: the runs are too short for the rate, and extrapolate is not set; or too short for any limit.
@@ -139,6 +144,8 @@ def calibrate(
     limits = limits.scaled(dict(zip((row.name for row in calibrated_rows()), factors.tolist(), strict=True)))
     if not is_enough:
         limits = _cautious(limits, found, sigma_shares)
+        if sigma_rad_s is not None:
+            limits = limits.model_copy(update={"speed": _widened_in_motion(limits.speed, sigma_rad_s, found.period_s)})
     rate = DeclaredRate(
         false_alarms_per_day=false_alarms_per_day,
         interval_95=_interval(found, factors, seed),
@@ -271,6 +278,17 @@ def _not_below_mean_over_speeds(residual: HealthyResidual) -> HealthyResidual:
     """A few minutes at a speed may happen to be quiet: no standard deviation is below the mean over the speeds."""
     least = residual.mean_residual_std
     return residual.model_copy(update={"residual_std": tuple(max(std, least) for std in residual.residual_std)})
+
+
+def _widened_in_motion(residual: HealthyResidual, sigma_rad_s: float, period_s: float) -> HealthyResidual:
+    """In some minutes fans may hardly move: limits widen as if the twin were off by a standard deviation in time, and
+    by half a period, because it is not known when between two samples a command changed.
+    """
+    error_s = MIN_TIME_ERROR_S + 0.5 * period_s
+    scale_rad_s = residual.mean_residual_std * sigma_rad_s / error_s
+    return residual.model_copy(
+        update={"transient_scale_rad_s": min(residual.transient_scale_rad_s or scale_rad_s, scale_rad_s)}
+    )
 
 
 def _not_below_mean_over_fans(residual: HealthyResidual, sigma_shares: Array) -> HealthyResidual:

@@ -2,11 +2,14 @@
 
 A twin that is accurate at constant speed is less accurate while the speed changes, so healthy residuals vary more
 there. Limits widen with this measure (an adaptive threshold by the size of the input: Emami-Naeini, Akhter and Rock,
-IEEE Transactions on Automatic Control 33 (1988) 1106). The speed is that of the healthy fan, which the twin predicts: a
-fan that a fault slows down must not widen its own limits.
+IEEE Transactions on Automatic Control 33 (1988) 1106). A fan that a fault slows down must not widen its own limits, so
+they widen with the motion of the readings only as far as a healthy fan may move: as its command and its twin have.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +18,15 @@ from scoring.detectors.low_pass import LowPass
 from scoring.detectors.state import ColumnState
 
 TIME_CONSTANT_S = 1.0
-"""and the time for which a reading is held, because readings follow the speed so much later"""
+RECENT_S = 5.0
+"""so long after its command a healthy fan may still move"""
 
 
 class Motion(ColumnState):
     """The measure of a tray's fans."""
 
-    def __init__(self, fans: int, held_s: float = 0.0) -> None:
-        """held_s: the longest time for which a tacho of the tray holds a reading."""
-        self.past = LowPass(fans, TIME_CONSTANT_S + held_s, np.nan)
+    def __init__(self, fans: int, time_constant_s: float = TIME_CONSTANT_S) -> None:
+        self.past = LowPass(fans, time_constant_s, np.nan)
         """rad/s; NaN before the first speed"""
 
     def update(self, speed_rad_s: Array, period_s: float) -> Array:
@@ -50,3 +53,41 @@ class Motion(ColumnState):
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
         return {"past": self.past.value}
+
+
+class HealthyMotion:
+    """How far healthy fans may move: as far as their commands or their twins have within about `RECENT_S`.
+
+    The command leads a fan that is faster than its twin, the twin one that still turns without a command.
+    """
+
+    def __init__(self, fans: int) -> None:
+        self._command, self._predicted = Motion(fans, RECENT_S), Motion(fans, RECENT_S)
+
+    def update(self, command: Array, predicted_rad_s: Array, period_s: float) -> Array:
+        """(n, fans) rad/s, infinite where nothing is predicted. Both (n, fans)."""
+        of_command = np.abs(self._command.update(command, period_s))
+        of_twin = np.abs(self._predicted.update(predicted_rad_s, period_s))
+        largest_command = np.abs(command) + of_command
+        share = np.divide(of_command, largest_command, out=np.zeros_like(of_command), where=largest_command > 0.0)
+        moved = np.maximum(of_twin, share * (np.abs(predicted_rad_s) + of_twin))
+        return np.where(np.isfinite(moved), moved, np.inf)
+
+    @property
+    def memory_s(self) -> float:
+        """How long commands and speeds affect the measure."""
+        return self._predicted.memory_s
+
+    def reset(self, fans: Array) -> None:
+        """Start again for some fans, (fans,) of bool."""
+        self._command.reset(fans)
+        self._predicted.reset(fans)
+
+    def snapshot(self) -> dict[str, Any]:
+        """The state as JSON can hold it."""
+        return {"command": self._command.snapshot(), "predicted": self._predicted.snapshot()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a snapshot. Raises as ColumnState.restore does."""
+        self._command.restore(state["command"])
+        self._predicted.restore(state["predicted"])

@@ -352,20 +352,22 @@ def test_a_tacho_that_counts_is_not_unsteady_while_its_fan_changes_its_speed() -
     assert largest(Tacho(kind="count", window_s=1.0)) < 1.0
 
 
-def test_limits_widen_while_the_twin_changes_its_speed_and_not_while_a_fault_does() -> None:
+def test_limits_widen_while_a_healthy_fan_moves_and_not_while_a_fault_does() -> None:
     moving = RESIDUAL.model_copy(update={"transient_scale_rad_s": 1.0})
     limits = LIMITS.model_copy(update={"speed": moving})
     still = white(3000)
     falling = -np.clip(np.arange(3000) - 2000, 0, 200)[:, np.newaxis] * 0.2
     faulty = replace(still, speed_residual=still.speed_residual + falling, speed_rad_s=still.speed_rad_s + falling)
-    commanded = replace(faulty, predicted_rad_s=still.predicted_rad_s + falling)
+    predicted = replace(faulty, predicted_rad_s=still.predicted_rad_s + falling)
+    commanded = replace(faulty, command=np.where(falling < 0.0, 0.5, 1.0) * still.command)
     row = [one.name for one in rows()].index("speed_smoothed")
 
-    def ratio(samples: Samples, *, moves_with_twin: bool = True) -> float:
-        scorer = FanScorer(FANS, limits, moves_with_twin=moves_with_twin)
+    def ratio(samples: Samples, *, limits_motion: bool = True) -> float:
+        scorer = FanScorer(FANS, limits, limits_motion=limits_motion)
         return float(scorer.update(samples).ratios[2100, row].min())
 
     not_widened = ratio(replace(faulty, speed_rad_s=still.speed_rad_s))
     assert ratio(faulty) == not_widened
+    assert ratio(predicted) < 0.5 * not_widened
     assert ratio(commanded) < 0.5 * not_widened
-    assert ratio(faulty, moves_with_twin=False) < 0.5 * not_widened
+    assert ratio(faulty, limits_motion=False) < 0.5 * not_widened
