@@ -48,6 +48,8 @@ class DecisionRules(IntEnum):
     HEALTHY_MOTION = 11
     """Limits widen while readings change, as far as those of a healthy fan may. Before, they did with any change, also
     by a fault."""
+    SPEEDS_OF_ALARM = 12
+    """An alarm returns at the speeds at which it came, or after ten minutes at others. Before, it did at any speed."""
 
 
 CURRENT_RULES = max(DecisionRules)

@@ -71,7 +71,12 @@ class TrayScorer:
         )
         self.wear = WearMonitor(twin.balances, self._diagnoser, config.wear_every_s, twin.command_unit)
         off_delay_s = config.least_off_delay_s(twin.tachos)
-        holding = holding_detectors(self.fan_scorer.detectors, off_delay_s, judges_rest=judges_rest)
+        holding = holding_detectors(
+            self.fan_scorer.detectors,
+            off_delay_s,
+            judges_rest=judges_rest,
+            knows_speeds=decision_rules >= DecisionRules.SPEEDS_OF_ALARM,
+        )
         settings = ConditionSettings(
             on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),
             off_delay_ns=round(off_delay_s * NS_PER_S),

@@ -4,8 +4,9 @@ A detector holds an alarm from the sample at which it exceeds its limit. It has 
 `return_ratio` for as long as samples affect it (`Detector.off_delay_s`): until then the fault may still be in it, and a
 contact that comes and goes is good for a moment only.
 
-The longer an alarm has stood, the longer it must be gone: a twin that errs at some speed by as much as the fault costs
-hides it there for a while.
+The longer an alarm has stood, the longer it must be gone. And it must be gone at the speeds at which it came: a twin
+that errs at another speed by as much as the fault costs hides it there. Elsewhere an alarm returns after
+`ELSEWHERE_NS`. A fault of several limits is not hidden by such errors, and returns at any speed.
 
 Only samples that could show the fault count. A blade that is touched takes ten per cent of the speed: 200 rpm at
 2,000 rpm, which is beyond a limit of 150, and 70 rpm at 700 rpm, which is not. So the largest ratio over speed that the
@@ -24,6 +25,9 @@ from schemas.units import NS_PER_S
 
 NOT_BELOW = -1
 RETURN_SHARE, LONGEST_RETURN_NS = 0.1, 60 * NS_PER_S  # of the time that a detector has held an alarm; and at most
+ELSEWHERE_NS = 600 * NS_PER_S
+NEAR = 1.15  # times the highest speed at which it exceeded, or the lowest over this
+PLAIN = 3.0  # limits; no healthy twin errs by so much
 LARGEST = 1e300  # ratio over speed of a fault that shows at any speed
 
 
@@ -39,6 +43,9 @@ class HoldingDetector:
     """whether it is in use and a fan that turns shows its return; False: it holds no alarm that it did not raise"""
     return_share: float = RETURN_SHARE
     """of the time for which it held the alarm, so long it must have returned; 0 in recordings of former versions"""
+    elsewhere_ns: int = ELSEWHERE_NS
+    """for so long it must have returned at other speeds than those at which it came; 0 in recordings of former
+    versions, where all speeds are alike"""
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,13 @@ class _Hold:
     age_ns: int = 0
     held_ns: int = 0
     """its age when it was above the ratio of return last"""
+    elsewhere_ns: int = 0
+    """how long it has been below the ratio of return at other speeds than those at which it exceeded"""
+    largest: float = 0.0
+    """ratio so far"""
+    slowest_rad_s: float = 0.0
+    fastest_rad_s: float = LARGEST
+    """at which it exceeded; any speed if that is not known"""
 
     def follow(self, speed_rad_s: float, period_ns: int, off_delay_ns: int) -> None:
         """Keep the highest speed."""
@@ -74,10 +88,22 @@ class _Hold:
         """Whether the fault would be seen at a speed, with at least this ratio."""
         return self.ratio_per_rad_s >= LARGEST or self.ratio_per_rad_s * speed_rad_s >= ratio
 
-    def exceed(self, ratio: float) -> None:
-        """The limit is exceeded, by this ratio."""
+    def is_near(self, speed_rad_s: float) -> bool:
+        """Whether it exceeded at about this speed."""
+        return self.slowest_rad_s / NEAR <= speed_rad_s <= self.fastest_rad_s * NEAR
+
+    def rise(self) -> None:
+        """It is above the ratio of return: it has not returned at all."""
+        self.below_ns, self.elsewhere_ns = NOT_BELOW, 0
+
+    def exceed(self, ratio: float, speed_rad_s: float) -> None:
+        """The limit is exceeded, by this ratio at this speed."""
         here = min(ratio / self.peak_rad_s, LARGEST) if self.peak_rad_s > 0.0 else LARGEST
-        self.ratio_per_rad_s, self.below_ns = max(self.ratio_per_rad_s, here), NOT_BELOW
+        self.ratio_per_rad_s = max(self.ratio_per_rad_s, here)
+        self.largest = max(self.largest, min(ratio, LARGEST))
+        self.slowest_rad_s = min(self.slowest_rad_s, speed_rad_s)
+        self.fastest_rad_s = max(self.fastest_rad_s, speed_rad_s)
+        self.rise()
 
 
 class AlarmReturn:
@@ -96,36 +122,42 @@ class AlarmReturn:
         """Take a sample. Returns whether no detector is above its ratio of return, and whether all have returned."""
         speed = abs(sample.speed_rad_s) if math.isfinite(sample.speed_rad_s) else 0.0
         above, over = False, True
+        is_plain = any(hold.largest >= PLAIN for hold in self._holds.values())
         for detector, ratio in zip(self._detectors, sample.ratios, strict=True):
             hold = self._holds.get(detector.name)
             if hold is None:
                 if not ratio > 1.0:
                     continue
-                hold = self._holds[detector.name] = _Hold()
+                hold = self._holds[detector.name] = _Hold(slowest_rad_s=speed, fastest_rad_s=speed)
             hold.follow(speed, period_ns, detector.off_delay_ns)
             shows = not detector.grows_with_speed or hold.shows_at(speed, self._return_ratio)
+            is_near = is_plain or not (detector.grows_with_speed and detector.elsewhere_ns) or hold.is_near(speed)
             if ratio > 1.0:
-                hold.exceed(ratio)
+                hold.exceed(ratio, speed)
             elif ratio >= self._return_ratio:
-                hold.below_ns = NOT_BELOW
-            elif ratio < self._return_ratio and shows:
+                hold.rise()
+            elif ratio < self._return_ratio and shows and is_near:
                 hold.below_ns = 0 if hold.below_ns == NOT_BELOW else hold.below_ns + period_ns
+            elif ratio < self._return_ratio and shows:
+                hold.elsewhere_ns += period_ns
             hold.age_ns += period_ns
             if ratio >= self._return_ratio:
                 above, hold.held_ns = True, hold.age_ns
             longer_ns = min(round(detector.return_share * hold.held_ns), LONGEST_RETURN_NS)
-            over &= hold.below_ns >= max(detector.off_delay_ns, longer_ns)
+            gone_elsewhere = 0 < detector.elsewhere_ns <= hold.elsewhere_ns + max(hold.below_ns, 0)
+            over &= gone_elsewhere or hold.below_ns >= max(detector.off_delay_ns, longer_ns)
         return not above, over
 
     def begin_delays_again(self) -> None:
         """After a gap the off-delays start again."""
         for hold in self._holds.values():
-            hold.below_ns = NOT_BELOW
+            hold.rise()
 
     def forget_sizes(self) -> None:
         """With another baseline the fault has another size: every sample counts again."""
         for hold in self._holds.values():
-            hold.ratio_per_rad_s = LARGEST
+            hold.ratio_per_rad_s = hold.fastest_rad_s = LARGEST
+            hold.slowest_rad_s = 0.0
 
     def hold_by_all(self) -> None:
         """Every detector that may holds the alarm: of one that a former version raised, it is not known which did."""
@@ -157,6 +189,10 @@ class AlarmReturn:
                 peak_age_ns=int(hold["peak_age_ns"]),
                 age_ns=int(hold.get("age_ns", 0)),
                 held_ns=int(hold.get("held_ns", 0)),
+                elsewhere_ns=int(hold.get("elsewhere_ns", 0)),
+                largest=float(hold.get("largest", 0.0)),
+                slowest_rad_s=float(hold.get("slowest_rad_s", 0.0)),
+                fastest_rad_s=float(hold.get("fastest_rad_s", LARGEST)),
             )
             for name, hold in stored.items()
             if name in used

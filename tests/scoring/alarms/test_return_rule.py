@@ -21,8 +21,8 @@ SETTINGS = ConditionSettings(
     on_delay_ns=0,
     off_delay_ns=0,
     detectors=(
-        HoldingDetector("speed_smoothed", 20, grows_with_speed=True),
-        HoldingDetector("speed_drift", 100, grows_with_speed=True),
+        HoldingDetector("speed_smoothed", 20, grows_with_speed=True, elsewhere_ns=1000),
+        HoldingDetector("speed_drift", 100, grows_with_speed=True, elsewhere_ns=1000),
         HoldingDetector("sensor", 300, grows_with_speed=False),
     ),
 )
@@ -83,6 +83,16 @@ def test_a_fault_large_enough_to_be_seen_there_has_gone() -> None:
     fan = Fan()
     fan.play([(4.0, LOW, LOW)])
     assert fan.play([CALM] * 3, SLOW) == [(3, Transition.CLEARED)]
+
+
+def test_a_small_fault_has_gone_at_the_speeds_at_which_it_came_or_after_a_long_time_at_others() -> None:
+    fan = Fan()
+    fan.play([(2.5, LOW, LOW)] * 3)
+    assert fan.play([CALM] * 90, SLOW) == [], "a twin may err there by as much"
+    assert fan.play([(MID, LOW, LOW)], SLOW) == []
+    assert fan.play([CALM] * 150, SLOW) == [(fan.samples - 150 + 99, Transition.CLEARED)], "after 1,000 ns"
+    fan.play([(2.5, LOW, LOW)] * 3, SLOW)
+    assert fan.play([CALM] * 3, 1.1 * SLOW) == [(fan.samples - 1, Transition.CLEARED)]
 
 
 def test_where_its_residual_is_not_scored_a_detector_neither_returns_nor_exceeds() -> None:
