@@ -100,7 +100,9 @@ def limits_of(
 ) -> Limits:
     every = healthy(runs, seconds, is_one_worse=is_one_worse)
     shares: dict[Signal, Array] = {source: np.linspace(0.01, 0.03, FANS) for source in RESIDUALS}
-    return calibrate(lambda: every, TOP_RAD_S, TIMING, per_day, 0, extrapolate, 100.0, sigma_shares=shares)
+    return calibrate(
+        lambda: every, TOP_RAD_S, TIMING, per_day, 0, extrapolate, 100.0, sigma_shares=shares, sigma_rad_s=0.5
+    )
 
 
 @cache
@@ -185,6 +187,7 @@ PROBES: dict[str, Callable[[], Hashable]] = {
     "cautious": extrapolated_limits,
     "mean-over-speeds": extrapolated_limits,
     "mean-over-fans": extrapolated_limits,
+    "least-time-error": extrapolated_limits,
     "tail-margin": extrapolated_limits,
 }
 

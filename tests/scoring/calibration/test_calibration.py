@@ -136,6 +136,18 @@ def test_extrapolated_limits_say_so_and_lie_further_out() -> None:
     assert "speed_drift" not in far.detectors  # the residual at another speed is not known from so little
 
 
+def test_few_data_in_which_fans_hardly_move_widen_limits_in_motion_as_if_the_twin_were_late() -> None:
+    runs, period_s = healthy(0.0, 9), 0.01
+    sigma_rad_s = 4.0
+    far = calibrate(runs, TOP_RAD_S, Timing(), 1.0, extrapolate=True, sigma_rad_s=sigma_rad_s)
+    scale_rad_s = far.speed.transient_scale_rad_s
+    assert scale_rad_s is not None
+    error_s = far.speed.mean_residual_std * sigma_rad_s / scale_rad_s
+    assert error_s >= 0.2 + 0.5 * period_s - 1e-9
+    enough = calibrate(runs, TOP_RAD_S, Timing(), 600.0, sigma_rad_s=sigma_rad_s)
+    assert enough.speed == calibrate(runs, TOP_RAD_S, Timing(), 600.0).speed
+
+
 def test_a_minute_of_one_fan_is_refused_even_with_extrapolate() -> None:
     with pytest.raises(TooLittleError):
         calibrate(healthy(0.0, 7, fans=1, runs=1, samples=3000), TOP_RAD_S, Timing(), 600.0, extrapolate=True)
