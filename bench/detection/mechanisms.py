@@ -385,7 +385,10 @@ MECHANISMS: Sequence[Mechanism] = (
     ),
     Mechanism(
         "return-where-it-shows",
-        "only samples at speeds that would show the fault count for its return",
-        (("scoring.alarms.return_rule:_Hold.shows_at", _returning(True)),),
+        "only samples at speeds at which it came, or that would show the fault, count for its return",
+        (
+            ("scoring.alarms.return_rule:_Hold.shows_at", _returning(True)),
+            ("scoring.alarms.return_rule:_Hold.is_near", _returning(True)),
+        ),
     ),
 )
