@@ -1,4 +1,4 @@
-"""How fast a fan is changing its speed: distance of the speed from its low-pass over one second or more.
+"""How fast a fan is changing its speed: distance of the speed from its low-pass over one second.
 
 A twin that is accurate at constant speed is less accurate while the speed changes, so healthy residuals vary more
 there. Limits widen with this measure (an adaptive threshold by the size of the input: Emami-Naeini, Akhter and Rock,

@@ -30,14 +30,7 @@ from scipy.stats import t as student_t
 
 from twin.errors import TwinError
 from twin.fitting.filtering import filtered_regression
-from twin.fitting.free_run_fit import (
-    ALL_FREE,
-    FreeRunFit,
-    FreeRunProblem,
-    Prior,
-    Unknowns,
-    fit_free_run,
-)
+from twin.fitting.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, Unknowns, fit_free_run
 from twin.fitting.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings, misfit_warnings
 from twin.fitting.reading_errors import counts, robust_scale
 from twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples

@@ -39,7 +39,7 @@ def find_limits(
         crossover_speed_rad_s=float(np.median(known_rad_s)) if len(known_rad_s) == len(bends_rad_s) else None,
         has_drive=all(twin.card.drive is not None for twin in twins),
         sigma_shares=_sigma_shares(twins[0]) if len(twins) == 1 else {},
-        sigma_rad_s=float(np.mean(np.concatenate([np.atleast_1d(twin.sigma_rad_s) for twin in twins]))),
+        sigma_rad_s=float(np.mean(np.concatenate([twin.sigma_rad_s for twin in twins]))),
     )
 
 
