@@ -263,7 +263,7 @@ class FanScorer:
         motion_rad_s = self._motion.update(speed_rad_s, period_s)
         transient_rad_s = np.abs(motion_rad_s)
         if self._healthy_motion:
-            healthy_rad_s = self._healthy_motion.update(samples.command, samples.predicted_rad_s, period_s)
+            healthy_rad_s = self._healthy_motion.update(samples.command, samples.predicted_rad_s, speed_rad_s, period_s)
             transient_rad_s = np.minimum(transient_rad_s, healthy_rad_s)
         values = {"speed": samples.speed_residual, "balance": samples.balance}
         sigma = {"speed": samples.speed_sigma_rad_s, "balance": samples.balance_sigma}

@@ -45,11 +45,14 @@ class DecisionRules(IntEnum):
     FALLS = 10
     """The causes of a fan that slows down include those of one that comes to rest. Before, they were named once it
     stood."""
-    HEALTHY_MOTION = 11
+    FIRST_MOTION = 11
+    """A first form of HEALTHY_MOTION, used for two days. Such recordings are decided as those of FALLS."""
+    FIRST_SPEEDS = 12
+    """The same."""
+    HEALTHY_MOTION = 13
     """Limits widen while readings change, as far as those of a healthy fan may. Before, they did with any change, also
-    by a fault."""
-    SPEEDS_OF_ALARM = 12
-    """An alarm returns at the speeds at which it came, or after ten minutes at others. Before, it did at any speed."""
+    by a fault. An alarm returns at the speeds at which it came, or after ten minutes at others. Before, it did at any
+    speed."""
 
 
 CURRENT_RULES = max(DecisionRules)

@@ -75,7 +75,7 @@ class TrayScorer:
             self.fan_scorer.detectors,
             off_delay_s,
             judges_rest=judges_rest,
-            knows_speeds=decision_rules >= DecisionRules.SPEEDS_OF_ALARM,
+            knows_speeds=decision_rules >= DecisionRules.HEALTHY_MOTION,
         )
         settings = ConditionSettings(
             on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),

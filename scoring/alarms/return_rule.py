@@ -6,7 +6,7 @@ contact that comes and goes is good for a moment only.
 
 The longer an alarm has stood, the longer it must be gone. And it must be gone at the speeds at which it came: a twin
 that errs at another speed by as much as the fault costs hides it there. Elsewhere an alarm returns after
-`ELSEWHERE_NS`. A fault of several limits is not hidden by such errors, and returns at any speed.
+`ELSEWHERE_NS`.
 
 Only samples that could show the fault count. A blade that is touched takes ten per cent of the speed: 200 rpm at
 2,000 rpm, which is beyond a limit of 150, and 70 rpm at 700 rpm, which is not. So the largest ratio over speed that the
@@ -26,8 +26,7 @@ from schemas.units import NS_PER_S
 NOT_BELOW = -1
 RETURN_SHARE, LONGEST_RETURN_NS = 0.1, 60 * NS_PER_S  # of the time that a detector has held an alarm; and at most
 ELSEWHERE_NS = 600 * NS_PER_S
-NEAR = 1.15  # times the highest speed at which it exceeded, or the lowest over this
-PLAIN = 3.0  # limits; no healthy twin errs by so much
+NEAR_SPEED_RATIO = 1.15  # to the highest speed at which it exceeded, and of the lowest to it
 LARGEST = 1e300  # ratio over speed of a fault that shows at any speed
 
 
@@ -72,11 +71,9 @@ class _Hold:
     """its age when it was above the ratio of return last"""
     elsewhere_ns: int = 0
     """how long it has been below the ratio of return at other speeds than those at which it exceeded"""
-    largest: float = 0.0
-    """ratio so far"""
-    slowest_rad_s: float = 0.0
-    fastest_rad_s: float = LARGEST
-    """at which it exceeded; any speed if that is not known"""
+    slowest_rad_s: float = LARGEST
+    fastest_rad_s: float = 0.0
+    """at which it exceeded"""
 
     def follow(self, speed_rad_s: float, period_ns: int, off_delay_ns: int) -> None:
         """Keep the highest speed."""
@@ -89,21 +86,27 @@ class _Hold:
         return self.ratio_per_rad_s >= LARGEST or self.ratio_per_rad_s * speed_rad_s >= ratio
 
     def is_near(self, speed_rad_s: float) -> bool:
-        """Whether it exceeded at about this speed."""
-        return self.slowest_rad_s / NEAR <= speed_rad_s <= self.fastest_rad_s * NEAR
+        """Whether it exceeded at about this speed, or between speeds below and above it."""
+        return self.slowest_rad_s / NEAR_SPEED_RATIO <= speed_rad_s <= self.fastest_rad_s * NEAR_SPEED_RATIO
 
     def rise(self) -> None:
         """It is above the ratio of return: it has not returned at all."""
         self.below_ns, self.elsewhere_ns = NOT_BELOW, 0
 
-    def exceed(self, ratio: float, speed_rad_s: float) -> None:
-        """The limit is exceeded, by this ratio at this speed."""
-        here = min(ratio / self.peak_rad_s, LARGEST) if self.peak_rad_s > 0.0 else LARGEST
-        self.ratio_per_rad_s = max(self.ratio_per_rad_s, here)
-        self.largest = max(self.largest, min(ratio, LARGEST))
-        self.slowest_rad_s = min(self.slowest_rad_s, speed_rad_s)
-        self.fastest_rad_s = max(self.fastest_rad_s, speed_rad_s)
+    def exceed(self, ratio: float) -> None:
+        """The limit is exceeded, by this ratio, at the highest speed that is still in it."""
+        if self.peak_rad_s > 0.0:
+            self.ratio_per_rad_s = max(self.ratio_per_rad_s, min(ratio / self.peak_rad_s, LARGEST))
+            self.slowest_rad_s = min(self.slowest_rad_s, self.peak_rad_s)
+            self.fastest_rad_s = max(self.fastest_rad_s, self.peak_rad_s)
+        else:
+            self.show_at_any_speed()
         self.rise()
+
+    def show_at_any_speed(self) -> None:
+        """It is not known at which speeds the fault shows."""
+        self.ratio_per_rad_s = self.fastest_rad_s = LARGEST
+        self.slowest_rad_s = 0.0
 
 
 class AlarmReturn:
@@ -122,18 +125,17 @@ class AlarmReturn:
         """Take a sample. Returns whether no detector is above its ratio of return, and whether all have returned."""
         speed = abs(sample.speed_rad_s) if math.isfinite(sample.speed_rad_s) else 0.0
         above, over = False, True
-        is_plain = any(hold.largest >= PLAIN for hold in self._holds.values())
         for detector, ratio in zip(self._detectors, sample.ratios, strict=True):
             hold = self._holds.get(detector.name)
             if hold is None:
                 if not ratio > 1.0:
                     continue
-                hold = self._holds[detector.name] = _Hold(slowest_rad_s=speed, fastest_rad_s=speed)
+                hold = self._holds[detector.name] = _Hold()
             hold.follow(speed, period_ns, detector.off_delay_ns)
             shows = not detector.grows_with_speed or hold.shows_at(speed, self._return_ratio)
-            is_near = is_plain or not (detector.grows_with_speed and detector.elsewhere_ns) or hold.is_near(speed)
+            is_near = not (detector.grows_with_speed and detector.elsewhere_ns) or hold.is_near(speed)
             if ratio > 1.0:
-                hold.exceed(ratio, speed)
+                hold.exceed(ratio)
             elif ratio >= self._return_ratio:
                 hold.rise()
             elif ratio < self._return_ratio and shows and is_near:
@@ -144,8 +146,11 @@ class AlarmReturn:
             if ratio >= self._return_ratio:
                 above, hold.held_ns = True, hold.age_ns
             longer_ns = min(round(detector.return_share * hold.held_ns), LONGEST_RETURN_NS)
-            gone_elsewhere = 0 < detector.elsewhere_ns <= hold.elsewhere_ns + max(hold.below_ns, 0)
-            over &= gone_elsewhere or hold.below_ns >= max(detector.off_delay_ns, longer_ns)
+            least_ns = max(detector.off_delay_ns, longer_ns)
+            elsewhere_ns = max(hold.below_ns, 0) + hold.elsewhere_ns
+            over &= hold.below_ns >= least_ns or (
+                hold.elsewhere_ns > 0 and elsewhere_ns >= max(detector.elsewhere_ns, least_ns)
+            )
         return not above, over
 
     def begin_delays_again(self) -> None:
@@ -156,12 +161,12 @@ class AlarmReturn:
     def forget_sizes(self) -> None:
         """With another baseline the fault has another size: every sample counts again."""
         for hold in self._holds.values():
-            hold.ratio_per_rad_s = hold.fastest_rad_s = LARGEST
-            hold.slowest_rad_s = 0.0
+            hold.show_at_any_speed()
 
     def hold_by_all(self) -> None:
         """Every detector that may holds the alarm: of one that a former version raised, it is not known which did."""
-        self._holds = {detector.name: _Hold(LARGEST) for detector in self._detectors if detector.is_certain}
+        self._holds = {detector.name: _Hold() for detector in self._detectors if detector.is_certain}
+        self.forget_sizes()
 
     def snapshot(self) -> dict[str, Any]:
         """The state, as JSON values."""
@@ -190,7 +195,6 @@ class AlarmReturn:
                 age_ns=int(hold.get("age_ns", 0)),
                 held_ns=int(hold.get("held_ns", 0)),
                 elsewhere_ns=int(hold.get("elsewhere_ns", 0)),
-                largest=float(hold.get("largest", 0.0)),
                 slowest_rad_s=float(hold.get("slowest_rad_s", 0.0)),
                 fastest_rad_s=float(hold.get("fastest_rad_s", LARGEST)),
             )

@@ -58,20 +58,21 @@ class Motion(ColumnState):
 class HealthyMotion:
     """How far healthy fans may move: as far as their commands or their twins have within about `RECENT_S`.
 
-    The command leads a fan that is faster than its twin, the twin one that still turns without a command.
+    The command leads a fan that is faster than its twin, the twin one that still turns without a command. Where
+    the command has changed by a share of itself, the speed may have changed by the same share: that of the twin, or the
+    reading of a fan that starts faster than its twin.
     """
 
     def __init__(self, fans: int) -> None:
         self._command, self._predicted = Motion(fans, RECENT_S), Motion(fans, RECENT_S)
 
-    def update(self, command: Array, predicted_rad_s: Array, period_s: float) -> Array:
-        """(n, fans) rad/s, infinite where nothing is predicted. Both (n, fans)."""
-        of_command = np.abs(self._command.update(command, period_s))
-        of_twin = np.abs(self._predicted.update(predicted_rad_s, period_s))
-        largest_command = np.abs(command) + of_command
+    def update(self, command: Array, predicted_rad_s: Array, speed_rad_s: Array, period_s: float) -> Array:
+        """(n, fans) rad/s, infinite where nothing is predicted. All (n, fans)."""
+        of_command, largest_command = _moved(self._command, command, period_s)
+        of_twin, fastest_rad_s = _moved(self._predicted, predicted_rad_s, period_s)
         share = np.divide(of_command, largest_command, out=np.zeros_like(of_command), where=largest_command > 0.0)
-        moved = np.maximum(of_twin, share * (np.abs(predicted_rad_s) + of_twin))
-        return np.where(np.isfinite(moved), moved, np.inf)
+        moved = np.maximum(of_twin, share * np.fmax(fastest_rad_s, np.abs(speed_rad_s)))
+        return np.where(np.isfinite(predicted_rad_s), moved, np.inf)
 
     @property
     def memory_s(self) -> float:
@@ -91,3 +92,9 @@ class HealthyMotion:
         """Continue from a snapshot. Raises as ColumnState.restore does."""
         self._command.restore(state["command"])
         self._predicted.restore(state["predicted"])
+
+
+def _moved(motion: Motion, values: Array, period_s: float) -> tuple[Array, Array]:
+    """How far values, (n, fans), are from their past, and the larger size of both."""
+    moved = motion.update(values, period_s)
+    return np.abs(moved), np.maximum(np.abs(values), np.abs(values - moved))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,14 +30,14 @@ SETTINGS = ConditionSettings(
 UP, MID, LOW, NONE = 1.2, 0.9, 0.1, math.nan
 FULL, SLOW = 200.0, 70.0
 CALM = (LOW, LOW, LOW)
-Sample = tuple[float, float, float]
+Sample = tuple[float, ...]
 
 
 class Fan:
     """The alarm of one fan; `play` returns the numbers of the samples at which it was raised and cleared."""
 
-    def __init__(self) -> None:
-        self.conditions = TrayConditions(1, SETTINGS)
+    def __init__(self, conditions: ConditionSettings = SETTINGS) -> None:
+        self.conditions = TrayConditions(1, conditions)
         self.samples = 0
 
     def play(self, samples: Sequence[Sample], speed: float = FULL) -> list[tuple[int, Transition]]:
@@ -79,20 +80,41 @@ def test_a_fault_too_small_to_be_seen_at_a_lower_speed_has_not_gone_there() -> N
     assert fan.play([CALM] * 3, FULL) == [(503, Transition.CLEARED)]
 
 
-def test_a_fault_large_enough_to_be_seen_there_has_gone() -> None:
+def test_a_fault_that_would_be_seen_there_has_gone_at_the_speeds_at_which_it_came_or_after_a_long_time_at_others() -> (
+    None
+):
     fan = Fan()
-    fan.play([(4.0, LOW, LOW)])
-    assert fan.play([CALM] * 3, SLOW) == [(3, Transition.CLEARED)]
-
-
-def test_a_small_fault_has_gone_at_the_speeds_at_which_it_came_or_after_a_long_time_at_others() -> None:
-    fan = Fan()
-    fan.play([(2.5, LOW, LOW)] * 3)
+    fan.play([(4.0, LOW, LOW)] * 3)
     assert fan.play([CALM] * 90, SLOW) == [], "a twin may err there by as much"
     assert fan.play([(MID, LOW, LOW)], SLOW) == []
     assert fan.play([CALM] * 150, SLOW) == [(fan.samples - 150 + 99, Transition.CLEARED)], "after 1,000 ns"
     fan.play([(2.5, LOW, LOW)] * 3, SLOW)
     assert fan.play([CALM] * 3, 1.1 * SLOW) == [(fan.samples - 1, Transition.CLEARED)]
+
+
+def test_a_late_statistic_does_not_make_the_speed_that_followed_one_at_which_the_alarm_came() -> None:
+    fan = Fan()
+    fan.play([(LOW, 2.9, LOW)] * 20)
+    fan.play([(LOW, 2.9, LOW)] * 2, SLOW)
+    assert fan.play([CALM] * 90, SLOW) == []
+    assert len(fan.play([CALM] * 11, FULL)) == 1
+
+
+def test_an_alarm_that_came_at_no_known_speed_may_return_at_any() -> None:
+    fan = Fan()
+    fan.play([(UP, LOW, LOW)], 0.0)
+    assert fan.play([CALM] * 3, SLOW) == [(3, Transition.CLEARED)]
+
+
+def test_a_long_off_delay_is_kept_at_any_speed() -> None:
+    slow = replace(SETTINGS, detectors=(HoldingDetector("speed_smoothed", 3000, grows_with_speed=True),))
+    elsewhere = replace(slow, detectors=(replace(slow.detectors[0], elsewhere_ns=1000),))
+    for conditions in (slow, elsewhere):
+        fan = Fan(conditions)
+        fan.play([(4.0,)])
+        assert fan.play([(LOW,)] * 400) == [(301, Transition.CLEARED)], "after 3,000 ns"
+        fan.play([(4.0,)])
+        assert fan.play([(LOW,)] * 299, SLOW) == []
 
 
 def test_where_its_residual_is_not_scored_a_detector_neither_returns_nor_exceeds() -> None:
