@@ -67,20 +67,42 @@ def test_the_noise_of_a_tacho_is_that_of_its_resolution_and_of_the_age_of_its_re
     np.testing.assert_allclose(rising, 1e4 * TACHO.held_s / np.sqrt(12.0), rtol=1e-3)
 
 
-def test_a_fan_that_slows_down_more_slowly_than_it_speeds_up_keeps_its_steady_speeds() -> None:
-    # A first-order lag, 0.8 s upwards and 1.6 s downwards: no physical model has two inertias.
+def uneven_run(tacho: Tacho) -> Run:
+    """A first-order lag, 0.8 s upwards and 1.6 s downwards: no physical model has two inertias."""
     command = np.repeat(np.random.default_rng(1).permutation(np.tile(np.linspace(0.25, 1.0, 7), 6)), 80)
     speed = np.empty_like(command)
     speed[0] = 200.0 * command[0]
     for k in range(1, len(command)):
         wanted = 200.0 * command[k - 1]
         speed[k] = wanted + (speed[k - 1] - wanted) * np.exp(-0.1 / (0.8 if wanted > speed[k - 1] else 1.6))
-    run = Run("made", np.arange(len(command)) / 10.0, command[:, np.newaxis], speed[:, np.newaxis], (TACHO,))
-    run = replace(run, speed_rad_s=measurement_of(run).of_speed(run.speed_rad_s))
+    run = Run("made", np.arange(len(command)) / 10.0, command[:, np.newaxis], speed[:, np.newaxis], (tacho,))
+    return replace(run, speed_rad_s=measurement_of(run).of_speed(run.speed_rad_s))
+
+
+@pytest.mark.parametrize("wrong_rad_s", [0.0, 100.0, 1000.0])
+def test_a_fan_that_slows_down_more_slowly_than_it_speeds_up_keeps_its_steady_speeds(wrong_rad_s: float) -> None:
+    run = uneven_run(TACHO)
+    wrong = np.zeros_like(run.speed_rad_s)
+    wrong[1000] = wrong_rad_s
+    run = replace(run, speed_rad_s=run.speed_rad_s + wrong)
     _, alpha, drag, _ = identify([run], with_lag=False).parameters[0]
     steady = np.linspace(0.25, 1.0, 4)
     found = 2.0 * steady / (alpha + np.sqrt(alpha**2 + 4.0 * drag * steady))
     np.testing.assert_allclose(found, 200.0 * steady, atol=3.0)  # 3.7 if all readings counted alike
+
+
+def test_all_readings_of_a_tacho_that_does_not_count_count_alike_whatever_the_fan_beside_it() -> None:
+    alone, counted = uneven_run(Tacho()), uneven_run(TACHO)
+    beside = Run(
+        "made",
+        alone.t_s,
+        np.hstack((alone.command, counted.command)),
+        np.hstack((alone.speed_rad_s, counted.speed_rad_s)),
+        (Tacho(), TACHO),
+    )
+    of_both = identify([beside], with_lag=False).parameters
+    np.testing.assert_allclose(of_both[0], identify([alone], with_lag=False).parameters[0], rtol=1e-2)
+    np.testing.assert_allclose(of_both[1], identify([counted], with_lag=False).parameters[0], rtol=1e-2)
 
 
 def test_stretches_overlap_by_what_their_first_readings_show_and_compare_each_reading_once(

@@ -16,6 +16,8 @@ from twin.fitting.trajectories import Trajectories
 from twin.runs import Array
 
 NORMAL_90_PERCENT = 1.645
+OUTLIER_SCALES = 3.0
+"""of the scale of all errors: beyond it an error says nothing of how they vary"""
 
 
 def robust_scale(residual: Array, trajectories: Trajectories) -> Array:
@@ -38,7 +40,7 @@ def robust_scale(residual: Array, trajectories: Trajectories) -> Array:
 
 
 def counts(trajectories: Trajectories) -> bool:
-    """Whether a tacho counts; readings of others all count alike."""
+    """Whether a tacho counts; readings of one that does not all count alike."""
     return any(tacho.held_s > 0.0 for tacho in trajectories.tacho)
 
 
@@ -50,10 +52,14 @@ def reliability(error_rad_s: Array, speed_rad_s: Array, trajectories: Trajectori
     slope = _slope(trajectories.measurement.of_speed(speed_rad_s), trajectories.measurement.t_s)
     usable = trajectories.compared & np.isfinite(slope) & np.isfinite(error_rad_s)
     weight = np.ones_like(slope)
+    largest_rad_s = OUTLIER_SCALES * robust_scale(error_rad_s, trajectories)
     for fan in np.unique(trajectories.fan):
+        if not trajectories.tacho[fan].held_s:
+            continue
         columns = trajectories.fan == fan
         use = usable[:, columns]
-        squared_slope, square = slope[:, columns][use] ** 2, error_rad_s[:, columns][use] ** 2
+        squared_slope = slope[:, columns][use] ** 2
+        square = np.minimum(error_rad_s[:, columns][use] ** 2, largest_rad_s[fan] ** 2)
         if not squared_slope.size:
             continue
         is_steady = squared_slope <= np.median(squared_slope)

@@ -91,8 +91,8 @@ def train_network(
     """Train the model's network. Returns the trained model, the parameters (fans, 4) and the iterations taken.
 
     max_iterations: of each network; those of the starts come before and are not counted. physics:
-    "refined" fits J, alpha, C_D and the lag of each fan along with the network; "fixed" leaves them as they were
-    identified, as published.
+    "refined" fits J, alpha, C_D and the lag of each fan along with the network (of a tacho that counts alpha and C_D
+    only); "fixed" leaves them as they were identified, as published.
     prior_std: how far the network's acceleration may be from the physics where there are no data, in units of its scale
     (twin.fitting.cross_validation chooses it). Zero: the weights stay zero.
     networks: how many are trained; the model is the mean of those that end about as well as the best.
@@ -249,7 +249,10 @@ class _BestFreeRun:
         self.iterations = 0
         self.guess_rad_s = self.data.interpolated_speed_rad_s()
         if counts(self.data):
-            self.problem.weight_like(self._free_run(untrained))
+            # By the physics: an untrained network without them says nothing of how the speed changes.
+            physical = FreeRunProblem(PhysicalModel(), self.data, top_speed_rad_s, NONE_FREE, nothing)
+            start = Unknowns(np.zeros(0), untrained.physics, self.data.starting_speed_rad_s())
+            self.problem.weight_like(physical.evaluate(start, self.guess_rad_s))
         self.problem.scale_rad_s = robust_scale(self._free_run(untrained).residual, self.data)
         self.best, self.best_loss = untrained, float(self._free_run(untrained).cost.sum())
         self.stalled_iterations = 0
