@@ -35,7 +35,7 @@ from scoring.calibration.healthy_variation import (
 from scoring.calibration.tail import Tail
 from scoring.calibration.windows import WindowMaxima, peaks
 from scoring.detectors.detector import UNREACHED, DetectorRow, DetectorSettings, HealthyEvidence, LimitRule, Signal
-from scoring.detectors.deviation import smoothed_deviation
+from scoring.detectors.deviation import smoothed_deviation, summed_deviation
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import calibrated_rows
 from scoring.fan_scorer import RESIDUALS
@@ -231,6 +231,7 @@ def _evidence(row: DetectorRow, limits: Limits, found: HealthyStatistics) -> Hea
         period_s=found.period_s,
         mean_ratio=found.mean_ratio(row),
         smoothed_std=_smoothed_std(limits, row.source, found),
+        summed_std=summed_deviation(residual.autocorrelation_time_s, found.period_s),
         smoothed_limit=smoothed.limit if smoothed else 0.0,
         mean_limit=moments.mean_quantile(MEANS_QUANTILE),
         count_std=found.count_sigmas / residual.mean_residual_std if row.source == "speed" else 0.0,
@@ -293,12 +294,15 @@ def _widened_in_motion(residual: HealthyResidual, sigma_rad_s: float, period_s: 
 
 def _not_below_mean_over_fans(residual: HealthyResidual, sigma_shares: Array) -> HealthyResidual:
     """A fan whose tacho has little noise has a small sigma, but its twin, air and supply err as those of the others:
-    no low-frequency standard deviation is below the root mean square over the fans. A fan far noisier than most is no
-    measure for them.
+    no low-frequency standard deviation is below the root mean square over the fans.
     """
-    alike = sigma_shares[sigma_shares <= ALIKE * np.median(sigma_shares)]
-    relative = (math.sqrt(np.mean(np.square(alike))) / sigma_shares).clip(1.0, None)
+    relative = (math.sqrt(np.mean(np.square(alike(sigma_shares)))) / sigma_shares).clip(1.0, None)
     return residual.model_copy(update={"low_frequency_std_of_fans": tuple(np.round(relative, 4).tolist())})
+
+
+def alike(sigma_of_fans: Array) -> Array:
+    """Those of the fans without any that is far noisier than most: it is no measure for the others."""
+    return sigma_of_fans[sigma_of_fans <= ALIKE * np.median(sigma_of_fans)]
 
 
 def _with(

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from schemas.standstill import Standstill
 from schemas.twin_card import DriveCard
 from twin.errors import TwinError
-from twin.fitting.free_run_fit import HUBER_DELTA
+from twin.fitting.free_run_fit import ERROR_ROUNDS, HEAVIER, HUBER_DELTA
 from twin.fitting.identification import Identification
-from twin.fitting.reading_errors import reliability, robust_scale
+from twin.fitting.reading_errors import ReadingErrors, reading_errors, robust_scale
 from twin.fitting.trajectories import MAX_SAMPLES, Trajectories, cut_into_trajectories, practical_samples
 from twin.models.drive import DRIVE_PARAMETERS, Drive
 from twin.models.integration import free_run, rk4_step_derivatives
@@ -39,7 +39,7 @@ LEAST_GAIN = 0.07
 """a share of the free-run error"""
 KICKS_S, RESTS_S = (0.3, 0.6, 1.2), (1.0, 2.0, 4.0)
 FIRST_ITERATIONS, MORE_ITERATIONS = 12, 5
-MOST_ITERATIONS = 2 * FIRST_ITERATIONS + (len(KICKS_S) + len(RESTS_S)) * MORE_ITERATIONS
+MOST_ITERATIONS = 2 * FIRST_ITERATIONS + (len(KICKS_S) + len(RESTS_S) + ERROR_ROUNDS) * MORE_ITERATIONS
 FIRST_DAMPING, DAMPING_DOWN, DAMPING_UP = 1e-3, 3.0, 4.0
 FIRST_PLATEAU, FIRST_KICK = 0.05, 0.5
 """shares of the range of commands above the lowest that turns the fans"""
@@ -134,11 +134,13 @@ def find_drive(
     if not with_drive < (1.0 - LEAST_GAIN) ** 2 * friction_alone:
         return None
     # Inertia and kick show while the speed changes, when readings say little of the rest.
-    by_reliability = _Problem(learned, drive, plain.top_speed_rad_s, highest)
-    by_reliability.weight_like(best)
+    of_steady_speeds = _Problem(learned, drive, plain.top_speed_rad_s, highest)
     steady = everything.copy()
     steady[[INERTIA, KICK]] = False
-    final = by_reliability.fit(best, steady, MORE_ITERATIONS, iteration_done)
+    final = best
+    for _ in range(ERROR_ROUNDS):
+        of_steady_speeds.learn_errors(final)
+        final = of_steady_speeds.fit(final, steady, MORE_ITERATIONS, iteration_done)
     return FoundDrive(drive, final[:, LAG:])
 
 
@@ -170,7 +172,7 @@ class _Problem:
 
     def __init__(self, runs: _Runs, drive: Drive, top_speed_rad_s: Array, highest_command: float) -> None:
         self._data, self._drive = runs.data, drive
-        self._reliability = np.ones(self._data.command.shape)
+        self._errors = ReadingErrors.unknown(self._data.command.shape)
         self._share = runs.kick(drive)
         self._top_speed_rad_s = top_speed_rad_s
         self._fans = len(top_speed_rad_s)
@@ -205,9 +207,15 @@ class _Problem:
             iteration_done()
         return unknowns
 
-    def weight_like(self, unknowns: Array) -> None:
-        """Let readings count by their reliability in the free run of these unknowns."""
-        self._reliability = reliability(*self._residual(unknowns), self._data)
+    def learn_errors(self, unknowns: Array) -> None:
+        """Let readings have the errors that they have in the free run of these unknowns."""
+        heavier = unknowns.copy()
+        heavier[:, INERTIA] += HEAVIER
+        data, speed = self._data, self._speed(unknowns)
+        readings, of_heavier = data.measurement.of_speed(speed), data.measurement.of_speed(self._speed(heavier))
+        with np.errstate(over="ignore", invalid="ignore"):
+            errors, by_inertia = data.speed_rad_s - readings, of_heavier - readings
+        self._errors = reading_errors(errors, speed, by_inertia, data, self._errors)
 
     def mean_square(self, unknowns: Array) -> float:
         """Mean square of the residual of all fans, (rad/s)^2."""
@@ -216,12 +224,16 @@ class _Problem:
 
     def _residual(self, unknowns: Array) -> tuple[Array, Array]:
         """(n, batch) weighted readings less those expected, 0 where nothing is compared; and the free run's speeds."""
-        data = self._data
-        equation, command = self._equation(unknowns)
-        speed, _ = free_run(equation, self._initial, command, data.step_s, self._guess)
+        data, speed = self._data, self._speed(unknowns)
         with np.errstate(over="ignore", invalid="ignore"):
-            error = data.speed_rad_s - data.measurement.of_speed(speed)
-            return np.where(data.compared, self._reliability * error, 0.0), speed
+            error = data.speed_rad_s - data.measurement.of_speed(speed) - self._errors.expected_rad_s
+            return np.where(data.compared, self._errors.weight * error, 0.0), speed
+
+    def _speed(self, unknowns: Array) -> Array:
+        """(n, batch) rad/s of the free run."""
+        equation, command = self._equation(unknowns)
+        speed, _ = free_run(equation, self._initial, command, self._data.step_s, self._guess)
+        return speed
 
     def _equation(self, unknowns: Array) -> tuple[FanEquation, Array]:
         fan = self._data.fan
@@ -250,7 +262,7 @@ class _Problem:
         forcing[1:, :, :LAG] = np.einsum("nbp,bpq->nbq", by_physics, chain)
         forcing[1:, :, LAG:] = by_command[..., np.newaxis] * by_settings[:-1]
         readings = data.measurement.of_speed(linear_recursion(by_speed, forcing))
-        sensitivity = (readings * self._reliability[..., np.newaxis]).transpose(1, 0, 2)
+        sensitivity = (readings * self._errors.weight[..., np.newaxis]).transpose(1, 0, 2)
         weight = np.where(data.compared, 1.0 / np.hypot(1.0, residual / (HUBER_DELTA * scale[fan])), 0.0)
         weighted = sensitivity * weight.T[..., np.newaxis]
         squares, gradient = np.zeros((self._fans, UNKNOWNS, UNKNOWNS)), np.zeros((self._fans, UNKNOWNS))

@@ -1,7 +1,7 @@
 """Levenberg-Marquardt on the free-run error, with exact sensitivities.
 
 Minimises the sum of a pseudo-Huber loss of (reading - that of the free run) / scale over every sample that is compared;
-if asked, the more reliable a reading is, the more it counts (twin.fitting.reading_errors). What the tachos are expected
+if asked, with what is known of the errors of readings (twin.fitting.reading_errors). What the tachos are expected
 to show of a free run is linear in it (twin.measurement), and so in its sensitivities. The unknowns are
 
     the weights of a network, shared by all fans,
@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.fitting.reading_errors import counts, reliability, robust_scale
+from twin.fitting.reading_errors import ReadingErrors, counts, reading_errors, robust_scale
 from twin.fitting.trajectories import Trajectories
 from twin.models.integration import free_run, free_run_sensitivities
 from twin.models.lag import effective_command, effective_command_by_lag
@@ -37,7 +37,7 @@ from twin.runs import Array
 Flags = NDArray[np.bool_]
 
 HUBER_DELTA = 3.0
-SCALE_ROUNDS = 2
+SCALE_ROUNDS, ERROR_ROUNDS = 2, 4  # with a constant scale, or with what was learned of the errors of readings
 MAX_CHUNK_NUMBERS = 4_000_000
 DAMPING_DOWN, DAMPING_UP = 3.0, 4.0
 FIRST_DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e9
@@ -45,6 +45,8 @@ HELD = 1e12
 
 ALL_FREE = np.ones(len(PARAMETER_NAMES), dtype=bool)
 OF_STEADY_SPEEDS = np.array([name in ("alpha", "C_D") for name in PARAMETER_NAMES])
+OF_INERTIA = np.array([name == "J" for name in PARAMETER_NAMES])
+HEAVIER = 0.1  # of ln J: by what its errors in motion are found
 NONE_FREE = np.zeros(len(PARAMETER_NAMES), dtype=bool)
 
 
@@ -98,8 +100,9 @@ class NetworkPrior:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A candidate: its free run and the residual of its readings (n, batch), each times its reliability and zero where
-    nothing is compared, and its cost (fans,) without the prior."""
+    """A candidate: its free run; the residual of its readings (n, batch), each less its expected error and times its
+    weight (ReadingErrors), zero where nothing is compared; and its cost (fans,) without the prior.
+    """
 
     unknowns: Unknowns
     speed_rad_s: Array
@@ -132,32 +135,35 @@ def fit_free_run(
     max_iterations: int,
     tolerance: float = 1e-5,
     estimate_initial_speed: bool = True,
-    by_reliability: bool = False,
+    with_errors: bool = False,
     iteration_done: IterationDone | None = None,
 ) -> FreeRunFit:
     """Fit the weights of the model, where it has any, starting from its own, and the free ones of the physics unknowns.
 
     physics: (fans, 4) to start from. top_speed_rad_s: (fans,). free: (4,) or (fans, 4).
     estimate_initial_speed: otherwise the first measured speeds are used, as in operation; an unstable equilibrium
-    then cannot be hidden by an initial speed that happens to lie on it. by_reliability: readings count by how reliable
-    they are in the free run to start from; inertia and lag are held, for what shows them then counts little. It stops
-    when a step lowers the cost by less than tolerance, relative, or when none lowers it.
+    then cannot be hidden by an initial speed that happens to lie on it. with_errors: readings of tachos that count are
+    taken with the errors that they have in the free run of each round (twin.fitting.reading_errors); inertia and lag
+    are held, for what shows them then counts little. It stops when a step lowers the cost by less than tolerance,
+    relative, or when none lowers it.
     """
     problem = FreeRunProblem(model, trajectories, top_speed_rad_s, free, prior, estimate_initial_speed)
     start = Unknowns(model.theta, physics, trajectories.starting_speed_rad_s())
     point = problem.evaluate(start, trajectories.interpolated_speed_rad_s())
     iteration = 0
-    if by_reliability and counts(trajectories):
+    learns_errors = with_errors and counts(trajectories)
+    if learns_errors:
         problem.free = problem.free & OF_STEADY_SPEEDS
-        problem.weight_like(point)
-        point = problem.evaluate(start, point.speed_rad_s)
-    for _ in range(SCALE_ROUNDS):
+    for _ in range(ERROR_ROUNDS if learns_errors else SCALE_ROUNDS):
+        if learns_errors:
+            problem.learn_errors(point)
+            point = problem.evaluate(point.unknowns, point.speed_rad_s)
         problem.scale_rad_s = robust_scale(point.residual, trajectories)
         point = problem.evaluate(point.unknowns, point.speed_rad_s)
         point, iteration, stopped = _descend(problem, point, iteration, max_iterations, tolerance, iteration_done)
         if stopped:
             break
-    return FreeRunFit(point, problem.rmse_rad_s(point), point.residual / problem.reliability, iteration)
+    return FreeRunFit(point, problem.rmse_rad_s(point), point.residual / problem.errors.weight, iteration)
 
 
 def _descend(
@@ -215,7 +221,7 @@ class FreeRunProblem:
         self.groups = 1 if self.weights else self.fans
         self.group_of_fan = np.zeros(self.fans, dtype=np.intp) if self.weights else np.arange(self.fans)
         self.scale_rad_s = np.ones(self.fans)
-        self.reliability = np.ones(trajectories.command.shape)
+        self.errors = ReadingErrors.unknown(trajectories.command.shape)
 
     def evaluate(self, unknowns: Unknowns, guess_rad_s: Array) -> Point:
         """The free run of these unknowns. guess_rad_s: (n, batch), speeds nearby."""
@@ -225,17 +231,22 @@ class FreeRunProblem:
         speed, _ = free_run(equation, unknowns.initial_speed_rad_s, command, data.step_s, guess)
         scale = self.scale_rad_s[data.fan]
         with np.errstate(over="ignore", invalid="ignore"):
-            error = data.speed_rad_s - data.measurement.of_speed(speed)
-            residual = np.where(data.compared, self.reliability * error, 0.0)
+            error = data.speed_rad_s - data.measurement.of_speed(speed) - self.errors.expected_rad_s
+            residual = np.where(data.compared, self.errors.weight * error, 0.0)
             loss = HUBER_DELTA**2 * (np.hypot(1.0, residual / (HUBER_DELTA * scale)) - 1.0)
             cost = np.bincount(data.fan, loss.sum(axis=0), self.fans).astype(np.float64)
         cost[~np.isfinite(cost)] = np.inf
         return Point(unknowns, speed, residual, cost)
 
-    def weight_like(self, point: Point) -> None:
-        """Let readings count by their reliability in the free run of this candidate."""
-        error_rad_s = point.residual / self.reliability
-        self.reliability = reliability(error_rad_s, point.speed_rad_s, self.trajectories)
+    def learn_errors(self, point: Point) -> None:
+        """Let readings have the errors that they have in the free run of this candidate."""
+        data = self.trajectories
+        heavier = replace(point.unknowns, physics=point.unknowns.physics + HEAVIER * OF_INERTIA)
+        readings = data.measurement.of_speed(point.speed_rad_s)
+        of_heavier = data.measurement.of_speed(self.evaluate(heavier, point.speed_rad_s).speed_rad_s)
+        with np.errstate(over="ignore", invalid="ignore"):
+            errors, by_inertia = data.speed_rad_s - readings, of_heavier - readings
+        self.errors = reading_errors(errors, point.speed_rad_s, by_inertia, data, self.errors)
 
     def equation(self, unknowns: Unknowns, part: slice) -> tuple[FanEquation, Array]:
         """The equation of some trajectories, and the command that acts on them (n, batch)."""
@@ -287,7 +298,7 @@ class FreeRunProblem:
 
     def sensitivities(self, point: Point, part: slice) -> Array:
         """(n, batch, M) derivatives of the free run's readings by weights, physics unknowns and initial speed, each
-        times its reliability.
+        times its weight.
         """
         data = self.trajectories
         fan, step_s = data.fan[part], data.step_s[:, part]
@@ -302,7 +313,7 @@ class FreeRunProblem:
         chain = parameters_by_unknowns(point.unknowns.physics, self.top_speed_rad_s)[fan]
         by_own = np.einsum("nbp,bpq->nbq", by_parameters, chain)
         sensitivities = np.concatenate((raw[..., : self.weights], by_own, raw[..., -1:]), axis=-1)
-        return data.measurement.of_speed(sensitivities, part) * self.reliability[:, part, np.newaxis]
+        return data.measurement.of_speed(sensitivities, part) * self.errors.weight[:, part, np.newaxis]
 
     def step(self, point: Point, squares: Array, gradient: Array, damping: Array) -> Unknowns:
         """The damped Gauss-Newton step: initial speeds eliminated first, then each fan's physics, then the weights."""
@@ -386,7 +397,8 @@ class FreeRunProblem:
         )
 
     def rmse_rad_s(self, point: Point) -> float:
-        """Root mean square of the errors of all samples that are compared, whatever their reliability."""
+        """Root mean square of the errors of all samples that are compared, whatever their weight."""
         compared = self.trajectories.compared
         with np.errstate(over="ignore"):
-            return float(np.sqrt(np.sum((point.residual / self.reliability) ** 2) / np.count_nonzero(compared)))
+            error_rad_s = np.where(compared, point.residual / self.errors.weight + self.errors.expected_rad_s, 0.0)
+            return float(np.sqrt(np.sum(error_rad_s**2) / np.count_nonzero(compared)))

@@ -236,7 +236,7 @@ def _refine(
             free=free,
             prior=prior,
             max_iterations=MAX_ITERATIONS,
-            by_reliability=True,
+            with_errors=True,
         )
         fit = replace(weighted, iterations=fit.iterations + weighted.iterations)
     return fit, *_covariance(fit, free, top_speed_rad_s, trajectories, prior)

@@ -185,7 +185,7 @@ class _Training:
                 max_iterations=round(share * max_iterations) - best_run.iterations,
                 tolerance=TOLERANCE,
                 estimate_initial_speed=estimate,
-                by_reliability=True,
+                with_errors=True,
                 iteration_done=best_run.iteration_done,
             )
             best_run.stage_done(fit.iterations)
@@ -252,7 +252,8 @@ class _BestFreeRun:
             # By the physics: an untrained network without them says nothing of how the speed changes.
             physical = FreeRunProblem(PhysicalModel(), self.data, top_speed_rad_s, NONE_FREE, nothing)
             start = Unknowns(np.zeros(0), untrained.physics, self.data.starting_speed_rad_s())
-            self.problem.weight_like(physical.evaluate(start, self.guess_rad_s))
+            physical.learn_errors(physical.evaluate(start, self.guess_rad_s))
+            self.problem.errors = physical.errors
         self.problem.scale_rad_s = robust_scale(self._free_run(untrained).residual, self.data)
         self.best, self.best_loss = untrained, float(self._free_run(untrained).cost.sum())
         self.stalled_iterations = 0

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.runtime.tray_twin import TrayTwin
 from schemas.messages import Array
-from scoring.calibration.calibration import calibrate
+from scoring.calibration.calibration import alike, calibrate
 from scoring.calibration.healthy_statistics import Runs
 from scoring.detectors.detector import Signal
 from scoring.limits import Limits, Timing
@@ -39,7 +39,7 @@ def find_limits(
         crossover_speed_rad_s=float(np.median(known_rad_s)) if len(known_rad_s) == len(bends_rad_s) else None,
         has_drive=all(twin.card.drive is not None for twin in twins),
         sigma_shares=_sigma_shares(twins[0]) if len(twins) == 1 else {},
-        sigma_rad_s=float(np.mean(np.concatenate([twin.sigma_rad_s for twin in twins]))),
+        sigma_rad_s=float(np.mean(alike(np.concatenate([twin.sigma_rad_s for twin in twins])))),
     )
 
 
