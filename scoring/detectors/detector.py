@@ -44,6 +44,8 @@ class HealthyEvidence:
     """mean of the detector's statistic, in multiples of its limit"""
     smoothed_std: float = 1.0
     """standard deviation of the low-passed standardised residual"""
+    summed_std: float = 1.0
+    """standard deviation of the sum of the standardised residual over one second"""
     smoothed_limit: float = 0.0
     """limit of the low-passed residual, in these standard deviations"""
     mean_limit: float = 0.0

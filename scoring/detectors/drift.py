@@ -22,6 +22,7 @@ from scoring.detectors.deviation import summed_deviation
 
 CAP_LIMITS = 1.05  # the sum is capped here: a long fault clears soon after it ends, and drift alone stays a warning
 MIN_CAUTIOUS_LIMIT = 2.0  # standard deviations: with too few healthy data no limit is set below this
+CAUTIOUS_S = 30.0  # of a tacho that counts: so long a shift of twice the reference value lasts at least
 REFERENCE_SHARE = 0.25  # of the limit of the smoothed residual, and at least so many sigma
 DEFAULT_REFERENCE_SIGMAS = 0.5
 
@@ -56,9 +57,16 @@ class DriftSettings(SingleLimit):
         return max(MIN_CAUTIOUS_LIMIT / self.limit, 1.0)
 
     def cautious(self, evidence: HealthyEvidence) -> DriftSettings:
-        """With too few data nothing adds up that a tacho hardly shows: the twin has learned from its readings."""
-        reference = max(self.reference_sigmas * evidence.unknown_factor, MIN_CAUTIOUS_LIMIT * evidence.count_std)
-        return self.model_copy(update={"reference_sigmas": reference})
+        """With too few data the reference value is larger by what is not known.
+
+        Of a tacho that counts it is above the error of a count and the means over ten. For how long the twin errs in
+        one direction these cannot know, so a shift has to last.
+        """
+        if not evidence.count_std:
+            return self.model_copy(update={"reference_sigmas": self.reference_sigmas * evidence.unknown_factor})
+        reference = max(evidence.mean_limit, evidence.count_std)
+        limit = max(self.limit, CAUTIOUS_S * reference / evidence.summed_std)
+        return self.model_copy(update={"reference_sigmas": reference, "limit": limit})
 
 
 class Drift(Detector):

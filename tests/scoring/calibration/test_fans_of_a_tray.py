@@ -14,6 +14,7 @@ from schemas.tacho import INSTANTANEOUS, Tacho
 from scoring.calibration.calibration import SHARED_SHARE, calibrate
 from scoring.calibration.healthy_statistics import HealthyRun, Runs
 from scoring.detectors.detector import Signal
+from scoring.detectors.deviation import summed_deviation
 from scoring.detectors.drift import DriftSettings
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.limits import Limits, Timing, default_timing
@@ -129,18 +130,24 @@ def test_a_counting_tacho_with_gaps_is_calibrated_all_the_same() -> None:
     assert "speed_drift" in found.detectors
 
 
-def test_with_few_data_nothing_adds_up_that_a_tacho_hardly_shows() -> None:
+def test_with_few_data_a_shift_lasts_until_it_is_reported_if_a_tacho_counts() -> None:
     counts = Tacho(kind="count", pulses=2, window_s=0.1)
 
-    def reference(tachos: tuple[Tacho, ...]) -> float:
+    def drift(tachos: tuple[Tacho, ...]) -> tuple[float, float]:
         found = calibrate(healthy(2, 120.0, tachos), 200.0, default_timing(FANS), 1.0, extrapolate=True, has_drive=True)
-        drift = found.settings_of("speed", DriftSettings)
-        assert drift
-        return drift.reference_sigmas * found.speed.mean_residual_std
+        settings = found.settings_of("speed", DriftSettings)
+        assert settings
+        sum_std = summed_deviation(found.speed.autocorrelation_time_s, settings.period_s)
+        return (
+            settings.reference_sigmas * found.speed.mean_residual_std,
+            settings.limit * sum_std / settings.reference_sigmas,
+        )
 
-    least = 2.0 * counts.resolution_rad_s / np.sqrt(6.0) / SIGMA_RAD_S
-    assert reference(INSTANTANEOUS) < 0.5 * least
-    assert reference((counts,)) == pytest.approx(least, rel=0.01)
+    least = counts.resolution_rad_s / np.sqrt(6.0) / SIGMA_RAD_S
+    assert drift(INSTANTANEOUS)[0] < 0.5 * least
+    reference, after_s = drift((counts,))
+    assert reference == pytest.approx(least, rel=0.01)
+    assert after_s == pytest.approx(30.0), "a shift of twice the reference value is reported after so long"
 
 
 def test_the_fewer_speeds_were_seen_the_wider_are_the_limits() -> None:
