@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from schemas.messages import Alarm, Severity, Statistic, Transition
 from schemas.units import SpeedUnit
-from scoring.alarms.alarm_flags import is_listed
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.table import row_of
 from scoring.diagnosis.shown_causes import STANDSTILL_CAUSES
@@ -42,6 +41,7 @@ TRANSITIONS = {
     Transition.DATA_RESTORED: "judged again, on new samples",
 }
 """transitions whose line depends on nothing else"""
+CONTINUES = "the alarm continues from before the restart"
 
 
 class AlarmText:
@@ -61,7 +61,7 @@ class AlarmText:
         if alarm.transition in (Transition.RAISED, Transition.SEVERITY):
             return f"{fan}: {self._deviation(alarm)}{self._cause_if_known(alarm)}"
         if alarm.transition == Transition.REPUBLISHED:
-            return f"{fan}: {_how_it_stands(alarm)}"
+            return f"{fan}: {_after_restart(alarm)}"
         return f"{fan}: {TRANSITIONS[alarm.transition]}"
 
     def _deviation(self, alarm: Alarm) -> str:
@@ -89,12 +89,10 @@ class AlarmText:
         return f"{name}, {100 * first.probability:.0f} %{evidence}"
 
 
-def _how_it_stands(alarm: Alarm) -> str:
+def _after_restart(alarm: Alarm) -> str:
     """Of an alarm that is over: what keeps it on the list, if anything does."""
     if alarm.active:
-        return "still stands"
-    if not is_listed(alarm):
-        return "stands no longer"
+        return CONTINUES
     kept = {
         "not acknowledged": not alarm.acknowledged,
         "not confirmed": not alarm.confirmed,

@@ -14,6 +14,7 @@ from typing import Any
 from schemas.messages import Alarm, Diagnosis, Severity, Transition
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_presented, is_retained, is_silenced
+from scoring.alarms.alarm_text import CONTINUES
 from scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 
 _DESCRIBES_THE_FAN = {
@@ -91,10 +92,12 @@ class CurrentAlarm:
 
 
 def words_of(alarm: Alarm) -> str:
-    """The message of an alarm, for people. Of a republished one that is over it says what holds it on the list, with
-    local times; in older recordings its message says "still stands"."""
-    if alarm.transition != Transition.REPUBLISHED or alarm.active:
+    """The message of an alarm, for people. That of a republished one is written here, because older versions worded it
+    otherwise. If it is over, it says what holds it on the list, with local times."""
+    if alarm.transition != Transition.REPUBLISHED:
         return alarm.message
+    if alarm.active:
+        return f"fan {alarm.fan}: {CONTINUES}"
     over = {"cleared", "acknowledged", "never raised"}
     holds = ", ".join(state for state in CurrentAlarm(alarm, "", (), "").states() if state not in over)
     before = "no alarm" if alarm.severity == Severity.NONE else "back to normal"

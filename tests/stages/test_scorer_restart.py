@@ -225,7 +225,7 @@ def test_from_a_snapshot_of_another_twin_only_operator_settings_are_restored() -
     assert successor.counters()["snapshots_of_another_twin"] == 1
     assert "the snapshot is of another twin" in successor.problem()
     acknowledged, shelved = standing_of(emitted)
-    assert (is_retained(acknowledged.newest), acknowledged.newest.message) == (False, "fan 0: stands no longer")
+    assert (is_retained(acknowledged.newest), acknowledged.newest.message) == (False, "fan 0: no alarm")
     assert (is_silenced(shelved.newest), shelved.newest.message) == (True, "fan 1: no alarm, shelved")
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])

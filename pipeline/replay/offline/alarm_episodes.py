@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from schemas.messages import Alarm, Diagnosis
+from scoring.alarms.current_alarms import words_of
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def _episode(messages: list[Alarm], cleared_ns: int | None) -> Episode:
         severity=max(alarm.severity for alarm in messages).name.lower(),
         residual_rad_s=_known(first.residual_rad_s),
         torque_balance_command=_known(first.torque_balance_command),
-        message=first.message,
+        message=words_of(first),
         causes=next((alarm.causes for alarm in reversed(messages) if alarm.causes), ()),
     )
 

@@ -56,6 +56,11 @@ def test_an_alarm_republished_after_a_restart_is_the_same_episode() -> None:
     assert (episode.raised_ns, episode.cleared_ns) == (10, 30)
 
 
+def test_an_alarm_that_a_recording_begins_with_continues_from_before_the_restart() -> None:
+    episode = one(alarm(10, Transition.REPUBLISHED, message="fan 0: still stands"), alarm(30, Transition.CLEARED))
+    assert episode.message.endswith(": the alarm continues from before the restart")
+
+
 def test_an_alarm_raised_again_by_a_scorer_without_a_snapshot_continues_its_episode() -> None:
     episode = one(alarm(10), alarm(15, onset_t_ns=14), alarm(30, Transition.CLEARED, onset_t_ns=14))
     assert (episode.raised_ns, episode.onset_ns, episode.cleared_ns) == (10, 5, 30)

@@ -84,12 +84,12 @@ def test_every_transition_is_one_line_that_names_the_fan(transition: Transition)
 @pytest.mark.parametrize(
     ("more", "expected"),
     [
-        ({}, "still stands"),
+        ({}, "the alarm continues from before the restart"),
         ({"active": False}, "back to normal, not acknowledged"),
         ({"active": False, "latched": True, "shelved_until_t_ns": 1},
          "back to normal, not acknowledged, latched, shelved"),
         ({"active": False, "acknowledged": True, "suppressed": True}, "back to normal, suppressed"),
-        ({"active": False, "acknowledged": True}, "stands no longer"),
+        ({"active": False, "acknowledged": True}, "back to normal"),
         ({"active": False, "acknowledged": True, "severity": Severity.NONE, "out_of_service": True},
          "no alarm, out of service"),
     ],

@@ -124,7 +124,7 @@ def test_a_machine_gets_it_all_as_json():
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"active": True}, "fan 0: still stands"),
+        ({"active": True}, "fan 0: the alarm continues from before the restart"),
         ({"active": False}, "fan 0: back to normal, unacknowledged"),
         ({"active": False, "acknowledged": True, "latched": True}, "fan 0: back to normal, latched"),
         ({"active": False, "acknowledged": True}, "fan 0: back to normal"),
@@ -134,7 +134,7 @@ def test_a_machine_gets_it_all_as_json():
         ),
     ],
 )
-def test_of_an_alarm_that_is_over_it_is_not_said_after_a_restart_that_it_stands(more, words):
+def test_a_republished_alarm_of_an_older_version_has_the_words_of_this_one(more, words):
     current = one(alarm(Transition.REPUBLISHED, **{"message": "fan 0: still stands"} | more))
     assert current.message == words
     assert current.line().endswith(f"  a  {words}")
