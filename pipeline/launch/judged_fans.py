@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,9 +57,13 @@ class AtRest:
     def line(self) -> str:
         """For people."""
         names = ", ".join(map(str, self.fans))
-        one = len(self.fans) == 1
-        why = f"stopped by {'its' if one else 'their'} command" if self.reason == InvalidReason.STOPPED else "starting"
-        return f"{self.tray}: {'fan' if one else 'fans'} {names}: {why}"
+        return f"{self.tray}: {'fan' if len(self.fans) == 1 else 'fans'} {names}: {self.words}"
+
+    @property
+    def words(self) -> str:
+        """The state, for people."""
+        whose = "its" if len(self.fans) == 1 else "their"
+        return f"stopped by {whose} command" if self.reason == InvalidReason.STOPPED else "starting"
 
     def as_json(self) -> dict[str, object]:
         """For machines."""
@@ -120,6 +124,10 @@ class JudgedFans:
                 for reason in JUDGED_AT_REST
                 if self._seen_s.get(tray.name, -np.inf) >= oldest_s and (self._reasons[tray.name] == reason).any()
             ]
+
+    def words_at_rest(self) -> dict[tuple[str, int], str]:
+        """The state of each fan that is stopped or starting now, for people, by tray and fan."""
+        return {(each.tray, fan): replace(each, fans=(fan,)).words for each in self.at_rest() for fan in each.fans}
 
     def unjudged(self, states: Sequence[StageState]) -> list[Unjudged]:
         """The fans that are not judged now, and why. states: of the site's stages; one may be the reason."""

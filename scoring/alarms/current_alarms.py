@@ -37,6 +37,13 @@ class CurrentAlarm:
     """last message of the occurrence that describes the fan, not an operator's action"""
     causes: tuple[Diagnosis, ...]
     acknowledged_by: str
+    message_t_ns: int = 0
+    """time of the sample that the message describes; 0 where it describes none"""
+
+    def about(self) -> str:
+        """The message without the fan and with its time: commands and speeds in it are those of then."""
+        about = self.message.removeprefix(f"fan {self.newest.fan}: ")
+        return f"at {clock(self.message_t_ns)}: {about}" if about and self.message_t_ns else about
 
     def line(self) -> str:
         """The last transition, for a log; a silenced active alarm is marked as such."""
@@ -83,6 +90,7 @@ class CurrentAlarm:
             "onset_t_ns": alarm.onset_t_ns,
             "t_ns": alarm.t_ns,
             "message": self.message,
+            "message_t_ns": self.message_t_ns,
             "causes": [
                 {"cause": each.cause, "probability": each.probability, "evidence": each.evidence}
                 for each in self.causes
@@ -138,6 +146,7 @@ def _current(messages: Sequence[Alarm]) -> CurrentAlarm:
         message=words_of(describing) if describing else "",
         causes=with_causes.causes if with_causes else (),
         acknowledged_by=acknowledging.operator_name if acknowledging and newest.acknowledged else "",
+        message_t_ns=describing.t_ns if describing and describing.transition != Transition.REPUBLISHED else 0,
     )
 
 

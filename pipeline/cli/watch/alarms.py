@@ -141,11 +141,12 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
     slow = _slow_changes(watcher)
     if json_output:
         shown = {"alarms": [each.as_json() for each in found], "not_judged": [each.as_json() for each in unjudged]}
-        shown |= {"slow_changes": slow}
+        shown |= {"at_rest": [each.as_json() for each in judged.at_rest()], "slow_changes": slow}
         typer.echo(json.dumps(shown))
     else:
+        at_rest = judged.words_at_rest()
         for each in found:
-            console.print(alarm_lines(each))
+            console.print(alarm_lines(each, at_rest.get((each.newest.header.tray, each.newest.fan), "")))
         lines = [Text(line, style="yellow") for line in slow] + [Text(each.line(), style="red") for each in unjudged]
         for line in lines:
             console.print(line)
@@ -305,18 +306,20 @@ def _counts(watcher: SiteWatcher, site: str, alarm: Alarm) -> bool:
 
 def _alone(alarm: Alarm) -> CurrentAlarm:
     """The alarm as this message alone describes it."""
-    return CurrentAlarm(alarm, alarm.message, alarm.causes, alarm.operator_name if alarm.acknowledged else "")
+    by = alarm.operator_name if alarm.acknowledged else ""
+    return CurrentAlarm(alarm, alarm.message, alarm.causes, by, alarm.t_ns)
 
 
 def _word(alarm: Alarm) -> str:
     return alarm.transition.name.lower()
 
 
-def alarm_lines(current: CurrentAlarm) -> Text:
-    """The alarm for people, in up to three lines: state, causes, message."""
+def alarm_lines(current: CurrentAlarm, now: str = "") -> Text:
+    """The alarm for people, in up to three lines: state, causes, message. now: what the fan does, if it is known."""
     alarm = current.newest
     by = f" by {current.acknowledged_by}" if current.acknowledged_by else ""
     words = [f"{word}{by}" if word == "acknowledged" else word for word in current.states()]
+    words += [f"now {now}"] if now else []
     style = _STYLES.get(alarm.severity, "bold red") if is_presented(alarm) else "dim"
     text = Text.assemble((f"{_name(alarm)}  {alarm.severity.name:7}", style), f"  {', '.join(words)}")
     if alarm.severity != Severity.NONE:
@@ -326,8 +329,8 @@ def alarm_lines(current: CurrentAlarm) -> Text:
         is_shown = not evidence or evidence in current.message
         why = "" if is_shown else f": {evidence.removeprefix(f'{CAUSES[CANNOT_TELL]}: ')}"
         text.append(f"\n    {_probable(current.causes)}{why}")
-    if current.message:
-        text.append(f"\n    {current.message}")
+    if about := current.about():
+        text.append(f"\n    {about}")
     return text
 
 

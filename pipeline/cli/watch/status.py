@@ -6,7 +6,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import typer
@@ -123,7 +123,8 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Gro
             problems.append(Text(f"{state.label}: {state.view.health.problem}", style="red"))
     notes = [Text(line) for line in note_lines(state.view.health for state in states if state.view)]
     problems += [Text(line, style="yellow") for line in (*loss_lines(states), *refused_lines(watcher.refused()))]
-    alarms = [_alarm_line(each) for each in watcher.current_alarms() if is_listed(each.newest)]
+    now = judged.words_at_rest()
+    alarms = [_alarm_line(each, now) for each in watcher.current_alarms() if is_listed(each.newest)]
     if not _has_scorer(states):
         not_judged = [Text("no fan is judged: the configuration has no scorer", style="yellow")]
     elif not any(state.view and state.view.alive and state.view.health.stage == "scorer" for state in states):
@@ -173,14 +174,16 @@ def _duration(seconds: float) -> str:
     return next((f"{seconds / size:.0f} {unit}" for unit, size in units if seconds >= 2 * size), f"{seconds:.0f} s")
 
 
-def _alarm_line(current: CurrentAlarm) -> Text:
+def _alarm_line(current: CurrentAlarm, at_rest: Mapping[tuple[str, int], str]) -> Text:
     alarm = current.newest
     style = _STYLES.get(alarm.severity, "bold red") if alarm.active else "green"
     text = Text.assemble(
         (f"{clock(alarm.t_ns)}  {alarm.severity.name:7}", style if is_presented(alarm) else "dim"),
         f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(current.states())}",
     )
-    about = current.message.removeprefix(f"fan {alarm.fan}: ")
+    about = current.about()
+    if now := at_rest.get((alarm.header.tray, alarm.fan)):
+        text.append(f", now {now}")
     if current.causes:
         first = current.causes[0]
         text.append(f", {first.cause} {100 * first.probability:.0f} %")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import threading
@@ -34,7 +35,7 @@ from schemas.messages import (
     Transition,
 )
 from schemas.topics import BY_NAME, tray_key
-from scoring.alarms.current_alarms import CurrentAlarm
+from scoring.alarms.current_alarms import CurrentAlarm, clock
 from scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from scoring.alarms.tray_conditions import TrayConditions
 from tests.support.fantwin_command import error_of, fantwin
@@ -186,7 +187,22 @@ def test_the_list_shows_current_alarms_and_with_all_also_those_that_are_over(sit
     assert [a["fan"] for a in site.listed("--all")] == [3, 5]
     first, cause, message = site.ask().splitlines()
     assert first.startswith(f"{TRAY} fan 3  ALARM    active, unacknowledged  since ")
-    assert (cause.strip(), message.strip()) == ("drag_up 83 %: drag +50 %", "too slow")
+    assert cause.strip() == "drag_up 83 %: drag +50 %"
+    assert message.strip() == f"at {clock(alarm['message_t_ns'])}: too slow"
+
+
+def test_the_list_says_when_a_message_was_true_and_that_the_fan_is_stopped_by_its_command_now(site):
+    site.raise_alarm(1)
+    site.core.not_judged = (InvalidReason.STARTING, InvalidReason.STOPPED)
+
+    def listed() -> list[str]:
+        (first, _, message) = site.ask().splitlines()
+        return [message] if "  active, unacknowledged, now stopped by its command  since " in first else []
+
+    (message,) = eventually(listed, "the scores show it")
+    assert re.fullmatch(r"    at \d\d:\d\d:\d\d: too slow", message)
+    at_rest = [{"tray": TRAY, "fans": [1], "state": "stopped"}, {"tray": TRAY, "fans": [0], "state": "starting"}]
+    assert json.loads(site.ask("--json"))["at_rest"] == at_rest
 
 
 def test_row_01_no_alarms_is_not_said_while_a_fan_is_not_judged(site):

@@ -40,6 +40,7 @@ from schemas.messages import (
 )
 from schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from schemas.units import NS_PER_S
+from scoring.alarms.current_alarms import clock
 from tests.support.running_chain import DEMO, FANS, SITE, TRAY, RunningCommand, eventually, fantwin
 from tests.support.score_data import one_sample
 
@@ -230,8 +231,9 @@ def test_alarms_are_shown_with_their_states_and_probable_causes(site):
     watcher = SiteWatcher(site.outside, SITE)
     view(site, watcher, HEALTH)
     watcher.ask_for_past_alarms()
-    text = shown(watcher, site.judged())
-    assert "fan 2: active, acknowledged, drag_up 87 %; more drag" in " ".join(text.split())
+    text = shown(watcher, site.judged(*[InvalidReason.NONE] * 2, InvalidReason.STOPPED))
+    line = "fan 2: active, acknowledged, now stopped by its command, drag_up 87 %; "
+    assert f"{line}at {clock(ALARM.t_ns + 1)}: more drag" in " ".join(text.split())
     assert "fan 3" not in text, "it is over, and everybody knows"
     assert "fan 4: never raised, shelved until it clears" in text
     reported = {alarm["fan"]: alarm for alarm in document(watcher, site.judged())["alarms"]}

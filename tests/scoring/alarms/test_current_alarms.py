@@ -113,6 +113,12 @@ def test_a_time_of_another_day_has_its_date():
     assert len(clock(now_ns - 2 * 86_400_000_000_000)) == len("2020-01-01 12:00:00")
 
 
+def test_a_message_has_its_time_unless_it_only_says_that_the_alarm_continues():
+    at = one(alarm(t_ns=7, message="fan 0: too slow"), alarm(Transition.ACKNOWLEDGED, 9))
+    assert at.about() == f"at {clock(7)}: too slow"
+    assert one(alarm(Transition.REPUBLISHED, 7)).about() == "the alarm continues from before the restart"
+
+
 def test_a_machine_gets_it_all_as_json():
     standing = one(alarm(causes=(Diagnosis(cause="drag_up", probability=0.8),), shelved_until_t_ns=7))
     shown = json.loads(json.dumps(standing.as_json()))
