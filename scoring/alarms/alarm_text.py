@@ -10,21 +10,8 @@ from schemas.messages import Alarm, Severity, Statistic, Transition
 from schemas.units import SpeedUnit
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.table import row_of
-from scoring.diagnosis.shown_causes import STANDSTILL_CAUSES
+from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, STANDSTILL_CAUSES
 
-CANNOT_TELL = "cannot_tell"
-CAUSES = {
-    "drag_up": "more drag (airflow blocked, filter clogged)",
-    "drag_down": "less drag (blade lost, airflow freer than before)",
-    "friction_up": "more friction (bearing)",
-    "gain_down": "less drive (supply, driver)",
-    "external_torque": "an external torque (something touches the rotor)",
-    "sensor_stuck": "a stuck tacho",
-    "sensor_dropout": "a tacho that drops out",
-    "sensor_scaling": "a tacho that counts wrongly",
-    **STANDSTILL_CAUSES,
-    CANNOT_TELL: "cannot tell yet",
-}
 TRANSITIONS = {
     Transition.CLEARED: "back to normal",
     Transition.ACKNOWLEDGED: "acknowledged",

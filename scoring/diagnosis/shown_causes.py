@@ -1,6 +1,8 @@
-"""Which causes of an alarm are shown, and the names of those of standstill. Commands read this without scipy."""
+"""Which causes of an alarm are shown, and their names for people. Commands read this without scipy."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 from schemas.messages import Diagnosis
 
@@ -15,9 +17,37 @@ STANDSTILL_CAUSES = {
     STILL_DRIVEN: "still driven",
     WINDMILLING: "turned by the air",
 }
-"""names for people"""
+CANNOT_TELL = "cannot_tell"
+CAUSES = {
+    "drag_up": "more drag (airflow blocked, filter clogged)",
+    "drag_down": "less drag (blade lost, airflow freer than before)",
+    "friction_up": "more friction (bearing)",
+    "gain_down": "less drive (supply, driver)",
+    "external_torque": "an external torque (something touches the rotor)",
+    "sensor_stuck": "a stuck tacho",
+    "sensor_dropout": "a tacho that drops out",
+    "sensor_scaling": "a tacho that counts wrongly",
+    **STANDSTILL_CAUSES,
+    CANNOT_TELL: "cannot tell yet",
+}
+"""names for people, with what the fault may be"""
 FALLING = "falling speed"
 """parameter of these causes while the fan still turns"""
+
+
+def short_name(cause: str) -> str:
+    """The name for people, without what the fault may be."""
+    return "cannot tell" if cause == CANNOT_TELL else CAUSES.get(cause, cause).partition(" (")[0]
+
+
+def with_share(cause: Diagnosis) -> str:
+    """The short name and the probability."""
+    return f"{short_name(cause.cause)} {100 * cause.probability:.0f} %"
+
+
+def most_probable(causes: Sequence[Diagnosis]) -> list[str]:
+    """The most probable cause with its probability; several where these are equal in per cent."""
+    return [with_share(each) for each in causes if f"{each.probability:.0%}" == f"{causes[0].probability:.0%}"]
 
 
 def is_of_standstill(cause: Diagnosis) -> bool:

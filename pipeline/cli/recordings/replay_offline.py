@@ -22,7 +22,9 @@ from pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, 
 from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from pipeline.replay.offline.rescoring import RescoredTray, rescore
 from pipeline.replay.offline.verify import CannotCompareError
+from schemas.messages import Diagnosis
 from schemas.units import NS_PER_S
+from scoring.diagnosis.shown_causes import most_probable
 
 EXIT_DIFFERS, EXIT_CANNOT_COMPARE, EXIT_LOST = 1, 2, 3
 _SHOWN = 40
@@ -215,7 +217,7 @@ def _table(title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> Table
     for one in alarms:
         raised = f"{(one['raised_ns'] - start_ns) / NS_PER_S:.2f}"
         cleared = "active" if one["cleared_ns"] is None else f"{(one['cleared_ns'] - start_ns) / NS_PER_S:.2f}"
-        first = f"{one['causes'][0]['cause']} {100 * one['causes'][0]['probability']:.0f} %" if one["causes"] else "-"
+        first = "\n".join(most_probable([Diagnosis(**each) for each in one["causes"]])) or "-"
         # the message also names fan and first cause; both have columns of their own, with the newest cause
         what = one["message"].removeprefix(f"fan {one['fan']}: ").partition("; ")[0]
         table.add_row(one["tray"], str(one["fan"]), raised, cleared, one["severity"], first, escape(what))

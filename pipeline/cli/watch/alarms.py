@@ -35,9 +35,8 @@ from schemas.messages import Action, Alarm, Diagnosis, Request, Severity, Transi
 from schemas.topics import alive_key, tray_key
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
-from scoring.alarms.alarm_text import CANNOT_TELL, CAUSES
 from scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms, until, words_of
-from scoring.diagnosis.shown_causes import MIN_PROBABILITY
+from scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
 from scoring.wear.slow_change import WEAR_HINT
 
 _DISCOVERY_S = 5.0  # every stage sends several health messages in this time
@@ -353,9 +352,7 @@ def _name(alarm: Alarm) -> str:
 def _probable(causes: Iterable[Diagnosis]) -> str:
     """The most probable cause, and the others that are probable enough to be listed."""
     return ", ".join(
-        f"{each.cause} {100 * each.probability:.0f} %"
-        for number, each in enumerate(causes)
-        if not number or each.probability >= MIN_PROBABILITY
+        with_share(each) for number, each in enumerate(causes) if not number or each.probability >= MIN_PROBABILITY
     )
 
 

@@ -31,6 +31,7 @@ from pipeline.runtime.signals import stop_on_signals
 from pipeline.runtime.snapshot_store import FORMER_SUFFIX
 from pipeline.selftest.scratch_site import FANTWIN, free_port
 from schemas.units import NS_PER_S
+from scoring.diagnosis.shown_causes import short_name
 
 DEMO_FOLDER = Path(__file__).parents[2] / "demo"
 DURATION_S = 34.0
@@ -207,7 +208,7 @@ def _print_report(summary: Summary, out: Path, took_s: float, console: Console) 
         times = (fault.start_ns, fault.alarm_ns, None, fault.stop_ns, fault.cleared_ns)
         cells = ["missed" if t is None else f"{(t - summary.start_ns) / NS_PER_S:.2f}" for t in times]
         cells[2] = "" if fault.delay_s is None else f"{fault.delay_s:.2f}"
-        cause = f"{fault.cause.replace('_', ' ')}, {fault.probability:.0%}" if fault.cause else ""
+        cause = f"{short_name(fault.cause)}, {fault.probability:.0%}" if fault.cause else ""
         table.add_row(fault.kind, str(fault.fan), *cells, cause)
     console.print(table)
     p50, p99 = ("unknown" if t is None else f"{t:.1f} ms" for t in summary.latency_ms.values())

@@ -33,6 +33,7 @@ from schemas.streams import LOSS_PREFIX
 from schemas.units import NS_PER_S
 from scoring.alarms.alarm_flags import is_listed, is_presented
 from scoring.alarms.current_alarms import CurrentAlarm, clock
+from scoring.diagnosis.shown_causes import most_probable
 
 _STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 _LISTEN_S = 2.5  # two health messages of every stage, which give rates
@@ -184,9 +185,7 @@ def _alarm_line(current: CurrentAlarm, at_rest: Mapping[tuple[str, int], str]) -
     about = current.about()
     if now := at_rest.get((alarm.header.tray, alarm.fan)):
         text.append(f", now {now}")
-    if current.causes:
-        first = current.causes[0]
-        text.append(f", {first.cause} {100 * first.probability:.0f} %")
+    text.append("".join(f", {cause}" for cause in most_probable(current.causes)))
     return text.append(f"; {about}") if about else text
 
 

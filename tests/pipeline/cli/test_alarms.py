@@ -187,7 +187,7 @@ def test_the_list_shows_current_alarms_and_with_all_also_those_that_are_over(sit
     assert [a["fan"] for a in site.listed("--all")] == [3, 5]
     first, cause, message = site.ask().splitlines()
     assert first.startswith(f"{TRAY} fan 3  ALARM    active, unacknowledged  since ")
-    assert cause.strip() == "drag_up 83 %: drag +50 %"
+    assert cause.strip() == "more drag 83 %: drag +50 %"
     assert message.strip() == f"at {clock(alarm['message_t_ns'])}: too slow"
 
 
@@ -229,7 +229,7 @@ def test_a_missing_diagnosis_is_explained_once():
     (raised,) = [alarm for alarm in alarms_of_one_fan() if alarm.transition == Transition.RAISED]
     unknown = (Diagnosis(cause="cannot_tell", probability=0.6, evidence="cannot tell yet: the command is not moving"),)
     _, cause, message = alarm_lines(CurrentAlarm(raised, "too slow", unknown, "")).plain.splitlines()
-    assert (cause.strip(), message.strip()) == ("cannot_tell 60 %: the command is not moving", "too slow")
+    assert (cause.strip(), message.strip()) == ("cannot tell 60 %: the command is not moving", "too slow")
 
 
 def test_an_acknowledgement_names_who_and_a_shelved_alarm_is_listed_and_not_presented(site):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from dataclasses import replace
@@ -9,12 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 from typer.testing import Result
 
+from pipeline.cli.recordings.replay_offline import _table
 from pipeline.recordings.reading import read_metadata, read_recording
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Alarm, InvalidReason, Raw
 from schemas.units import NS_PER_S
+from scoring.diagnosis.shown_causes import short_name
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.killed_site import Site
 from tests.support.offline_replay import changed
@@ -98,13 +102,32 @@ def test_the_list_names_severity_and_probable_cause_and_is_not_wide(golden):
     first, what = alarm["causes"][0], alarm["message"].partition(": ")[2][:12]
     lines = replay(GOLDEN).stdout.splitlines()
     (row,) = [line for line in lines if line.lstrip().startswith("tray1")]
-    for expected in (alarm["severity"], f"{first['cause']} {100 * first['probability']:.0f} %", what):
+    cause = f"{short_name(first['cause'])} {100 * first['probability']:.0f} %"
+    assert "_" not in cause
+    for expected in (alarm["severity"], cause, what):
         assert expected in row
     what_if = replay(GOLDEN, "--set", "scorer.limit_factor=1000").stdout.splitlines()
     assert "against the recording: 1 alarms lost" in what_if
     (gone,) = [line for line in what_if if line.lstrip().startswith("tray1")]
-    assert alarm["severity"] in gone and first["cause"] in gone
+    assert alarm["severity"] in gone and cause in gone
     assert max(map(len, lines + what_if)) <= 100
+
+
+def test_causes_that_are_equally_probable_are_all_in_the_table():
+    causes = [{"cause": cause, "probability": share} for cause, share in (("blocked", 0.402), ("no_power", 0.398))]
+    rest = {"cause": "no_tacho", "probability": 0.2}
+    alarm = {
+        "tray": "a",
+        "fan": 0,
+        "raised_ns": 0,
+        "cleared_ns": None,
+        "severity": "alarm",
+        "message": "fan 0: too slow",
+    }
+    console = Console(width=100, file=io.StringIO(), record=True)
+    console.print(_table("alarms", [{**alarm, "causes": [*causes, rest]}], 0))
+    text = console.export_text()
+    assert "blocked 40 %" in text and "no power 40 %" in text and "tacho" not in text
 
 
 def test_counts_of_stages_and_reasons_for_unscored_samples_have_distinct_names(golden):

@@ -232,7 +232,7 @@ def test_alarms_are_shown_with_their_states_and_probable_causes(site):
     view(site, watcher, HEALTH)
     watcher.ask_for_past_alarms()
     text = shown(watcher, site.judged(*[InvalidReason.NONE] * 2, InvalidReason.STOPPED))
-    line = "fan 2: active, acknowledged, now stopped by its command, drag_up 87 %; "
+    line = "fan 2: active, acknowledged, now stopped by its command, more drag 87 %; "
     assert f"{line}at {clock(ALARM.t_ns + 1)}: more drag" in " ".join(text.split())
     assert "fan 3" not in text, "it is over, and everybody knows"
     assert "fan 4: never raised, shelved until it clears" in text

@@ -9,10 +9,10 @@ import pytest
 
 from schemas.messages import Alarm, Diagnosis, Severity, Statistic, Transition
 from schemas.units import SpeedUnit
-from scoring.alarms.alarm_text import CAUSES, AlarmText
+from scoring.alarms.alarm_text import AlarmText
 from scoring.diagnosis.diagnosis import CANNOT_TELL, DROPOUT, STUCK
 from scoring.diagnosis.hypotheses import CAUSES as HYPOTHESES
-from scoring.diagnosis.shown_causes import STANDSTILL_CAUSES
+from scoring.diagnosis.shown_causes import CAUSES, STANDSTILL_CAUSES, short_name
 
 
 def line(
@@ -73,6 +73,7 @@ def test_causes_of_a_fan_that_comes_to_rest_are_named_beside_those_of_one_that_t
 
 def test_every_cause_that_can_be_found_has_words() -> None:
     assert set(CAUSES) == {cause.name for cause in HYPOTHESES} | {CANNOT_TELL, STUCK, DROPOUT} | set(STANDSTILL_CAUSES)
+    assert [cause for cause in CAUSES if "_" in short_name(cause) or "(" in short_name(cause)] == []
 
 
 @pytest.mark.parametrize("transition", [t for t in Transition if t != Transition.NONE])
