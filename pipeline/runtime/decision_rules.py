@@ -53,6 +53,9 @@ class DecisionRules(IntEnum):
     """Limits widen while readings change, as far as those of a healthy fan may. Before, they did with any change, also
     by a fault. An alarm returns at the speeds at which it came, or after ten minutes at others. Before, it did at any
     speed."""
+    PLAIN_WORDS = 14
+    """Sentences on why a cause is unclear have words for causes, and say that the speed has changed too little. Before,
+    they had code names, and said that the command was not moving, even when it was. No decision differs."""
 
 
 CURRENT_RULES = max(DecisionRules)

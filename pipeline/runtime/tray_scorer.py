@@ -68,6 +68,7 @@ class TrayScorer:
             twin.standstill,
             knows_readings=judges_rest,
             knows_falls=decision_rules >= DecisionRules.FALLS,
+            plain_words=decision_rules >= DecisionRules.PLAIN_WORDS,
         )
         self.wear = WearMonitor(twin.balances, self._diagnoser, config.wear_every_s, twin.command_unit)
         off_delay_s = config.least_off_delay_s(twin.tachos)

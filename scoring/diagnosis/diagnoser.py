@@ -58,11 +58,12 @@ class Diagnoser:
         *,
         knows_readings: bool = True,
         knows_falls: bool = True,
+        plain_words: bool = True,
     ) -> None:
         """advice: None only to diagnose as for recordings made before there was any; see `diagnose`. standstill: None
         where the detector of it is not used. knows_readings: False only to diagnose as for recordings made before
         causes accounted for what a tacho resolves; knows_falls: before a fan that slows down was compared with one that
-        comes to rest.
+        comes to rest; plain_words: see `diagnose`.
         """
         self._healthy = healthy
         self._advice = advice
@@ -70,6 +71,7 @@ class Diagnoser:
         self._standstill = standstill
         self._knows_readings = knows_readings
         self._knows_falls = knows_falls
+        self._plain_words = plain_words
         self._blocks: deque[_Block] = deque()
         self._period_ns = 0
         self._due: dict[int, list[int]] = {}
@@ -132,7 +134,7 @@ class Diagnoser:
         if window is None:
             return ()
         tacho = self._tachos[fan] if self._knows_readings else None
-        causes = diagnose(window, self._healthy[fan], self._advice, tacho).causes
+        causes = diagnose(window, self._healthy[fan], self._advice, tacho, plain_words=self._plain_words).causes
         if self._knows_falls and self._standstill is not None:
             rest = coming_to_rest(window, self._standstill, self._healthy[fan], self._tachos[fan])
             causes = rest.beside(causes) if rest else causes

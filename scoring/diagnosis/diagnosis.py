@@ -29,8 +29,9 @@ from scoring.diagnosis.sensor_evidence import (
     stuck_log_ratio,
     stuck_log_ratio_of_readings,
 )
+from scoring.diagnosis.shown_causes import CANNOT_TELL, short_name
 
-CANNOT_TELL, STUCK, DROPOUT = "cannot_tell", "sensor_stuck", "sensor_dropout"
+STUCK, DROPOUT = "sensor_stuck", "sensor_dropout"
 CANNOT_TELL_YET = "cannot tell yet"
 ADVICE = Advice()
 MIN_AFTER_ONSET_S = 0.2
@@ -79,13 +80,19 @@ class Diagnosis:
 
 
 def diagnose(
-    window: Window, healthy: HealthyBalance, advice: Advice | None = ADVICE, tacho: Tacho | None = None
+    window: Window,
+    healthy: HealthyBalance,
+    advice: Advice | None = ADVICE,
+    tacho: Tacho | None = None,
+    *,
+    plain_words: bool = True,
 ) -> Diagnosis:
     """Diagnose one fan from its last seconds, some before the onset of the fault and all since.
 
     advice: on what would show the cause, where it is unclear; None only to diagnose as for recordings made before there
     was any. Missing readings then counted from the onset of the alarm, not from the first of them. tacho: None where
-    each sample is a reading of its own, and for recordings made before it was accounted for.
+    each sample is a reading of its own, and for recordings made before it was accounted for. plain_words: False only
+    for recordings made when sentences had the names of causes that messages have.
 
     About three seconds of health before the onset are enough; the samples after it decide. The diagnosis can be
     repeated as samples arrive. It takes milliseconds.
@@ -122,7 +129,7 @@ def diagnose(
     evidence: dict[str, tuple[Evidence | None, str]] = {one.cause.name: _evidence(one) for one in explanations}
     evidence[STUCK] = _of_stuck(repeats, window.period_s)
     evidence[DROPOUT] = _of_dropout(missing, 0.0 if advice is None else (len(speed) - dropout_onset) * window.period_s)
-    unclear = _clarity(names, weight, healthy_share, regression.speeds_after if enough else None)
+    unclear = _clarity(names, weight, healthy_share, regression.speeds_after if enough else None, plain_words)
     if advice is not None and unclear.startswith(CANNOT_TELL_YET):
         unclear = advice.added_to(unclear, window, healthy)
     evidence[CANNOT_TELL] = None, unclear
@@ -175,16 +182,20 @@ def _of_dropout(missing: float, seconds: float) -> tuple[Evidence | None, str]:
     return found, f"{100 * missing:.0f} % of the readings{over} are missing"
 
 
-def _clarity(names: list[str], weight: Array, healthy_share: float, speeds_after: Array | None) -> str:
+def _clarity(
+    names: list[str], weight: Array, healthy_share: float, speeds_after: Array | None, plain_words: bool
+) -> str:
     """Why the cause is unclear, or that it is clear."""
     first, second = np.argsort(-weight[:-1])[:2]
+    one, other = (short_name(names[each]) if plain_words else names[each] for each in (first, second))
     if weight[-1] < weight[first] * CLEAR_RATIO:
-        return f"little doubt: {names[first]} is more than twice as probable as all others together"
+        return f"little doubt: {one} is more than twice as probable as all others together"
     if speeds_after is None:
         return f"{CANNOT_TELL_YET}: too few speeds since the onset"
     if healthy_share > 0.5:
         return f"{CANNOT_TELL_YET}: the torque balance is that of a healthy fan"
     low, high = np.quantile(speeds_after, (0.05, 0.95))
     if high - low < STEADY_SHARE * high:
-        return f"{CANNOT_TELL_YET}: the command is not moving"
-    return f"{CANNOT_TELL_YET}: {names[first]} and {names[second]} explain it alike"
+        still = "the speed has changed too little since the alarm began"
+        return f"{CANNOT_TELL_YET}: {still if plain_words else 'the command is not moving'}"
+    return f"{CANNOT_TELL_YET}: {one} and {other} explain it alike"

@@ -188,6 +188,25 @@ def test_a_weak_drive_is_not_taken_for_no_power() -> None:
     assert set(first) == {"cannot_tell", "gain_down"}
 
 
+@pytest.mark.parametrize(
+    ("level", "now", "before"),
+    [
+        (40.0, "less drive and more friction explain it alike", "gain_down and friction_up explain it alike"),
+        (70.0, "the speed has changed too little since the alarm began", "the command is not moving"),
+    ],
+)
+def test_why_a_cause_is_unclear_is_said_in_words_and_in_older_recordings_as_before(
+    level: float, now: str, before: str
+) -> None:
+    command = commands((80.0, 40.0))
+    driven = command.copy()
+    driven[round(20.0 / PERIOD_S) :] = level
+    for rules, words in ((CURRENT_RULES, now), (DecisionRules.HEALTHY_MOTION, before)):
+        found = seen(command, speed_of(driven), alarm_sigmas=5.0, decision_rules=rules)
+        evidence = [cause.evidence for alarm in found.alarms for cause in alarm.causes]
+        assert any(each.startswith(f"cannot tell yet: {words}: move the command to ") for each in evidence)
+
+
 @pytest.mark.parametrize(("reading", "causes"), [(0.0, ["blocked", "no_power", "no_tacho"]), (np.nan, ["no_tacho"])])
 def test_a_fan_that_does_not_start_is_an_alarm_after_three_times_the_longest_start(
     reading: float, causes: list[str]

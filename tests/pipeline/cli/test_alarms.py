@@ -227,9 +227,18 @@ def alarms_of_one_fan() -> list[Alarm]:
 
 def test_a_missing_diagnosis_is_explained_once():
     (raised,) = [alarm for alarm in alarms_of_one_fan() if alarm.transition == Transition.RAISED]
-    unknown = (Diagnosis(cause="cannot_tell", probability=0.6, evidence="cannot tell yet: the command is not moving"),)
+    unknown = (
+        Diagnosis(
+            cause="cannot_tell",
+            probability=0.6,
+            evidence="cannot tell yet: too few speeds since the onset",
+        ),
+    )
     _, cause, message = alarm_lines(CurrentAlarm(raised, "too slow", unknown, "")).plain.splitlines()
-    assert (cause.strip(), message.strip()) == ("cannot tell 60 %: the command is not moving", "too slow")
+    assert (cause.strip(), message.strip()) == (
+        "cannot tell 60 %: too few speeds since the onset",
+        "too slow",
+    )
 
 
 def test_an_acknowledgement_names_who_and_a_shelved_alarm_is_listed_and_not_presented(site):

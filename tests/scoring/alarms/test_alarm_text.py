@@ -27,7 +27,11 @@ def line(
 
 
 BLOCKED = Diagnosis(cause="drag_up", probability=0.87, evidence="drag +62 % (95 %: 55 to 70)")
-NOT_YET = Diagnosis(cause="cannot_tell", probability=0.9, evidence="cannot tell yet: the command is not moving")
+NOT_YET = Diagnosis(
+    cause="cannot_tell",
+    probability=0.9,
+    evidence="cannot tell yet: too few speeds since the onset",
+)
 
 
 def test_a_deviation_of_the_speed_is_in_the_trays_unit() -> None:
@@ -59,7 +63,7 @@ def test_the_first_cause_is_named_with_its_probability_and_evidence_where_there_
     assert line(causes=(BLOCKED, NOT_YET)) == f"fan 2: 71 rad/s below the twin (limit 8); {known}"
     assert line(Transition.DIAGNOSED, causes=(BLOCKED, NOT_YET)) == f"fan 2: {known}"
     assert line(causes=(NOT_YET, BLOCKED)) == "fan 2: 71 rad/s below the twin (limit 8)"
-    assert line(Transition.DIAGNOSED, causes=(NOT_YET,)) == "fan 2: cannot tell yet: the command is not moving"
+    assert line(Transition.DIAGNOSED, causes=(NOT_YET,)) == "fan 2: cannot tell yet: too few speeds since the onset"
     assert line(Transition.DIAGNOSED, causes=(replace(NOT_YET, evidence=""),)) == "fan 2: cannot tell yet"
     assert line(Transition.DIAGNOSED) == "fan 2: cause unknown"
 
