@@ -10,7 +10,7 @@ import typer
 
 from pipeline.bus.session import Bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of
+from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of, share_note
 from pipeline.config.loading import load_config
 from pipeline.runtime.signals import stop_on_signals
 
@@ -30,6 +30,9 @@ def command(
 ) -> None:
     """Send a command to one fan, and wait until acquisition has sent it to the device.
 
+    A command is in the unit of the line, from command_min to command_max of the tray. The fan keeps it until something
+    sets another.
+
     Example: fantwin command -c fantwin.toml --fan 0 0.6
     """
     settings = load_config(config, overrides or (), stages=())
@@ -48,3 +51,5 @@ def command(
         typer.echo(json.dumps({"tray": chosen.name, "fan": number, "kind": kind, "value": value, "unit": unit.strip()}))
     else:
         typer.echo(f"{chosen.name}, fan {number}: {kind} {value:g}{unit} sent")
+    if not set_point and (note := share_note(chosen, value)):
+        typer.echo(note, err=True)

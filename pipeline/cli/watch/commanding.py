@@ -25,6 +25,8 @@ _POLL_S = 0.01
 STAGE = "acquisition"
 MOST_SESSIONS = 64
 """so many last healths are kept"""
+LARGEST_SHARE = 2.0
+"""a tray whose commands go further does not count them as shares of 1"""
 
 
 def chosen_tray(config: Config, name: str | None) -> TrayConfig:
@@ -56,6 +58,15 @@ def command_of(tray: TrayConfig, values: dict[int, float], *, is_set_point: bool
         wanted[fan] = value * RAD_S_PER_UNIT[tray.speed_unit] if is_set_point else value
     columns = (unchanged, wanted) if is_set_point else (wanted, unchanged)
     return Command(fans=tray.fans, t_ns=time.time_ns(), command=columns[0], set_point_rad_s=columns[1])
+
+
+def share_note(tray: TrayConfig, command: float) -> str:
+    """A note where a command looks like a share of the range, and the tray's commands are none; else empty."""
+    low, high = tray.command_min, tray.command_max
+    if not (0.0 < command < 1.0 and high > LARGEST_SHARE):
+        return ""
+    share = f"{100 * command:g} % of this range is {low + command * (high - low):.4g}"
+    return f"note: commands of tray {tray.name} go from {low:g} to {high:g}, and {command:g} was sent; {share}"
 
 
 class CommandSender:

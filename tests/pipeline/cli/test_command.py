@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli.watch.commanding import command_of
+from pipeline.cli.watch.commanding import command_of, share_note
 from pipeline.config.models import TrayConfig
 from tests.support.fantwin_command import error_of
-from tests.support.running_chain import DEMO, Chain, RunningCommand, fantwin
+from tests.support.running_chain import DEMO, Chain, RunningCommand, eventually, fantwin
 
 
 @pytest.fixture
@@ -49,6 +50,28 @@ def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():
     message = command_of(TrayConfig(name="a", fans=2, speed_unit="rpm", speed_max=9000), {1: 6000.0}, is_set_point=True)
     np.testing.assert_allclose(message.set_point_rad_s, [np.nan, 6000 * 2 * np.pi / 60])
     assert np.isnan(message.command).all()
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "command", "is_noted"),
+    [(0, 255, 0.6, True), (0, 100, 0.01, True), (0, 1, 0.6, False), (0, 2, 0.6, False), (0, 255, 1, False),
+     (0, 255, 0, False), (-255, 255, -0.6, False)],
+)  # fmt: skip
+def test_a_share_is_noted_where_commands_are_no_shares(low, high, command, is_noted):
+    assert bool(share_note(TrayConfig(name="a", fans=1, command_min=low, command_max=high), command)) == is_noted
+
+
+def test_a_note_names_the_range_and_the_command_that_was_probably_meant(chain, acquisition):
+    chain.start_tray()
+    words = (*chain.words("command"), "--set", "tray.0.command_max=255", "--json")
+
+    def sent() -> subprocess.CompletedProcess[str] | None:
+        done = fantwin(*words, "--fan", 3, 0.6)
+        return None if done.returncode else done
+
+    done = eventually(sent, "the acquisition that starts takes a command")
+    assert json.loads(done.stdout)["value"] == 0.6
+    assert done.stderr == "note: commands of tray tray1 go from 0 to 255, and 0.6 was sent; 60 % of this range is 153\n"
 
 
 @pytest.mark.parametrize(
