@@ -22,7 +22,7 @@ from scoring.detectors.deviation import summed_deviation
 
 CAP_LIMITS = 1.05  # the sum is capped here: a long fault clears soon after it ends, and drift alone stays a warning
 MIN_CAUTIOUS_LIMIT = 2.0  # standard deviations: with too few healthy data no limit is set below this
-CAUTIOUS_S = 30.0  # of a tacho that counts: so long a shift of twice the reference value lasts at least
+CAUTIOUS_S = 15.0  # of a tacho that counts: so long a shift of twice the reference value lasts at least
 REFERENCE_SHARE = 0.25  # of the limit of the smoothed residual, and at least so many sigma
 DEFAULT_REFERENCE_SIGMAS = 0.5
 

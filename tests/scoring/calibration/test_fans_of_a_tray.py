@@ -147,7 +147,7 @@ def test_with_few_data_a_shift_lasts_until_it_is_reported_if_a_tacho_counts() ->
     assert drift(INSTANTANEOUS)[0] < 0.5 * least
     reference, after_s = drift((counts,))
     assert reference == pytest.approx(least, rel=0.01)
-    assert after_s == pytest.approx(30.0), "a shift of twice the reference value is reported after so long"
+    assert after_s == pytest.approx(15.0), "a shift of twice the reference value is reported after so long"
 
 
 def test_the_fewer_speeds_were_seen_the_wider_are_the_limits() -> None:
