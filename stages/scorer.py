@@ -293,7 +293,7 @@ def build(context: Context) -> BuiltStage:
     """
     tray = context.tray
     path = context.snapshot_folder / f"scorer-{tray.name}.snapshot" if context.snapshot_folder else None
-    twin = healthy_twin(context, load_tray_twin(twin_path(context), tray.fans))
+    twin = healthy_twin(context, load_tray_twin(twin_path(tray, context.folder), tray.fans))
     store = SnapshotStore(path) if path else None
     if store:
         store.lock(f"site {context.site}")
@@ -313,7 +313,7 @@ def build(context: Context) -> BuiltStage:
 def check(context: Context) -> list[str]:
     """Why the scorer cannot run; the twin integrator reports a twin that cannot be loaded."""
     try:
-        twin = load_tray_twin(twin_path(context), context.tray.fans)
+        twin = load_tray_twin(twin_path(context.tray, context.folder), context.tray.fans)
     except StageError:
         return []
     try:

@@ -22,6 +22,7 @@ class StageRow:
             `[name]` in the configuration.
         scope: one process for the site, or one for each tray.
         may_drop: that of its declaration, for those who count losses and would wait long for its imports.
+        needs_twin: it cannot start unless every tray has a twin.
     """
 
     name: str
@@ -29,6 +30,7 @@ class StageRow:
     enabled_by: Literal["default", "section"] = "section"
     scope: Literal["site", "tray"] = "site"
     may_drop: bool = False
+    needs_twin: bool = False
 
     def load(self) -> Any:
         """Import the stage and return its declaration."""
@@ -41,8 +43,8 @@ STAGES: dict[str, StageRow] = {
     for row in (
         StageRow("acquisition", "stages.acquisition:STAGE", enabled_by="default", scope="tray"),
         StageRow("resampler", "stages.resampler:STAGE", enabled_by="default"),
-        StageRow("twin_integrator", "stages.twin_integrator:STAGE", enabled_by="default"),
-        StageRow("scorer", "stages.scorer:STAGE", enabled_by="default"),
+        StageRow("twin_integrator", "stages.twin_integrator:STAGE", enabled_by="default", needs_twin=True),
+        StageRow("scorer", "stages.scorer:STAGE", enabled_by="default", needs_twin=True),
         StageRow("recorder", "stages.recorder:STAGE", enabled_by="default"),
         StageRow("viewer", "stages.viewer:STAGE", enabled_by="default", may_drop=True),
     )

@@ -21,6 +21,7 @@ from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.launch.stage_notes import note_lines
 from pipeline.launch.watchdog import Watchdog
 from pipeline.runtime.clock import REPLAY
+from pipeline.runtime.tray_twin import load_tray_twin, twin_path
 from schemas.messages import StageStatus
 from schemas.topics import alive_key
 
@@ -95,6 +96,7 @@ class Launcher:
         Raises:
             UserError: a stage cannot run as configured; the others have been stopped.
         """
+        self._refuse_unusable_twins()
         with Bus(self._config.bus, stop) as bus:
             self._refuse_second_launcher(bus, stop)
             self._watcher = SiteWatcher(bus, self._config.site)
@@ -114,6 +116,15 @@ class Launcher:
                 self.outcome.notes = note_lines(view.health for view in self._watcher.stages())
                 self.outcome.unusable = self._watcher.unusable(sessions)
         return self.outcome
+
+    def _refuse_unusable_twins(self) -> None:
+        """Refuse a twin that is missing or of other fans, by its card, before any stage has made a file.
+
+        The stages check the rest.
+        """
+        if any(STAGES[name].needs_twin for name in self._config.stages):
+            for tray in self._config.trays:
+                load_tray_twin(twin_path(tray, self._config.folder), tray.fans)
 
     def _refuse_second_launcher(self, bus: Bus, stop: threading.Event) -> None:
         """Refuse to start when stages of this site already run, or where a replay presents the site and a device would.

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.config.models import TrayConfig
 from pipeline.runtime.onnx_metadata import read_onnx_metadata
-from pipeline.runtime.stage import Context, StageError
+from pipeline.runtime.stage import StageError
 from schemas.messages import Array
 from schemas.tacho import Tacho, tacho_of_each_fan
 from schemas.twin_card import CARD_PROPERTY, BalanceCard, CardError, TwinCard
@@ -188,13 +189,12 @@ def load_tray_twin(path: Path, fans: int | None = None) -> TrayTwin:
     return tray_twin(path, read_file(path), fans)
 
 
-def twin_path(context: Context) -> Path:
-    """Where the twin of a context's one tray is.
+def twin_path(tray: TrayConfig, folder: Path) -> Path:
+    """Where the twin of a tray is. folder: of the configuration.
 
     Raises:
         StageError: the tray names none.
     """
-    tray = context.tray
     if tray.twin is None:
         raise StageError(f'tray {tray.name} has no twin: set [[tray]] twin = "FILE.onnx"')
-    return context.resolve(tray.twin)
+    return folder / tray.twin

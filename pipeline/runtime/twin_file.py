@@ -61,7 +61,7 @@ def load_twin(context: Context) -> TwinFile:
     Raises:
         StageError: the tray names none, or one that cannot be used or was trained with other tachos.
     """
-    path = twin_path(context)
+    path = twin_path(context.tray, context.folder)
     twin = TwinFile.load(path, context.tray.fans)
     of_tray = tacho_of_each_fan(context.tray.tacho, context.tray.fans)
     if twin.tachos != of_tray and any(tacho.window_s > 0.0 for tacho in twin.tachos):

@@ -19,7 +19,7 @@ from schemas.codec import decode
 from schemas.messages import Raw
 from schemas.topics import tray_key
 from tests.support.running_chain import (
-    DEMO,
+    FANS,
     SITE,
     TRAY,
     Chain,
@@ -30,6 +30,7 @@ from tests.support.running_chain import (
     published,
     view_of,
 )
+from tests.support.twin_files import write_twin
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 MANY = 100  # scores: the chain has come to run evenly
@@ -162,18 +163,18 @@ def test_without_their_launcher_all_stages_end_in_order_and_leave_a_whole_record
 
 
 def test_a_stage_that_cannot_start_ends_all_with_one_line(tmp_path, endpoint):
-    chain = Chain(tmp_path, endpoint, "tray.0.twin='none.onnx'", viewer=False)
+    twin = write_twin(tmp_path / "twin.onnx", fans=FANS, calibration={"speed": "none"})
+    chain = Chain(tmp_path, endpoint, f"tray.0.twin='{twin}'", viewer=False)
     try:
         up = chain.start_up()
         assert up.process.wait(60) == 1
         up.kill()
         errors = [line for line in up.lines if line.startswith("fantwin:")]
-        assert errors == [
-            f"fantwin: {DEMO}/none.onnx: cannot read the twin: No such file or directory; correct [[tray]] twin"
-        ]
+        assert errors and errors[0].startswith(f"fantwin: {twin}: its calibration cannot be used: speed")
+        assert len(errors) == 1
         assert "Traceback" not in "\n".join(up.lines)
         started = chain.process_ids()
-        assert "twin_integrator" in started
+        assert "scorer" in started
         assert not any(map(is_running, started.values()))
     finally:
         chain.close()

@@ -117,7 +117,7 @@ def _twin(context: Context) -> TrayTwin | None:
     if context.tray.twin is None:
         return None
     try:
-        return load_tray_twin(twin_path(context), context.tray.fans)
+        return load_tray_twin(twin_path(context.tray, context.folder), context.tray.fans)
     except StageError:  # the twin integrator reports it
         return None
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -50,6 +51,36 @@ def test_a_wrong_configuration_is_one_line_before_anything_starts(tmp_path, endp
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "did you mean 'on_delay_s'" in done.stderr
+
+
+@pytest.fixture
+def no_bus(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Where the launcher would connect to the bus, before it starts anything, ConnectionError is raised."""
+
+    def connect(*_: object) -> None:
+        raise ConnectionError
+
+    monkeypatch.setattr("pipeline.launch.launcher.Bus", connect)
+    return connect
+
+
+@pytest.mark.parametrize(
+    ("settings", "fault"),
+    [
+        (["tray.0.twin='none.onnx'"], f"{DEMO}/none.onnx: cannot read the twin: No such file or directory; correct "),
+        (["tray.0.fans=5"], f"{DEMO}/twin.onnx: a twin of 8 fans, [[tray]] says fans = 5: choose a twin that fits"),
+    ],
+)
+def test_a_twin_that_cannot_be_used_is_refused_before_anything_starts(no_bus, settings, fault):
+    with pytest.raises(UserError, match=re.escape(fault)):
+        Launcher(load_config(DEMO / "demo.toml", settings), (), no_bus).run(threading.Event())
+
+
+def test_a_site_that_only_records_needs_no_twin(no_bus):
+    """The twin that the configuration names may not have been made yet."""
+    settings = ["launcher.stages=['acquisition', 'resampler', 'recorder']", "tray.0.twin='none.onnx'"]
+    with pytest.raises(ConnectionError):
+        Launcher(load_config(DEMO / "demo.toml", settings), (), no_bus).run(threading.Event())
 
 
 def test_the_process_list_has_one_acquisition_for_each_tray_in_the_order_of_the_data_flow(tmp_path):
