@@ -5,8 +5,10 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
@@ -20,6 +22,7 @@ from pipeline.launch.site_state import site_states
 from pipeline.launch.site_watcher import SiteWatcher
 from pipeline.launch.stage_notes import note_lines
 from pipeline.launch.watchdog import Watchdog
+from pipeline.recordings.parts import part_files, part_path
 from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.tray_twin import load_tray_twin, twin_path
 from schemas.messages import StageStatus
@@ -65,6 +68,15 @@ class Outcome:
     unusable: list[str] = field(default_factory=list)
     """a line for each device that sent no sample that could be used"""
     run_folder: str = ""
+    recordings: list[str] = field(default_factory=list)
+    """the parts that were recorded, in order"""
+
+    @property
+    def recorded(self) -> str:
+        """The parts in a few words."""
+        if len(self.recordings) > 1:
+            return f"{self.recordings[0]} to {self.recordings[-1]}, {len(self.recordings)} parts"
+        return self.recordings[0] if self.recordings else "nothing"
 
     @property
     def exit_code(self) -> int:
@@ -99,6 +111,7 @@ class Launcher:
         self._refuse_unusable_twins()
         with Bus(self._config.bus, stop) as bus:
             self._refuse_second_launcher(bus, stop)
+            before = self._parts()
             self._watcher = SiteWatcher(bus, self._config.site)
             try:
                 self._start_all(stop)
@@ -109,6 +122,8 @@ class Launcher:
                 self._restart_those_down()
             finally:
                 self._stop_all()
+                last = max(before, default=0)
+                self.outcome.recordings = [str(path) for number, path in self._parts().items() if number > last]
                 ready = [slot for slot in self._slots if slot.was_ready]  # one that was never ready has lost nothing
                 sessions = {each for slot in ready for each in slot.sessions}
                 self.outcome.lost = self._watcher.losses(sessions)
@@ -149,6 +164,15 @@ class Launcher:
                 )
             if not bus.came_second or time.monotonic() >= until_s or stop.wait(_POLL_S):
                 return
+
+    def _parts(self) -> dict[int, Path]:
+        """The parts of the recording that are there, by number and in order, under their names when finished."""
+        recorder: Any = self._config.sections.get("recorder")
+        with suppress(OSError):
+            if recorder is not None:
+                path = self._config.run_folder / recorder.file
+                return {number: part_path(path, number) for number, _ in sorted(part_files(path))}
+        return {}
 
     def _start_all(self, stop: threading.Event) -> None:
         """Consumers first: sources start when all others are ready, so that no first sample is missed."""

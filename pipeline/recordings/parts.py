@@ -27,6 +27,25 @@ from pipeline.recordings.sequence_ledger import SequenceLedger
 from pipeline.recordings.writing import RecordingWriter
 
 
+def part_path(path: Path, number: int) -> Path:
+    """The name of a finished part. path: NAME.mcap."""
+    return path if number == 1 else path.with_stem(f"{path.stem}-{number}")
+
+
+def part_files(path: Path) -> list[tuple[int, Path]]:
+    """All files of the parts of NAME.mcap with their numbers: finished, active, and originals of repaired ones.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    stem, suffix = re.escape(path.stem), re.escape(path.suffix)
+    others = "|".join(map(re.escape, (ACTIVE_SUFFIX, ORIGINAL_SUFFIX, FORMER_ORIGINAL_SUFFIX)))
+    pattern = re.compile(rf"{stem}(?:-(\d+))?{suffix}({others})?")
+    paths = path.parent.iterdir() if path.parent.is_dir() else ()
+    matches = ((pattern.fullmatch(path.name), path) for path in paths)
+    return [(int(match[1] or 1), path) for match, path in matches if match]
+
+
 class RecordingParts:
     """The folder of one recording: its parts so far, and the next one."""
 
@@ -56,7 +75,7 @@ class RecordingParts:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._disk = Disk(path.parent)
             self._repair()
-            self._number = max((number for number, _ in self._files()), default=0)
+            self._number = max((number for number, _ in part_files(self._path)), default=0)
         except OSError as error:
             raise refused(f"{path}: cannot be written", error, "name another file or folder") from error
         last = self._last_part()
@@ -74,7 +93,7 @@ class RecordingParts:
         """
         self.free_bytes()  # raises if the disk is gone: do not write to its mount point
         try:
-            self._number = 1 + max([self._number, *(number for number, _ in self._files())])
+            self._number = 1 + max([self._number, *(number for number, _ in part_files(self._path))])
         except OSError as error:
             raise refused(f"{self._path.parent}: cannot be read", error, "name another folder") from error
         if self._writer:
@@ -88,7 +107,9 @@ class RecordingParts:
             **about,
         }
         try:
-            writer = RecordingWriter(self._name(self._number), metadata, self._attachments, t_ns=t_ns, ledger=ledger)
+            writer = RecordingWriter(
+                part_path(self._path, self._number), metadata, self._attachments, t_ns=t_ns, ledger=ledger
+            )
         except RecordingError:
             self._number -= 1
             raise
@@ -106,24 +127,12 @@ class RecordingParts:
 
     def delete_oldest(self) -> str | None:
         """Delete the oldest finished part and give its name; None if there is none."""
-        for _, path in sorted(self._files()):
+        for _, path in sorted(part_files(self._path)):
             if path.suffix == self._path.suffix and self._is_ours(path):
                 with suppress(OSError):
                     path.unlink()
                     return path.name
         return None
-
-    def _name(self, number: int) -> Path:
-        return self._path if number == 1 else self._path.with_stem(f"{self._path.stem}-{number}")
-
-    def _files(self) -> list[tuple[int, Path]]:
-        """All files of parts with their numbers: finished, active, and originals of repaired ones."""
-        stem, suffix = re.escape(self._path.stem), re.escape(self._path.suffix)
-        others = "|".join(map(re.escape, (ACTIVE_SUFFIX, ORIGINAL_SUFFIX, FORMER_ORIGINAL_SUFFIX)))
-        pattern = re.compile(rf"{stem}(?:-(\d+))?{suffix}({others})?")
-        paths = self._path.parent.iterdir() if self._path.parent.is_dir() else ()
-        matches = ((pattern.fullmatch(path.name), path) for path in paths)
-        return [(int(match[1] or 1), path) for match, path in matches if match]
 
     def _is_ours(self, path: Path) -> bool:
         try:
@@ -132,7 +141,7 @@ class RecordingParts:
             return False
 
     def _repair(self) -> None:
-        for _, path in sorted(self._files()):
+        for _, path in sorted(part_files(self._path)):
             if not path.name.endswith(ACTIVE_SUFFIX):
                 continue
             try:
@@ -154,7 +163,7 @@ class RecordingParts:
 
     def _last_part(self) -> Contents | None:
         """The contents of the last part of this recording."""
-        for _, path in sorted(self._files(), reverse=True):
+        for _, path in sorted(part_files(self._path), reverse=True):
             if (path.suffix == self._path.suffix or path in self.unrepaired) and self._is_ours(path):
                 return contents_of(path)
         return None

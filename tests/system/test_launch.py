@@ -128,6 +128,7 @@ def test_visitors_change_nothing_and_ctrl_c_stops_in_order_with_everything_recor
     assert [f"resampler, {TRAY}"] == [note.partition(":")[0] for note in outcome.pop("notes") if " Hz" in note]
     assert outcome == {
         "run_folder": str(chain.folder),
+        "recordings": [str(chain.folder / "recording.mcap")],
         "restarts": {},
         "killed": [],
         "failed": [],
@@ -169,6 +170,7 @@ def test_a_stage_that_cannot_start_ends_all_with_one_line(tmp_path, endpoint):
         up = chain.start_up()
         assert up.process.wait(60) == 1
         up.kill()
+        assert f"recorded until then: {tmp_path}/recording.mcap" in up.lines
         errors = [line for line in up.lines if line.startswith("fantwin:")]
         assert errors and errors[0].startswith(f"fantwin: {twin}: its calibration cannot be used: speed")
         assert len(errors) == 1

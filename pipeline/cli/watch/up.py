@@ -12,6 +12,7 @@ import typer
 
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.config.loading import load_config
+from pipeline.errors import UserError
 from pipeline.launch.event_log import EventLog
 from pipeline.launch.launcher import Launcher, Outcome
 from pipeline.launch.refused_input import refused_lines
@@ -33,15 +34,20 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
     ignore_hangup()
     settings = load_config(config, overrides or ())
     log = EventLog(sys.stderr.fileno())
+    launcher = Launcher(settings, overrides or (), log.say)
     try:
-        outcome = Launcher(settings, overrides or (), log.say).run(stop)
+        outcome = launcher.run(stop)
         if not json_output:
             for line in (*outcome.notes, *refused_lines(outcome.refused)):
                 log.say(line)
             losses = ", ".join(f"{name} {count}" for name, count in outcome.lost.items() if count)
-            log.say(f"stopped; lost: {losses or 'nothing'}; files in {outcome.run_folder}")
+            log.say(f"stopped; lost: {losses or 'nothing'}; recorded: {outcome.recorded}")
             for line in outcome.unusable:
                 log.say(line)
+    except UserError:
+        if launcher.outcome.recordings:
+            log.say(f"recorded until then: {launcher.outcome.recorded}")
+        raise
     finally:
         log.close()
     if json_output:
@@ -52,7 +58,7 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
 
 def _print_json(outcome: Outcome) -> None:
     """To standard output, where somebody may read it; the exit code stands whether or not it can be written."""
-    names = ("run_folder", "restarts", "killed", "failed", "lost", "refused", "notes", "unusable")
+    names = ("run_folder", "recordings", "restarts", "killed", "failed", "lost", "refused", "notes", "unusable")
     found = {name: getattr(outcome, name) for name in names}
     with suppress(OSError):
         os.write(sys.stdout.fileno(), f"{json.dumps(found)}\n".encode())

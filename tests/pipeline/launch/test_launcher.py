@@ -8,6 +8,7 @@ import re
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -323,6 +324,51 @@ def test_a_stage_that_was_never_ready_has_failed(monkeypatch):
     outcome, lines = stopped(Heard(), monkeypatch, was_ready=False)
     assert outcome.exit_code == 1
     assert lines == ["recorder: was never ready: it has received nothing"]
+
+
+class NoSessions:
+    """A watcher that has heard nothing."""
+
+    def stages(self) -> list[Any]:
+        return []
+
+    def losses(self, _launched: object) -> dict[str, int]:
+        return {}
+
+    def refused(self) -> dict[str, dict[str, int]]:
+        return {}
+
+    def unusable(self, _launched: object) -> list[str]:
+        return []
+
+
+@pytest.mark.parametrize(
+    ("files", "recorded"),
+    [
+        ((), "nothing"),
+        (("recording-3.mcap",), "recording-3.mcap"),
+        (("recording-3.mcap", "recording-4.mcap.active"), "recording-3.mcap to {}recording-4.mcap, 2 parts"),
+    ],
+)
+def test_it_says_which_files_a_run_recorded_also_one_that_failed(tmp_path, monkeypatch, files, recorded):
+    for name in ("recording.mcap", "recording-2.mcap.active"):  # the latter was left by a killed recorder
+        (tmp_path / name).touch()
+    monkeypatch.setattr("pipeline.launch.launcher.Bus", lambda *_: nullcontext())
+    monkeypatch.setattr("pipeline.launch.launcher.SiteWatcher", lambda *_: NoSessions())
+    settings = [f"run_folder='{tmp_path}'", "launcher.stages=['recorder']"]
+    launcher = Launcher(load_config(DEMO / "demo.toml", settings), (), lambda _line: None)
+
+    def fail(_stop: object) -> None:
+        (tmp_path / "recording-2.mcap.active").rename(tmp_path / "recording-2.mcap")
+        for name in files:
+            (tmp_path / name).touch()
+        raise UserError("a stage cannot start")
+
+    monkeypatch.setattr(launcher, "_refuse_second_launcher", lambda *_: None)
+    monkeypatch.setattr(launcher, "_start_all", fail)
+    with pytest.raises(UserError, match="a stage cannot start"):
+        launcher.run(threading.Event())
+    assert launcher.outcome.recorded == (f"{tmp_path}/{recorded.format(f'{tmp_path}/')}" if files else recorded)
 
 
 @pytest.mark.parametrize(
