@@ -37,6 +37,11 @@ LEVELS_PER_RANGE = 10
 SMALL_COMMAND_RANGE = 0.1
 SMALL_SPEED_RANGE_IN_NOISE = 5.0
 
+SHORTEST_TIME_CONSTANTS = 75
+"""one round of `fantwin sweep`: 13 levels until the speed has settled, and ten for one time constant each"""
+RECOMMENDED_TIME_CONSTANTS, RECOMMENDED_S = 150, 300.0
+"""two rounds, and the five minutes of docs/tutorial/own-fan.md; the longer of the two"""
+
 LAGS = 5
 """past samples that a command may depend on"""
 FEWEST_MOVES = 50
@@ -69,6 +74,22 @@ def identifiability_warnings(runs: Sequence[Run], parameters: Array, covariance:
             *_drag(pieces, fan, parameters[fan], covariance[fan]),
             *_lag(pieces, parameters[fan], covariance[fan]),
         )
+    )
+
+
+def short_warnings(pieces: Sequence[Run], time_constant_s: Array) -> tuple[str, ...]:
+    """One line if the runs are too short to show what the fans do; none if they are not.
+
+    pieces: without gaps. time_constant_s: (fans,).
+    """
+    recorded_s, slowest_s = sum(piece.duration_s for piece in pieces), float(time_constant_s.max())
+    if recorded_s >= SHORTEST_TIME_CONSTANTS * slowest_s:
+        return ()
+    recommended_s = max(RECOMMENDED_TIME_CONSTANTS * slowest_s, RECOMMENDED_S)
+    return (
+        f"too short: {recorded_s:.0f} s are {recorded_s / slowest_s:.0f} time constants of the slowest fan "
+        f"({slowest_s:.2g} s), and one round of steps takes {SHORTEST_TIME_CONSTANTS}; "
+        f"record {np.ceil(recommended_s / 60.0):.0f} min or more, in steps over the whole range of the command",
     )
 
 

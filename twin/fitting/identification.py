@@ -31,7 +31,7 @@ from scipy.stats import t as student_t
 from twin.errors import TwinError
 from twin.fitting.filtering import filtered_regression
 from twin.fitting.free_run_fit import ALL_FREE, FreeRunFit, FreeRunProblem, Prior, Unknowns, fit_free_run
-from twin.fitting.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings, misfit_warnings
+from twin.fitting.identifiability import TOP_SPEED_QUANTILE, identifiability_warnings, misfit_warnings, short_warnings
 from twin.fitting.reading_errors import counts, robust_scale
 from twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
 from twin.measurement import with_measured_command
@@ -118,6 +118,7 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True, progress: Progress =
         iterations += fit.iterations
     parameters = physical_parameters(fit.point.unknowns.physics, top_speed)
     rmse_rad_s = _rmse_rad_s(fit, trajectories, fans)
+    time_constant_s = _positive(physics.time_constant_s(speed, parameters), pieces)
     progress("identification: checks", 0, 0, np.nan)
     return Identification(
         parameters=parameters,
@@ -125,10 +126,13 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True, progress: Progress =
         degrees_of_freedom=freedom,
         lambda_per_s=lambda_per_s,
         rmse_rad_s=rmse_rad_s,
-        time_constant_s=_positive(physics.time_constant_s(speed, parameters), pieces),
+        time_constant_s=time_constant_s,
         top_speed_rad_s=top_speed,
         iterations=iterations,
-        warnings=identifiability_warnings(runs, parameters, covariance),
+        warnings=(
+            *short_warnings(pieces, time_constant_s),
+            *identifiability_warnings(runs, parameters, covariance),
+        ),
         misfits=misfit_warnings(pieces, rmse_rad_s, _floor_rad_s(fit, trajectories, fans)),
     )
 

@@ -7,6 +7,7 @@ from simulation.published_fan import published_fan
 from tests.support import fan_data
 from twin.errors import TwinError
 from twin.fitting.filtering import filter_between_samples
+from twin.fitting.identifiability import short_warnings
 from twin.fitting.identification import Identification, filtering_operator, identify
 from twin.runs import Run
 
@@ -130,6 +131,22 @@ def test_swapped_columns_of_a_dead_sensor_are_refused() -> None:
         identify([Run("stuck", t_s, command, np.full_like(command, 3.0))])
     with pytest.raises(TwinError, match="fewer than ten measured speeds"):
         identify([Run("dead", t_s, command, np.full_like(command, np.nan))])
+
+
+def test_a_recording_of_few_time_constants_is_said_to_be_too_short_before_anything_else() -> None:
+    """The published fan has a time constant of about 0.2 s: 5 s are few, 20 s are enough."""
+    first = identify([fan_data.published_run(1, duration_s=5.0)]).warnings[0]
+    assert first.startswith("too short: 5 s are 24 time constants of the slowest fan (0.21 s), and one round of steps")
+    assert "takes 75; record 5 min or more" in first
+    parts = [fan_data.published_run(seed, duration_s=10.0) for seed in (1, 2)]
+    assert not any("too short" in line for line in identify(parts).warnings), "recordings count together"
+
+
+def test_a_slow_fan_is_to_be_recorded_for_longer() -> None:
+    run = fan_data.published_run(1, duration_s=5.0)
+    (line,) = short_warnings([run], np.array([0.1, 10.0]))
+    assert "of the slowest fan (10 s)" in line
+    assert "record 25 min or more" in line
 
 
 def test_two_nearby_levels_are_warned_about() -> None:
