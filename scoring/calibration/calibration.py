@@ -46,6 +46,7 @@ NEEDED_ALARMS = 3.0  # false alarms expected in the healthy runs, for their rate
 VARIATION_FAN_S = 5 * DAY_S  # enough to measure how residuals vary; the frequency of large values needs all data
 ENOUGH_BLOCKS = 8
 MIN_WINDOWS = 6
+MIN_S_OF_A_FAN = 60.0  # scored, the mean over fans; with less, limits may be far too narrow: docs/how-to/calibrate.md
 WINDOWS_OF_BLOCK = 6  # a minute
 MAX_ALARM_SHARE = 0.25  # share of the windows: with more of them the limits would be within the noise
 MIN_LEVEL = 0.1 / UNREACHED
@@ -114,7 +115,8 @@ def calibrate(
     sigma_rad_s: of the speed, the mean over the fans; None: not known.
 
     Raises:
-        TooLittleError: the runs are too short for the rate, and extrapolate is not set; or too short for any limit.
+        TooLittleError: the runs are too short for the rate, and extrapolate is not set; or too short for any limit
+            (of each fan, MIN_S_OF_A_FAN).
         FragmentedError: samples are missing in every second.
         MixedRatesError: the runs are not all of one sampling period.
     """
@@ -127,7 +129,9 @@ def calibrate(
     )
     found = healthy_statistics(runs, limits, top_speed_rad_s)
     is_enough = supports(found.fan_s, false_alarms_per_day)
-    if found.windows < MIN_WINDOWS or not (is_enough or extrapolate):
+    fans = max((run.statistics.shape[2] for run in found.maxima), default=1)
+    allows = extrapolate and found.fan_s >= MIN_S_OF_A_FAN * fans
+    if found.windows < MIN_WINDOWS or not (is_enough or allows):
         raise too_little(found.fan_s, false_alarms_per_day)
     for source, moments in found.moments.items():
         if moments.count.sum() and not moments.seconds:

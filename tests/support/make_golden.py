@@ -47,7 +47,8 @@ def main() -> None:
         folder = Path(name)
         healthy = folder / "healthy.mcap"
         run(
-            "simulate", "--fans", FANS, "--rate", 50, "--profile", "multisine", "--duration", 60, "--recording", healthy
+            *("simulate", "--fans", FANS, "--rate", 50, "--profile", "multisine"),
+            *("--duration", 120, "--recording", healthy),
         )
         run("train", healthy, "--model", "physical", "--name", "golden", "-o", folder / "twin.onnx")
         run("calibrate", folder / "twin.onnx", healthy, "--false-alarms-per-day", 24, "--extrapolate")

@@ -24,7 +24,7 @@ from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.replay.offline.limits_of_twin import find_limits
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
-from scoring.calibration.calibration import FragmentedError, TooLittleError, supports, too_little
+from scoring.calibration.calibration import MIN_S_OF_A_FAN, FragmentedError, TooLittleError, supports, too_little
 from scoring.calibration.healthy_statistics import MixedRatesError
 from scoring.detectors.table import calibrated_rows
 from scoring.limits import Limits, Timing
@@ -138,7 +138,7 @@ def _calibrated(
                 raise too_little(longest_fan_s, per_day)
             limits = find_limits([known], runs, timing, per_day, seed=seed, extrapolate=extrapolate)
         except TooLittleError as error:
-            raise UserError(_too_little(error, per_day)) from error
+            raise UserError(_too_little(error, per_day, extrapolate=extrapolate)) from error
         except MixedRatesError as error:
             raise UserError(_mixed_rates(error)) from error
         except FragmentedError as error:
@@ -196,14 +196,18 @@ def _named_once(recordings: list[Path]) -> None:
         seen.add(path.resolve())
 
 
-def _too_little(error: TooLittleError, per_day: float) -> str:
-    if error.fan_hours < error.needed_fan_hours:
+def _too_little(error: TooLittleError, per_day: float, *, extrapolate: bool) -> str:
+    if error.fan_hours < error.needed_fan_hours and not extrapolate:
         return (
             f"{error.fan_hours:.2g} fan-hours of healthy running cannot support {_rate(per_day)}: that takes "
             f"{error.needed_fan_hours:.3g}; record more, declare {_round_up(error.least_per_day):g} or more, or set "
             "limits without a declared rate: --extrapolate"
         )
-    return f"{error.fan_hours * 3600:.0f} s of healthy running is too little for any limit: give at least one minute"
+    scored = f"{error.fan_hours * 3600:.0f} s of healthy running could be scored, all fans together"
+    return (
+        f"{scored}: too little for any limit; that takes {MIN_S_OF_A_FAN:.0f} s of each fan: "
+        "record two minutes or more, better ten"
+    )
 
 
 def _mixed_rates(error: MixedRatesError) -> str:

@@ -155,6 +155,15 @@ def test_too_little_data_is_refused_with_the_amount_needed_and_the_twin_is_uncha
     assert (folder / "twin.onnx").read_bytes() == before
 
 
+def test_too_little_data_for_any_limit_is_refused_also_with_extrapolate(folder: Path) -> None:
+    before = (folder / "twin.onnx").read_bytes()
+    few = "--to", 40, "--false-alarms-per-day", 1, "--extrapolate"
+    error = error_of("calibrate", folder / "twin.onnx", folder / "healthy.mcap", *few)
+    assert re.match(r"\d\d s of healthy running could be scored, all fans together: too little for any limit; ", error)
+    assert error.endswith("that takes 60 s of each fan: record two minutes or more, better ten")
+    assert (folder / "twin.onnx").read_bytes() == before
+
+
 def test_recordings_too_short_for_the_rate_are_refused_before_any_of_them_is_scored(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -125,7 +125,7 @@ def test_too_little_running_is_refused_with_the_amount_needed() -> None:
 
 
 def test_extrapolated_limits_say_so_and_lie_further_out() -> None:
-    runs = healthy(0.0, 6, runs=1)
+    runs = healthy(0.0, 6, runs=2)
     near = calibrate(runs, TOP_RAD_S, Timing(), 600.0)
     far = calibrate(runs, TOP_RAD_S, Timing(), 1.0, extrapolate=True)
     assert far.declared_rate is not None
@@ -151,6 +151,15 @@ def test_few_data_in_which_fans_hardly_move_widen_limits_in_motion_as_if_the_twi
 def test_a_minute_of_one_fan_is_refused_even_with_extrapolate() -> None:
     with pytest.raises(TooLittleError):
         calibrate(healthy(0.0, 7, fans=1, runs=1, samples=3000), TOP_RAD_S, Timing(), 600.0, extrapolate=True)
+
+
+def test_what_a_fan_has_run_counts_and_not_how_many_fans_there_are() -> None:
+    """Of 20 s of four fans, limits came out at 0.6 of those from 15 minutes, or there was no value for one at all."""
+    with pytest.raises(TooLittleError):
+        calibrate(healthy(0.0, 7, fans=4, runs=1, samples=5000), TOP_RAD_S, Timing(), 1.0, extrapolate=True)
+    enough = calibrate(healthy(0.0, 7, fans=4, runs=2, samples=5000), TOP_RAD_S, Timing(), 1.0, extrapolate=True)
+    assert enough.declared_rate is not None
+    assert enough.declared_rate.extrapolated
 
 
 def test_the_same_seed_gives_the_same_limits() -> None:
