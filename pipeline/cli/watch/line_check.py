@@ -22,7 +22,7 @@ from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from schemas.codec import CodecError, decode
 from schemas.messages import Array, Raw
 from schemas.topics import tray_key
-from schemas.units import NS_PER_S, RAD_S_PER_UNIT
+from schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
 
 FIRST_SAMPLE_S = 6.0
 """a microcontroller restarts when its port is opened, and sends its first sample after some seconds"""
@@ -182,6 +182,14 @@ def _ranges(command: Array, speed_rad_s: Array, tray: TrayConfig, twin: TrayTwin
         known = f"; the twin knows {twin.card.top_speed_rad_s / per_unit:.0f}" if twin else ""
         yield False, f'speeds up to {fastest_rad_s / per_unit:.0f} {tray.speed_unit}{known}: is speed_unit "{other}"?'
         return
-    slowest = float(np.nanmin(speed_rad_s)) / per_unit
-    speeds = f"speeds {slowest:.0f} to {float(np.nanmax(speed_rad_s)) / per_unit:.0f} {tray.speed_unit}"
-    yield True, f"commands {low:g} to {high:g}, {speeds}: are these what the fans do?"
+    speeds = _speeds(speed_rad_s, tray.speed_unit)
+    if (
+        tray.speed_unit == "rad/s"
+    ):  # numbers in rpm that are taken for rad/s are plausible ones, and ten times too large
+        speeds += f" ({_speeds(speed_rad_s, 'rpm')})"
+    yield True, f"commands {low:g} to {high:g}, speeds {speeds}: are these what the fans do?"
+
+
+def _speeds(speed_rad_s: Array, unit: SpeedUnit) -> str:
+    slowest, fastest = (float(of(speed_rad_s)) / RAD_S_PER_UNIT[unit] for of in (np.nanmin, np.nanmax))
+    return f"{slowest:.0f} to {fastest:.0f} {unit}"

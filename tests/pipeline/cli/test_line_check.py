@@ -57,6 +57,15 @@ def test_a_line_that_fits_is_shown_with_its_grid_and_ranges(line_hz: float, grid
     assert ranges[1].startswith("commands 0.5 to 0.5, speeds 2865 to ")
 
 
+def test_speeds_in_rad_s_are_also_shown_in_rpm() -> None:
+    """Numbers in rpm that are taken for rad/s are possible speeds; in rpm they look ten times too large."""
+    _, ranges = found(10, speed_rad_s=900.0)
+    assert ranges == (
+        True,
+        "commands 0.5 to 0.5, speeds 900 to 919 rad/s (8594 to 8776 rpm): are these what the fans do?",
+    )
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [
