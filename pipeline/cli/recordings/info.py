@@ -28,6 +28,9 @@ from pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 from schemas.messages import Health
 from schemas.units import NS_PER_S
 
+_WIDEST = 1000
+"""columns of a table; a terminal that is narrower wraps its lines, and every name can be copied and searched for"""
+
 
 def info(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="A recording, or the parts of one.")],
@@ -122,7 +125,7 @@ def _counts_as_json(counts: StreamCounts) -> dict[str, Any]:
 
 
 def _show(parts: Sequence[Contents], breaks: Iterable[str]) -> None:
-    console = Console(soft_wrap=True, highlight=False)
+    console = Console(soft_wrap=True, highlight=False, width=_WIDEST)
     for part in parts:
         for line in _about(part):
             console.print(line)
@@ -181,8 +184,8 @@ def _about(part: Contents) -> list[str]:
 
 
 def _table(part: Contents) -> Table:
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("topic", overflow="fold")
+    table = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False, show_edge=False)
+    table.add_column("topic", no_wrap=True)
     for column in ("messages", "missing", "duplicated", "first", "last", "per s"):
         table.add_column(column, justify="right", no_wrap=True)
     for key, counts in sum_by_key(part.streams.items()).items():

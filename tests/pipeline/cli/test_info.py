@@ -66,6 +66,25 @@ def test_topics_are_listed_with_missing_messages(tmp_path):
     }
 
 
+@pytest.mark.parametrize(
+    ("stage", "widest"),
+    [("twin_integrator", 80), ("a_stage_with_a_name_that_no_terminal_of_80_columns_has_room_for", 999)],
+)
+def test_the_name_of_a_topic_is_whole_and_those_of_fantwin_have_room_in_80_columns(
+    tmp_path, monkeypatch, stage, widest
+):
+    monkeypatch.setenv("COLUMNS", "80")
+    with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
+        for number in range(2):
+            header = Header("stage-1", number, "")
+            health = Health(header=header, stage=stage, instance="all", status=StageStatus.OK, t_ns=1, uptime_s=1.0)
+            writer.add_message(health_key("plant", stage, "all"), health, (1_800_000_000 + number) * SECOND_NS)
+    (row,) = (line for line in fantwin("info", tmp_path / "r.mcap").stdout.splitlines() if line.startswith("health/"))
+    assert row.split()[:4] == [f"health/{stage}/all", "2", "0", "0"]
+    assert row.split()[-1] == "1.0"
+    assert len(row) <= widest
+
+
 def test_metadata_twins_and_stages_are_in_the_json(tmp_path):
     (found,) = shown(recording(tmp_path / "r.mcap"), exit_code=3)["files"]
     assert found["metadata"] == METADATA
