@@ -105,7 +105,11 @@ def play(core: Core, scores: Sequence[Score]) -> None:
     ("more", "level", "text"),
     [
         ({"transition": Transition.RAISED}, "WARN", "warning raised: so"),
-        ({"transition": Transition.REPUBLISHED, "severity": Severity.ALARM}, "ERROR", "alarm republished: so"),
+        (
+            {"transition": Transition.REPUBLISHED, "severity": Severity.ALARM},
+            "ERROR",
+            "alarm republished: fan 0: the alarm continues from before the restart",
+        ),
         ({"transition": Transition.CLEARED, "active": False}, "INFO", "cleared: so"),
         ({"transition": Transition(88)}, "INFO", "unknown (88): so"),
         (
