@@ -6,7 +6,8 @@ contact that comes and goes is good for a moment only.
 
 The longer an alarm has stood, the longer it must be gone. And it must be gone at the speeds at which it came: a twin
 that errs at another speed by as much as the fault costs hides it there. Elsewhere an alarm returns after
-`ELSEWHERE_NS`.
+`ELSEWHERE_NS`. A residual of several limits is not hidden by such errors, and returns at any speed. (Residuals are
+clipped at two limits: a low-pass exceeds three only where it smooths many noisy readings.)
 
 Only samples that could show the fault count. A blade that is touched takes ten per cent of the speed: 200 rpm at
 2,000 rpm, which is beyond a limit of 150, and 70 rpm at 700 rpm, which is not. So the largest ratio over speed that the
@@ -26,6 +27,7 @@ from schemas.units import NS_PER_S
 NOT_BELOW = -1
 RETURN_SHARE, LONGEST_RETURN_NS = 0.1, 60 * NS_PER_S  # of the time that a detector has held an alarm; and at most
 ELSEWHERE_NS = 600 * NS_PER_S
+HIDDEN_RATIO = 3.0  # to its limit; no healthy twin errs by so much
 NEAR_SPEED_RATIO = 1.15  # to the highest speed at which it exceeded, and of the lowest to it
 LARGEST = 1e300  # ratio over speed of a fault that shows at any speed
 
@@ -71,6 +73,8 @@ class _Hold:
     """its age when it was above the ratio of return last"""
     elsewhere_ns: int = 0
     """how long it has been below the ratio of return at other speeds than those at which it exceeded"""
+    largest: float = 0.0
+    """ratio so far"""
     slowest_rad_s: float = LARGEST
     fastest_rad_s: float = 0.0
     """at which it exceeded"""
@@ -95,6 +99,7 @@ class _Hold:
 
     def exceed(self, ratio: float) -> None:
         """The limit is exceeded, by this ratio, at the highest speed that is still in it."""
+        self.largest = max(self.largest, min(ratio, LARGEST))
         if self.peak_rad_s > 0.0:
             self.ratio_per_rad_s = max(self.ratio_per_rad_s, min(ratio / self.peak_rad_s, LARGEST))
             self.slowest_rad_s = min(self.slowest_rad_s, self.peak_rad_s)
@@ -125,6 +130,12 @@ class AlarmReturn:
         """Take a sample. Returns whether no detector is above its ratio of return, and whether all have returned."""
         speed = abs(sample.speed_rad_s) if math.isfinite(sample.speed_rad_s) else 0.0
         above, over = False, True
+        sizes = [
+            self._holds[each.name].largest
+            for each in self._detectors
+            if each.grows_with_speed and each.name in self._holds
+        ]
+        is_hidden_nowhere = max(sizes, default=0.0) >= HIDDEN_RATIO
         for detector, ratio in zip(self._detectors, sample.ratios, strict=True):
             hold = self._holds.get(detector.name)
             if hold is None:
@@ -133,7 +144,8 @@ class AlarmReturn:
                 hold = self._holds[detector.name] = _Hold()
             hold.follow(speed, period_ns, detector.off_delay_ns)
             shows = not detector.grows_with_speed or hold.shows_at(speed, self._return_ratio)
-            is_near = not (detector.grows_with_speed and detector.elsewhere_ns) or hold.is_near(speed)
+            knows_speeds = detector.grows_with_speed and detector.elsewhere_ns > 0
+            is_near = is_hidden_nowhere or not knows_speeds or hold.is_near(speed)
             if ratio > 1.0:
                 hold.exceed(ratio)
             elif ratio >= self._return_ratio:
@@ -195,6 +207,7 @@ class AlarmReturn:
                 age_ns=int(hold.get("age_ns", 0)),
                 held_ns=int(hold.get("held_ns", 0)),
                 elsewhere_ns=int(hold.get("elsewhere_ns", 0)),
+                largest=float(hold.get("largest", 0.0)),
                 slowest_rad_s=float(hold.get("slowest_rad_s", 0.0)),
                 fastest_rad_s=float(hold.get("fastest_rad_s", LARGEST)),
             )
