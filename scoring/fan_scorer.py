@@ -51,6 +51,7 @@ class FanScorer:
         skips_transients: bool = True,
         allows_for_counts: bool = True,
         limits_motion: bool = True,
+        begins_still: bool = True,
     ) -> None:
         """for_calibration: keep what calibration needs, for `observed`; statistics then grow beyond their limits.
 
@@ -59,6 +60,7 @@ class FanScorer:
         allows_for_counts: False only to decide as for recordings made before readings of a tacho that counts were
         allowed to be unsteady while the fan changes its speed, and to repeat where a healthy fan would read the same.
         limits_motion: False only to decide as for recordings made when limits widened with any motion of the readings.
+        begins_still: see Baseline.end_interval.
         """
         self.limits = limits
         self.residuals: dict[Signal, Residual] = {source: Residual(fans, source, limits) for source in RESIDUALS}
@@ -97,6 +99,7 @@ class FanScorer:
         self._motion = Motion(fans)
         self._healthy_motion = HealthyMotion(fans) if limits_motion else None
         self._movement = Movement(fans) if skips_transients else None
+        self._begins_still = begins_still
         self._gaps = Gaps(len(INPUTS), fans) if forgets_over_gaps else None
         self._memories = self._memories_ns()
         self._shortest_memory_ns = min(memory_ns for _, _, memory_ns in self._memories)
@@ -226,7 +229,9 @@ class FanScorer:
         commissioning = speed.is_commissioning | balance.is_commissioning
         moving = self._movement.end_interval(commissioning) if self._movement else None
         for residual in self.residuals.values():
-            residual.end_interval(expected, self._within_limit, self._below_half_limit, moving)
+            residual.end_interval(
+                expected, self._within_limit, self._below_half_limit, moving, begins_still=self._begins_still
+            )
         self._below_half_limit[:] = self._within_limit[:] = True
 
     def _memories_ns(self) -> list[tuple[int, Callable[[Array], None], int]]:

@@ -56,6 +56,7 @@ class TrayScorer:
             skips_transients=self._holds,
             allows_for_counts=decision_rules >= DecisionRules.ONE_ALARM,
             limits_motion=decision_rules >= DecisionRules.HEALTHY_MOTION,
+            begins_still=decision_rules >= DecisionRules.FIRST_BASELINE,
         )
         advice = Advice(twin.command_unit) if self._holds else None
         if judges_rest:

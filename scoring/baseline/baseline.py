@@ -2,8 +2,10 @@
 
 The time since the first sample of a session is cut into intervals. The mean residual of the first steady interval is
 the first baseline. A fan that starts from rest has no steady residual yet; after a number of unsteady intervals the
-next one is accepted. During commissioning the baseline is the median of the means of its intervals. Later intervals
-refine it, as a running mean first and with a fixed time constant in the long run.
+next one is accepted. On a slow line an interval has too few samples to show whether it is steady: there the first
+baseline is from an interval in which the fan did not move, and not from the very first, in which that is not known.
+During commissioning the baseline is the median of the means of its intervals. Later intervals refine it, as a running
+mean first and with a fixed time constant in the long run.
 
 Nothing is learned from an anomaly. While commissioning, an interval counts if no statistic exceeded its limit; later,
 if none exceeded half of it. The commissioned baseline is limited to the offsets of healthy fans, and the later one to
@@ -33,6 +35,7 @@ MIN_VALID_SHARE = 0.5  # of an interval's samples
 FIXED_POINT_ONE = 1 << 20  # one sigma, or one sigma squared; integer sums do not depend on how samples are cut
 LARGEST_SIGMAS = 1e3  # larger residuals are clipped to this
 MAX_STEADY_STD = 2.0  # standard deviation relative to a healthy one: an interval with more is not steady
+MIN_STEADY_SAMPLES = 5  # of an interval: fewer do not show that it is steady
 MAX_UNSTEADY_INTERVALS = 10  # intervals without a steady one, after which an unsteady one is accepted
 ROUNDING = 1e-9
 OFFSET_RANGE_RMS = 3.0  # an offset may be so many times the root mean square of healthy ones
@@ -115,13 +118,20 @@ class Baseline(ColumnState):
         self._counts += valid.sum(axis=0)
 
     def end_interval(
-        self, samples: int, within_limit: Array, below_half_limit: Array, moving: Array | None = None
+        self,
+        samples: int,
+        within_limit: Array,
+        below_half_limit: Array,
+        moving: Array | None = None,
+        *,
+        begins_still: bool = True,
     ) -> None:
         """End the present interval of so many samples.
 
         within_limit, below_half_limit: (fans,) whether every statistic stayed there during the interval. moving:
         (fans,) whether the fan moved, so that only its first baseline may come from the interval
-        (scoring.baseline.movement); None: no fan.
+        (scoring.baseline.movement); None: no fan. begins_still: False only to decide as for recordings made when one
+        sample of a slow line could be the first baseline.
         """
         counts, is_set, commissioning = np.maximum(self._counts, 1), self.is_set, self.is_commissioning
         product, information, square = self._sums / counts / FIXED_POINT_ONE
@@ -132,6 +142,8 @@ class Baseline(ColumnState):
             explained = product * product / np.maximum(information, MIN_INFORMATION)
             deviation = np.sqrt(np.maximum(square - explained, 0.0))
             unsteady = seen & ~is_set & (deviation > MAX_STEADY_STD * self._residual_std)
+            if begins_still and moving is not None and samples < MIN_STEADY_SAMPLES:
+                unsteady |= seen & ~is_set & (moving | (self.unsteady_intervals == 0))
             unsteady &= self.unsteady_intervals < MAX_UNSTEADY_INTERVALS
             self.unsteady_intervals += unsteady
             good &= ~unsteady
