@@ -63,7 +63,7 @@ def _drops(scorer: FanScorer, source: Signal, speed_rad_s: float, rad_s_per_sigm
         if row.source != source or detector is None:
             continue
         if isinstance(detector, Drift):
-            drifts.append(detector)
+            drifts += detector.sums
         elif isinstance(detector, Smoothed):
             smoothed = detector.limit_sigmas(_period_s(scorer)) / limits.mean_residual_std
     at_once = smoothed * unit * rad_s_per_sigma

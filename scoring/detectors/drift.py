@@ -1,9 +1,10 @@
-"""A CUSUM of the residual: detects a small shift that stays."""
+"""CUSUMs of the residual: one detects a small shift that stays, one a large shift sooner."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 from pydantic import Field
 
 from schemas.messages import Alarm, Array
@@ -22,7 +23,9 @@ from scoring.detectors.deviation import summed_deviation
 
 CAP_LIMITS = 1.05  # the sum is capped here: a long fault clears soon after it ends, and drift alone stays a warning
 MIN_CAUTIOUS_LIMIT = 2.0  # standard deviations: with too few healthy data no limit is set below this
-CAUTIOUS_S = 15.0  # of a tacho that counts: so long a shift of twice the reference value lasts at least
+CAUTIOUS_S = 10.0  # of a tacho that counts: so long a shift of twice the reference value lasts at least
+LARGE_SHARE = 1.5  # of the reference value: that of the sum for large shifts
+CAUTIOUS_LARGE_S = 2.0  # and so long a shift of twice that lasts
 REFERENCE_SHARE = 0.25  # of the limit of the smoothed residual, and at least so many sigma
 DEFAULT_REFERENCE_SIGMAS = 0.5
 
@@ -36,12 +39,22 @@ class DriftSettings(SingleLimit):
         gt=0,
         description="reference value k of the CUSUM: smaller shifts do not add up",
     )
+    large_limit: float | None = Field(
+        default=None,
+        gt=0,
+        description="the same of a second sum, for shifts beyond 1.5 reference values; None: there is none",
+    )
     period_s: float = Field(gt=0, description="sampling period of the healthy runs, for the deviation of their sum")
 
     @classmethod
     def unreached(cls) -> DriftSettings:
         """With any period, which `prepared` replaces."""
         return cls(limit=UNREACHED, period_s=1.0)
+
+    def scaled(self, factor: float) -> DriftSettings:
+        """See DetectorSettings."""
+        large = self.large_limit and self.large_limit * factor
+        return self.model_copy(update={"limit": self.limit * factor, "large_limit": large})
 
     def prepared(self, evidence: HealthyEvidence) -> DriftSettings:
         """The reference value is above the short means of healthy residuals, and above their typical offsets."""
@@ -60,42 +73,57 @@ class DriftSettings(SingleLimit):
         """With too few data the reference value is larger by what is not known.
 
         Of a tacho that counts it is above the error of a count and the means over ten. For how long the twin errs in
-        one direction these cannot know, so a shift has to last.
+        one direction these cannot know, so a shift has to last. A large one need not last as long.
         """
         if not evidence.count_std:
             return self.model_copy(update={"reference_sigmas": self.reference_sigmas * evidence.unknown_factor})
         reference = max(evidence.mean_limit, evidence.count_std)
         limit = max(self.limit, CAUTIOUS_S * reference / evidence.summed_std)
-        return self.model_copy(update={"reference_sigmas": reference, "limit": limit})
+        large_limit = CAUTIOUS_LARGE_S * LARGE_SHARE * reference / evidence.summed_std
+        return self.model_copy(update={"reference_sigmas": reference, "limit": limit, "large_limit": large_limit})
+
+
+class _Sum:
+    """One CUSUM, with its limit."""
+
+    def __init__(self, context: DetectorContext, reference_sigmas: float, limit: float, period_s: float) -> None:
+        deviation = summed_deviation(context.autocorrelation_time_s, period_s)
+        self.reference_sigmas, self.limit_sigma_s = reference_sigmas, deviation * limit
+        cap = CAP_LIMITS * limit * deviation if context.capped else math.inf
+        self.cusum = Cusum(context.fans, reference_sigmas, cap)
+
+    def update(self, block: DetectorInput) -> Array:
+        """(n, fans) of a block."""
+        return self.cusum.update(block.persistent, block.valid, block.period_s) / self.limit_sigma_s
 
 
 class Drift(Detector):
-    """Two-sided CUSUM (scoring.detectors.cusum) in multiples of its limit."""
+    """Two-sided CUSUMs (scoring.detectors.cusum) in multiples of their limits; the larger multiple decides."""
 
     settings = DriftSettings
 
     def __init__(self, settings: DriftSettings, context: DetectorContext) -> None:
         self._settings = settings
         self._mean_residual_std = context.mean_residual_std
-        deviation = summed_deviation(context.autocorrelation_time_s, settings.period_s)
-        self.limit_sigma_s = deviation * settings.limit
-        """the limit of the sum, sigma seconds"""
-        self.reference_sigmas, self.period_s = settings.reference_sigmas, settings.period_s
-        cap = CAP_LIMITS * settings.limit * deviation if context.capped else math.inf
-        self._cusum = Cusum(context.fans, settings.reference_sigmas, cap)
+        self.period_s, reference = settings.period_s, settings.reference_sigmas
+        self.sums = [_Sum(context, reference, settings.limit, self.period_s)]
+        if settings.large_limit is not None:
+            self.sums.append(_Sum(context, LARGE_SHARE * reference, settings.large_limit, self.period_s))
 
     def update(self, block: DetectorInput) -> Array:
         """See Detector."""
-        return self._cusum.update(block.persistent, block.valid, block.period_s) / self.limit_sigma_s
+        ratios = [each.update(block) for each in self.sums]
+        return ratios[0] if len(ratios) == 1 else np.maximum(*ratios)
 
     def reset(self, fans: Array) -> None:
         """See Detector."""
-        self._cusum.reset(fans)
+        for each in self.sums:
+            each.cusum.reset(fans)
 
     @property
     def memory_s(self) -> float:
         """The time in which a residual of zero takes a sum at its cap back to zero."""
-        return CAP_LIMITS * self.limit_sigma_s / self._settings.reference_sigmas
+        return max(CAP_LIMITS * each.limit_sigma_s / each.reference_sigmas for each in self.sums)
 
     def limit_sigmas(self, period_s: float) -> float:
         """The reference value: any larger shift adds up until it reaches the limit."""
@@ -103,7 +131,8 @@ class Drift(Detector):
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
-        return {"sums": self._cusum.sums}
+        names = ("sums", "large_sums")
+        return {name: each.cusum.sums for name, each in zip(names, self.sums, strict=False)}
 
     @classmethod
     def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:

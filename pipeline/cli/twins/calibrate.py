@@ -264,7 +264,8 @@ def _print(output: Path, limits: Limits, drops: Sequence[str]) -> None:
     table = Table("detector", "settings", box=None, pad_edge=False)
     for row in calibrated_rows():
         settings = limits.detectors.get(row.name)
-        shown = ", ".join(f"{name} {value:.3g}" for name, value in settings) if settings else "not used"
+        in_use = [(name, value) for name, value in settings or () if value is not None]
+        shown = ", ".join(f"{name} {value:.3g}" for name, value in in_use) or "not used"
         table.add_row(row.name, shown)
     console.print(table)
     declared = _rate(rate.false_alarms_per_day)

@@ -133,7 +133,7 @@ def test_a_counting_tacho_with_gaps_is_calibrated_all_the_same() -> None:
 def test_with_few_data_a_shift_lasts_until_it_is_reported_if_a_tacho_counts() -> None:
     counts = Tacho(kind="count", pulses=2, window_s=0.1)
 
-    def drift(tachos: tuple[Tacho, ...]) -> tuple[float, float]:
+    def drift(tachos: tuple[Tacho, ...]) -> tuple[float, float, float | None]:
         found = calibrate(healthy(2, 120.0, tachos), 200.0, default_timing(FANS), 1.0, extrapolate=True, has_drive=True)
         settings = found.settings_of("speed", DriftSettings)
         assert settings
@@ -141,13 +141,17 @@ def test_with_few_data_a_shift_lasts_until_it_is_reported_if_a_tacho_counts() ->
         return (
             settings.reference_sigmas * found.speed.mean_residual_std,
             settings.limit * sum_std / settings.reference_sigmas,
+            settings.large_limit and settings.large_limit * sum_std / settings.reference_sigmas,
         )
 
     least = counts.resolution_rad_s / np.sqrt(6.0) / SIGMA_RAD_S
-    assert drift(INSTANTANEOUS)[0] < 0.5 * least
-    reference, after_s = drift((counts,))
+    of_pulses = drift(INSTANTANEOUS)
+    assert of_pulses[0] < 0.5 * least
+    assert of_pulses[2] is None
+    reference, after_s, large_after_s = drift((counts,))
     assert reference == pytest.approx(least, rel=0.01)
-    assert after_s == pytest.approx(15.0), "a shift of twice the reference value is reported after so long"
+    assert after_s == pytest.approx(10.0), "a shift of twice the reference value is reported after so long"
+    assert large_after_s == pytest.approx(3.0), "one of three times the reference value after 2 s"
 
 
 def test_the_fewer_speeds_were_seen_the_wider_are_the_limits() -> None:

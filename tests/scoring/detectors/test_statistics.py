@@ -88,6 +88,11 @@ def of_drift() -> Update:
     return of(Drift(DriftSettings(limit=2.0, reference_sigmas=0.25, period_s=STEP_S), context()))
 
 
+def of_both_drifts() -> Update:
+    both = DriftSettings(limit=2.0, reference_sigmas=0.25, large_limit=0.5, period_s=STEP_S)
+    return of(Drift(both, context()))
+
+
 def of_variance_growth() -> Update:
     return of(growth_of(FANS, 0.2))
 
@@ -104,7 +109,7 @@ def of_missing_readings() -> Update:
 
 @pytest.mark.parametrize(
     "make",
-    [of_low_pass, of_cusum, of_smoothed, of_drift, of_variance_growth, of_sensor, of_missing_readings],
+    [of_low_pass, of_cusum, of_smoothed, of_drift, of_both_drifts, of_variance_growth, of_sensor, of_missing_readings],
 )
 @settings(max_examples=40, deadline=None)
 @given(
@@ -193,6 +198,27 @@ def test_a_shift_is_found_as_fast_as_the_textbook_says(shift: float, expected: f
 def test_a_shift_below_the_reference_value_is_never_found() -> None:
     z = np.full((100_000, 1), 0.49)
     assert Cusum(1, 0.5, math.inf).update(z, np.ones(z.shape, np.bool_), STEP_S).max() == 0.0
+
+
+def test_a_second_sum_finds_large_shifts_sooner_and_small_ones_no_sooner() -> None:
+    one = DriftSettings(limit=50.0, reference_sigmas=1.0, period_s=STEP_S)
+    both = one.model_copy(update={"large_limit": 5.0})
+
+    def found_after(settings: DriftSettings, shift: float) -> int:
+        drift = Drift(settings, replace(context(1), capped=True))
+        ratio = drift.update(block_of(np.full((3000, 1), shift), np.ones((3000, 1), np.bool_)))
+        state = drift.snapshot()
+        drift.reset(np.array([True]))
+        again = drift.update(block_of(np.zeros((1, 1)), np.ones((1, 1), np.bool_)))
+        assert again[0, 0] == 0.0, "both sums start again"
+        drift.restore(state)
+        assert drift.snapshot() == state
+        return int((ratio > 1.0).argmax())
+
+    for shift in (1.2, 1.5):
+        assert found_after(both, shift) == found_after(one, shift) > 0
+    assert found_after(both, 4.0) == pytest.approx(found_after(one, 4.0) * 0.1 * 3.0 / 2.5, abs=2.0)
+    assert found_after(both.scaled(2.0), 4.0) == pytest.approx(2 * found_after(both, 4.0), abs=2.0)
 
 
 def test_the_deviation_of_noise_is_found_and_doubles_with_it() -> None:
