@@ -168,6 +168,21 @@ def test_a_fan_is_not_commissioned_from_its_run_up() -> None:
     assert baseline(CURRENT_RULES) < 0.1 * SIGMA
 
 
+@pytest.mark.parametrize("rules", [DecisionRules.PLAIN_WORDS, CURRENT_RULES])
+def test_at_2_hz_a_fan_that_speeds_up_as_its_session_begins_is_not_judged_by_its_first_reading(
+    rules: DecisionRules,
+) -> None:
+    samples, period_ns = 240, 500_000_000
+    residual = noise(samples) + np.where(np.arange(samples)[:, np.newaxis] < 4, -2.5 * SIGMA, 0.0)
+    item = prediction_of(residual, period_ns=period_ns)
+    ramp = np.minimum(100.0 + 50.0 * np.arange(samples), 300.0)[:, np.newaxis] - 300.0
+    item.measured_speed_rad_s[:] += ramp
+    item.predicted_speed_rad_s[:] += ramp
+    _, alarms = feed(core_of(calibration=CARD, decision_rules=rules), [item])
+    is_alarm = [alarm.transition for alarm in alarms if alarm.transition in (Transition.RAISED, Transition.CLEARED)]
+    assert is_alarm == ([Transition.RAISED] if rules < DecisionRules.FIRST_BASELINE else [])
+
+
 @pytest.mark.parametrize("rules", [FORMER, CURRENT_RULES])
 def test_a_diagnosis_that_says_nothing_new_is_no_message(rules: DecisionRules) -> None:
     samples = 70 * SECOND
