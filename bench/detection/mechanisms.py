@@ -107,6 +107,11 @@ def _plain_reference(prepared: Any) -> Any:
     )
 
 
+def _without_large_limit(cautious: Any) -> Any:
+    """A drift with the sum for small shifts alone."""
+    return lambda settings, evidence: cautious(settings, evidence).model_copy(update={"large_limit": None})
+
+
 def _never_valid(field: str) -> Change:
     def change(stretches: Any) -> Any:
         def silenced(scorer: Any, block: Any) -> Any:
@@ -342,6 +347,11 @@ MECHANISMS: Sequence[Mechanism] = (
         "cautious",
         "limits from too few healthy data are no closer than a few standard deviations",
         ((f"{_CALIBRATION}:_cautious", _first_argument),),
+    ),
+    Mechanism(
+        "large-shifts",
+        "with few data and a counting tacho a second sum of the drift finds large shifts sooner",
+        (("scoring.detectors.drift:DriftSettings.cautious", _without_large_limit),),
     ),
     Mechanism(
         "mean-over-speeds",

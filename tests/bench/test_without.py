@@ -185,6 +185,7 @@ PROBES: dict[str, Callable[[], Hashable]] = {
     "fan-offsets": limits_of_many_runs,
     "worst-fan": limits_with_one_worse,
     "cautious": extrapolated_limits,
+    "large-shifts": extrapolated_limits,
     "mean-over-speeds": extrapolated_limits,
     "mean-over-fans": extrapolated_limits,
     "least-time-error": extrapolated_limits,
