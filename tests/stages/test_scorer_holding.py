@@ -141,6 +141,20 @@ def test_a_touched_blade_is_one_alarm_while_a_thermostat_moves_the_fan(rules: De
         assert found.count(Transition.RAISED) > 2
 
 
+@pytest.mark.parametrize("rules", [DecisionRules.FALLS, CURRENT_RULES])
+def test_at_other_speeds_than_those_of_its_fault_an_alarm_returns_after_ten_minutes(rules: DecisionRules) -> None:
+    samples = 900 * SECOND
+    at = np.arange(samples)[:, np.newaxis]
+    residual = noise(samples) - np.where(at < 40 * SECOND, 3.0 * SIGMA, 0.0)
+    touched = prediction(residual, speed=np.where(at < 40 * SECOND, 300.0, 240.0))
+    _, alarms = feed(core_after_commissioning(rules), [touched])
+    (cleared_s,) = [(a.t_ns - EPOCH_NS) / 1e9 - 40.0 for a in alarms if a.transition == Transition.CLEARED]
+    if rules < DecisionRules.HEALTHY_MOTION:
+        assert cleared_s < 60.0
+    else:
+        assert 600.0 < cleared_s < 660.0
+
+
 def test_while_an_alarm_is_active_the_baseline_of_the_fan_stays() -> None:
     samples = 120 * SECOND
     at = np.arange(samples)[:, np.newaxis]
