@@ -23,7 +23,7 @@ from scoring.detectors.deviation import summed_deviation
 
 CAP_LIMITS = 1.05  # the sum is capped here: a long fault clears soon after it ends, and drift alone stays a warning
 MIN_CAUTIOUS_LIMIT = 2.0  # standard deviations: with too few healthy data no limit is set below this
-CAUTIOUS_S = 10.0  # of a tacho that counts: so long a shift of twice the reference value lasts at least
+CAUTIOUS_S = 15.0  # of a tacho that counts: so long a shift of twice the reference value lasts at least
 LARGE_SHARE = 1.5  # of the reference value: that of the sum for large shifts
 CAUTIOUS_LARGE_S = 2.0  # and so long a shift of twice that lasts
 REFERENCE_SHARE = 0.25  # of the limit of the smoothed residual, and at least so many sigma

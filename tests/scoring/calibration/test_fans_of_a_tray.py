@@ -150,7 +150,7 @@ def test_with_few_data_a_shift_lasts_until_it_is_reported_if_a_tacho_counts() ->
     assert of_pulses[2] is None
     reference, after_s, large_after_s = drift((counts,))
     assert reference == pytest.approx(least, rel=0.01)
-    assert after_s == pytest.approx(10.0), "a shift of twice the reference value is reported after so long"
+    assert after_s == pytest.approx(15.0), "a shift of twice the reference value is reported after so long"
     assert large_after_s == pytest.approx(3.0), "one of three times the reference value after 2 s"
 
 
