@@ -40,7 +40,7 @@ def _returning(value: Any) -> Change:
 
 
 def _first_argument(_: Any) -> Any:
-    return lambda first, *_args: first
+    return lambda first, *_args, **_options: first
 
 
 def _one_spread(over_speed: Any) -> Any:

@@ -43,6 +43,7 @@ from scoring.limits import DeclaredRate, Limits, Timing
 
 DAY_S = 86_400.0
 NEEDED_ALARMS = 3.0  # false alarms expected in the healthy runs, for their rate to be distinguished from others
+SURE_ALARMS = 10.0  # of a tacho that counts: limits of fewer have the margins of few data
 VARIATION_FAN_S = 5 * DAY_S  # enough to measure how residuals vary; the frequency of large values needs all data
 ENOUGH_BLOCKS = 8
 MIN_WINDOWS = 6
@@ -146,8 +147,9 @@ def calibrate(
     found = healthy_statistics(runs, limits, top_speed_rad_s)
     factors = _factors(found, target)
     limits = limits.scaled(dict(zip((row.name for row in calibrated_rows()), factors.tolist(), strict=True)))
-    if not is_enough:
-        limits = _cautious(limits, found, sigma_shares)
+    expected_alarms = false_alarms_per_day * found.fan_s / DAY_S
+    if not is_enough or (found.count_sigmas > 0.0 and expected_alarms < SURE_ALARMS):
+        limits = _cautious(limits, found, sigma_shares, knows_other_speeds=is_enough)
         if sigma_rad_s is not None:
             limits = limits.model_copy(update={"speed": _widened_in_motion(limits.speed, sigma_rad_s, found.period_s)})
     rate = DeclaredRate(
@@ -249,8 +251,12 @@ def _smoothed_std(limits: Limits, source: Signal, found: HealthyStatistics) -> f
     return smoothed_deviation(limits.timing.smoothing_s, limits.residual(source).autocorrelation_time_s, found.period_s)
 
 
-def _cautious(limits: Limits, found: HealthyStatistics, sigma_shares: Mapping[Signal, Array]) -> Limits:
+def _cautious(
+    limits: Limits, found: HealthyStatistics, sigma_shares: Mapping[Signal, Array], *, knows_other_speeds: bool
+) -> Limits:
     """Limits where the running is too short to set them by rarity; see DetectorSettings.cautious_factor.
+
+    knows_other_speeds: whether it shows the residual at all speeds, so that no detector has to be left out.
 
     They are multiples of a standard deviation that few independent errors of the twin have shown, one for each speed of
     a fan, and so those of the upper end of its confidence interval.
@@ -274,7 +280,7 @@ def _cautious(limits: Limits, found: HealthyStatistics, sigma_shares: Mapping[Si
             replace(_evidence(row, limits, found), unknown_factor=1.0 if row.source == "tacho" else unknown)
         )
         for row in used
-        if factors[row.name] is not None
+        if factors[row.name] is not None or knows_other_speeds
     }
     return limits.model_copy(update={"detectors": detectors})
 

@@ -130,6 +130,25 @@ def test_a_counting_tacho_with_gaps_is_calibrated_all_the_same() -> None:
     assert "speed_drift" in found.detectors
 
 
+@pytest.mark.parametrize(("expected_alarms", "has_margins"), [(5.0, True), (20.0, False)])
+def test_of_a_tacho_that_counts_a_few_expected_alarms_declare_a_rate_and_keep_the_margins(
+    expected_alarms: float, has_margins: bool
+) -> None:
+    counts = Tacho(kind="count", pulses=2, window_s=0.1)
+    per_day = expected_alarms * 86_400.0 / (2 * 120.0 * FANS)
+
+    def drift(tachos: tuple[Tacho, ...]) -> DriftSettings:
+        found = calibrate(healthy(2, 120.0, tachos), 200.0, default_timing(FANS), per_day, has_drive=False)
+        assert found.declared_rate
+        assert not found.declared_rate.extrapolated
+        settings = found.settings_of("speed", DriftSettings)
+        assert settings, "such data show the residual at all speeds"
+        return settings
+
+    assert (drift((counts,)).large_limit is not None) == has_margins
+    assert drift(INSTANTANEOUS).large_limit is None
+
+
 def test_with_few_data_a_shift_lasts_until_it_is_reported_if_a_tacho_counts() -> None:
     counts = Tacho(kind="count", pulses=2, window_s=0.1)
 
