@@ -7,6 +7,7 @@ killed before the other stages, because its death alone must lose nothing.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -135,6 +136,24 @@ def check_alarms(chain: Chain, onset_t_ns: int) -> None:
     assert names == {alarm.request for alarm in alarms if alarm.request}
 
 
+def check_replay(chain: Chain) -> None:
+    """A replay that is given what each session was given decides the same, to the bit.
+
+    The last message of a killed process may have reached one subscriber and not the other. What the resampler took and
+    the recorder did not cannot be computed again; the replay then says so, and where.
+    """
+    done = fantwin("replay", "--offline", "--verify", "--json", *chain.recordings())
+    verified = json.loads(done.stdout)["verified"]
+    assert verified["equal"], verified["differences"]
+    assert verified["samples_equal"] > 1_000
+    assert verified["alarms_equal"] >= 10
+    reasons = verified["not_comparable"]
+    assert done.returncode == (3 if reasons else 0), done.stderr
+    expected = re.compile(rf"{TRAY}: after .*Z: the recording lacks 1 raw messages that were scored")
+    assert len(reasons) <= 1, reasons
+    assert all(expected.fullmatch(reason) for reason in reasons), reasons
+
+
 def test_operators_are_answered_and_killed_stages_come_back_without_losing_state(chain):
     chain.start_tray("--fault", f"inlet:fan={FAULTY},start=8,stop=600,size=2.5")
     up = chain.start_up()
@@ -165,6 +184,4 @@ def test_operators_are_answered_and_killed_stages_come_back_without_losing_state
     check_recordings(chain)
     check_alarms(chain, answer["onset_t_ns"])
 
-    # a replay that is given what each session was given decides the same, to the bit
-    verified = fantwin("replay", "--offline", "--verify", *chain.recordings())
-    assert verified.returncode == 0, verified.stdout + verified.stderr
+    check_replay(chain)
