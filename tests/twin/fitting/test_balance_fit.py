@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.recordings.runs import read_runs
+from schemas.tacho import Tacho
 from simulation import published_fan
 from simulation.plant import FanParameters, advance, at_rest
 from tests.support.fan_data import NOISE_RAD_S
@@ -89,6 +90,14 @@ def test_with_friction_least_squares_find_it_and_the_other_coefficients(plants) 
     found = fit.coefficients.mean(axis=0)
     np.testing.assert_allclose(found[:3], TRUTH[:3], rtol=0.03)
     assert found[3] == pytest.approx(TRUTH[3], abs=0.005), "half a per cent of the full command"
+
+
+def test_with_a_tacho_that_counts_least_squares_have_to_explain_more_than_its_errors_could(plants) -> None:
+    run, identification = plants
+    counted = replace(run, tacho=(Tacho(kind="count", window_s=0.01),))
+    assert set(fit_balance([counted], [], identification).sources) == {"physics"}
+    wrong = replace(identification, parameters=identification.parameters * (4.0, 1.0, 1.0, 1.0))
+    assert set(fit_balance([counted], [], wrong).sources) == {"least-squares"}
 
 
 def test_standard_errors_are_about_the_scatter_from_recording_to_recording(plants) -> None:
