@@ -18,6 +18,7 @@ import numpy as np
 from schemas.messages import Array
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
+from scoring.baseline.baseline import MIN_STEADY_READINGS
 from scoring.baseline.movement import Movement
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Signal
 from scoring.detectors.motion import HealthyMotion, Motion
@@ -60,7 +61,7 @@ class FanScorer:
         allows_for_counts: False only to decide as for recordings made before readings of a tacho that counts were
         allowed to be unsteady while the fan changes its speed, and to repeat where a healthy fan would read the same.
         limits_motion: False only to decide as for recordings made when limits widened with any motion of the readings.
-        begins_still: see Baseline.end_interval.
+        begins_still: False only to decide as for recordings made when a single reading could be the first baseline.
         """
         self.limits = limits
         self.residuals: dict[Signal, Residual] = {source: Residual(fans, source, limits) for source in RESIDUALS}
@@ -99,7 +100,7 @@ class FanScorer:
         self._motion = Motion(fans)
         self._healthy_motion = HealthyMotion(fans) if limits_motion else None
         self._movement = Movement(fans) if skips_transients else None
-        self._begins_still = begins_still
+        self._held_ns = np.array([tacho.held_s * NS_PER_S for tacho in of_each_fan]) if begins_still else None
         self._gaps = Gaps(len(INPUTS), fans) if forgets_over_gaps else None
         self._memories = self._memories_ns()
         self._shortest_memory_ns = min(memory_ns for _, _, memory_ns in self._memories)
@@ -228,10 +229,11 @@ class FanScorer:
         speed, balance = (self.residuals[source].baseline for source in RESIDUALS)
         commissioning = speed.is_commissioning | balance.is_commissioning
         moving = self._movement.end_interval(commissioning) if self._movement else None
+        few_readings = None
+        if self._held_ns is not None:
+            few_readings = self._interval_ns / np.maximum(self._held_ns, period_ns) < MIN_STEADY_READINGS
         for residual in self.residuals.values():
-            residual.end_interval(
-                expected, self._within_limit, self._below_half_limit, moving, begins_still=self._begins_still
-            )
+            residual.end_interval(expected, self._within_limit, self._below_half_limit, moving, few_readings)
         self._below_half_limit[:] = self._within_limit[:] = True
 
     def _memories_ns(self) -> list[tuple[int, Callable[[Array], None], int]]:

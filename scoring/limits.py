@@ -51,7 +51,7 @@ class DeclaredRate(_Entry):
 
     false_alarms_per_day: float = Field(gt=0, description="declared, for each fan")
     interval_95: tuple[float, float] = Field(
-        description="95 % confidence interval of the rate of these limits, from the healthy runs used to set them"
+        description="95 % confidence interval of the rate of the limits without margins, from their healthy runs"
     )
     extrapolated: bool = Field(description="limits are extrapolated beyond the healthy data; the rate is a target only")
     fan_hours: float = Field(gt=0, description="length of the healthy runs, summed over fans")

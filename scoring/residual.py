@@ -196,15 +196,14 @@ class Residual:
         within_limit: Array,
         below_half_limit: Array,
         moving: Array | None,
-        *,
-        begins_still: bool = True,
+        few_readings: Array | None = None,
     ) -> None:
         """End the interval; see Baseline.end_interval."""
         if self._shared:
             commissioned = self.baseline.is_set & ~self.baseline.is_commissioning
             alone = self._shared.end_interval(samples, commissioned, below_half_limit, moving)
             below_half_limit = below_half_limit & ~alone
-        self.baseline.end_interval(samples, within_limit, below_half_limit, moving, begins_still=begins_still)
+        self.baseline.end_interval(samples, within_limit, below_half_limit, moving, few_readings)
 
     def restart(self, fans: Array) -> None:
         """Commission some fans again, (fans,) of bool."""

@@ -57,8 +57,8 @@ class DecisionRules(IntEnum):
     """Sentences on why a cause is unclear have words for causes, and say that the speed has changed too little. Before,
     they had code names, and said that the command was not moving, even when it was. No decision differs."""
     FIRST_BASELINE = 15
-    """On a line of less than 5 Hz the first baseline comes from a fan that does not move. Before, it was the first
-    reading, also of a fan that speeds up, and such a fan had an alarm that never returned."""
+    """Where an interval has fewer than five readings, the first baseline comes from a fan that does not move. Before,
+    it came from the first interval, also of a fan that speeds up, and such a fan had an alarm that never returned."""
 
 
 CURRENT_RULES = max(DecisionRules)

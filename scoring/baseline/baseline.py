@@ -35,7 +35,7 @@ MIN_VALID_SHARE = 0.5  # of an interval's samples
 FIXED_POINT_ONE = 1 << 20  # one sigma, or one sigma squared; integer sums do not depend on how samples are cut
 LARGEST_SIGMAS = 1e3  # larger residuals are clipped to this
 MAX_STEADY_STD = 2.0  # standard deviation relative to a healthy one: an interval with more is not steady
-MIN_STEADY_SAMPLES = 5  # of an interval: fewer do not show that it is steady
+MIN_STEADY_READINGS = 5  # of an interval: fewer do not show that it is steady
 MAX_UNSTEADY_INTERVALS = 10  # intervals without a steady one, after which an unsteady one is accepted
 ROUNDING = 1e-9
 OFFSET_RANGE_RMS = 3.0  # an offset may be so many times the root mean square of healthy ones
@@ -123,15 +123,14 @@ class Baseline(ColumnState):
         within_limit: Array,
         below_half_limit: Array,
         moving: Array | None = None,
-        *,
-        begins_still: bool = True,
+        few_readings: Array | None = None,
     ) -> None:
         """End the present interval of so many samples.
 
         within_limit, below_half_limit: (fans,) whether every statistic stayed there during the interval. moving:
         (fans,) whether the fan moved, so that only its first baseline may come from the interval
-        (scoring.baseline.movement); None: no fan. begins_still: False only to decide as for recordings made when one
-        sample of a slow line could be the first baseline.
+        (scoring.baseline.movement); None: no fan. few_readings: (fans,) whether an interval has too few to show that it
+        is steady; None: no fan.
         """
         counts, is_set, commissioning = np.maximum(self._counts, 1), self.is_set, self.is_commissioning
         product, information, square = self._sums / counts / FIXED_POINT_ONE
@@ -142,8 +141,8 @@ class Baseline(ColumnState):
             explained = product * product / np.maximum(information, MIN_INFORMATION)
             deviation = np.sqrt(np.maximum(square - explained, 0.0))
             unsteady = seen & ~is_set & (deviation > MAX_STEADY_STD * self._residual_std)
-            if begins_still and moving is not None and samples < MIN_STEADY_SAMPLES:
-                unsteady |= seen & ~is_set & (moving | (self.unsteady_intervals == 0))
+            if few_readings is not None and moving is not None:
+                unsteady |= few_readings & seen & ~is_set & (moving | (self.unsteady_intervals == 0))
             unsteady &= self.unsteady_intervals < MAX_UNSTEADY_INTERVALS
             self.unsteady_intervals += unsteady
             good &= ~unsteady

@@ -44,6 +44,7 @@ from scoring.limits import DeclaredRate, Limits, Timing
 DAY_S = 86_400.0
 NEEDED_ALARMS = 3.0  # false alarms expected in the healthy runs, for their rate to be distinguished from others
 SURE_ALARMS = 10.0  # of a tacho that counts: limits of fewer have the margins of few data
+COARSE_COUNTS = 0.25  # errors of counts that are smaller, in standard deviations of the residual, do not matter
 VARIATION_FAN_S = 5 * DAY_S  # enough to measure how residuals vary; the frequency of large values needs all data
 ENOUGH_BLOCKS = 8
 MIN_WINDOWS = 6
@@ -148,7 +149,7 @@ def calibrate(
     factors = _factors(found, target)
     limits = limits.scaled(dict(zip((row.name for row in calibrated_rows()), factors.tolist(), strict=True)))
     expected_alarms = false_alarms_per_day * found.fan_s / DAY_S
-    if not is_enough or (found.count_sigmas > 0.0 and expected_alarms < SURE_ALARMS):
+    if not is_enough or (_count_std(limits, found) > 0.0 and expected_alarms < SURE_ALARMS):
         limits = _cautious(limits, found, sigma_shares, knows_other_speeds=is_enough)
         if sigma_rad_s is not None:
             limits = limits.model_copy(update={"speed": _widened_in_motion(limits.speed, sigma_rad_s, found.period_s)})
@@ -240,11 +241,17 @@ def _evidence(row: DetectorRow, limits: Limits, found: HealthyStatistics) -> Hea
         summed_std=summed_deviation(residual.autocorrelation_time_s, found.period_s),
         smoothed_limit=smoothed.limit if smoothed else 0.0,
         mean_limit=moments.mean_quantile(MEANS_QUANTILE),
-        count_std=found.count_sigmas / residual.mean_residual_std if row.source == "speed" else 0.0,
+        count_std=_count_std(limits, found) if row.source == "speed" else 0.0,
         between_runs_std=between_runs_std(moments, residual),
         # the friction of a day shifts the balance equally at all speeds, but not the speed
         offset_unknown_at_other_speeds=row.source == "speed" and residual.baseline.speed_exponent == 0,
     )
+
+
+def _count_std(limits: Limits, found: HealthyStatistics) -> float:
+    """The largest error of a count among the fans, in that of the speed residual; 0 where none of them matters."""
+    count_std = found.count_sigmas / limits.speed.mean_residual_std
+    return count_std if count_std >= COARSE_COUNTS else 0.0
 
 
 def _smoothed_std(limits: Limits, source: Signal, found: HealthyStatistics) -> float:

@@ -53,7 +53,7 @@ class DriftSettings(SingleLimit):
 
     def scaled(self, factor: float) -> DriftSettings:
         """See DetectorSettings."""
-        large = self.large_limit and self.large_limit * factor
+        large = None if self.large_limit is None else self.large_limit * factor
         return self.model_copy(update={"limit": self.limit * factor, "large_limit": large})
 
     def prepared(self, evidence: HealthyEvidence) -> DriftSettings:
@@ -72,12 +72,13 @@ class DriftSettings(SingleLimit):
     def cautious(self, evidence: HealthyEvidence) -> DriftSettings:
         """With too few data the reference value is larger by what is not known.
 
-        Of a tacho that counts it is above the error of a count and the means over ten. For how long the twin errs in
-        one direction these cannot know, so a shift has to last. A large one need not last as long.
+        Of a tacho that counts it is above the error of a count, the means over ten and the offsets between runs. For
+        how long the twin errs in one direction these cannot know, so a shift has to last. A large one need not last as
+        long.
         """
         if not evidence.count_std:
             return self.model_copy(update={"reference_sigmas": self.reference_sigmas * evidence.unknown_factor})
-        reference = max(evidence.mean_limit, evidence.count_std)
+        reference = max(evidence.mean_limit, evidence.count_std, evidence.between_runs_std)
         limit = max(self.limit, CAUTIOUS_S * reference / evidence.summed_std)
         large_limit = CAUTIOUS_LARGE_S * LARGE_SHARE * reference / evidence.summed_std
         return self.model_copy(update={"reference_sigmas": reference, "limit": limit, "large_limit": large_limit})

@@ -12,6 +12,8 @@ import pytest
 from pipeline.runtime.decision_rules import CURRENT_RULES, FORMER_DEFAULTS, DecisionRules
 from schemas.blocks import join
 from schemas.messages import InvalidReason, Prediction, Raw, Statistic, Transition
+from schemas.tacho import Tacho
+from schemas.units import NS_PER_S
 from stages.resampler import ResamplerConfig, ResamplerCore
 from stages.scorer import ScorerCore
 from tests.support.scored_blocks import (
@@ -183,16 +185,18 @@ def test_a_fan_is_not_commissioned_from_its_run_up() -> None:
 
 
 @pytest.mark.parametrize("rules", [DecisionRules.PLAIN_WORDS, CURRENT_RULES])
-def test_at_2_hz_a_fan_that_speeds_up_as_its_session_begins_is_not_judged_by_its_first_reading(
-    rules: DecisionRules,
+@pytest.mark.parametrize(("rate_hz", "tacho"), [(2, Tacho()), (10, Tacho(kind="count", window_s=1.0))])
+def test_a_fan_that_speeds_up_as_its_session_begins_is_not_judged_by_its_first_reading(
+    rate_hz: int, tacho: Tacho, rules: DecisionRules
 ) -> None:
-    samples, period_ns = 240, 500_000_000
-    residual = noise(samples) + np.where(np.arange(samples)[:, np.newaxis] < 4, -2.5 * SIGMA, 0.0)
-    item = prediction_of(residual, period_ns=period_ns)
-    ramp = np.minimum(100.0 + 50.0 * np.arange(samples), 300.0)[:, np.newaxis] - 300.0
+    held = max(1, round(rate_hz * tacho.held_s))
+    time_s = np.arange(120 * rate_hz)[:, np.newaxis] // held * held / rate_hz
+    wrong = np.where(time_s < 2.0, -2.5 * SIGMA, 0.0)
+    item = prediction_of(noise(len(time_s))[::held].repeat(held, axis=0) + wrong, period_ns=NS_PER_S // rate_hz)
+    ramp = np.minimum(100.0 * time_s - 200.0, 0.0)
     item.measured_speed_rad_s[:] += ramp
     item.predicted_speed_rad_s[:] += ramp
-    _, alarms = feed(core_of(calibration=CARD, decision_rules=rules), [item])
+    _, alarms = feed(core_of(calibration=CARD, decision_rules=rules, tachos=(tacho,)), [item])
     is_alarm = [alarm.transition for alarm in alarms if alarm.transition in (Transition.RAISED, Transition.CLEARED)]
     assert is_alarm == ([Transition.RAISED] if rules < DecisionRules.FIRST_BASELINE else [])
 

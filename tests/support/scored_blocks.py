@@ -12,6 +12,7 @@ from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
 from pipeline.runtime.snapshot_store import SnapshotStore
 from schemas.messages import Action, Alarm, Header, InvalidReason, Prediction, Request, Score, ScorerSnapshot
+from schemas.tacho import INSTANTANEOUS, Tacho
 from schemas.units import SpeedUnit
 from scoring.diagnosis.regression_window import HealthyBalance
 from stages.scorer import ScorerCore
@@ -72,13 +73,13 @@ def core_of(
     sha256: str = "twin",
     snapshot_store: SnapshotStore | None = None,
     decision_rules: DecisionRules = CURRENT_RULES,
+    tachos: tuple[Tacho, ...] = INSTANTANEOUS,
     **config: Any,
 ) -> ScorerCore:
     """Without a calibration: limits on the speed residual alone, 2 SIGMA."""
     settings = ScorerConfig.model_validate(config)
-    twin = HealthyTwin(
-        sha256, limits_in_force(settings, calibration, None, decision_rules), [balance_of_a_fan()] * fans, "%"
-    )
+    limits = limits_in_force(settings, calibration, None, decision_rules)
+    twin = HealthyTwin(sha256, limits, [balance_of_a_fan()] * fans, "%", tachos=tachos)
     return ScorerCore(fans, unit, settings, twin, snapshot_store, decision_rules)
 
 

@@ -16,8 +16,9 @@ by the share 1 - r, it reduces the standard deviation by at most the share 1 - s
 Fuller, Measurement Error Models, 1987, section 1.1). So least squares is chosen where its standard deviation is below
 that of the physics times sqrt(r), with r = inertia / J, but between 1/2 and 1: noise does not explain a J of twice the
 inertia or more. The errors of a tacho that counts last for a count and depend on the motion, so that they bias all the
-coefficients. On simulated racks of them least squares reached 0.73 times the standard deviation of the physics, and a
-balance at held speeds that was off by twice as much. With such a tacho r is 1/4.
+coefficients. On simulated racks least squares reached 0.73 times the standard deviation of the physics, and a balance
+at held speeds that was off by twice as much. So r is 1/4 where those errors, resolution / sqrt(6), would make half of
+the standard deviation of least squares or more.
 
 A fan that stands, starts or stops is left out, and so is the first second of each stretch; with a tacho that averages
 also as long as a reading shows any of that. Errors are those of the
@@ -48,6 +49,7 @@ SETTLING_S = 3.0 / FILTER_RATE_PER_S
 ENOUGH_RUNS, GROUPS = 4, 8
 MIN_RELIABILITY = 0.5
 RELIABILITY_OF_COUNTS = 0.25
+LEAST_SHARE_OF_COUNTS = 0.5
 INERTIA, FRICTION = COEFFICIENTS.index("inertia"), COEFFICIENTS.index("friction")
 LOWER_BOUNDS = (0.0, 0.0, 0.0, -np.inf)
 
@@ -101,7 +103,8 @@ def fit_balance(runs: Sequence[Run], held_out: Sequence[Run], identification: Id
     judged = _stretches(held_out, lag_s, lowest_speed_rad_s) or learned
     fans = range(len(lag_s))
     tachos = tacho_of_each_fan(runs[0].tacho, len(fans))
-    chosen = [_choose(learned, identification, fan, counts=tachos[fan].held_s > 0.0) for fan in fans]
+    errors_rad_s = [tacho.resolution_rad_s / np.sqrt(6.0) for tacho in tachos]
+    chosen = [_choose(learned, identification, fan, errors_rad_s[fan]) for fan in fans]
     coefficients = np.array([coefficients for coefficients, _, _ in chosen])
     sigma = np.array(
         [_residual_std([balance_of(run, coefficients[fan]) for run in _by_run(judged, fan)]) for fan in fans]
@@ -152,11 +155,11 @@ def _bridged(speed_rad_s: Array) -> Array:
 
 
 def _choose(
-    learned: Sequence[_Stretch], identification: Identification, fan: int, *, counts: bool
+    learned: Sequence[_Stretch], identification: Identification, fan: int, error_of_counts_rad_s: float
 ) -> tuple[Array, Array, BalanceSource]:
     """(4,) coefficients of a fan, the (4, 4) covariance of their errors, and which candidate they are.
 
-    counts: whether its tacho does.
+    error_of_counts_rad_s: standard deviation; 0 where its tacho does not count.
     """
     runs = _by_run(learned, fan)
     parts = 1 if len(runs) >= ENOUGH_RUNS else -(-GROUPS // len(runs))
@@ -171,8 +174,9 @@ def _choose(
         [np.concatenate([balance_of(group, next(of_others)) for group in of_run]) for of_run in groups]
     )
     physics_std = _residual_std([balance_of(run, physics) for run in runs])
+    of_counts = physics[INERTIA] * FILTER_RATE_PER_S * error_of_counts_rad_s
     of_inertia = np.clip(free[INERTIA] / physics[INERTIA], MIN_RELIABILITY, 1.0)
-    reliability = RELIABILITY_OF_COUNTS if counts else of_inertia
+    reliability = RELIABILITY_OF_COUNTS if of_counts >= LEAST_SHARE_OF_COUNTS * least_squares_std else of_inertia
     if least_squares_std < physics_std * np.sqrt(reliability):
         return free, _jackknife(np.array(without)), "least-squares"
     return physics, of_physics, "physics"

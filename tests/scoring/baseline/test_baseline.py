@@ -37,15 +37,15 @@ def test_the_first_good_interval_gives_the_baseline() -> None:
 
 @pytest.mark.parametrize("per_interval", [1, 2])
 def test_on_a_slow_line_a_fan_that_still_moves_has_no_baseline(per_interval: int) -> None:
-    def baseline_after(levels: list[float], moving: list[bool], *, begins_still: bool = True) -> float:
+    def baseline_after(levels: list[float], moving: list[bool], few_readings: bool = True) -> float:
         baseline = baseline_of(commissioning_limit_sigmas=30.0)
         for level, moves in zip(levels, moving, strict=True):
             baseline.add(np.full((per_interval, 2), level), np.ones((per_interval, 2), np.bool_))
-            baseline.end_interval(per_interval, GOOD, GOOD, np.array([moves, moves]), begins_still=begins_still)
+            baseline.end_interval(per_interval, GOOD, GOOD, np.array([moves, moves]), np.full(2, few_readings))
         return float(baseline.value[0])
 
     assert baseline_after([-18.0, -9.0, 2.0], [False, True, False]) == 2.0
-    assert baseline_after([-18.0, -9.0, 2.0], [False, True, False], begins_still=False) == pytest.approx(-8.0)
+    assert baseline_after([-18.0, -9.0, 2.0], [False, True, False], few_readings=False) == pytest.approx(-8.0)
     many = [5.0] * MAX_UNSTEADY_INTERVALS
     assert baseline_after(many, [True] * len(many)) == 0.0
     assert baseline_after([*many, 7.0], [True] * (len(many) + 1)) == 7.0, "one that never settles is accepted"

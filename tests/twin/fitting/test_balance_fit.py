@@ -94,7 +94,8 @@ def test_with_friction_least_squares_find_it_and_the_other_coefficients(plants) 
 
 def test_with_a_tacho_that_counts_least_squares_have_to_explain_more_than_its_errors_could(plants) -> None:
     run, identification = plants
-    counted = replace(run, tacho=(Tacho(kind="count", window_s=0.01),))
+    counted, finely = (replace(run, tacho=(Tacho(kind="count", pulses=n, window_s=0.01),)) for n in (2, 1000))
+    assert fit_balance([finely], [], identification).sources.count("least-squares") > 0.9 * run.fans
     assert set(fit_balance([counted], [], identification).sources) == {"physics"}
     wrong = replace(identification, parameters=identification.parameters * (4.0, 1.0, 1.0, 1.0))
     assert set(fit_balance([counted], [], wrong).sources) == {"least-squares"}
