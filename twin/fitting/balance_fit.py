@@ -16,9 +16,9 @@ by the share 1 - r, it reduces the standard deviation by at most the share 1 - s
 Fuller, Measurement Error Models, 1987, section 1.1). So least squares is chosen where its standard deviation is below
 that of the physics times sqrt(r), with r = inertia / J, but between 1/2 and 1: noise does not explain a J of twice the
 inertia or more. The errors of a tacho that counts last for a count and depend on the motion, so that they bias all the
-coefficients. On simulated racks least squares reached 0.73 times the standard deviation of the physics, and a balance
-at held speeds that was off by twice as much. So r is 1/4 where those errors, resolution / sqrt(6), would make half of
-the standard deviation of least squares or more.
+coefficients. All that such a bias can take away is the variance that the errors cause, (J lambda)^2 times theirs; least
+squares must lower the variance by more. (On simulated racks least squares reached 0.73 times the standard deviation of
+the physics, and a balance at held speeds that was off by twice as much.)
 
 A fan that stands, starts or stops is left out, and so is the first second of each stretch; with a tacho that averages
 also as long as a reading shows any of that. Errors are those of the
@@ -33,7 +33,6 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import lsq_linear
 
-from schemas.tacho import tacho_of_each_fan
 from schemas.twin_card import BalanceSource
 from twin.errors import TwinError
 from twin.evaluation.resampling import resampled
@@ -48,8 +47,6 @@ LOWEST_SHARE_OF_TOP = 0.05
 SETTLING_S = 3.0 / FILTER_RATE_PER_S
 ENOUGH_RUNS, GROUPS = 4, 8
 MIN_RELIABILITY = 0.5
-RELIABILITY_OF_COUNTS = 0.25
-LEAST_SHARE_OF_COUNTS = 0.5
 INERTIA, FRICTION = COEFFICIENTS.index("inertia"), COEFFICIENTS.index("friction")
 LOWER_BOUNDS = (0.0, 0.0, 0.0, -np.inf)
 
@@ -102,9 +99,7 @@ def fit_balance(runs: Sequence[Run], held_out: Sequence[Run], identification: Id
     learned = _stretches(runs, lag_s, lowest_speed_rad_s)
     judged = _stretches(held_out, lag_s, lowest_speed_rad_s) or learned
     fans = range(len(lag_s))
-    tachos = tacho_of_each_fan(runs[0].tacho, len(fans))
-    errors_rad_s = [tacho.resolution_rad_s / np.sqrt(6.0) for tacho in tachos]
-    chosen = [_choose(learned, identification, fan, errors_rad_s[fan]) for fan in fans]
+    chosen = [_choose(learned, identification, fan) for fan in fans]
     coefficients = np.array([coefficients for coefficients, _, _ in chosen])
     sigma = np.array(
         [_residual_std([balance_of(run, coefficients[fan]) for run in _by_run(judged, fan)]) for fan in fans]
@@ -155,12 +150,9 @@ def _bridged(speed_rad_s: Array) -> Array:
 
 
 def _choose(
-    learned: Sequence[_Stretch], identification: Identification, fan: int, error_of_counts_rad_s: float
+    learned: Sequence[_Stretch], identification: Identification, fan: int
 ) -> tuple[Array, Array, BalanceSource]:
-    """(4,) coefficients of a fan, the (4, 4) covariance of their errors, and which candidate they are.
-
-    error_of_counts_rad_s: standard deviation; 0 where its tacho does not count.
-    """
+    """(4,) coefficients of a fan, the (4, 4) covariance of their errors, and which candidate they are."""
     runs = _by_run(learned, fan)
     parts = 1 if len(runs) >= ENOUGH_RUNS else -(-GROUPS // len(runs))
     groups = [np.array_split(run, parts) for run in runs]
@@ -174,12 +166,23 @@ def _choose(
         [np.concatenate([balance_of(group, next(of_others)) for group in of_run]) for of_run in groups]
     )
     physics_std = _residual_std([balance_of(run, physics) for run in runs])
-    of_counts = physics[INERTIA] * FILTER_RATE_PER_S * error_of_counts_rad_s
-    of_inertia = np.clip(free[INERTIA] / physics[INERTIA], MIN_RELIABILITY, 1.0)
-    reliability = RELIABILITY_OF_COUNTS if of_counts >= LEAST_SHARE_OF_COUNTS * least_squares_std else of_inertia
-    if least_squares_std < physics_std * np.sqrt(reliability):
+    reliability = np.clip(free[INERTIA] / physics[INERTIA], MIN_RELIABILITY, 1.0)
+    of_counts = (physics[INERTIA] * FILTER_RATE_PER_S) ** 2 * _variance_of_counts(learned, fan)
+    if least_squares_std**2 < min(physics_std**2 * reliability, physics_std**2 - of_counts):
         return free, _jackknife(np.array(without)), "least-squares"
     return physics, of_physics, "physics"
+
+
+def _variance_of_counts(stretches: Sequence[_Stretch], fan: int) -> float:
+    """Mean square error of a fan's readings, (rad/s)^2, of whole counts and of their age; 0 where it does not count."""
+    found = []
+    for stretch in stretches:
+        grid, speed_rad_s = stretch.grid.fan(fan), stretch.grid.speed_rad_s[:, fan]
+        (tacho,) = grid.tacho
+        held = max(1, round(tacho.held_s / grid.median_period_s))
+        change = (speed_rad_s[held:] - speed_rad_s[:-held]) if tacho.held_s else np.zeros(1)
+        found.append(tacho.resolution_rad_s**2 / 6.0 + change**2 / 12.0)
+    return float(np.nanmean(np.concatenate(found)))
 
 
 def _physics(groups: Sequence[Array], identification: Identification, fan: int) -> tuple[Array, Array]:

@@ -38,16 +38,23 @@ def published() -> tuple[Run, Identification]:
 
 
 @pytest.fixture(scope="module")
-def plants() -> tuple[Run, Identification]:
-    """24 times the fan PLANT, each on its own command and with its own noise; identified once."""
-    fans, noise_rad_s = 24, 4.0
+def without_noise() -> Run:
+    """24 times the fan PLANT, each on its own command, at 100 Hz."""
+    fans = 24
     duty = published_fan.random_stairs(3, 40.0, fans, 0.05, 1.0)
     state, speeds = at_rest(fans), []
     for held in duty:
         speeds.append(state.speed_rad_s)
         state = advance(state, held, 0.01, PLANT)
-    noise = np.random.default_rng(4).normal(0.0, noise_rad_s, (len(duty), fans))
-    run = Run("plants", np.arange(len(duty)) / 100.0, duty, np.array(speeds) + noise)
+    return Run("plants", np.arange(len(duty)) / 100.0, duty, np.array(speeds))
+
+
+@pytest.fixture(scope="module")
+def plants(without_noise) -> tuple[Run, Identification]:
+    """Each with its own noise; identified once."""
+    fans, noise_rad_s = without_noise.fans, 4.0
+    noise = np.random.default_rng(4).normal(0.0, noise_rad_s, without_noise.speed_rad_s.shape)
+    run = replace(without_noise, speed_rad_s=without_noise.speed_rad_s + noise)
     one = identify([run.fan(0)])
     many = {
         "parameters": np.repeat(one.parameters, fans, axis=0),
@@ -92,13 +99,25 @@ def test_with_friction_least_squares_find_it_and_the_other_coefficients(plants) 
     assert found[3] == pytest.approx(TRUTH[3], abs=0.005), "half a per cent of the full command"
 
 
-def test_with_a_tacho_that_counts_least_squares_have_to_explain_more_than_its_errors_could(plants) -> None:
-    run, identification = plants
-    counted, finely = (replace(run, tacho=(Tacho(kind="count", pulses=n, window_s=0.01),)) for n in (2, 1000))
-    assert fit_balance([finely], [], identification).sources.count("least-squares") > 0.9 * run.fans
-    assert set(fit_balance([counted], [], identification).sources) == {"physics"}
+def counted(run: Run, tacho: Tacho) -> Run:
+    """What a tacho that counts would have read of the speeds of a run at 100 Hz."""
+    held = round(100.0 * tacho.window_s)
+    turned = np.cumsum(run.speed_rad_s, axis=0) / 100.0 / tacho.resolution_rad_s / tacho.window_s
+    pulses = np.floor(turned[held - 1 :: held])
+    readings = np.diff(pulses, axis=0, prepend=0.0) * tacho.resolution_rad_s
+    shown = np.repeat(readings, held, axis=0)[: run.samples - held]
+    return replace(run.rows(held, held + len(shown)), speed_rad_s=shown, tacho=(tacho,))
+
+
+def test_with_a_tacho_that_counts_least_squares_have_to_explain_more_than_its_errors_could(
+    without_noise, plants
+) -> None:
+    run, (_, identification) = without_noise, plants
+    coarse, fine = Tacho(kind="count", window_s=0.1), Tacho(kind="count", pulses=1000, window_s=0.01)
+    assert set(fit_balance([counted(run, coarse)], [], identification).sources) == {"physics"}
+    assert fit_balance([counted(run, fine)], [], identification).sources.count("least-squares") > 0.7 * run.fans
     wrong = replace(identification, parameters=identification.parameters * (4.0, 1.0, 1.0, 1.0))
-    assert set(fit_balance([counted], [], wrong).sources) == {"least-squares"}
+    assert set(fit_balance([counted(run, coarse)], [], wrong).sources) == {"least-squares"}
 
 
 def test_standard_errors_are_about_the_scatter_from_recording_to_recording(plants) -> None:
