@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import re
@@ -363,13 +364,13 @@ def test_into_a_pipe_a_running_site_is_shown_once_and_a_loss_is_exit_code_3(site
     ]
     for thread in threads:
         thread.start()
-    for number in range(6000):
-        if not any(thread.is_alive() for thread in threads):
+    for number in itertools.count():
+        alive = [thread for thread in threads if thread.is_alive()]
+        if not alive:
             break
         site.health.put(encode(replace(HEALTH, t_ns=HEALTH.t_ns + number)))
         site.score.put(encode(one_sample(FANS)))
-        threads[0].join(0.05)
-        threads[1].join(0.05)
+        alive[0].join(0.1)
     assert [answer.returncode for answer in done] == [3, 3, 3], done
     assert all("scorer" in answer.stdout for answer in done)
 
