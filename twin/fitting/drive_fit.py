@@ -8,7 +8,8 @@ Most fans have no such drive. It is looked for where readings are of pulses, as 
 starts, all together `FEWEST_STARTS` times. It is kept only if it lowers the free-run error of the physics by
 `LEAST_GAIN` or more, compared with friction alone, which is no drive: a hybrid learns that by itself. Errors are of all
 runs together: held-out ones may hold no start and no command of the plateau, and five settings of 10,000 readings fit
-no chance.
+no chance. Readings count as they do in the fit (twin.fitting.reading_errors): while the speed changes, those of a slow
+line err by more than a drive explains.
 """
 
 import itertools
@@ -39,7 +40,7 @@ LEAST_GAIN = 0.07
 """a share of the free-run error"""
 KICKS_S, RESTS_S = (0.3, 0.6, 1.2), (1.0, 2.0, 4.0)
 FIRST_ITERATIONS, MORE_ITERATIONS = 12, 5
-MOST_ITERATIONS = 2 * FIRST_ITERATIONS + (len(KICKS_S) + len(RESTS_S) + ERROR_ROUNDS) * MORE_ITERATIONS
+MOST_ITERATIONS = 2 * FIRST_ITERATIONS + (len(KICKS_S) + len(RESTS_S) + 2 * ERROR_ROUNDS) * MORE_ITERATIONS
 FIRST_DAMPING, DAMPING_DOWN, DAMPING_UP = 1e-3, 3.0, 4.0
 FIRST_PLATEAU, FIRST_KICK = 0.05, 0.5
 """shares of the range of commands above the lowest that turns the fans"""
@@ -129,18 +130,23 @@ def find_drive(
             unknowns = problem.fit(best, everything, MORE_ITERATIONS, iteration_done)
             if (of_other := problem.mean_square(unknowns)) < loss:
                 best, loss, drive = unknowns, of_other, other
-    with_drive = _Problem(judged, drive, plain.top_speed_rad_s, highest).mean_square(best)
-    friction_alone = _Problem(judged, never, plain.top_speed_rad_s, highest).mean_square(of_friction)
-    if not with_drive < (1.0 - LEAST_GAIN) ** 2 * friction_alone:
-        return None
     # Inertia and kick show while the speed changes, when readings say little of the rest.
-    of_steady_speeds = _Problem(learned, drive, plain.top_speed_rad_s, highest)
     steady = everything.copy()
     steady[[INERTIA, KICK]] = False
-    final = best
-    for _ in range(ERROR_ROUNDS):
-        of_steady_speeds.learn_errors(final)
-        final = of_steady_speeds.fit(final, steady, MORE_ITERATIONS, iteration_done)
+
+    def steadied(of: Drive, unknowns: Array, free: NDArray[np.bool_]) -> Array:
+        problem = _Problem(learned, of, plain.top_speed_rad_s, highest)
+        for _ in range(ERROR_ROUNDS):
+            problem.learn_errors(unknowns)
+            unknowns = problem.fit(unknowns, free & steady, MORE_ITERATIONS, iteration_done)
+        return unknowns
+
+    final, of_friction = steadied(drive, best, everything), steadied(never, of_friction, without)
+    with_drive = _Problem(judged, drive, plain.top_speed_rad_s, highest)
+    with_drive.learn_errors(final)
+    friction_alone = _Problem(judged, never, plain.top_speed_rad_s, highest, with_drive.errors)
+    if not with_drive.mean_square(final) < (1.0 - LEAST_GAIN) ** 2 * friction_alone.mean_square(of_friction):
+        return None
     return FoundDrive(drive, final[:, LAG:])
 
 
@@ -170,9 +176,17 @@ class _Runs:
 class _Problem:
     """The free run of fans behind one drive. Unknowns (fans, 6): ln J, two ln dampings, DRIVE_PARAMETERS."""
 
-    def __init__(self, runs: _Runs, drive: Drive, top_speed_rad_s: Array, highest_command: float) -> None:
+    def __init__(
+        self,
+        runs: _Runs,
+        drive: Drive,
+        top_speed_rad_s: Array,
+        highest_command: float,
+        errors: ReadingErrors | None = None,
+    ) -> None:
+        """errors: of the readings; None: not known."""
         self._data, self._drive = runs.data, drive
-        self._errors = ReadingErrors.unknown(self._data.command.shape)
+        self.errors = errors or ReadingErrors.unknown(self._data.command.shape)
         self._share = runs.kick(drive)
         self._top_speed_rad_s = top_speed_rad_s
         self._fans = len(top_speed_rad_s)
@@ -215,7 +229,7 @@ class _Problem:
         readings, of_heavier = data.measurement.of_speed(speed), data.measurement.of_speed(self._speed(heavier))
         with np.errstate(over="ignore", invalid="ignore"):
             errors, by_inertia = data.speed_rad_s - readings, of_heavier - readings
-        self._errors = reading_errors(errors, speed, by_inertia, data, self._errors)
+        self.errors = reading_errors(errors, speed, by_inertia, data, self.errors)
 
     def mean_square(self, unknowns: Array) -> float:
         """Mean square of the residual of all fans, (rad/s)^2."""
@@ -226,8 +240,8 @@ class _Problem:
         """(n, batch) weighted readings less those expected, 0 where nothing is compared; and the free run's speeds."""
         data, speed = self._data, self._speed(unknowns)
         with np.errstate(over="ignore", invalid="ignore"):
-            error = data.speed_rad_s - data.measurement.of_speed(speed) - self._errors.expected_rad_s
-            return np.where(data.compared, self._errors.weight * error, 0.0), speed
+            error = data.speed_rad_s - data.measurement.of_speed(speed) - self.errors.expected_rad_s
+            return np.where(data.compared, self.errors.weight * error, 0.0), speed
 
     def _speed(self, unknowns: Array) -> Array:
         """(n, batch) rad/s of the free run."""
@@ -262,7 +276,7 @@ class _Problem:
         forcing[1:, :, :LAG] = np.einsum("nbp,bpq->nbq", by_physics, chain)
         forcing[1:, :, LAG:] = by_command[..., np.newaxis] * by_settings[:-1]
         readings = data.measurement.of_speed(linear_recursion(by_speed, forcing))
-        sensitivity = (readings * self._errors.weight[..., np.newaxis]).transpose(1, 0, 2)
+        sensitivity = (readings * self.errors.weight[..., np.newaxis]).transpose(1, 0, 2)
         weight = np.where(data.compared, 1.0 / np.hypot(1.0, residual / (HUBER_DELTA * scale[fan])), 0.0)
         weighted = sensitivity * weight.T[..., np.newaxis]
         squares, gradient = np.zeros((self._fans, UNKNOWNS, UNKNOWNS)), np.zeros((self._fans, UNKNOWNS))

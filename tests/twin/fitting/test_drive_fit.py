@@ -19,6 +19,7 @@ DRIVE = Drive(turning_command=10.0, kick_s=0.6, rest_s=2.0)
 PHYSICS = np.array([[0.35, 0.25, 5e-4, 0.0]])
 SETTINGS = np.array([[50.0, 10.0, 180.0]])
 RATE_HZ, HOLD_S = 10.0, 12.0
+AGE_S = 4.0
 
 
 def run_of(drive: Drive | None, seed: int) -> Run:
@@ -64,3 +65,17 @@ def test_a_drive_is_looked_for_where_readings_are_of_pulses_and_starts_are_many(
 
 def test_a_fan_whose_command_acts_as_it_is_gets_no_drive() -> None:
     assert found_in(None) is None
+
+
+def test_errors_of_readings_while_the_speed_changes_do_not_hide_a_drive() -> None:
+    """Of unknown age, as on a line that is slower than the fan: they exceed all that a drive explains by far."""
+    runs = [of_unknown_age(run_of(DRIVE, seed), seed) for seed in (1, 2)]
+    found = find_drive(runs[:1], runs[1:], identify(runs[:1], with_lag=False), find_standstill(runs))
+    assert found is not None
+    np.testing.assert_allclose(found.settings[:, 0], SETTINGS[:, 0], rtol=0.1)
+
+
+def of_unknown_age(run: Run, seed: int) -> Run:
+    age_s = np.random.default_rng(seed).uniform(-AGE_S, AGE_S, run.speed_rad_s.shape)
+    slope = np.gradient(run.speed_rad_s, run.t_s, axis=0)
+    return replace(run, speed_rad_s=np.maximum(run.speed_rad_s + age_s * slope, 0.0))
