@@ -196,12 +196,18 @@ class FanScorer:
         return min(limits, default=np.inf)
 
     def limit_at(
-        self, source: Signal, speed_rad_s: Array, statistic: int, period_s: float, learned_scale: Array
+        self,
+        source: Signal,
+        speed_rad_s: Array,
+        statistic: int,
+        period_s: float,
+        learned_scale: Array,
+        unseen: Array,
     ) -> Array:
         """(fans,) how far the residual may be from its baseline at these speeds, sigma; infinite without a limit.
 
         By the detector of a statistic if that watches this residual and finds shifts; else by the smoothed residual.
-        learned_scale: (fans,) of the baseline at that time, see ScoredBlock.
+        learned_scale, unseen: (fans,) at that time, see ScoredBlock and Samples.
         """
         of_source = [row for row in self._rows if row.source == source and row.name in self.detectors]
         limits = {row.statistic: self.detectors[row.name].limit_sigmas(period_s) for row in of_source}
@@ -209,7 +215,7 @@ class FanScorer:
         if not np.isfinite(limit):
             limit = self.limit_sigmas(source, period_s)
         mean_std = self.limits.residual(source).mean_residual_std
-        return limit / mean_std * self.residuals[source].limit_std(speed_rad_s, learned_scale)
+        return limit / mean_std * self.residuals[source].limit_std(speed_rad_s, learned_scale, unseen)
 
     def persistent_limit_sigmas(self, source: Signal, period_s: float) -> float:
         """How far a shift that stays may be from the commissioned baseline, sigma; infinite without any limit.
@@ -272,17 +278,12 @@ class FanScorer:
         if self._healthy_motion:
             healthy_rad_s = self._healthy_motion.update(samples.command, samples.predicted_rad_s, speed_rad_s, period_s)
             transient_rad_s = np.minimum(transient_rad_s, healthy_rad_s)
-        values = {"speed": samples.speed_residual, "balance": samples.balance}
-        sigma = {"speed": samples.speed_sigma_rad_s, "balance": samples.balance_sigma}
-        valid = {"speed": samples.speed_valid, "balance": samples.balance_valid}
         piece = Piece(
             samples=samples,
             transient_rad_s=transient_rad_s,
             movement=self._movement.samples(motion_rad_s, speed_rad_s) if self._movement else None,
             residuals={
-                source: residual.samples(
-                    values[source], sigma[source], valid[source], speed_rad_s, transient_rad_s, period_s
-                )
+                source: residual.samples(*samples.residual(source), speed_rad_s, transient_rad_s, period_s)
                 for source, residual in self.residuals.items()
             },
             table=self._rows,

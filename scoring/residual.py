@@ -22,6 +22,8 @@ from scoring.limits import Limits
 
 CLIP_LIMITS = 2.0  # residuals are clipped to this many limits of the smoothed one: one outlier raises no alarm
 MIN_CLIP_STDS = 5.0
+RANGE_STDS = 3.0  # how far an error of a twin may be, in its standard deviations
+SEEN_SIGMAS = 0.5  # where its own error may be larger, baselines do not learn
 LARGEST_SIGMAS = 1e6  # so that sums and squares stay finite
 
 
@@ -39,7 +41,10 @@ class ResidualSamples:
     std: Array
     """standard deviation of the healthy residual, sigma"""
     low_frequency_std: Array
-    """of its low frequencies at this speed and in this motion, relative to their median"""
+    """of its low frequencies at this speed and in this motion, relative to their median; more where the twin may be
+    wrong because it was not trained there"""
+    seen: Array
+    """where the twin was trained: elsewhere its own error is no offset of the fan to be learned"""
     clip: float
     """how far samples count, standard deviations"""
     reach: Array
@@ -56,6 +61,7 @@ class ResidualSamples:
             self.scaling[rows],
             self.std[rows],
             self.low_frequency_std[rows],
+            self.seen[rows],
             self.clip,
             self.reach[rows],
             self.speed_sigmas[rows],
@@ -136,13 +142,12 @@ class Residual:
         values: Array,
         sigma: Array,
         valid: Array,
+        unseen: Array,
         speed_rad_s: Array,
         transient_rad_s: Array,
         period_s: float,
     ) -> ResidualSamples:
-        """What of samples does not depend on the baselines. All (n, fans); values: the residual, sigma; sigma: in the
-        unit of the residual.
-        """
+        """What of samples does not depend on the baselines. All (n, fans); the first four: see Samples."""
         expected, scaling = self._expected(speed_rad_s), speed_scaling(self._healthy.baseline, speed_rad_s, valid)
         std, clip = self._residual_std(speed_rad_s, valid), self._clip(period_s)
         return ResidualSamples(
@@ -151,7 +156,9 @@ class Residual:
             expected=expected,
             scaling=scaling,
             std=std,
-            low_frequency_std=self._low_frequency_std(speed_rad_s, transient_rad_s, valid),
+            low_frequency_std=self._low_frequency_std(speed_rad_s, transient_rad_s, valid)
+            + self._of_unseen(unseen, std),
+            seen=unseen < SEEN_SIGMAS,
             clip=clip,
             reach=self._healthy.baseline.commissioning_limit_sigmas * scaling + clip * std,
             speed_sigmas=np.divide(speed_rad_s, sigma, out=np.zeros(valid.shape), where=valid).clip(
@@ -171,9 +178,10 @@ class Residual:
             shared = self._shared.at(of.speed_sigmas)
             residual = residual - shared
             commissioned = baseline.commissioned * of.scaling
-            self._shared.add(of.residual - commissioned, of.speed_sigmas, scored & ~baseline.is_commissioning)
+            commissioned_now = scored & ~baseline.is_commissioning & of.seen
+            self._shared.add(of.residual - commissioned, of.speed_sigmas, commissioned_now)
         learned = np.where(of.valid, residual, own).clip(own - of.reach, own + of.reach)
-        baseline.add(learned, of.valid, of.scaling)
+        baseline.add(learned, of.valid & (of.seen | ~baseline.is_set), of.scaling)
         shift = np.where(scored, residual - own, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
         standardised = shift / of.std
         persistent = standardised / self._persistent_std(of.low_frequency_std, of.scaling, learned_scale)
@@ -242,19 +250,20 @@ class Residual:
         low = self._fan_offsets[before, column]
         return low + (place - before) * (self._fan_offsets[np.minimum(before + 1, last), column] - low)
 
-    def limit_std(self, speed_rad_s: Array, learned_scale: Array | None = None) -> Array:
+    def limit_std(self, speed_rad_s: Array, learned_scale: Array | None = None, unseen: Array | float = 0.0) -> Array:
         """(fans,) what limits of a constant residual are relative to at these constant speeds (fans,), sigma.
 
-        learned_scale: see Baseline.offset_uncertainty.
+        learned_scale: see Baseline.offset_uncertainty. unseen: see Samples.
         """
         speed, still = speed_rad_s[np.newaxis], np.zeros((1, len(speed_rad_s)))
         valid = np.isfinite(speed)
         scaling = speed_scaling(self._healthy.baseline, speed, valid)
-        low_frequency_std = self._low_frequency_std(speed, still, valid)
+        residual_std = self._residual_std(speed, valid)
+        low_frequency_std = self._low_frequency_std(speed, still, valid) + self._of_unseen(unseen, residual_std)
         uncertain = np.where(valid, scaling, 0.0)
         learned = self.baseline.learned_scale if learned_scale is None else learned_scale
         relative = self._persistent_std(low_frequency_std, uncertain, learned)
-        std: Array = self._residual_std(speed, valid) * relative
+        std: Array = residual_std * relative
         return std[0]
 
     @property
@@ -303,6 +312,10 @@ class Residual:
         if healthy.low_frequency_std_of_fans:
             relative = relative * np.array(healthy.low_frequency_std_of_fans)
         return relative
+
+    def _of_unseen(self, unseen: Array | float, std: Array) -> Array:
+        """What it adds: an error of RANGE_STDS standard deviations stays within the reference value of the drift."""
+        return RANGE_STDS * unseen / (std * self._reference_sigmas)
 
     def _persistent_std(self, low_frequency_std: Array, scaling: Array, learned_scale: Array) -> Array:
         """The same with an uncertain baseline: an unknown offset stays within the reference value of the drift."""

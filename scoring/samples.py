@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from schemas.messages import Array, InvalidReason, Prediction
+from scoring.detectors.detector import Signal
+from scoring.unseen_error import UnseenError
 
 BALANCE_COUNTS = tuple(map(int, (InvalidReason.NONE, InvalidReason.WARMING_UP, InvalidReason.OUT_OF_RANGE)))
 IDLE = tuple(map(int, (InvalidReason.STOPPED, InvalidReason.STARTING)))
@@ -24,10 +26,14 @@ class Samples:
     speed_valid: Array
     speed_sigma_rad_s: Array
     """the sigma of the speed residual"""
+    speed_unseen: Array
+    """standard deviation of the twin's own error where it was not trained, sigma; 0 where it was"""
     balance: Array
     balance_valid: Array
     balance_sigma: Array
     """that of the torque balance, in the unit of the command"""
+    balance_unseen: Array
+    """as speed_unseen"""
     command: Array
     predicted_rad_s: Array
     """what a healthy fan would read; NaN without a free run"""
@@ -40,14 +46,20 @@ class Samples:
     alive: Array
     """samples arrived on the line"""
 
+    def residual(self, source: Signal) -> tuple[Array, Array, Array, Array]:
+        """One of the residuals, its sigma, where it is valid, and the twin's own error."""
+        if source == "speed":
+            return self.speed_residual, self.speed_sigma_rad_s, self.speed_valid, self.speed_unseen
+        return self.balance, self.balance_sigma, self.balance_valid, self.balance_unseen
+
     def rows(self, rows: slice) -> Samples:
         """Some of the samples."""
         columns = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "period_ns"}
         return Samples(period_ns=self.period_ns, **{name: column[rows] for name, column in columns.items()})
 
 
-def samples_of(prediction: Prediction) -> Samples:
-    """The samples of a block of predictions.
+def samples_of(prediction: Prediction, unseen_error: UnseenError | None = None) -> Samples:
+    """The samples of a block of predictions. unseen_error: of the twin; None: it does not say.
 
     The torque balance also counts while the free run warms up, and while the command is out of the twin's range, where
     a controller takes it when a fan fails.
@@ -57,6 +69,11 @@ def samples_of(prediction: Prediction) -> Samples:
     with np.errstate(all="ignore"):
         speed_residual = residual / prediction.sigma_rad_s
         balance = balance / prediction.torque_balance_sigma_command
+    speed_unseen = balance_unseen = np.zeros(residual.shape)
+    if unseen_error:
+        of_speed, of_balance = unseen_error.of(prediction)
+        speed_unseen = of_speed / prediction.sigma_rad_s
+        balance_unseen = of_balance / prediction.torque_balance_sigma_command
     balance_counts = among(invalid_reason, *BALANCE_COUNTS)
     return Samples(
         t_ns=prediction.t_ns,
@@ -65,9 +82,11 @@ def samples_of(prediction: Prediction) -> Samples:
         speed_residual=speed_residual,
         speed_valid=prediction.valid & np.isfinite(speed_residual),
         speed_sigma_rad_s=np.broadcast_to(prediction.sigma_rad_s, residual.shape),
+        speed_unseen=speed_unseen,
         balance=balance,
         balance_valid=balance_counts & np.isfinite(balance),
         balance_sigma=np.broadcast_to(prediction.torque_balance_sigma_command, residual.shape),
+        balance_unseen=balance_unseen,
         command=prediction.command,
         predicted_rad_s=prediction.predicted_speed_rad_s,
         idle=among(invalid_reason, *IDLE),

@@ -10,11 +10,11 @@ from scoring.scored_block import ScoredBlock
 BAND_SIGMAS = 2.0
 
 
-def score_of(item: Prediction, scored: ScoredBlock, state: Array) -> Score:
-    """The message of a block that was scored. state: (n, fans) of FanState."""
+def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array) -> Score:
+    """The message of a block that was scored. state: (n, fans) of FanState. unseen: (n, fans), see Samples."""
     valid, sigma = np.isfinite(scored.score), item.sigma_rad_s
     residual = item.measured_speed_rad_s - item.predicted_speed_rad_s
-    band = np.broadcast_to(BAND_SIGMAS * sigma, residual.shape)
+    band = BAND_SIGMAS * sigma * np.hypot(1.0, unseen)
     if len(item.reading_range_rad_s):
         band = band + item.reading_range_rad_s
     of_prediction = item.invalid_reason

@@ -79,11 +79,12 @@ def rough_run(
     fan_variation: float = 0.1,
     lag_s: float = 0.0,
     low: float = ROUGH_RANGE[0],
+    high: float = ROUGH_RANGE[1],
 ) -> SimulatedRun:
-    """Rough fans under random stairs from `low` up. Parameters vary from -fan_variation to +fan_variation over fans."""
+    """Rough fans under random stairs from `low` to `high`, whose parameters vary by +-fan_variation over the fans."""
     factors = 1.0 + fan_variation * np.linspace(-1.0, 1.0, fans) if fans > 1 else np.ones(1)
     parts = [(_rough_torque, INERTIA * s, VISCOUS * s, DRAG * s) for s in factors.tolist()]
-    return _measured(random_stairs(seed, duration_s, fans, low, ROUGH_RANGE[1]), parts, lag_s, seed, f"rough {seed}")
+    return _measured(random_stairs(seed, duration_s, fans, low, high), parts, lag_s, seed, f"rough {seed}")
 
 
 def random_stairs(seed: int, duration_s: float, fans: int, low: float, high: float) -> Array:

@@ -43,7 +43,7 @@ from schemas.units import NS_PER_S
 from scoring.expected_reading import AveragedCommand
 from scoring.torque_balance import BalanceModel, TorqueBalance
 
-RANGE_MARGIN = 0.05  # of the width of the training range: a twin is used this far beyond it
+RANGE_MARGIN = 0.05  # of the width of the training range: so far beyond it a twin is used at least
 LONGEST_BRIDGE = (
     1 << 16
 )  # grid samples; above half a second at 100 kHz a new start is faster than running through the loss
@@ -78,9 +78,8 @@ class TwinIntegratorCore(Core):
         self._warm_up_ns = round((config.warm_up_s + reach_s) * NS_PER_S)
         self._hold_limit_ns = round(config.hold_limit_s * NS_PER_S)
         low, high = twin.card.command_range
-        margin = RANGE_MARGIN * (high - low)
         self._largest_move = LARGEST_MOVE_S * (high - low)
-        self._lowest_command, self._highest_command = low - margin, high + margin
+        self._lowest_command, self._highest_command = _usable_commands(twin)
         self._standstill = twin.card.standstill
         self._off_below = twin.off_below if self._standstill is None else _off_below(twin, self._standstill)
         self._run = FreeRun(twin, config.start_samples)
@@ -330,6 +329,16 @@ class TwinIntegratorCore(Core):
 def _off_below(twin: TwinFile, standstill: Standstill) -> Array:
     """(fans,) as TrayTwin.off_below, where the friction of a fan is not above a command that turns it."""
     return np.minimum(twin.off_below, standstill.turning_command)
+
+
+def _usable_commands(twin: TwinFile) -> tuple[float, float]:
+    """The lowest and the highest command for which the twin is used: as far as its card says how wrong it may be."""
+    low, high = twin.card.command_range
+    margin = RANGE_MARGIN * (high - low)
+    unseen = twin.unseen_error
+    if unseen is None:
+        return low - margin, high + margin
+    return min(unseen.table.commands[0], low - margin), max(unseen.table.commands[-1], high + margin)
 
 
 def _balance_of(twin: TwinFile, off_below: Array) -> TorqueBalance:

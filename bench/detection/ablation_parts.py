@@ -97,7 +97,7 @@ class SimulatedPart:
             faulty.setdefault(run, []).append(block)
         for run, blocks in faulty.items():
             write_predictions(blocks, _of_run(folder, run))
-        healthy = HealthySamples(folder)
+        healthy = HealthySamples(folder, fleet.twins)
         seconds = sizes.seconds(sizes.calibration_days)
         progress(f"healthy running: {sizes.calibration_days:g} fan-days in {sizes.runs} runs of {seconds / 60:.0f} min")
         plant = everyday(fleet, sizes.runs, sizes.seed + 2000)

@@ -72,7 +72,7 @@ def calibrated_twin(
     known = load_tray_twin(twin)
     runs = []
     for path in kept:
-        blocks = [samples_of(block) for block in read_predictions(path)]
+        blocks = [samples_of(block, known.unseen_error) for block in read_predictions(path)]
         fans = blocks[0].speed_rad_s.shape[1]
         runs.append(HealthyRun(path.stem, fans, blocks, range(fans) if known.fans > 1 else None, known.card.tacho))
     timing = HealthyRuns(recordings, twin, (), lambda _: None).timing()

@@ -29,8 +29,10 @@ COLUMNS = (
     "speed_rad_s",
     "speed_residual",
     "speed_sigma_rad_s",
+    "speed_unseen",
     "balance",
     "balance_sigma",
+    "balance_unseen",
     "command",
     "predicted_rad_s",
 )
@@ -60,14 +62,16 @@ class Scorer:
 class HealthySamples:
     """Samples of healthy runs, kept in files, to be gone through several times."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, twins: Iterable[Path]) -> None:
+        """twins: of the trays."""
         self._folder = folder
+        self._unseen_errors = [load_tray_twin(twin).unseen_error for twin in twins]
         self._fans: dict[str, int] = {}
         self._rows: dict[str, int] = {}
 
     def take(self, run: str, block: Prediction) -> None:
         """Keep a block of a run."""
-        samples = samples_of(block)
+        samples = samples_of(block, self._unseen_errors[tray_number(run)])
         self._fans[run] = block.fans
         self._rows[run] = self._rows.get(run, 0) + len(block.t_ns)
         for name in (*COLUMNS, *FLAGS):

@@ -99,7 +99,7 @@ def prepared(
     if libraries:
         progress("fitting the libraries")
         methods += library_methods(RATE_HZ, _fitting(fleet, sizes.seed + 1000, progress), few_fans=True)
-    kept = HealthySamples(folder)
+    kept = HealthySamples(folder, fleet.twins)
     seconds = sizes.seconds(sizes.calibration_days)
     progress(f"calibration: {sizes.calibration_days:g} fan-days in {sizes.runs} runs of {seconds / 60:.0f} min")
     stream = predictions(fleet, everyday(fleet, sizes.runs, sizes.seed + 2000), seconds, progress)

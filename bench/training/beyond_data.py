@@ -1,7 +1,7 @@
 """Beyond the data: twins trained below 75 % of the command, judged above.
 
 How wrong the free run is there, beside NARX and the physics, and whether the card says so: the share of readings within
-two standard deviations of the free run, by the healthy sigma alone, and with the twin's own error as well
+two standard deviations of the free run, by the healthy sigma alone, and with the unseen error of the card as well
 (twin.fitting.model_uncertainty).
 """
 
@@ -20,7 +20,6 @@ from bench.training.rough_table import DUTY_RANGE, simulated_plant
 from simulation.published_fan import random_stairs
 from twin.build import TrainedTwin, train_twin
 from twin.evaluation.accuracy import compared_readings, evaluation_pieces, free_run_readings
-from twin.evaluation.own_error import own_error_rad_s
 from twin.runs import Run
 
 SHARE = 0.75
@@ -47,7 +46,7 @@ def main(
                 rows[title].append(row | _judged(twin, held_out, _highest(training), unit_rad_s))
     show(
         rows,
-        ["rmse: rad/s, of esc_test rpm", "asked of the hybrid: coverage 0.9 with its own error"],
+        ["rmse: rad/s, of esc_test rpm", "asked of the hybrid: coverage 0.9 with the unseen error"],
         as_json=json_output,
     )
 
@@ -81,23 +80,23 @@ def _highest(runs: Sequence[Run]) -> float:
 def _judged(twin: TrainedTwin, runs: Sequence[Run], trained_to: float, unit_rad_s: float) -> dict[str, Any]:
     """Over the samples whose command is above that of training."""
     sigma_rad_s, uncertainty = np.array(twin.card.sigma_rad_s), twin.card.model_uncertainty
-    errors, own = [], []
+    errors, unseen = [], []
     for piece in evaluation_pieces(runs):
         predicted = free_run_readings(twin.model, twin.parameters, piece)
         error = compared_readings(piece) - predicted
         kept = np.isfinite(error) & (piece.command > trained_to)
         errors.append(error[kept])
-        own.append(
-            (own_error_rad_s(uncertainty, predicted, piece.command) if uncertainty else np.zeros_like(error))[kept]
+        unseen.append(
+            (uncertainty.unseen_std_at(predicted, piece.command) if uncertainty else np.zeros_like(error))[kept]
         )
-    error, own_rad_s = np.concatenate(errors), np.concatenate(own)
+    error, unseen_rad_s = np.concatenate(errors), np.concatenate(unseen)
     return {
         "rmse": float(np.sqrt(np.mean(error**2))) / unit_rad_s,
         "covered by sigma": round(float(np.mean(np.abs(error) <= 2.0 * sigma_rad_s)), 2),
-        "with its own error": round(float(np.mean(np.abs(error) <= 2.0 * np.hypot(sigma_rad_s, own_rad_s))), 2)
+        "with the unseen error": round(float(np.mean(np.abs(error) <= 2.0 * np.hypot(sigma_rad_s, unseen_rad_s))), 2)
         if uncertainty
         else "-",
-        "own error, median": float(np.median(own_rad_s)) / unit_rad_s if uncertainty else "-",
+        "unseen error, median": float(np.median(unseen_rad_s)) / unit_rad_s if uncertainty else "-",
     }
 
 

@@ -19,6 +19,7 @@ from scoring.detectors.standstill import StandstillSettings
 from scoring.detectors.tacho import TachoSettings
 from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.limits import Limits, Timing, uncalibrated
+from scoring.unseen_error import UnseenError
 
 LEAST_OFF_DELAY_S, OFF_DELAY_COUNTS = 1.0, 10.0
 
@@ -77,6 +78,8 @@ class HealthyTwin:
     standstill: Standstill | None = None
     highest_command: float = math.inf
     """that it was trained on"""
+    unseen_error: UnseenError | None = None
+    """where it was not trained; None: its card does not say"""
 
 
 def limits_in_force(
@@ -160,4 +163,5 @@ def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
         card.tacho,
         card.standstill,
         card.command_range[1],
+        twin.unseen_error,
     )

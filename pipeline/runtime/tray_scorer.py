@@ -26,7 +26,7 @@ from scoring.alarms.tray_conditions import AlarmEvent
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.fan_scorer import HALF_LIMIT, FanScorer
-from scoring.samples import among, arrived, samples_of
+from scoring.samples import Samples, among, arrived, samples_of
 from scoring.score_message import score_of
 from scoring.scored_block import ScoredBlock
 from scoring.wear.followed import followed_fans, shared_by_all
@@ -95,14 +95,15 @@ class TrayScorer:
     def score(self, item: Prediction) -> tuple[Score, list[Alarm]]:
         """The score of a block of new samples, and the messages on alarms."""
         self._sigma_rad_s = item.sigma_rad_s
-        scored, state, events = self._decide(item)
+        samples = samples_of(item, self._twin.unseen_error)
+        scored, state, events = self._decide(item, samples)
         self._feed_diagnoser(item, scored)
-        score = score_of(item, scored, state)
+        score = score_of(item, scored, state, samples.speed_unseen)
         self._feed_wear(item, scored, state)
         sigma_rad_s, sigma_command = item.sigma_rad_s, item.torque_balance_sigma_command
 
         def limits(row: int, fan: int) -> tuple[float, float]:
-            of_speed, of_balance = self._limits_at(item, scored, row, int(scored.statistic[row, fan]))
+            of_speed, of_balance = self._limits_at(item, samples, scored, row, int(scored.statistic[row, fan]))
             return float((of_speed * sigma_rad_s)[fan]), float((of_balance * sigma_command)[fan])
 
         context = AlarmContext(balance_command=scored.balance_smoothed * sigma_command, limits=limits)
@@ -141,23 +142,24 @@ class TrayScorer:
         self.fan_scorer.restore(state["scorer"])
 
     def _limits_at(
-        self, item: Prediction, scored: ScoredBlock, row: int, statistic: int
+        self, item: Prediction, samples: Samples, scored: ScoredBlock, row: int, statistic: int
     ) -> tuple[Array | float, Array | float]:
         """How far both residuals may be from their baselines, by the alarm's statistic; (fans,) or for all, sigma."""
         period_s = item.period_ns / NS_PER_S
         if not self._holds:
             return self.fan_scorer.limit_sigmas("speed", period_s), self.fan_scorer.limit_sigmas("balance", period_s)
-        speed = item.measured_speed_rad_s[row]
+        speed, limit_at = item.measured_speed_rad_s[row], self.fan_scorer.limit_at
+        of_speed, of_balance = scored.speed_learned_scale[row], scored.balance_learned_scale[row]
         return (
-            self.fan_scorer.limit_at("speed", speed, statistic, period_s, scored.speed_learned_scale[row]),
-            self.fan_scorer.limit_at("balance", speed, statistic, period_s, scored.balance_learned_scale[row]),
+            limit_at("speed", speed, statistic, period_s, of_speed, samples.speed_unseen[row]),
+            limit_at("balance", speed, statistic, period_s, of_balance, samples.balance_unseen[row]),
         )
 
-    def _decide(self, item: Prediction) -> tuple[ScoredBlock, Array, list[AlarmEvent]]:
+    def _decide(self, item: Prediction, samples: Samples) -> tuple[ScoredBlock, Array, list[AlarmEvent]]:
         """The scores, the states (n, fans) and the alarms' events. While an alarm is active, baselines stay."""
         speed = np.where(np.isfinite(item.predicted_speed_rad_s), item.predicted_speed_rad_s, item.measured_speed_rad_s)
         events: list[AlarmEvent] = []
-        scored, stretches = self.fan_scorer.stretches(samples_of(item))
+        scored, stretches = self.fan_scorer.stretches(samples)
         state = np.empty(scored.score.shape, np.uint8)
         for rows in stretches:
             was_active = self.alarms.active

@@ -15,6 +15,7 @@ from pipeline.runtime.stage import StageError
 from schemas.messages import Array
 from schemas.tacho import Tacho, tacho_of_each_fan
 from schemas.twin_card import CARD_PROPERTY, BalanceCard, CardError, TwinCard
+from scoring.unseen_error import UnseenError
 
 if TYPE_CHECKING:
     from scoring.diagnosis.regression_window import HealthyBalance
@@ -106,6 +107,14 @@ class TrayTwin:
         with np.errstate(all="ignore"):
             speed = 2.0 * left / (viscous + np.sqrt(np.square(viscous) + 4.0 * drag * left))
         return np.where(np.isfinite(speed) & (speed > 0.0), speed, self.card.top_speed_rad_s)
+
+    @property
+    def unseen_error(self) -> UnseenError | None:
+        """How far it may be wrong where it was not trained; None where the card does not say."""
+        table = self.card.model_uncertainty
+        if table is None or table.seen_std_rad_s is None:
+            return None
+        return UnseenError(table, self.card.drive, self.balance.viscous, self.balance.drag)
 
     def healthy_balances(self) -> list[HealthyBalance]:
         """The balance of each fan, for diagnosis."""

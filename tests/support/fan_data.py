@@ -26,9 +26,11 @@ def published_run(seed: int, duration_s: float = 40.0, fans: int = 1) -> Run:
     return published_fan.published_fan(command, seed, f"published {seed}").run
 
 
-def rough_run(seed: int, duration_s: float = 40.0, fans: int = 1, low: float = ROUGH_RANGE[0]) -> Run:
+def rough_run(
+    seed: int, duration_s: float = 40.0, fans: int = 1, low: float = ROUGH_RANGE[0], high: float = ROUGH_RANGE[1]
+) -> Run:
     """Fans with a dead zone in the drive and Stribeck friction, whose physics differ by 10 % from fan to fan."""
-    return published_fan.rough_run(seed, duration_s, fans, low=low).run
+    return published_fan.rough_run(seed, duration_s, fans, low=low, high=high).run
 
 
 def counted_run(seed: int, tacho: Tacho, duration_s: float = 120.0, rate_hz: float = 10.0) -> Run:

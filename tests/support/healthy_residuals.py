@@ -42,7 +42,9 @@ def samples_of(speed: Array, balance: Array, first: int = 0, period_ns: int = ST
         speed_residual=speed,
         speed_valid=np.isfinite(speed),
         speed_sigma_rad_s=np.full(speed.shape, 1e4),  # so coarse that nothing counts as shared by the fans
+        speed_unseen=np.zeros(speed.shape),
         balance=balance,
+        balance_unseen=np.zeros(balance.shape),
         balance_sigma=np.full(speed.shape, 1e4),
         balance_valid=np.isfinite(balance),
         command=np.full(speed.shape, 50.0),

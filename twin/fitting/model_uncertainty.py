@@ -10,6 +10,7 @@ The fans of a tray are taken together: what one of them has shown is known of al
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -37,6 +38,8 @@ POINTS, REACH = 13, 1.5
 """of the table along each axis, and how far it reaches, in half recorded ranges"""
 SLOWEST = 3.0
 """time constants are limited to so many of the typical one: they grow without limit where a fan hardly turns"""
+SEEN_QUANTILE = 0.95
+"""of the standard deviations at the samples of training"""
 LEAST_NOISE = 1e-4
 """of a reading, in half the recorded range of speeds: data without noise determine no more than numbers can hold"""
 
@@ -67,9 +70,11 @@ def model_uncertainty(
     std_rad_s2 = np.linalg.norm(solve_triangular(root, values.T, lower=True), axis=0)
     held_s = _held_s(parameters, speed_rad_s, SLOWEST * typical_s)
     std_rad_s = (std_rad_s2 * held_s).reshape(POINTS, POINTS)
-    return ModelUncertainty(
+    table = ModelUncertainty(
         tuple(speeds_rad_s.tolist()), tuple(commands.tolist()), tuple(map(tuple, np.round(std_rad_s, 4).tolist()))
     )
+    seen_rad_s = np.concatenate([table.std_at(run.speed_rad_s, run.command).ravel() for run in runs])
+    return replace(table, seen_std_rad_s=round(float(np.nanquantile(seen_rad_s, SEEN_QUANTILE)), 4))
 
 
 def _held_s(parameters: Array, speed_rad_s: Array, slowest_s: float) -> Array:

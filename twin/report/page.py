@@ -9,7 +9,6 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from twin.evaluation.own_error import own_error_rad_s
 from twin.evaluation.residual_analysis import SIGNIFICANCE
 from twin.kinds import kind_title
 from twin.report import figures
@@ -136,7 +135,7 @@ def _what_is_known(content: Content, fan: FanContent) -> list[Figure]:
     known = content.card.model_uncertainty
     if known is None:
         return []
-    std_rad_s = own_error_rad_s(known, fan.predicted_rad_s, fan.raised_command)
+    std_rad_s = known.std_at(fan.predicted_rad_s, fan.raised_command)
     beyond = std_rad_s[np.isfinite(std_rad_s)] > fan.sigma_rad_s
     share = f" So are {100.0 * beyond.mean():.3g} % of the samples here." if beyond.size else ""
     return [

@@ -56,6 +56,7 @@ class HealthyRuns:
         loaded = load_tray_twin(twin)
         self._knows_fans = loaded.fans > 1
         self._tachos = loaded.card.tacho
+        self._unseen_error = loaded.unseen_error
         self._pass = 0
         self._kept: list[HealthyRun] | None = None
         self.trays: list[RecordedTray] = []
@@ -142,7 +143,9 @@ class HealthyRuns:
         with open_replay_input([path], None, self._overrides, self._twin, *part_s) as replay_input:
             for tray in replay_input.trays:
                 name = tray.name
-                yield RecordedTray(path, name, tray.fans), map(samples_of, replay_input.pipeline(name).predictions())
+                predictions = replay_input.pipeline(name).predictions()
+                samples = (samples_of(block, self._unseen_error) for block in predictions)
+                yield RecordedTray(path, name, tray.fans), samples
 
 
 def _refuse_one_fan_among_several(trays: Sequence[RecordedTray]) -> None:

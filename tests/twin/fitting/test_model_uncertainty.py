@@ -8,7 +8,6 @@ from tests.support import fan_data
 from tests.twin.fitting.test_drive_fit import DRIVE, run_of
 from twin.build import TrainedTwin, train_twin
 from twin.evaluation.accuracy import compared_readings, free_run_readings
-from twin.evaluation.own_error import own_error_rad_s
 from twin.fitting.identification import identify
 from twin.fitting.model_uncertainty import model_uncertainty, variance_of_independent
 from twin.models.physical import PhysicalModel
@@ -30,13 +29,16 @@ def known(twin: TrainedTwin) -> ModelUncertainty:
 def along(twin: TrainedTwin, run: Run) -> tuple[Array, Array]:
     """(n,) the error of the free run, and what it may be, of one fan."""
     predicted = free_run_readings(twin.model, twin.parameters, run)
-    return (compared_readings(run) - predicted)[:, 0], own_error_rad_s(known(twin), predicted, run.command)[:, 0]
+    return (compared_readings(run) - predicted)[:, 0], known(twin).std_at(predicted, run.command)[:, 0]
 
 
 def test_beyond_its_data_it_says_how_wrong_a_twin_may_be_and_within_them_that_it_is_right(upper) -> None:
     sigma = upper.card.sigma_rad_s[0]
     _, within_rad_s = along(upper, fan_data.rough_run(6, 30.0, low=50.0))
     assert np.median(within_rad_s) < 0.5 * sigma
+    seen_rad_s = known(upper).seen_std_rad_s
+    assert seen_rad_s is not None
+    assert 0.85 < np.mean(within_rad_s <= seen_rad_s) < 1.0
     test = fan_data.rough_run(3, 40.0)
     error, std_rad_s = along(upper, test)
     beyond = (test.command[:, 0] > 10.0) & (test.command[:, 0] < 20.0)
@@ -53,9 +55,7 @@ def test_more_data_leave_less_open() -> None:
     assert short is not None
     assert long is not None
     speed_rad_s = np.nan_to_num(run.speed_rad_s)
-    short_rad_s, long_rad_s = (
-        np.quantile(own_error_rad_s(each, speed_rad_s, run.command), 0.9) for each in (short, long)
-    )
+    short_rad_s, long_rad_s = (np.quantile(each.std_at(speed_rad_s, run.command), 0.9) for each in (short, long))
     assert long_rad_s < 0.6 * short_rad_s
 
 

@@ -1,0 +1,45 @@
+"""How far a twin may be wrong where it was not trained, beyond the errors that its healthy runs show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.messages import Array, Prediction
+from schemas.model_uncertainty import ModelUncertainty
+from schemas.twin_card import DriveCard
+
+
+@dataclass(frozen=True, eq=False)
+class UnseenError:
+    """Standard deviations by the table of a twin's card. viscous, drag: (fans,) of the torque balance.
+
+    The table is asked at pairs of speed and command of a healthy fan. A fault takes a fan to pairs that nobody has seen
+    either, and must not widen its own limits.
+    """
+
+    table: ModelUncertainty
+    drive: DriveCard | None
+    viscous: Array
+    drag: Array
+
+    def of(self, prediction: Prediction) -> tuple[Array, Array]:
+        """(n, fans) each, of the predicted speed, rad/s, and of the torque balance, in the unit of the command.
+
+        0 without a prediction or a reading. The balance may be wrong in what this command does to a healthy fan, and in
+        what a healthy fan needs at the measured speed. An error of the speed counts as that of the command which keeps
+        a fan at the speed.
+        """
+        measured_rad_s, command = prediction.measured_speed_rad_s, prediction.command
+        needed = command - prediction.torque_balance_command
+        commands = np.stack((command, needed))
+        if self.drive is not None:
+            commands = self.drive.raised(commands)
+        speeds_rad_s = np.stack((prediction.predicted_speed_rad_s, measured_rad_s))
+        unseen_rad_s = self.table.unseen_std_at(speeds_rad_s, commands)
+        if not unseen_rad_s.any():
+            return unseen_rad_s[0], unseen_rad_s[1]
+        of_speed, of_needed = np.nan_to_num(unseen_rad_s)
+        slope = np.maximum(self.viscous + 2.0 * self.drag * np.abs(measured_rad_s), 0.0)
+        return of_speed, np.nan_to_num(slope * np.hypot(of_speed, of_needed))
