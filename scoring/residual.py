@@ -19,10 +19,10 @@ from scoring.detectors.drift import DEFAULT_REFERENCE_SIGMAS, DriftSettings
 from scoring.detectors.low_pass import LowPass
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.limits import Limits
+from scoring.unseen_error import RANGE_STDS
 
 CLIP_LIMITS = 2.0  # residuals are clipped to this many limits of the smoothed one: one outlier raises no alarm
 MIN_CLIP_STDS = 5.0
-RANGE_STDS = 3.0  # how far an error of a twin may be, in its standard deviations
 SEEN_SIGMAS = 0.5  # where its own error may be larger, baselines do not learn
 LARGEST_SIGMAS = 1e6  # so that sums and squares stay finite
 
@@ -181,7 +181,7 @@ class Residual:
             commissioned_now = scored & ~baseline.is_commissioning & of.seen
             self._shared.add(of.residual - commissioned, of.speed_sigmas, commissioned_now)
         learned = np.where(of.valid, residual, own).clip(own - of.reach, own + of.reach)
-        baseline.add(learned, of.valid & (of.seen | ~baseline.is_set), of.scaling)
+        baseline.add(learned, of.valid & (of.seen | baseline.is_commissioning), of.scaling)
         shift = np.where(scored, residual - own, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
         standardised = shift / of.std
         persistent = standardised / self._persistent_std(of.low_frequency_std, of.scaling, learned_scale)

@@ -335,10 +335,10 @@ def _usable_commands(twin: TwinFile) -> tuple[float, float]:
     """The lowest and the highest command for which the twin is used: as far as its card says how wrong it may be."""
     low, high = twin.card.command_range
     margin = RANGE_MARGIN * (high - low)
-    unseen = twin.unseen_error
-    if unseen is None:
+    table = twin.unseen_error.table if twin.unseen_error else None
+    if table is None:
         return low - margin, high + margin
-    return min(unseen.table.commands[0], low - margin), max(unseen.table.commands[-1], high + margin)
+    return min(table.commands[0], low - margin), max(table.commands[-1], high + margin)
 
 
 def _balance_of(twin: TwinFile, off_below: Array) -> TorqueBalance:

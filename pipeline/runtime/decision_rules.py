@@ -60,6 +60,10 @@ class DecisionRules(IntEnum):
     """Where an interval has fewer than five readings, the first baseline comes from a fan that does not move. Before,
     it came from the first interval, also of a fan that speeds up, and such a fan had an alarm that never returned."""
 
+    UNSEEN = 16
+    """Band and limits are wider where the twin was not trained, and at the end of a drive's plateau. Before, they were
+    the same there."""
+
 
 CURRENT_RULES = max(DecisionRules)
 FORMER_DEFAULTS = {

@@ -79,7 +79,7 @@ class HealthyTwin:
     highest_command: float = math.inf
     """that it was trained on"""
     unseen_error: UnseenError | None = None
-    """where it was not trained; None: its card does not say"""
+    """where healthy runs do not show it; None: its card says nothing about it"""
 
 
 def limits_in_force(

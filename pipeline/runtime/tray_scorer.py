@@ -47,6 +47,7 @@ class TrayScorer:
         self._holds = decision_rules >= DecisionRules.HOLDING
         self._twin = twin
         self._text = text
+        self._unseen_error = twin.unseen_error if decision_rules >= DecisionRules.UNSEEN else None
         self._sigma_rad_s = np.ones(fans)
         self.fan_scorer = FanScorer(
             fans,
@@ -95,7 +96,7 @@ class TrayScorer:
     def score(self, item: Prediction) -> tuple[Score, list[Alarm]]:
         """The score of a block of new samples, and the messages on alarms."""
         self._sigma_rad_s = item.sigma_rad_s
-        samples = samples_of(item, self._twin.unseen_error)
+        samples = samples_of(item, self._unseen_error)
         scored, state, events = self._decide(item, samples)
         self._feed_diagnoser(item, scored)
         score = score_of(item, scored, state, samples.speed_unseen)

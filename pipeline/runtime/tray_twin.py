@@ -110,11 +110,14 @@ class TrayTwin:
 
     @property
     def unseen_error(self) -> UnseenError | None:
-        """How far it may be wrong where it was not trained; None where the card does not say."""
-        table = self.card.model_uncertainty
-        if table is None or table.seen_std_rad_s is None:
+        """How far it may be wrong where healthy runs do not show it; None where the card says nothing about it."""
+        card, table = self.card, self.card.model_uncertainty
+        if table is not None and table.seen_std_rad_s is None:
+            table = None
+        if table is None and card.drive is None:
             return None
-        return UnseenError(table, self.card.drive, self.balance.viscous, self.balance.drag)
+        low, high = card.command_range
+        return UnseenError(table, card.drive, self.balance.viscous, self.balance.drag, high - low)
 
     def healthy_balances(self) -> list[HealthyBalance]:
         """The balance of each fan, for diagnosis."""

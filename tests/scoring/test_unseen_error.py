@@ -13,7 +13,7 @@ from schemas.twin_card import DriveCard
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits
 from scoring.samples import Samples
-from scoring.unseen_error import UnseenError
+from scoring.unseen_error import RANGE_STDS, UnseenError
 from tests.support.healthy_residuals import samples_of as healthy_samples
 from tests.support.scored_blocks import CALIBRATION, NEEDED, TWIN_SPEED, prediction_of
 
@@ -24,7 +24,7 @@ TABLE = ModelUncertainty((0.0, 600.0), (0.0, 100.0), ((0.0, 0.0), (0.0, 20.0)), 
 
 
 def of_twin(drive: DriveCard | None = None) -> UnseenError:
-    return UnseenError(TABLE, drive, viscous=np.array([0.05]), drag=np.array([0.0002]))
+    return UnseenError(TABLE, drive, viscous=np.array([0.05]), drag=np.array([0.0002]), command_width=100.0)
 
 
 def residual(shift: float, seconds: int, seed: int, unseen: float) -> Samples:
@@ -95,6 +95,16 @@ def test_a_command_on_the_plateau_of_a_drive_counts_as_its_end() -> None:
     drive = DriveCard(turning_command=10.0, kick_s=0.5, rest_s=1.0, lowest_command=(2.0 * NEEDED,))
     prediction = prediction_of(np.zeros(1))
     assert of_twin(drive).of(prediction)[0] == pytest.approx(2.0 * of_twin().of(prediction)[0])
+
+
+@pytest.mark.parametrize(("beyond", "is_near"), [(-1.5, False), (-0.9, True), (0.0, True), (1.9, True), (2.5, False)])
+def test_around_the_end_of_a_plateau_a_drive_may_be_wrong(beyond: float, is_near: bool) -> None:
+    """By a hundredth of the range of commands, 1 here, without a table too."""
+    drive = DriveCard(turning_command=10.0, kick_s=0.5, rest_s=1.0, lowest_command=(NEEDED - beyond,))
+    of_speed, of_balance = replace(of_twin(drive), table=None).of(prediction_of(np.zeros(1)))
+    assert RANGE_STDS * of_balance == pytest.approx(1.0 if is_near else 0.0)
+    slope = 0.05 + 2.0 * 0.0002 * TWIN_SPEED
+    assert RANGE_STDS * of_speed * slope == pytest.approx(1.0 if is_near else 0.0)
 
 
 def test_without_prediction_or_reading_it_adds_nothing() -> None:

@@ -1,0 +1,30 @@
+"""stages.scorer: where its twin may be wrong the band is wider; recordings of before are decided as they were."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
+from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
+from schemas.model_uncertainty import ModelUncertainty
+from scoring.unseen_error import UnseenError
+from stages.scorer import ScorerCore
+from tests.support.scored_blocks import CALIBRATION, SIGMA, balance_of_a_fan, feed, prediction_of
+
+EVERYWHERE = ModelUncertainty((0.0, 600.0), (0.0, 100.0), ((20.0, 20.0), (20.0, 20.0)), seen_std_rad_s=0.0)
+
+
+@pytest.mark.parametrize(("rules", "is_wider"), [(CURRENT_RULES, True), (DecisionRules.FIRST_BASELINE, False)])
+def test_the_unseen_error_widens_band_and_limits(rules: DecisionRules, is_wider: bool) -> None:
+    unseen_error = UnseenError(EVERYWHERE, None, np.array([0.05]), np.array([0.0002]), command_width=100.0)
+    settings = ScorerConfig()
+    limits = limits_in_force(settings, CALIBRATION, None, rules)
+    twin = HealthyTwin("twin", limits, [balance_of_a_fan()], "%", unseen_error=unseen_error)
+    core = ScorerCore(1, "rad/s", settings, twin, None, rules)
+    noise = np.random.default_rng(1).normal(0.0, SIGMA, 4000)
+    noise[2000:] += 20.0
+    scores, alarms = feed(core, [prediction_of(noise)])
+    half_rad_s = (scores[0].upper_bound_rad_s - scores[0].lower_bound_rad_s) / 2.0
+    np.testing.assert_allclose(half_rad_s, 2.0 * (np.hypot(SIGMA, 20.0) if is_wider else SIGMA))
+    assert bool(alarms) != is_wider
