@@ -42,7 +42,7 @@ class ScorerConfig(StageConfig):
         ge=0,
         description="how long a return must last at least to clear; default: 1 s, of a tacho that counts ten counts",
     )
-    deadband: float = Field(default=0.5, ge=0, lt=1, description="share of its limit below which a return begins")
+    deadband: float = Field(default=0.5, ge=0, lt=1, description="a return begins below 1 - deadband times the limit")
     alarm_ratio: float = Field(default=1.5, ge=1, description="score from which a warning is an alarm")
     latching: bool = Field(default=False, description="whether a cleared alarm stays until it is reset")
     confirming: bool = Field(default=False, description="whether an acknowledged alarm must be confirmed, too")

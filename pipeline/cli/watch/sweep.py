@@ -46,8 +46,9 @@ def sweep(
     """Move the commands of all fans over their range while `fantwin up` records: levels up and down, long and short.
 
     Two steps over the whole range show the time constants of the fans; each level then lasts five of the longest. Each
-    fan has the levels in another order, so that the load of their supply is not that of any one of them. At
-    the end, after Ctrl-C and after an error the fans get a safe command. Nothing else may set the commands meanwhile.
+    fan runs through the levels in a different order, so that the load on the common supply does not follow any one fan.
+    At the end, after Ctrl-C and after an error each fan gets the command of --safe, or the one it had before. Nothing
+    else may set the commands meanwhile.
 
     Example: fantwin sweep -c fantwin.toml --fans all --low 0.2
     """
