@@ -224,6 +224,11 @@ MECHANISMS: Sequence[Mechanism] = (
         ((f"{_CALIBRATION}:_widened_in_motion", _first_argument),),
     ),
     Mechanism(
+        "unvisited-speeds",
+        "with few data limits are wider at speeds beyond those of calibration",
+        ((f"{_CALIBRATION}:wider_at_unvisited_speeds", _first_argument),),
+    ),
+    Mechanism(
         "expected-residual",
         "the mean healthy residual at each speed is subtracted",
         ((f"{_VARIATION}:_over_speed", _no_mean),),

@@ -33,6 +33,7 @@ from scoring.calibration.healthy_variation import (
     with_baseline,
 )
 from scoring.calibration.tail import Tail
+from scoring.calibration.unvisited_speeds import wider_at_unvisited_speeds
 from scoring.calibration.windows import WindowMaxima, peaks
 from scoring.detectors.detector import UNREACHED, DetectorRow, DetectorSettings, HealthyEvidence, LimitRule, Signal
 from scoring.detectors.deviation import smoothed_deviation, summed_deviation
@@ -269,6 +270,8 @@ def _cautious(
     a fan, and so those of the upper end of its confidence interval.
     """
     limits = _each(limits, lambda residual, _: _not_below_mean_over_speeds(residual))
+    if not knows_other_speeds and _count_std(limits, found) > 0.0:
+        limits = _each(limits, lambda residual, _: wider_at_unvisited_speeds(residual, found.top_speed_rad_s))
     if sigma_shares:
         limits = _each(limits, lambda residual, source: _not_below_mean_over_fans(residual, sigma_shares[source]))
     visited = sum(int((seconds >= VISITED_S).sum()) for seconds in found.visited_s.values())

@@ -189,6 +189,7 @@ PROBES: dict[str, Callable[[], Hashable]] = {
     "mean-over-speeds": extrapolated_limits,
     "mean-over-fans": extrapolated_limits,
     "least-time-error": extrapolated_limits,
+    "unvisited-speeds": extrapolated_limits,
     "tail-margin": extrapolated_limits,
 }
 
