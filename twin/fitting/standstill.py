@@ -1,8 +1,8 @@
 """How healthy fans stop, stand and start, from measured runs.
 
 A command *turns* the fans if one turned under it, or under lower ones, for `STEADY_S`, and did not slow down. It
-*stops* them if one stood under it, or under higher ones, for `STOOD_S`; what follows the last increase of the command
-before a start belongs to the start. Readings lag, so both times are extended by the reach of the tacho.
+*stops* them if it, or higher ones, lasted `STOOD_S` and one came to rest under it; what follows the last increase of the
+command before a start belongs to the start. Readings lag, so both times are extended by the reach of the tacho.
 
 A reading of half of the lowest steady speed is taken for that of a fan that stands or comes to rest: a fan that loses
 its power is then recognised before the last pulse, and a windmilling one is not called turning.
@@ -22,8 +22,9 @@ from twin.runs import Array, Run
 
 STEADY_S = 5.0
 STOOD_S = 10.0
+AT_REST_S = 2.0  # a tacho of a fan that turns may read nothing for less
 STEADY_SHARE = 0.8  # of the reading before: a fan that loses more slows down
-LOWEST_SHARE_OF_TOP = 0.05  # a lower reading is of a fan that stands, whatever the lowest steady speed
+LOWEST_SHARE_OF_TOP = 0.05  # a lower reading is of a fan at rest, whatever the lowest steady speed
 STANDING_SHARE = 0.5  # of the lowest steady speed
 LOWEST_QUANTILE = 0.001  # of steady readings: one odd reading does not set the lowest steady speed
 MIN_LOG_FALL = 0.5  # a shorter coast says little about the time constant
@@ -63,14 +64,15 @@ def find_standstill(runs: Sequence[Run]) -> Standstill | None:
     top = max(float(one.max()) for one in speeds if len(one))
     if top <= 0.0:
         return None
-    standing_below = LOWEST_SHARE_OF_TOP * top
-    off, turning = _commands(series, standing_below)
+    at_rest_below = LOWEST_SHARE_OF_TOP * top
+    off = max((command for one in series for command in _stopping_commands(one, at_rest_below)), default=None)
+    turning = _turning_command(series, at_rest_below, off)
     if turning is None:
         return None
-    steady = [_steady_speeds(one, turning, standing_below) for one in series]
+    steady = [_steady_speeds(one, turning, at_rest_below) for one in series]
     lowest = float(np.quantile(np.concatenate(steady), LOWEST_QUANTILE)) if any(map(len, steady)) else 0.0
-    standing_below = max(standing_below, STANDING_SHARE * lowest)
-    off, turning = _commands(series, standing_below)
+    standing_below = max(at_rest_below, STANDING_SHARE * lowest)
+    turning = _turning_command(series, standing_below, off)
     if turning is None:
         return None
     found = Standstill(turning_command=turning, standing_below_rad_s=standing_below, off_command=off)
@@ -98,30 +100,23 @@ def _series(run: Run) -> Iterator[_FanSeries]:
             yield _FanSeries(period_s, command, speed, tacho.reach_s, tacho.mean_delay_s)
 
 
-def _commands(series: Sequence[_FanSeries], standing_below: float) -> tuple[float | None, float | None]:
-    """The highest command that stops fans, and the lowest above it that turns them."""
-    stopping = [command for one in series for command in _stopping_commands(one, standing_below)]
-    off = max(stopping, default=None)
-    turning = min(
-        (
-            float(commands.min())
-            for one in series
-            if len(commands := _turning_commands(one, standing_below, -np.inf if off is None else off))
-        ),
-        default=None,
-    )
-    return off, turning
+def _turning_command(series: Sequence[_FanSeries], standing_below: float, off: float | None) -> float | None:
+    """The lowest command above the highest that stops fans which turns them."""
+    above = -np.inf if off is None else off
+    found = [_turning_commands(one, standing_below, above) for one in series]
+    return min((float(commands.min()) for commands in found if len(commands)), default=None)
 
 
-def _stopping_commands(one: _FanSeries, standing_below: float) -> Iterator[float]:
-    lowest = one.lowest_command(STOOD_S)
+def _stopping_commands(one: _FanSeries, at_rest_below: float) -> Iterator[float]:
+    """The highest command of each rest. One that still slows down does not count: it may come to turn steadily."""
+    lowest, least = one.lowest_command(STOOD_S), round((AT_REST_S + one.reach_s) / one.period_s)
     increases = np.flatnonzero(np.diff(one.command, prepend=one.command[:1]) > 0.0)
-    for first, last in _stretches(one.speed_rad_s < standing_below):
+    for first, last in _stretches(one.speed_rad_s < at_rest_below):
         end = last
         if last < len(one.command):  # it starts: from the last increase on
             before = increases[np.searchsorted(increases, last, side="right") - 1] if len(increases) else 0
             end = int(before) if first < before <= last else first
-        stood = lowest[first:end]
+        stood = lowest[first + least : end]
         if np.isfinite(stood).any():
             yield float(np.nanmax(stood))
 

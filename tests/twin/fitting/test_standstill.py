@@ -17,14 +17,16 @@ COUNT = Tacho(kind="count", window_s=1.0)
 PLATEAU, PER_COMMAND, COAST_S = 30.0, 2.0, 1.3
 
 
-def measured(*levels: tuple[float, float], start_delay_s: float = 0.0, tacho: Tacho = COUNT) -> Run:
+def measured(
+    *levels: tuple[float, float], start_delay_s: float = 0.0, coast_s: float = COAST_S, tacho: Tacho = COUNT
+) -> Run:
     """A fan under levels (command, seconds): at least at its plateau above a command of 20, slower down than up."""
     command = np.concatenate([np.full(round(seconds / PERIOD_S), level) for level, seconds in levels])
     speed, now, driven_s = np.zeros(len(command)), 0.0, 0.0
     for row, level in enumerate(command):
         driven_s = driven_s + PERIOD_S if level > 20.0 else 0.0
         target = max(PLATEAU, PER_COMMAND * level) if driven_s > start_delay_s else 0.0
-        now += (target - now) * PERIOD_S / (0.8 if target > now else COAST_S)
+        now += (target - now) * PERIOD_S / (0.8 if target > now else coast_s)
         speed[row] = now
     t_s = np.arange(len(command), dtype=np.float64) * PERIOD_S
     return Run("levels", t_s, command, _counted(speed, tacho), (tacho,))
@@ -71,6 +73,20 @@ def test_a_slow_start_is_not_a_command_that_stops_the_fan() -> None:
     assert (found.off_command, found.turning_command) == (10.0, 30.0)
     assert found.start_s is not None
     assert 15.0 < found.start_s < 18.5
+
+
+def test_a_command_is_not_taken_to_stop_a_fan_that_turns_under_it_slowly_or_unread() -> None:
+    slow = measured((300.0, 30.0), (25.0, 13.0), (150.0, 20.0), coast_s=6.0, tacho=Tacho())
+    found = find_standstill([slow])
+    assert found is not None
+    assert 100.0 < slow.speed_rad_s[420] < found.standing_below_rad_s, "near the end it reads as one that stands"
+    assert (found.off_command, found.turning_command) == (None, 150.0)
+    run = measured((100.0, 30.0), (0.0, 20.0), (100.0, 30.0), tacho=Tacho())
+    speed = run.speed_rad_s.copy()
+    speed[-7:] = 0.0
+    found = find_standstill([replace(run, speed_rad_s=speed)])
+    assert found is not None
+    assert (found.off_command, found.turning_command) == (0.0, 100.0)
 
 
 def test_lapses_of_the_tacho_are_measured() -> None:
