@@ -63,6 +63,9 @@ class DecisionRules(IntEnum):
     UNSEEN = 16
     """Band and limits are wider where the twin was not trained, and at the end of a drive's plateau. Before, they were
     the same there."""
+    RUNNING_ON = 17
+    """A fan that does not slow down under a command that stops it, or turns after it has been at rest, has an alarm
+    within a second or two of its tacho's reach. Before, it had one after three of the longest coasts."""
 
 
 CURRENT_RULES = max(DecisionRules)

@@ -15,6 +15,7 @@ from pipeline.runtime.tray_twin import TrayTwin
 from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS, Tacho
 from scoring.detectors.missing_readings import MissingReadingsSettings
+from scoring.detectors.running_on import RunningOnSettings
 from scoring.detectors.standstill import StandstillSettings
 from scoring.detectors.tacho import TachoSettings
 from scoring.diagnosis.regression_window import HealthyBalance
@@ -124,12 +125,14 @@ def _with_missing_readings(
 def _with_standstill(limits: Limits, standstill: Standstill | None, decision_rules: DecisionRules) -> Limits:
     if standstill is None:
         return limits
-    settings = {"standstill": StandstillSettings(healthy=standstill, watches="both")}
-    if decision_rules >= DecisionRules.AT_REST:
-        settings = {
-            "standstill": StandstillSettings(healthy=standstill, watches="driven"),
-            "running_on": StandstillSettings(healthy=standstill, watches="stopped"),
-        }
+    if decision_rules < DecisionRules.AT_REST:
+        settings = {"standstill": StandstillSettings(healthy=standstill, with_stopped=True)}
+        return limits.model_copy(update={"detectors": {**limits.detectors, **settings}})
+    by_coast_only = decision_rules < DecisionRules.RUNNING_ON
+    settings = {
+        "standstill": StandstillSettings(healthy=standstill),
+        "running_on": RunningOnSettings(healthy=standstill, by_coast_only=by_coast_only),
+    }
     return limits.model_copy(update={"detectors": {**limits.detectors, **settings}})
 
 

@@ -6,6 +6,7 @@ from schemas.messages import Statistic
 from scoring.detectors.detector import DetectorRow, LimitRule
 from scoring.detectors.drift import Drift
 from scoring.detectors.missing_readings import MissingReadings
+from scoring.detectors.running_on import RunningOn
 from scoring.detectors.smoothed import Smoothed
 from scoring.detectors.standstill import StandstillDetector
 from scoring.detectors.tacho import Tacho
@@ -21,7 +22,7 @@ DETECTORS = (
     DetectorRow("sensor", Statistic.SENSOR, "tacho", Tacho),
     DetectorRow("missing_readings", Statistic.SENSOR, "tacho", MissingReadings, came_later=True),
     DetectorRow("standstill", Statistic.STANDSTILL, "tacho", StandstillDetector, comes_first=True),
-    DetectorRow("running_on", Statistic.STANDSTILL, "tacho", StandstillDetector, comes_first=True, only_at_rest=True),
+    DetectorRow("running_on", Statistic.STANDSTILL, "tacho", RunningOn, comes_first=True, only_at_rest=True),
 )
 
 

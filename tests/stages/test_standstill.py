@@ -72,7 +72,7 @@ def seen(
 ) -> Seen:
     """With alarm_sigmas and missing_share as they are, only the detectors of standstill can raise an alarm."""
     config = ScorerConfig(alarm_sigmas=alarm_sigmas, not_judged_s=5.0)
-    limits = limits_in_force(config, None, healthy)
+    limits = limits_in_force(config, None, healthy, decision_rules)
     tacho = TachoSettings(stuck_s=1e9, missing_share=missing_share)
     limits = limits.model_copy(update={"detectors": {**limits.detectors, "sensor": tacho}})
     twin = HealthyTwin("t", limits, [balance_of_a_fan()], "%", INSTANTANEOUS, healthy)
@@ -223,12 +223,32 @@ def test_a_fan_that_does_not_start_is_an_alarm_after_three_times_the_longest_sta
 
 def test_a_fan_that_turns_although_its_command_stops_it_is_an_alarm() -> None:
     command = commands((80.0, 20.0), (0.0, 30.0))
-    found = seen(command, speed_of(np.full(len(command), 80.0)))
+    speed = speed_of(np.full(len(command), 80.0))
+    found = seen(command, speed)
     (raised_s,) = found.times(Transition.RAISED)
-    assert 32.0 < raised_s < 32.3
+    assert 22.0 < raised_s < 22.3, "a coast three times as slow has lost 30 % in 1.07 s"
     assert found.alarms[0].message == (
         "fan 0: turns although the command of 0 stops it: still driven 70 %, turned by the air 30 %"
     )
+    former = seen(command, speed, decision_rules=DecisionRules.UNSEEN)
+    (raised_s,) = former.times(Transition.RAISED)
+    assert 32.0 < raised_s < 32.3, "recordings of before are decided by the longest coast"
+
+
+def test_a_fan_that_turns_after_it_has_been_at_rest_is_an_alarm_and_one_that_coasts_slowly_is_not() -> None:
+    command = commands((80.0, 20.0), (0.0, 60.0))
+    driven = commands((80.0, 20.0), (0.0, 30.0), (40.0, 5.0), (0.0, 25.0))
+    found = seen(command, speed_of(driven))
+    (raised_s,) = found.times(Transition.RAISED)
+    turns_s = float(np.flatnonzero(speed_of(driven)[1000:] > HEALTHY.standing_below_rad_s)[0]) * PERIOD_S + 50.0
+    assert turns_s + 1.0 < raised_s < turns_s + 1.3
+    (cleared_s,) = found.times(Transition.CLEARED)
+    assert 57.0 < cleared_s < 62.0
+    t_s = np.arange(len(command)) * PERIOD_S
+    top = speed_of(command)[399]
+    for slower, alarms in ((2.5, 0), (5.0, 1)):
+        coast = np.where(t_s < 20.0, speed_of(command), top * np.exp(-(t_s - 20.0) / slower))
+        assert len(seen(command, coast).times(Transition.RAISED)) == alarms
 
 
 def test_a_card_without_it_decides_as_before() -> None:

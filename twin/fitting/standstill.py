@@ -1,8 +1,8 @@
 """How healthy fans stop, stand and start, from measured runs.
 
 A command *turns* the fans if one turned under it, or under lower ones, for `STEADY_S`, and did not slow down. It
-*stops* them if it, or higher ones, lasted `STOOD_S` and one came to rest under it; what follows the last increase of the
-command before a start belongs to the start. Readings lag, so both times are extended by the reach of the tacho.
+*stops* them if it, or higher ones, lasted `STOOD_S` and one came to rest under it; what follows the last increase of
+the command before a start belongs to the start. Readings lag, so both times are extended by the reach of the tacho.
 
 A reading of half of the lowest steady speed is taken for that of a fan that stands or comes to rest: a fan that loses
 its power is then recognised before the last pulse, and a windmilling one is not called turning.
