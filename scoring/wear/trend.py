@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 NS_PER_DAY = 86_400 * NS_PER_S
 CAPACITY = 128
 MIN_POINTS = 10
+MAX_ERROR_RATIO = 3.0
+"""to the median error of the points; those with larger errors say nothing, and are left out of a trend"""
 MIN_EFFECTIVE_POINTS = 5.0
 BATCHES = 24
 MAX_HORIZON_RATIO = 10.0
@@ -45,11 +47,12 @@ SCATTER_PER_MEDIAN = 1.4826
 class Trend:
     """A line through the points, at days since `origin_ns`, the mean of their times.
 
-    slope_per_day with its 95 % interval (low, high). level, level_error: the line at the origin. t_quantile: half the
-    95 % interval in standard errors. days: observed time.
+    first_ns: of the first point. slope_per_day with its 95 % interval (low, high). level, level_error: the line at the
+    origin. t_quantile: half the 95 % interval in standard errors. days: observed time.
     """
 
     origin_ns: int
+    first_ns: int
     slope_per_day: float
     low: float
     high: float
@@ -115,12 +118,14 @@ class WearSeries:
 
     def trend(self) -> Trend | None:
         """The line through the points; None while there are too few independent points."""
-        n = len(self._t_ns)
+        std_error = np.array(self._std_error)
+        is_known = std_error <= MAX_ERROR_RATIO * np.median(std_error) if len(std_error) else np.zeros(0, bool)
+        t_ns, value = np.array(self._t_ns, np.int64)[is_known], np.array(self._value)[is_known]
+        n = len(t_ns)
         if n < MIN_POINTS:
             return None
-        origin_ns = self._t_ns[0] + round(float(np.mean([t - self._t_ns[0] for t in self._t_ns])))
-        day = np.array([t - origin_ns for t in self._t_ns], dtype=float) / NS_PER_DAY
-        value = np.array(self._value)
+        origin_ns = int(t_ns[0]) + round(float((t_ns - t_ns[0]).mean()))
+        day = (t_ns - origin_ns) / NS_PER_DAY
         fitted: Any = theilslopes(value, day)
         slope = float(fitted.slope)
         level = float(np.median(value - slope * day))
@@ -129,12 +134,13 @@ class WearSeries:
         if effective < MIN_EFFECTIVE_POINTS:
             return None
         scatter = SCATTER_PER_MEDIAN * float(np.median(np.abs(residual))) * np.sqrt(n / (n - 2.0))
-        scatter = max(scatter, float(np.median(self._std_error)))
+        scatter = max(scatter, float(np.median(std_error[is_known])))
         level_error = scatter / np.sqrt(effective * THEIL_SEN_EFFICIENCY)
         slope_error = level_error / float(day.std())
         t_quantile = float(stdtrit(min(effective, n // max(1, n // BATCHES)) - 2.0, 0.975))
         return Trend(
             origin_ns=origin_ns,
+            first_ns=int(t_ns[0]),
             slope_per_day=slope,
             low=slope - t_quantile * slope_error,
             high=slope + t_quantile * slope_error,

@@ -142,7 +142,8 @@ class WearMonitor:
             self._noticed_t_ns = measured_t_ns
             has_drag = any(len(fan.series["drag"]) for fan in self._fans)
             parameter = "drag" if has_drag else "gain"  # the drag of some fans was identified as zero
-            self._notices = slow_changes(parameter, [fan.series[parameter] for fan in self._fans])
+            trends = [fan.wear[parameter].trend if parameter in fan.wear else None for fan in self._fans]
+            self._notices = slow_changes(parameter, trends)
         return self._notices
 
     def snapshot(self) -> dict[str, Any]:
