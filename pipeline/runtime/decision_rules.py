@@ -65,7 +65,8 @@ class DecisionRules(IntEnum):
     the same there."""
     RUNNING_ON = 17
     """A fan that does not slow down under a command that stops it, or turns after it has been at rest, has an alarm
-    within a second or two of its tacho's reach. Before, it had one after three of the longest coasts."""
+    within a second or two of its tacho's reach. Before, it had one after three of the longest coasts. The alarm of a
+    fan that stood returns at any speed. Before, it did as others."""
 
 
 CURRENT_RULES = max(DecisionRules)

@@ -79,6 +79,7 @@ class TrayScorer:
             off_delay_s,
             judges_rest=judges_rest,
             knows_speeds=decision_rules >= DecisionRules.HEALTHY_MOTION,
+            knows_standing=decision_rules >= DecisionRules.RUNNING_ON,
         )
         settings = ConditionSettings(
             on_delay_ns=round(twin.limits.timing.on_delay_s * NS_PER_S),

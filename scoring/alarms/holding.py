@@ -11,13 +11,19 @@ from scoring.detectors.table import rows
 
 
 def holding_detectors(
-    detectors: Mapping[str, Detector], off_delay_s: float, *, judges_rest: bool = True, knows_speeds: bool = True
+    detectors: Mapping[str, Detector],
+    off_delay_s: float,
+    *,
+    judges_rest: bool = True,
+    knows_speeds: bool = True,
+    knows_standing: bool = True,
 ) -> tuple[HoldingDetector, ...]:
     """What decides on the return of alarms, in the order of the table.
 
     off_delay_s: the least for all. judges_rest: False only to decide as for recordings made before fans at rest were
     judged and the time of a return grew with that of its alarm. knows_speeds: False only to decide as for recordings
-    made when an alarm returned at any speed as soon as at those at which it came.
+    made when an alarm returned at any speed as soon as at those at which it came; knows_standing: False for those made
+    when it did not even if the fan had stood.
     """
     made = []
     for row in rows():
@@ -29,6 +35,7 @@ def holding_detectors(
                 off_delay_ns=round(max(off_delay_s, own_s) * NS_PER_S),
                 grows_with_speed=row.source != "tacho",
                 return_share=RETURN_SHARE if judges_rest else 0.0,
+                is_of_standing_fan=knows_standing and row.comes_first,
                 elsewhere_ns=ELSEWHERE_NS if knows_speeds else 0,
                 is_certain=not row.only_at_rest and (detector is not None or not (judges_rest or row.came_later)),
             )

@@ -6,8 +6,9 @@ contact that comes and goes is good for a moment only.
 
 The longer an alarm has stood, the longer it must be gone. And it must be gone at the speeds at which it came: a twin
 that errs at another speed by as much as the fault costs hides it there. Elsewhere an alarm returns after
-`ELSEWHERE_NS`. A residual of several limits is not hidden by such errors, and returns at any speed. (Residuals are
-clipped at two limits: a low-pass exceeds three only where it smooths many noisy readings.)
+`ELSEWHERE_NS`. A residual of several limits is not hidden by such errors, and returns at any speed, and so does that of
+a fan that stood. (Residuals are clipped at two limits: a low-pass exceeds three only where it smooths many noisy
+readings.)
 
 Only samples that could show the fault count. A blade that is touched takes ten per cent of the speed: 200 rpm at
 2,000 rpm, which is beyond a limit of 150, and 70 rpm at 700 rpm, which is not. So the largest ratio over speed that the
@@ -44,6 +45,8 @@ class HoldingDetector:
     """whether it is in use and a fan that turns shows its return; False: it holds no alarm that it did not raise"""
     return_share: float = RETURN_SHARE
     """of the time for which it held the alarm, so long it must have returned; 0 in recordings of former versions"""
+    is_of_standing_fan: bool = False
+    """whether it shows that the fan stood, or ran on: such a fault is seen at every speed"""
     elsewhere_ns: int = ELSEWHERE_NS
     """for so long it must have returned at other speeds than those at which it came; 0 in recordings of former
     versions, where all speeds are alike"""
@@ -135,7 +138,8 @@ class AlarmReturn:
             for each in self._detectors
             if each.grows_with_speed and each.name in self._holds
         ]
-        is_hidden_nowhere = max(sizes, default=0.0) >= HIDDEN_RATIO
+        has_stood = any(each.is_of_standing_fan and each.name in self._holds for each in self._detectors)
+        is_hidden_nowhere = has_stood or max(sizes, default=0.0) >= HIDDEN_RATIO
         for detector, ratio in zip(self._detectors, sample.ratios, strict=True):
             hold = self._holds.get(detector.name)
             if hold is None:
@@ -143,7 +147,7 @@ class AlarmReturn:
                     continue
                 hold = self._holds[detector.name] = _Hold()
             hold.follow(speed, period_ns, detector.off_delay_ns)
-            shows = not detector.grows_with_speed or hold.shows_at(speed, self._return_ratio)
+            shows = not detector.grows_with_speed or has_stood or hold.shows_at(speed, self._return_ratio)
             knows_speeds = detector.grows_with_speed and detector.elsewhere_ns > 0
             is_near = is_hidden_nowhere or not knows_speeds or hold.is_near(speed)
             if ratio > 1.0:

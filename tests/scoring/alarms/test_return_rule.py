@@ -100,6 +100,15 @@ def test_a_fault_of_several_limits_has_gone_at_any_speed_at_which_it_would_be_se
     assert fan.play([CALM] * 90, SLOW) == [], "how long a tacho is stuck says nothing of the size of a fault"
 
 
+def test_the_alarm_of_a_fan_that_stood_returns_at_any_speed() -> None:
+    standing = replace(SETTINGS.detectors[2], is_of_standing_fan=True)
+    for has_stood in (False, True):
+        fan = Fan(replace(SETTINGS, detectors=(*SETTINGS.detectors[:2], standing)))
+        fan.play([(UP, LOW, UP if has_stood else LOW)], speed=SLOW)
+        cleared = fan.play([CALM] * 40, speed=FULL)
+        assert cleared == ([(31, Transition.CLEARED)] if has_stood else []), "after the off-delay of its detectors"
+
+
 def test_a_late_statistic_does_not_make_the_speed_that_followed_one_at_which_the_alarm_came() -> None:
     fan = Fan()
     fan.play([(LOW, 2.9, LOW)] * 20)
