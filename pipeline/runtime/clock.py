@@ -52,6 +52,8 @@ class StageClock:
         """the producer of the replay"""
         self._times: dict[str, _ReplayTime] = {}
         """by tray: the last clock message of the replay"""
+        self._replayed_until_ns: dict[str, int] = {}
+        """by tray: the time that the last replay has reached"""
 
     def set_replay_alive(self, alive: bool) -> None:
         """The replayer's liveliness token has appeared or gone."""
@@ -72,6 +74,7 @@ class StageClock:
         site."""
         if not self._is_replay_alive or clock.header.producer != self._owner:
             return False
+        self._replayed_until_ns[clock.header.tray] = clock.t_ns
         self._times[clock.header.tray] = _ReplayTime(clock, self._host_ns(), self._monotonic_s())
         return True
 
@@ -80,12 +83,13 @@ class StageClock:
         last = self._time_of(tray)
         return last.clock.t_ns if last else self._host_ns()
 
-    def now_ns(self, tray: str) -> int | None:
-        """The time against which the age of a sample is measured. None in a replay that is paused or runs as fast as it
-        can: an age has no meaning there."""
+    def now_ns(self, tray: str, t_ns: int) -> int | None:
+        """The time against which the age of a sample of t_ns is measured. None where an age has no meaning: in a replay
+        that is paused or runs as fast as it can, and of its last samples once it has left."""
         last = self._time_of(tray)
         if last is None:
-            return self._host_ns()
+            was_replayed = t_ns <= self._replayed_until_ns.get(tray, t_ns - 1)
+            return None if was_replayed else self._host_ns()
         if last.clock.rate == 0.0 or math.isinf(last.clock.rate):
             return None
         return last.clock.t_ns + round((self._host_ns() - last.host_ns) * last.clock.rate)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from schemas.messages import AwaitedInput, Counter, Health, Input, Message, Note, Output, StageStatus, newest_t_ns
+from schemas.messages import AwaitedInput, Counter, Health, Input, Note, Output, StageStatus
 from schemas.streams import stage_losses
 from schemas.units import NS_PER_S
 
@@ -45,10 +45,10 @@ class HealthBuilder:
         if key in self._main_input_t_ns:
             self._main_input_t_ns[key] = now_ns
 
-    def add_output(self, message: Message, sent_t_ns: int, now_ns: int | None) -> None:
-        """An output has been sent. Its latency is the age of its newest sample at `now_ns`, if the time is known."""
+    def add_output(self, t_ns: int, sent_t_ns: int, now_ns: int | None) -> None:
+        """An output has been sent, with its newest sample at t_ns, 0 if it has none. Its latency is the age of that at
+        `now_ns`, if the time is known."""
         self._newest_output_t_ns = sent_t_ns
-        t_ns = newest_t_ns(message)
         if t_ns and now_ns is not None:
             self._latencies_ms.append((time.monotonic(), (now_ns - t_ns) / 1e6))
 

@@ -35,7 +35,7 @@ from pipeline.runtime.sources import Sources
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.envelope import Envelope
-from schemas.messages import Clock, Header, Health, Message, Note, StageStatus
+from schemas.messages import Clock, Header, Health, Message, Note, StageStatus, newest_t_ns
 from schemas.streams import stage_losses
 from schemas.topics import BY_NAME, alive_key, health_key, sessions_key, topic_of, tray_key
 
@@ -392,7 +392,8 @@ class Runner:
         for message in produce():
             tray = name or message.header.tray or input_tray
             stamped = self._outputs.publish(tray, message, from_timer=from_timer)
-            self._health.add_output(stamped, HOST_CLOCK.now_ns(), self._clock.now_ns(tray))
+            t_ns = newest_t_ns(stamped)
+            self._health.add_output(t_ns, HOST_CLOCK.now_ns(), self._clock.now_ns(tray, t_ns))
         self._active_core = None
 
     def _catch_up(self) -> None:

@@ -35,7 +35,7 @@ def clock_message(t_ns: int, rate: float, tray: str = "a", producer: str = "repl
 
 def test_without_a_replay_the_time_is_the_hosts():
     clock = StageClock(Host())
-    assert clock.tick_ns("a") == clock.now_ns("a") == HOST_NS
+    assert clock.tick_ns("a") == clock.now_ns("a", HOST_NS) == HOST_NS
 
 
 def test_a_tick_stays_at_the_last_time_of_the_replay_and_ages_advance_at_its_rate():
@@ -44,15 +44,15 @@ def test_a_tick_stays_at_the_last_time_of_the_replay_and_ages_advance_at_its_rat
     assert clock.update(clock_message(1000, 2.0))
     host.ns += 50
     assert clock.tick_ns("a") == 1000
-    assert clock.now_ns("a") == 1100
-    assert clock.tick_ns("b") == clock.now_ns("b") == host.ns
+    assert clock.now_ns("a", HOST_NS) == 1100
+    assert clock.tick_ns("b") == clock.now_ns("b", HOST_NS) == host.ns
 
 
 def test_there_is_no_age_while_a_replay_is_paused_or_runs_as_fast_as_it_can():
     clock = clock_of(Host())
     for rate in (0.0, math.inf):
         clock.update(clock_message(1000, rate))
-        assert clock.now_ns("a") is None
+        assert clock.now_ns("a", HOST_NS) is None
         assert clock.tick_ns("a") == 1000
 
 
@@ -66,6 +66,8 @@ def test_the_hosts_time_applies_again_once_the_replay_has_left():
         leave(clock)
         assert clock.tick_ns("a") == HOST_NS
         assert not clock.update(clock_message(2000, 1.0)), "what is still on the way no longer applies"
+        assert clock.now_ns("a", 1000) is None, "its last samples have no age by the host's time"
+        assert clock.now_ns("a", 1001) == clock.now_ns("b", 1000) == HOST_NS
 
 
 def test_row_12_a_clock_is_taken_from_the_replay_that_owns_the_site_only():
@@ -92,7 +94,7 @@ def test_row_12_a_clock_that_is_not_renewed_expires_and_another_replay_may_follo
     host.ns += round(4.9e9)
     assert clock.tick_ns("a") == 1000, "a paused replay renews it 20 times a second"
     host.ns += round(0.2e9)
-    assert clock.tick_ns("a") == clock.now_ns("a") == host.ns
+    assert clock.tick_ns("a") == clock.now_ns("a", HOST_NS) == host.ns
     clock.add_replay_health("replay-all-2", has_stopped=False)
     assert clock.update(clock_message(3000, 1.0, producer="replay-all-2"))
     assert clock.tick_ns("a") == 3000

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline.runtime.health import AWAITED_AFTER_NS, LATENCY_WINDOW_S, HealthBuilder
-from schemas.messages import AwaitedInput, Clock, Health, StageStatus
+from schemas.messages import AwaitedInput, Health, StageStatus
 
 KEY = "fantwin/s/tray1/grid"
 START_NS = 1_800_000_000_000_000_000
@@ -41,7 +41,7 @@ def test_row_01_the_times_of_the_newest_input_and_output_are_given(builder):
     empty = health(builder, START_NS)
     assert (empty.newest_input_t_ns, empty.newest_output_t_ns) == (0, 0)
     builder.add_input(KEY, START_NS + 5, START_NS + 5)
-    builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS + 7, None)
+    builder.add_output(START_NS, START_NS + 7, None)
     found = health(builder, START_NS + 9)
     assert (found.newest_input_t_ns, found.newest_output_t_ns) == (START_NS + 5, START_NS + 7)
     assert found.latency_p50_ms == 0.0, "the time of a paused replay is not known"
@@ -50,16 +50,16 @@ def test_row_01_the_times_of_the_newest_input_and_output_are_given(builder):
 def test_latencies_are_of_the_last_ten_seconds(builder, monkeypatch):
     now_s = [100.0]
     monkeypatch.setattr("pipeline.runtime.health.time.monotonic", lambda: now_s[0])
-    builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS, START_NS + 47_000_000_000)
+    builder.add_output(START_NS, START_NS, START_NS + 47_000_000_000)
     assert health(builder, START_NS).latency_p50_ms == 47_000.0
     now_s[0] += LATENCY_WINDOW_S / 2
-    builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS, START_NS + 1_000_000)
+    builder.add_output(START_NS, START_NS, START_NS + 1_000_000)
     now_s[0] += LATENCY_WINDOW_S / 2 + 0.1
     assert health(builder, START_NS).latency_p50_ms == 1.0
 
 
 def test_what_was_sent_while_catching_up_is_no_latency(builder):
-    builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS, START_NS + 60_000_000_000)
+    builder.add_output(START_NS, START_NS, START_NS + 60_000_000_000)
     builder.has_caught_up()
-    builder.add_output(Clock(t_ns=START_NS, rate=1.0), START_NS, START_NS + 1_000_000)
+    builder.add_output(START_NS, START_NS, START_NS + 1_000_000)
     assert health(builder, START_NS).latency_p99_ms == 1.0
