@@ -1,4 +1,4 @@
-"""Listens to the line of one tray and says what does not fit its configuration: rate, range, fans, unit.
+"""Listens to the line of one tray and says what does not fit its configuration: rate, range, fans, unit, tachos.
 
 Acquisition's own core reads the source, so that the samples are those that a running site would get. If acquisition
 runs already, its samples are taken from the bus instead.
@@ -17,6 +17,7 @@ import numpy as np
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config, TrayConfig
 from pipeline.devices.line_rate import MAX_SAMPLES, GridTiming, SampleTimes, grid_rate_hz, is_too_slow, leaves_gaps
+from pipeline.devices.tacho_evidence import find_tacho, tacho_hints
 from pipeline.runtime.stage import Context, StageError, load_stage
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from schemas.codec import CodecError, decode
@@ -29,6 +30,7 @@ FIRST_SAMPLE_S = 6.0
 FASTEST_FAN_RAD_S = 5000.0
 """48,000 rpm: a larger speed was given in another unit"""
 RATE_TOLERANCE = 0.01
+LISTEN_FOR_TACHOS_S = 60
 SLOWEST_S = 1.0
 """between two samples of the slowest line that can be judged"""
 Finding = tuple[bool, str]
@@ -134,6 +136,8 @@ def _findings(samples: Sequence[Raw], tray: TrayConfig, config: Config, twin: Tr
     command = np.concatenate([sample.command for sample in fitting])
     speed_rad_s = np.concatenate([sample.speed_rad_s for sample in fitting])
     yield from _ranges(command, speed_rad_s, tray, twin)
+    t_s = np.concatenate([sample.host_receive_t_ns for sample in fitting]) / NS_PER_S
+    yield from _tachos(t_s, speed_rad_s, tray)
 
 
 def _rate(times: SampleTimes, config: Config, twin: TrayTwin | None) -> Finding:
@@ -188,6 +192,19 @@ def _ranges(command: Array, speed_rad_s: Array, tray: TrayConfig, twin: TrayTwin
     ):  # numbers in rpm that are taken for rad/s are plausible ones, and ten times too large
         speeds += f" ({_speeds(speed_rad_s, 'rpm')})"
     yield True, f"commands {low:g} to {high:g}, speeds {speeds}: are these what the fans do?"
+
+
+def _tachos(t_s: Array, speed_rad_s: Array, tray: TrayConfig) -> Iterator[Finding]:
+    """Whether the readings are those of the declared tachos. t_s: (n,). speed_rad_s: (n, fans)."""
+    hints = tacho_hints(t_s, speed_rad_s, tray.tacho, range(tray.fans))
+    for hint in hints:
+        yield False, f"{hint}: see `tacho` in [[tray]]"
+    seen = [fan for fan, readings in enumerate(speed_rad_s.T) if find_tacho(t_s, readings) is not None]
+    if seen and not hints:
+        yield True, f"tachos of fans {', '.join(map(str, seen))}: they read as declared"
+    if not seen and "tacho" not in tray.model_fields_set:
+        advice = f"--listen-s {LISTEN_FOR_TACHOS_S} while the fans change their speeds"
+        yield True, f"no tacho is declared, and these readings do not show whether they count: {advice} may"
 
 
 def _speeds(speed_rad_s: Array, unit: SpeedUnit) -> str:

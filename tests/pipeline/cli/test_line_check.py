@@ -51,7 +51,7 @@ def found(rate_hz: float, command: float = 0.5, speed_rad_s: float = 300.0, fans
 
 @pytest.mark.parametrize(("line_hz", "grid_hz", "gap_s"), [(1, 1, "5"), (10, 10, "0.5"), (100, 100, "0.1")])
 def test_a_line_that_fits_is_shown_with_its_grid_and_ranges(line_hz: float, grid_hz: int, gap_s: str) -> None:
-    rate, ranges = found(line_hz, tray__0__speed_unit="rpm")
+    rate, ranges, _ = found(line_hz, tray__0__speed_unit="rpm")
     assert rate == (True, f"{line_hz} samples a second: grid of {grid_hz} Hz, gaps are longer than {gap_s} s")
     assert ranges[0]
     assert ranges[1].startswith("commands 0.5 to 0.5, speeds 2865 to ")
@@ -59,11 +59,44 @@ def test_a_line_that_fits_is_shown_with_its_grid_and_ranges(line_hz: float, grid
 
 def test_speeds_in_rad_s_are_also_shown_in_rpm() -> None:
     """Numbers in rpm that are taken for rad/s are possible speeds; in rpm they look ten times too large."""
-    _, ranges = found(10, speed_rad_s=900.0)
+    _, ranges, _ = found(10, speed_rad_s=900.0)
     assert ranges == (
         True,
         "commands 0.5 to 0.5, speeds 900 to 919 rad/s (8594 to 8776 rpm): are these what the fans do?",
     )
+
+
+@pytest.mark.parametrize(
+    ("tacho", "said"),
+    [
+        (
+            None,
+            (False, "every 1.00 s: a count over 1 s, 2 pulses a revolution; declared is instantaneous: see `tacho`"),
+        ),
+        ('{kind="count", window_s=1.0}', (True, "tachos of fans 0, 1: they read as declared")),
+    ],
+)
+def test_tachos_that_count_are_found_in_what_a_line_sends(tacho: str | None, said: tuple[bool, str]) -> None:
+    """A minute of fans that speed up and slow down, counted over a second and sent ten times a second."""
+    config = config_of(**({"tray__0__tacho": tacho} if tacho else {}))
+    count_rad_s = 2.0 * np.pi / 2.0
+    at_s = np.arange(600) / 10.0
+    speed = 150.0 + 100.0 * np.sin(2.0 * np.pi * np.floor(at_s) / 31.0)
+    line = [
+        Raw(
+            fans=2,
+            host_receive_t_ns=np.array([round((1e9 + second) * NS_PER_S)]),
+            command=np.full((1, 2), 0.5),
+            speed_rad_s=np.full((1, 2), count_rad_s * np.floor(now / count_rad_s)),
+        )
+        for second, now in zip(at_s, speed, strict=True)
+    ]
+    *_, (ok, text) = _findings(line, config.trays[0], config, None)
+    assert ok == said[0]
+    assert said[1] in text
+    *_, (is_fine, short) = _findings(line[:20], config.trays[0], config, None)
+    assert is_fine
+    assert short.startswith("commands" if tacho else "no tacho is declared, and these readings do not show")
 
 
 @pytest.mark.parametrize(
