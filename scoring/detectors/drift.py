@@ -23,9 +23,10 @@ from scoring.detectors.deviation import summed_deviation
 
 CAP_LIMITS = 1.05  # the sum is capped here: a long fault clears soon after it ends, and drift alone stays a warning
 MIN_CAUTIOUS_LIMIT = 2.0  # standard deviations: with too few healthy data no limit is set below this
-CAUTIOUS_S = 15.0  # of a tacho that counts: so long a shift of twice the reference value lasts at least
+CAUTIOUS_SHARE = 0.7  # of a tacho that counts, of the error of a count and of the means over ten: see `cautious`
+CAUTIOUS_S = 25.0  # and so long a shift of twice the reference value lasts at least
 LARGE_SHARE = 1.5  # of the reference value: that of the sum for large shifts
-CAUTIOUS_LARGE_S = 2.0  # and so long a shift of twice that lasts
+CAUTIOUS_LARGE_S = 3.0  # and so long a shift of twice that lasts
 REFERENCE_SHARE = 0.25  # of the limit of the smoothed residual, and at least so many sigma
 DEFAULT_REFERENCE_SIGMAS = 0.5
 
@@ -72,13 +73,13 @@ class DriftSettings(SingleLimit):
     def cautious(self, evidence: HealthyEvidence) -> DriftSettings:
         """With too few data the reference value is larger by what is not known.
 
-        Of a tacho that counts it is above the error of a count, the means over ten and the offsets between runs. For
-        how long the twin errs in one direction these cannot know, so a shift has to last. A large one need not last as
-        long.
+        Of a tacho that counts it is 70 % of the error of a count or of the largest mean over ten, and above the offsets
+        between runs. For how long the twin errs in one direction these cannot know, so a shift has to last. A large one
+        need not last as long. With half of them instead of 70 %, twins that err by 20 rpm at some speeds raise alarms.
         """
         if not evidence.count_std:
             return self.model_copy(update={"reference_sigmas": self.reference_sigmas * evidence.unknown_factor})
-        reference = max(evidence.mean_limit, evidence.count_std, evidence.between_runs_std)
+        reference = max(CAUTIOUS_SHARE * max(evidence.mean_limit, evidence.count_std), evidence.between_runs_std)
         limit = max(self.limit, CAUTIOUS_S * reference / evidence.summed_std)
         large_limit = CAUTIOUS_LARGE_S * LARGE_SHARE * reference / evidence.summed_std
         return self.model_copy(update={"reference_sigmas": reference, "limit": limit, "large_limit": large_limit})
