@@ -369,6 +369,11 @@ MECHANISMS: Sequence[Mechanism] = (
         ((f"{_CALIBRATION}:_not_below_mean_over_fans", _first_argument),),
     ),
     Mechanism(
+        "plateau-end",
+        "band and limits are wider around the end of a drive's plateau",
+        (("scoring.unseen_error:PLATEAU_END_ERROR", _by(0.0)),),
+    ),
+    Mechanism(
         "tail-margin",
         "a limit beyond all healthy values is the upper end of its confidence interval",
         (
