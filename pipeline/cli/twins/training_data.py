@@ -49,6 +49,7 @@ TACHO_CONSEQUENCE = (
     "hint: if so, the delay of the tacho is taken for inertia, and what follows, warnings too, may come from that"
 )
 MANY_OUTLIERS = 0.001
+_NUMBER = r"\d[\d.]*(?:e[+-]\d+)?"
 _EXTRA_MODULES = ("jinja2", "matplotlib", "onnx", "scipy", "torch")
 
 
@@ -71,16 +72,29 @@ class TrainingData:
         return RAD_S_PER_TABLE_UNIT[self.speed_unit]
 
     def with_fan_numbers(self, warnings: Sequence[str]) -> list[str]:
-        """The outlier warnings, then those of the model maker with its column numbers replaced by fan numbers."""
-        return [
-            *self.outliers,
-            *(re.sub(r"^fan (\d+):", lambda found: f"fan {self.fans[int(found[1])]}:", line) for line in warnings),
-        ]
+        """The outlier warnings, then those of the model maker with its column numbers replaced by fan numbers, and with
+        its speeds in the unit of the recordings, too."""
+        numbered = [re.sub(r"^fan (\d+):", lambda found: f"fan {self.fans[int(found[1])]}:", line) for line in warnings]
+        return [*self.outliers, *map(self._with_unit, numbered)]
+
+    def _with_unit(self, line: str) -> str:
+        if self.speed_unit == "rad/s":
+            return line
+
+        def in_both(found: re.Match[str]) -> str:
+            in_unit = re.sub(_NUMBER, lambda number: _rounded(float(number[0]) / self.rad_s_per_unit), found[1])
+            return f"{found[0]} ({in_unit} {self.speed_unit})"
+
+        return re.sub(rf"({_NUMBER}(?: and {_NUMBER})?) rad/s", in_both, line)
 
     def tacho_hints(self) -> list[str]:
         """What speaks against the declared tachos in the longest run; see pipeline.devices.tacho_evidence."""
         longest = max(self.recorded, key=lambda run: len(run.t_s))
         return tacho_hints(longest.t_s, longest.speed_rad_s, self.runs[0].tacho, self.fans)
+
+
+def _rounded(value: float) -> str:
+    return f"{float(f'{value:.3g}'):g}"
 
 
 def read_training_data(

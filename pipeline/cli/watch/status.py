@@ -108,11 +108,14 @@ def _no_stage(config: Config) -> str:
 
 def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Group:
     """The page for people: a row for each stage, then problems, then alarms, then the fans that are not judged."""
-    table = Table("stage", "state", title="stages", title_justify="left", box=SIMPLE_HEAD)
+    table = Table(title="stages", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     lost = watcher.losses()
+    states = site_states(watcher, process_list(config))
+    names_width = max((len(state.label) for state in states), default=0)
+    table.add_column("stage", no_wrap=True, min_width=names_width)  # a name that is cut may be any stage's
+    table.add_column("state")
     for column in ("up", "in /s", "out /s", "p50 ms", "p99 ms", "lost"):
         table.add_column(column, justify="right")
-    states = site_states(watcher, process_list(config))
     is_anyone_there = any(state.view and state.view.alive for state in states)
     problems = [] if is_anyone_there else [Text(_no_stage(config), style="red")]
     for state in states:

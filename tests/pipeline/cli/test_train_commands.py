@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.cli.twins.training_data import TrainingData
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Raw
 from schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
@@ -159,6 +160,20 @@ def test_figures_are_in_the_recordings_own_unit(folder, twin):
     for figure in ("r2", "coverage_2_sigma", "samples"):
         assert rpm[figure] == radians[figure]
     assert " rpm, max error " in fantwin("evaluate", twin, folder / "healthy-rpm.mcap").stdout
+
+
+def test_warnings_name_the_recordings_fans_and_speeds_in_their_own_unit_too():
+    data = TrainingData([], [], "rpm", [3, 5], ("b.mcap: fan 3: outliers",))
+    warnings = ["fan 1: it misses the speed by 5.9 rad/s", "fan 0: the speed keeps between 44 and 1.2e+02 rad/s"]
+    assert data.with_fan_numbers(warnings) == [
+        "b.mcap: fan 3: outliers",
+        "fan 5: it misses the speed by 5.9 rad/s (56.3 rpm)",
+        "fan 3: the speed keeps between 44 and 1.2e+02 rad/s (420 and 1150 rpm)",
+    ]
+    assert replace(data, speed_unit="rad/s").with_fan_numbers(warnings[:1]) == [
+        data.outliers[0],
+        "fan 5: it misses the speed by 5.9 rad/s",
+    ]
 
 
 def test_a_part_of_a_recording_can_be_used(folder, twin):
