@@ -25,6 +25,7 @@ from twin.errors import TwinError
 from twin.evaluation.accuracy import (
     Evaluation,
     Figures,
+    UnseenStd,
     evaluate_model,
     evaluation_pieces,
     free_run_residuals,
@@ -219,14 +220,25 @@ def evaluate(
     """Figures of a twin, or of its file, on runs.
 
     fan_numbers: what the recordings call the runs' fans, as in fan_rows. A twin of one fan serves any. The tachos are
-    those of the twin's card.
+    those of the twin's card. The band is wider where the card says that the twin was not trained.
     Raises TwinError when the fans do not fit.
     """
     loaded = OnnxTwin(twin) if isinstance(twin, str | Path) else twin
     model = loaded if isinstance(loaded, OnnxTwin) else loaded.model
     rows = fan_rows(loaded.card, common_fans(runs), fan_numbers)
     runs = measured_as_in_card(loaded.card, rows, runs)
-    return evaluate_model(model, loaded.parameters[rows], np.array(loaded.card.sigma_rad_s)[rows], runs)
+    sigma_rad_s = np.array(loaded.card.sigma_rad_s)[rows]
+    return evaluate_model(model, loaded.parameters[rows], sigma_rad_s, runs, _unseen_std(loaded.card, rows))
+
+
+def _unseen_std(card: TwinCard, rows: Sequence[int]) -> UnseenStd | None:
+    table, drive = card.model_uncertainty, card.drive
+    if table is None:
+        return None
+    if drive is None:
+        return table.unseen_std_at
+    of_rows = replace(drive, lowest_command=tuple(drive.lowest_command[row] for row in rows))
+    return lambda speed_rad_s, command: table.unseen_std_at(speed_rad_s, of_rows.raised(command))
 
 
 def _reading_sigma_rad_s(

@@ -9,7 +9,7 @@ and R2 are equations (32) to (34) of Peng and Chen, the band of two sigma (35) a
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,8 @@ from twin.models.model import TwinModel
 from twin.runs import Array, Run, common_fans, starting_samples, starting_speed_rad_s
 
 Flags = NDArray[np.bool_]
+UnseenStd = Callable[[Array, Array], Array]
+"""of speeds in rad/s and commands, (n, fans) each: the standard deviation of the unseen error, rad/s"""
 
 START_ITERATIONS = 3
 START_NUDGE = 1e-4
@@ -34,7 +36,7 @@ class Figures:
     """Free-run figures in rad/s (r2 and coverage without unit), and the one-step error beside them.
 
     Infinite where the free run diverged; NaN where nothing was measured, and r2 where the speed never changed.
-    coverage_2_sigma: the share of samples within two healthy standard deviations of the free run. floor_rad_s: the
+    coverage_2_sigma: the share of samples in the band, within two standard deviations of the free run. floor_rad_s: the
     rmse that the tachos would leave a perfect model; 0 where they are instantaneous, for their noise is not known.
     """
 
@@ -55,19 +57,26 @@ class Evaluation:
     pooled: Figures
 
 
-def evaluate_model(model: TwinModel, parameters: Array, sigma_rad_s: Array, runs: Sequence[Run]) -> Evaluation:
-    """Evaluate on runs. parameters: (fans, 4). sigma_rad_s: (fans,) healthy standard deviation of the free run."""
+def evaluate_model(
+    model: TwinModel, parameters: Array, sigma_rad_s: Array, runs: Sequence[Run], unseen_std: UnseenStd | None = None
+) -> Evaluation:
+    """Evaluate on runs. parameters: (fans, 4). sigma_rad_s: (fans,) healthy standard deviation of the free run.
+
+    The band has this and the unseen error, as that of a running site.
+    """
     pieces = evaluation_pieces(runs)
     speed = np.concatenate([compared_readings(piece) for piece in pieces])
     expected = [free_run_readings(model, parameters, piece) for piece in pieces]
     residual = _residual(speed, np.concatenate(expected))
     with np.errstate(invalid="ignore"):
         noise = [measurement_of(piece).noise_rad_s(its) for piece, its in zip(pieces, expected, strict=True)]
+        unseen = [unseen_std(its, piece.command) for piece, its in zip(pieces, expected, strict=True) if unseen_std]
+    std = np.hypot(sigma_rad_s, np.nan_to_num(np.concatenate(unseen))) if unseen else sigma_rad_s
     one_step = one_step_residuals(model, parameters, pieces)
     measured = np.isfinite(speed)
     squared_deviation = np.where(measured, speed - _column_mean(speed), 0.0) ** 2
     found = _Samples(
-        measured, residual, one_step, np.abs(residual) <= 2.0 * sigma_rad_s, squared_deviation, np.concatenate(noise)
+        measured, residual, one_step, np.abs(residual) <= 2.0 * std, squared_deviation, np.concatenate(noise)
     )
     return Evaluation(tuple(_figures(found.of(fan)) for fan in range(speed.shape[1])), _figures(found))
 

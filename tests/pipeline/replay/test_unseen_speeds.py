@@ -106,6 +106,15 @@ def test_a_speed_that_training_has_not_seen_widens_the_band_and_raises_no_alarm(
     assert replayed(folder, "beyond", knows_nothing(twin))[1], "the same run raises alarms if the twin does not know"
 
 
+def test_evaluate_counts_the_band_of_a_running_site(folder: Path) -> None:
+    twin = folder / "twin.onnx"
+    covered = [
+        json.loads(fantwin("evaluate", each, folder / "beyond.mcap", "--json").output)["coverage_2_sigma"]
+        for each in (twin, knows_nothing(twin))
+    ]
+    assert 1.0 - covered[0] < 0.8 * (1.0 - covered[1]), "a third of the commands are beyond training"
+
+
 def test_a_fault_at_such_a_speed_is_found(folder: Path) -> None:
     _, since_s = blocked_at_its_highest_command(beyond())
     scores, alarms = replayed(folder, "blocked", folder / "twin.onnx")
