@@ -32,7 +32,7 @@ from twin.evaluation.accuracy import (
 )
 from twin.evaluation.reading_range import reading_sigma_rad_s
 from twin.evaluation.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
-from twin.export.fan_rows import fan_rows, measured_as_in_card
+from twin.export.fan_rows import drive_of_fans, fan_rows, measured_as_in_card
 from twin.export.onnx_export import export_onnx
 from twin.export.onnx_twin import OnnxTwin
 from twin.fitting.balance import FILTER_RATE_PER_S
@@ -232,13 +232,10 @@ def evaluate(
 
 
 def _unseen_std(card: TwinCard, rows: Sequence[int]) -> UnseenStd | None:
-    table, drive = card.model_uncertainty, card.drive
+    table, drive = card.model_uncertainty, drive_of_fans(card, rows)
     if table is None:
         return None
-    if drive is None:
-        return table.unseen_std_at
-    of_rows = replace(drive, lowest_command=tuple(drive.lowest_command[row] for row in rows))
-    return lambda speed_rad_s, command: table.unseen_std_at(speed_rad_s, of_rows.raised(command))
+    return lambda speed_rad_s, command: table.unseen_std_at(speed_rad_s, drive.raised(command) if drive else command)
 
 
 def _reading_sigma_rad_s(

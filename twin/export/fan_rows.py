@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from schemas.twin_card import TwinCard
+from schemas.twin_card import DriveCard, TwinCard
 from twin.errors import TwinError
 from twin.runs import Run
 
@@ -31,6 +31,13 @@ def fan_rows(card: TwinCard, fans: int, fan_numbers: Sequence[int] | None = None
         f"twin {card.name!r} has {card.fans} fans and does not say which, the runs have {in_runs}; "
         "give recordings of as many fans, or retrain"
     )
+
+
+def drive_of_fans(card: TwinCard, rows: Sequence[int]) -> DriveCard | None:
+    """The drive of a twin for the fans of some runs; rows: as fan_rows gives them."""
+    if card.drive is None:
+        return None
+    return replace(card.drive, lowest_command=tuple(card.drive.lowest_command[row] for row in rows))
 
 
 def measured_as_in_card(card: TwinCard, rows: Sequence[int], runs: Sequence[Run]) -> list[Run]:

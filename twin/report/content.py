@@ -1,15 +1,15 @@
 """What a report says, in numbers: a twin run freely over recordings, fan by fan."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.twin_card import DataCard, TwinCard
+from schemas.twin_card import DataCard, DriveCard, TwinCard
 from twin.build import evaluate
 from twin.evaluation.accuracy import Evaluation, Figures, compared_readings, evaluation_pieces, free_run_readings
 from twin.evaluation.residual_analysis import ResidualAnalysis, analyse_residual
-from twin.export.fan_rows import fan_rows, measured_as_in_card
+from twin.export.fan_rows import drive_of_fans, fan_rows, measured_as_in_card
 from twin.export.onnx_twin import OnnxTwin
 from twin.report.speed_bins import SpeedBin, speed_bins
 from twin.report.timeline import Timeline, timeline
@@ -42,9 +42,9 @@ class Parameter:
 class FanContent:
     """One fan. Arrays (n,) are in rad/s or command units, over all pieces one after the other.
 
-    column: of the runs. raised_command: with a drive, the command or the end of its plateau. number: as the recording
-    counts fans. predicted_rad_s: the readings expected of the free run, NaN where it diverged. error_rad_s: measured
-    minus that, NaN where nothing is compared, infinite where the free run diverged.
+    column: of the runs. number: as the recording counts fans. predicted_rad_s: the readings expected of the free run,
+    NaN where it diverged. error_rad_s: measured minus that, NaN where nothing is compared, infinite where the free run
+    diverged.
     """
 
     column: int
@@ -52,13 +52,18 @@ class FanContent:
     figures: Figures
     sigma_rad_s: float
     command: Array
-    raised_command: Array
+    drive: DriveCard | None
     measured_rad_s: Array
     predicted_rad_s: Array
     error_rad_s: Array
     parameters: tuple[Parameter, ...]
     residual: ResidualAnalysis
     by_speed: tuple[SpeedBin, ...]
+
+    @property
+    def raised_command(self) -> Array:
+        """(n,) the command, or with a drive the end of its plateau if that is higher."""
+        return self.drive.raised(self.command[:, np.newaxis])[:, 0] if self.drive else self.command
 
     @property
     def rmse_in_sigma(self) -> float:
@@ -108,10 +113,6 @@ def report_content(
     command, measured = (
         np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("command", "speed_rad_s")
     )
-    raised = command
-    if drive := twin.card.drive:
-        of_rows = tuple(drive.lowest_command[row] for row in rows)
-        raised = replace(drive, lowest_command=of_rows).raised(command)
     predicted = np.concatenate([free_run_readings(twin, parameters, piece) for piece in pieces])
     predicted[~np.isfinite(predicted)] = np.nan
     compared = np.concatenate([compared_readings(piece) for piece in pieces])
@@ -132,7 +133,7 @@ def report_content(
                 figures=evaluation.per_fan[fan],
                 sigma_rad_s=float(sigma_rad_s[fan]),
                 command=command[:, fan],
-                raised_command=raised[:, fan],
+                drive=drive_of_fans(twin.card, rows[fan : fan + 1]),
                 measured_rad_s=measured[:, fan],
                 predicted_rad_s=predicted[:, fan],
                 error_rad_s=error[:, fan],

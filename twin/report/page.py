@@ -9,11 +9,13 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from schemas.model_uncertainty import ModelUncertainty
 from twin.evaluation.residual_analysis import SIGNIFICANCE
 from twin.kinds import kind_title
 from twin.report import figures
 from twin.report.assessment import AS_DECLARED, LOOSER, Assessment, assess, level_of
 from twin.report.content import Content, FanContent
+from twin.report.record_next import least_known
 from twin.report.steady_states import StaticCurve, static_curve
 
 MOST_FANS_DRAWN = 12
@@ -127,11 +129,11 @@ def fan_figures(content: Content, fan: FanContent) -> list[Figure]:
             "Points off the zero line are speeds at which the twin is biased; long bars speeds of large scatter.",
             figures.error_over_speed(content, fan),
         ),
-        *_what_is_known(content, fan),
+        *_what_is_known(content, fan, curve),
     ]
 
 
-def _what_is_known(content: Content, fan: FanContent) -> list[Figure]:
+def _what_is_known(content: Content, fan: FanContent, curve: StaticCurve) -> list[Figure]:
     known = content.card.model_uncertainty
     if known is None:
         return []
@@ -142,10 +144,27 @@ def _what_is_known(content: Content, fan: FanContent) -> list[Figure]:
         Figure(
             "What the twin knows",
             "How far the twin itself may be wrong, because of what it has not seen in training. Outside of the red "
-            f"line that is more than the healthy sigma: record there and train again to rely on it.{share}",
+            f"line that is more than the healthy sigma.{share} {_record_next(content, fan, known, curve)}",
             figures.what_is_known(content, fan, known),
         )
     ]
+
+
+def _record_next(content: Content, fan: FanContent, known: ModelUncertainty, curve: StaticCurve) -> str:
+    if known.seen_std_rad_s is None:
+        return "Record where it may be most wrong, and train again to rely on it."
+    least = least_known(known, curve, fan.drive)
+    if least is None:
+        return "Within these commands nothing is much less known than the rest: more such data narrow it little."
+    each, name = content.unit.rad_s, content.unit.name
+    unit = f" {content.card.command_unit}" if content.card.command_unit else ""
+    speed, std, seen = (
+        f"{float(f'{value / each:.3g}'):,g} {name}"
+        for value in (least.speed_rad_s, least.std_rad_s, known.seen_std_rad_s)
+    )
+    command = f"{least.command:.3g}{unit}"
+    where = f"the command held at {command}" if least.held else f"steps from {speed} to the command {command}"
+    return f"What to record next: {where}, where the twin may be wrong by {std} ({seen} where it was trained)."
 
 
 def _how_time_is_drawn(content: Content) -> str:

@@ -1,0 +1,47 @@
+"""What to record next, so that more data narrow the error of a twin most."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.model_uncertainty import ModelUncertainty
+from schemas.twin_card import DriveCard
+from twin.report.steady_states import StaticCurve
+
+WORTH = 1.5
+"""times what training has seen: a smaller standard deviation is hardly narrowed by more of the same data"""
+
+
+@dataclass(frozen=True)
+class LeastKnown:
+    """A speed, rad/s, and a command at which the twin may be most wrong, rad/s; held: the fan settles there."""
+
+    speed_rad_s: float
+    command: float
+    std_rad_s: float
+    held: bool
+
+
+def least_known(known: ModelUncertainty, curve: StaticCurve, drive: DriveCard | None) -> LeastKnown | None:
+    """Where a held command, or else a step from one settled speed to another, would tell most.
+
+    curve: of the fan, over the commands that are possible. drive: of that fan. None: nothing within these commands is
+    much less known than what training has seen, or the card does not say what that is.
+    """
+    settled = curve.twin[np.isfinite(curve.twin).all(axis=1)]
+    if known.seen_std_rad_s is None or not len(settled):
+        return None
+    commands, speeds_rad_s = settled.T
+    raised = drive.raised(commands[:, np.newaxis])[:, 0] if drive else commands
+    of_steps = known.std_at(*np.meshgrid(speeds_rad_s, raised, indexing="ij"))
+    of_holds = np.diag(of_steps)
+    least = WORTH * known.seen_std_rad_s
+    if of_holds.max() >= least:
+        at = int(of_holds.argmax())
+        return LeastKnown(float(speeds_rad_s[at]), float(commands[at]), float(of_holds[at]), held=True)
+    start, end = np.unravel_index(int(of_steps.argmax()), of_steps.shape)
+    if of_steps[start, end] < least:
+        return None
+    return LeastKnown(float(speeds_rad_s[start]), float(commands[end]), float(of_steps[start, end]), held=False)
