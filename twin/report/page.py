@@ -31,6 +31,8 @@ PARAMETER_MEANING = {
     "friction": ("friction", "of the command, does not turn the rotor"),
     "kick_command": ("kick", "command with which the drive starts the rotor"),
 }
+AT_REST_SHARE = 0.01
+"""of the top speed: a lower one is at rest"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +165,8 @@ def _record_next(content: Content, fan: FanContent, known: ModelUncertainty, cur
         for value in (least.speed_rad_s, least.std_rad_s, known.seen_std_rad_s)
     )
     command = f"{least.command:.3g}{unit}"
-    where = f"the command held at {command}" if least.held else f"steps from {speed} to the command {command}"
+    start = "rest" if least.speed_rad_s < AT_REST_SHARE * content.card.top_speed_rad_s else speed
+    where = f"the command held at {command}" if least.held else f"steps from {start} to the command {command}"
     return f"What to record next: {where}, where the twin may be wrong by {std} ({seen} where it was trained)."
 
 
