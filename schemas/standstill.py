@@ -8,6 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+SLOWED_SHARE = 0.7
+"""of its speed: a fan that still has more has not slowed down"""
+
 
 class Standstill(BaseModel):
     """Found in the training runs, for all fans of a twin together. Commands in the unit of the card.
@@ -29,6 +32,11 @@ class Standstill(BaseModel):
         default=None,
         ge=0,
         description="longest time from a command to stop, at full speed, to a reading of a fan at rest",
+    )
+    slowing_s: float | None = Field(
+        default=None,
+        ge=0,
+        description="longest time from a command to stop to a reading of 70 % of the speed; null in early cards",
     )
     coast_time_constant_s: float | None = Field(
         default=None, gt=0, description="typical time constant of a fan that coasts"

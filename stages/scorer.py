@@ -50,6 +50,7 @@ OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
 ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
 READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_KEPT}"
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
+NOT_CALIBRATED = "the twin is not calibrated: only the speed band raises alarms; see fantwin calibrate"
 RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 SET_BACK_NS = NS_PER_S  # a snapshot further ahead of the present is of a clock that was set back since
 BACK_IN_TIME_NS = 120 * NS_PER_S  # a restarted producer catches up with less; older samples are of another recording
@@ -176,7 +177,8 @@ class ScorerCore(Core):
 
     def notes(self) -> list[str]:
         """Which share of the samples was judged, and why the others were not; fans that change slowly."""
-        return [*self._judged_share.notes, *self._tray.wear.notices(), *self._tray.followed]
+        of_twin = [] if self._twin.is_calibrated else [NOT_CALIBRATED]
+        return [*of_twin, *self._judged_share.notes, *self._tray.wear.notices(), *self._tray.followed]
 
     def problem(self) -> str:
         """What people should look at: input, snapshot, fans without a score, baselines at their limit, wear."""

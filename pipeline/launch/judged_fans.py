@@ -16,10 +16,11 @@ from pipeline.launch.event_log import without_figures
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import CodecError, decode
-from schemas.messages import InvalidReason, Score
+from schemas.messages import FanState, InvalidReason, Score
 from schemas.topics import tray_key
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST, REASONS
 
+RETURNING = "within its limits: it clears once it has stayed there, at about the speeds at which it came"
 JUDGED_WITHIN_S = 5.0
 """a fan is judged now if it had a valid score, or was stopped or starting, this recently"""
 _SAMPLED_S = 0.1  # scores of a tray are looked at this often: a fast line sends hundreds a second
@@ -91,6 +92,7 @@ class JudgedFans:
         """by tray: when a score was looked at"""
         self._judged_s = {tray.name: np.full(tray.fans, -np.inf) for tray in trays}
         self._reasons = {tray.name: np.zeros(tray.fans, np.uint8) for tray in trays}
+        self._states = {tray.name: np.zeros(tray.fans, np.uint8) for tray in trays}
         for tray in trays:
             bus.subscribe(tray_key(site, tray.name, "score"), lambda _key, data, name=tray.name: self.add(name, data))
 
@@ -112,7 +114,7 @@ class JudgedFans:
             self._seen_s[tray] = now_s
             judged = score.valid | np.isin(score.invalid_reason, JUDGED_AT_REST)
             judged_s[judged.any(axis=0)] = now_s
-            self._reasons[tray] = score.invalid_reason[-1]
+            self._reasons[tray], self._states[tray] = score.invalid_reason[-1], score.state[-1]
 
     def at_rest(self) -> list[AtRest]:
         """The fans that are stopped or starting now; they are judged by whether they stand or turn as commanded."""
@@ -125,9 +127,18 @@ class JudgedFans:
                 if self._seen_s.get(tray.name, -np.inf) >= oldest_s and (self._reasons[tray.name] == reason).any()
             ]
 
-    def words_at_rest(self) -> dict[tuple[str, int], str]:
-        """The state of each fan that is stopped or starting now, for people, by tray and fan."""
-        return {(each.tray, fan): replace(each, fans=(fan,)).words for each in self.at_rest() for fan in each.fans}
+    def words_now(self) -> dict[tuple[str, int], str]:
+        """What each fan does that is stopped, starting or returning now, for people, by tray and fan."""
+        at_rest = {(each.tray, fan): replace(each, fans=(fan,)).words for each in self.at_rest() for fan in each.fans}
+        oldest_s = self._now_s() - JUDGED_WITHIN_S
+        with self._lock:
+            returning = {
+                (tray.name, fan): RETURNING
+                for tray in self._trays
+                if self._seen_s.get(tray.name, -np.inf) >= oldest_s
+                for fan in np.flatnonzero(self._states[tray.name] == FanState.RETURNING).tolist()
+            }
+        return returning | at_rest
 
     def unjudged(self, states: Sequence[StageState]) -> list[Unjudged]:
         """The fans that are not judged now, and why. states: of the site's stages; one may be the reason."""

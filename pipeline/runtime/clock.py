@@ -53,7 +53,7 @@ class StageClock:
         self._times: dict[str, _ReplayTime] = {}
         """by tray: the last clock message of the replay"""
         self._replayed_until_ns: dict[str, int] = {}
-        """by tray: the time that the last replay has reached"""
+        """by tray: when the replay was there last, by the host's time: older samples may be its"""
 
     def set_replay_alive(self, alive: bool) -> None:
         """The replayer's liveliness token has appeared or gone."""
@@ -74,7 +74,7 @@ class StageClock:
         site."""
         if not self._is_replay_alive or clock.header.producer != self._owner:
             return False
-        self._replayed_until_ns[clock.header.tray] = clock.t_ns
+        self._replayed_until_ns[clock.header.tray] = self._host_ns()
         self._times[clock.header.tray] = _ReplayTime(clock, self._host_ns(), self._monotonic_s())
         return True
 

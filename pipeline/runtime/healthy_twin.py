@@ -41,7 +41,8 @@ class ScorerConfig(StageConfig):
     off_delay_s: float | None = Field(
         default=None,
         ge=0,
-        description="how long a return must last at least to clear; default: 1 s, of a tacho that counts ten counts",
+        description="how long a return must last at least to clear, and as long as samples affect a statistic; "
+        "default: 1 s, of a tacho that counts ten counts",
     )
     deadband: float = Field(default=0.5, ge=0, lt=1, description="a return begins below 1 - deadband times the limit")
     alarm_ratio: float = Field(default=1.5, ge=1, description="score from which a warning is an alarm")
@@ -81,6 +82,7 @@ class HealthyTwin:
     """that it was trained on"""
     unseen_error: UnseenError | None = None
     """where healthy runs do not show it; None: its card says nothing about it"""
+    is_calibrated: bool = True
 
 
 def limits_in_force(
@@ -167,4 +169,5 @@ def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
         card.standstill,
         card.command_range[1],
         twin.unseen_error,
+        card.calibration is not None,
     )

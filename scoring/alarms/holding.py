@@ -35,6 +35,7 @@ def holding_detectors(
                 off_delay_ns=round(max(off_delay_s, own_s) * NS_PER_S),
                 grows_with_speed=row.source != "tacho",
                 return_share=RETURN_SHARE if judges_rest else 0.0,
+                least_off_delay_ns=round(off_delay_s * NS_PER_S),
                 is_of_standing_fan=knows_standing and row.comes_first,
                 elsewhere_ns=ELSEWHERE_NS if knows_speeds else 0,
                 is_certain=not row.only_at_rest and (detector is not None or not (judges_rest or row.came_later)),

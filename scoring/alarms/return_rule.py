@@ -6,9 +6,11 @@ contact that comes and goes is good for a moment only.
 
 The longer an alarm has stood, the longer it must be gone. And it must be gone at the speeds at which it came: a twin
 that errs at another speed by as much as the fault costs hides it there. Elsewhere an alarm returns after
-`ELSEWHERE_NS`. A residual of several limits is not hidden by such errors, and returns at any speed, and so does that of
-a fan that stood. (Residuals are clipped at two limits: a low-pass exceeds three only where it smooths many noisy
-readings.)
+`ELSEWHERE_NS`. A residual of several limits is not hidden by such errors, and returns at any speed. (Residuals are
+clipped at two limits: a low-pass exceeds three only where it smooths many noisy readings.)
+
+What began with a standstill is over with it: such a residual returns at any speed, after the least off-delay. One that
+was there before is another fault.
 
 Only samples that could show the fault count. A blade that is touched takes ten per cent of the speed: 200 rpm at
 2,000 rpm, which is beyond a limit of 150, and 70 rpm at 700 rpm, which is not. So the largest ratio over speed that the
@@ -28,6 +30,7 @@ from schemas.units import NS_PER_S
 NOT_BELOW = -1
 RETURN_SHARE, LONGEST_RETURN_NS = 0.1, 60 * NS_PER_S  # of the time that a detector has held an alarm; and at most
 ELSEWHERE_NS = 600 * NS_PER_S
+TOGETHER_NS = 10 * NS_PER_S  # so long before a standstill is seen its residual may have begun
 HIDDEN_RATIO = 3.0  # to its limit; no healthy twin errs by so much
 NEAR_SPEED_RATIO = 1.15  # to the highest speed at which it exceeded, and of the lowest to it
 LARGEST = 1e300  # ratio over speed of a fault that shows at any speed
@@ -46,7 +49,9 @@ class HoldingDetector:
     return_share: float = RETURN_SHARE
     """of the time for which it held the alarm, so long it must have returned; 0 in recordings of former versions"""
     is_of_standing_fan: bool = False
-    """whether it shows that the fan stood, or ran on: such a fault is seen at every speed"""
+    """whether it shows that the fan stood, or ran on"""
+    least_off_delay_ns: int = 0
+    """of all detectors"""
     elsewhere_ns: int = ELSEWHERE_NS
     """for so long it must have returned at other speeds than those at which it came; 0 in recordings of former
     versions, where all speeds are alike"""
@@ -138,8 +143,11 @@ class AlarmReturn:
             for each in self._detectors
             if each.grows_with_speed and each.name in self._holds
         ]
-        has_stood = any(each.is_of_standing_fan and each.name in self._holds for each in self._detectors)
-        is_hidden_nowhere = has_stood or max(sizes, default=0.0) >= HIDDEN_RATIO
+        is_hidden_nowhere = max(sizes, default=0.0) >= HIDDEN_RATIO
+        stood = [
+            self._holds[each.name] for each in self._detectors if each.is_of_standing_fan and each.name in self._holds
+        ]
+        since_standing_ns = max((hold.age_ns + TOGETHER_NS for hold in stood), default=NOT_BELOW)
         for detector, ratio in zip(self._detectors, sample.ratios, strict=True):
             hold = self._holds.get(detector.name)
             if hold is None:
@@ -147,9 +155,10 @@ class AlarmReturn:
                     continue
                 hold = self._holds[detector.name] = _Hold()
             hold.follow(speed, period_ns, detector.off_delay_ns)
-            shows = not detector.grows_with_speed or has_stood or hold.shows_at(speed, self._return_ratio)
+            is_of_standing = detector.grows_with_speed and hold.age_ns <= since_standing_ns
+            shows = not detector.grows_with_speed or is_of_standing or hold.shows_at(speed, self._return_ratio)
             knows_speeds = detector.grows_with_speed and detector.elsewhere_ns > 0
-            is_near = is_hidden_nowhere or not knows_speeds or hold.is_near(speed)
+            is_near = is_of_standing or is_hidden_nowhere or not knows_speeds or hold.is_near(speed)
             if ratio > 1.0:
                 hold.exceed(ratio)
             elif ratio >= self._return_ratio:
@@ -162,7 +171,8 @@ class AlarmReturn:
             if ratio >= self._return_ratio:
                 above, hold.held_ns = True, hold.age_ns
             longer_ns = min(round(detector.return_share * hold.held_ns), LONGEST_RETURN_NS)
-            least_ns = max(detector.off_delay_ns, longer_ns)
+            own_ns = detector.least_off_delay_ns if is_of_standing else detector.off_delay_ns
+            least_ns = max(own_ns, longer_ns)
             elsewhere_ns = max(hold.below_ns, 0) + hold.elsewhere_ns
             over &= hold.below_ns >= least_ns or (
                 hold.elsewhere_ns > 0 and elsewhere_ns >= max(detector.elsewhere_ns, least_ns)

@@ -71,11 +71,12 @@ class DriftSettings(SingleLimit):
         return max(MIN_CAUTIOUS_LIMIT / self.limit, 1.0)
 
     def cautious(self, evidence: HealthyEvidence) -> DriftSettings:
-        """With too few data the reference value is larger by what is not known.
+        """With too few data the reference value is larger by what is not known, or a shift has to last longer.
 
-        Of a tacho that counts it is 70 % of the error of a count or of the largest mean over ten, and above the offsets
-        between runs. For how long the twin errs in one direction these cannot know, so a shift has to last. A large one
-        need not last as long. With half of them instead of 70 %, twins that err by 20 rpm at some speeds raise alarms.
+        Of a tacho that counts the reference value is 70 % of the error of a count or of the largest mean over ten, and
+        above the offsets between runs. For how long the twin errs in one direction these cannot know, so a shift has to
+        last. A large one need not last as long. With half of them instead of 70 %, twins that err by 20 rpm at some
+        speeds raise alarms.
         """
         if not evidence.count_std:
             return self.model_copy(update={"reference_sigmas": self.reference_sigmas * evidence.unknown_factor})

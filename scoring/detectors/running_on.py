@@ -3,11 +3,11 @@
 A healthy fan coasts, and then stands. What coasts look like is in the twin's card (schemas.standstill). A fan runs on
 
 - if it turns for three times the longest coast;
-- if it does not slow down: its reading is above that of a coast three times as slow as usual, which begins at its
-  highest reading soon after the command, and above 70 % of that reading;
+- if it keeps its speed: its reading is above 70 % of the highest one soon after the command, for three times as long as
+  that ever took;
 - if it turns after it has been at rest.
 
-Readings lag, so what is seen within the reach of the tacho and `MIN_MOVE_S` is not judged.
+Readings lag, so what is seen within the reach of the tacho and a second is not judged.
 """
 
 from __future__ import annotations
@@ -19,15 +19,13 @@ import numpy as np
 from pydantic import Field
 
 from schemas.messages import Alarm, Array
-from schemas.standstill import Standstill
+from schemas.standstill import SLOWED_SHARE, Standstill
 from schemas.units import NS_PER_S
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, DetectorSettings, LimitRule, Signal
 from scoring.detectors.durations import Durations
+from scoring.detectors.healthy_times import coast_limit_s, lag_s, slowing_limit_s, start_limit_s
 
-MARGIN = 3.0  # times the longest or the usual of healthy runs
-MIN_MOVE_S = 1.0  # and the reach of the tacho: the shortest limit of a start or a coast; training shows few of them
-LEAST_FALL = 0.7  # of the highest reading: a coast is judged below it
 CERTAIN = 2.0  # ratios above 1 are multiplied by it: a fan that does not do as commanded is an alarm, not a warning
 OFF_DELAY_S = 2.0
 PEAK_STEPS = 64.0  # of a rad/s: with the next, sums that do not depend on how samples are cut into blocks
@@ -61,19 +59,16 @@ class RunningOn(Detector):
 
     def __init__(self, settings: RunningOnSettings, context: DetectorContext) -> None:
         self._healthy = healthy = settings.healthy
-        reach_s = np.array([tacho.reach_s for tacho in context.tachos])
-        lag_s = MIN_MOVE_S + reach_s
-        self._lag_s = settings.factor * lag_s
-        self._memory_s = settings.factor * np.maximum(MARGIN * (healthy.start_s or 0.0), lag_s)
-        coast_limit_s = np.maximum(MARGIN * (healthy.coast_s or 0.0), lag_s)
-        self._coast_limit_s = settings.factor * coast_limit_s if healthy.coast_s is not None else np.inf + reach_s
         self._by_coast_only = settings.by_coast_only
-        constant_s = healthy.coast_time_constant_s
-        self._time_constant_s = np.inf if constant_s is None else settings.factor * MARGIN * constant_s
+        reach_s = np.array([tacho.reach_s for tacho in context.tachos])
+        self._lag_s = settings.factor * lag_s(reach_s)
+        self._coast_limit_s = settings.factor * coast_limit_s(healthy, reach_s)
+        self._slowing_limit_s = np.minimum(settings.factor * slowing_limit_s(healthy, reach_s), self._coast_limit_s)
+        self._memory_s = settings.factor * start_limit_s(healthy, reach_s) if settings.by_coast_only else self._lag_s
         self._lasted_ns = np.zeros((4, context.fans), np.int64)
         """for how long the fan has turned although it is stopped, has been stopped, at rest, and at rest for the lag"""
         self._peak_rad_s = np.zeros(context.fans)
-        """highest reading within the lag since the command stopped it"""
+        """highest reading within the lag since the command stopped it; 0 if there is none"""
 
     def update(self, block: DetectorInput) -> Array:
         """See Detector."""
@@ -84,21 +79,21 @@ class RunningOn(Detector):
     def ratio(self, block: DetectorInput) -> Array:
         """(n, fans) how long each has run on, in multiples of its limit: 0 where it does not."""
         speed = block.speed_rad_s
-        stops, known, turns = self._healthy.stops(block.command, speed), np.isfinite(speed), self._healthy.turns(speed)
+        stops, turns = self._healthy.stops(block.command, speed), self._healthy.turns(speed)
+        stands = np.isfinite(speed) & ~turns
         count = Durations(block.valid, block.period_ns)
-        ran_on = count.of(stops & turns, ~stops | (known & ~turns), self._lasted_ns[0])
+        ran_on = count.of(stops & turns, ~stops | stands, self._lasted_ns[0])
         if self._by_coast_only:
-            return ran_on / NS_PER_S / self._coast_limit_s
-        stopped = count.of(stops, ~stops, self._lasted_ns[1])
-        at_rest = count.of(stops & ~turns, ~stops | turns, self._lasted_ns[2])
+            return ran_on / self._coast_limit_s / NS_PER_S
         lag_ns = self._lag_s * NS_PER_S
+        stopped = count.of(stops, ~stops, self._lasted_ns[1])
+        at_rest = count.of(stops & stands, ~stops | turns, self._lasted_ns[2])
         rested = count.of(stops & (at_rest >= lag_ns), ~stops, self._lasted_ns[3])
         is_first = turns & block.valid & (stopped <= lag_ns)
         peak = self._peaks(np.where(is_first, np.abs(speed), 0.0), ~stops & block.valid)
-        slowed = np.divide(np.abs(speed), peak, out=np.ones_like(peak), where=turns & (peak > 0.0))
-        coast_s = self._lag_s - self._time_constant_s * np.log(np.clip(slowed, 1e-9, LEAST_FALL))
-        limit_s = np.where(rested > 0, self._lag_s, np.minimum(self._coast_limit_s, coast_s))
-        return ran_on / NS_PER_S / limit_s
+        keeps_speed = turns & (peak > 0.0) & (np.nan_to_num(np.abs(speed)) > SLOWED_SHARE * peak)
+        limit_s = np.where(keeps_speed, self._slowing_limit_s, self._coast_limit_s)
+        return ran_on / np.where(rested > 0, self._lag_s, limit_s) / NS_PER_S
 
     def _peaks(self, readings: Array, ends: Array) -> Array:
         """(n, fans) the highest of the readings since the last end."""
@@ -125,14 +120,20 @@ class RunningOn(Detector):
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
-        names = ("ran_on_ns", "stopped_ns", "at_rest_ns", "rested_ns")
-        return {**dict(zip(names, self._lasted_ns, strict=True)), "peak_rad_s": self._peak_rad_s}
+        ran_on, stopped, at_rest, rested = self._lasted_ns
+        former = {"ran_on_ns": ran_on}
+        if self._by_coast_only:
+            return former
+        of_rest = {"stopped_ns": stopped, "at_rest_ns": at_rest, "rested_ns": rested}
+        return {**former, **of_rest, "peak_rad_s": self._peak_rad_s}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """See ColumnState. Snapshots of former versions know how long it has run on, and nothing else."""
-        super().restore({**self.snapshot(), **state})
+        """See ColumnState. It starts again from a snapshot of a former version, which does not know when a fan was
+        stopped."""
+        if self._by_coast_only or "peak_rad_s" in state:
+            super().restore(state)
 
     @classmethod
     def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
-        """See Detector. What it does against which command is the evidence of the first cause."""
-        return (alarm.causes[0].evidence if alarm.causes else "") or "turns although its command stops it"
+        """Not used: alarm texts are those of the first row of their statistic, that of StandstillDetector."""
+        raise NotImplementedError

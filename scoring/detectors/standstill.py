@@ -23,11 +23,11 @@ from schemas.units import NS_PER_S
 from scoring.detectors.alarm_units import AlarmUnits
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, DetectorSettings, LimitRule, Signal
 from scoring.detectors.durations import Durations
-from scoring.detectors.running_on import CERTAIN, MARGIN, MIN_MOVE_S, OFF_DELAY_S, RunningOn, RunningOnSettings
+from scoring.detectors.healthy_times import lapse_limit_s, start_limit_s
+from scoring.detectors.running_on import CERTAIN, OFF_DELAY_S, RunningOn, RunningOnSettings
 
-MIN_LAPSE_S = 0.5
 MISSING_S = 2.0  # beyond the reach of the tacho
-UNKNOWN_START_S, UNKNOWN_STARTED_S = 30.0, 5.0  # beyond the reach, if no start was seen: its limit, and its length
+UNKNOWN_STARTED_S = 5.0  # beyond the reach: the length of a start, if none was seen
 
 
 class StandstillSettings(DetectorSettings):
@@ -59,14 +59,10 @@ class StandstillDetector(Detector):
     def __init__(self, settings: StandstillSettings, context: DetectorContext) -> None:
         self._healthy = healthy = settings.healthy
         reach_s = np.array([tacho.reach_s for tacho in context.tachos])
-        known_start = healthy.start_s is not None
-        least_s = MIN_MOVE_S + reach_s
-        start_limit_s = np.maximum(MARGIN * (healthy.start_s or 0.0), least_s)
-        start_limit_s = start_limit_s if known_start else UNKNOWN_START_S + reach_s
-        self._started_ns = ((healthy.start_s or 0.0) if known_start else UNKNOWN_STARTED_S + reach_s) * NS_PER_S
-        lapse_limit_s = max(MIN_LAPSE_S, MARGIN * healthy.lapse_s)
-        self._lapse_limit_s = settings.factor * lapse_limit_s
-        self._start_limit_s = settings.factor * np.maximum(start_limit_s, lapse_limit_s)
+        started_s = UNKNOWN_STARTED_S + reach_s if healthy.start_s is None else healthy.start_s
+        self._started_ns = started_s * NS_PER_S
+        self._lapse_limit_s = settings.factor * lapse_limit_s(healthy)
+        self._start_limit_s = settings.factor * start_limit_s(healthy, reach_s)
         self._missing_limit_s: Array = settings.factor * (reach_s + MISSING_S)
         of_stopped = RunningOnSettings(healthy=healthy, factor=settings.factor, by_coast_only=True)
         self._of_stopped = RunningOn(of_stopped, context) if settings.with_stopped else None
@@ -116,4 +112,4 @@ class StandstillDetector(Detector):
     @classmethod
     def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
         """See Detector. What it does against which command is the evidence of the first cause."""
-        return (alarm.causes[0].evidence if alarm.causes else "") or "does not turn as commanded"
+        return (alarm.causes[0].evidence if alarm.causes else "") or "does not turn or stop as commanded"

@@ -39,7 +39,7 @@ def slow_changes(parameter: str, trends: Sequence[Trend | None]) -> list[str]:
         least = max(MIN_CHANGE, MIN_INTERVALS * float(np.hypot(half_interval, others_half)))
         if min(abs(change), abs(change - others)) < least:
             continue
-        compared = f", the fans beside it {100 * others:+.1f} %" if beside else ""
+        compared = f", the fans beside it {_percent(others)}" if beside else ""
         lines.append(f"fan {fan}: {parameter} {_over_time(change, trend.days)}{compared}: {WEAR_HINT}")
     return lines
 
@@ -55,4 +55,13 @@ def _of_line(trend: Trend) -> tuple[float, float]:
 
 def _over_time(change: float, days: float) -> str:
     unit, each, times = ("days", "a day", days) if days >= 2.0 else ("h", "an hour", days * HOURS_PER_DAY)
-    return f"{100 * change:+.1f} % in {times:.3g} {unit}, {100 * change / times:+.2g} % {each}"
+    return f"{_percent(change)} in {times:.{_places(times)}f} {unit}, {_percent(change / times)} {each}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:+.{_places(100 * share)}f} %"
+
+
+def _places(value: float) -> int:
+    """For two digits at least."""
+    return 2 if abs(value) < 1.0 else 1 if abs(value) < 10.0 else 0

@@ -140,7 +140,7 @@ class WearSeries:
         t_quantile = float(stdtrit(min(effective, n // max(1, n // BATCHES)) - 2.0, 0.975))
         return Trend(
             origin_ns=origin_ns,
-            first_ns=int(t_ns[0]),
+            first_ns=self._t_ns[0],
             slope_per_day=slope,
             low=slope - t_quantile * slope_error,
             high=slope + t_quantile * slope_error,

@@ -9,10 +9,17 @@ from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_force
 from schemas.model_uncertainty import ModelUncertainty
 from scoring.unseen_error import UnseenError
-from stages.scorer import ScorerCore
+from stages.scorer import NOT_CALIBRATED, ScorerCore
 from tests.support.scored_blocks import CALIBRATION, SIGMA, balance_of_a_fan, feed, prediction_of
 
 EVERYWHERE = ModelUncertainty((0.0, 600.0), (0.0, 100.0), ((20.0, 20.0), (20.0, 20.0)), seen_std_rad_s=0.0)
+
+
+@pytest.mark.parametrize("is_calibrated", [True, False])
+def test_people_are_told_that_a_twin_is_not_calibrated(is_calibrated: bool) -> None:
+    limits = limits_in_force(ScorerConfig(), CALIBRATION if is_calibrated else None)
+    twin = HealthyTwin("twin", limits, [balance_of_a_fan()], "%", is_calibrated=is_calibrated)
+    assert (NOT_CALIBRATED in ScorerCore(1, "rad/s", ScorerConfig(), twin).notes()) != is_calibrated
 
 
 @pytest.mark.parametrize(("rules", "is_wider"), [(CURRENT_RULES, True), (DecisionRules.FIRST_BASELINE, False)])

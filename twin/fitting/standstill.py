@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from schemas.standstill import Standstill
+from schemas.standstill import SLOWED_SHARE, Standstill
 from twin.runs import Array, Run
 
 STEADY_S = 5.0
@@ -78,13 +78,14 @@ def find_standstill(runs: Sequence[Run]) -> Standstill | None:
     found = Standstill(turning_command=turning, standing_below_rad_s=standing_below, off_command=off)
     starts_s = [start_s for one in series for start_s in _starts(one, found)]
     coasts = [coast for one in series for coast in _coasts(one, found)]
-    constants_s = [constant_s for _, constant_s, _ in coasts if constant_s > 0.0]
+    constants_s = [coast.time_constant_s for coast in coasts if coast.time_constant_s > 0.0]
     log_fall = float(np.log(top / standing_below))
-    from_top_s = [seconds + constant_s * max(log_fall - log, 0.0) for seconds, constant_s, log in coasts]
+    from_top_s = [coast.seconds + coast.time_constant_s * max(log_fall - coast.log_fall, 0.0) for coast in coasts]
     return found.model_copy(
         update={
             "start_s": max(starts_s, default=None),
             "coast_s": max(from_top_s, default=None),
+            "slowing_s": max((coast.slowing_s for coast in coasts), default=None),
             "coast_time_constant_s": float(np.median(constants_s)) if constants_s else None,
             "lapse_s": _longest_lapse_s(series, found, max(starts_s, default=STEADY_S)),
         }
@@ -108,12 +109,18 @@ def _turning_command(series: Sequence[_FanSeries], standing_below: float, off: f
 
 
 def _stopping_commands(one: _FanSeries, at_rest_below: float) -> Iterator[float]:
-    """The highest command of each rest. One that still slows down does not count: it may come to turn steadily."""
+    """The highest command of each rest: of those not above the command under which the fan came to rest.
+
+    A fan that still slows down is not at rest: it may come to turn steadily.
+    """
     lowest, least = one.lowest_command(STOOD_S), round((AT_REST_S + one.reach_s) / one.period_s)
     increases = np.flatnonzero(np.diff(one.command, prepend=one.command[:1]) > 0.0)
     for first, last in _stretches(one.speed_rad_s < at_rest_below):
         end = last
-        if last < len(one.command):  # it starts: from the last increase on
+        above = np.flatnonzero(one.command[first:last] > one.command[first : first + least + 1].max())
+        if len(above):
+            end = first + int(above[0])
+        elif last < len(one.command):  # it starts: from the last increase on
             before = increases[np.searchsorted(increases, last, side="right") - 1] if len(increases) else 0
             end = int(before) if first < before <= last else first
         stood = lowest[first + least : end]
@@ -141,15 +148,31 @@ def _starts(one: _FanSeries, found: Standstill) -> Iterator[float]:
             yield float(turns[first:last].argmax()) * one.period_s
 
 
-def _coasts(one: _FanSeries, found: Standstill) -> Iterator[tuple[float, float, float]]:
-    """From a command to stop to the first reading of a fan that stands: time, its time constant, log of the fall."""
+@dataclass(frozen=True)
+class _Coast:
+    """From a command to stop to the first reading of a fan that stands.
+
+    seconds: its length. time_constant_s: 0 where it is too short to show it. log_fall: of its readings, the logarithm.
+    slowing_s: until the reading is below `SLOWED_SHARE` of the highest one since the command.
+    """
+
+    seconds: float
+    time_constant_s: float
+    log_fall: float
+    slowing_s: float
+
+
+def _coasts(one: _FanSeries, found: Standstill) -> Iterator[_Coast]:
     stands = one.speed_rad_s < found.standing_below_rad_s
     for first, last in _stretches(found.stops(one.command, one.speed_rad_s)):
         if first and found.turns(one.speed_rad_s[first]) and stands[first:last].any():
-            seconds = float(stands[first:last].argmax()) * one.period_s
+            rows = int(stands[first:last].argmax())
+            seconds = rows * one.period_s
             log = float(np.log(one.speed_rad_s[first] / found.standing_below_rad_s))
             constant_s = max(seconds - one.mean_delay_s, 0.0) / log if log >= MIN_LOG_FALL else 0.0
-            yield seconds, constant_s, log
+            readings = np.nan_to_num(one.speed_rad_s[first : first + rows + 1])
+            slowed = np.flatnonzero(readings > SLOWED_SHARE * readings.max())[-1] + 1
+            yield _Coast(seconds, constant_s, log, float(slowed) * one.period_s)
 
 
 def _longest_lapse_s(series: Sequence[_FanSeries], found: Standstill, start_s: float) -> float:

@@ -23,6 +23,7 @@ RATE_TOLERANCE = 0.01
 UNCERTAIN = 1.0
 """A parameter is poorly determined when half its 95 % interval is wider than this share of its value."""
 OFTEN_MISSING = 0.1
+ANOTHER_UNIT = 3.0  # times the top speed of training: numbers in rpm taken for rad/s are ten times too large
 CHANCE_PEAK = 2.0
 BIASED_IN_SIGMA, BIASED_IN_ERRORS = 0.2, 3.0
 BIASED_AT_A_SPEED_IN_SIGMA = 1.0
@@ -65,6 +66,10 @@ def warnings(content: Content) -> tuple[str, ...]:
 
 def _about_the_data(content: Content) -> Iterable[str]:
     card = content.card
+    fastest_rad_s = max(float(np.nanmax(np.abs(fan.measured_rad_s), initial=0.0)) for fan in content.fans)
+    if fastest_rad_s > ANOTHER_UNIT * card.top_speed_rad_s > 0.0:
+        fastest, known = (f"{value / content.unit.rad_s:,.0f}" for value in (fastest_rad_s, card.top_speed_rad_s))
+        yield f"Speeds up to {fastest} {content.unit.name}, the twin knows {known}: is the recording's unit right?"
     trained_on = {data.sha256 for data in card.training.data}
     if seen := [data.name for data in content.recordings if data.sha256 in trained_on]:
         yield f"{', '.join(seen)}: used in training, at least in part; there these figures are too optimistic."

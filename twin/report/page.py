@@ -33,6 +33,8 @@ PARAMETER_MEANING = {
 }
 AT_REST_SHARE = 0.01
 """of the top speed: a lower one is at rest"""
+AT_REST_SHARE = 0.01
+"""of the top speed: a lower one is at rest"""
 
 
 @dataclass(frozen=True, eq=False)

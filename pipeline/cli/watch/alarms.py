@@ -143,9 +143,9 @@ def _list(bus: Bus, config: Config, stop: threading.Event, *, show_all: bool, wa
         shown |= {"at_rest": [each.as_json() for each in judged.at_rest()], "slow_changes": slow}
         typer.echo(json.dumps(shown))
     else:
-        at_rest = judged.words_at_rest()
+        now = judged.words_now()
         for each in found:
-            console.print(alarm_lines(each, at_rest.get((each.newest.header.tray, each.newest.fan), "")))
+            console.print(alarm_lines(each, now.get((each.newest.header.tray, each.newest.fan), "")))
         lines = [Text(line, style="yellow") for line in slow] + [Text(each.line(), style="red") for each in unjudged]
         for line in lines:
             console.print(line)

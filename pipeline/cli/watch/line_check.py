@@ -16,6 +16,7 @@ import numpy as np
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config, TrayConfig
+from pipeline.devices.device_clock import UINT32
 from pipeline.devices.line_rate import MAX_SAMPLES, GridTiming, SampleTimes, grid_rate_hz, is_too_slow, leaves_gaps
 from pipeline.devices.tacho_evidence import find_tacho, tacho_hints
 from pipeline.runtime.stage import Context, StageError, load_stage
@@ -136,8 +137,9 @@ def _findings(samples: Sequence[Raw], tray: TrayConfig, config: Config, twin: Tr
     command = np.concatenate([sample.command for sample in fitting])
     speed_rad_s = np.concatenate([sample.speed_rad_s for sample in fitting])
     yield from _ranges(command, speed_rad_s, tray, twin)
-    t_s = np.concatenate([sample.host_receive_t_ns for sample in fitting]) / NS_PER_S
-    yield from _tachos(t_s, speed_rad_s, tray)
+    times_us = np.concatenate([times.times_of(sample) for sample in fitting])
+    steps_us = (np.diff(times_us, prepend=times_us[:1]) + UINT32 // 2) % UINT32 - UINT32 // 2  # a clock may wrap
+    yield from _tachos(np.cumsum(steps_us) / 1e6, speed_rad_s, tray)
 
 
 def _rate(times: SampleTimes, config: Config, twin: TrayTwin | None) -> Finding:
@@ -199,12 +201,21 @@ def _tachos(t_s: Array, speed_rad_s: Array, tray: TrayConfig) -> Iterator[Findin
     hints = tacho_hints(t_s, speed_rad_s, tray.tacho, range(tray.fans))
     for hint in hints:
         yield False, f"{hint}: see `tacho` in [[tray]]"
-    seen = [fan for fan, readings in enumerate(speed_rad_s.T) if find_tacho(t_s, readings) is not None]
-    if seen and not hints:
-        yield True, f"tachos of fans {', '.join(map(str, seen))}: they read as declared"
-    if not seen and "tacho" not in tray.model_fields_set:
-        advice = f"--listen-s {LISTEN_FOR_TACHOS_S} while the fans change their speeds"
-        yield True, f"no tacho is declared, and these readings do not show whether they count: {advice} may"
+    seen = [find_tacho(t_s, readings) is not None for readings in speed_rad_s.T]
+    if any(seen) and not hints:
+        yield True, f"tachos of {_fans(seen)}: they read as declared"
+    if not all(seen) and (hints or "tacho" not in tray.model_fields_set):
+        unseen = _fans([not one for one in seen])
+        yield (
+            True,
+            f"{unseen}: not shown whether the tacho counts; listen while the speeds change: "
+            f"--listen-s {LISTEN_FOR_TACHOS_S}",
+        )
+
+
+def _fans(chosen: Sequence[bool]) -> str:
+    numbers = [str(fan) for fan, is_chosen in enumerate(chosen) if is_chosen]
+    return f"fan{'s' * (len(numbers) > 1)} {', '.join(numbers)}"
 
 
 def _speeds(speed_rad_s: Array, unit: SpeedUnit) -> str:

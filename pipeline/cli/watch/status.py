@@ -127,7 +127,7 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> Gro
             problems.append(Text(f"{state.label}: {state.view.health.problem}", style="red"))
     notes = [Text(line) for line in note_lines(state.view.health for state in states if state.view)]
     problems += [Text(line, style="yellow") for line in (*loss_lines(states), *refused_lines(watcher.refused()))]
-    now = judged.words_at_rest()
+    now = judged.words_now()
     alarms = [_alarm_line(each, now) for each in watcher.current_alarms() if is_listed(each.newest)]
     if not _has_scorer(states):
         not_judged = [Text("no fan is judged: the configuration has no scorer", style="yellow")]
@@ -178,7 +178,7 @@ def _duration(seconds: float) -> str:
     return next((f"{seconds / size:.0f} {unit}" for unit, size in units if seconds >= 2 * size), f"{seconds:.0f} s")
 
 
-def _alarm_line(current: CurrentAlarm, at_rest: Mapping[tuple[str, int], str]) -> Text:
+def _alarm_line(current: CurrentAlarm, words_now: Mapping[tuple[str, int], str]) -> Text:
     alarm = current.newest
     style = _STYLES.get(alarm.severity, "bold red") if alarm.active else "green"
     text = Text.assemble(
@@ -186,7 +186,7 @@ def _alarm_line(current: CurrentAlarm, at_rest: Mapping[tuple[str, int], str]) -
         f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(current.states())}",
     )
     about = current.about()
-    if now := at_rest.get((alarm.header.tray, alarm.fan)):
+    if now := words_now.get((alarm.header.tray, alarm.fan)):
         text.append(f", now {now}")
     text.append("".join(f", {cause}" for cause in most_probable(current.causes)))
     return text.append(f"; {about}") if about else text

@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline.config.models import TrayConfig
-from pipeline.launch.judged_fans import JUDGED_WITHIN_S, JudgedChanges, JudgedFans, Unjudged
+from pipeline.launch.judged_fans import JUDGED_WITHIN_S, RETURNING, JudgedChanges, JudgedFans, Unjudged
 from pipeline.launch.site_state import StageState, Word
 from pipeline.launch.site_watcher import SiteWatcher
 from schemas.codec import encode
-from schemas.messages import Header, InvalidReason, Output
+from schemas.messages import FanState, Header, InvalidReason, Output
 from schemas.topics import tray_key
 from tests.pipeline.launch.test_site_watcher import SCORER, STRANGER, StubBus, health
 from tests.support.score_data import one_sample
@@ -60,6 +61,16 @@ def test_row_01_fans_are_named_with_the_reason(listener):
         "a: fan 3 not judged: no speed",
         "b: no fan is judged: the twin is warming up",
     ]
+
+
+def test_what_fans_do_now_is_known_as_long_as_scores_come(listener):
+    sample = one_sample(FANS, InvalidReason.NONE, InvalidReason.STOPPED, InvalidReason.NONE, InvalidReason.STARTING)
+    states = np.array([[FanState.RETURNING, FanState.RETURNING, FanState.ALARM, FanState.STARTING]], np.uint8)
+    listener.judged.add("a", encode(replace(sample, header=Header("", 0, "a"), state=states)))
+    now = {("a", 0): RETURNING, ("a", 1): "stopped by its command", ("a", 3): "starting"}
+    assert listener.judged.words_now() == now
+    listener.now_s += JUDGED_WITHIN_S + 1.0
+    assert listener.judged.words_now() == {}
 
 
 def test_a_fan_with_one_invalid_sample_is_still_judged(listener):

@@ -66,8 +66,8 @@ def test_the_hosts_time_applies_again_once_the_replay_has_left():
         leave(clock)
         assert clock.tick_ns("a") == HOST_NS
         assert not clock.update(clock_message(2000, 1.0)), "what is still on the way no longer applies"
-        assert clock.now_ns("a", 1000) is None, "its last samples have no age by the host's time"
-        assert clock.now_ns("a", 1001) == clock.now_ns("b", 1000) == HOST_NS
+        assert clock.now_ns("a", 1500) is None, "its last samples have no age by the host's time"
+        assert clock.now_ns("a", HOST_NS + 1) == clock.now_ns("b", 1500) == HOST_NS
 
 
 def test_row_12_a_clock_is_taken_from_the_replay_that_owns_the_site_only():
@@ -94,7 +94,7 @@ def test_row_12_a_clock_that_is_not_renewed_expires_and_another_replay_may_follo
     host.ns += round(4.9e9)
     assert clock.tick_ns("a") == 1000, "a paused replay renews it 20 times a second"
     host.ns += round(0.2e9)
-    assert clock.tick_ns("a") == clock.now_ns("a", HOST_NS) == host.ns
+    assert clock.tick_ns("a") == clock.now_ns("a", host.ns) == host.ns
     clock.add_replay_health("replay-all-2", has_stopped=False)
     assert clock.update(clock_message(3000, 1.0, producer="replay-all-2"))
     assert clock.tick_ns("a") == 3000

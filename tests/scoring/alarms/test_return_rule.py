@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from schemas.messages import Action, FanState, Transition
 from scoring.alarms.fan_condition import ConditionSettings
-from scoring.alarms.return_rule import HoldingDetector
+from scoring.alarms.return_rule import TOGETHER_NS, HoldingDetector
 from scoring.alarms.tray_conditions import TrayConditions
 
 STEP_NS = 10
@@ -100,13 +100,33 @@ def test_a_fault_of_several_limits_has_gone_at_any_speed_at_which_it_would_be_se
     assert fan.play([CALM] * 90, SLOW) == [], "how long a tacho is stuck says nothing of the size of a fault"
 
 
-def test_the_alarm_of_a_fan_that_stood_returns_at_any_speed() -> None:
-    standing = replace(SETTINGS.detectors[2], is_of_standing_fan=True)
+def test_what_began_with_a_standstill_is_over_with_it_and_what_was_there_before_is_not() -> None:
+    standing = replace(SETTINGS.detectors[2], off_delay_ns=30, is_of_standing_fan=True)
+    of_standing = replace(SETTINGS, detectors=(*SETTINGS.detectors[:2], standing))
     for has_stood in (False, True):
-        fan = Fan(replace(SETTINGS, detectors=(*SETTINGS.detectors[:2], standing)))
-        fan.play([(UP, LOW, UP if has_stood else LOW)], speed=SLOW)
-        cleared = fan.play([CALM] * 40, speed=FULL)
-        assert cleared == ([(31, Transition.CLEARED)] if has_stood else []), "after the off-delay of its detectors"
+        fan = Fan(of_standing)
+        fan.play([(LOW, UP, UP if has_stood else LOW)], speed=FULL)
+        cleared = fan.play([CALM] * 40, speed=SLOW)
+        assert cleared == ([(4, Transition.CLEARED)] if has_stood else []), "after the off-delay of the standstill"
+    fan = Fan(
+        replace(of_standing, detectors=tuple(replace(each, elsewhere_ns=10**12) for each in of_standing.detectors))
+    )
+    before = TOGETHER_NS // STEP_NS
+    fan.conditions.update(*one_long_sample((UP, LOW, LOW), before * STEP_NS))
+    fan.play([(UP, LOW, UP)])
+    assert fan.play([CALM] * 40, speed=SLOW) == []
+
+
+def one_long_sample(ratios: Sample, period_ns: int) -> tuple[Any, ...]:
+    score = np.full((1, 1), max(ratios))
+    return (
+        np.array([0]),
+        period_ns,
+        score,
+        np.isfinite(score),
+        np.array([ratios])[:, :, np.newaxis],
+        np.full((1, 1), FULL),
+    )
 
 
 def test_a_late_statistic_does_not_make_the_speed_that_followed_one_at_which_the_alarm_came() -> None:

@@ -35,7 +35,7 @@ def under_a_thermostat(growth: float, seed: int, points: int = 37) -> Trend | No
 def test_a_fan_that_clogs_is_noticed_with_the_fans_beside_it() -> None:
     (line,) = slow_changes("drag", [trend_of(0.0, 1), trend_of(0.0, 2), trend_of(0.055, 3), trend_of(0.002, 4)])
     assert line.startswith("fan 2: drag +5.")
-    assert " % in 3 h, +1.9 % an hour, the fans beside it -0.0 %: " in line
+    assert " % in 3.0 h, +1.9 % an hour, the fans beside it -0.0" in line
     assert line.endswith(": see fantwin wear")
 
 
@@ -54,7 +54,7 @@ def test_points_that_are_hardly_determined_hide_no_clogging_and_are_none() -> No
     healthy = [under_a_thermostat(0.0, seed) for seed in range(60)]
     assert slow_changes("drag", healthy) == []
     (line,) = slow_changes("drag", [under_a_thermostat(0.6, 100), *healthy[:3]])
-    assert line.startswith("fan 0: drag +") and " % in 6 h, +" in line
+    assert line.startswith("fan 0: drag +") and " % in 6.0 h, +" in line
 
 
 def test_a_fan_without_others_or_with_too_few_points_is_judged_by_itself_or_not_at_all() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from schemas.standstill import Standstill
+from schemas.standstill import SLOWED_SHARE, Standstill
 from schemas.tacho import Tacho
 from twin.fitting.standstill import find_standstill
 from twin.runs import Array, Run
@@ -56,6 +56,33 @@ def test_stops_and_starts_are_found_with_their_times() -> None:
     assert found.coast_s is not None
     assert expected_s < found.coast_s < expected_s + COUNT.reach_s + 1.0
     assert found.lapse_s == 0.0
+    slowed_s = COAST_S * np.log(1.0 / SLOWED_SHARE)
+    assert found.slowing_s is not None
+    assert slowed_s < found.slowing_s < slowed_s + COUNT.reach_s + 0.5
+
+
+def test_a_fan_that_keeps_its_speed_for_a_while_is_allowed_to() -> None:
+    """Its drive acts five seconds late, so that the command it is under is known, and its speed stays."""
+    late = round(5.0 / PERIOD_S)
+    run = measured(*STOPS)
+    delayed = replace(
+        run, speed_rad_s=np.concatenate((np.full((late, 1), run.speed_rad_s[0, 0]), run.speed_rad_s))[:-late]
+    )
+    prompt, found = find_standstill([run]), find_standstill([delayed])
+    assert found is not None
+    assert prompt is not None
+    assert found.slowing_s == pytest.approx(5.0 + (prompt.slowing_s or 0.0), abs=1.0)
+
+
+def test_a_fan_that_stood_under_a_rising_command_does_not_stop_under_it() -> None:
+    """It starts above 20 only, and once it turns it turns at 15, too."""
+    up = [(level, 15.0) for level in (0.0, 5.0, 10.0, 15.0)]
+    started, then = measured(*up, (100.0, 30.0)), [(40.0, 30.0), (15.0, 30.0), (0.0, 30.0)]
+    turning = measured((100.0, 30.0), *[(max(level, 20.1), seconds) for level, seconds in then[:2]], then[2])
+    commands = np.concatenate([np.full(round(seconds / PERIOD_S), level) for level, seconds in [(100.0, 30.0), *then]])
+    found = find_standstill([started, replace(turning, command=commands[:, np.newaxis])])
+    assert found is not None
+    assert (found.off_command, found.turning_command) == (0.0, 15.0)
 
 
 def test_a_fan_that_never_stopped_shows_what_turns_it_and_nothing_else() -> None:

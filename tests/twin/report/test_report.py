@@ -242,6 +242,12 @@ def test_the_worst_fan_decides_and_is_named(twin):
     assert "A twin of one fan is used for 3: fans differ, and so may their errors." in judged.warnings
 
 
+def test_speeds_of_another_unit_are_recognised(twin):
+    run = published_run(5, 10.0)
+    (first, *_) = assess(content_of(twin, with_speed(run, run.speed_rad_s * 60.0 / (2.0 * np.pi)))).warnings
+    assert re.fullmatch(r"Speeds up to \d,\d{3} rad/s, the twin knows \d{3}: is the recording's unit right\?", first)
+
+
 def test_limitations_of_the_figures_are_reported_as_warnings(twin):
     run = published_run(7, 20.0)
     trained_on = DataCard("healthy.mcap", twin.card.training.data[0].sha256, 1, run.samples)

@@ -1,0 +1,45 @@
+"""How long a fan may take, and a tacho be silent, before that is no longer healthy: limits from the twin's card."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from schemas.messages import Array
+from schemas.standstill import Standstill
+
+MARGIN = 3.0  # times the longest of healthy runs
+MIN_LAPSE_S = 0.5
+MIN_MOVE_S = 1.0  # and the reach of the tacho: the shortest limit of a start or a coast; training shows few of them
+UNKNOWN_START_S = 30.0  # beyond the reach, if no start was seen
+
+
+def lag_s(reach_s: Array) -> Array:
+    """(fans,) after which a reading shows what a command has done."""
+    return MIN_MOVE_S + reach_s
+
+
+def lapse_limit_s(healthy: Standstill) -> float:
+    """For so long the tacho of a fan that turns may read as if it stood."""
+    return max(MIN_LAPSE_S, MARGIN * healthy.lapse_s)
+
+
+def start_limit_s(healthy: Standstill, reach_s: Array) -> Array:
+    """(fans,) for so long a fan may stand after a command that turns it."""
+    known = UNKNOWN_START_S + reach_s
+    if healthy.start_s is not None:
+        known = np.maximum(MARGIN * healthy.start_s, lag_s(reach_s))
+    return np.maximum(known, lapse_limit_s(healthy))
+
+
+def coast_limit_s(healthy: Standstill, reach_s: Array) -> Array:
+    """(fans,) for so long a fan may turn after a command that stops it; infinite if no coast was seen."""
+    return _of_coast(healthy.coast_s, reach_s)
+
+
+def slowing_limit_s(healthy: Standstill, reach_s: Array) -> Array:
+    """(fans,) for so long it may keep its speed then; infinite if the card does not say how soon fans slow down."""
+    return _of_coast(healthy.slowing_s, reach_s)
+
+
+def _of_coast(longest_s: float | None, reach_s: Array) -> Array:
+    return np.inf + reach_s if longest_s is None else np.maximum(MARGIN * longest_s, lag_s(reach_s))
