@@ -36,6 +36,7 @@ def holding_detectors(
                 grows_with_speed=row.source != "tacho",
                 return_share=RETURN_SHARE if judges_rest else 0.0,
                 least_off_delay_ns=round(off_delay_s * NS_PER_S),
+                is_sum=row.detector.is_sum,
                 is_of_standing_fan=knows_standing and row.comes_first,
                 elsewhere_ns=ELSEWHERE_NS if knows_speeds else 0,
                 is_certain=not row.only_at_rest and (detector is not None or not (judges_rest or row.came_later)),

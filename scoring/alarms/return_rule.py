@@ -9,8 +9,8 @@ that errs at another speed by as much as the fault costs hides it there. Elsewhe
 `ELSEWHERE_NS`. A residual of several limits is not hidden by such errors, and returns at any speed. (Residuals are
 clipped at two limits: a low-pass exceeds three only where it smooths many noisy readings.)
 
-What began with a standstill is over with it: such a residual returns at any speed, after the least off-delay. One that
-was there before is another fault.
+What began with a standstill is over with it: such a residual returns at any speed, after the least off-delay, and its
+sum once it is below its limit, for it falls slowly. One that was there before is another fault.
 
 Only samples that could show the fault count. A blade that is touched takes ten per cent of the speed: 200 rpm at
 2,000 rpm, which is beyond a limit of 150, and 70 rpm at 700 rpm, which is not. So the largest ratio over speed that the
@@ -48,6 +48,8 @@ class HoldingDetector:
     """whether it is in use and a fan that turns shows its return; False: it holds no alarm that it did not raise"""
     return_share: float = RETURN_SHARE
     """of the time for which it held the alarm, so long it must have returned; 0 in recordings of former versions"""
+    is_sum: bool = False
+    """whether its statistic is a sum, which falls only as fast as it may"""
     is_of_standing_fan: bool = False
     """whether it shows that the fan stood, or ran on"""
     least_off_delay_ns: int = 0
@@ -159,16 +161,17 @@ class AlarmReturn:
             shows = not detector.grows_with_speed or is_of_standing or hold.shows_at(speed, self._return_ratio)
             knows_speeds = detector.grows_with_speed and detector.elsewhere_ns > 0
             is_near = is_of_standing or is_hidden_nowhere or not knows_speeds or hold.is_near(speed)
+            return_ratio = 1.0 if is_of_standing and detector.is_sum else self._return_ratio
             if ratio > 1.0:
                 hold.exceed(ratio)
-            elif ratio >= self._return_ratio:
+            elif ratio >= return_ratio:
                 hold.rise()
-            elif ratio < self._return_ratio and shows and is_near:
+            elif ratio < return_ratio and shows and is_near:
                 hold.below_ns = 0 if hold.below_ns == NOT_BELOW else hold.below_ns + period_ns
-            elif ratio < self._return_ratio and shows:
+            elif ratio < return_ratio and shows:
                 hold.elsewhere_ns += period_ns
             hold.age_ns += period_ns
-            if ratio >= self._return_ratio:
+            if ratio >= return_ratio:
                 above, hold.held_ns = True, hold.age_ns
             longer_ns = min(round(detector.return_share * hold.held_ns), LONGEST_RETURN_NS)
             own_ns = detector.least_off_delay_ns if is_of_standing else detector.off_delay_ns

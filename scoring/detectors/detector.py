@@ -164,6 +164,8 @@ class Detector(ColumnState):
     """One statistic of a tray's fans. The result does not depend on how samples are cut into blocks."""
 
     settings: ClassVar[type[DetectorSettings]]
+    is_sum: ClassVar[bool] = False
+    """whether its statistic adds up, and falls only as fast as it may"""
 
     @abstractmethod
     def __init__(self, settings: DetectorSettings, context: DetectorContext) -> None: ...

@@ -104,6 +104,7 @@ class Drift(Detector):
     """Two-sided CUSUMs (scoring.detectors.cusum) in multiples of their limits; the larger multiple decides."""
 
     settings = DriftSettings
+    is_sum = True
 
     def __init__(self, settings: DriftSettings, context: DetectorContext) -> None:
         self._settings = settings
