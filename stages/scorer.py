@@ -50,7 +50,10 @@ OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
 ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
 READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_KEPT}"
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
-NOT_CALIBRATED = "the twin is not calibrated: only the speed band raises alarms; see fantwin calibrate"
+NOT_CALIBRATED = (
+    "the twin is not calibrated: only large errors of the speed, missing readings and standstill raise alarms; "
+    "see fantwin calibrate"
+)
 RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 SET_BACK_NS = NS_PER_S  # a snapshot further ahead of the present is of a clock that was set back since
 BACK_IN_TIME_NS = 120 * NS_PER_S  # a restarted producer catches up with less; older samples are of another recording

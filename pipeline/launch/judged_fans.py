@@ -20,7 +20,7 @@ from schemas.messages import FanState, InvalidReason, Score
 from schemas.topics import tray_key
 from scoring.alarms.unscored_monitor import JUDGED_AT_REST, REASONS
 
-RETURNING = "within its limits: it clears once it has stayed there, at about the speeds at which it came"
+RETURNING = "within its limits (the alarm clears once it stays there, for most faults near the speeds of the alarm)"
 JUDGED_WITHIN_S = 5.0
 """a fan is judged now if it had a valid score, or was stopped or starting, this recently"""
 _SAMPLED_S = 0.1  # scores of a tray are looked at this often: a fast line sends hundreds a second

@@ -64,9 +64,10 @@ class DecisionRules(IntEnum):
     """Band and limits are wider where the twin was not trained, and at the end of a drive's plateau. Before, they were
     the same there."""
     RUNNING_ON = 17
-    """A fan that does not slow down under a command that stops it, or turns after it has been at rest, has an alarm
-    within a second or two of its tacho's reach. Before, it had one after three of the longest coasts. The alarm of a
-    fan that stood returns at any speed. Before, it did as others."""
+    """A fan that keeps its speed under a command that stops it has an alarm after three times the longest time in
+    which a healthy fan slows down; one that turns again after it has been at rest, a second after its tacho's reach.
+    Before, both took three times the longest coast. Residuals that exceed their limits with a standstill return at any
+    speed. Before, they returned like others."""
 
 
 CURRENT_RULES = max(DecisionRules)

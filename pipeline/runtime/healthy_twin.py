@@ -41,8 +41,8 @@ class ScorerConfig(StageConfig):
     off_delay_s: float | None = Field(
         default=None,
         ge=0,
-        description="how long a return must last at least to clear, and as long as samples affect a statistic; "
-        "default: 1 s, of a tacho that counts ten counts",
+        description="shortest return that clears an alarm; it is longer for statistics with a longer memory; "
+        "default: 1 s, or ten counts of a counting tacho",
     )
     deadband: float = Field(default=0.5, ge=0, lt=1, description="a return begins below 1 - deadband times the limit")
     alarm_ratio: float = Field(default=1.5, ge=1, description="score from which a warning is an alarm")

@@ -23,7 +23,7 @@ def holding_detectors(
     off_delay_s: the least for all. judges_rest: False only to decide as for recordings made before fans at rest were
     judged and the time of a return grew with that of its alarm. knows_speeds: False only to decide as for recordings
     made when an alarm returned at any speed as soon as at those at which it came; knows_standing: False for those made
-    when it did not even if the fan had stood.
+    when a standstill changed nothing of the return of residuals.
     """
     made = []
     for row in rows():

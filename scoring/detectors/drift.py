@@ -73,10 +73,10 @@ class DriftSettings(SingleLimit):
     def cautious(self, evidence: HealthyEvidence) -> DriftSettings:
         """With too few data the reference value is larger by what is not known, or a shift has to last longer.
 
-        Of a tacho that counts the reference value is 70 % of the error of a count or of the largest mean over ten, and
-        above the offsets between runs. For how long the twin errs in one direction these cannot know, so a shift has to
-        last. A large one need not last as long. With half of them instead of 70 %, twins that err by 20 rpm at some
-        speeds raise alarms.
+        With a counting tacho the reference value is 70 % of the larger of the error of a count and the 99.9 % quantile
+        of means over ten counts, and at least the standard deviation of the offsets between runs. They do not show for
+        how long the twin errs in one direction, so a shift has to last. A large shift need not last as long. With 50 %
+        instead of 70 %, twins that err by 20 rpm at some speeds raise alarms.
         """
         if not evidence.count_std:
             return self.model_copy(update={"reference_sigmas": self.reference_sigmas * evidence.unknown_factor})

@@ -1,4 +1,4 @@
-"""How long a fan may take, and a tacho be silent, before that is no longer healthy: limits from the twin's card."""
+"""How long starts, coasts and lapses of a healthy fan may take, in s: limits from the twin's card."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ UNKNOWN_START_S = 30.0  # beyond the reach, if no start was seen
 
 
 def lag_s(reach_s: Array) -> Array:
-    """(fans,) after which a reading shows what a command has done."""
+    """(fans,) s, the longest time until readings show what a command has done."""
     return MIN_MOVE_S + reach_s
 
 
 def lapse_limit_s(healthy: Standstill) -> float:
-    """For so long the tacho of a fan that turns may read as if it stood."""
+    """Longest time, s, for which the tacho of a fan that turns may read as if it stood."""
     return max(MIN_LAPSE_S, MARGIN * healthy.lapse_s)
 
 
 def start_limit_s(healthy: Standstill, reach_s: Array) -> Array:
-    """(fans,) for so long a fan may stand after a command that turns it."""
+    """(fans,) longest time, s, for which a fan may stand after a command that turns it."""
     known = UNKNOWN_START_S + reach_s
     if healthy.start_s is not None:
         known = np.maximum(MARGIN * healthy.start_s, lag_s(reach_s))
@@ -32,12 +32,12 @@ def start_limit_s(healthy: Standstill, reach_s: Array) -> Array:
 
 
 def coast_limit_s(healthy: Standstill, reach_s: Array) -> Array:
-    """(fans,) for so long a fan may turn after a command that stops it; infinite if no coast was seen."""
+    """(fans,) longest time, s, for which a fan may turn after a command that stops it; infinite if unknown."""
     return _of_coast(healthy.coast_s, reach_s)
 
 
 def slowing_limit_s(healthy: Standstill, reach_s: Array) -> Array:
-    """(fans,) for so long it may keep its speed then; infinite if the card does not say how soon fans slow down."""
+    """(fans,) longest time, s, for which it may keep its speed then; infinite if the card does not say it."""
     return _of_coast(healthy.slowing_s, reach_s)
 
 

@@ -3,8 +3,8 @@
 A healthy fan coasts, and then stands. What coasts look like is in the twin's card (schemas.standstill). A fan runs on
 
 - if it turns for three times the longest coast;
-- if it keeps its speed: its reading is above 70 % of the highest one soon after the command, for three times as long as
-  that ever took;
+- if it keeps its speed: its reading stays above 70 % of the highest one soon after the command, for three times the
+  longest time in which a coasting fan lost 30 %;
 - if it turns after it has been at rest.
 
 Readings lag, so what is seen within the reach of the tacho and a second is not judged.
@@ -28,7 +28,7 @@ from scoring.detectors.healthy_times import coast_limit_s, lag_s, slowing_limit_
 
 CERTAIN = 2.0  # ratios above 1 are multiplied by it: a fan that does not do as commanded is an alarm, not a warning
 OFF_DELAY_S = 2.0
-PEAK_STEPS = 64.0  # of a rad/s: with the next, sums that do not depend on how samples are cut into blocks
+PEAK_STEPS = 64.0  # in a rad/s: peaks are rounded, so that sums with the next are exact, however blocks are cut
 BEYOND_SPEEDS_RAD_S = 2.0**20
 
 

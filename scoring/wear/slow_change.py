@@ -2,8 +2,8 @@
 
 The change of a fan is that of its trend line over the time observed (scoring.wear.trend). The weather, the supply and
 the room act on all fans of a tray, so the median change of those that were first measured with it is subtracted. A
-change is noticed where what is left is large, and beyond twice its 95 % interval: it is asked of every fan again with
-every point, and a healthy one should never be named.
+change is noticed where it and this difference are at least `MIN_CHANGE` and at least twice the half-width of the 95 %
+interval. The limit is wide because every fan is tested again with every point, and a healthy fan must not be named.
 """
 
 from __future__ import annotations

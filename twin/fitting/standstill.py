@@ -102,7 +102,7 @@ def _series(run: Run) -> Iterator[_FanSeries]:
 
 
 def _turning_command(series: Sequence[_FanSeries], standing_below: float, off: float | None) -> float | None:
-    """The lowest command above the highest that stops fans which turns them."""
+    """The lowest command that turns the fans; above `off`, the highest that stops them."""
     above = -np.inf if off is None else off
     found = [_turning_commands(one, standing_below, above) for one in series]
     return min((float(commands.min()) for commands in found if len(commands)), default=None)

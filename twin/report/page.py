@@ -33,8 +33,6 @@ PARAMETER_MEANING = {
 }
 AT_REST_SHARE = 0.01
 """of the top speed: a lower one is at rest"""
-AT_REST_SHARE = 0.01
-"""of the top speed: a lower one is at rest"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +157,10 @@ def _record_next(content: Content, fan: FanContent, known: ModelUncertainty, cur
         return "Record where it may be most wrong, and train again to rely on it."
     least = least_known(known, curve, fan.drive)
     if least is None:
-        return "Within these commands nothing is much less known than the rest: more such data narrow it little."
+        return (
+            "At these commands the twin is nowhere much less certain than where it was trained: "
+            "more such data hardly reduce its error."
+        )
     each, name = content.unit.rad_s, content.unit.name
     unit = f" {content.card.command_unit}" if content.card.command_unit else ""
     speed, std, seen = (

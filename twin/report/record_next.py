@@ -10,8 +10,8 @@ from schemas.model_uncertainty import ModelUncertainty
 from schemas.twin_card import DriveCard
 from twin.report.steady_states import StaticCurve
 
-WORTH = 1.5
-"""times what training has seen: a smaller standard deviation is hardly narrowed by more of the same data"""
+LEAST_RATIO = 1.5
+"""to the standard deviation where the twin was trained: more data of the same kind hardly reduce a smaller one"""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class LeastKnown:
 
 
 def least_known(known: ModelUncertainty, curve: StaticCurve, drive: DriveCard | None) -> LeastKnown | None:
-    """Where a held command, or else a step from one settled speed to another, would tell most.
+    """The held command, or else the step from one settled speed, at which the twin may be most wrong.
 
     curve: of the fan, over the commands that are possible. drive: of that fan. None: nothing within these commands is
     much less known than what training has seen, or the card does not say what that is.
@@ -37,7 +37,7 @@ def least_known(known: ModelUncertainty, curve: StaticCurve, drive: DriveCard | 
     raised = drive.raised(commands[:, np.newaxis])[:, 0] if drive else commands
     of_steps = known.std_at(*np.meshgrid(speeds_rad_s, raised, indexing="ij"))
     of_holds = np.diag(of_steps)
-    least = WORTH * known.seen_std_rad_s
+    least = LEAST_RATIO * known.seen_std_rad_s
     if of_holds.max() >= least:
         at = int(of_holds.argmax())
         return LeastKnown(float(speeds_rad_s[at]), float(commands[at]), float(of_holds[at]), held=True)

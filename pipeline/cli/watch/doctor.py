@@ -46,7 +46,7 @@ def doctor(
 ) -> None:
     """Check the installation, and a configuration if one is given.
 
-    It listens to the line of each tray and names what does not fit: rate, commands, speeds, fans, unit.
+    It listens to the line of each tray and names what does not fit: rate, commands, speeds, fans, unit, tachos.
 
     Exit code 1 if there is a problem to fix.
 
