@@ -78,9 +78,9 @@ class RackData:
         return fault_schedule(self.test_racks())
 
     def make(self, learning: Sequence[str], progress: Callable[[str], None]) -> None:
-        """Write the recordings that are not there yet."""
+        """Write the recordings that are not there yet, with those that choose among the weights of a twin."""
         self._write(SWEEP, racks(self.count, SHORT_S, self.seed + SEEDS[SWEEP]), None, progress)
-        for name in learning:
+        for name in dict.fromkeys(("15 minutes", *learning)):
             run, seconds, count = LEARNING[name]
             for number in range(count):
                 of = racks(self.count, seconds, self.seed + SEEDS[run] + number)

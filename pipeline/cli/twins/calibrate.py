@@ -71,7 +71,7 @@ def calibrate(
 
     Every recording is scored like a live fan, with commissioning at its start. Limits are set so that false alarms are
     as frequent as declared. If the data cannot support the rate, the command refuses and says how much is needed.
-    Without calibration only the speed band raises alarms.
+    Without calibration only large errors of the speed, missing readings and standstill raise alarms.
 
     Exit codes: 0 success; 1 error; 3 --verify found more false alarms than declared; 130 Ctrl-C.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from pipeline.recordings.length import longest_s
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
-from schemas.units import SpeedUnit
+from schemas.units import NS_PER_S, SpeedUnit
 from scoring.baseline.shared_offset import LEAST_FANS
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.limits import Timing, default_timing
@@ -22,6 +23,8 @@ from scoring.samples import Samples, samples_of
 MAX_KEPT_SAMPLES = 10_000_000
 """of fans, about 80 bytes each: so many are kept between passes; with more, recordings are read again"""
 
+REPORTED_EVERY_S = 5.0
+"""of the time that the work takes"""
 CLOCK_MARGIN = 1.01
 """by which the clock of a device may be faster than that of the host"""
 
@@ -70,20 +73,31 @@ class HealthyRuns:
         """
         self._pass += 1
         if self._kept is not None:
-            yield from self._kept
+            for run in self._kept:
+                yield run._replace(blocks=self._reported(run.name, run.blocks))
             return
         self.trays = []
         kept = _KeptRuns()
         for path in self._paths:
-            self._progress(f"pass {self._pass}: {path}")
             try:
                 for tray, blocks in self._of(path):
                     self.trays.append(tray)
                     known_as = range(tray.fans) if self._knows_fans else None
-                    yield kept.recording(HealthyRun(str(path), tray.fans, blocks, known_as, self._tachos))
+                    run = kept.recording(HealthyRun(str(path), tray.fans, blocks, known_as, self._tachos))
+                    yield run._replace(blocks=self._reported(str(path), run.blocks))
             except CodecError as error:
                 raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
         self._kept = kept.complete
+
+    def _reported(self, name: str, blocks: Iterable[Samples]) -> Iterator[Samples]:
+        where, scored_s, shown_s = f"pass {self._pass}: {name}", 0.0, time.monotonic()
+        self._progress(where)
+        for block in blocks:
+            yield block
+            scored_s += len(block.t_ns) * block.period_ns / NS_PER_S
+            if time.monotonic() - shown_s > REPORTED_EVERY_S:
+                shown_s = time.monotonic()
+                self._progress(f"{where}, {scored_s / 3600.0:.1f} h")
 
     def timing(self) -> Timing:
         """The times of the scorer in the configuration of the recordings, with the overrides applied.
