@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from schemas.units import NS_PER_S
-from scoring.alarms.return_rule import ELSEWHERE_NS, RETURN_SHARE, HoldingDetector
+from scoring.alarms.return_rule import ELSEWHERE_NS, RETURN_SHARE, TOGETHER_NS, HoldingDetector
 from scoring.detectors.detector import Detector
 from scoring.detectors.table import rows
 
@@ -37,9 +37,14 @@ def holding_detectors(
                 return_share=RETURN_SHARE if judges_rest else 0.0,
                 least_off_delay_ns=round(off_delay_s * NS_PER_S),
                 is_sum=row.detector.is_sum,
-                is_of_standing_fan=knows_standing and row.comes_first,
+                standing_ns=_standing_ns(detector) if knows_standing and row.comes_first else 0,
                 elsewhere_ns=ELSEWHERE_NS if knows_speeds else 0,
                 is_certain=not row.only_at_rest and (detector is not None or not (judges_rest or row.came_later)),
             )
         )
     return tuple(made)
+
+
+def _standing_ns(detector: Detector | None) -> int:
+    """A stall within a start is seen after the longest start, its residual before."""
+    return TOGETHER_NS + round((detector.memory_s if detector else 0.0) * NS_PER_S)

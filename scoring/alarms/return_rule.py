@@ -30,7 +30,7 @@ from schemas.units import NS_PER_S
 NOT_BELOW = -1
 RETURN_SHARE, LONGEST_RETURN_NS = 0.1, 60 * NS_PER_S  # of the time that a detector has held an alarm; and at most
 ELSEWHERE_NS = 600 * NS_PER_S
-TOGETHER_NS = 10 * NS_PER_S  # so long before a standstill is seen its residual may have begun
+TOGETHER_NS = 10 * NS_PER_S  # so long before or after a standstill is seen its residual may begin
 HIDDEN_RATIO = 3.0  # to its limit; no healthy twin errs by so much
 NEAR_SPEED_RATIO = 1.15  # to the highest speed at which it exceeded, and of the lowest to it
 LARGEST = 1e300  # ratio over speed of a fault that shows at any speed
@@ -50,8 +50,8 @@ class HoldingDetector:
     """of the time for which it held the alarm, so long it must have returned; 0 in recordings of former versions"""
     is_sum: bool = False
     """whether its statistic is a sum, which falls only as fast as it may"""
-    is_of_standing_fan: bool = False
-    """whether it shows that the fan stood, or ran on"""
+    standing_ns: int = 0
+    """so long before this detector sees a standstill its residuals may have begun; 0: it sees none"""
     least_off_delay_ns: int = 0
     """of all detectors"""
     elsewhere_ns: int = ELSEWHERE_NS
@@ -146,10 +146,7 @@ class AlarmReturn:
             if each.grows_with_speed and each.name in self._holds
         ]
         is_hidden_nowhere = max(sizes, default=0.0) >= HIDDEN_RATIO
-        stood = [
-            self._holds[each.name] for each in self._detectors if each.is_of_standing_fan and each.name in self._holds
-        ]
-        since_standing_ns = max((hold.age_ns + TOGETHER_NS for hold in stood), default=NOT_BELOW)
+        standings_ns = self._standings_ns()
         for detector, ratio in zip(self._detectors, sample.ratios, strict=True):
             hold = self._holds.get(detector.name)
             if hold is None:
@@ -157,7 +154,8 @@ class AlarmReturn:
                     continue
                 hold = self._holds[detector.name] = _Hold()
             hold.follow(speed, period_ns, detector.off_delay_ns)
-            is_of_standing = detector.grows_with_speed and hold.age_ns <= since_standing_ns
+            began_in_one = any(youngest <= hold.age_ns <= oldest for youngest, oldest in standings_ns)
+            is_of_standing = detector.grows_with_speed and began_in_one
             shows = not detector.grows_with_speed or is_of_standing or hold.shows_at(speed, self._return_ratio)
             knows_speeds = detector.grows_with_speed and detector.elsewhere_ns > 0
             is_near = is_of_standing or is_hidden_nowhere or not knows_speeds or hold.is_near(speed)
@@ -181,6 +179,17 @@ class AlarmReturn:
                 hold.elsewhere_ns > 0 and elsewhere_ns >= max(detector.elsewhere_ns, least_ns)
             )
         return not above, over
+
+    def _standings_ns(self) -> list[tuple[int, int]]:
+        """Of each standstill that was seen: the ages of residuals that began with it, the youngest and the oldest."""
+        seen = [
+            (each, self._holds[each.name]) for each in self._detectors if each.standing_ns and each.name in self._holds
+        ]
+        return [
+            (hold.age_ns - hold.held_ns - TOGETHER_NS, hold.age_ns + each.standing_ns)
+            for each, hold in seen
+            if hold.largest > 0.0  # not of a snapshot that does not tell
+        ]
 
     def begin_delays_again(self) -> None:
         """After a gap the off-delays start again."""

@@ -30,6 +30,7 @@ CERTAIN = 2.0  # ratios above 1 are multiplied by it: a fan that does not do as 
 OFF_DELAY_S = 2.0
 PEAK_STEPS = 64.0  # in a rad/s: peaks are rounded, so that sums with the next are exact, however blocks are cut
 BEYOND_SPEEDS_RAD_S = 2.0**20
+LONG_AGO_NS = 1 << 60  # when a stop was that nobody has seen: the speed that it began with is not known
 
 
 class RunningOnSettings(DetectorSettings):
@@ -64,9 +65,10 @@ class RunningOn(Detector):
         self._lag_s = settings.factor * lag_s(reach_s)
         self._coast_limit_s = settings.factor * coast_limit_s(healthy, reach_s)
         self._slowing_limit_s = np.minimum(settings.factor * slowing_limit_s(healthy, reach_s), self._coast_limit_s)
-        self._memory_s = settings.factor * start_limit_s(healthy, reach_s) if settings.by_coast_only else self._lag_s
+        self._memory_s = settings.factor * float(np.max(start_limit_s(healthy, reach_s))) * settings.by_coast_only
         self._lasted_ns = np.zeros((4, context.fans), np.int64)
         """for how long the fan has turned although it is stopped, has been stopped, at rest, and at rest for the lag"""
+        self._lasted_ns[1] = LONG_AGO_NS
         self._peak_rad_s = np.zeros(context.fans)
         """highest reading within the lag since the command stopped it; 0 if there is none"""
 
@@ -106,12 +108,13 @@ class RunningOn(Detector):
     def reset(self, fans: Array) -> None:
         """See Detector."""
         self._lasted_ns[:, fans] = 0
+        self._lasted_ns[1, fans] = LONG_AGO_NS
         self._peak_rad_s[fans] = 0.0
 
     @property
     def memory_s(self) -> float:
-        """After a longer gap the fan may have been started and stopped again."""
-        return float(np.max(self._memory_s))
+        """In a gap the fan may have been started and stopped again."""
+        return self._memory_s
 
     @property
     def off_delay_s(self) -> float:

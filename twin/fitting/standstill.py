@@ -65,14 +65,16 @@ def find_standstill(runs: Sequence[Run]) -> Standstill | None:
     if top <= 0.0:
         return None
     at_rest_below = LOWEST_SHARE_OF_TOP * top
-    off = max((command for one in series for command in _stopping_commands(one, at_rest_below)), default=None)
-    turning = _turning_command(series, at_rest_below, off)
+    rests = [rest for one in series for rest in _rests(one, at_rest_below)]
+    off = max((rest.stopping for rest in rests if rest.stopping is not None), default=None)
+    stood = max((rest.stood for rest in rests if rest.stood is not None), default=-np.inf)
+    turning = _turning_command(series, at_rest_below, stood)
     if turning is None:
         return None
     steady = [_steady_speeds(one, turning, at_rest_below) for one in series]
     lowest = float(np.quantile(np.concatenate(steady), LOWEST_QUANTILE)) if any(map(len, steady)) else 0.0
     standing_below = max(at_rest_below, STANDING_SHARE * lowest)
-    turning = _turning_command(series, standing_below, off)
+    turning = _turning_command(series, standing_below, stood)
     if turning is None:
         return None
     found = Standstill(turning_command=turning, standing_below_rad_s=standing_below, off_command=off)
@@ -101,31 +103,55 @@ def _series(run: Run) -> Iterator[_FanSeries]:
             yield _FanSeries(period_s, command, speed, tacho.reach_s, tacho.mean_delay_s)
 
 
-def _turning_command(series: Sequence[_FanSeries], standing_below: float, off: float | None) -> float | None:
-    """The lowest command that turns the fans; above `off`, the highest that stops them."""
-    above = -np.inf if off is None else off
+def _turning_command(series: Sequence[_FanSeries], standing_below: float, above: float) -> float | None:
+    """The lowest command that turns the fans, above one under which a fan stood."""
     found = [_turning_commands(one, standing_below, above) for one in series]
     return min((float(commands.min()) for commands in found if len(commands)), default=None)
 
 
-def _stopping_commands(one: _FanSeries, at_rest_below: float) -> Iterator[float]:
-    """The highest command of each rest: of those not above the command under which the fan came to rest.
+@dataclass(frozen=True)
+class _Rest:
+    """Of a fan at rest, None if it did not last. stood: the highest command under which it stood. stopping: the highest
+    that stops a fan: not above the command under which this one came to rest."""
 
-    A fan that still slows down is not at rest: it may come to turn steadily.
-    """
-    lowest, least = one.lowest_command(STOOD_S), round((AT_REST_S + one.reach_s) / one.period_s)
+    stood: float | None
+    stopping: float | None
+
+
+def _rests(one: _FanSeries, at_rest_below: float) -> Iterator[_Rest]:
+    """A fan that still slows down is not at rest: it may come to turn steadily. A few readings end no rest."""
+    lowest = one.lowest_command(STOOD_S)
+    least, reach = (round(seconds / one.period_s) for seconds in (AT_REST_S + one.reach_s, one.reach_s))
     increases = np.flatnonzero(np.diff(one.command, prepend=one.command[:1]) > 0.0)
-    for first, last in _stretches(one.speed_rad_s < at_rest_below):
+    for first, last in _stretches(_without_lapses(_last_known(one.speed_rad_s) < at_rest_below, least)):
         end = last
-        above = np.flatnonzero(one.command[first:last] > one.command[first : first + least + 1].max())
-        if len(above):
-            end = first + int(above[0])
-        elif last < len(one.command):  # it starts: from the last increase on
+        if last < len(one.command):  # it starts: from the last increase on
             before = increases[np.searchsorted(increases, last, side="right") - 1] if len(increases) else 0
             end = int(before) if first < before <= last else first
-        stood = lowest[first + least : end]
-        if np.isfinite(stood).any():
-            yield float(np.nanmax(stood))
+        # Of a fan that is at rest when a recording begins, it is not known what stopped it.
+        came_under = one.command[max(first - reach, 0) : first + 1].max() if first else 0.0
+        above = np.flatnonzero(one.command[first:end] > came_under)
+        to = first + int(above[0]) if len(above) else end
+        yield _Rest(_highest(lowest[first + least : end]), _highest(lowest[first + least : to]))
+
+
+def _highest(commands: Array) -> float | None:
+    return float(np.nanmax(commands)) if np.isfinite(commands).any() else None
+
+
+def _last_known(speed_rad_s: Array) -> Array:
+    """The readings, with the last one in place of those that are missing; NaN before the first."""
+    rows = np.maximum.accumulate(np.where(np.isfinite(speed_rad_s), np.arange(len(speed_rad_s)), -1))
+    return np.where(rows >= 0, speed_rad_s[np.maximum(rows, 0)], np.nan)
+
+
+def _without_lapses(flags: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
+    """The flags, true also in gaps of fewer rows than the longest between true ones."""
+    filled = flags.copy()
+    for first, last in _stretches(~flags):
+        if first and last < len(flags) and last - first < longest:
+            filled[first:last] = True
+    return filled
 
 
 def _turning_commands(one: _FanSeries, standing_below: float, above: float) -> Array:

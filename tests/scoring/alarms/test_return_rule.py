@@ -101,7 +101,7 @@ def test_a_fault_of_several_limits_has_gone_at_any_speed_at_which_it_would_be_se
 
 
 def test_what_began_with_a_standstill_is_over_with_it_and_what_was_there_before_is_not() -> None:
-    standing = replace(SETTINGS.detectors[2], off_delay_ns=30, is_of_standing_fan=True)
+    standing = replace(SETTINGS.detectors[2], off_delay_ns=30, standing_ns=TOGETHER_NS)
     of_standing = replace(SETTINGS, detectors=(*SETTINGS.detectors[:2], standing))
     for has_stood in (False, True):
         fan = Fan(of_standing)
@@ -115,6 +115,29 @@ def test_what_began_with_a_standstill_is_over_with_it_and_what_was_there_before_
     fan.conditions.update(*one_long_sample((UP, LOW, LOW), before * STEP_NS))
     fan.play([(UP, LOW, UP)])
     assert fan.play([CALM] * 40, speed=SLOW) == []
+
+
+def test_a_residual_that_begins_long_after_a_standstill_is_another_fault() -> None:
+    """A fan that ran on, whose alarm stays while it is driven; an hour later something brakes it."""
+    running_on = replace(SETTINGS.detectors[2], off_delay_ns=30, standing_ns=TOGETHER_NS)
+    fan = Fan(replace(SETTINGS, detectors=(*SETTINGS.detectors[:2], running_on)))
+    fan.play([(LOW, LOW, UP)])
+    fan.conditions.update(*one_long_sample((LOW, LOW, NONE), 2 * TOGETHER_NS))
+    fan.play([(LOW, UP, NONE)] * 3)
+    assert fan.play([CALM] * 90, speed=SLOW) == []
+
+
+def test_an_alarm_of_a_snapshot_that_does_not_tell_is_none_of_a_standstill() -> None:
+    running_on = replace(SETTINGS.detectors[2], off_delay_ns=30, standing_ns=TOGETHER_NS)
+    drift = replace(SETTINGS.detectors[1], is_sum=True)
+    former = Fan()
+    former.play([(UP, LOW, LOW)])
+    stored = former.conditions.snapshot()
+    for fan in stored["fans"]:
+        fan.pop("holds")
+    fan = Fan(replace(SETTINGS, detectors=(SETTINGS.detectors[0], drift, running_on)))
+    fan.conditions.restore(stored)
+    assert fan.play([(LOW, MID, LOW)] * 20) == []
 
 
 def one_long_sample(ratios: Sample, period_ns: int) -> tuple[Any, ...]:

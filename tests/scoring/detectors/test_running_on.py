@@ -27,8 +27,13 @@ def detector(tacho: Tacho = INSTANTANEOUS[0], *, by_coast_only: bool = False) ->
     return RunningOn(RunningOnSettings(healthy=HEALTHY, by_coast_only=by_coast_only), context(tacho))
 
 
+def stopped(of: RunningOn, speed_rad_s: Array) -> Array:
+    """(n,) for readings (n,) since a stop."""
+    return ratios(of, np.concatenate((speed_rad_s[:1], speed_rad_s)), np.r_[50.0, np.zeros(len(speed_rad_s))])[1:]
+
+
 def ratios(of: RunningOn, speed_rad_s: Array, command: Array | float = 0.0) -> Array:
-    """(n,) for readings (n,) at 10 Hz."""
+    """(n,) for readings (n,) at 10 Hz; the fan is stopped, and nobody has seen when."""
     speed = speed_rad_s[:, np.newaxis]
     nothing = np.zeros(speed.shape, bool)
     block = DetectorInput(
@@ -55,28 +60,35 @@ def exceeded_s(ratio: Array) -> float:
 def test_a_fan_that_keeps_its_speed_has_three_times_what_healthy_ones_need_and_the_lag_at_least(
     tacho: Tacho, after_s: float
 ) -> None:
-    assert exceeded_s(ratios(detector(tacho), np.full(100, 200.0))) == pytest.approx(after_s, abs=0.11)
+    assert exceeded_s(stopped(detector(tacho), np.full(100, 200.0))) == pytest.approx(after_s, abs=0.11)
 
 
 def test_one_that_has_slowed_down_has_three_coasts() -> None:
     speed = np.concatenate((np.full(8, 200.0), np.full(200, 130.0)))
-    assert exceeded_s(ratios(detector(), speed)) == pytest.approx(12.0, abs=0.11)
+    assert exceeded_s(stopped(detector(), speed)) == pytest.approx(12.0, abs=0.11)
 
 
 def test_a_second_stop_is_measured_by_its_own_speed() -> None:
     of = detector()
-    first = ratios(of, np.concatenate((200.0 * np.exp(-np.arange(40) / 10.0), np.zeros(40))))
+    first = stopped(of, np.concatenate((200.0 * np.exp(-np.arange(40) / 10.0), np.zeros(40))))
     turning = ratios(of, np.full(50, 100.0), command=50.0)
     assert max(first.max(), turning.max()) < 1.0
-    second = ratios(of, 100.0 * np.exp(-np.arange(40) / 10.0))
-    assert second.max() < 1.0, "it has not run on since the first"
-    assert exceeded_s(ratios(detector(), np.full(40, 100.0))) < 2.0
+    assert exceeded_s(stopped(of, np.full(40, 100.0))) < 2.0, "100 rad/s are all of its speed"
 
 
 def test_readings_that_are_missing_are_no_rest() -> None:
     coast = 200.0 * np.exp(-np.arange(60) / 15.0)
     coast[10:25] = np.nan
-    assert ratios(detector(), coast).max() < 1.0
+    assert stopped(detector(), coast).max() < 1.0
+
+
+def test_the_speed_that_a_stop_began_with_is_not_known_after_a_gap() -> None:
+    of = detector()
+    assert stopped(of, 200.0 * np.exp(-np.arange(20) / 15.0)).max() < 1.0
+    of.reset(np.array([True]))
+    assert of.memory_s == 0.0
+    slow = 50.0 * np.exp(-np.arange(30) / 60.0)
+    assert ratios(of, slow).max() < 1.0, "a slow fan takes longer to lose 30 %"
 
 
 def test_after_a_rest_it_may_not_turn_for_longer_than_the_lag() -> None:
@@ -105,7 +117,7 @@ def test_a_snapshot_of_a_former_version_does_not_tell_when_the_fan_was_stopped()
     assert ratios(of, 200.0 * np.exp(-np.arange(30) / 15.0)).max() < 1.0
     continued, whole = detector(), detector()
     speed = np.full(40, 200.0)
-    first = ratios(whole, speed[:7])
+    first = stopped(whole, speed[:7])
     continued.restore(whole.snapshot())
     again = ratios(continued, speed[7:])
-    np.testing.assert_array_equal(np.concatenate((first, again)), ratios(detector(), speed))
+    np.testing.assert_array_equal(np.concatenate((first, again)), stopped(detector(), speed))

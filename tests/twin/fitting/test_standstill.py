@@ -82,7 +82,29 @@ def test_a_fan_that_stood_under_a_rising_command_does_not_stop_under_it() -> Non
     commands = np.concatenate([np.full(round(seconds / PERIOD_S), level) for level, seconds in [(100.0, 30.0), *then]])
     found = find_standstill([started, replace(turning, command=commands[:, np.newaxis])])
     assert found is not None
-    assert (found.off_command, found.turning_command) == (0.0, 15.0)
+    assert (found.off_command, found.turning_command) == (0.0, 40.0), "under 15 it may stand or turn"
+    assert found.start_s is not None
+    assert found.start_s < 5.0
+
+
+@pytest.mark.parametrize("disturbed", ["", "missing", "glitch", "gap", "quick"])
+def test_a_command_that_only_a_standing_fan_has_seen_does_not_stop_it(disturbed: str) -> None:
+    """It is at rest under 15 for half a minute, and turns under 15 later."""
+    rest = [(0.0, 5.0 if disturbed == "quick" else 30.0), (15.0, 30.0), (40.0, 30.0), (100.0, 30.0)]
+    standing = measured(*rest) if not disturbed else measured((100.0, 30.0), *rest)
+    turning = measured((100.0, 30.0), (20.1, 60.0))
+    turning = replace(turning, command=np.where(turning.command == 20.1, 15.0, turning.command))
+    speed, t_s = standing.speed_rad_s.copy(), standing.t_s.copy()
+    row = round(75.0 / PERIOD_S)
+    if disturbed == "missing":
+        speed[row] = np.nan
+    if disturbed == "glitch":
+        speed[row] = 90.0
+    if disturbed == "gap":
+        t_s[row:] += 5.0
+    found = find_standstill([replace(standing, speed_rad_s=speed, t_s=t_s), turning])
+    assert found is not None
+    assert (found.off_command or 0.0) == 0.0
 
 
 def test_a_fan_that_never_stopped_shows_what_turns_it_and_nothing_else() -> None:
