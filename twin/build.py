@@ -10,11 +10,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from schemas.model_uncertainty import ModelUncertainty
 from schemas.standstill import Standstill
 from schemas.tacho import INSTANTANEOUS
 from schemas.twin_card import (
     BalanceCard,
     DataCard,
+    DriveCard,
     Four,
     HealthyCard,
     TrainingCard,
@@ -154,7 +156,13 @@ def train_twin(
         raise TwinError(
             f"the {kind} model of {name!r} diverges when run freely; record more levels, or try another kind"
         )
-    validation = evaluate_model(model, parameters, sigma_rad_s, judged)
+    uncertainty = None
+    if isinstance(model, NetworkOde) and model.has_physics and np.any(model.theta):
+        commanded = drive.raised(runs) if drive else runs
+        of_physics = parameters[:, : len(PARAMETER_NAMES)]
+        uncertainty = model_uncertainty(model, of_physics, commanded, acting, identification)
+    unseen_std = _unseen_std(uncertainty, drive.card if drive else None)
+    validation = evaluate_model(model, parameters, sigma_rad_s, judged, unseen_std)
     progress("torque balance", 0, 0, np.nan)
     if drive is None:
         balance = fit_balance(runs, validation_runs, identification)
@@ -199,17 +207,7 @@ def train_twin(
         standstill=standstill,
         drive=drive.card if drive else None,
         reading_sigma_rad_s=_reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces),
-        model_uncertainty=(
-            model_uncertainty(
-                model,
-                parameters[:, : len(PARAMETER_NAMES)],
-                drive.raised(runs) if drive else runs,
-                acting,
-                identification,
-            )
-            if isinstance(model, NetworkOde) and model.has_physics and np.any(model.theta)
-            else None
-        ),
+        model_uncertainty=uncertainty,
     )
     return TrainedTwin(model, parameters, card, identification, validation)
 
@@ -228,11 +226,11 @@ def evaluate(
     rows = fan_rows(loaded.card, common_fans(runs), fan_numbers)
     runs = measured_as_in_card(loaded.card, rows, runs)
     sigma_rad_s = np.array(loaded.card.sigma_rad_s)[rows]
-    return evaluate_model(model, loaded.parameters[rows], sigma_rad_s, runs, _unseen_std(loaded.card, rows))
+    unseen_std = _unseen_std(loaded.card.model_uncertainty, drive_of_fans(loaded.card, rows))
+    return evaluate_model(model, loaded.parameters[rows], sigma_rad_s, runs, unseen_std)
 
 
-def _unseen_std(card: TwinCard, rows: Sequence[int]) -> UnseenStd | None:
-    table, drive = card.model_uncertainty, drive_of_fans(card, rows)
+def _unseen_std(table: ModelUncertainty | None, drive: DriveCard | None) -> UnseenStd | None:
     if table is None:
         return None
     return lambda speed_rad_s, command: table.unseen_std_at(speed_rad_s, drive.raised(command) if drive else command)

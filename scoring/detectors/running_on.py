@@ -138,5 +138,5 @@ class RunningOn(Detector):
 
     @classmethod
     def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
-        """Not used: alarm texts are those of the first row of their statistic, that of StandstillDetector."""
-        raise NotImplementedError
+        """See Detector. What it does against which command is the evidence of the first cause."""
+        return (alarm.causes[0].evidence if alarm.causes else "") or "does not turn or stop as commanded"

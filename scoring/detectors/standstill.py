@@ -111,5 +111,5 @@ class StandstillDetector(Detector):
 
     @classmethod
     def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:
-        """See Detector. What it does against which command is the evidence of the first cause."""
-        return (alarm.causes[0].evidence if alarm.causes else "") or "does not turn or stop as commanded"
+        """See Detector."""
+        return RunningOn.text(alarm, source, units)

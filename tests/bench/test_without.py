@@ -19,6 +19,7 @@ from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, limits_in_f
 from schemas.messages import Alarm, Array, InvalidReason, Prediction, Score
 from schemas.standstill import Standstill
 from schemas.tacho import Tacho
+from schemas.twin_card import DriveCard
 from scoring.calibration.calibration import calibrate
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.detectors.detector import Signal
@@ -26,6 +27,7 @@ from scoring.diagnosis.diagnoser import Diagnoser
 from scoring.fan_scorer import RESIDUALS, FanScorer
 from scoring.limits import Limits, Timing
 from scoring.samples import samples_of
+from scoring.unseen_error import UnseenError
 from stages.scorer import ScorerCore
 from tests.support.healthy_residuals import autoregressive
 from tests.support.scored_blocks import balance_of_a_fan
@@ -126,12 +128,13 @@ def faulty() -> Prediction:
     return replace(made, valid=made.invalid_reason == InvalidReason.NONE)
 
 
-def judged(limits: Limits) -> Hashable:
+def judged(limits: Limits, unseen_error: UnseenError | None = None) -> Hashable:
     """All that a scorer says about the faulty run."""
     config = ScorerConfig(off_delay_s=1.0, deadband=0.25)
     every = limits_in_force(config, limits.model_dump(), STANDSTILL)
     balances = [balance_of_a_fan()] * FANS
-    core = ScorerCore(FANS, "rpm", config, HealthyTwin("", every, balances, "", (TACHO,) * FANS, STANDSTILL))
+    twin = HealthyTwin("", every, balances, "", (TACHO,) * FANS, STANDSTILL, unseen_error=unseen_error)
+    core = ScorerCore(FANS, "rpm", config, twin)
     said: list[Hashable] = []
     with patch.object(Diagnoser, "diagnose", return_value=()):  # which takes most of the time
         messages = core.step(faulty())
@@ -165,6 +168,13 @@ def decisions() -> Hashable:
     return judged(far_limits())
 
 
+def decisions_behind_a_drive() -> Hashable:
+    """Plateaus end in the middle of the commands."""
+    drive = DriveCard(turning_command=20.0, kick_s=0.5, rest_s=1.0, lowest_command=(50.0,) * FANS)
+    slope = np.full(FANS, 1.0 / 6.0)
+    return judged(far_limits(), UnseenError(None, drive, slope, np.zeros(FANS), command_width=1000.0))
+
+
 def limits() -> Hashable:
     return limits_of(3, 60.0, 3000.0).model_dump_json()
 
@@ -191,6 +201,7 @@ PROBES: dict[str, Callable[[], Hashable]] = {
     "least-time-error": extrapolated_limits,
     "unvisited-speeds": extrapolated_limits,
     "tail-margin": extrapolated_limits,
+    "plateau-end": decisions_behind_a_drive,
 }
 
 
