@@ -36,7 +36,8 @@ class Standstill(BaseModel):
     slowing_s: float | None = Field(
         default=None,
         ge=0,
-        description="longest time from a command to stop to a reading of 70 % of the speed; null in early cards",
+        description="longest time from a command to stop to a reading of 70 % of the speed, less the mean delay of "
+        "readings; null in early cards",
     )
     coast_time_constant_s: float | None = Field(
         default=None, gt=0, description="typical time constant of a fan that coasts"

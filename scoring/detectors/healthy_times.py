@@ -33,13 +33,12 @@ def start_limit_s(healthy: Standstill, reach_s: Array) -> Array:
 
 def coast_limit_s(healthy: Standstill, reach_s: Array) -> Array:
     """(fans,) longest time, s, for which a fan may turn after a command that stops it; infinite if unknown."""
-    return _of_coast(healthy.coast_s, reach_s)
+    if healthy.coast_s is None:
+        return np.inf + reach_s
+    return np.maximum(MARGIN * healthy.coast_s, lag_s(reach_s))
 
 
 def slowing_limit_s(healthy: Standstill, reach_s: Array) -> Array:
-    """(fans,) longest time, s, for which it may keep its speed then; infinite if the card does not say it."""
-    return _of_coast(healthy.slowing_s, reach_s)
-
-
-def _of_coast(longest_s: float | None, reach_s: Array) -> Array:
-    return np.inf + reach_s if longest_s is None else np.maximum(MARGIN * longest_s, lag_s(reach_s))
+    """(fans,) longest time, s, for which readings may show that it keeps its speed then; infinite if unknown."""
+    slowing_s = np.inf if healthy.slowing_s is None else max(MARGIN * healthy.slowing_s, MIN_MOVE_S)
+    return slowing_s + reach_s

@@ -179,7 +179,8 @@ class _Coast:
     """From a command to stop to the first reading of a fan that stands.
 
     seconds: its length. time_constant_s: 0 where it is too short to show it. log_fall: of its readings, the logarithm.
-    slowing_s: until the reading is below `SLOWED_SHARE` of the highest one since the command.
+    slowing_s: until the reading is below `SLOWED_SHARE` of the highest one since the command, less the mean delay of
+    readings.
     """
 
     seconds: float
@@ -198,7 +199,8 @@ def _coasts(one: _FanSeries, found: Standstill) -> Iterator[_Coast]:
             constant_s = max(seconds - one.mean_delay_s, 0.0) / log if log >= MIN_LOG_FALL else 0.0
             readings = np.nan_to_num(one.speed_rad_s[first : first + rows + 1])
             slowed = np.flatnonzero(readings > SLOWED_SHARE * readings.max())[-1] + 1
-            yield _Coast(seconds, constant_s, log, float(slowed) * one.period_s)
+            slowing_s = max(float(slowed) * one.period_s - one.mean_delay_s, 0.0)
+            yield _Coast(seconds, constant_s, log, slowing_s)
 
 
 def _longest_lapse_s(series: Sequence[_FanSeries], found: Standstill, start_s: float) -> float:
