@@ -142,6 +142,7 @@ def _rows(tray: str, t_ns: int, state: dict[str, Any]) -> list[dict[str, Any]]:
             "fan": number,
             "parameter": parameter,
             **{name: values[name] for name in _SHOWN},
+            "change_std_error": None if values["per_day"] else values["series"]["std_error"][-1],
             "command_unit": state["command_unit"],
             "seen_t_ns": fan["t_ns"],
             "t_ns": t_ns,
@@ -156,7 +157,10 @@ def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
     unit = escape(state["command_unit"])
     date = f"{datetime.fromtimestamp(t_ns / NS_PER_S):%Y-%m-%d %H:%M}"
     without = [str(number) for number, fan in enumerate(state["fans"]) if not fan["t_ns"]]
-    caption = [f"balance, friction: command{f' in {unit}' if unit else ''}; drag, gain: % of healthy"]
+    caption = [
+        f"balance, friction: command{f' in {unit}' if unit else ''}; drag, gain: % of healthy",
+        "± 95 %: of the last point, while there is no trend",
+    ]
     caption += [f"no data yet for fan {', '.join(without)}: {_NEEDED}"] if without else []
     table = Table(
         "fan",
@@ -176,6 +180,8 @@ def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
         per_day = row["per_day"]
         significant = per_day and not per_day["low"] <= 0.0 <= per_day["high"]
         change = _number(row, row["change"])
+        if row["change_std_error"] is not None:  # of the last point; a trend has an interval of its own
+            change += f" ± {_number(row, 2.0 * row['change_std_error'], digits=2)[1:]}"
         table.add_row(name, row["parameter"], change, _per_day(row), _forecast(row), style="" if significant else "dim")
     return table
 
@@ -187,7 +193,7 @@ def _number(row: dict[str, Any], value: float, digits: int = 3) -> str:
 def _per_day(row: dict[str, Any]) -> str:
     per_day = row["per_day"]
     if per_day is None:
-        return ""
+        return "no trend yet"
     half = (per_day["high"] - per_day["low"]) / 2
     return f"{_number(row, per_day['value'])} ± {_number(row, half, digits=2)[1:]}"
 

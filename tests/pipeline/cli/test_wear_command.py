@@ -88,7 +88,21 @@ def test_people_are_shown_a_table(tmp_path, notes):
     (worn,) = [line for line in lines if line.lstrip().startswith("1  ")]
     assert re.search(r"balance +\+0.3\d+ +\+0.0\d+ ± 0.0\d+ +in 6.\d days \(", worn)
     assert not [line for line in lines if line.lstrip().startswith("drag") and "days" in line]
-    assert "balance, friction: command in %; drag, gain: % of healthy" in lines[-1]
+    assert "balance, friction: command in %; drag, gain: % of healthy" in lines[-2]
+
+
+def test_before_a_trend_the_error_of_the_last_point_is_shown(tmp_path, notes):
+    state = json.loads(notes[0].state_json)
+    drag = state["wear"]["fans"][WORN]["parameters"]["drag"]
+    drag |= {"change": 0.275, "per_day": None}
+    drag["series"]["std_error"][-1] = 0.18
+    early = replace(notes[0], state_json=json.dumps(state))
+    path = recording(tmp_path / "r.mcap", [early])
+    found = rows(path)
+    assert found[WORN, "drag"]["change_std_error"] == 0.18
+    trend = rows(recording(tmp_path / "later.mcap", notes))[WORN, "balance"]
+    assert trend["per_day"] and trend["change_std_error"] is None
+    assert re.search(r"drag +\+27.5 ± 36 +no trend yet", fantwin("wear", path).stdout)
 
 
 def without_points(note: ScorerSnapshot, *fans: int) -> ScorerSnapshot:
