@@ -123,7 +123,8 @@ def _rests(one: _FanSeries, at_rest_below: float) -> Iterator[_Rest]:
     lowest = one.lowest_command(STOOD_S)
     least, reach = (round(seconds / one.period_s) for seconds in (AT_REST_S + one.reach_s, one.reach_s))
     increases = np.flatnonzero(np.diff(one.command, prepend=one.command[:1]) > 0.0)
-    for first, last in _stretches(_without_lapses(_last_known(one.speed_rad_s) < at_rest_below, least)):
+    stands = _last_known(one.speed_rad_s) < at_rest_below
+    for first, last in _stretches(_without_glitches(stands, least, reach // 2 + 1)):  # one wrong reading
         end = last
         if last < len(one.command):  # it starts: from the last increase on
             before = increases[np.searchsorted(increases, last, side="right") - 1] if len(increases) else 0
@@ -145,12 +146,14 @@ def _last_known(speed_rad_s: Array) -> Array:
     return np.where(rows >= 0, speed_rad_s[np.maximum(rows, 0)], np.nan)
 
 
-def _without_lapses(flags: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
-    """The flags, true also in gaps of fewer rows than the longest between true ones."""
-    filled = flags.copy()
-    for first, last in _stretches(~flags):
-        if first and last < len(flags) and last - first < longest:
+def _without_glitches(stands: NDArray[np.bool_], least: int, longest: int) -> NDArray[np.bool_]:
+    """The flags, true also where a fan that has stood for the least rows reads for no longer as if it turned."""
+    filled, began = stands.copy(), 0
+    for first, last in _stretches(~stands):
+        if first - began >= least and last - first <= longest and last < len(stands):
             filled[first:last] = True
+        else:
+            began = last
     return filled
 
 
