@@ -80,6 +80,13 @@ class FakeStage:
         self.publisher.put(encode(health))
 
 
+def seen_stages(bus: Bus, listeners: Listeners, *names: str) -> list[FakeStage]:
+    """Once the listeners see them: what was said before is lost."""
+    stages = [FakeStage(bus, name) for name in names]
+    eventually(lambda: len(listeners.present()) == len(names), "their tokens are seen")
+    return stages
+
+
 def line(key: str, producer: str, received: int, first: int = 0, missing: int = 0) -> Input:
     reached = first + received + missing
     return Input(key=key, producer=producer, received=received, missing=missing, duplicated=0, next_sequence=reached)
@@ -99,8 +106,7 @@ def settled(listeners: Listeners, stop: threading.Event, say) -> list[str]:
 
 def test_discovery_waits_for_the_health_of_every_present_stage(sites):
     bus, listeners = sites
-    stages = [FakeStage(bus, "twin_integrator"), FakeStage(bus, "viewer")]
-    eventually(lambda: len(listeners.present()) == 2, "their tokens are seen")
+    stages = seen_stages(bus, listeners, "twin_integrator", "viewer")
     done = threading.Event()
 
     def say_on() -> None:
@@ -122,8 +128,7 @@ def test_discovery_waits_for_the_health_of_every_present_stage(sites):
 
 def test_the_replay_is_drained_when_the_whole_chain_has_consumed_everything(sites):
     bus, listeners = sites
-    twin, scorer = FakeStage(bus, "twin_integrator"), FakeStage(bus, "scorer")
-    eventually(lambda: len(listeners.present()) == 2, "their tokens are seen")
+    twin, scorer = seen_stages(bus, listeners, "twin_integrator", "scorer")
     steps = [
         lambda: twin.say(line(GRID, "replay-1", 60), published=60),
         lambda: twin.say(line(GRID, "replay-1", 100), published=100),
@@ -148,7 +153,7 @@ def test_the_replay_is_drained_when_the_whole_chain_has_consumed_everything(site
 def test_whoever_stops_changing_and_is_behind_is_named(sites, monkeypatch):
     monkeypatch.setattr("pipeline.replay.live.listeners._STALLED_S", 0.2)
     bus, listeners = sites
-    twin = FakeStage(bus, "twin_integrator")
+    (twin,) = seen_stages(bus, listeners, "twin_integrator")
     twin.say(line(GRID, "replay-1", 99))
     eventually(listeners._views, "it is known")
     assert settled(listeners, threading.Event(), lambda: twin.say(line(GRID, "replay-1", 99))) == ["twin_integrator"]
@@ -156,7 +161,7 @@ def test_whoever_stops_changing_and_is_behind_is_named(sites, monkeypatch):
 
 def test_messages_before_the_first_received_one_count_as_lost_for_listeners_present_from_the_start(sites):
     bus, listeners = sites
-    twin, recorder = FakeStage(bus, "twin_integrator"), FakeStage(bus, "recorder")
+    twin, recorder = seen_stages(bus, listeners, "twin_integrator", "recorder")
     twin.say()
     eventually(listeners._views, "it is known")
     listeners._present_at_start = {twin.producer}
