@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+from typing import ClassVar, Self
+
 import numpy as np
+from pydantic import Field
 
 from schemas.messages import Array
 from schemas.standstill import Standstill
+from scoring.detectors.detector import DetectorSettings, LimitRule
 
 MARGIN = 3.0  # times the longest of healthy runs
 MIN_LAPSE_S = 0.5
 MIN_MOVE_S = 1.0  # and the reach of the tacho: the shortest limit of a start or a coast; training shows few of them
 UNKNOWN_START_S = 30.0  # beyond the reach, if no start was seen
+
+
+class HealthyTimes(DetectorSettings):
+    """Settings of a detector whose limits are such times."""
+
+    rule: ClassVar[LimitRule] = LimitRule.GIVEN
+    healthy: Standstill = Field(description="how healthy fans stop, stand and start")
+    factor: float = Field(default=1.0, gt=0, description="multiplies the times")
+
+    @classmethod
+    def unreached(cls) -> Self:
+        """Calibration does not set it."""
+        raise NotImplementedError("the settings are those of the twin's card")
+
+    def scaled(self, factor: float) -> Self:
+        """See DetectorSettings."""
+        return self.model_copy(update={"factor": self.factor * factor})
 
 
 def lag_s(reach_s: Array) -> Array:
@@ -25,10 +46,10 @@ def lapse_limit_s(healthy: Standstill) -> float:
 
 def start_limit_s(healthy: Standstill, reach_s: Array) -> Array:
     """(fans,) longest time, s, for which a fan may stand after a command that turns it."""
-    known = UNKNOWN_START_S + reach_s
+    limit_s = UNKNOWN_START_S + reach_s
     if healthy.start_s is not None:
-        known = np.maximum(MARGIN * healthy.start_s, lag_s(reach_s))
-    return np.maximum(known, lapse_limit_s(healthy))
+        limit_s = np.maximum(MARGIN * healthy.start_s, lag_s(reach_s))
+    return np.maximum(limit_s, lapse_limit_s(healthy))
 
 
 def coast_limit_s(healthy: Standstill, reach_s: Array) -> Array:

@@ -13,18 +13,18 @@ Readings lag, so what is seen within the reach of the tacho and a second is not 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from schemas.messages import Alarm, Array
-from schemas.standstill import SLOWED_SHARE, Standstill
+from schemas.standstill import SLOWED_SHARE
 from schemas.units import NS_PER_S
 from scoring.detectors.alarm_units import AlarmUnits
-from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, DetectorSettings, LimitRule, Signal
+from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Signal
 from scoring.detectors.durations import Durations
-from scoring.detectors.healthy_times import coast_limit_s, lag_s, slowing_limit_s, start_limit_s
+from scoring.detectors.healthy_times import HealthyTimes, coast_limit_s, lag_s, slowing_limit_s, start_limit_s
 
 CERTAIN = 2.0  # ratios above 1 are multiplied by it: a fan that does not do as commanded is an alarm, not a warning
 OFF_DELAY_S = 2.0
@@ -33,24 +33,12 @@ BEYOND_SPEEDS_RAD_S = 2.0**20
 LONG_AGO_NS = 1 << 60  # when a stop was that nobody has seen: the speed that it began with is not known
 
 
-class RunningOnSettings(DetectorSettings):
+class RunningOnSettings(HealthyTimes):
     """From the card of the twin."""
 
-    rule: ClassVar[LimitRule] = LimitRule.GIVEN
-    healthy: Standstill = Field(description="how healthy fans stop, stand and start")
-    factor: float = Field(default=1.0, gt=0, description="multiplies the times")
     by_coast_only: bool = Field(
         default=False, description="whether only the first of the three counts, as in earlier recordings"
     )
-
-    @classmethod
-    def unreached(cls) -> RunningOnSettings:
-        """Calibration does not set it."""
-        raise NotImplementedError("the settings are those of the twin's card")
-
-    def scaled(self, factor: float) -> RunningOnSettings:
-        """See DetectorSettings."""
-        return self.model_copy(update={"factor": self.factor * factor})
 
 
 class RunningOn(Detector):

@@ -12,43 +12,28 @@ commanded.
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from pydantic import Field
 
 from schemas.messages import Alarm, Array
-from schemas.standstill import Standstill
 from schemas.units import NS_PER_S
 from scoring.detectors.alarm_units import AlarmUnits
-from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, DetectorSettings, LimitRule, Signal
+from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Signal
 from scoring.detectors.durations import Durations
-from scoring.detectors.healthy_times import lapse_limit_s, start_limit_s
+from scoring.detectors.healthy_times import HealthyTimes, lapse_limit_s, start_limit_s
 from scoring.detectors.running_on import CERTAIN, OFF_DELAY_S, RunningOn, RunningOnSettings
 
 MISSING_S = 2.0  # beyond the reach of the tacho
 UNKNOWN_STARTED_S = 5.0  # beyond the reach: the length of a start, if none was seen
 
 
-class StandstillSettings(DetectorSettings):
+class StandstillSettings(HealthyTimes):
     """From the card of the twin."""
 
-    rule: ClassVar[LimitRule] = LimitRule.GIVEN
-    healthy: Standstill = Field(description="how healthy fans stop, stand and start")
-    factor: float = Field(default=1.0, gt=0, description="multiplies the times")
     with_stopped: bool = Field(
         default=False,
         description="whether it judges stopped fans, too, and has a ratio everywhere, as in earlier recordings",
     )
-
-    @classmethod
-    def unreached(cls) -> StandstillSettings:
-        """Calibration does not set it."""
-        raise NotImplementedError("the settings are those of the twin's card")
-
-    def scaled(self, factor: float) -> StandstillSettings:
-        """See DetectorSettings."""
-        return self.model_copy(update={"factor": self.factor * factor})
 
 
 class StandstillDetector(Detector):
