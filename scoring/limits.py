@@ -6,7 +6,7 @@ twin that was not calibrated has a limit on its smoothed speed residual only, fr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny, ValidationError, field_validator, model_validator
@@ -111,6 +111,12 @@ class Limits(_Entry):
                 return self.balance
             case "tacho":
                 raise ValueError("the tacho has no residual")
+
+    def with_residuals(self, change: Callable[[HealthyResidual, Signal], HealthyResidual]) -> Limits:
+        """The same with the healthy residual of each source changed."""
+        return self.model_copy(
+            update={"speed": change(self.speed, "speed"), "balance": change(self.balance, "balance")}
+        )
 
     def settings_of(self, source: Signal, kind: type[Settings]) -> Settings | None:
         """Settings of a kind of detector on a source; None where it is not used."""

@@ -134,7 +134,7 @@ def _plain_adaptation_limit(limit_of: Any) -> Any:
         if made is not residual:
             return made
         calibration = import_module("scoring.calibration.calibration")
-        smoothed_std = calibration._smoothed_std(limits, source, found)
+        smoothed_std = calibration.smoothed_std(limits, source, found)
         sigmas = MIN_CAUTIOUS_LIMIT * smoothed_std * residual.mean_residual_std
         return calibration.with_baseline(residual, {"adaptation_limit_sigmas": sigmas})
 
@@ -151,6 +151,7 @@ def _of_single_readings(_: Any) -> Any:
 
 _TABLE = "scoring.detectors.table:DETECTORS"
 _CALIBRATION = "scoring.calibration.calibration"
+_FEW_DATA = "scoring.calibration.few_data"
 _VARIATION = "scoring.calibration.healthy_variation"
 _BASELINE = "scoring.baseline.baseline"
 _SMOOTHED_TOO = "; its limit no longer bounds clipping, drift and adaptation, and persistent-spread goes with it"
@@ -210,7 +211,7 @@ MECHANISMS: Sequence[Mechanism] = (
         "limits are wider while the speed changes",
         (
             (f"{_VARIATION}:_transient_scale_rad_s", _returning(None)),
-            (f"{_CALIBRATION}:_widened_in_motion", _first_argument),
+            (f"{_CALIBRATION}:widened_in_motion", _first_argument),
         ),
     ),
     Mechanism(
@@ -221,12 +222,12 @@ MECHANISMS: Sequence[Mechanism] = (
     Mechanism(
         "least-time-error",
         "with few data they are so as if the twin were off by 0.2 s and half a period",
-        ((f"{_CALIBRATION}:_widened_in_motion", _first_argument),),
+        ((f"{_CALIBRATION}:widened_in_motion", _first_argument),),
     ),
     Mechanism(
         "unvisited-speeds",
         "with few data limits are wider at speeds beyond those of calibration",
-        ((f"{_CALIBRATION}:wider_at_unvisited_speeds", _first_argument),),
+        ((f"{_FEW_DATA}:wider_at_unvisited_speeds", _first_argument),),
     ),
     Mechanism(
         "expected-residual",
@@ -351,7 +352,7 @@ MECHANISMS: Sequence[Mechanism] = (
     Mechanism(
         "cautious",
         "limits from too few healthy data are no closer than a few standard deviations",
-        ((f"{_CALIBRATION}:_cautious", _first_argument),),
+        ((f"{_CALIBRATION}:cautious", _first_argument),),
     ),
     Mechanism(
         "large-shifts",
@@ -361,12 +362,12 @@ MECHANISMS: Sequence[Mechanism] = (
     Mechanism(
         "mean-over-speeds",
         "from few data no healthy standard deviation is below the mean over the speeds",
-        ((f"{_CALIBRATION}:_not_below_mean_over_speeds", _first_argument),),
+        ((f"{_FEW_DATA}:_not_below_mean_over_speeds", _first_argument),),
     ),
     Mechanism(
         "mean-over-fans",
         "from few data limits on slow deviations are not narrower for a fan with little noise",
-        ((f"{_CALIBRATION}:_not_below_mean_over_fans", _first_argument),),
+        ((f"{_FEW_DATA}:_not_below_mean_over_fans", _first_argument),),
     ),
     Mechanism(
         "plateau-end",

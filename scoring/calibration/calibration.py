@@ -10,33 +10,29 @@ end of the confidence interval of the extrapolated tail.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
-from scipy.stats import chi2
 
 from schemas.messages import Array
 from scoring.baseline.fan_offsets import fan_offsets
 from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.baseline.shared_offset import LEAST_FANS
 from scoring.calibration.alarm_rate import rate_interval
+from scoring.calibration.evidence import count_std, evidence, smoothed_std
+from scoring.calibration.few_data import cautious, widened_in_motion
 from scoring.calibration.healthy_statistics import HealthyStatistics, Runs, healthy_statistics, truncate_runs
 from scoring.calibration.healthy_variation import (
     UNLIMITED,
     baselines_over_speed,
-    between_runs_std,
     persistent_std,
     variation,
     with_baseline,
 )
 from scoring.calibration.tail import Tail
-from scoring.calibration.unvisited_speeds import wider_at_unvisited_speeds
 from scoring.calibration.windows import WindowMaxima, peaks
-from scoring.detectors.detector import UNREACHED, DetectorRow, DetectorSettings, HealthyEvidence, LimitRule, Signal
-from scoring.detectors.deviation import smoothed_deviation, summed_deviation
+from scoring.detectors.detector import UNREACHED, DetectorRow, DetectorSettings, LimitRule, Signal
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.detectors.table import calibrated_rows
 from scoring.fan_scorer import RESIDUALS
@@ -45,7 +41,6 @@ from scoring.limits import DeclaredRate, Limits, Timing
 DAY_S = 86_400.0
 NEEDED_ALARMS = 3.0  # false alarms expected in the healthy runs, for their rate to be distinguished from others
 SURE_ALARMS = 10.0  # of a tacho that counts: limits of fewer have the margins of few data
-COARSE_COUNTS = 0.25  # errors of counts that are smaller, in standard deviations of the residual, do not matter
 VARIATION_FAN_S = 5 * DAY_S  # enough to measure how residuals vary; the frequency of large values needs all data
 ENOUGH_BLOCKS = 8
 MIN_WINDOWS = 6
@@ -53,16 +48,9 @@ MIN_S_OF_A_FAN = 60.0  # scored, the mean over fans; with less, limits may be fa
 WINDOWS_OF_BLOCK = 6  # a minute
 MAX_ALARM_SHARE = 0.25  # share of the windows: with more of them the limits would be within the noise
 MIN_LEVEL = 0.1 / UNREACHED
-MEANS_QUANTILE = 0.999  # of means over a second or ten counts: a shift that is exceeded more often is not a drift
 SEEN_WINDOWS = 50.0  # with an alarm, to count how often statistics alarm together
-MIN_TIME_ERROR_S = (
-    0.2  # of a twin while a fan changes its speed, standard deviation; three nights of racks show as much
-)
-CONFIDENCE = 0.95
-VISITED_S = 20.0  # a fan that turned at a speed for so long has shown the error of its twin there
 SHARED_SHARE = 0.03  # of the speed, or of the command: as the air of a room and a supply vary
-ALIKE = 3.0  # times the median sigma of the fans
-LEAST_VISITED = 8  # limits beyond those of so few would find nothing
+MARGIN_ROUNDS = 3  # of scoring the runs with larger limits, at most
 ROUNDING = 1e-9
 
 
@@ -148,12 +136,14 @@ def calibrate(
     limits = _with_rough_limits(part, limits, target / len(_rows_by_rarity()), top_speed_rad_s)
     found = healthy_statistics(runs, limits, top_speed_rad_s)
     factors = _factors(found, target)
-    limits = limits.scaled(dict(zip((row.name for row in calibrated_rows()), factors.tolist(), strict=True)))
+    limits = _scaled(limits, factors)
     expected_alarms = false_alarms_per_day * found.fan_s / DAY_S
-    if not is_enough or (_count_std(limits, found) > 0.0 and expected_alarms < SURE_ALARMS):
-        limits = _cautious(limits, found, sigma_shares, knows_other_speeds=is_enough)
+    if not is_enough or (count_std(limits, found) > 0.0 and expected_alarms < SURE_ALARMS):
+        limits = cautious(limits, found, sigma_shares, knows_other_speeds=is_enough)
         if sigma_rad_s is not None:
-            limits = limits.model_copy(update={"speed": _widened_in_motion(limits.speed, sigma_rad_s, found.period_s)})
+            limits = widened_in_motion(limits, sigma_rad_s, found.period_s)
+        limits, found = _with_declared_alarms(runs, limits, target, top_speed_rad_s)
+        factors = np.ones(len(calibrated_rows()))
     rate = DeclaredRate(
         false_alarms_per_day=false_alarms_per_day,
         interval_95=_interval(found, factors, seed),
@@ -170,7 +160,7 @@ def _with_shared(limits: Limits, found: HealthyStatistics) -> Limits:
         return limits
     command_of_speed = found.command_sum / max(found.speed_sum_rad_s, 1e-9)
     most: dict[Signal, float] = {"speed": SHARED_SHARE, "balance": SHARED_SHARE * command_of_speed}
-    return _each(limits, lambda residual, source: residual.model_copy(update={"shared_limit": most[source]}))
+    return limits.with_residuals(lambda residual, source: residual.model_copy(update={"shared_limit": most[source]}))
 
 
 def _with_variation(
@@ -182,7 +172,7 @@ def _with_variation(
     """
     top_speed_rad_s, moments = found.top_speed_rad_s, found.moments
     offsets = {s: fan_offsets(moments[s].cells, found.centres_rad_s, found.period_s) for s in RESIDUALS}
-    limits = _each(limits, lambda residual, s: residual.model_copy(update={"fan_offsets": offsets[s]}))
+    limits = limits.with_residuals(lambda residual, s: residual.model_copy(update={"fan_offsets": offsets[s]}))
     if found.fan_s > VARIATION_FAN_S or any(offsets.values()) or limits.speed.shared_limit:
         found = healthy_statistics(runs, limits, top_speed_rad_s)
     found, baselines = baselines_over_speed(runs, limits, found, crossover_speed_rad_s, has_drive=has_drive)
@@ -194,10 +184,9 @@ def _with_variation(
 
     missing = [source for source in RESIDUALS if not found.moments[source].count.sum()]
     used = {row.name: limits.detectors[row.name] for row in calibrated_rows() if row.source not in missing}
-    limits = _each(limits, varying).model_copy(update={"detectors": used})
+    limits = limits.with_residuals(varying).model_copy(update={"detectors": used})
     seen = healthy_statistics(runs, limits, top_speed_rad_s)
-    return _each(
-        limits,
+    return limits.with_residuals(
         lambda residual, source: residual.model_copy(
             update={"persistent_std": persistent_std(residual, seen.moments[source], top_speed_rad_s)}
         ),
@@ -208,15 +197,15 @@ def _with_rough_limits(runs: Runs, limits: Limits, share: float, top_speed_rad_s
     """Limits by rarity that each statistic alone exceeds in a share of the windows."""
     found = healthy_statistics(runs, limits, top_speed_rad_s)
     limits = _calibrated(limits, found, LimitRule.FIRST, share)
-    limits = _each(limits, lambda residual, source: _with_adaptation_limit(residual, source, limits, found))
-    limits = _with(limits, LimitRule.RARITY, lambda row, now: now.prepared(_evidence(row, limits, found)))
+    limits = limits.with_residuals(lambda residual, source: _with_adaptation_limit(residual, source, limits, found))
+    limits = _with(limits, LimitRule.RARITY, lambda row, now: now.prepared(evidence(row, limits, found)))
     found = healthy_statistics(runs, limits, top_speed_rad_s)
     return _calibrated(limits, found, LimitRule.RARITY, share)
 
 
 def _calibrated(limits: Limits, found: HealthyStatistics, rule: LimitRule, share: float) -> Limits:
     level = {row.name: _level(found, number, share) for number, row in enumerate(calibrated_rows())}
-    return _with(limits, rule, lambda row, now: now.calibrated(level[row.name], _evidence(row, limits, found)))
+    return _with(limits, rule, lambda row, now: now.calibrated(level[row.name], evidence(row, limits, found)))
 
 
 def _with_adaptation_limit(
@@ -226,103 +215,8 @@ def _with_adaptation_limit(
     smoothed = limits.settings_of(source, SmoothedSettings)
     if smoothed is None:
         return residual
-    limit = smoothed.limit * _smoothed_std(limits, source, found) * residual.mean_residual_std
+    limit = smoothed.limit * smoothed_std(limits, source, found) * residual.mean_residual_std
     return with_baseline(residual, {"adaptation_limit_sigmas": limit})
-
-
-def _evidence(row: DetectorRow, limits: Limits, found: HealthyStatistics) -> HealthyEvidence:
-    if row.source == "tacho":
-        return HealthyEvidence(period_s=found.period_s)
-    smoothed, moments = limits.settings_of(row.source, SmoothedSettings), found.moments[row.source]
-    residual = limits.residual(row.source)
-    return HealthyEvidence(
-        period_s=found.period_s,
-        mean_ratio=found.mean_ratio(row),
-        smoothed_std=_smoothed_std(limits, row.source, found),
-        summed_std=summed_deviation(residual.autocorrelation_time_s, found.period_s),
-        smoothed_limit=smoothed.limit if smoothed else 0.0,
-        mean_limit=moments.mean_quantile(MEANS_QUANTILE),
-        count_std=_count_std(limits, found) if row.source == "speed" else 0.0,
-        between_runs_std=between_runs_std(moments, residual),
-        # the friction of a day shifts the balance equally at all speeds, but not the speed
-        offset_unknown_at_other_speeds=row.source == "speed" and residual.baseline.speed_exponent == 0,
-    )
-
-
-def _count_std(limits: Limits, found: HealthyStatistics) -> float:
-    """The largest error of a count among the fans, in that of the speed residual; 0 where none of them matters."""
-    count_std = found.count_sigmas / limits.speed.mean_residual_std
-    return count_std if count_std >= COARSE_COUNTS else 0.0
-
-
-def _smoothed_std(limits: Limits, source: Signal, found: HealthyStatistics) -> float:
-    return smoothed_deviation(limits.timing.smoothing_s, limits.residual(source).autocorrelation_time_s, found.period_s)
-
-
-def _cautious(
-    limits: Limits, found: HealthyStatistics, sigma_shares: Mapping[Signal, Array], *, knows_other_speeds: bool
-) -> Limits:
-    """Limits where the running is too short to set them by rarity; see DetectorSettings.cautious_factor.
-
-    knows_other_speeds: whether it shows the residual at all speeds, so that no detector has to be left out.
-
-    They are multiples of a standard deviation that few independent errors of the twin have shown, one for each speed of
-    a fan, and so those of the upper end of its confidence interval.
-    """
-    limits = _each(limits, lambda residual, _: _not_below_mean_over_speeds(residual))
-    if not knows_other_speeds and _count_std(limits, found) > 0.0:
-        limits = _each(limits, lambda residual, _: wider_at_unvisited_speeds(residual, found.top_speed_rad_s))
-    if sigma_shares:
-        limits = _each(limits, lambda residual, source: _not_below_mean_over_fans(residual, sigma_shares[source]))
-    visited = sum(int((seconds >= VISITED_S).sum()) for seconds in found.visited_s.values())
-    independent = max(visited, LEAST_VISITED)
-    unknown = math.sqrt(independent / float(chi2.ppf(1.0 - CONFIDENCE, independent)))
-    used = [row for row in calibrated_rows() if row.name in limits.detectors]
-    factors = {row.name: limits.detectors[row.name].cautious_factor(_evidence(row, limits, found)) for row in used}
-    limits = limits.scaled(
-        {
-            row.name: max(factors.get(row.name) or 1.0, 1.0 if row.source == "tacho" else unknown)
-            for row in calibrated_rows()
-        }
-    )
-    detectors = {
-        row.name: limits.detectors[row.name].cautious(
-            replace(_evidence(row, limits, found), unknown_factor=1.0 if row.source == "tacho" else unknown)
-        )
-        for row in used
-        if factors[row.name] is not None or knows_other_speeds
-    }
-    return limits.model_copy(update={"detectors": detectors})
-
-
-def _not_below_mean_over_speeds(residual: HealthyResidual) -> HealthyResidual:
-    """A few minutes at a speed may happen to be quiet: no standard deviation is below the mean over the speeds."""
-    least = residual.mean_residual_std
-    return residual.model_copy(update={"residual_std": tuple(max(std, least) for std in residual.residual_std)})
-
-
-def _widened_in_motion(residual: HealthyResidual, sigma_rad_s: float, period_s: float) -> HealthyResidual:
-    """In some minutes fans may hardly move: limits widen as if the twin were off by a standard deviation in time, and
-    by half a period, because it is not known when between two samples a command changed.
-    """
-    error_s = MIN_TIME_ERROR_S + 0.5 * period_s
-    scale_rad_s = residual.mean_residual_std * sigma_rad_s / error_s
-    return residual.model_copy(
-        update={"transient_scale_rad_s": min(residual.transient_scale_rad_s or scale_rad_s, scale_rad_s)}
-    )
-
-
-def _not_below_mean_over_fans(residual: HealthyResidual, sigma_shares: Array) -> HealthyResidual:
-    """A fan whose tacho has little noise has a small sigma, but its twin, air and supply err as those of the others:
-    no low-frequency standard deviation is below the root mean square over the fans.
-    """
-    relative = (math.sqrt(np.mean(np.square(alike(sigma_shares)))) / sigma_shares).clip(1.0, None)
-    return residual.model_copy(update={"low_frequency_std_of_fans": tuple(np.round(relative, 4).tolist())})
-
-
-def alike(sigma_of_fans: Array) -> Array:
-    """Those of the fans without any that is far noisier than most: it is no measure for the others."""
-    return sigma_of_fans[sigma_of_fans <= ALIKE * np.median(sigma_of_fans)]
 
 
 def _with(
@@ -339,9 +233,14 @@ def _with(
     return limits.model_copy(update={"detectors": detectors})
 
 
-def _each(limits: Limits, change: Callable[[HealthyResidual, Signal], HealthyResidual]) -> Limits:
-    """Limits with both residuals changed."""
-    return limits.model_copy(update={source: change(limits.residual(source), source) for source in RESIDUALS})
+def _scaled(limits: Limits, factors: Array) -> Limits:
+    """Limits times the factors of the rows of the table."""
+    return limits.scaled(dict(zip((row.name for row in calibrated_rows()), factors.tolist(), strict=True)))
+
+
+def _allowed(found: HealthyStatistics, target: float) -> int:
+    """How many alarms these runs may have, if a share `target` of the windows may have one."""
+    return int(target * found.windows + ROUNDING)
 
 
 def _factors(found: HealthyStatistics, target: float) -> Array:
@@ -358,7 +257,7 @@ def _factors(found: HealthyStatistics, target: float) -> Array:
         1.0 if row.detector.settings.rule is LimitRule.FIXED else _level(found, number, target / independent)
         for number, row in enumerate(calibrated_rows())
     ]
-    return _with_alarms_at_most(found, np.array(factors), int(target * found.windows + ROUNDING))
+    return _with_alarms_at_most(found, np.array(factors), _allowed(found, target))
 
 
 def _with_alarms_at_most(found: HealthyStatistics, factors: Array, allowed: int) -> Array:
@@ -380,6 +279,25 @@ def _with_alarms_at_most(found: HealthyStatistics, factors: Array, allowed: int)
             return factors
         at_once = min(max(too_many // len(by_rarity), 1), len(beyond[most]))
         factors[most] *= beyond[most][at_once - 1] * (1.0 + ROUNDING)
+
+
+def _with_declared_alarms(
+    runs: Runs, limits: Limits, target: float, top_speed_rad_s: float
+) -> tuple[Limits, HealthyStatistics]:
+    """Limits with margins, larger where the runs would otherwise have more alarms than allowed; what they then show.
+
+    Margins change reference values, which limits by rarity say nothing about. Larger limits let baselines learn more,
+    so the runs are scored with them again.
+    """
+    ones = np.ones(len(calibrated_rows()))
+    found = healthy_statistics(runs, limits, top_speed_rad_s)
+    for _ in range(MARGIN_ROUNDS):
+        factors = _with_alarms_at_most(found, ones, _allowed(found, target))
+        if (factors == 1.0).all():
+            break
+        limits = _scaled(limits, factors)
+        found = healthy_statistics(runs, limits, top_speed_rad_s)
+    return limits, found
 
 
 def _rows_by_rarity() -> list[int]:

@@ -70,8 +70,6 @@ class HealthyStatistics:
     """of each detector of a residual, the sum of its statistic in its limit"""
     fan_s: float = 0.0
     """time that was scored, summed over fans"""
-    visited_s: dict[int, Array] = field(default_factory=dict)
-    """by the number of a fan in the twin or else in its tray, (SPEED_BINS,) how long it was scored at a speed"""
     speed_sum_rad_s: float = 0.0
     """over the samples that were scored"""
     command_sum: float = 0.0
@@ -95,6 +93,12 @@ class HealthyStatistics:
     def mean_speed_rad_s(self) -> float:
         """Mean speed of the samples that were scored."""
         return self.speed_sum_rad_s * self.period_s / max(self.fan_s, 1e-9)
+
+    @property
+    def visited_s(self) -> list[Array]:
+        """Of each fan, (SPEED_BINS,) how long it was scored at a speed."""
+        speed, balance = (self.moments[source].of_fans for source in RESIDUALS)
+        return [np.maximum(speed[fan][0], balance[fan][0]) * self.period_s for fan in speed]
 
     @property
     def windows(self) -> int:
@@ -210,15 +214,14 @@ class _RunStatistics:
             largest = found.observed[name]
             for key, value in detector.observed().items():
                 largest[key] = max(largest.get(key, 0.0), value)
-        at_speed_s = np.maximum(*(self._cells[source][0] for source in RESIDUALS)) * found.period_s
-        for fan, seconds in zip(self._run.known_as or range(self._run.fans), at_speed_s, strict=True):
-            found.visited_s[fan] = found.visited_s.get(fan, 0.0) + seconds
         for source, moments in found.moments.items():
             baseline = self._scorer.residuals[source].baseline
             settled = baseline.is_set & ~baseline.is_commissioning
             count, total = self._cells[source]
             moments.count += count.sum(axis=0)
             moments.total += total.sum(axis=0)
+            for column, fan in enumerate(self._run.known_as or range(self._run.fans)):
+                moments.of_fans[fan] = moments.of_fans.get(fan, 0.0) + self._cells[source][:, column]
             if self._run.known_as is not None:
                 moments.cells.append(Cells(self._run.known_as, count, total))
             moments.baselines.append(baseline.commissioned[settled if settled.any() else baseline.is_set])

@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 from scipy.stats import t
 
 from schemas.messages import Array
+from scoring.baseline.fan_offsets import FULL_S, MIN_S
 from scoring.baseline.healthy_residual import HealthyResidual
 from scoring.baseline.settings import BaselineSettings
 from scoring.calibration.healthy_statistics import HealthyStatistics, Runs, healthy_statistics
@@ -155,11 +156,24 @@ def _over_speed(
     speeds, means, deviations = [], [], []
     for group in groups:
         count = max(moments.count[group].sum(), 1.0)
-        mean = float(moments.total[group].sum() / count)
+        mean = float(moments.total[group].sum() / count) if len(groups) > 1 else 0.0
         speeds.append(float((moments.count[group] * centre[group]).sum() / count))
-        means.append(mean if len(groups) > 1 else 0.0)
-        deviations.append(math.sqrt(max(float(moments.square[group].sum() / count) - means[-1] ** 2, 1e-6)))
+        means.append(_mean_over_fans(moments, group, found.period_s) if len(groups) > 1 else 0.0)
+        deviations.append(math.sqrt(max(float(moments.square[group].sum() / count) - mean**2, 1e-6)))
     return tuple(speeds), tuple(means), tuple(deviations)
+
+
+def _mean_over_fans(moments: ResidualMoments, bins: list[int], period_s: float) -> float:
+    """What the residuals of all fans have in common at some speeds; a fan that did not turn there counts as zero.
+
+    Two fans differ by more than what all of them have in common: the error of one that alone was there says nothing
+    about the others.
+    """
+    count, total = np.stack([of_fan[:, bins].sum(axis=1) for of_fan in moments.of_fans.values()], axis=1)
+    seconds = count * period_s
+    weight = np.where(seconds >= MIN_S, np.minimum(seconds, FULL_S), 0.0)
+    share = float((weight > 0.0).mean())
+    return share * float((weight * total / np.maximum(count, 1.0)).sum() / max(weight.sum(), 1.0))
 
 
 def between_runs_std(moments: ResidualMoments, residual: HealthyResidual) -> float:

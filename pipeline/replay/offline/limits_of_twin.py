@@ -8,7 +8,8 @@ import numpy as np
 
 from pipeline.runtime.tray_twin import TrayTwin
 from schemas.messages import Array
-from scoring.calibration.calibration import alike, calibrate
+from scoring.calibration.calibration import calibrate
+from scoring.calibration.few_data import alike
 from scoring.calibration.healthy_statistics import Runs
 from scoring.detectors.detector import Signal
 from scoring.limits import Limits, Timing

@@ -17,6 +17,7 @@ from scoring.detectors.detector import Signal
 from scoring.detectors.deviation import summed_deviation
 from scoring.detectors.drift import DriftSettings
 from scoring.detectors.smoothed import SmoothedSettings
+from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits, Timing, default_timing
 from scoring.samples import Samples
 from tests.support.healthy_residuals import Raised, alarms_of, autoregressive, in_blocks, samples_of
@@ -171,6 +172,50 @@ def test_with_few_data_a_shift_lasts_until_it_is_reported_if_a_tacho_counts() ->
     assert reference == pytest.approx(0.7 * least, rel=0.01)
     assert after_s == pytest.approx(25.0), "a shift of twice the reference value is reported after so long"
     assert large_after_s == pytest.approx(4.5), "one of three times the reference value after 3 s"
+
+
+def test_with_the_margins_of_few_data_the_recordings_have_no_more_alarms_than_declared() -> None:
+    # Margins take a smaller reference value than the rarity of sums does: one fan that errs for some seconds,
+    # twice in each run and so more often than declared, would then raise an alarm each time.
+    fans, samples, runs = 60, 800, 3
+    counts = (Tacho(kind="count", pulses=2, window_s=1.0),)
+
+    def errs() -> Iterator[HealthyRun]:
+        for run in range(runs):
+            row = np.arange(samples)[:, np.newaxis]
+            error = 4.0 * ((row % 400 >= 380) & (np.arange(fans) == 1))
+            speed, balance = (autoregressive(samples, fans, 0.0, 2 * run + number) for number in (0, 1))
+            made = samples_of(speed + error, balance, period_ns=5 * PERIOD_NS)
+            sigma = np.full(speed.shape, SIGMA_RAD_S)
+            yield HealthyRun(f"run {run}", fans, in_blocks(replace(made, speed_sigma_rad_s=sigma)), tachos=counts)
+
+    per_day = 3.5 * 86_400.0 / (runs * samples * 0.5 * fans)
+    limits = calibrate(errs, 200.0, default_timing(fans), per_day)
+    settings = limits.settings_of("speed", DriftSettings)
+    assert settings
+    assert settings.large_limit is not None, "these are the margins of few data"
+    scorers = [FanScorer(fans, limits, tachos=counts) for _ in range(runs)]
+    alarms = [alarms_of(limits, run.blocks, fans, scorer) for run, scorer in zip(errs(), scorers, strict=True)]
+    assert sum(map(len, alarms)) <= 3
+
+
+def test_what_one_fan_alone_does_at_a_speed_is_not_expected_of_the_others() -> None:
+    def each(slow_fans: range) -> Runs:
+        def runs() -> Iterator[HealthyRun]:
+            made = tray(8, 1200.0)
+            row = np.arange(len(made.t_ns))[:, np.newaxis]
+            slow = (row % 300 >= 200) & np.isin(np.arange(FANS), slow_fans)
+            speed_rad_s = np.where(slow, 30.0, 110.0 + 20.0 * (row // 50 % 5)) + 1e-3 * made.speed_rad_s
+            residual = made.speed_residual + np.where(slow, -6.0, 0.0)
+            yield HealthyRun("one", FANS, in_blocks(replace(made, speed_rad_s=speed_rad_s, speed_residual=residual)))
+
+        return runs
+
+    one, all_of_them = (calibrate(each(fans), 200.0, Timing(), 600.0).speed for fans in (range(1, 2), range(FANS)))
+    assert one.expected_residual_sigmas[0] == pytest.approx(all_of_them.expected_residual_sigmas[0] / FANS, rel=0.15)
+    assert all_of_them.expected_residual_sigmas[0] < -4.0
+    assert one.persistent_std[0] > 2.0 * max(one.persistent_std[1:]), "but limits are wider there"
+    assert all_of_them.persistent_std[0] < 0.5 * one.persistent_std[0]
 
 
 def test_the_fewer_speeds_were_seen_the_wider_are_the_limits() -> None:
