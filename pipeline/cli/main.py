@@ -20,6 +20,7 @@ PANELS = {
 """folder -> heading of its commands in `fantwin --help`"""
 COMMANDS = {
     "demo": "watch.demo",
+    "commission": "watch.commission",
     "up": "watch.up",
     "run": "watch.run",
     "status": "watch.status",

@@ -1,0 +1,70 @@
+"""What the plant's own controller does with the fans, and whether it is enough for a twin to be trained on it.
+
+A twin needs to see each fan settle at several commands, and change between them. The thresholds are those of a short
+sweep: it holds ten levels for some seconds each.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.config.models import TrayConfig
+from schemas.messages import Raw
+from schemas.units import NS_PER_S
+
+RANGES = 10
+"""equal parts of the commands of a tray"""
+NEEDED_RANGES, NEEDED_S = 4, 20.0
+"""a fan has been in so many of them, for so long each"""
+NEEDED_CHANGES = 10
+"""of its command, by more than a range"""
+LONGEST_BETWEEN_SAMPLES_NS = 3 * NS_PER_S
+"""a longer time is a gap, in which nothing is known"""
+
+
+class OrdinaryOperation:
+    """The commands of a tray's fans so far."""
+
+    def __init__(self, tray: TrayConfig) -> None:
+        self._low, self._width = tray.command_min, (tray.command_max - tray.command_min) / RANGES
+        self._seconds = np.zeros((tray.fans, RANGES))
+        self._changes = np.zeros(tray.fans, np.int64)
+        self._changed_from = np.full(tray.fans, np.nan)
+        self._lowest, self._highest = np.full(tray.fans, np.inf), np.full(tray.fans, -np.inf)
+        self._last_t_ns: int | None = None
+
+    def take(self, raw: Raw) -> None:
+        """Take samples, in the order in which they were received."""
+        fan = np.arange(raw.fans)
+        for t_ns, command in zip(raw.host_receive_t_ns.tolist(), raw.command, strict=True):
+            since_ns = 0 if self._last_t_ns is None else t_ns - self._last_t_ns
+            self._last_t_ns = t_ns
+            known = np.isfinite(command)
+            place = np.clip((np.where(known, command, self._low) - self._low) / self._width, 0, RANGES - 1).astype(int)
+            if 0 < since_ns <= LONGEST_BETWEEN_SAMPLES_NS:
+                self._seconds[fan, place] += np.where(known, since_ns / NS_PER_S, 0.0)
+            has_changed = known & ~(np.abs(command - self._changed_from) <= self._width)
+            self._changes += has_changed & np.isfinite(self._changed_from)
+            self._changed_from = np.where(has_changed, command, self._changed_from)
+            self._lowest = np.fmin(self._lowest, command)
+            self._highest = np.fmax(self._highest, command)
+
+    def missing(self) -> list[str]:
+        """What each fan has not done yet, a few words for each that lacks something."""
+        held = (self._seconds >= NEEDED_S).sum(axis=1)
+        return [
+            f"fan {fan}: {self._range_of(fan)}, {held[fan]} of {NEEDED_RANGES} levels held for {NEEDED_S:.0f} s, "
+            f"{self._changes[fan]} of {NEEDED_CHANGES} changes"
+            for fan in range(len(held))
+            if held[fan] < NEEDED_RANGES or self._changes[fan] < NEEDED_CHANGES
+        ]
+
+    def held(self) -> list[str]:
+        """Which fans had one command all the time, a few words for each."""
+        return [f"fan {fan}: {self._range_of(fan)}" for fan in np.flatnonzero(self._changes == 0).tolist()]
+
+    def _range_of(self, fan: int) -> str:
+        low, high = self._lowest[fan], self._highest[fan]
+        if not np.isfinite(low):
+            return "no command yet"
+        return f"command {low:.3g}" if low == high else f"commands {low:.3g} to {high:.3g}"

@@ -1,0 +1,31 @@
+"""Adds the twin of a tray to the text of a configuration; all else stays as its user wrote it."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+from pipeline.config.models import ConfigError
+
+_HEADER = re.compile(r"^([ \t]*)\[\[[ \t]*tray[ \t]*\]\].*$", re.MULTILINE)
+
+
+def with_twin(text: str, twin: str, path: Path) -> str:
+    """The text of a configuration with one tray, which gets this twin. path: the file, for the error.
+
+    Raises:
+        ConfigError: there is no place for it that is certain to be right, so its user has to add it.
+    """
+    entry = f"twin = {json.dumps(twin, ensure_ascii=False)}"
+    wanted = tomllib.loads(text)
+    wanted["tray"][0]["twin"] = twin
+    added = _HEADER.sub(lambda found: f"{found[0]}\n{found[1]}{entry}", text, count=1)
+    try:
+        is_right = tomllib.loads(added) == wanted
+    except tomllib.TOMLDecodeError:
+        is_right = False
+    if not is_right:
+        raise ConfigError(f"{path}: write its tray as a section [[tray]], so that {entry} can be added to it")
+    return added

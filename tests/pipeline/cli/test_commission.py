@@ -1,0 +1,91 @@
+"""`fantwin commission`: what it refuses, and when a plant has moved its fans enough. Whole runs: tests/system."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.cli.watch.ordinary_operation import OrdinaryOperation
+from pipeline.config.models import TrayConfig
+from schemas.messages import Raw
+from schemas.units import NS_PER_S
+from tests.support.fantwin_command import error_of
+
+TRAY = TrayConfig.model_validate({"name": "tray1", "fans": 2, "command_max": 100.0})
+
+
+def samples(commands: np.ndarray, first_s: float = 0.0, period_s: float = 0.5) -> Raw:
+    """Of two fans; commands: (n, 2)."""
+    n = len(commands)
+    t_ns = ((first_s + period_s * np.arange(n)) * NS_PER_S).astype(np.int64)
+    return Raw(
+        fans=2,
+        host_receive_t_ns=t_ns,
+        device_clock_us=np.zeros(n, np.uint32),
+        device_sequence=np.arange(n, dtype=np.uint32),
+        command=commands,
+        speed_rad_s=np.ones((n, 2)),
+    )
+
+
+def stairs(levels: list[float], held: int = 50) -> np.ndarray:
+    """Two fans, of which the second holds the first level."""
+    moved = np.repeat(levels, held)
+    return np.column_stack((moved, np.full(len(moved), levels[0])))
+
+
+def test_a_fan_has_moved_enough_after_enough_levels_and_changes_and_the_others_are_named() -> None:
+    operation = OrdinaryOperation(TRAY)
+    assert operation.missing()[0] == "fan 0: no command yet, 0 of 4 levels held for 20 s, 0 of 10 changes"
+    operation.take(samples(stairs([20.0, 45.0, 70.0, 95.0, 20.0, 45.0])))
+    first, second = operation.missing()
+    assert first == "fan 0: commands 20 to 95, 4 of 4 levels held for 20 s, 5 of 10 changes"
+    assert second == "fan 1: command 20, 1 of 4 levels held for 20 s, 0 of 10 changes"
+    operation.take(samples(stairs([20.0, 45.0, 70.0, 95.0, 20.0]), first_s=150.0))
+    (left,) = operation.missing()
+    assert left.startswith("fan 1:")
+    assert operation.held() == ["fan 1: command 20"]
+
+
+def test_a_command_that_flickers_between_two_ranges_does_not_change_and_gaps_do_not_count() -> None:
+    operation = OrdinaryOperation(TRAY)
+    flickers = np.where(np.arange(400) % 2 == 0, 29.9, 30.1)
+    operation.take(samples(np.column_stack((flickers, flickers))))
+    assert operation.held() == ["fan 0: commands 29.9 to 30.1", "fan 1: commands 29.9 to 30.1"]
+    sparse = OrdinaryOperation(TRAY)
+    sparse.take(samples(stairs([20.0, 45.0], held=10), period_s=10.0))
+    assert sparse.missing()[0] == "fan 0: commands 20 to 45, 0 of 4 levels held for 20 s, 1 of 10 changes"
+
+
+@pytest.mark.parametrize(
+    ("tray", "rest", "words", "error"),
+    [
+        ('twin = "old.onnx"', "", (), "tray tray1 has twin old.onnx already: remove `twin`, then start again"),
+        (
+            "",
+            '[launcher]\nstages = ["acquisition", "recorder"]',
+            (),
+            "launcher.stages leaves out twin_integrator, scorer",
+        ),
+        (
+            "",
+            '[[tray]]\nname = "b"\nfans = 1',
+            (),
+            "has trays tray1, b: commission each with a configuration of its own",
+        ),
+        ("", "", ("-o", "kept.onnx"), "kept.onnx: exists already: name another with -o"),
+        ("", "", ("-o", "twin.bin"), "name a file that ends in .onnx with -o"),
+    ],
+)
+def test_what_cannot_end_well_is_refused_before_anything_is_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tray: str, rest: str, words: tuple[str, ...], error: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("kept.onnx").write_bytes(b"kept")
+    text = f'[[tray]]\nname = "tray1"\nfans = 1\nport = "line"\n{tray}\n{rest}\n'
+    Path("fantwin.toml").write_text(text, encoding="utf-8")
+    assert error in error_of("commission", *words)
+    assert Path("fantwin.toml").read_text(encoding="utf-8") == text
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fantwin.toml", "kept.onnx"]
