@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pipeline.config.models import ConfigError
 
-_HEADER = re.compile(r"^([ \t]*)\[\[[ \t]*tray[ \t]*\]\].*$", re.MULTILINE)
+_HEADER = re.compile(r"^([ \t]*)\[\[[ \t]*tray[ \t]*\]\][^\r\n]*(\r?)$", re.MULTILINE)
 
 
 def with_twin(text: str, twin: str, path: Path) -> str:
@@ -19,13 +19,13 @@ def with_twin(text: str, twin: str, path: Path) -> str:
         ConfigError: there is no place for it that is certain to be right, so its user has to add it.
     """
     entry = f"twin = {json.dumps(twin, ensure_ascii=False)}"
-    wanted = tomllib.loads(text)
-    wanted["tray"][0]["twin"] = twin
-    added = _HEADER.sub(lambda found: f"{found[0]}\n{found[1]}{entry}", text, count=1)
+    added = _HEADER.sub(lambda found: f"{found[0]}\n{found[1]}{entry}{found[2]}", text, count=1)
     try:
-        is_right = tomllib.loads(added) == wanted
-    except tomllib.TOMLDecodeError:
+        wanted, got = tomllib.loads(text), tomllib.loads(added)
+        (tray,) = wanted["tray"]
+        is_right = "twin" not in tray and got == wanted | {"tray": [tray | {"twin": twin}]}
+    except (tomllib.TOMLDecodeError, KeyError, ValueError, TypeError):
         is_right = False
     if not is_right:
-        raise ConfigError(f"{path}: write its tray as a section [[tray]], so that {entry} can be added to it")
+        raise ConfigError(f"{path}: {entry} cannot be added: write its tray as one section [[tray]] without twin")
     return added

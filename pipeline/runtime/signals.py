@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import sys
 import threading
 
 
@@ -20,6 +21,17 @@ def stop_on_signals(stop: threading.Event) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: None)
     threading.Thread(target=_obey, args=(reader, writer, stop), name="signals", daemon=True).start()
+
+
+def set_when_stdin_closes(event: threading.Event) -> None:
+    """Set `event` when standard input ends: the process that started this one holds it open for as long as it lives."""
+    threading.Thread(target=_wait_for_stdin, args=(event,), name="stdin", daemon=True).start()
+
+
+def _wait_for_stdin(event: threading.Event) -> None:
+    while os.read(sys.stdin.fileno(), 1024):  # not sys.stdin.read(): its lock would be held at the interpreter's end
+        pass
+    event.set()
 
 
 def ignore_hangup() -> None:

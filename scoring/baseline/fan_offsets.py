@@ -20,6 +20,8 @@ from scoring.baseline.healthy_residual import FanOffsets
 MIN_FANS = 3
 MIN_RUNS = 12
 """of a fan: with fewer, the offsets contain too much of single days, which limits set on the same runs cannot show"""
+MIN_LONG_RUNS, LONG_S = 3, 4 * 3600.0
+"""or so many in which a fan was scored for so long: in a night it meets each speed again and again"""
 MIN_S, FULL_S = 3.0, 30.0  # of one run in a speed bin: to count at all, and to count fully
 ROUNDS = 20
 DIGITS = 4
@@ -38,9 +40,12 @@ class Cells:
 def fan_offsets(runs: Sequence[Cells], centres_rad_s: Array, period_s: float) -> FanOffsets | None:
     """The offsets of all fans; None if there are too few fans or runs. centres_rad_s: (bins,)."""
     numbers = np.array([number for run in runs for number in run.known_as], int)
-    if len(set(numbers.tolist())) < MIN_FANS or np.bincount(numbers).max() < MIN_RUNS:
+    if len(set(numbers.tolist())) < MIN_FANS:
         return None
     count = np.concatenate([run.count for run in runs])
+    is_long = count.sum(axis=1) * period_s >= LONG_S
+    if np.bincount(numbers).max() < MIN_RUNS and np.bincount(numbers, is_long).max() < MIN_LONG_RUNS:
+        return None
     mean = np.concatenate([run.total for run in runs]) / np.maximum(count, 1.0)
     seconds = count * period_s
     weight = np.where(seconds >= MIN_S, np.minimum(seconds / FULL_S, 1.0), 0.0)

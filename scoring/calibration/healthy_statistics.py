@@ -39,6 +39,8 @@ class HealthyRun(NamedTuple):
     """the numbers of these fans in the twin; None where it does not know its fans one by one"""
     tachos: tuple[Tacho, ...] = INSTANTANEOUS
     """how their speeds are measured: one for all fans, or one for each"""
+    tray: str = ""
+    """its name: runs of one tray are of the same fans"""
 
 
 Runs = Callable[[], Iterable[HealthyRun]]
@@ -220,7 +222,9 @@ class _RunStatistics:
             count, total = self._cells[source]
             moments.count += count.sum(axis=0)
             moments.total += total.sum(axis=0)
-            for column, fan in enumerate(self._run.known_as or range(self._run.fans)):
+            tray, numbers = ("", self._run.known_as) if self._run.known_as else (self._run.tray, range(self._run.fans))
+            for column, number in enumerate(numbers):
+                fan = (tray, number)
                 moments.of_fans[fan] = moments.of_fans.get(fan, 0.0) + self._cells[source][:, column]
             if self._run.known_as is not None:
                 moments.cells.append(Cells(self._run.known_as, count, total))

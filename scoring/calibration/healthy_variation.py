@@ -30,6 +30,7 @@ SPEED_EXPONENT = 2  # of the drag, which another density of the air changes
 MAX_REMAINING_SQUARE = 0.97  # baselines follow the speed if they leave at most so much of the mean square over seconds
 TRANSIENT_ALLOWANCE = 3.0  # times the mean square in motion: one fan has the same error in each transient
 MAX_RIDGE, INITIAL_RIDGE = 1.0, 0.1
+SHORT_SHARE = 0.5  # of the mean time of the fans at a speed: one that was there for less only passed it
 UNLIMITED = BaselineSettings(commissioning_limit_sigmas=UNREACHED, adaptation_limit_sigmas=UNREACHED)
 
 
@@ -169,11 +170,12 @@ def _mean_over_fans(moments: ResidualMoments, bins: list[int], period_s: float) 
     Two fans differ by more than what all of them have in common: the error of one that alone was there says nothing
     about the others.
     """
-    count, total = np.stack([of_fan[:, bins].sum(axis=1) for of_fan in moments.of_fans.values()], axis=1)
+    scored = [of_fan for of_fan in moments.of_fans.values() if of_fan[0].any()]
+    count, total = np.stack([of_fan[:, bins].sum(axis=1) for of_fan in scored], axis=1)
     seconds = count * period_s
-    weight = np.where(seconds >= MIN_S, np.minimum(seconds, FULL_S), 0.0)
+    weight = np.where(seconds >= min(MIN_S, SHORT_SHARE * seconds.mean()), np.minimum(seconds, FULL_S), 0.0)
     share = float((weight > 0.0).mean())
-    return share * float((weight * total / np.maximum(count, 1.0)).sum() / max(weight.sum(), 1.0))
+    return share * float((weight * total / np.maximum(count, 1.0)).sum() / max(weight.sum(), 1e-9))
 
 
 def between_runs_std(moments: ResidualMoments, residual: HealthyResidual) -> float:

@@ -29,8 +29,8 @@ class ResidualMoments:
     square: Array = _zeros(SPEED_BINS)
     cells: list[Cells] = field(default_factory=list)
     """of each run with fans that the twin knows"""
-    of_fans: dict[int, Array] = field(default_factory=dict)
-    """by the number of a fan in the twin or else in its tray, (2, SPEED_BINS) counts and sums"""
+    of_fans: dict[tuple[str, int], Array] = field(default_factory=dict)
+    """by the tray and the number of a fan, (2, SPEED_BINS) counts and sums; no tray where the twin knows its fans"""
     baselines: list[Array] = field(default_factory=list)
     """commissioned baselines of the fans of each run"""
     seconds: int = 0

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -21,9 +22,9 @@ from schemas.messages import Raw
 from schemas.topics import tray_key
 
 FANTWIN = (sys.executable, "-P", "-m", "pipeline")
-RECORDING_STAGES = ("acquisition", "resampler", "recorder")
-FIRST_SAMPLE_S = 60.0
-"""until a site that only records has started and its first sample has arrived"""
+RECORDING_ONLY = ("--set", f"launcher.stages={json.dumps(['acquisition', 'resampler', 'recorder'])}")
+SILENT_S = 60.0
+"""without a sample, from the start of a recording on: the line is dead"""
 STANDARD_ERROR = 2
 """its file descriptor"""
 _POLL_S = 0.1
@@ -42,8 +43,8 @@ class Commands:
         self.say = say
         self.quiet = quiet
 
-    def run(self, *words: object) -> None:
-        """Run a command to its end.
+    def run(self, *words: object, site: RecordingSite | None = None) -> None:
+        """Run a command to its end. site: of which it needs the samples.
 
         Raises:
             Stopped: the user wants to stop.
@@ -52,18 +53,23 @@ class Commands:
         line = [str(word) for word in words]
         self.say(f"fantwin {shlex.join(line)}")
         child = _started(line, stdout=STANDARD_ERROR if self.quiet else None)
-        self.wait(child)
+        self.wait(child, site)
         if child.returncode:
             raise UserError(f"`fantwin {line[0]}` failed (exit code {child.returncode}); see the lines before this one")
 
-    def wait(self, child: subprocess.Popen[str]) -> None:
-        """Wait for its end; pass a wish to stop on."""
+    def wait(self, child: subprocess.Popen[str], site: RecordingSite | None = None) -> None:
+        """Wait for its end, and end it early if its site ends or the user wants to stop."""
         while child.poll() is None:
-            if self.stop.wait(_POLL_S):
+            is_stopped = self.stop.wait(_POLL_S)
+            if site:
+                site.discard_samples()
+            if is_stopped or (site and site.has_ended):
                 child.send_signal(signal.SIGINT)
                 child.wait()
         if self.stop.is_set():
             raise Stopped
+        if site:
+            site.check()
 
 
 class RecordingSite:
@@ -73,10 +79,11 @@ class RecordingSite:
         """configured: the words that give a command this configuration. log: what `up` says is added to it."""
         self._commands = commands
         self._config = config
-        self._words = ["up", *configured, "--json", "--set", f"launcher.stages={json.dumps(RECORDING_STAGES)}"]
+        self._tray = config.trays[0]
+        self._words = ["up", *configured, "--json", "--until-stdin-closes", *RECORDING_ONLY]
         self._log = log
         self._received: list[bytes] = []
-        self._has_samples = False
+        self._last_sample_s = time.monotonic()
         self._lock = threading.Lock()
         self.recordings: list[Path] = []
         """after the end"""
@@ -85,15 +92,69 @@ class RecordingSite:
 
     def __enter__(self) -> Self:
         with self._log.open("a", encoding="utf-8") as log:
-            self._up = _started(self._words, stdout=subprocess.PIPE, stderr=log)
-        self._bus = Bus(self._config.bus, listens=False)
-        self._bus.subscribe(tray_key(self._config.site, self._config.trays[0].name, "raw"), self._take)
+            self._up = _started(self._words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
+        try:
+            self._bus = Bus(self._config.bus, listens=False)
+            self._bus.subscribe(tray_key(self._config.site, self._tray.name, "raw"), self._take)
+        except BaseException:
+            self._end()
+            raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._bus.close()
+        self._end()
+        if error is None:
+            if self._up.returncode not in (0, 3):
+                raise self._failed()
+            if not self.recordings:
+                raise UserError(f"nothing was recorded (all that was said: {self._log})")
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether it has, by itself."""
+        return self._up.poll() is not None
+
+    def discard_samples(self) -> None:
+        """Forget those that have arrived since the last call of `wait`."""
+        with self._lock:
+            self._received.clear()
+
+    def check(self) -> None:
+        """Raises UserError if the site has ended."""
+        if self.has_ended:
+            raise self._failed()
+
+    def wait_for_samples(self) -> None:
+        """Wait for the first samples. Raises as `wait`."""
+        while not self.wait(_POLL_S):
+            pass
+
+    def wait(self, seconds: float) -> list[Raw]:
+        """Wait; returns the samples that have arrived since the last call.
+
+        Raises:
+            Stopped: the user wants to stop.
+            UserError: the site has ended, or no sample has arrived for long.
+        """
+        if self._commands.stop.wait(seconds):
+            raise Stopped
+        self.check()
+        with self._lock:
+            received, self._received = self._received, []
+        samples = [
+            message for message in map(_raw, received) if message is not None and message.fans == self._tray.fans
+        ]
+        now_s = time.monotonic()
+        if samples:
+            self._last_sample_s = now_s
+        elif now_s - self._last_sample_s > SILENT_S:
+            raise UserError(f"no sample for {SILENT_S:.0f} s: {self._last_line()} (all lines: {self._log})")
+        return samples
+
+    def _end(self) -> None:
         if self._up.poll() is None:
             self._up.send_signal(signal.SIGINT)
         answer, _ = self._up.communicate()
@@ -101,50 +162,22 @@ class RecordingSite:
             outcome: dict[str, Any] = json.loads(answer)
             self.recordings = [Path(name) for name in outcome["recordings"]]
             self.lost = {name: count for name, count in outcome["lost"].items() if count}
-        if error is None and self._up.returncode not in (0, 3):
-            raise self._failed()
 
-    def wait_for_samples(self) -> None:
-        """Wait for the first samples.
-
-        Raises:
-            UserError: none arrives.
-        """
-        waited_s = 0.0
-        while not self._has_samples:
-            if waited_s > FIRST_SAMPLE_S:
-                raise UserError(f"no sample of the tray in {FIRST_SAMPLE_S:.0f} s: run `fantwin doctor`")
-            self.wait(_POLL_S)
-            waited_s += _POLL_S
-
-    def wait(self, seconds: float) -> list[Raw]:
-        """Wait; returns the samples that have arrived since the last call.
-
-        Raises:
-            Stopped: the user wants to stop.
-            UserError: the site has ended.
-        """
-        if self._commands.stop.wait(seconds):
-            raise Stopped
-        if self._up.poll() is not None:
-            raise self._failed()
-        with self._lock:
-            received, self._received = self._received, []
-        return [message for message in map(_raw, received) if message is not None]
+    def _last_line(self) -> str:
+        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return lines[-1] if lines else "no output"
 
     def _failed(self) -> UserError:
-        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return UserError(f"recording failed: {lines[-1] if lines else 'no output'} (all lines: {self._log})")
+        return UserError(f"recording failed: {self._last_line()} (all lines: {self._log})")
 
     def _take(self, _key: str, payload: bytes) -> None:
         with self._lock:
             self._received.append(payload)
-            self._has_samples = True
 
 
 def _started(words: list[str], **streams: Any) -> subprocess.Popen[str]:
     command = [*FANTWIN, *words]
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL, text=True, start_new_session=True, **streams)
+    return subprocess.Popen(command, text=True, start_new_session=True, **{"stdin": subprocess.DEVNULL, **streams})
 
 
 def _raw(payload: bytes) -> Raw | None:

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from pipeline.bus.endpoint import accepts_connections
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.progress import EXIT_INTERRUPTED
 from pipeline.cli.twins.training_data import check_writable, read_training_data, twin_errors
-from pipeline.cli.watch.child_commands import FANTWIN, RECORDING_STAGES, Commands, RecordingSite, Stopped
+from pipeline.cli.watch.child_commands import FANTWIN, RECORDING_ONLY, Commands, RecordingSite, Stopped
+from pipeline.cli.watch.doctor import running_sessions
 from pipeline.cli.watch.ordinary_operation import OrdinaryOperation
+from pipeline.cli.watch.sweep import range_within
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
 from pipeline.config.registry import STAGES
@@ -28,9 +33,8 @@ from pipeline.runtime.signals import stop_on_signals
 from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.limits import Limits
 
+EXIT_LOST = 3
 SHOWN_EVERY_S = 60.0
-HELD_OUT = 2
-"""recordings of ordinary operation: one sets the width of the band, both set the limits"""
 
 
 def commission(
@@ -43,7 +47,7 @@ def commission(
     safe: Annotated[float | None, typer.Option(help="Of --sweep: the command at its end.")] = None,
     rounds: Annotated[int, typer.Option(min=1, max=100, help="Of --sweep: how often all levels are passed.")] = 2,
     minutes: Annotated[
-        float, typer.Option(min=0.1, max=10_000, help="Length of each of two recordings of ordinary operation.")
+        float, typer.Option(min=0.1, max=10_000, help="Length of each recording of ordinary operation.")
     ] = 10.0,
     at_most_hours: Annotated[
         float, typer.Option(min=0.01, max=1000, help="Without --sweep: wait so long for the plant to move the fans.")
@@ -64,7 +68,9 @@ def commission(
     Without --sweep no fan is moved: the first recording lasts until the plant has moved every fan through enough
     commands, and what is missing is shown. The limits are those of little data: calibrate again after some days.
 
-    Ctrl-C ends it without a twin, with exit code 130; recordings stay. With --json it does not start `fantwin up`.
+    Ctrl-C ends it without a twin; recordings stay. With --json it does not start `fantwin up`.
+
+    Exit codes: 0 success; 1 failed, and one line says why; 3 success, but data were lost while recording; 130 Ctrl-C.
 
     Example: fantwin commission -c fantwin.toml --sweep --low 0.2
     """
@@ -72,31 +78,42 @@ def commission(
     tray = _only_tray(settings)
     twin = output or settings.folder / f"{tray.name}.onnx"
     _refuse_what_cannot_end_well(settings, tray, twin)
+    if sweep:
+        range_within(tray, low, high, safe)
+    elif given := [name for name, value in (("--low", low), ("--high", high), ("--safe", safe)) if value is not None]:
+        raise UserError(f"{given[0]} is of a sweep: add --sweep, which moves the fans")
     configured = ["-c", str(config), *(word for override in overrides or () for word in ("--set", override))]
     stop = threading.Event()
     stop_on_signals(stop)
-    signal.signal(signal.SIGHUP, lambda _number, _frame: stop.set())  # else `up` would go on recording
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup sets it
+        signal.signal(signal.SIGHUP, lambda _number, _frame: stop.set())
 
     def say(line: str) -> None:
         typer.echo(line, err=json_output)
 
     work = _Commissioning(settings, configured, Commands(stop, say, quiet=json_output))
     try:
-        with_sweep = _sweep_words(low, high, safe, rounds) if sweep else None
-        work.make(twin, with_sweep, 60.0 * minutes, 3600.0 * at_most_hours, false_alarms_per_day)
+        with_sweep = _sweep_words(low, high, safe) if sweep else None
+        work.make(twin, with_sweep, rounds, 60.0 * minutes, 3600.0 * at_most_hours, false_alarms_per_day)
     except Stopped:
         kept = ", ".join(map(str, work.recordings))
         typer.echo(f"interrupted: no twin was written; recorded until then: {kept or 'nothing'}", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    except UserError as error:
+        if not work.recordings:
+            raise
+        raise UserError(f"{error}; recorded until then: {', '.join(map(str, work.recordings))}") from error
     entry = _write_entry(settings, twin)
     for fan in work.held:
         say(f"{fan} while the data for its limits were recorded: they are uncertain at others; calibrate again later")
     say(f'{config}: tray {tray.name} has twin = "{entry}" now')
     if json_output:
         typer.echo(json.dumps(work.as_json(twin, entry)))
-    elif watch:
-        say(f"fantwin up {' '.join(configured)}")
+    elif watch and not stop.is_set():
+        say(f"fantwin up {shlex.join(configured)}")
         os.execv(FANTWIN[0], [*FANTWIN, "up", *configured])
+    if work.lost:
+        raise typer.Exit(EXIT_LOST)
 
 
 def _only_tray(settings: Config) -> TrayConfig:
@@ -109,6 +126,10 @@ def _only_tray(settings: Config) -> TrayConfig:
 
 def _refuse_what_cannot_end_well(settings: Config, tray: TrayConfig, twin: Path) -> None:
     """Before anything is recorded."""
+    if tray.command_min == tray.command_max:
+        raise UserError(
+            f"{settings.path}: command_min and command_max of tray {tray.name} are equal: no twin can be made"
+        )
     if tray.twin is not None:
         raise UserError(
             f"{settings.path}: tray {tray.name} has twin {tray.twin} already: remove `twin`, then start again"
@@ -122,13 +143,15 @@ def _refuse_what_cannot_end_well(settings: Config, tray: TrayConfig, twin: Path)
     if twin.exists():
         raise UserError(f"{twin}: exists already: name another with -o")
     check_writable(twin, ".onnx")
+    if accepts_connections(settings.bus.endpoint) and (running := running_sessions(settings)):
+        raise UserError(f"site {settings.site!r} runs already ({', '.join(sorted(running))}): stop it first")
     with twin_errors():
         import_module("twin.build")  # the extra may not be installed
 
 
-def _sweep_words(low: float | None, high: float | None, safe: float | None, rounds: int) -> list[str]:
-    given = {"--low": low, "--high": high, "--safe": safe, "--rounds": rounds}
-    return [word for name, value in given.items() if value is not None for word in (name, f"{value:g}")]
+def _sweep_words(low: float | None, high: float | None, safe: float | None) -> list[str]:
+    given = {"--low": low, "--high": high, "--safe": safe}
+    return [word for name, value in given.items() if value is not None for word in (name, repr(value))]
 
 
 class _Commissioning:
@@ -146,22 +169,35 @@ class _Commissioning:
         """fans that hardly moved while the data for their limits were recorded"""
 
     def make(
-        self, twin: Path, sweep: list[str] | None, operation_s: float, at_most_s: float, false_alarms_per_day: float
+        self,
+        twin: Path,
+        sweep: list[str] | None,
+        rounds: int,
+        operation_s: float,
+        at_most_s: float,
+        false_alarms_per_day: float,
     ) -> None:
-        """Make a calibrated twin. sweep: the options of a sweep; None: the plant moves the fans."""
-        run, stages = self._commands.run, f"launcher.stages={json.dumps(RECORDING_STAGES)}"
-        run("doctor", *self._configured, "--set", stages)
+        """Make a calibrated twin.
+
+        sweep: the options of a sweep but for its rounds; None: the plant moves the fans, within at_most_s.
+        """
+        run = self._commands.run
+        run("doctor", *self._configured, *RECORDING_ONLY)
         if sweep is None:
             moved = self._recorded(lambda site: self._operate(site, operation_s, at_most_s))
         else:
-            moved = self._recorded(lambda _site: run("sweep", *self._configured, *sweep))
-        self._operation = OrdinaryOperation(self._settings.trays[0])
+            moved = self._recorded(lambda site: self._sweep(site, sweep, rounds))
         if hints := read_training_data(moved, None, None, 0.0, float("inf")).tacho_hints():
             raise UserError(f"{hints[0]}: declare it as `tacho` in [[tray]], then start again")
-        held_out = [self._recorded(lambda site: self._operate(site, operation_s)) for _ in range(HELD_OUT)]
-        self.held = self._operation.held()
-        run("train", *moved, "--validate", *held_out[0], "-o", twin)
+        self._operation = OrdinaryOperation(self._settings.trays[0])
+        if sweep is None:
+            held_out = [self._recorded(lambda site: self._operate(site, operation_s))]
+        else:  # the limits need other speeds than those that the plant happens to have in some minutes
+            held_out = [self._recorded(lambda site: self._sweep(site, sweep, 1))]
+        held_out.append(self._recorded(lambda site: self._operate(site, operation_s)))
+        self.held = self._operation.held() if sweep is None else []
         try:
+            run("train", *moved, "--validate", *held_out[0], "-o", twin)
             healthy = [path for recording in held_out for path in recording]
             run("calibrate", twin, *healthy, "--false-alarms-per-day", f"{false_alarms_per_day:g}", "--extrapolate")
         except (Stopped, UserError):
@@ -202,6 +238,9 @@ class _Commissioning:
         self._commands.say(f"recorded {', '.join(map(str, site.recordings))}; lost: {lost or 'nothing'}")
         return site.recordings
 
+    def _sweep(self, site: RecordingSite, options: list[str], rounds: int) -> None:
+        self._commands.run("sweep", *self._configured, *options, "--rounds", rounds, site=site)
+
     def _operate(self, site: RecordingSite, at_least_s: float, at_most_s: float | None = None) -> None:
         """Record ordinary operation; with at_most_s until the fans have moved enough."""
         operation = self._operation
@@ -229,16 +268,20 @@ def _write_entry(settings: Config, twin: Path) -> str:
     """Write the twin into the configuration; returns the path as it is written there."""
     resolved, folder = twin.resolve(), settings.folder.resolve()
     entry = str(resolved.relative_to(folder)) if resolved.is_relative_to(folder) else str(resolved)
-    text = with_twin(settings.text, entry, settings.path)
     path = settings.path.resolve()
     unfinished = path.with_name(f"{path.name}.part")
     try:
-        unfinished.write_text(text, encoding="utf-8")
-        unfinished.chmod(path.stat().st_mode)
+        text = with_twin(path.read_bytes().decode(), entry, settings.path)  # its user may have edited it meanwhile
+        before = path.stat()
+        with unfinished.open("wb") as file:
+            file.write(text.encode())
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.chmod(before.st_mode)
+        with suppress(PermissionError):
+            os.chown(unfinished, before.st_uid, before.st_gid)
         unfinished.replace(path)
-    except OSError as error:
+    except (OSError, UnicodeDecodeError) as error:
         unfinished.unlink(missing_ok=True)
-        raise UserError(
-            f'{settings.path}: cannot be written ({error.strerror}): add twin = "{entry}" to its tray'
-        ) from error
+        raise UserError(f'{settings.path}: cannot be changed ({error}): add twin = "{entry}" to its tray') from error
     return entry

@@ -134,14 +134,14 @@ def _check_bus(settings: Config, running: dict[str, Session]) -> Iterator[tuple[
         )
     else:
         try:
-            running |= _sessions(settings)
+            running |= running_sessions(settings)
             site = f"site {settings.site!r} runs there" if running else "fantwin answers there"
             yield True, f"bus.endpoint {endpoint}: {site}"
         except BusError:
             yield False, foreign_program(endpoint)
 
 
-def _sessions(settings: Config) -> dict[str, Session]:
+def running_sessions(settings: Config) -> dict[str, Session]:
     """The sessions of the site that run, by name; those are waited for that the first one met still introduces."""
     stop, found = threading.Event(), set[str]()
     with Bus(settings.bus, listens=False) as bus:

@@ -19,7 +19,7 @@ from pipeline.launch.event_log import without_figures
 from pipeline.launch.processes import EXIT_CANNOT_START
 from pipeline.runtime.notifier import starting
 from pipeline.runtime.runner import Runner
-from pipeline.runtime.signals import stop_on_signals
+from pipeline.runtime.signals import set_when_stdin_closes, stop_on_signals
 from pipeline.runtime.stage import load_stage
 from schemas.messages import Health
 from schemas.streams import LOSS_PREFIX
@@ -54,7 +54,7 @@ def run(
         typer.echo(error, err=True)  # for the launcher, which then gives up instead of restarting it
         raise typer.Exit(EXIT_CANNOT_START) from error
     if until_stdin_closes:
-        threading.Thread(target=_set_when_stdin_closes, args=(runner.launcher_gone,), daemon=True).start()
+        set_when_stdin_closes(runner.launcher_gone)
     try:
         last = runner.run()
     except (OSError, UserError) as error:
@@ -94,10 +94,3 @@ def _say(line: str) -> None:
     """To standard error; the launcher that reads it may have gone."""
     with suppress(OSError):
         os.write(sys.stderr.fileno(), f"{line}\n".encode())
-
-
-def _set_when_stdin_closes(launcher_gone: threading.Event) -> None:
-    """The launcher holds our standard input open for as long as it lives."""
-    while os.read(sys.stdin.fileno(), 1024):  # not sys.stdin.read(): its lock would be held at the interpreter's end
-        pass
-    launcher_gone.set()

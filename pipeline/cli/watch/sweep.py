@@ -55,12 +55,7 @@ def sweep(
     settings = load_config(config, overrides or (), stages=())
     chosen = chosen_tray(settings, tray)
     numbers = _fans(fans, chosen)
-    lowest, highest = chosen.command_min if low is None else low, chosen.command_max if high is None else high
-    if not chosen.command_min <= lowest < highest <= chosen.command_max:
-        limits = f"{chosen.command_min:g} to {chosen.command_max:g}"
-        raise UserError(f"--low {lowest:g} --high {highest:g}: name a range within {limits} of tray {chosen.name}")
-    if safe is not None:
-        command_of(chosen, {numbers[0]: safe})
+    lowest, highest = range_within(chosen, low, high, safe)
     stop = threading.Event()
     stop_on_signals(stop)
     steps: list[str] = []
@@ -98,6 +93,21 @@ def sweep(
         typer.echo(f"{'stopped' if is_stopped else 'done'}; the fans are left at these commands: {left_at}")
     if is_stopped:
         raise typer.Exit(1)
+
+
+def range_within(tray: TrayConfig, low: float | None, high: float | None, safe: float | None) -> tuple[float, float]:
+    """The commands of a sweep, lowest and highest: the limits of the tray where none is given.
+
+    Raises:
+        UserError: one of them, or the safe command, is outside those limits.
+    """
+    lowest, highest = tray.command_min if low is None else low, tray.command_max if high is None else high
+    if not tray.command_min <= lowest < highest <= tray.command_max:
+        limits = f"{tray.command_min:g} to {tray.command_max:g}"
+        raise UserError(f"--low {lowest:g} --high {highest:g}: name a range within {limits} of tray {tray.name}")
+    if safe is not None:
+        command_of(tray, {0: safe})
+    return lowest, highest
 
 
 def _leave(line: _BusLine, at_end: Mapping[int, float], left_at: str) -> None:

@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 from contextlib import suppress
+from typing import Annotated
 
 import typer
 
@@ -16,10 +17,15 @@ from pipeline.errors import UserError
 from pipeline.launch.event_log import EventLog
 from pipeline.launch.launcher import Launcher, Outcome
 from pipeline.launch.refused_input import refused_lines
-from pipeline.runtime.signals import ignore_hangup, stop_on_signals
+from pipeline.runtime.signals import ignore_hangup, set_when_stdin_closes, stop_on_signals
 
 
-def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_output: JsonOption = False) -> None:
+def up(
+    config: ConfigOption = DEFAULT_CONFIG,
+    overrides: SetOption = None,
+    json_output: JsonOption = False,
+    until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
+) -> None:
     """Start all stages, restart those that die, stop all in order on Ctrl-C.
 
     Events are written to standard error. The site keeps running when the terminal is closed; SIGTERM stops it, too.
@@ -32,6 +38,8 @@ def up(config: ConfigOption = DEFAULT_CONFIG, overrides: SetOption = None, json_
     stop = threading.Event()
     stop_on_signals(stop)  # first: what follows takes a second or two
     ignore_hangup()
+    if until_stdin_closes:
+        set_when_stdin_closes(stop)
     settings = load_config(config, overrides or ())
     log = EventLog(sys.stderr.fileno())
     launcher = Launcher(settings, overrides or (), log.say)

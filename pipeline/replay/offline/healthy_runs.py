@@ -83,7 +83,7 @@ class HealthyRuns:
                 for tray, blocks in self._of(path):
                     self.trays.append(tray)
                     known_as = range(tray.fans) if self._knows_fans else None
-                    run = kept.recording(HealthyRun(str(path), tray.fans, blocks, known_as, self._tachos))
+                    run = kept.recording(HealthyRun(str(path), tray.fans, blocks, known_as, self._tachos, tray.tray))
                     yield run._replace(blocks=self._reported(str(path), run.blocks))
             except CodecError as error:
                 raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error

@@ -29,13 +29,23 @@ def test_the_twin_is_added_and_all_else_stays(text: str) -> None:
     assert [line for line in added.splitlines() if "twin = " not in line] == text.splitlines()
 
 
+def test_the_ends_of_lines_stay() -> None:
+    assert with_twin('[[tray]]\r\nname = "a"\r\n', "a.onnx", PATH) == '[[tray]]\r\ntwin = "a.onnx"\r\nname = "a"\r\n'
+
+
 @pytest.mark.parametrize(
     "text",
     [
         'tray = [{ name = "a", fans = 2 }]\n',
         'site = """\n[[tray]]\n"""\n[[tray]]\nname = "a"\n',
+        '[[tray]]\nname = "a"\n[[tray]]\nname = "b"\n',
+        '[[tray]]\nname = "a"\ntwin = "old.onnx"\n',
+        "[viewer]\n",
+        "[[tray]\n",
     ],
 )
 def test_a_place_that_is_not_certain_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match=r"fantwin.toml: write its tray as a section \[\[tray\]\]"):
+    with pytest.raises(
+        ConfigError, match=r'fantwin.toml: twin = "a.onnx" cannot be added: write its tray as one section \[\[tray\]\]'
+    ):
         with_twin(text, "a.onnx", PATH)

@@ -62,6 +62,15 @@ def test_too_few_fans_or_days_give_no_offsets(fans: int, days: int) -> None:
     assert fan_offsets(runs_of(np.zeros((fans, BINS)), days, noise=1.0), CENTRES, STEP_S) is None
 
 
+def test_three_nights_are_enough_and_two_are_not() -> None:
+    offsets = without_its_mean(np.random.default_rng(4).normal(0.0, 1.0, (4, BINS)))
+    nights = [
+        Cells(run.known_as, 150.0 * run.count, 150.0 * run.total) for run in runs_of(offsets, 3, noise=0.1, seen=0.9)
+    ]
+    assert np.sqrt(np.mean((found_of(nights) - offsets) ** 2)) < 0.15
+    assert fan_offsets(nights[:2], CENTRES, STEP_S) is None
+
+
 def test_runs_too_short_at_every_speed_give_no_offsets() -> None:
     short = [Cells(run.known_as, run.count / 20.0, run.total) for run in runs_of(np.zeros((5, BINS)), 12, noise=1.0)]
     assert fan_offsets(short, CENTRES, STEP_S) is None
