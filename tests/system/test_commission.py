@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from pipeline.recordings.reading import read_recording
 from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.limits import Limits
 from tests.support.fantwin_command import fantwin
-from tests.support.running_chain import RunningCommand
+from tests.support.running_chain import RunningCommand, eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 FANS = 2
@@ -80,6 +81,17 @@ def test_a_tray_that_its_plant_moves_gets_a_calibrated_twin(
         "recording-3.mcap",
     ]
     assert twin.card.training.data[0].name == "recording.mcap"
+
+
+def test_what_is_killed_leaves_no_recorder_behind(configuration: Path, tray: RunningCommand) -> None:
+    run = RunningCommand(["commission", "-c", configuration, "--json"])
+    try:
+        run.line_with("recording ordinary operation for 10 min")
+        run.end(signal.SIGKILL)
+        finished = configuration.parent / "runs" / "recording.mcap"
+        eventually(finished.exists, "the recorder ends in order")
+    finally:
+        run.kill()
 
 
 def test_ctrl_c_leaves_the_recording_and_no_twin(configuration: Path, tray: RunningCommand) -> None:

@@ -155,9 +155,7 @@ class RecordingSite:
         return samples
 
     def _end(self) -> None:
-        if self._up.poll() is None:
-            self._up.send_signal(signal.SIGINT)
-        answer, _ = self._up.communicate()
+        answer, _ = self._up.communicate()  # closes its standard input, at which it stops in order
         if answer:
             outcome: dict[str, Any] = json.loads(answer)
             self.recordings = [Path(name) for name in outcome["recordings"]]
