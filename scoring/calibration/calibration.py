@@ -284,7 +284,7 @@ def _with_alarms_at_most(found: HealthyStatistics, factors: Array, allowed: int)
 def _with_declared_alarms(
     runs: Runs, limits: Limits, target: float, top_speed_rad_s: float
 ) -> tuple[Limits, HealthyStatistics]:
-    """Limits with margins, larger where the runs would otherwise have more alarms than allowed; what they then show.
+    """Limits with margins, increased where the runs would have more alarms than allowed; and what the runs then show.
 
     Margins change reference values, which limits by rarity say nothing about. Larger limits let baselines learn more,
     so the runs are scored with them again.

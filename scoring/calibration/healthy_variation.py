@@ -30,7 +30,7 @@ SPEED_EXPONENT = 2  # of the drag, which another density of the air changes
 MAX_REMAINING_SQUARE = 0.97  # baselines follow the speed if they leave at most so much of the mean square over seconds
 TRANSIENT_ALLOWANCE = 3.0  # times the mean square in motion: one fan has the same error in each transient
 MAX_RIDGE, INITIAL_RIDGE = 1.0, 0.1
-SHORT_SHARE = 0.5  # of the mean time of the fans at a speed: one that was there for less only passed it
+SHORT_SHARE = 0.5  # of the mean time of the fans at a speed: a fan counts with this, or with MIN_S if that is less
 UNLIMITED = BaselineSettings(commissioning_limit_sigmas=UNREACHED, adaptation_limit_sigmas=UNREACHED)
 
 

@@ -110,7 +110,7 @@ class RecordingSite:
             if self._up.returncode not in (0, 3):
                 raise self._failed()
             if not self.recordings:
-                raise UserError(f"nothing was recorded (all that was said: {self._log})")
+                raise UserError(f"nothing was recorded (all lines: {self._log})")
 
     @property
     def has_ended(self) -> bool:

@@ -40,17 +40,26 @@ SHOWN_EVERY_S = 60.0
 def commission(
     config: ConfigOption = DEFAULT_CONFIG,
     sweep: Annotated[
-        bool, typer.Option("--sweep", help="Move the fans, as `fantwin sweep` does; else the plant has to.")
+        bool,
+        typer.Option("--sweep", help="Move the fans, as `fantwin sweep` does; otherwise the plant must move them."),
     ] = False,
-    low: Annotated[float | None, typer.Option(help="Of --sweep: lowest command.")] = None,
-    high: Annotated[float | None, typer.Option(help="Of --sweep: highest command.")] = None,
-    safe: Annotated[float | None, typer.Option(help="Of --sweep: the command at its end.")] = None,
-    rounds: Annotated[int, typer.Option(min=1, max=100, help="Of --sweep: how often all levels are passed.")] = 2,
+    low: Annotated[float | None, typer.Option(help="With --sweep: lowest command.")] = None,
+    high: Annotated[float | None, typer.Option(help="With --sweep: highest command.")] = None,
+    safe: Annotated[float | None, typer.Option(help="With --sweep: the command at the end.")] = None,
+    rounds: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            max=100,
+            help="With --sweep: how often the first sweep passes all levels; the second passes them once.",
+        ),
+    ] = 2,
     minutes: Annotated[
         float, typer.Option(min=0.1, max=10_000, help="Length of each recording of ordinary operation.")
     ] = 10.0,
     at_most_hours: Annotated[
-        float, typer.Option(min=0.01, max=1000, help="Without --sweep: wait so long for the plant to move the fans.")
+        float,
+        typer.Option(min=0.01, max=1000, help="Without --sweep: the longest wait for the plant to move the fans."),
     ] = 24.0,
     false_alarms_per_day: Annotated[
         float, typer.Option(min=1e-6, max=8640, help="The rate to declare: false alarms per fan and day.")
@@ -64,13 +73,15 @@ def commission(
 ) -> None:
     """Record healthy fans, train their twin, set its alarm limits, write it into the configuration, start watching.
 
-    The steps are the commands of docs/tutorial/own-fan.md; each is shown before it runs. The fans must be healthy.
-    Without --sweep no fan is moved: the first recording lasts until the plant has moved every fan through enough
-    commands, and what is missing is shown. The limits are those of little data: calibrate again after some days.
+    The steps are commands of docs/tutorial/own-fan.md; each is shown before it runs, except the `up` that records. The
+    fans must be healthy. Without --sweep no fan is moved: the first recording lasts until the plant has moved every fan
+    through enough commands, and what is missing is shown. The limits come from little data: calibrate again after a few
+    days.
 
     Ctrl-C ends it without a twin; recordings stay. With --json it does not start `fantwin up`.
 
     Exit codes: 0 success; 1 failed, and one line says why; 3 success, but data were lost while recording; 130 Ctrl-C.
+    Once `fantwin up` is started, the exit code is that of `up`.
 
     Example: fantwin commission -c fantwin.toml --sweep --low 0.2
     """
@@ -81,7 +92,7 @@ def commission(
     if sweep:
         range_within(tray, low, high, safe)
     elif given := [name for name, value in (("--low", low), ("--high", high), ("--safe", safe)) if value is not None]:
-        raise UserError(f"{given[0]} is of a sweep: add --sweep, which moves the fans")
+        raise UserError(f"{given[0]} needs --sweep, which moves the fans: add --sweep")
     configured = ["-c", str(config), *(word for override in overrides or () for word in ("--set", override))]
     stop = threading.Event()
     stop_on_signals(stop)
@@ -105,7 +116,10 @@ def commission(
         raise UserError(f"{error}; recorded until then: {', '.join(map(str, work.recordings))}") from error
     entry = _write_entry(settings, twin)
     for fan in work.held:
-        say(f"{fan} while the data for its limits were recorded: they are uncertain at others; calibrate again later")
+        say(
+            f"{fan} while the data for its limits were recorded: its limits are uncertain at other commands; "
+            "calibrate again later"
+        )
     say(f'{config}: tray {tray.name} has twin = "{entry}" now')
     if json_output:
         typer.echo(json.dumps(work.as_json(twin, entry)))
@@ -139,7 +153,9 @@ def _refuse_what_cannot_end_well(settings: Config, tray: TrayConfig, twin: Path)
         raise UserError(f"{settings.path}: launcher.stages leaves out {', '.join(missing)}: remove launcher.stages")
     with_twin(settings.text, twin.name, settings.path)
     if not os.access(settings.path.resolve().parent, os.W_OK):
-        raise UserError(f"{settings.path}: its folder cannot be written to, and the twin is to be added to it")
+        raise UserError(
+            f"{settings.path}: its folder is not writable, so the twin could not be added to the configuration"
+        )
     if twin.exists():
         raise UserError(f"{twin}: exists already: name another with -o")
     check_writable(twin, ".onnx")
@@ -188,7 +204,7 @@ class _Commissioning:
         else:
             moved = self._recorded(lambda site: self._sweep(site, sweep, rounds))
         if hints := read_training_data(moved, None, None, 0.0, float("inf")).tacho_hints():
-            raise UserError(f"{hints[0]}: declare it as `tacho` in [[tray]], then start again")
+            raise UserError(f"{hints[0]}: declare the tacho that was found as `tacho` in [[tray]], then start again")
         self._operation = OrdinaryOperation(self._settings.trays[0])
         if sweep is None:
             held_out = [self._recorded(lambda site: self._operate(site, operation_s))]

@@ -53,14 +53,14 @@ class OrdinaryOperation:
         """What each fan has not done yet, a few words for each that lacks something."""
         held = (self._seconds >= NEEDED_S).sum(axis=1)
         return [
-            f"fan {fan}: {self._range_of(fan)}, {held[fan]} of {NEEDED_RANGES} levels held for {NEEDED_S:.0f} s, "
-            f"{self._changes[fan]} of {NEEDED_CHANGES} changes"
+            f"fan {fan}: {self._range_of(fan)}, {NEEDED_S:.0f} s in {held[fan]} of {NEEDED_RANGES} tenths of the "
+            f"range, {self._changes[fan]} of {NEEDED_CHANGES} changes"
             for fan in range(len(held))
             if held[fan] < NEEDED_RANGES or self._changes[fan] < NEEDED_CHANGES
         ]
 
     def held(self) -> list[str]:
-        """Which fans had one command all the time, a few words for each."""
+        """Which fans never changed their command by more than a tenth of the range, a few words for each."""
         return [f"fan {fan}: {self._range_of(fan)}" for fan in np.flatnonzero(self._changes == 0).tolist()]
 
     def _range_of(self, fan: int) -> str:
