@@ -15,7 +15,7 @@ from pipeline.config.loading import load_config
 from pipeline.recordings.reading import read_recording
 from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.limits import Limits
-from tests.support.fantwin_command import fantwin
+from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import RunningCommand, eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
@@ -83,10 +83,13 @@ def test_a_tray_that_its_plant_moves_gets_a_calibrated_twin(
     assert twin.card.training.data[0].name == "recording.mcap"
 
 
-def test_what_is_killed_leaves_no_recorder_behind(configuration: Path, tray: RunningCommand) -> None:
+def test_beside_a_running_site_it_is_refused_and_what_is_killed_leaves_no_recorder_behind(
+    configuration: Path, tray: RunningCommand
+) -> None:
     run = RunningCommand(["commission", "-c", configuration, "--json"])
     try:
         run.line_with("recording ordinary operation for 10 min")
+        assert "site 'site' runs already" in error_of("commission", "-c", configuration)
         run.end(signal.SIGKILL)
         finished = configuration.parent / "runs" / "recording.mcap"
         eventually(finished.exists, "the recorder ends in order")
