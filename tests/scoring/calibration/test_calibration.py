@@ -283,7 +283,7 @@ def test_the_recordings_themselves_have_no_more_alarms_than_declared() -> None:
     runs = days(25, 0, 8, fans=10, seconds=60, period_ns=COARSE_NS)
 
     def with_one_that_strays() -> Iterator[HealthyRun]:
-        for number, (name, fans, blocks, known_as, _) in enumerate(runs()):
+        for number, (name, fans, blocks, known_as, *_) in enumerate(runs()):
             strays = np.where((np.arange(fans) == 3) & (number % 2 == 0), 4.0, 0.0)
             late = [
                 replace(b, speed_residual=b.speed_residual + strays * ((b.t_ns // 10_000_000_000) == 5)[:, np.newaxis])
