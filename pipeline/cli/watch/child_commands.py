@@ -37,11 +37,11 @@ class Stopped(Exception):  # noqa: N818  not an error
 class Commands:
     """Runs commands, each to its end."""
 
-    def __init__(self, stop: threading.Event, say: Callable[[str], None], *, quiet: bool) -> None:
-        """say: is given each command line. quiet: what the commands print goes to standard error."""
+    def __init__(self, stop: threading.Event, say: Callable[[str], None], *, to_standard_error: bool) -> None:
+        """say: is given each command line. to_standard_error: what the commands print goes to standard error."""
         self.stop = stop
         self.say = say
-        self.quiet = quiet
+        self.to_standard_error = to_standard_error
 
     def run(self, *words: object, site: RecordingSite | None = None) -> None:
         """Run a command to its end. site: of which it needs the samples.
@@ -52,7 +52,7 @@ class Commands:
         """
         line = [str(word) for word in words]
         self.say(f"fantwin {shlex.join(line)}")
-        child = _started(line, stdout=STANDARD_ERROR if self.quiet else None)
+        child = _started(line, stdout=STANDARD_ERROR if self.to_standard_error else None)
         self.wait(child, site)
         if child.returncode:
             raise UserError(f"`fantwin {line[0]}` failed (exit code {child.returncode}); see the lines before this one")

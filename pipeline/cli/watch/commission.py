@@ -102,7 +102,7 @@ def commission(
     def say(line: str) -> None:
         typer.echo(line, err=json_output)
 
-    work = _Commissioning(settings, configured, Commands(stop, say, quiet=json_output))
+    work = _Commissioning(settings, configured, Commands(stop, say, to_standard_error=json_output))
     try:
         with_sweep = _sweep_words(low, high, safe) if sweep else None
         work.make(twin, with_sweep, rounds, 60.0 * minutes, 3600.0 * at_most_hours, false_alarms_per_day)
