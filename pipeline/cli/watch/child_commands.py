@@ -6,7 +6,6 @@ import json
 import shlex
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -17,11 +16,11 @@ from typing import Any, Self
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.errors import UserError
+from pipeline.selftest.scratch_site import FANTWIN
 from schemas.codec import CodecError, decode
 from schemas.messages import Raw
 from schemas.topics import tray_key
 
-FANTWIN = (sys.executable, "-P", "-m", "pipeline")
 RECORDING_ONLY = ("--set", f"launcher.stages={json.dumps(['acquisition', 'resampler', 'recorder'])}")
 SILENT_S = 60.0
 """without a sample, from the start of a recording on: the line is dead"""
