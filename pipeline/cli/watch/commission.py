@@ -178,7 +178,6 @@ class _Commissioning:
         self._settings = settings
         self._configured = configured
         self._commands = commands
-        self._operation = OrdinaryOperation(settings.trays[0])
         self.recordings: list[Path] = []
         self.lost: dict[str, int] = {}
         """while recording, by stage"""
@@ -199,20 +198,20 @@ class _Commissioning:
         sweep: the options of a sweep but for its rounds; None: the plant moves the fans, within at_most_s.
         """
         run = self._commands.run
+        first, later = (OrdinaryOperation(self._settings.trays[0]) for _ in range(2))
         run("doctor", *self._configured, *RECORDING_ONLY)
         if sweep is None:
-            moved = self._recorded(lambda site: self._operate(site, operation_s, at_most_s))
+            moved = self._recorded(lambda site: self._operate(site, first, operation_s, at_most_s))
         else:
             moved = self._recorded(lambda site: self._sweep(site, sweep, rounds))
         if hints := read_training_data(moved, None, None, 0.0, float("inf")).tacho_hints():
             raise UserError(f"{hints[0]}: declare the tacho that was found as `tacho` in [[tray]], then start again")
-        self._operation = OrdinaryOperation(self._settings.trays[0])
         if sweep is None:
-            held_out = [self._recorded(lambda site: self._operate(site, operation_s))]
+            held_out = [self._recorded(lambda site: self._operate(site, later, operation_s))]
         else:  # the limits need other speeds than those that the plant happens to have in some minutes
             held_out = [self._recorded(lambda site: self._sweep(site, sweep, 1))]
-        held_out.append(self._recorded(lambda site: self._operate(site, operation_s)))
-        self.held = self._operation.held() if sweep is None else []
+        held_out.append(self._recorded(lambda site: self._operate(site, later, operation_s)))
+        self.held = later.held() if sweep is None else []
         try:
             run("train", *moved, "--validate", *held_out[0], "-o", twin)
             healthy = [path for recording in held_out for path in recording]
@@ -258,9 +257,10 @@ class _Commissioning:
     def _sweep(self, site: RecordingSite, options: list[str], rounds: int) -> None:
         self._commands.run("sweep", *self._configured, *options, "--rounds", rounds, site=site)
 
-    def _operate(self, site: RecordingSite, at_least_s: float, at_most_s: float | None = None) -> None:
-        """Record ordinary operation; with at_most_s until the fans have moved enough."""
-        operation = self._operation
+    def _operate(
+        self, site: RecordingSite, operation: OrdinaryOperation, at_least_s: float, at_most_s: float | None = None
+    ) -> None:
+        """Record ordinary operation, which `operation` sees; with at_most_s until the fans have moved enough."""
         until = "" if at_most_s is None else ", and until the fans have moved enough"
         self._commands.say(f"recording ordinary operation for {at_least_s / 60:.3g} min{until}")
         began_s, shown_s, recorded_s, missing = time.monotonic(), 0.0, 0.0, list[str]()
