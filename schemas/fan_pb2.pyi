@@ -429,7 +429,7 @@ class Command(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., t_ns: _Optional[int] = ..., command: _Optional[_Iterable[float]] = ..., set_point_rad_s: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class ModelCard(_message.Message):
-    __slots__ = ("header", "t_ns", "twin", "kind", "sha256", "sigma_rad_s", "card_json")
+    __slots__ = ("header", "t_ns", "twin", "kind", "sha256", "sigma_rad_s", "card_json", "content")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     T_NS_FIELD_NUMBER: _ClassVar[int]
     TWIN_FIELD_NUMBER: _ClassVar[int]
@@ -437,6 +437,7 @@ class ModelCard(_message.Message):
     SHA256_FIELD_NUMBER: _ClassVar[int]
     SIGMA_RAD_S_FIELD_NUMBER: _ClassVar[int]
     CARD_JSON_FIELD_NUMBER: _ClassVar[int]
+    CONTENT_FIELD_NUMBER: _ClassVar[int]
     header: Header
     t_ns: int
     twin: str
@@ -444,7 +445,22 @@ class ModelCard(_message.Message):
     sha256: str
     sigma_rad_s: _containers.RepeatedScalarFieldContainer[float]
     card_json: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin: _Optional[str] = ..., kind: _Optional[str] = ..., sha256: _Optional[str] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., card_json: _Optional[str] = ...) -> None: ...
+    content: bytes
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin: _Optional[str] = ..., kind: _Optional[str] = ..., sha256: _Optional[str] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., card_json: _Optional[str] = ..., content: _Optional[bytes] = ...) -> None: ...
+
+class NewTwin(_message.Message):
+    __slots__ = ("header", "t_ns", "twin", "sha256", "content")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    TWIN_FIELD_NUMBER: _ClassVar[int]
+    SHA256_FIELD_NUMBER: _ClassVar[int]
+    CONTENT_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    t_ns: int
+    twin: str
+    sha256: str
+    content: bytes
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin: _Optional[str] = ..., sha256: _Optional[str] = ..., content: _Optional[bytes] = ...) -> None: ...
 
 class Clock(_message.Message):
     __slots__ = ("header", "t_ns", "rate")

@@ -321,7 +321,11 @@ class Command:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelCard:
-    """The twin in force."""
+    """The twin in force.
+
+    content: the ONNX file of a learned twin, in force from the sample at t_ns on; empty: it is the file that the
+    configuration names.
+    """
 
     header: Header = Header()
     t_ns: int
@@ -330,6 +334,18 @@ class ModelCard:
     sha256: str
     sigma_rad_s: Array = column("fans", np.float64, optional=True)
     card_json: str = ""
+    content: bytes = b""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NewTwin:
+    """A learned twin that is to take over. content: its ONNX file."""
+
+    header: Header = Header()
+    t_ns: int
+    twin: str
+    sha256: str
+    content: bytes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -420,7 +436,7 @@ class Health:
 
 
 Message: TypeAlias = (
-    Raw | Grid | Prediction | Score | Alarm | Request | ScorerSnapshot | Command | ModelCard | Clock | Health
+    Raw | Grid | Prediction | Score | Alarm | Request | ScorerSnapshot | Command | ModelCard | NewTwin | Clock | Health
 )
 MESSAGE_TYPES: tuple[type[Message], ...] = get_args(Message)
 

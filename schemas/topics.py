@@ -15,6 +15,7 @@ from schemas.messages import (
     Health,
     Message,
     ModelCard,
+    NewTwin,
     Prediction,
     Raw,
     Request,
@@ -49,6 +50,8 @@ class Topic:
     history: int
     largest_bytes: int
     about: str
+    is_needed_first: bool = False
+    """a consumer that begins needs its last message before those of other topics"""
 
     @property
     def is_rare(self) -> bool:
@@ -70,7 +73,8 @@ TOPICS: tuple[Topic, ...] = (
         "snapshot", ScorerSnapshot, "on change, and each minute", True, 4, 16 * MIB, "a scorer's state for a restart"
     ),
     Topic("command", Command, ON_CHANGE, True, 64, 64 * KIB, "commands and set-points for the fans"),
-    Topic("twin", ModelCard, ON_CHANGE, True, 8, 4 * MIB, "the twin in force"),
+    Topic("twin", ModelCard, ON_CHANGE, True, 8, 4 * MIB, "the twin in force", True),
+    Topic("new_twin", NewTwin, ON_CHANGE, False, 2, 4 * MIB, "a learned twin that is to take over", True),
     Topic("clock", Clock, "20 Hz", False, 1, 4 * KIB, "position of a replay"),
     Topic("health", Health, "1 Hz for each stage", True, 8, 2 * MIB, "status and losses of a stage"),
 )

@@ -44,3 +44,31 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array)
         score=scored.score,
         statistic=scored.statistic,
     )
+
+
+def unscored(item: Prediction) -> Score:
+    """The message of a block that was not scored, because there is no twin."""
+    unknown = np.full(item.command.shape, np.nan)
+    why = np.where(item.invalid_reason == InvalidReason.NONE, InvalidReason.NO_TWIN, item.invalid_reason)
+    return Score(
+        fans=item.fans,
+        period_ns=item.period_ns,
+        t_ns=item.t_ns,
+        command=item.command,
+        measured_speed_rad_s=item.measured_speed_rad_s,
+        predicted_speed_rad_s=unknown,
+        lower_bound_rad_s=unknown,
+        upper_bound_rad_s=unknown,
+        band_variance=unknown,
+        residual_rad_s=unknown,
+        smoothed_residual_rad_s=unknown,
+        outside=np.zeros(unknown.shape, np.bool_),
+        state=np.full(unknown.shape, int(FanState.UNKNOWN), np.uint8),
+        valid=np.zeros(unknown.shape, np.bool_),
+        invalid_reason=why.astype(np.uint8),
+        torque_balance_command=unknown,
+        speed_baseline_rad_s=unknown,
+        balance_baseline_command=unknown,
+        score=unknown,
+        statistic=np.zeros(unknown.shape, np.uint8),
+    )

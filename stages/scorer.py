@@ -1,7 +1,7 @@
 """Scorer: compares the measurements with the twin, and maintains the alarm of each fan.
 
-Reads: topic `prediction` (measured and predicted speed rad/s, torque balance in command units), and `request` (what
-operators request about alarms).
+Reads: topic `prediction` (measured and predicted speed rad/s, torque balance in command units), `request` (what
+operators request about alarms), and `twin` where twins are learned (pipeline.runtime.learned_scorer).
 Writes: topic `score` (residuals, baselines, the statistic closest to its limit, state), `alarm` (every transition of a
 fan's alarm), `snapshot` (the state to continue from after a restart).
 Timing: one score message for every prediction message, immediately; delays count the time of valid samples.
@@ -23,14 +23,16 @@ import numpy as np
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.healthy_twin import HealthyTwin, ScorerConfig, healthy_twin
 from pipeline.runtime.judged_share import JudgedShare
+from pipeline.runtime.learned_scorer import LearnedTwinScorer
 from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.snapshot_store import SnapshotStore
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from pipeline.runtime.tray_scorer import DATA_LOST_AFTER_NS, TrayScorer
-from pipeline.runtime.tray_twin import load_tray_twin, twin_path
+from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin, twin_path
 from schemas.blocks import select
 from schemas.messages import (
     Alarm,
+    ModelCard,
     Prediction,
     Request,
     Score,
@@ -71,8 +73,10 @@ class ScorerCore(Core):
         snapshot_store: SnapshotStore | None = None,
         decision_rules: DecisionRules = CURRENT_RULES,
         started_t_ns: int | None = None,
+        continues: ScorerSnapshot | None = None,
     ) -> None:
-        """snapshot_store: where snapshots are kept; None: nowhere, as in a replay. started_t_ns: the present time."""
+        """snapshot_store: where snapshots are kept; None: nowhere, as in a replay. started_t_ns: the present time.
+        continues: the last snapshot of the twin before this one, instead of the one in the store."""
         self._fans = fans
         self._twin = twin
         self._config = config
@@ -89,8 +93,8 @@ class ScorerCore(Core):
         self._set_back, self._set_back_until_t_ns = "", 0
         """that the snapshot was set back, for people"""
         self._start_new()
-        snapshot = snapshot_store.load() if snapshot_store else None
-        self._at_start = self.restore(snapshot) if snapshot else []
+        stored = snapshot_store.load() if snapshot_store and not continues else None
+        self._at_start = self.restore(stored) if stored else self._continued(continues) if continues else []
         """messages to be emitted first"""
         is_ahead = started_t_ns is not None and self._last_t_ns > started_t_ns + SET_BACK_NS
         self._may_be_set_back = is_ahead and self._is_restored and not self._not_restored
@@ -136,6 +140,13 @@ class ScorerCore(Core):
             return [replace(snapshot, restored=True), *self._tray.alarms.discard_all(snapshot.t_ns, keep_silenced=True)]
         return [replace(snapshot, restored=True), *self._tray.alarms.republish()]
 
+    def _continued(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
+        """Take over from another twin: what belongs to operators stays, all else is of that twin."""
+        _, *alarms = self.restore(snapshot)
+        if self._not_restored == ANOTHER_TWIN:  # as it should be
+            self._not_restored = ""
+        return alarms
+
     def tick(self, now_ns: int) -> list[Alarm | ScorerSnapshot]:
         """Emit once what was restored, also if it is then discarded: a replay restores it, too."""
         if self._may_be_set_back:
@@ -143,8 +154,11 @@ class ScorerCore(Core):
         at_start, self._at_start = self._at_start, []
         return at_start
 
-    def step(self, item: Prediction | Request) -> list[Score | Alarm | ScorerSnapshot]:
-        """Score a block and return its score and alarm transitions; or answer a request."""
+    def step(self, item: Prediction | Request | ModelCard) -> list[Score | Alarm | ScorerSnapshot]:
+        """Score a block and return its score and alarm transitions; or answer a request. The twin is that of the
+        configuration, so its card says nothing new."""
+        if isinstance(item, ModelCard):
+            return []
         if isinstance(item, Request):
             self._may_be_set_back = False
             return [*self.tick(0), *self._answer(item)]
@@ -207,9 +221,13 @@ class ScorerCore(Core):
 
     def close(self) -> list[ScorerSnapshot]:
         """The snapshot that the next session continues from."""
-        snapshots = self._take_snapshot(at_once=True) if self._last_t_ns > np.iinfo(np.int64).min else []
+        snapshots = self.last_snapshot()
         self.abort()
         return snapshots
+
+    def last_snapshot(self) -> list[ScorerSnapshot]:
+        """The state now; nothing before the first sample."""
+        return self._take_snapshot(at_once=True) if self._last_t_ns > np.iinfo(np.int64).min else []
 
     def abort(self) -> None:
         """Save nothing; another process may use the snapshot."""
@@ -290,33 +308,39 @@ def _json(state: Mapping[str, Any]) -> str:
 
 
 def build(context: Context) -> BuiltStage:
-    """The core of one tray.
+    """The core of one tray; without a twin in the configuration, of the twins that are learned.
 
     Raises:
-        StageError: the tray names no twin, or one that cannot be used; the snapshot file cannot be read, or another
-            process uses it.
+        StageError: the twin cannot be used; the snapshot file cannot be read, or another process uses it.
     """
     tray = context.tray
     path = context.snapshot_folder / f"scorer-{tray.name}.snapshot" if context.snapshot_folder else None
-    twin = healthy_twin(context, load_tray_twin(twin_path(tray, context.folder), tray.fans))
     store = SnapshotStore(path) if path else None
-    if store:
-        store.lock(f"site {context.site}")
-    return BuiltStage(
-        ScorerCore(
+
+    def core_of(twin: TrayTwin, continues: ScorerSnapshot | None = None) -> ScorerCore:
+        return ScorerCore(
             tray.fans,
             tray.speed_unit,
             context.config,
-            twin,
+            healthy_twin(context, twin),
             store,
             decision_rules=context.decision_rules,
             started_t_ns=context.started_t_ns,
+            continues=continues,
         )
-    )
+
+    twin = load_tray_twin(twin_path(tray, context.folder), tray.fans) if tray.twin else None
+    if twin is not None:
+        healthy_twin(context, twin)  # it may be refused, before the snapshot is locked
+    if store:
+        store.lock(f"site {context.site}")
+    return BuiltStage(core_of(twin) if twin else LearnedTwinScorer(tray, core_of, store))
 
 
 def check(context: Context) -> list[str]:
     """Why the scorer cannot run; the twin integrator reports a twin that cannot be loaded."""
+    if context.tray.twin is None:
+        return []
     try:
         twin = load_tray_twin(twin_path(context.tray, context.folder), context.tray.fans)
     except StageError:
@@ -331,7 +355,7 @@ def check(context: Context) -> list[str]:
 STAGE = Stage(
     name="scorer",
     about="two residuals, their statistics, and the fans' alarms",
-    reads=("prediction", "request"),
+    reads=("prediction", "request", "twin"),
     writes=("score", "alarm", "snapshot"),
     config=ScorerConfig,
     build=build,

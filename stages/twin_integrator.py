@@ -1,7 +1,9 @@
 """Twin integrator: runs the healthy twin on the same commands as the fans.
 
-Reads: topic `grid` (command, measured speed rad/s, uniform time).
-Writes: topic `prediction` (measured and predicted speed rad/s, sigma rad/s), and `twin` (the model card) at start.
+Reads: topic `grid` (command, measured speed rad/s, uniform time), and `new_twin` where the configuration names no twin
+(pipeline.runtime.learned_integrator).
+Writes: topic `prediction` (measured and predicted speed rad/s, sigma rad/s), and `twin` (the model card) at start and
+when a new twin takes over.
 Timing: one prediction message for every grid message, immediately and of the same size; the graph runs once per message
 for all fans.
 
@@ -32,12 +34,13 @@ from pydantic import Field
 
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.free_run import FreeRun, FreeRunInputs
+from pipeline.runtime.learned_integrator import LearnedTwinIntegrator
 from pipeline.runtime.old_samples import OldSamples
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from pipeline.runtime.starting_fans import StartingFans
 from pipeline.runtime.twin_file import TwinFile, load_twin
 from schemas.blocks import select
-from schemas.messages import Array, Grid, InvalidReason, ModelCard, Prediction
+from schemas.messages import Array, Grid, InvalidReason, ModelCard, NewTwin, Prediction
 from schemas.standstill import Standstill
 from schemas.units import NS_PER_S
 from scoring.expected_reading import AveragedCommand
@@ -70,7 +73,9 @@ class TwinIntegratorCore(Core):
         started_t_ns: int,
         *,
         decision_rules: DecisionRules = CURRENT_RULES,
+        content: bytes = b"",
     ) -> None:
+        """content: of the file of a learned twin, published with its card."""
         self._twin = twin
         self._knows_breaks = decision_rules >= DecisionRules.BREAKS
         self._producer = ""  # of the newest grid
@@ -98,6 +103,7 @@ class TwinIntegratorCore(Core):
                 sha256=twin.sha256,
                 sigma_rad_s=twin.sigma_rad_s,
                 card_json=twin.card_json,
+                content=content,
             )
         ]
         self._last_t_ns: int | None = None
@@ -107,8 +113,10 @@ class TwinIntegratorCore(Core):
         self._old_samples = OldSamples()
         self._counts: Counter[str] = Counter()
 
-    def step(self, item: Grid) -> list[ModelCard | Prediction]:
-        """Predict the speeds of a block."""
+    def step(self, item: Grid | NewTwin) -> list[ModelCard | Prediction]:
+        """Predict the speeds of a block. The twin is that of the configuration: no other one takes over."""
+        if isinstance(item, NewTwin):
+            return []
         messages: list[ModelCard | Prediction] = [*self.tick(0)]
         if item.fans != self._twin.fans:
             self._counts["lost_wrong_fan_count"] += len(item.t_ns)
@@ -359,17 +367,25 @@ def _balance_of(twin: TwinFile, off_below: Array) -> TorqueBalance:
 
 
 def build(context: Context) -> BuiltStage:
-    """The core of one tray and its twin.
+    """The core of one tray and its twin; without one in the configuration, of the twins that are learned.
 
     Raises:
-        StageError: the tray names no twin, or one that cannot be used.
+        StageError: the twin cannot be used.
     """
-    twin, rules = load_twin(context), context.decision_rules
-    return BuiltStage(TwinIntegratorCore(twin, context.config, context.started_t_ns, decision_rules=rules))
+    config, rules = context.config, context.decision_rules
+    if context.tray.twin is None:
+
+        def core_of(twin: TwinFile, first_t_ns: int, content: bytes) -> TwinIntegratorCore:
+            return TwinIntegratorCore(twin, config, first_t_ns, decision_rules=rules, content=content)
+
+        return BuiltStage(LearnedTwinIntegrator(context.tray, core_of))
+    return BuiltStage(TwinIntegratorCore(load_twin(context), config, context.started_t_ns, decision_rules=rules))
 
 
 def check(context: Context) -> list[str]:
     """What would keep the twin from being loaded."""
+    if context.tray.twin is None:
+        return []
     try:
         load_twin(context)
     except StageError as error:
@@ -380,7 +396,7 @@ def check(context: Context) -> list[str]:
 STAGE = Stage(
     name="twin_integrator",
     about="the healthy twin on the same commands as the fans",
-    reads=("grid",),
+    reads=("grid", "new_twin"),
     writes=("prediction", "twin"),
     config=TwinIntegratorConfig,
     build=build,

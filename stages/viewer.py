@@ -4,7 +4,7 @@ Reads `score`, `alarm`, `twin` and `health`; writes nothing. One core serves all
 the tray. Samples are collected and drawn twice a second, because a call into Rerun is expensive and a row in it is
 cheap. Only samples and alarms are on the time line, at the time of the sample. Reports in host time go to a page
 without time; otherwise, in a replay of an old recording, these reports would be the newest data, which viewers follow.
-Only this stage may drop messages: the runner keeps a bounded queue in front of it and counts what it drops.
+It may drop messages: the runner keeps a bounded queue in front of it and counts what it drops.
 """
 
 from __future__ import annotations

@@ -28,6 +28,7 @@ from twin.evaluation.accuracy import (
     Evaluation,
     Figures,
     UnseenStd,
+    compared_readings,
     evaluate_model,
     evaluation_pieces,
     free_run_residuals,
@@ -228,6 +229,18 @@ def evaluate(
     sigma_rad_s = np.array(loaded.card.sigma_rad_s)[rows]
     unseen_std = _unseen_std(loaded.card.model_uncertainty, drive_of_fans(loaded.card, rows))
     return evaluate_model(model, loaded.parameters[rows], sigma_rad_s, runs, unseen_std)
+
+
+def free_run_of(twin: OnnxTwin, runs: Sequence[Run]) -> tuple[Array, Array, Array]:
+    """Residual of the free run and measured speed, rad/s, and command: (samples, fans) each, over runs of its fans.
+
+    NaN where nothing can be compared. Raises TwinError when the fans do not fit.
+    """
+    rows = fan_rows(twin.card, common_fans(runs))
+    pieces = evaluation_pieces(measured_as_in_card(twin.card, rows, runs))
+    residual = free_run_residuals(twin, twin.parameters[rows], pieces)
+    measured = np.concatenate([compared_readings(piece) for piece in pieces])
+    return residual, measured, np.concatenate([piece.command for piece in pieces])
 
 
 def _unseen_std(table: ModelUncertainty | None, drive: DriveCard | None) -> UnseenStd | None:

@@ -24,7 +24,7 @@ from schemas.messages import Alarm, Array, Prediction, Score
 from schemas.units import NS_PER_S
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.samples import samples_of
-from twin.export.calibrated import with_calibration
+from twin.export.card_entries import with_card_entries
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def calibrated_twin(
         runs.append(HealthyRun(path.stem, fans, blocks, range(fans) if known.fans > 1 else None, known.card.tacho))
     timing = HealthyRuns(recordings, twin, (), lambda _: None).timing()
     limits = find_limits([known], lambda: runs, timing, alarms_per_day, extrapolate=extrapolate)
-    output.write_bytes(with_calibration(twin.read_bytes(), json.loads(limits.model_dump_json())))
+    output.write_bytes(with_card_entries(twin.read_bytes(), {"calibration": json.loads(limits.model_dump_json())}))
 
 
 def scorer_of(recording: Path, twin: Path) -> Core:

@@ -22,7 +22,7 @@ from schemas.messages import Alarm, Array, Prediction, Score
 from scoring.calibration.healthy_statistics import HealthyRun
 from scoring.limits import Limits, default_timing
 from scoring.samples import Samples, samples_of
-from twin.export.calibrated import with_calibration
+from twin.export.card_entries import with_card_entries
 
 NAME = "fantwin"
 COLUMNS = (
@@ -126,7 +126,7 @@ def calibrated_twins(
     for number, path in enumerate(given):
         made.append(path.with_name(f"calibrated-{path.name}"))
         calibration = json.loads(limits.of(fans_of(number)).model_dump_json())
-        made[-1].write_bytes(with_calibration(path.read_bytes(), calibration))
+        made[-1].write_bytes(with_card_entries(path.read_bytes(), {"calibration": calibration}))
     return made, limits
 
 

@@ -11,8 +11,9 @@ the fan is on and lasts for a quarter of the part; the last part of a fault and 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,12 @@ SETTLED_S, SHORT_S = 8.0, 2.0
 """how long a sweep holds its levels: until the fans have settled, and so that they never do"""
 ON_BEFORE_S, ON_AFTER_S = 10.0, 60.0
 """the fan is on for so long around the beginning of its fault"""
+
+
+AGED_EVERY_S = 600.0
+"""how often the speeds change with ageing"""
+Ageing: TypeAlias = Callable[[float], Array]
+"""(columns,) factor on the speed of each fan at a time in seconds"""
 
 
 @dataclass(frozen=True)
@@ -136,13 +143,19 @@ def swept_duty(t_s: float) -> Array:
 
 
 def reports(
-    of: Racks, rate_hz: float, faults: list[Fault] | None = None, *, is_swept: bool = False
+    of: Racks,
+    rate_hz: float,
+    faults: list[Fault] | None = None,
+    *,
+    is_swept: bool = False,
+    ageing: Ageing | None = None,
 ) -> Iterator[list[Raw]]:
     """The samples of each rack, block by block, as its device sends them.
 
-    rate_hz: one of RATES_HZ. is_swept: under `swept_duty` instead of the thermostat.
+    rate_hz: one of RATES_HZ. is_swept: under `swept_duty` instead of the thermostat. ageing: slow changes that are no
+    faults of the schedule.
     """
-    course = _Course(of, faults or [], is_swept=is_swept)
+    course = _Course(of, faults or [], ageing, is_swept=is_swept)
     chance = np.random.default_rng([of.seed, 3, round(rate_hz)])
     rows, sent = round(of.seconds * rate_hz), 0
     while sent < rows:
@@ -155,8 +168,10 @@ def reports(
 class _Course:
     """Fans and tachos as time goes on."""
 
-    def __init__(self, of: Racks, faults: list[Fault], *, is_swept: bool) -> None:
+    def __init__(self, of: Racks, faults: list[Fault], ageing: Ageing | None, *, is_swept: bool) -> None:
         self._of = of
+        self._ageing = ageing
+        self._aged_until_s = 0.0
         self._is_swept = is_swept
         self._faults = faults
         self._fans = FourPinFans(of.parameters, np.random.default_rng([of.seed, 2]), RACK_FANS)
@@ -205,9 +220,13 @@ class _Course:
             for fault in self._active:
                 if fault.kind == "tacho-dropout":
                     self._missing[fault.fan] = fault.size_at(t_s)
-        elif t_s > self._grows_until_s:
+        elif t_s > self._grows_until_s and (self._ageing is None or t_s < self._aged_until_s):
             return
-        self._fans.damage = four_pin_damage(self._active, self._of.columns, t_s)
+        damage = four_pin_damage(self._active, self._of.columns, t_s)
+        if self._ageing is not None:
+            self._aged_until_s = t_s + AGED_EVERY_S
+            damage = replace(damage, speed_factor=np.asarray(damage.speed_factor) * self._ageing(t_s))
+        self._fans.damage = damage
 
 
 def _lines(

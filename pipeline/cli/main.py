@@ -44,6 +44,8 @@ COMMANDS = {
     "evaluate": "twins.evaluate",
     "compare": "twins.compare",
     "report": "twins.report",
+    "learn": "twins.learn",
+    "twins": "twins.twins",
     "simulate": "simulation.simulate",
 }
 """command -> its module in this folder; the module's function of the same name is the command"""

@@ -117,7 +117,12 @@ def enabled_stages(launcher: LauncherConfig, table: Mapping[str, Any]) -> tuple[
     `enabled_by`; `table` is the whole configuration."""
     if launcher.stages is not None:
         return tuple(name for name in STAGES if name in launcher.stages)
-    return tuple(name for name, row in STAGES.items() if row.enabled_by == "default" or name in table)
+    learns = any("twin" not in tray for tray in table["tray"])
+    return tuple(
+        name
+        for name, row in STAGES.items()
+        if row.enabled_by == "default" or name in table or (row.enabled_by == "tray without twin" and learns)
+    )
 
 
 def _override(table: dict[str, Any], override: str) -> None:

@@ -19,15 +19,15 @@ class StageRow:
         name: also the name of its section in the configuration.
         declaration: import string of its `pipeline.runtime.stage.Stage`, `module:attribute`.
         enabled_by: what enables it where `launcher.stages` is not given. "default": always; "section": a section
-            `[name]` in the configuration.
+            `[name]` in the configuration; "tray without twin": a tray that names no twin.
         scope: one process for the site, or one for each tray.
         may_drop: that of its declaration, for those who count losses and would wait long for its imports.
-        needs_twin: it cannot start unless every tray has a twin.
+        needs_twin: it cannot start unless every tray has a twin, or learns one.
     """
 
     name: str
     declaration: str
-    enabled_by: Literal["default", "section"] = "section"
+    enabled_by: Literal["default", "section", "tray without twin"] = "section"
     scope: Literal["site", "tray"] = "site"
     may_drop: bool = False
     needs_twin: bool = False
@@ -38,11 +38,14 @@ class StageRow:
         return getattr(import_module(module), attribute)
 
 
+LEARNER = "learner"
+"""the stage that gives a tray its twin"""
 STAGES: dict[str, StageRow] = {
     row.name: row
     for row in (
         StageRow("acquisition", "stages.acquisition:STAGE", enabled_by="default", scope="tray"),
         StageRow("resampler", "stages.resampler:STAGE", enabled_by="default"),
+        StageRow(LEARNER, "stages.learner:STAGE", enabled_by="tray without twin", may_drop=True),
         StageRow("twin_integrator", "stages.twin_integrator:STAGE", enabled_by="default", needs_twin=True),
         StageRow("scorer", "stages.scorer:STAGE", enabled_by="default", needs_twin=True),
         StageRow("recorder", "stages.recorder:STAGE", enabled_by="default"),

@@ -12,7 +12,7 @@ from typing import Any
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config
-from pipeline.config.registry import STAGES
+from pipeline.config.registry import LEARNER, STAGES
 from pipeline.devices.host_clock import HOST_CLOCK
 from pipeline.errors import UserError
 from pipeline.launch.loss_accounting import Launched
@@ -135,10 +135,11 @@ class Launcher:
     def _refuse_unusable_twins(self) -> None:
         """Refuse a twin that is missing or of other fans, by its card, before any stage has made a file.
 
-        The stages check the rest.
+        A tray that names none learns one. The stages check the rest.
         """
+        learns = LEARNER in self._config.stages
         if any(STAGES[name].needs_twin for name in self._config.stages):
-            for tray in self._config.trays:
+            for tray in (tray for tray in self._config.trays if tray.twin or not learns):
                 load_tray_twin(twin_path(tray, self._config.folder), tray.fans)
 
     def _refuse_second_launcher(self, bus: Bus, stop: threading.Event) -> None:

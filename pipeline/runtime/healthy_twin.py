@@ -144,21 +144,19 @@ def healthy_twin(context: Context, twin: TrayTwin) -> HealthyTwin:
     Raises:
         StageError: the twin's calibration cannot be used for this tray.
     """
-    again = "calibrate it again: fantwin calibrate"
+    again, name = "calibrate it again: fantwin calibrate", context.tray.twin or twin.card.name
     try:
         limits = limits_in_force(context.config, twin.card.calibration, twin.card.standstill, context.decision_rules)
     except ValidationError as error:
         first = error.errors()[0]
         why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise StageError(f"{context.tray.twin}: its calibration cannot be used: {why}; {again}") from error
+        raise StageError(f"{name}: its calibration cannot be used: {why}; {again}") from error
     for residual in (limits.speed, limits.balance):
         fans = len(residual.fan_offsets.offset_sigmas) if residual.fan_offsets else context.tray.fans
         if len(residual.low_frequency_std_of_fans) not in (0, twin.card.fans):
             fans = len(residual.low_frequency_std_of_fans)
         if fans != context.tray.fans:
-            raise StageError(
-                f"{context.tray.twin}: its calibration is of {fans} fans, the tray has {context.tray.fans}; {again}"
-            )
+            raise StageError(f"{name}: its calibration is of {fans} fans, the tray has {context.tray.fans}; {again}")
     card = twin.card
     return HealthyTwin(
         twin.sha256,

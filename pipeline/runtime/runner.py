@@ -91,6 +91,7 @@ class Runner:
             run_folder=config.run_folder,
             started_t_ns=started_t_ns,
             snapshot_folder=config.run_folder,
+            configuration_path=config.path,
             configuration_text=config.text,
             overrides=config.overrides,
         )
@@ -398,7 +399,7 @@ class Runner:
 
     def _catch_up(self) -> None:
         """Request what producers still keep from before this stage started: only then is it ready."""
-        keys = sorted(self._read_keys)
+        keys = sorted(self._read_keys, key=lambda key: (not topic_of(key).is_needed_first, key))
         if "health" in self.stage.reads:
             keys.append(health_key(self._site, "*", "*"))
         self._recovery.catch_up(keys)

@@ -102,6 +102,8 @@ class Context:
     started_t_ns: int
     snapshot_folder: Path | None = None
     """where a stage keeps the state that survives a restart; None: nothing is kept, as in a replay"""
+    configuration_path: Path | None = None
+    """the configuration file; None: there is none, as in a replay"""
     configuration_text: str = field(default="", repr=False)
     overrides: tuple[str, ...] = ()
     """the keys set on the command line, `key=value`"""

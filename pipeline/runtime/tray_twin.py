@@ -208,5 +208,7 @@ def twin_path(tray: TrayConfig, folder: Path) -> Path:
         StageError: the tray names none.
     """
     if tray.twin is None:
-        raise StageError(f'tray {tray.name} has no twin: set [[tray]] twin = "FILE.onnx"')
+        raise StageError(
+            f'tray {tray.name} has no twin: set [[tray]] twin = "FILE.onnx", or leave out launcher.stages to learn one'
+        )
     return folder / tray.twin

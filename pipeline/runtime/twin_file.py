@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from pipeline.config.models import TrayConfig
 from pipeline.runtime.stage import Context, StageError
 from pipeline.runtime.tray_twin import TrayTwin, for_fans, read_file, tray_twin, twin_path
 from schemas.messages import Array
@@ -45,7 +46,15 @@ class TwinFile(TrayTwin):
         Raises:
             StageError: the file is missing, not ONNX, not a twin, from another fantwin, or for other fans.
         """
-        content = read_file(path)
+        return cls.of_content(path, read_file(path), fans)
+
+    @classmethod
+    def of_content(cls, path: Path, content: bytes, fans: int | None = None) -> TwinFile:
+        """The twin in the content of a file. path: its name, for errors.
+
+        Raises:
+            StageError: as `load`.
+        """
         session = _session(path, content)
         known = tray_twin(path, content, fans)
         _check_graph(path, session, known.card)
@@ -62,8 +71,22 @@ def load_twin(context: Context) -> TwinFile:
         StageError: the tray names none, or one that cannot be used or was trained with other tachos.
     """
     path = twin_path(context.tray, context.folder)
-    twin = TwinFile.load(path, context.tray.fans)
-    of_tray = tacho_of_each_fan(context.tray.tacho, context.tray.fans)
+    return _with_tachos_of(context.tray, path, TwinFile.load(path, context.tray.fans))
+
+
+def learned_twin(tray: TrayConfig, name: str, content: bytes) -> TwinFile:
+    """A learned twin, ready to run for its tray. content: of its file.
+
+    Raises:
+        StageError: it cannot be used.
+    """
+    path = Path(name)
+    return _with_tachos_of(tray, path, TwinFile.of_content(path, content, tray.fans))
+
+
+def _with_tachos_of(tray: TrayConfig, path: Path, twin: TwinFile) -> TwinFile:
+    """The same twin. Raises StageError if it was trained with other tachos than those of the tray."""
+    of_tray = tacho_of_each_fan(tray.tacho, tray.fans)
     if twin.tachos != of_tray and any(tacho.window_s > 0.0 for tacho in twin.tachos):
         raise StageError(
             f"{path}: the twin was trained on readings by {_text(twin.tachos)}, but [[tray]] tacho is "

@@ -171,7 +171,7 @@ def health_of(producer: str, duplicated: int, stage: str = "recorder") -> Health
 
 @settings(deadline=None, max_examples=25)
 @given(st.tuples(*(any_message(topic.message) for topic in TOPICS)))
-def test_every_topic_is_recorded_with_its_bytes(tmp_path_factory, messages):
+def test_every_topic_it_is_given_is_recorded_with_its_bytes(tmp_path_factory, messages):
     run = context(tmp_path_factory.mktemp("recorder"))
     core = STAGE.build(run).core
     envelopes = [envelope(m, topic.name, k + 1) for k, (m, topic) in enumerate(zip(messages, TOPICS, strict=True))]

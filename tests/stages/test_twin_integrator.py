@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
-from pipeline.runtime.stage import Context, StageError
+from pipeline.runtime.stage import Context
 from pipeline.runtime.twin_file import TwinFile
 from schemas.blocks import cut, join
 from schemas.messages import Grid, Header, InvalidReason, ModelCard, Prediction
@@ -417,9 +417,16 @@ def _context(folder: Path, twin: Path | None, *tacho: Tacho) -> Context:
     return Context("site", (tray,), TwinIntegratorConfig(), folder, folder, EPOCH_NS)
 
 
-def test_a_tray_without_a_twin_gets_an_error_that_names_the_setting(tmp_path: Path) -> None:
-    with pytest.raises(StageError, match=r'tray tray1 has no twin: set \[\[tray\]\] twin = "FILE.onnx"'):
-        STAGE.build(_context(tmp_path, None))
+def test_without_a_twin_samples_pass_and_none_is_valid(tmp_path: Path) -> None:
+    core = STAGE.build(_context(tmp_path, None)).core
+    grid = grid_of(np.full((5, 2), 50.0))
+    (made,) = core.step(grid)
+    assert isinstance(made, Prediction)
+    assert (made.invalid_reason == InvalidReason.NO_TWIN).all()
+    assert core.step(grid) == [], "the same samples again"
+    assert core.step(grid_of(np.full(5, 50.0))) == []
+    assert core.counters() == {"lost_wrong_fan_count": 5}
+    assert core.problem() == "grid of 1 fans, [[tray]] says fans = 2: correct one of them"
 
 
 def test_the_twin_is_found_beside_the_configuration(tmp_path: Path) -> None:

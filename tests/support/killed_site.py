@@ -5,6 +5,7 @@ Its recordings show the input of each session like those of a real site, but tak
 
 from __future__ import annotations
 
+import hashlib
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -19,8 +20,8 @@ from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.decision_rules import CURRENT_RULES
 from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
-from schemas.messages import Action, Header, InputPosition, Message, Raw, Request
-from schemas.topics import TOPICS, tray_key
+from schemas.messages import Action, Header, InputPosition, Message, NewTwin, Raw, Request
+from schemas.topics import BY_NAME, TOPICS, tray_key
 from schemas.units import NS_PER_S
 from tests.support.twin_files import small_hybrid, write_twin
 
@@ -72,7 +73,6 @@ class Stages:
 
     def __init__(self, config: Config, path: Path, started_t_ns: int, *, remembers: bool = True) -> None:
         (tray,) = config.trays
-        assert tray.twin
         self.config = config
         self.remembers = remembers
         self.tray = tray.name
@@ -84,8 +84,9 @@ class Stages:
             "started_t_ns": str(started_t_ns),
             f"speed_unit.{tray.name}": tray.speed_unit,
         }
-        twin = (config.folder / tray.twin).read_bytes()
-        attachments = {"configuration.toml": config.text.encode(), f"{tray.name}.onnx": twin}
+        attachments = {"configuration.toml": config.text.encode()}
+        if tray.twin:
+            attachments[f"{tray.name}.onnx"] = (config.folder / tray.twin).read_bytes()
         self.writer = RecordingWriter(path, metadata, attachments, t_ns=started_t_ns, overwrite=True)
         self.records = True
         self.lost_on_the_bus = 0
@@ -94,6 +95,7 @@ class Stages:
         self._ticked_ns = started_t_ns
         self.source = Session("acquisition-0", None)
         self.operator = Session("operator-0", None)
+        self.learner = Session("learner-0", None)
         self.stages = {stage: self._begin(stage) for stage in CHAIN}
 
     def take(self, raw: Raw) -> None:
@@ -109,6 +111,11 @@ class Stages:
             None,
         )
 
+    def put_in_force(self, name: str, content: bytes) -> None:
+        """Publish a learned twin as the learner would."""
+        sha256 = hashlib.sha256(content).hexdigest()
+        self._publish(self.learner, NewTwin(t_ns=self.now_ns, twin=name, sha256=sha256, content=content), None)
+
     def tick(self) -> None:
         """Let time pass for the stages, up to `now_ns`."""
         while self.now_ns - self._ticked_ns >= TICK_NS:
@@ -118,13 +125,13 @@ class Stages:
 
     def kill(self, stage: str) -> None:
         """kill -9: the state of the core is lost; its successor takes the messages still kept again, topic by topic."""
-        store = getattr(self._core(stage), "_snapshot_store", None)
+        store = getattr(self._core(stage), "_snapshot_store", None) or getattr(self._core(stage), "_store", None)
         if store:
             store.unlock()  # as the system does for a killed process
         self.stages[stage] = self._begin(stage)
         feeding = self.source if stage == "resampler" else self.stages[CHAIN[CHAIN.index(stage) - 1]]
-        kept = (*feeding.kept, *self.operator.kept)
-        for read in sorted(load_stage(stage).reads):
+        kept = (*feeding.kept, *self.operator.kept, *self.learner.kept)
+        for read in sorted(load_stage(stage).reads, key=lambda name: (not BY_NAME[name].is_needed_first, name)):
             for topic, message in kept:
                 if topic == read:
                     self._step(stage, topic, message)
@@ -185,7 +192,7 @@ class Stages:
         session.published[topic] = sequence + 1
         stamped: Any = replace(message, header=Header(session.producer, sequence, self.tray, position))
         session.kept.append((topic, stamped))
-        if self.records:
+        if self.records and BY_NAME[topic].recorded:
             self.writer.add_message(tray_key(self.config.site, self.tray, topic), stamped, self.now_ns)
         if topic == "raw" and self.lost_on_the_bus:
             self.lost_on_the_bus -= 1
@@ -199,12 +206,21 @@ class Site(Stages):
     """A tray of three fans and its stages."""
 
     def __init__(
-        self, folder: Path, seed: int, block_size: int = 1, *, calibrated: bool = False, remembers: bool = True
+        self,
+        folder: Path,
+        seed: int,
+        block_size: int = 1,
+        *,
+        calibrated: bool = False,
+        remembers: bool = True,
+        learns: bool = False,
     ) -> None:
-        """remembers: whether a restarted scorer finds the snapshot of the one before it."""
+        """remembers: whether a restarted scorer finds the snapshot of the one before it. learns: the configuration
+        names no twin."""
         card = {"calibration": CALIBRATION} if calibrated else {}
         write_twin(folder / "twin.onnx", small_hybrid(), fans=FANS, **card)
-        (folder / "site.toml").write_text(CONFIGURATION % block_size)
+        text = CONFIGURATION % block_size
+        (folder / "site.toml").write_text(text.replace('twin = "twin.onnx"\n', "") if learns else text)
         self.path = folder / "recording.mcap"
         super().__init__(load_config(folder / "site.toml"), self.path, EPOCH_NS, remembers=remembers)
         self.rng = np.random.default_rng(seed)

@@ -38,7 +38,13 @@ SCALARS: dict[str, st.SearchStrategy[Any]] = {
     "lost": UINT64,
     "fan": st.integers(0, 2**31 - 1),
 }
-OF_TYPE: dict[Any, st.SearchStrategy[Any]] = {str: TEXT, float: FLOAT, bool: st.booleans(), int: UINT64}
+OF_TYPE: dict[Any, st.SearchStrategy[Any]] = {
+    str: TEXT,
+    float: FLOAT,
+    bool: st.booleans(),
+    int: UINT64,
+    bytes: st.binary(max_size=20),
+}
 
 
 def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:

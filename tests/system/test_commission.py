@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli.watch import commission, ordinary_operation
+from pipeline.cli.watch import commission
 from pipeline.config.loading import load_config
+from pipeline.learning import ordinary_operation
 from pipeline.recordings.reading import read_recording
 from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.limits import Limits

@@ -245,9 +245,9 @@ def _round_up(rate: float) -> float:
 
 def _write(twin: Path, output: Path, limits: Limits) -> None:
     with twin_errors():
-        from twin.export.calibrated import with_calibration  # noqa: PLC0415  the command line loads twin only when needed
+        from twin.export.card_entries import with_card_entries  # noqa: PLC0415  the command line loads twin only when needed
 
-        content = with_calibration(twin.read_bytes(), json.loads(limits.model_dump_json()))
+        content = with_card_entries(twin.read_bytes(), {"calibration": json.loads(limits.model_dump_json())})
     beside = output.with_name(output.name + ".new")
     try:
         beside.write_bytes(content)

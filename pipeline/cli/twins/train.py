@@ -37,6 +37,10 @@ Physics: TypeAlias = Literal["fixed", "refined"]
 NetworkInputs: TypeAlias = Literal["speed,command", "speed"]
 
 
+NETWORKS = 4
+"""with so many, twins hardly depend on the seed: docs/reference/benchmarks.md"""
+
+
 def train(
     recordings: RecordingsArgument,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="TWIN.onnx", help="Twin to write.")],
@@ -65,8 +69,12 @@ def train(
         Physics, typer.Option(help="Hybrid: physics refined with the network, or fixed as identified.")
     ] = "refined",
     networks: Annotated[
-        int, typer.Option(help="Networks to train and average (hybrid, neural ODE), for as many times the time.")
-    ] = 1,
+        int | None,
+        typer.Option(
+            help="Networks to train and average (hybrid, neural ODE), for as many times the time. Default: "
+            f"{NETWORKS}, and 1 where they cannot be averaged."
+        ),
+    ] = None,
     command_unit: Annotated[str, typer.Option(help="Unit of the command, for the card, e.g. %.")] = "",
     json_output: JsonOption = False,
 ) -> None:
@@ -84,7 +92,7 @@ def train(
         from twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
         from twin.kinds import find_kind  # noqa: PLC0415
 
-        find_kind(model)
+        can_average = find_kind(model).averages_networks and trainer == "levenberg-marquardt"
         check_writable(output, ".onnx")
         training_data = read_training_data(recordings, tray, fans, from_s, to_s, window_s)
         held_out = (
@@ -106,7 +114,7 @@ def train(
                 max_iterations=iterations,
                 network_inputs=tuple(network_inputs.split(",")),
                 physics=physics,
-                networks=networks,
+                networks=networks if networks is not None else NETWORKS if can_average else 1,
                 command_unit=command_unit,
                 fan_numbers=training_data.fans,
                 data=data_cards(training_data),

@@ -22,13 +22,13 @@ from pipeline.cli.progress import EXIT_INTERRUPTED
 from pipeline.cli.twins.training_data import check_writable, read_training_data, twin_errors
 from pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, RecordingSite, Stopped
 from pipeline.cli.watch.doctor import running_sessions
-from pipeline.cli.watch.ordinary_operation import OrdinaryOperation
 from pipeline.cli.watch.sweep import range_within
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.config.twin_entry import with_twin
 from pipeline.errors import UserError
+from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.runtime.signals import stop_on_signals
 from pipeline.runtime.tray_twin import load_tray_twin
 from pipeline.selftest.scratch_site import FANTWIN

@@ -20,7 +20,7 @@ from pipeline.replay.offline.sample_stream import SampleStream
 from pipeline.replay.stage_chain import StageChain
 from pipeline.runtime.stage import Context, Core, Stage
 from schemas.blocks import cut
-from schemas.messages import Header, Message, Prediction, ScorerSnapshot
+from schemas.messages import Header, Message, NewTwin, Prediction, ScorerSnapshot
 from schemas.messages import newest_t_ns as message_t_ns
 from schemas.topics import BY_NAME
 
@@ -130,8 +130,8 @@ class OfflinePipeline:
                     self._observe(message)
 
         if inputs:
-            for block in self._samples(session, inputs):
-                yield from main_output(core.step(block))
+            for part in self._with_twins(session, inputs):
+                yield from main_output(core.step(part))
         else:
             for block, until_t_ns in self._raw.of(session):
                 if counters is None and session.producer in self._raw.is_past_known:
@@ -158,6 +158,8 @@ class OfflinePipeline:
 
     def _run_last(self, core: Core, session: Session) -> Iterator[Message]:
         """What the last stage makes of its samples, and of the requests between them."""
+        for card in session.twins:
+            core.step(card)
         requests = deque(session.requests)
         for block in self._samples(session, self._last_inputs):
             done = 0
@@ -180,6 +182,21 @@ class OfflinePipeline:
             for block in streams[span.producer].of(span):
                 self._observe(block)
                 yield replace(block, header=Header(span.producer, 0, block.header.tray))
+
+    def _with_twins(self, session: Session, inputs: Mapping[str, SampleStream[Any]]) -> Iterator[Any]:
+        """The samples of a session, and before its first sample each learned twin."""
+        twins = deque(session.twins)
+        for block in self._samples(session, inputs):
+            done = 0
+            while twins and twins[0].t_ns <= block.t_ns[-1]:
+                card = twins.popleft()
+                row = max(done, int(np.searchsorted(block.t_ns, card.t_ns)))
+                if row > done:
+                    yield cut(block, done, row)
+                    done = row
+                yield NewTwin(t_ns=card.t_ns, twin=card.twin, sha256=card.sha256, content=card.content)
+            if done < len(block.t_ns):
+                yield cut(block, done, len(block.t_ns)) if done else block
 
     def _core(self, stage: Stage) -> Core:
         return stage.build(self._contexts[stage.name]).core

@@ -7,6 +7,7 @@ sequence number; samples of grids, predictions and scores by their time.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from schemas import fan_pb2
 from schemas.codec import CodecError
 from schemas.envelope import Envelope
 from schemas.fast_decode import decode_header
-from schemas.messages import Alarm, Grid, Message, Prediction, Request, Score, ScorerSnapshot
+from schemas.messages import Alarm, Grid, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
 
 BEGINNING = -(2**63)
 RAW_MISSING = "{raw_missing}"
@@ -65,6 +66,8 @@ class Session:
     """what it was restored from"""
     requests: list[tuple[int, Request]] = field(default_factory=list)
     """operators' requests, each with the time of the sample after which it was answered, in order"""
+    twins: list[ModelCard] = field(default_factory=list)
+    """learned twins: of an integrator those that it used, each with its first sample; of a scorer all of the tray"""
     last_t_ns: int = 0
     """time of the newest sample in its recorded output"""
     next_sequence: int = 0
@@ -96,17 +99,26 @@ class TrayPlan:
         """The sessions of the stage that makes the decisions."""
         return list(self.sessions.values())[-1]
 
+    def without_learned_twins(self) -> None:
+        """Let all sessions use the twin that they are built with."""
+        for session in (session for sessions in self.sessions.values() for session in sessions):
+            session.twins = []
+
     @property
     def restarts(self) -> int:
         """How many sessions followed another one."""
         return sum(len(sessions) - 1 for sessions in self.sessions.values())
 
 
-def undisturbed_plan(chain: StageChain) -> TrayPlan:
-    """One session of each stage, which consumes everything there is."""
+def undisturbed_plan(chain: StageChain, twins: Iterable[ModelCard] = ()) -> TrayPlan:
+    """One session of each stage, which consumes everything there is. twins: the learned ones, each with its first
+    sample."""
     first, *others = (stage.name for stage in chain.stages)
     raw = Session("", spans=[Span("", 0, None)])
-    return TrayPlan({first: [raw]} | {name: [Session("", spans=[Span("", BEGINNING, None)])] for name in others})
+    of_all = list(twins)
+    return TrayPlan(
+        {first: [raw]} | {name: [Session("", spans=[Span("", BEGINNING, None)], twins=of_all)] for name in others}
+    )
 
 
 class NoInputPositionError(Exception):
@@ -134,6 +146,7 @@ class PlanReader:
         self._sessions: dict[str, dict[str, Session]] = {stage.name: {} for stage in chain.stages}
         self._snapshots: dict[str, ScorerSnapshot] = {}
         self._requests: dict[str, Request] = {}
+        self._twins: dict[tuple[str, int], ModelCard] = {}
         self._answers: dict[tuple[str, str], tuple[int, int]] = {}
         self._has_positions = True
         self.alarms: dict[tuple[str, int], Alarm] = {}
@@ -168,6 +181,11 @@ class PlanReader:
         self._add_sides(plan)
         _limit_unknown_beginnings(plan)
         return plan
+
+    @property
+    def twins(self) -> list[ModelCard]:
+        """The learned twins, each with its first sample, in order."""
+        return sorted(self._twins.values(), key=lambda card: card.t_ns)
 
     @property
     def no_plan_reason(self) -> str:
@@ -205,14 +223,21 @@ class PlanReader:
             self._snapshots.setdefault(header.producer, message)
         elif isinstance(message, Request):
             self._requests[f"{header.producer}/{header.sequence}"] = message
+        elif isinstance(message, ModelCard):
+            if message.content:
+                self._twins.setdefault((header.producer, header.sequence), message)
         elif isinstance(message, Alarm):
             self.alarms.setdefault((header.producer, header.sequence), message)
             if message.request:
                 self._answers.setdefault((header.producer, message.request), (header.sequence, message.t_ns))
 
     def _add_sides(self, plan: TrayPlan) -> None:
+        for of_stage in list(plan.sessions.values())[1:-1]:
+            for session in of_stage:
+                session.twins = [card for card in self.twins if card.header.producer == session.producer]
         sessions = {session.producer: session for session in plan.last}
         for producer, session in sessions.items():
+            session.twins = self.twins
             session.snapshot = self._snapshots.get(producer)
         for (producer, name), (_, t_ns) in sorted(self._answers.items(), key=lambda answer: answer[1]):
             if name in self._requests and producer in sessions:

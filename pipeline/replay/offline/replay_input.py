@@ -22,7 +22,7 @@ from pipeline.replay.stage_chain import StageChain, decision_chain
 from pipeline.runtime.decision_rules import CURRENT_RULES, DecisionRules
 from pipeline.runtime.stage import Context
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Message
+from schemas.messages import Alarm, Message, ModelCard
 
 
 @dataclass
@@ -32,8 +32,8 @@ class ReplayInput:
     paths: tuple[Path, ...]
     metadata: RecordingMetadata
     config: Config
-    twins: dict[str, Path]
-    """by tray"""
+    twins: dict[str, Path | None]
+    """by tray; None: those that were learned while it was recorded"""
     is_as_recorded: bool
     """configuration and twins are those of the recording"""
     is_same_grid: bool
@@ -83,7 +83,18 @@ class ReplayInput:
         plan = reader.plan() if self.is_same_grid and not self.is_part else None
         if plan:
             plan.uses_recorded_snapshots = self.is_as_recorded
+            if self.twins[tray] is not None:
+                plan.without_learned_twins()
         return plan, list(reader.alarms.values()), reader.no_plan_reason
+
+    def learned_twins(self, tray: str) -> list[ModelCard]:
+        """Those that replace one another in the recording, each with its first sample; none if another twin is used."""
+        if self.twins[tray] is not None:
+            return []
+        reader = PlanReader(self.stages)
+        for envelope in self.envelopes(tray, ("twin",)):
+            reader.add(envelope)
+        return reader.twins
 
     def pipeline(
         self, tray: str, plan: TrayPlan | None = None, observe: Callable[[Message], None] = lambda _message: None
@@ -91,11 +102,13 @@ class ReplayInput:
         """The stages of a tray, ready to run. Without a plan, one session of each processes everything."""
         raw = RawBlocks(lambda: self.envelopes(tray, ("raw",)), observe, (self.start_s, self.end_s))
         contexts = self.contexts(self.config.tray(tray))
-        return OfflinePipeline(self.stages, contexts, raw, plan or undisturbed_plan(self.stages), observe)
+        plan = plan or undisturbed_plan(self.stages, self.learned_twins(tray))
+        return OfflinePipeline(self.stages, contexts, raw, plan, observe)
 
     def contexts(self, tray: TrayConfig) -> list[Context]:
         """What each stage of a tray is built from, in the order of the chain."""
-        with_twin = tray.model_copy(update={"twin": self.twins[tray.name].resolve()})
+        twin = self.twins[tray.name]
+        with_twin = tray.model_copy(update={"twin": twin.resolve() if twin else None})
         return [
             Context(
                 site=self.config.site,
@@ -159,7 +172,7 @@ def open_replay_input(
             paths=ordered,
             metadata=metadata,
             config=replace(base, trays=trays),
-            twins={tray.name: _twin_of(tray, base, attached, recorded, twin, ordered[0]) for tray in trays},
+            twins={tray.name: _twin_of(tray, base, attached, recorded, twin, ordered) for tray in trays},
             started_t_ns=_started_t_ns(ordered[0], metadata, first_sample_t_ns),
             first_sample_t_ns=first_sample_t_ns,
             is_as_recorded=is_as_recorded,
@@ -198,9 +211,15 @@ def _recorded_twins(metadata: RecordingMetadata, folder: Path, trays: Iterable[s
 
 
 def _twin_of(
-    tray: TrayConfig, base: Config, attached: Config | None, recorded: dict[str, Path], twin: Path | None, path: Path
-) -> Path:
-    """The twin that was given, else that of another configuration or of a key, else the recorded one."""
+    tray: TrayConfig,
+    base: Config,
+    attached: Config | None,
+    recorded: dict[str, Path],
+    twin: Path | None,
+    paths: Sequence[Path],
+) -> Path | None:
+    """The twin that was given, else that of another configuration or of a key, else the recorded one. None: the
+    recording has learned twins."""
     if twin is not None:
         return twin
     as_recorded = attached is not None and base.path == attached.path and tray.twin == attached.tray(tray.name).twin
@@ -208,7 +227,15 @@ def _twin_of(
         return tray.twin if tray.twin.is_absolute() else base.folder / tray.twin
     if tray.name in recorded:
         return recorded[tray.name]
-    raise RecordingError(f"{path}: no twin of {tray.name} in this recording: name one with --twin FILE.onnx")
+    if any(has_learned_twins(path, tray.name) for path in paths):
+        return None
+    raise RecordingError(f"{paths[0]}: no twin of {tray.name} in this recording: name one with --twin FILE.onnx")
+
+
+def has_learned_twins(path: Path, tray: str) -> bool:
+    """Whether a recording has twins that were learned while it was recorded."""
+    cards = (envelope.message for envelope in read_recording(path, ("twin",), tray))
+    return any(isinstance(card, ModelCard) and card.content for card in cards)
 
 
 def _started_t_ns(path: Path, metadata: RecordingMetadata, first_sample_t_ns: int) -> int:

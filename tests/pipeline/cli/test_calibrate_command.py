@@ -100,13 +100,13 @@ def strict(folder: Path, calibrated: Path) -> Path:
 
 def with_limits(path: Path, calibrated: Path, factor: float) -> Path:
     """The twin with so many times its limits, and a declared rate that is far lower."""
-    from twin.export.calibrated import with_calibration  # noqa: PLC0415
+    from twin.export.card_entries import with_card_entries  # noqa: PLC0415
 
     was = Limits.model_validate(load_tray_twin(calibrated).card.calibration)
     assert was.declared_rate
     rate = was.declared_rate.model_copy(update={"false_alarms_per_day": 0.1})
     limits = was.times(factor).model_copy(update={"declared_rate": rate})
-    path.write_bytes(with_calibration(calibrated.read_bytes(), json.loads(limits.model_dump_json())))
+    path.write_bytes(with_card_entries(calibrated.read_bytes(), {"calibration": json.loads(limits.model_dump_json())}))
     return path
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cli.watch.ordinary_operation import OrdinaryOperation
 from pipeline.config.models import TrayConfig
+from pipeline.learning.ordinary_operation import OrdinaryOperation
 from schemas.messages import Raw
 from schemas.units import NS_PER_S
 from tests.support.fantwin_command import error_of

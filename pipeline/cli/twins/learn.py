@@ -1,0 +1,76 @@
+"""`fantwin learn`: the next version of a tray's learned twin, now."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from pipeline.cli.progress import interruptible, working
+from pipeline.cli.twins.next_version import make_next_version
+from pipeline.cli.twins.versions_text import version_lines
+from pipeline.config.loading import load_config
+from pipeline.config.models import Config, TrayConfig
+from pipeline.errors import UserError
+from pipeline.learning.versions import learning_folder
+
+IDLE = 19
+"""the lowest priority: stages come first"""
+
+
+def learn(
+    config: ConfigOption = DEFAULT_CONFIG,
+    tray: Annotated[str | None, typer.Option(help="Which tray, where several learn their twins.")] = None,
+    overrides: SetOption = None,
+    json_output: JsonOption = False,
+    until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
+) -> None:
+    """Make the next version of a learned twin from the tray's healthy history, as `fantwin up` does by itself.
+
+    It takes over at once if it was taken, also on a running site. `fantwin twins` lists the versions.
+
+    Exit codes: 0 a version was made; 1 error, such as too little history; 130 Ctrl-C.
+
+    Example: fantwin learn -c fantwin.toml
+    """
+    if until_stdin_closes:
+        os.nice(IDLE)
+        threading.Thread(target=_end_with_parent, daemon=True).start()
+    settings = load_config(config, overrides or (), stages=("learner",))
+    of = learning_tray(settings, tray)
+    folder = learning_folder(settings.run_folder, of.name)
+    section = settings.sections["learner"]
+    with interruptible("no version was made"), working(f"learning the twin of {of.name}") as show:
+        version = make_next_version(folder, of.name, section.false_alarms_per_day, show)  # type: ignore[attr-defined]
+    if json_output:
+        typer.echo(version.model_dump_json())
+    else:
+        for line in version_lines([version], version.name if version.outcome == "taken" else "", ()):
+            typer.echo(line)
+
+
+def learning_tray(settings: Config, name: str | None) -> TrayConfig:
+    """The tray called `name`, or the only one that learns its twin.
+
+    Raises:
+        UserError: there is none, or several; or it names a twin.
+    """
+    learning = [tray for tray in settings.trays if tray.twin is None]
+    chosen = [settings.tray(name)] if name else learning
+    if len(chosen) > 1:
+        raise UserError(f"several trays learn their twins: choose one with --tray: {', '.join(t.name for t in chosen)}")
+    if not chosen or chosen[0] not in learning:
+        which = f"tray {chosen[0].name} has" if chosen else "every tray has"
+        raise UserError(f"{settings.path}: {which} a twin of its own: `twin` in [[tray]]; without it, one is learned")
+    return chosen[0]
+
+
+def _end_with_parent() -> None:
+    """The stage that started this process holds its standard input open."""
+    while os.read(sys.stdin.fileno(), 1):
+        pass
+    os._exit(1)

@@ -1,0 +1,106 @@
+"""`fantwin learn` as a child process of the lowest priority, one at a time in this process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+from pipeline.optional_dependencies import how_to_install, is_installed
+
+_TURN = threading.Lock()
+"""trays learn one after the other: memory and one core are for one"""
+STOP_S = 2.0
+
+
+class Learning(Protocol):
+    """Makes the next version of a tray's twin, beside all else."""
+
+    def start(self) -> str:
+        """Begin, unless another tray is learning; returns why not, or nothing."""
+        ...
+
+    def poll(self) -> str | None:
+        """None while it works; then, once, what went wrong, or an empty string."""
+        ...
+
+    @property
+    def seconds(self) -> float | None:
+        """How long it has been working; None: it is not."""
+        ...
+
+    def stop(self) -> None:
+        """End it; no version is made."""
+        ...
+
+
+class LearningProcess:
+    """The command for one tray of a configuration."""
+
+    def __init__(self, config: Path, overrides: Sequence[str], tray: str, log: Path) -> None:
+        """log: what the last one said is written there."""
+        sets = [word for override in overrides for word in ("--set", override)]
+        self._command = [sys.executable, "-P", "-m", "pipeline", "learn", "-c", str(config), "--tray", tray, *sets]
+        self._log = log
+        self._child: subprocess.Popen[bytes] | None = None
+        self._began_s = 0.0
+
+    def start(self) -> str:
+        """Begin, unless another tray is learning; returns why not, or nothing."""
+        if not is_installed("torch"):
+            return f"no twin can be learned without the extra `train`; {how_to_install('train')}"
+        if not _TURN.acquire(blocking=False):
+            return "another tray is learning"
+        try:
+            with self._log.open("wb") as log:
+                self._child = subprocess.Popen(
+                    [*self._command, "--until-stdin-closes"],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                    stderr=log,
+                    env={**os.environ, "OMP_NUM_THREADS": "1"},
+                )
+        except OSError as error:
+            _TURN.release()
+            return f"learning could not be started: {error.strerror}"
+        self._began_s = time.monotonic()
+        return ""
+
+    def poll(self) -> str | None:
+        """None while it works; then, once, what went wrong, or an empty string."""
+        if self._child is None or self._child.poll() is None:
+            return None
+        status = self._child.returncode
+        self._release()
+        if not status:
+            return ""
+        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return lines[-1].removeprefix("fantwin: ") if lines else f"`fantwin learn` ended with status {status}"
+
+    @property
+    def seconds(self) -> float | None:
+        """How long it has been working; None: it is not."""
+        return None if self._child is None else time.monotonic() - self._began_s
+
+    def stop(self) -> None:
+        """End it; no version is made."""
+        if self._child is None:
+            return
+        self._child.terminate()
+        try:
+            self._child.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            self._child.wait()
+        self._release()
+
+    def _release(self) -> None:
+        if self._child and self._child.stdin:
+            self._child.stdin.close()
+        self._child = None
+        _TURN.release()

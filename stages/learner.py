@@ -1,0 +1,262 @@
+"""Learner: gives a tray that names no twin its twin, and better ones as healthy hours come.
+
+Reads: topic `raw` (samples), `score` (whether a fan has an alarm), and `request` (fans that are commissioned again).
+Writes: topic `new_twin`: the version in force, at start and when it changes.
+Timing: a version is made when the healthy history has doubled, at least once in a week of healthy running, and some
+hours after an operator has commissioned fans again.
+
+It keeps the healthy history (pipeline.learning.healthy_history) and starts `fantwin learn` beside the stages, which
+makes the next version and decides whether it takes over (pipeline.cli.twins.next_version). An operator can change the
+version in force: see `fantwin twins`. The learner may drop messages: it must never delay a score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+from pydantic import Field
+
+from pipeline.errors import UserError
+from pipeline.learning.healthy_history import LEAST_S, HealthyHistory, recorded_raws
+from pipeline.learning.learning_process import Learning, LearningProcess
+from pipeline.learning.ordinary_operation import OrdinaryOperation
+from pipeline.learning.versions import Period, TwinVersions, Version, learning_folder
+from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.recordings.metadata import recording_metadata
+from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
+from schemas.messages import Action, FanState, Message, NewTwin, Raw, Request, Score
+from schemas.units import NS_PER_S
+from scoring.samples import among
+
+LOOK_NS = NS_PER_S
+"""how often the learner looks for what has changed"""
+AGAIN_AFTER = 1.25
+"""times the history with which learning failed"""
+LONGEST_WAIT_S = 7 * 24 * 3600.0
+"""of healthy running between two versions"""
+AFTER_COMMISSIONING_S = 4 * 3600.0
+"""of healthy running after fans were commissioned again: then the twin is compared with them"""
+
+
+class LearnerConfig(StageConfig):
+    """Section `[learner]`, for trays that name no twin."""
+
+    false_alarms_per_day: float = Field(
+        default=1.0, ge=1e-6, le=8640, description="the rate to declare: false alarms per fan and day"
+    )
+    first_minutes: float = Field(default=10.0, ge=1.0, description="healthy running before the first version")
+    hold_back_minutes: float = Field(
+        default=10.0, ge=0, description="samples are learned from if no alarm was raised for this long after them"
+    )
+    kept_hours: float = Field(default=168.0, ge=1.0, description="healthy running to keep for learning")
+
+
+class LearnerCore(Core):
+    """The learner of one tray."""
+
+    def __init__(
+        self,
+        fans: int,
+        config: LearnerConfig,
+        history: HealthyHistory,
+        versions: TwinVersions,
+        operation: OrdinaryOperation,
+        learning: Learning,
+    ) -> None:
+        """operation: what the fans have done in the history. learning: makes versions."""
+        self._fans = fans
+        self._config = config
+        self._history = history
+        self._versions = versions
+        self._operation = operation
+        self._learning = learning
+        self._has_alarm = False
+        self._looked_ns = 0
+        self._seen_change: int | None = None
+        self._in_force: Version | None = None
+        self._last: Version | None = None
+        self._faulty: tuple[Period, ...] = ()
+        self._commissioned_t_ns = 0
+        """when fans were last commissioned again"""
+        self._failed_s = 0.0
+        """healthy running with which the last attempt failed; 0: it did not"""
+        self._problem = ""
+
+    def step(self, item: Raw | Score | Request) -> Sequence[Message]:
+        """Add samples to the healthy history, or see whether a fan has an alarm or is commissioned again."""
+        if isinstance(item, Request):
+            if item.action == Action.COMMISSION:
+                self._history.close()
+                self._commissioned_t_ns = item.t_ns
+            return []
+        if isinstance(item, Score):
+            if item.fans == self._fans and len(item.t_ns):
+                self._has_alarm = bool(among(item.state, FanState.ALARM, FanState.RETURNING).any())
+            return []
+        if item.fans == self._fans:
+            self._history.add(item, has_alarm=self._has_alarm, is_watched=self._in_force is not None)
+            if self._last is None:
+                self._operation.take(item)
+        return []
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        """Publish the version in force when it has changed, and start learning when it is due."""
+        if 0 <= now_ns - self._looked_ns < LOOK_NS:
+            return []
+        self._looked_ns = now_ns
+        self._history.flush()
+        ended = self._learning.poll()
+        if ended:
+            self._problem, self._failed_s = f"learning: {ended}", self._history.seconds
+        elif ended is not None:
+            self._problem, self._failed_s = "", 0.0
+        cards = self._changed(now_ns)
+        if self._learning.seconds is None and self._is_due():
+            self._history.finish()
+            refused = self._learning.start()
+            if refused and refused != self._problem:
+                self._problem = refused
+        return cards
+
+    def close(self) -> Sequence[Message]:
+        """Keep the history."""
+        self._learning.stop()
+        self._history.close()
+        return []
+
+    def abort(self) -> None:
+        """Stop learning."""
+        self._learning.stop()
+
+    def notes(self) -> Sequence[str]:
+        """The version in force and what it finds; or what the first one waits for."""
+        work = self._learning.seconds
+        making = [f"the next version is being made; since {work:.0f} s"] if work is not None else []
+        if self._in_force is None:
+            return [self._waits_for(), *making]
+        return [f"{self._in_force.name} is in force; {_finds(self._in_force)}", *making]
+
+    def problem(self) -> str:
+        """Why nothing is learned, or that a version waits for the operator."""
+        offered = (
+            self._last if self._last and self._last.outcome == "offered" and self._last != self._in_force else None
+        )
+        waits = f"{offered.name} is offered: {offered.why} (fantwin twins)" if offered else ""
+        return "; ".join(filter(None, (self._problem, self._history.problem, waits)))
+
+    def _changed(self, now_ns: int) -> list[NewTwin]:
+        """The version in force, if it is another one than before."""
+        changed = self._versions.changed_ns
+        if changed == self._seen_change:
+            return []
+        try:
+            listed, in_force, faulty = self._versions.all(), self._versions.in_force(), self._versions.faulty()
+            content = self._versions.file(in_force.name).read_bytes() if in_force else b""
+        except (OSError, UserError) as error:
+            self._problem = str(error)
+            return []
+        if faulty != self._faulty:
+            self._history.finish()  # what was called faulty must not be part of what is recorded from now on
+        self._faulty, self._seen_change, self._last = faulty, changed, listed[-1] if listed else None
+        if in_force is None or in_force == self._in_force:
+            return []
+        self._in_force = in_force
+        return [NewTwin(t_ns=now_ns, twin=in_force.name, sha256=in_force.sha256, content=content)]
+
+    def _is_due(self) -> bool:
+        if self._has_alarm:
+            return False
+        if self._failed_s:
+            return self._history.seconds >= max(AGAIN_AFTER * self._failed_s, self._failed_s + LEAST_S)
+        if self._last is None:
+            return self._history.seconds >= 60.0 * self._config.first_minutes and not self._operation.missing()
+        if self._commissioned_t_ns > self._last.made_t_ns:
+            return self._history.seconds_since(self._commissioned_t_ns) >= AFTER_COMMISSIONING_S
+        learned_s = sum(last - first for first, last in self._last.periods) / NS_PER_S
+        return self._history.seconds_since(self._last.made_t_ns) >= min(learned_s, LONGEST_WAIT_S)
+
+    def _waits_for(self) -> str:
+        minutes = self._history.seconds / 60.0
+        missing = self._operation.missing()
+        lacks = f"; still missing: {'; '.join(missing)}; `fantwin sweep` moves the fans" if missing else ""
+        return f"no twin yet, nothing is judged; {minutes:.0f} of {self._config.first_minutes:g} min recorded{lacks}"
+
+
+def _finds(version: Version) -> str:
+    """What the limits of a version find at its middle speed, and what they promise."""
+    rate = f"{version.declared_per_day:g} false alarm(s) per fan and day"
+    promise = (
+        f"the target is {rate}, which {version.hours:.2g} h cannot show" if version.is_target else f"{rate} declared"
+    )
+    known = [drop for drop in version.drops if drop.within_a_minute is not None]
+    if not known:
+        return promise
+    drop = known[len(known) // 2]
+    unit = version.speed_unit
+    return (
+        f"at {drop.speed:,.0f} {unit} it finds a drop of {drop.within_a_minute:,.0f} {unit} within a minute; {promise}"
+    )
+
+
+class _NamesItsTwin(Core):
+    """Of a tray that names its twin: it learns none."""
+
+    def step(self, item: Raw | Score | Request) -> Sequence[Message]:
+        """Nothing."""
+        return []
+
+
+def build(context: Context) -> BuiltStage:
+    """The core of one tray, with its history and versions.
+
+    Raises:
+        StageError: there is no configuration file that `fantwin learn` could read; the versions cannot be read.
+    """
+    tray, config = context.tray, context.config
+    if tray.twin is not None:
+        return BuiltStage(_NamesItsTwin())
+    folder = learning_folder(context.run_folder, tray.name)
+    metadata, attachments = recording_metadata(context)
+    history = HealthyHistory(
+        folder,
+        context.site,
+        tray.name,
+        metadata,
+        attachments,
+        hold_back_s=60.0 * config.hold_back_minutes,
+        kept_s=3600.0 * config.kept_hours,
+    )
+    versions = TwinVersions(folder, tray.name)
+    operation = OrdinaryOperation(tray)
+    try:
+        if not versions.all():
+            for raw in recorded_raws(folder):
+                operation.take(raw)
+    except UserError as error:
+        raise StageError(str(error)) from error
+    assert context.configuration_path
+    learning = LearningProcess(context.configuration_path, context.overrides, tray.name, folder / "learn.log")
+    return BuiltStage(LearnerCore(tray.fans, config, history, versions, operation, learning))
+
+
+def check(context: Context) -> list[str]:
+    """What would keep it from learning."""
+    if context.tray.twin is None and not is_installed("torch"):
+        return [f"no twin can be learned without the extra `train`; {how_to_install('train')}"]
+    with suppress(UserError):
+        TwinVersions(learning_folder(context.run_folder, context.tray.name), context.tray.name).all()
+        return []
+    return ["the versions of the twin cannot be read: see `fantwin twins`"]
+
+
+STAGE = Stage(
+    name="learner",
+    about="learns the twin of a tray that names none, from its healthy running",
+    reads=("raw", "score", "request"),
+    writes=("new_twin",),
+    config=LearnerConfig,
+    build=build,
+    may_drop=True,
+    check=check,
+)

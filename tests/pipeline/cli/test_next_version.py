@@ -1,0 +1,125 @@
+"""Learned versions from real training: the first, better limits with more data, and what fans that have changed get."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeline.cli.twins import next_version
+from pipeline.cli.twins.next_version import make_next_version
+from pipeline.errors import UserError
+from pipeline.learning.healthy_history import stretches
+from pipeline.learning.versions import TwinVersions, Version
+from pipeline.runtime.tray_twin import load_tray_twin
+from tests.support.fantwin_command import error_of, fantwin
+from tests.support.healthy_stretches import FANS, add_stretch
+
+pytestmark = pytest.mark.slow
+
+
+def made(folder: Path) -> Version:
+    return make_next_version(folder, "tray1", 1.0, lambda _line: None)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The learning folder of a tray with two versions, and then with fans that have changed."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(next_version, "COMMISSIONED_S", 300.0)
+    patch.setattr(next_version, "MOST_TRAINING_SAMPLES", 1500)
+    folder = tmp_path_factory.mktemp("site") / "runs" / "learned" / "tray1"
+    add_stretch(folder, 0, 120.0, 1)
+    made(folder)
+    add_stretch(folder, 1000, 300.0, 2)
+    made(folder)
+    yield folder
+    patch.undo()
+
+
+@pytest.fixture(scope="module")
+def changed(site: Path) -> Path:
+    """The same after all fans have become faster, and after one has become slower."""
+    add_stretch(site, 2000, 120.0, 3, (1.06, 1.05))
+    made(site)
+    add_stretch(site, 3000, 120.0, 4, (1.0, 0.92))
+    made(site)
+    return site
+
+
+def test_the_first_version_has_a_twin_with_limits_and_is_a_target_only(site: Path) -> None:
+    first = TwinVersions(site, "tray1").all()[0]
+    assert (first.name, first.how, first.outcome, first.reference) == ("tray1-1", "trained", "taken", "tray1-1")
+    assert first.is_target
+    twin = load_tray_twin(site / "tray1-1.onnx", FANS)
+    assert twin.card.name == "tray1-1"
+    assert twin.sha256 == first.sha256
+    assert twin.card.calibration
+    assert first.error < 10.0, "rad/s; the noise is sqrt(10)"
+
+
+def test_more_healthy_running_tightens_the_limits(site: Path) -> None:
+    first, second = TwinVersions(site, "tray1").all()[:2]
+    assert second.outcome == "taken"
+    assert second.hours > 3.0 * first.hours
+    for before, after in zip(first.drops, second.drops, strict=True):
+        assert before.within_a_minute and after.within_a_minute
+    assert sum(drop.within_a_minute or 0.0 for drop in second.drops) < sum(
+        drop.within_a_minute or 0.0 for drop in first.drops
+    )
+    assert load_tray_twin(site / "tray1-2.onnx", FANS).card.name == "tray1-2"
+    assert not list(site.glob("learning-*")), "the working folder is gone"
+
+
+def test_fans_that_have_all_changed_get_an_offer_and_nothing_is_taken(changed: Path) -> None:
+    versions = TwinVersions(changed, "tray1")
+    third = versions.all()[2]
+    assert third.outcome == "offered"
+    assert third.why.startswith("all fans are ")
+    assert "% faster than with tray1-2: not taken, for you to say whether maintenance" in third.why
+    in_force = versions.in_force()
+    assert in_force
+    assert in_force.name == "tray1-2"
+    assert third.change[0] == pytest.approx(0.0, abs=0.02), "an offered version is its own reference"
+
+
+def test_one_fan_that_has_changed_is_named_and_never_learned(changed: Path) -> None:
+    versions = TwinVersions(changed, "tray1")
+    fourth = versions.all()[3]
+    assert fourth.outcome == "offered"
+    assert fourth.why.startswith("fan 1 is ")
+    assert "% slower than with tray1-2: not taken, for that is no healthy change; inspect it" in fourth.why
+    learned = [each.period for each in stretches(changed, versions.not_learned())]
+    assert len(learned) == 2, "the two before the fans changed"
+
+
+def test_the_list_says_what_is_in_force_and_the_command_changes_it(changed: Path, tmp_path: Path) -> None:
+    config = changed.parents[2] / "fantwin.toml"
+    config.write_text('run_folder = "runs"\n[[tray]]\nname = "tray1"\nfans = 2\n', encoding="utf-8")
+    listed = fantwin("twins", "-c", config).stdout
+    assert "tray1-2: IN FORCE: " in listed
+    assert "tray1-3: offered: trained, made from 0.0333 h" in listed
+    assert fantwin("twins", "-c", config, "--use", "tray1-3").exit_code == 0
+    assert json.loads(fantwin("twins", "-c", config, "--json").stdout)["in_force"] == "tray1-3"
+    assert "no version 'tray1-9'; there are tray1-1, tray1-2" in error_of("twins", "-c", config, "--use", "tray1-9")
+    fantwin("twins", "-c", config, "--use", "tray1-2")
+    day = ("--faulty-from", "2027-01-14", "--faulty-to", "2027-01-17")
+    assert "tray1-2 stays in force, for there is no other" not in listed
+    said = fantwin("twins", "-c", config, *day).stdout
+    assert "tray1-2 was learned from that time and stays in force, for there is no other version" in said
+    assert "called faulty: 2027-01-14" in said
+    assert "no healthy history to learn from yet" in error_of("learn", "-c", config)
+
+
+def test_a_tray_with_a_twin_of_its_own_and_wrong_times_are_refused_in_one_line(tmp_path: Path) -> None:
+    config = tmp_path / "fantwin.toml"
+    config.write_text('[[tray]]\nname = "tray1"\nfans = 2\ntwin = "a.onnx"\n', encoding="utf-8")
+    assert "every tray has a twin of its own: `twin` in [[tray]]" in error_of("twins", "-c", config)
+    config.write_text('[[tray]]\nname = "tray1"\nfans = 2\n', encoding="utf-8")
+    assert "tray1 has no twin yet: `fantwin up` makes the first" in fantwin("twins", "-c", config).stdout
+    assert "not a time: write 2026-11-24" in error_of("twins", "-c", config, "--faulty-from", "x", "--faulty-to", "y")
+    assert "give --faulty-from and --faulty-to" in error_of("twins", "-c", config, "--faulty-from", "2026-11-24")
+    with pytest.raises(UserError, match="no healthy history to learn from yet"):
+        made(tmp_path / "learned")

@@ -1,0 +1,103 @@
+"""pipeline.learning.versions: what is in force, what is taken back, and what is never learned from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import UserError
+from pipeline.learning.versions import Drop, TwinVersions, Version
+from schemas.units import NS_PER_S
+
+DAY_NS = 86_400 * NS_PER_S
+
+
+def version(name: str, day: int, **other: Any) -> Version:
+    """Learned from the days up to `day`."""
+    fields: dict[str, Any] = {
+        "name": name,
+        "how": "trained",
+        "made_t_ns": day * DAY_NS,
+        "hours": 24.0,
+        "periods": tuple((each * DAY_NS, (each + 1) * DAY_NS - 1) for each in range(1, day)),
+        "since_t_ns": 0,
+        "speed_unit": "rpm",
+        "error": 10.0,
+        "change": (0.0, 0.01),
+        "reference": name,
+        "drops": (Drop(speed=1000.0, at_once=90.0, within_a_minute=40.0),),
+        "declared_per_day": 1.0,
+        "is_target": False,
+        "outcome": "taken",
+        "why": "it is better",
+        "sha256": "0" * 64,
+    }
+    return Version(**{**fields, **other})
+
+
+@pytest.fixture
+def versions(tmp_path: Path) -> TwinVersions:
+    return TwinVersions(tmp_path / "learned", "tray1")
+
+
+def in_force(versions: TwinVersions) -> str:
+    found = versions.in_force()
+    return found.name if found else ""
+
+
+def test_a_taken_version_is_in_force_and_an_offered_one_is_not_until_it_is_used(versions: TwinVersions) -> None:
+    assert versions.next_name() == "tray1-1"
+    assert versions.changed_ns == 0
+    versions.add(version("tray1-1", 2))
+    changed = versions.changed_ns
+    versions.add(version("tray1-2", 3, outcome="offered"))
+    assert versions.changed_ns != changed
+    assert in_force(versions) == "tray1-1"
+    assert versions.next_name() == "tray1-3"
+    versions.use("tray1-2")
+    assert in_force(versions) == "tray1-2"
+    assert [each.name for each in TwinVersions(versions.folder, "tray1").all()] == ["tray1-1", "tray1-2"]
+
+
+def test_a_version_that_learned_from_a_faulty_day_is_taken_back_to_the_newest_that_did_not(
+    versions: TwinVersions,
+) -> None:
+    for number, day in enumerate((2, 3, 4), 1):
+        versions.add(version(f"tray1-{number}", day))
+    assert versions.call_faulty((5 * DAY_NS, 6 * DAY_NS)) == ("", "")
+    assert in_force(versions) == "tray1-3"
+    assert versions.call_faulty((2 * DAY_NS, 3 * DAY_NS)) == ("tray1-3", "tray1-1")
+    assert in_force(versions) == "tray1-1"
+    assert (2 * DAY_NS, 3 * DAY_NS) in versions.not_learned()
+
+
+def test_where_every_version_learned_from_a_faulty_day_the_one_in_force_stays(versions: TwinVersions) -> None:
+    versions.add(version("tray1-1", 2))
+    assert versions.call_faulty((DAY_NS, DAY_NS + 1)) == ("tray1-1", "")
+    assert in_force(versions) == "tray1-1"
+
+
+def test_of_changed_fans_nothing_is_learned_until_their_version_is_used_and_then_nothing_from_before(
+    versions: TwinVersions,
+) -> None:
+    versions.add(version("tray1-1", 2))
+    since = 3 * DAY_NS
+    offered = version("tray1-2", 4, outcome="offered", since_t_ns=since, periods=((since, since + 5),))
+    versions.add(offered)
+    assert (since, since + 5) in versions.not_learned()
+    versions.use("tray1-2")
+    assert (since, since + 5) not in versions.not_learned()
+    assert (0, since - 1) in versions.not_learned()
+
+
+def test_an_unknown_version_and_a_damaged_list_are_refused_in_one_line(versions: TwinVersions) -> None:
+    with pytest.raises(UserError, match="no version 'x'; there are none yet"):
+        versions.use("x")
+    versions.add(version("tray1-1", 2))
+    with pytest.raises(UserError, match="no version 'x'; there are tray1-1"):
+        versions.use("x")
+    (versions.folder / "versions.json").write_text("{", encoding="utf-8")
+    with pytest.raises(UserError, match=r"versions\.json: cannot read the versions of the twin: .*; move it away"):
+        versions.all()

@@ -1,0 +1,109 @@
+"""Twins that took over while a site was recorded: a replay changes them at the same sample."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.replay.offline.replay_input import open_replay_input
+from pipeline.replay.offline.rescoring import rescore
+from schemas.messages import Action, InvalidReason, ModelCard, Score, Transition
+from tests.support.killed_site import CALIBRATION, FANS, Site
+from tests.support.offline_replay import made_equal, recorded, verified
+from tests.support.twin_files import small_hybrid, write_twin
+
+
+def twin_of(folder: Path, name: str, seed: int, *, calibrated: bool = False) -> bytes:
+    card = {"calibration": CALIBRATION} if calibrated else {}
+    return write_twin(folder / f"{name}.onnx", small_hybrid(seed), fans=FANS, name=name, **card).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("learned")
+
+
+@pytest.fixture(scope="module")
+def learned(folder: Path) -> Path:
+    """No twin, then one, then another one with an alarm active and a fan out of service, then killed stages."""
+    site = Site(folder, 7, block_size=4, learns=True)
+    first, second = twin_of(folder, "tray1-1", 1), twin_of(folder, "tray1-2", 2, calibrated=True)
+    site.run(300)
+    site.ask(Action.OUT_OF_SERVICE, fan=2)
+    site.put_in_force("tray1-1", first)
+    site.run(280)
+    site.put_in_force("tray1-2", second)
+    site.run(120)
+    site.kill("scorer")
+    site.run(60)
+    site.kill("twin_integrator")
+    site.run(90)
+    site.put_in_force("tray1-1", first)
+    site.run(90)
+    return site.finished()
+
+
+def test_before_the_first_twin_nothing_is_judged_and_afterwards_all_is(learned: Path) -> None:
+    scores: list[Score] = recorded(learned, "score")
+    reasons = np.concatenate([score.invalid_reason for score in scores])
+    without = np.flatnonzero((reasons == InvalidReason.NO_TWIN).any(axis=1))
+    assert len(without) > 200
+    assert without[-1] < 310
+    valid = np.concatenate([score.valid for score in scores])
+    assert not valid[: without[-1]].any()
+    assert valid[400:500].all(axis=1).sum() > 80
+    assert valid[-40:].any()
+
+
+def test_each_twin_is_published_with_its_file_and_its_first_sample(learned: Path, folder: Path) -> None:
+    cards: list[ModelCard] = recorded(learned, "twin")
+    assert [card.twin for card in cards] == ["tray1-1", "tray1-2", "tray1-2", "tray1-1"]
+    assert cards[1].content == (folder / "tray1-2.onnx").read_bytes()
+    first_of = {p.twin: p.t_ns[0] for p in reversed(recorded(learned, "prediction")) if p.twin}
+    assert first_of["tray1-2"] == cards[1].t_ns
+
+
+def test_what_operators_set_stays_when_a_twin_takes_over_and_alarms_start_again(learned: Path) -> None:
+    alarms = recorded(learned, "alarm")
+    assert {alarm.fan for alarm in alarms if alarm.transition == Transition.OUT_OF_SERVICE} == {2}
+    last_of_fan_2 = [alarm for alarm in alarms if alarm.fan == 2][-1]
+    assert last_of_fan_2.out_of_service
+    raised = [alarm for alarm in alarms if alarm.transition == Transition.RAISED]
+    assert raised
+    taken_over_t_ns = recorded(learned, "twin")[1].t_ns
+    cleared = [
+        alarm for alarm in alarms if not alarm.active and alarm.fan == 0 and alarm.t_ns <= taken_over_t_ns + 50_000_000
+    ]
+    assert cleared, "an alarm of the former twin ends with it"
+
+
+def test_a_replay_is_equal_to_the_bit(learned: Path) -> None:
+    assert made_equal(verified(learned)) > 700
+
+
+def test_a_replay_with_one_twin_uses_it_from_the_beginning(learned: Path, folder: Path) -> None:
+    with open_replay_input([learned], None, (), folder / "tray1-2.onnx") as replay_input:
+        (tray,) = rescore(replay_input, None, verify=False)
+    assert tray.not_judged["no_twin"] == 0
+    assert tray.scored > 550
+
+
+def test_a_replay_of_a_part_begins_with_the_twin_that_was_in_force(learned: Path) -> None:
+    with open_replay_input([learned], None, (), None, 4.0, 6.0) as replay_input:
+        (tray,) = rescore(replay_input, None, verify=False)
+    assert tray.scored > 30
+    assert tray.not_judged["no_twin"] == 0
+
+
+def test_a_twin_that_cannot_be_used_is_refused_and_the_former_one_stays(tmp_path: Path) -> None:
+    site = Site(tmp_path, 8, learns=True)
+    site.put_in_force("tray1-1", twin_of(tmp_path, "tray1-1", 1))
+    site.run(300)
+    site.put_in_force("tray1-2", b"not a twin")
+    site.run(60)
+    integrator = site.stages["twin_integrator"].core
+    assert integrator
+    assert integrator.problem().startswith("tray1-2 did not take over: tray1-2: not an ONNX file that can be run")
+    assert recorded(site.finished(), "prediction")[-1].twin == "tray1-1"

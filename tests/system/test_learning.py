@@ -1,0 +1,70 @@
+"""`fantwin up` without a twin: it learns one beside the running stages, which go on with it, and a replay agrees."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.learning.versions import TwinVersions, learning_folder
+from pipeline.recordings.reading import read_recording
+from schemas.messages import InvalidReason, ModelCard, Score
+from tests.support.fantwin_command import fantwin
+from tests.support.healthy_stretches import FANS, add_stretch
+from tests.support.running_chain import RunningCommand, eventually
+
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
+
+
+@pytest.fixture
+def configuration(tmp_path: Path, endpoint: str) -> Path:
+    """Of a tray with some minutes of healthy history, enough for a first version."""
+    path = tmp_path / "fantwin.toml"
+    path.write_text(
+        f'run_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n[[tray]]\nname = "tray1"\nfans = {FANS}\n'
+        f'command_max = 100\nport = "{tmp_path / "line"}"\n[learner]\nfirst_minutes = 2\n[viewer]\nserve = false\n',
+        encoding="utf-8",
+    )
+    folder = learning_folder(tmp_path / "runs", "tray1")
+    add_stretch(folder, -100_000_000, 320.0, 1)
+    return path
+
+
+@pytest.fixture
+def tray(tmp_path: Path) -> Iterator[RunningCommand]:
+    tray = RunningCommand(["simulate", "--fans", FANS, "--link", tmp_path / "line", "--profile", "prbs", "--json"])
+    try:
+        tray.line_with("fans on")
+        yield tray
+    finally:
+        tray.kill()
+
+
+@pytest.mark.timeout(400)
+def test_a_twin_is_learned_and_takes_over_while_the_stages_run(configuration: Path, tray: RunningCommand) -> None:
+    versions = TwinVersions(learning_folder(configuration.parent / "runs", "tray1"), "tray1")
+    up = RunningCommand(["up", "-c", configuration, "--json"])
+    try:
+        up.line_with("learner, tray1: no twin yet, nothing is judged; ")
+        eventually(versions.in_force, "the first version is made", 200.0)
+        up.line_with("learner, tray1: tray1-1 is in force; ")
+        assert up.end() == 0
+        outcome = up.output()
+    finally:
+        up.kill()
+    assert outcome["restarts"] == {}
+    assert not any(outcome["lost"].values())
+    (recording,) = map(Path, outcome["recordings"])
+    messages = [envelope.message for envelope in read_recording(recording)]
+    (card,) = [message for message in messages if isinstance(message, ModelCard)]
+    assert card.content == versions.file("tray1-1").read_bytes()
+    scores = [message for message in messages if isinstance(message, Score)]
+    t_ns = np.concatenate([score.t_ns for score in scores])
+    without = np.concatenate([(score.invalid_reason == InvalidReason.NO_TWIN).all(axis=1) for score in scores])
+    assert without[t_ns < card.t_ns].all()
+    assert not without[t_ns >= card.t_ns].any()
+    verified = fantwin("replay", "--offline", "--verify", recording)
+    assert verified.exit_code == 0, verified.output
+    assert "to the bit" in verified.stdout
