@@ -1,9 +1,9 @@
-"""Learner: gives a tray that names no twin its twin, and better ones as healthy hours come.
+"""Learner: learns the twin of a tray that names none, and improves it as healthy running accumulates.
 
 Reads: topic `raw` (samples), `score` (whether a fan has an alarm), and `request` (fans that are commissioned again).
 Writes: topic `new_twin`: the version in force, at start and when it changes.
-Timing: a version is made when the healthy history has doubled, at least once in a week of healthy running, and some
-hours after an operator has commissioned fans again.
+Timing: a version is made when the healthy history has doubled, at least once in a week of healthy running, and after
+four hours of healthy running since an operator has commissioned fans again.
 
 It keeps the healthy history (pipeline.learning.healthy_history) and starts `fantwin learn` beside the stages, which
 makes the next version and decides whether it takes over (pipeline.cli.twins.next_version). An operator can change the
@@ -32,7 +32,7 @@ from scoring.samples import among
 LOOK_NS = NS_PER_S
 """how often the learner looks for what has changed"""
 AGAIN_AFTER = 1.25
-"""times the history with which learning failed"""
+"""after a failure, learning starts again when the history is this many times as long"""
 LONGEST_WAIT_S = 7 * 24 * 3600.0
 """of healthy running between two versions"""
 AFTER_COMMISSIONING_S = 4 * 3600.0
@@ -49,7 +49,7 @@ class LearnerConfig(StageConfig):
     hold_back_minutes: float = Field(
         default=10.0, ge=0, description="samples are learned from if no alarm was raised for this long after them"
     )
-    kept_hours: float = Field(default=168.0, ge=1.0, description="healthy running to keep for learning")
+    kept_hours: float = Field(default=168.0, ge=48.0, description="healthy running to keep for learning")
 
 
 class LearnerCore(Core):
@@ -74,6 +74,8 @@ class LearnerCore(Core):
         self._has_alarm = False
         self._looked_ns = 0
         self._seen_change: int | None = None
+        self._is_list_read = False
+        """the versions could be read: otherwise nothing is learned, for nobody would know of it"""
         self._in_force: Version | None = None
         self._last: Version | None = None
         self._faulty: tuple[Period, ...] = ()
@@ -112,11 +114,10 @@ class LearnerCore(Core):
         elif ended is not None:
             self._problem, self._failed_s = "", 0.0
         cards = self._changed(now_ns)
-        if self._learning.seconds is None and self._is_due():
+        if self._learning.is_free and self._is_due():
             self._history.finish()
-            refused = self._learning.start()
-            if refused and refused != self._problem:
-                self._problem = refused
+            if problem := self._learning.start():
+                self._problem, self._failed_s = f"learning: {problem}", self._history.seconds
         return cards
 
     def close(self) -> Sequence[Message]:
@@ -132,7 +133,7 @@ class LearnerCore(Core):
     def notes(self) -> Sequence[str]:
         """The version in force and what it finds; or what the first one waits for."""
         work = self._learning.seconds
-        making = [f"the next version is being made; since {work:.0f} s"] if work is not None else []
+        making = [f"making the next version, for {work:.0f} s"] if work is not None else []
         if self._in_force is None:
             return [self._waits_for(), *making]
         return [f"{self._in_force.name} is in force; {_finds(self._in_force)}", *making]
@@ -146,16 +147,24 @@ class LearnerCore(Core):
         return "; ".join(filter(None, (self._problem, self._history.problem, waits)))
 
     def _changed(self, now_ns: int) -> list[NewTwin]:
-        """The version in force, if it is another one than before."""
-        changed = self._versions.changed_ns
-        if changed == self._seen_change:
+        """The version in force, if it is another one than before.
+
+        One that was not chosen by an operator waits while a fan has an alarm: with another twin the alarm would end,
+        and the fault would be part of the new baselines.
+        """
+        changed = self._versions.change_id
+        if changed == self._seen_change and self._is_list_read:
             return []
         try:
+            if self._has_alarm and not self._versions.is_chosen():
+                return []
             listed, in_force, faulty = self._versions.all(), self._versions.in_force(), self._versions.faulty()
             content = self._versions.file(in_force.name).read_bytes() if in_force else b""
         except (OSError, UserError) as error:
-            self._problem = str(error)
+            self._problem, self._is_list_read = str(error), False
             return []
+        if not self._is_list_read:
+            self._is_list_read, self._problem = True, ""
         if faulty != self._faulty:
             self._history.finish()  # what was called faulty must not be part of what is recorded from now on
         self._faulty, self._seen_change, self._last = faulty, changed, listed[-1] if listed else None
@@ -165,7 +174,7 @@ class LearnerCore(Core):
         return [NewTwin(t_ns=now_ns, twin=in_force.name, sha256=in_force.sha256, content=content)]
 
     def _is_due(self) -> bool:
-        if self._has_alarm:
+        if self._has_alarm or not self._is_list_read:
             return False
         if self._failed_s:
             return self._history.seconds >= max(AGAIN_AFTER * self._failed_s, self._failed_s + LEAST_S)
@@ -179,23 +188,25 @@ class LearnerCore(Core):
     def _waits_for(self) -> str:
         minutes = self._history.seconds / 60.0
         missing = self._operation.missing()
-        lacks = f"; still missing: {'; '.join(missing)}; `fantwin sweep` moves the fans" if missing else ""
+        lacks = f"; not moved enough yet: {'; '.join(missing)}; `fantwin sweep` moves the fans" if missing else ""
         return f"no twin yet, nothing is judged; {minutes:.0f} of {self._config.first_minutes:g} min recorded{lacks}"
 
 
 def _finds(version: Version) -> str:
-    """What the limits of a version find at its middle speed, and what they promise."""
+    """What the limits of a version find at its middle speed, and their false-alarm rate."""
     rate = f"{version.declared_per_day:g} false alarm(s) per fan and day"
-    promise = (
-        f"the target is {rate}, which {version.hours:.2g} h cannot show" if version.is_target else f"{rate} declared"
+    declared = (
+        f"target: {rate}, which {version.hours:.2g} h of data cannot support"
+        if version.is_target
+        else f"{rate} declared"
     )
     known = [drop for drop in version.drops if drop.within_a_minute is not None]
     if not known:
-        return promise
+        return declared
     drop = known[len(known) // 2]
     unit = version.speed_unit
     return (
-        f"at {drop.speed:,.0f} {unit} it finds a drop of {drop.within_a_minute:,.0f} {unit} within a minute; {promise}"
+        f"at {drop.speed:,.0f} {unit} it finds a drop of {drop.within_a_minute:,.0f} {unit} within a minute; {declared}"
     )
 
 
@@ -211,7 +222,7 @@ def build(context: Context) -> BuiltStage:
     """The core of one tray, with its history and versions.
 
     Raises:
-        StageError: there is no configuration file that `fantwin learn` could read; the versions cannot be read.
+        StageError: the versions or the history cannot be read.
     """
     tray, config = context.tray, context.config
     if tray.twin is not None:

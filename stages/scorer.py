@@ -141,8 +141,11 @@ class ScorerCore(Core):
         return [replace(snapshot, restored=True), *self._tray.alarms.republish()]
 
     def _continued(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
-        """Take over from another twin: what belongs to operators stays, all else is of that twin."""
+        """Take over from another core; returns what has changed. Of another twin, only what belongs to operators
+        stays."""
         _, *alarms = self.restore(snapshot)
+        if not self._not_restored:
+            return []
         if self._not_restored == ANOTHER_TWIN:  # as it should be
             self._not_restored = ""
         return alarms

@@ -54,12 +54,12 @@ FAULTS_PER_WEEK = 2.0
 """of all racks together"""
 REPAIRED_AFTER_S = 8 * 3600.0
 FIRST_FAULT_DAY = 2.0
-FILTER_PER_DAY, FILTER_CHANGED_DAY = 0.001, 12.0
-"""share of the speed of all fans that a clogging filter takes a day, until it is changed"""
+FILTER_PER_DAY, FILTER_CHANGED = 0.001, 0.4
+"""share of the speed of all fans that a clogging filter takes a day, until it is changed: share of the time"""
 WEAR_PER_DAY = 0.001
 """the same of the first fan of each second rack"""
-FIRMWARE_DAY, FIRMWARE_FACTOR = 20.0, 1.04
-"""from that day on all fans turn faster by this factor"""
+FIRMWARE, FIRMWARE_FACTOR = 2.0 / 3.0, 1.04
+"""from that share of the time on, all fans turn faster by this factor"""
 NOTED_AFTER_D = 0.1
 """so many days after filter and firmware were changed, operators commission the fans again"""
 USED_AFTER_D = 1.0
@@ -69,14 +69,14 @@ AFTER_FAULT_S = 1800.0
 DAY_NS = round(DAY_S * NS_PER_S)
 
 
-def ageing(columns: int) -> Any:
+def ageing(columns: int, days: float) -> Any:
     """The slow changes of the fans; see racks.Ageing."""
     wears = (np.arange(columns) % (2 * RACK_FANS)) == 0
 
     def factor(t_s: float) -> Array:
         day = t_s / DAY_S
-        filter_days = day if day < FILTER_CHANGED_DAY else day - FILTER_CHANGED_DAY
-        all_fans = (1.0 - FILTER_PER_DAY * filter_days) * (FIRMWARE_FACTOR if day >= FIRMWARE_DAY else 1.0)
+        filter_days = day if day < FILTER_CHANGED * days else day - FILTER_CHANGED * days
+        all_fans = (1.0 - FILTER_PER_DAY * filter_days) * (FIRMWARE_FACTOR if day >= FIRMWARE * days else 1.0)
         return all_fans * np.where(wears, 1.0 - WEAR_PER_DAY * day, 1.0)
 
     return factor
@@ -109,6 +109,7 @@ class LearningAtOnce:
         self.took_s: list[float] = []
 
     seconds = None
+    is_free = True
 
     def start(self) -> str:
         """Make the next version."""
@@ -146,11 +147,11 @@ class _Site:
     """the version at the end of each day"""
     problems: dict[str, int] = field(default_factory=dict)
     """what the learner reported, and the first day"""
-    noted: list[float] = field(default_factory=lambda: [FILTER_CHANGED_DAY, FIRMWARE_DAY])
+    noted: list[float] = field(default_factory=list[float])
     """the days of changes that operators have not noted yet"""
 
     @classmethod
-    def new(cls, folder: Path, name: str) -> _Site:
+    def new(cls, folder: Path, name: str, days: float) -> _Site:
         config = _config(folder, name)
         contexts = {stage: _context(config, stage) for stage in ("resampler", "twin_integrator", "scorer", "learner")}
         of, tray = contexts["learner"], config.trays[0]
@@ -164,7 +165,7 @@ class _Site:
         learning = LearningAtOnce(place, name, of.config.false_alarms_per_day)
         learner = LearnerCore(RACK_FANS, of.config, history, versions, OrdinaryOperation(tray), learning)
         chain = [load_stage(stage).build(contexts[stage]).core for stage in ("resampler", "twin_integrator", "scorer")]
-        return cls(versions, learning, learner, chain)
+        return cls(versions, learning, learner, chain, noted=[FILTER_CHANGED * days, FIRMWARE * days])
 
     def take(self, raw: Raw, tray: str) -> None:
         """The next lines."""
@@ -220,6 +221,7 @@ def _config(folder: Path, tray: str) -> Config:
     text = (
         f'site = "bench"\nrun_folder = "{folder / "runs"}"\n'
         f'[[tray]]\nname = "{tray}"\nfans = {RACK_FANS}\nspeed_unit = "rpm"\ntacho = [{windows}]\n'
+        "[resampler]\nblock_size = 60\n"
     )
     return parse_config(text, folder / "fantwin.toml", (), ("resampler", "twin_integrator", "scorer", "learner"))
 
@@ -241,9 +243,9 @@ def run(count: int, days: float, seed: int, rate_hz: float, folder: Path, consol
     of = racks(count, days * DAY_S, seed, fans_seed=seed)
     faults = month_faults(of)
     names = [f"rack{rack + 1}" for rack in range(count)]
-    sites = [_Site.new(folder, name) for name in names]
+    sites = [_Site.new(folder, name, days) for name in names]
     shown_day, began_s = -1, time.monotonic()
-    for blocks in reports(of, rate_hz, faults, ageing=ageing(of.columns)):
+    for blocks in reports(of, rate_hz, faults, ageing=ageing(of.columns, days)):
         for site, name, raw in zip(sites, names, blocks, strict=True):
             site.take(raw, name)
         day = max(site.sent for site in sites) * 500 / rate_hz / DAY_S

@@ -61,7 +61,11 @@ def page() -> str:
     ]
     for name, row in STAGES.items():
         stage = row.load()
-        start = "" if row.enabled_by == "default" else " It runs if the file has this section."
+        start = {
+            "default": "",
+            "section": " It runs if the file has this section.",
+            "tray without twin": " It runs if a tray names no twin, or if the file has this section.",
+        }[row.enabled_by]
         parts += [
             f"## `[{name}]`\n",
             f"{stage.about[0].upper()}{stage.about[1:]}.{start}\n",

@@ -137,7 +137,7 @@ class HealthyHistory:
             self.problem = f"{writer.path}: the healthy history cannot be kept: {error}"
 
     def flush(self) -> None:
-        """Let no more than what is held back be lost in a crash."""
+        """Write to disk, so that a crash loses only the samples held back."""
         if self._writer:
             try:
                 self._writer.flush()
@@ -168,7 +168,7 @@ class HealthyHistory:
             self._fail(error)
 
     def _fail(self, error: RecordingError) -> None:
-        """The disk refuses: the recording ends with what is on it, and the next sample tries again."""
+        """A write failed: the unfinished recording is deleted, and the next sample starts another."""
         writer, self._writer, self._period = self._writer, None, (0, 0)
         if writer:
             with suppress(OSError, RecordingError):
@@ -186,7 +186,7 @@ class HealthyHistory:
                 each.path.unlink()
 
     def _repair(self) -> None:
-        """Give what a killed process left the name of a finished recording."""
+        """Repair the recording that a killed process left open, and name it as finished."""
         active = self._folder / HEALTHY / (OPEN_NAME + ACTIVE_SUFFIX)
         left = [active] if active.exists() else []
         try:

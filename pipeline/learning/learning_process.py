@@ -14,15 +14,20 @@ from typing import Protocol
 from pipeline.optional_dependencies import how_to_install, is_installed
 
 _TURN = threading.Lock()
-"""trays learn one after the other: memory and one core are for one"""
+"""one tray learns at a time, to limit memory and processor use"""
 STOP_S = 2.0
 
 
 class Learning(Protocol):
     """Makes the next version of a tray's twin, beside all else."""
 
+    @property
+    def is_free(self) -> bool:
+        """Whether no tray of this process is learning."""
+        ...
+
     def start(self) -> str:
-        """Begin, unless another tray is learning; returns why not, or nothing."""
+        """Begin, if it is free; returns what went wrong, or nothing."""
         ...
 
     def poll(self) -> str | None:
@@ -43,20 +48,26 @@ class LearningProcess:
     """The command for one tray of a configuration."""
 
     def __init__(self, config: Path, overrides: Sequence[str], tray: str, log: Path) -> None:
-        """log: what the last one said is written there."""
+        """log: file for the standard error of the last run."""
         sets = [word for override in overrides for word in ("--set", override)]
         self._command = [sys.executable, "-P", "-m", "pipeline", "learn", "-c", str(config), "--tray", tray, *sets]
         self._log = log
         self._child: subprocess.Popen[bytes] | None = None
         self._began_s = 0.0
 
+    @property
+    def is_free(self) -> bool:
+        """Whether no tray of this process is learning."""
+        return not _TURN.locked()
+
     def start(self) -> str:
-        """Begin, unless another tray is learning; returns why not, or nothing."""
+        """Begin, if it is free; returns what went wrong, or nothing."""
         if not is_installed("torch"):
             return f"no twin can be learned without the extra `train`; {how_to_install('train')}"
         if not _TURN.acquire(blocking=False):
             return "another tray is learning"
         try:
+            self._log.parent.mkdir(parents=True, exist_ok=True)
             with self._log.open("wb") as log:
                 self._child = subprocess.Popen(
                     [*self._command, "--until-stdin-closes"],

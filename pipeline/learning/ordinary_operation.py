@@ -54,7 +54,7 @@ class OrdinaryOperation:
         held = (self._seconds >= NEEDED_S).sum(axis=1)
         return [
             f"fan {fan}: {self._range_of(fan)}, {NEEDED_S:.0f} s in {held[fan]} of {NEEDED_RANGES} tenths of the "
-            f"range, {self._changes[fan]} of {NEEDED_CHANGES} changes"
+            f"range, {min(self._changes[fan], NEEDED_CHANGES)} of {NEEDED_CHANGES} changes"
             for fan in range(len(held))
             if held[fan] < NEEDED_RANGES or self._changes[fan] < NEEDED_CHANGES
         ]

@@ -24,7 +24,7 @@ Period: TypeAlias = tuple[int, int]
 
 
 class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="ignore")  # of a newer fantwin, as after an update that is undone
 
 
 class Drop(_Record):
@@ -41,12 +41,13 @@ class Drop(_Record):
 class Version(_Record):
     """One version, and why it took over or did not.
 
-    made_t_ns: the newest sample that it was learned from. hours: of the tray, that its limits are from. periods: of the
-    healthy history that it was learned from, since_t_ns on: before that, the fans were others. error: of the free run
-    over the newest period, root mean square over all fans. reference: the version that changes of the fans are seen
-    from, the last one of commissioning. change: of each fan, how its speed in the newest period differs from that of
-    the reference's twin under the same commands, as a share. declared_per_day: false alarms of a fan that the limits
-    are for; is_target: the data are too few to show that they keep it. Speeds are in the unit of the tray.
+    made_t_ns: the newest sample that it was learned from. hours: healthy running from which its limits were set.
+    periods: of the recordings from which it was learned. since_t_ns: earlier recordings are not used, because the fans
+    have changed since. error: of the free run over the newest recording, root mean square over all fans. reference: the
+    version against which changes of the fans' speeds are measured, the first one learned from 24 hours. change: of each
+    fan, how its speed in the newest recording differs from the reference's prediction, as a share. declared_per_day:
+    false alarms of a fan that the limits are for; is_target: the data are too few to show that they keep it. Speeds are
+    in the unit of the tray.
     """
 
     name: str
@@ -69,6 +70,8 @@ class Version(_Record):
 
 class _List(_Record):
     in_force: str = ""
+    is_chosen: bool = False
+    """an operator has put it in force"""
     versions: tuple[Version, ...] = ()
     faulty: tuple[Period, ...] = ()
 
@@ -82,8 +85,8 @@ class TwinVersions:
         self._path = folder / LIST_NAME
 
     @property
-    def changed_ns(self) -> int:
-        """Something that differs after each change of the list; 0: there is none."""
+    def change_id(self) -> int:
+        """A value that changes with each change of the list; 0 if there is no list."""
         try:
             status = self._path.stat()
         except OSError:
@@ -102,6 +105,10 @@ class TwinVersions:
         """The version in force, if there is one. Raises as `all`."""
         listed = self._read()
         return next((version for version in listed.versions if version.name == listed.in_force), None)
+
+    def is_chosen(self) -> bool:
+        """Whether an operator has put the version in force, also by calling a time faulty. Raises as `all`."""
+        return self._read().is_chosen
 
     def faulty(self) -> tuple[Period, ...]:
         """The periods that operators called faulty. Raises as `all`."""
@@ -132,8 +139,8 @@ class TwinVersions:
             UserError: the list cannot be read or written.
         """
         with self._changing() as listed:
-            in_force = version.name if version.outcome == "taken" else listed.in_force
-            self._write(listed.model_copy(update={"in_force": in_force, "versions": (*listed.versions, version)}))
+            taken = {"in_force": version.name, "is_chosen": False} if version.outcome == "taken" else {}
+            self._write(listed.model_copy(update={**taken, "versions": (*listed.versions, version)}))
 
     def use(self, name: str) -> None:
         """Put a version in force, an earlier one or one that is offered.
@@ -145,7 +152,7 @@ class TwinVersions:
             names = [version.name for version in listed.versions]
             if name not in names:
                 raise UserError(f"{self.folder}: no version {name!r}; there are {', '.join(names) or 'none yet'}")
-            self._write(listed.model_copy(update={"in_force": name}))
+            self._write(listed.model_copy(update={"in_force": name, "is_chosen": True}))
 
     def call_faulty(self, period: Period) -> tuple[str, str]:
         """Never learn from a period. A twin in force that did is replaced by the newest taken version that did not.
@@ -162,6 +169,7 @@ class TwinVersions:
             clean = [v.name for v in listed.versions if v.outcome == "taken" and v.name not in tainted]
             was, now = (listed.in_force, clean[-1] if clean else "") if listed.in_force in tainted else ("", "")
             update = {"faulty": (*listed.faulty, period), "in_force": now or listed.in_force}
+            update["is_chosen"] = bool(now) or listed.is_chosen
             self._write(listed.model_copy(update=update))
         return was, now
 

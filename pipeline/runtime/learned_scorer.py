@@ -1,7 +1,8 @@
 """The scorer of a tray whose twins are learned while it runs: one core after the other, each of one twin.
 
 Predictions name their twin, and the integrator publishes a twin before its first prediction. So the core changes at the
-same sample in a replay.
+same sample in a replay. Where only the limits are new, baselines, alarms and wear go on; with another twin they start
+from the beginning, except for what operators have set.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -17,6 +19,7 @@ import numpy as np
 
 from pipeline.config.models import TrayConfig
 from pipeline.runtime.judged_share import JudgedShare
+from pipeline.runtime.onnx_metadata import without_metadata
 from pipeline.runtime.snapshot_store import SnapshotStore
 from pipeline.runtime.stage import Core, StageError
 from pipeline.runtime.tray_twin import TrayTwin, tray_twin
@@ -33,14 +36,16 @@ class ScorerOfTwin(Core, Protocol):
         ...
 
     def last_snapshot(self) -> Sequence[ScorerSnapshot]:
-        """The state now, of which there is none before the first sample."""
+        """The current state; empty before the first sample."""
         ...
 
 
 MOST_HELD = 4096
 """messages that wait for their twin: 40 s at 100 Hz"""
+LIMITS = ("name", "calibration")
+"""the entries of a card that do not affect predictions"""
 CoreOf = Callable[[TrayTwin, ScorerSnapshot | None], ScorerOfTwin]
-"""the core of a twin; of another one before it, with the last snapshot of that"""
+"""the core of a twin, which continues from the last snapshot of the one before it"""
 
 
 class LearnedTwinScorer(Core):
@@ -126,7 +131,7 @@ class LearnedTwinScorer(Core):
     def problem(self) -> str:
         """A twin that has not arrived or cannot be used, or what the core reports."""
         if self._held:
-            return f"predictions are of {self._held[0].twin}, which has not arrived: {len(self._held)} messages wait"
+            return f"the twin {self._held[0].twin} has not arrived: {len(self._held)} messages wait for it"
         return self._problem or (self._core.problem() if self._core else "")
 
     def _note_what_was_scored(self, snapshot: ScorerSnapshot) -> None:
@@ -156,7 +161,10 @@ class LearnedTwinScorer(Core):
         try:
             twin = tray_twin(Path(name), card.content, self._tray.fans)
             before = self._core.last_snapshot() if self._core else []
-            core = self._core_of(twin, before[0] if before else None)
+            continues = before[0] if before else None
+            if continues and self._has_other_limits_only(card):
+                continues = replace(continues, twin_sha256=twin.sha256)  # baselines, alarms and wear go on
+            core = self._core_of(twin, continues)
         except StageError as error:
             self._problem = str(error)
             return []
@@ -168,6 +176,15 @@ class LearnedTwinScorer(Core):
         self._core, self._twin, self._snapshot, self._problem = core, name, None, ""
         requests, self._requests = self._requests, []
         return [*emitted, *(message for request in requests for message in core.step(request))]
+
+    def _has_other_limits_only(self, card: ModelCard) -> bool:
+        """Whether a twin predicts as the current one does."""
+        now = self._cards[self._twin]
+        if without_metadata(now.content) != without_metadata(card.content):
+            return False
+        cards = (json.loads(each.card_json) for each in (now, card))
+        first, second = ({key: value for key, value in each.items() if key not in LIMITS} for each in cards)
+        return first == second
 
     def _unscored(self, item: Prediction) -> list[Message]:
         new = item.t_ns > np.maximum.accumulate(np.concatenate(([self._newest_t_ns], item.t_ns)))[:-1]

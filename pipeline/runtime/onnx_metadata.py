@@ -24,6 +24,21 @@ def read_onnx_metadata(content: bytes) -> dict[str, str]:
     return {entry.key: entry.value for entry in model.metadata_props}
 
 
+def without_metadata(content: bytes) -> bytes:
+    """An ONNX file without its metadata properties: equal for files of the same graph and weights.
+
+    Raises:
+        ValueError: it is not an ONNX file.
+    """
+    model = _MODEL()
+    try:
+        model.ParseFromString(content)
+    except DecodeError as error:
+        raise ValueError("not an ONNX file") from error
+    model.ClearField("metadata_props")
+    return model.SerializeToString()
+
+
 def _model_message() -> Any:
     """The message ModelProto of onnx.proto with the one field needed here. Field numbers are those of onnx.proto."""
     file = descriptor_pb2.FileDescriptorProto(

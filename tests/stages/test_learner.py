@@ -53,6 +53,10 @@ class FakeLearning:
         return ""
 
     @property
+    def is_free(self) -> bool:
+        return not self._is_working
+
+    @property
     def seconds(self) -> float | None:
         return 1.0 if self._is_working else None
 
@@ -117,7 +121,9 @@ def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path
     learner.run(600, moves=False)
     assert learner.learning.starts == []
     (note,) = learner.core.notes()
-    assert note.startswith("no twin yet, nothing is judged; 10 of 5 min recorded; still missing: fan 0: command 0.5,")
+    assert note.startswith(
+        "no twin yet, nothing is judged; 10 of 5 min recorded; not moved enough yet: fan 0: command 0.5,"
+    )
     learner.run(600)
     assert learner.put_in_force == ["tray1-1"]
     (note,) = learner.core.notes()
@@ -204,3 +210,38 @@ def test_samples_of_another_number_of_fans_are_left_alone(tmp_path: Path) -> Non
     results: Sequence[Message] = learner.core.step(two)
     assert results == []
     assert learner.history.seconds == 0.0
+
+
+def test_a_version_waits_for_the_end_of_an_alarm_unless_an_operator_chose_it(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    assert learner.put_in_force == ["tray1-1"]
+    learner.versions.add(version("tray1-2", 2))
+    learner.versions.file("tray1-2").write_bytes(b"tray1-2")
+    learner.run(100, state=FanState.ALARM)
+    assert learner.put_in_force == ["tray1-1"]
+    learner.versions.use("tray1-1")
+    learner.versions.use("tray1-2")
+    learner.run(100, state=FanState.ALARM)
+    assert learner.put_in_force == ["tray1-1", "tray1-2"]
+    learner.versions.add(version("tray1-3", 2))
+    learner.versions.file("tray1-3").write_bytes(b"tray1-3")
+    learner.run(100, state=FanState.ALARM)
+    learner.run(20)
+    assert learner.put_in_force == ["tray1-1", "tray1-2", "tray1-3"]
+
+
+def test_while_the_list_of_versions_cannot_be_read_nothing_is_learned_and_the_reason_is_said(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    made = len(learner.learning.starts)
+    listed = tmp_path / "versions.json"
+    content = listed.read_bytes()
+    listed.write_bytes(b"{")
+    learner.run(3000)
+    assert len(learner.learning.starts) == made
+    assert "cannot read the versions of the twin" in learner.core.problem()
+    listed.write_bytes(content)
+    learner.run(600)
+    assert len(learner.learning.starts) > made
+    assert learner.core.problem() == ""

@@ -31,7 +31,8 @@ def learn(
 ) -> None:
     """Make the next version of a learned twin from the tray's healthy history, as `fantwin up` does by itself.
 
-    It takes over at once if it was taken, also on a running site. `fantwin twins` lists the versions.
+    The new version takes over within seconds, also on a running site, unless it is only offered. `fantwin twins` lists
+    the versions.
 
     Exit codes: 0 a version was made; 1 error, such as too little history; 130 Ctrl-C.
 
@@ -65,7 +66,7 @@ def learning_tray(settings: Config, name: str | None) -> TrayConfig:
         raise UserError(f"several trays learn their twins: choose one with --tray: {', '.join(t.name for t in chosen)}")
     if not chosen or chosen[0] not in learning:
         which = f"tray {chosen[0].name} has" if chosen else "every tray has"
-        raise UserError(f"{settings.path}: {which} a twin of its own: `twin` in [[tray]]; without it, one is learned")
+        raise UserError(f"{settings.path}: {which} a twin of its own: remove `twin` from [[tray]] to learn one")
     return chosen[0]
 
 

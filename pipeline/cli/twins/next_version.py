@@ -1,8 +1,8 @@
 """The next version of a learned twin, from the healthy history of its tray.
 
-A new twin is trained on all but the newest stretch of the history and compared over that stretch with the one in force.
-Unless it is clearly better, the one in force stays and gets new limits. Where the fans have changed more than healthy
-fans do, the new version is offered to the operator and not taken.
+A new twin is trained on recordings before the newest and compared over the newest with the twin in force. Unless it is
+clearly better, the new version is the twin in force with new limits. Where the fans have changed more than healthy fans
+do, the new version is offered to the operator and not taken.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class _Part:
 def make_next_version(folder: Path, tray: str, per_day: float, say: Callable[[str], None]) -> Version:
     """Make the next version and add it to the list; it is in force if it was taken.
 
-    per_day: false alarms of a fan to declare. say: is told what is being done, a line each.
+    per_day: false alarms of a fan to declare. say: called with a progress line for each step.
 
     Raises:
         UserError: there is nothing to learn from, or too little; a file cannot be read or written.
@@ -132,7 +132,14 @@ class _Work:
         compared = f"error {error:.3g} {test.speed_unit}, that of {before.name} {error_before:.3g}"
         if error < BETTER * error_before:
             return self._made(trained, "trained", test, "taken", compared, reference)
-        return self._made(in_force, "new limits", test, "taken", f"no better when trained: {compared}", reference)
+        return self._made(
+            in_force,
+            "new limits",
+            test,
+            "taken",
+            f"a newly trained twin is less than 2 % better: {compared}",
+            reference,
+        )
 
     def _moved(self, reference: Version, test: TrainingData) -> str:
         """What has changed since the reference more than healthy fans do, in words; empty if nothing has."""
@@ -298,11 +305,11 @@ def changed_fans(change: Array, reference: str) -> str:
     together = len(change) > 1 and np.all(np.sign(change) == np.sign(change[far[0]]))
     if together and np.min(np.abs(change)) > 0.5 * np.max(np.abs(change)):
         return (
-            f"all fans are {_faster(float(np.mean(change)))} than with {reference}: not taken, for you to say whether "
-            "maintenance, a filter or new firmware is the reason"
+            f"all fans are {_faster(float(np.mean(change)))} than when {reference} was made; if maintenance, a filter "
+            "or new firmware is the reason, put this version in force"
         )
     named = ", ".join(f"fan {fan} is {_faster(float(change[fan]))}" for fan in far.tolist())
-    return f"{named} than with {reference}: not taken, for that is no healthy change; inspect it"
+    return f"{named} than when {reference} was made; inspect it, or put this version in force if it was replaced"
 
 
 def _faster(change: float) -> str:

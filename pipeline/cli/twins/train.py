@@ -71,7 +71,7 @@ def train(
     networks: Annotated[
         int | None,
         typer.Option(
-            help="Networks to train and average (hybrid, neural ODE), for as many times the time. Default: "
+            help="Networks to train and average (hybrid, neural ODE), up to that many times as long. Default: "
             f"{NETWORKS}, and 1 where they cannot be averaged."
         ),
     ] = None,

@@ -24,18 +24,22 @@ def twins(
         str | None, typer.Option(metavar="VERSION", help="Put this version in force: an earlier or an offered one.")
     ] = None,
     faulty_from: Annotated[
-        str | None, typer.Option("--faulty-from", metavar="TIME", help="With --faulty-to: never learn from this time.")
+        str | None,
+        typer.Option("--faulty-from", metavar="TIME", help="Start of a time to mark as faulty; needs --faulty-to."),
     ] = None,
     faulty_to: Annotated[
-        str | None, typer.Option("--faulty-to", metavar="TIME", help="Times are local: 2026-11-24 or 2026-11-24T18:00.")
+        str | None,
+        typer.Option(
+            "--faulty-to", metavar="TIME", help="End of the faulty time. Times are local; a date alone is 00:00."
+        ),
     ] = None,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """List the versions of a learned twin, choose one, or call a time faulty so that it is never learned.
+    """List the versions of a learned twin, put one in force, or mark a time as faulty: it is never learned from.
 
-    A running site changes to the version in force at once. If the version in force was learned from a time that is
-    called faulty, the newest one that was not takes its place.
+    A running site changes to the version in force within seconds. If that was learned from a time that is marked as
+    faulty, the newest version that was not takes its place.
 
     Example: fantwin twins -c fantwin.toml
 
@@ -68,9 +72,8 @@ def twins(
 
 
 def _no_other(name: str) -> str:
-    return (
-        f"{name} was learned from that time and stays in force, for there is no other version; the next one will not be"
-    )
+    stays = f"{name} was learned from that time and stays in force: there is no other version"
+    return f"{stays}; the next will not use that time"
 
 
 def _period(first: str, last: str) -> Period:

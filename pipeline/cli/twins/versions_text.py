@@ -9,26 +9,27 @@ from pipeline.recordings.dates import format_local
 
 
 def version_lines(versions: Sequence[Version], in_force: str, faulty: Sequence[Period]) -> list[str]:
-    """Some lines for each version, and one for each period that is called faulty."""
+    """A line for each version, more for the newest and for the one in force, and one for each faulty period."""
     lines: list[str] = []
     for version in versions:
-        lines += _lines(version, is_in_force=version.name == in_force)
-    return [*lines, *(f"called faulty: {format_local(first)} to {format_local(last)}" for first, last in faulty)]
+        of_version = _lines(version, is_in_force=version.name == in_force)
+        lines += of_version if version.name == in_force or version is versions[-1] else of_version[:1]
+    return [*lines, *(f"marked as faulty: {format_local(first)} to {format_local(last)}" for first, last in faulty)]
 
 
 def _lines(version: Version, *, is_in_force: bool) -> list[str]:
-    state = "IN FORCE" if is_in_force else version.outcome
+    state = "IN FORCE" if is_in_force else "offered" if version.outcome == "offered" else "not in force"
     unit = version.speed_unit
-    made = f"made from {version.hours:.3g} h up to {format_local(version.made_t_ns)}"
+    made = f"limits from {version.hours:.3g} h up to {format_local(version.made_t_ns)}"
     rate = f"{version.declared_per_day:g} false alarm{'s' * (version.declared_per_day != 1)} per fan and day"
-    promise = f"target {rate}, which so few data cannot show" if version.is_target else f"declared {rate}"
+    declared = f"target {rate}; too little data to support it" if version.is_target else f"declared {rate}"
     change = ", ".join(f"{100 * each:+.1f} %" for each in version.change)
     return [
-        f"{version.name}: {state}: {version.how}, {made}",
+        f"{version.name}: {state}: {version.how}; {made}",
         f"  why: {version.why}",
-        f"  error {version.error:.3g} {unit}; {promise}",
+        f"  error {version.error:.3g} {unit}; {declared}",
         *(f"  found at {drop.speed:,.0f} {unit}: {_found(drop, unit)}" for drop in version.drops),
-        f"  speed of the fans beside {version.reference}: {change}",
+        f"  speed of the fans relative to {version.reference}: {change}",
     ]
 
 

@@ -78,7 +78,7 @@ def test_fans_that_have_all_changed_get_an_offer_and_nothing_is_taken(changed: P
     third = versions.all()[2]
     assert third.outcome == "offered"
     assert third.why.startswith("all fans are ")
-    assert "% faster than with tray1-2: not taken, for you to say whether maintenance" in third.why
+    assert "% faster than when tray1-2 was made; if maintenance, a filter or new firmware" in third.why
     in_force = versions.in_force()
     assert in_force
     assert in_force.name == "tray1-2"
@@ -90,7 +90,7 @@ def test_one_fan_that_has_changed_is_named_and_never_learned(changed: Path) -> N
     fourth = versions.all()[3]
     assert fourth.outcome == "offered"
     assert fourth.why.startswith("fan 1 is ")
-    assert "% slower than with tray1-2: not taken, for that is no healthy change; inspect it" in fourth.why
+    assert "% slower than when tray1-2 was made; inspect it, or put this version in force" in fourth.why
     learned = [each.period for each in stretches(changed, versions.not_learned())]
     assert len(learned) == 2, "the two before the fans changed"
 
@@ -100,23 +100,24 @@ def test_the_list_says_what_is_in_force_and_the_command_changes_it(changed: Path
     config.write_text('run_folder = "runs"\n[[tray]]\nname = "tray1"\nfans = 2\n', encoding="utf-8")
     listed = fantwin("twins", "-c", config).stdout
     assert "tray1-2: IN FORCE: " in listed
-    assert "tray1-3: offered: trained, made from 0.0333 h" in listed
+    assert "tray1-3: offered: trained; limits from 0.0333 h" in listed
     assert fantwin("twins", "-c", config, "--use", "tray1-3").exit_code == 0
     assert json.loads(fantwin("twins", "-c", config, "--json").stdout)["in_force"] == "tray1-3"
     assert "no version 'tray1-9'; there are tray1-1, tray1-2" in error_of("twins", "-c", config, "--use", "tray1-9")
     fantwin("twins", "-c", config, "--use", "tray1-2")
     day = ("--faulty-from", "2027-01-14", "--faulty-to", "2027-01-17")
-    assert "tray1-2 stays in force, for there is no other" not in listed
     said = fantwin("twins", "-c", config, *day).stdout
-    assert "tray1-2 was learned from that time and stays in force, for there is no other version" in said
-    assert "called faulty: 2027-01-14" in said
+    assert "tray1-2 was learned from that time and stays in force: there is no other version; the next" in said
+    assert "marked as faulty: 2027-01-14" in said
     assert "no healthy history to learn from yet" in error_of("learn", "-c", config)
 
 
 def test_a_tray_with_a_twin_of_its_own_and_wrong_times_are_refused_in_one_line(tmp_path: Path) -> None:
     config = tmp_path / "fantwin.toml"
     config.write_text('[[tray]]\nname = "tray1"\nfans = 2\ntwin = "a.onnx"\n', encoding="utf-8")
-    assert "every tray has a twin of its own: `twin` in [[tray]]" in error_of("twins", "-c", config)
+    assert "every tray has a twin of its own: remove `twin` from [[tray]] to learn one" in error_of(
+        "twins", "-c", config
+    )
     config.write_text('[[tray]]\nname = "tray1"\nfans = 2\n', encoding="utf-8")
     assert "tray1 has no twin yet: `fantwin up` makes the first" in fantwin("twins", "-c", config).stdout
     assert "not a time: write 2026-11-24" in error_of("twins", "-c", config, "--faulty-from", "x", "--faulty-to", "y")

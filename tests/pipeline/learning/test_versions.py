@@ -49,11 +49,11 @@ def in_force(versions: TwinVersions) -> str:
 
 def test_a_taken_version_is_in_force_and_an_offered_one_is_not_until_it_is_used(versions: TwinVersions) -> None:
     assert versions.next_name() == "tray1-1"
-    assert versions.changed_ns == 0
+    assert versions.change_id == 0
     versions.add(version("tray1-1", 2))
-    changed = versions.changed_ns
+    changed = versions.change_id
     versions.add(version("tray1-2", 3, outcome="offered"))
-    assert versions.changed_ns != changed
+    assert versions.change_id != changed
     assert in_force(versions) == "tray1-1"
     assert versions.next_name() == "tray1-3"
     versions.use("tray1-2")

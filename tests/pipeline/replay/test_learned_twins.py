@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.replay.offline.replay_input import open_replay_input
 from pipeline.replay.offline.rescoring import rescore
-from schemas.messages import Action, InvalidReason, ModelCard, Score, Transition
+from schemas.messages import Action, FanState, InvalidReason, ModelCard, Score, Transition
 from tests.support.killed_site import CALIBRATION, FANS, Site
 from tests.support.offline_replay import made_equal, recorded, verified
 from tests.support.twin_files import small_hybrid, write_twin
@@ -107,3 +107,29 @@ def test_a_twin_that_cannot_be_used_is_refused_and_the_former_one_stays(tmp_path
     assert integrator
     assert integrator.problem().startswith("tray1-2 did not take over: tray1-2: not an ONNX file that can be run")
     assert recorded(site.finished(), "prediction")[-1].twin == "tray1-1"
+
+
+def test_with_new_limits_alone_baselines_and_alarms_go_on(tmp_path: Path) -> None:
+    site = Site(tmp_path, 9, learns=True)
+    model = small_hybrid(1)
+    first = write_twin(tmp_path / "1.onnx", model, fans=FANS, name="tray1-1", calibration=CALIBRATION).read_bytes()
+    wider = {**CALIBRATION, "speed": {"step": 2.5, "drift": 9.0, "growth": 5.0}}
+    second = write_twin(tmp_path / "2.onnx", model, fans=FANS, name="tray1-2", calibration=wider).read_bytes()
+    site.put_in_force("tray1-1", first)
+    site.run(585)
+    site.put_in_force("tray1-2", second)
+    site.run(200)
+    recording = site.finished()
+    cards, scores = recorded(recording, "twin"), recorded(recording, "score")
+    before = next(score for score in reversed(scores) if score.t_ns[-1] < cards[1].t_ns)
+    after = next(score for score in scores if score.t_ns[0] > cards[1].t_ns and score.valid.any())
+    commissioned = before.state[-1] == FanState.ALARM
+    assert (after.state[-1][commissioned & after.valid[-1]] == FanState.ALARM).all()
+    known = np.isfinite(before.speed_baseline_rad_s[-1]) & np.isfinite(after.speed_baseline_rad_s[0])
+    assert known.any()
+    np.testing.assert_allclose(after.speed_baseline_rad_s[0][known], before.speed_baseline_rad_s[-1][known], atol=1.0)
+    alarms = recorded(recording, "alarm")
+    active = {alarm.fan for alarm in alarms if alarm.transition == Transition.RAISED and alarm.t_ns < cards[1].t_ns}
+    assert active
+    assert not [alarm for alarm in alarms if alarm.transition == Transition.RAISED and alarm.t_ns > cards[1].t_ns]
+    assert made_equal(verified(recording)) > 600
