@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 MOST_TRAINING_SAMPLES = 10_000
 """of a fan: so many are enough for small networks, and take a minute or two"""
-MOST_LIMITS_S = 24 * 3600.0
+WANTED_S = 24 * 3600.0
 """of healthy running that limits are from, unless the declared rate takes more; an hour takes about ten seconds"""
 MOST_RECORDINGS = 24
 """the newest ones that a twin is trained on"""
@@ -111,7 +111,7 @@ class _Work:
         rate_hz, fans = _rate_hz(history[-1])
         self._most_training_s = MOST_TRAINING_SAMPLES / rate_hz
         needed_s = 3600.0 * too_little(0.0, per_day).needed_fan_hours / fans
-        self._limits_from = _newest(history, max(MOST_LIMITS_S, MARGIN * needed_s))
+        self._limits_from = newest(history, max(WANTED_S, MARGIN * needed_s))
 
     def version(self) -> tuple[Version, bytes]:
         """The version and the content of its file."""
@@ -242,14 +242,12 @@ def _data(part: _Part) -> TrainingData:
     return read_training_data(part.paths, None, None, part.from_s, part.to_s)
 
 
-def _newest(history: Sequence[Stretch], most_s: float) -> list[Stretch]:
-    """The newest stretches that are together no longer than most_s, one at least."""
-    chosen, left_s = [history[-1]], most_s - history[-1].seconds
-    for each in reversed(history[:-1]):
-        left_s -= each.seconds
-        if left_s < 0.0:
-            break
-        chosen.insert(0, each)
+def newest(history: Sequence[Stretch], wanted_s: float) -> list[Stretch]:
+    """The newest stretches that are together as long as wanted, or all."""
+    chosen: list[Stretch] = []
+    for each in reversed(history):
+        if sum(one.seconds for one in chosen) < wanted_s:
+            chosen.insert(0, each)
     return chosen
 
 

@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli.twins import next_version
-from pipeline.cli.twins.next_version import make_next_version
+from pipeline.cli.twins.next_version import make_next_version, newest
 from pipeline.errors import UserError
-from pipeline.learning.healthy_history import stretches
+from pipeline.learning.healthy_history import Stretch, stretches
 from pipeline.learning.versions import TwinVersions, Version
 from pipeline.runtime.tray_twin import load_tray_twin
+from schemas.units import NS_PER_S
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.healthy_stretches import FANS, add_stretch
 
@@ -124,3 +125,11 @@ def test_a_tray_with_a_twin_of_its_own_and_wrong_times_are_refused_in_one_line(t
     assert "give --faulty-from and --faulty-to" in error_of("twins", "-c", config, "--faulty-from", "2026-11-24")
     with pytest.raises(UserError, match="no healthy history to learn from yet"):
         made(tmp_path / "learned")
+
+
+def test_limits_are_from_as_many_of_the_newest_recordings_as_are_wanted_and_not_from_fewer() -> None:
+    hours = [8, 8, 8, 8, 3]
+    history = [Stretch(Path(f"{k}.mcap"), (k, k + hours[k] * 3600 * NS_PER_S)) for k in range(len(hours))]
+    assert newest(history, 24 * 3600.0) == history[1:]
+    assert newest(history, 3600.0) == history[-1:]
+    assert newest(history, 100 * 3600.0) == history
