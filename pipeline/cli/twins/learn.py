@@ -18,9 +18,6 @@ from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UserError
 from pipeline.learning.versions import learning_folder
 
-IDLE = 19
-"""the lowest priority: stages come first"""
-
 
 def learn(
     config: ConfigOption = DEFAULT_CONFIG,
@@ -39,7 +36,7 @@ def learn(
     Example: fantwin learn -c fantwin.toml
     """
     if until_stdin_closes:
-        os.nice(IDLE)
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))  # it runs while no stage does
         threading.Thread(target=_end_with_parent, daemon=True).start()
     settings = load_config(config, overrides or (), stages=("learner",))
     of = learning_tray(settings, tray)

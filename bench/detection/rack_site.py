@@ -1,0 +1,218 @@
+"""One rack under `fantwin up` without a twin: the cores of its stages, what it learns, and what its operators do.
+
+The learner makes its versions by the function of `fantwin learn`, while no sample comes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from pydantic import TypeAdapter
+
+from bench.detection.plant import START_NS
+from bench.detection.rack_scoring import Episode, episodes
+from bench.detection.racks import DAY_S, RACK_FANS, TACHOS
+from pipeline.cli.twins.next_version import make_next_version
+from pipeline.config.loading import parse_config
+from pipeline.config.models import Config
+from pipeline.errors import UserError
+from pipeline.learning.healthy_history import HealthyHistory
+from pipeline.learning.ordinary_operation import OrdinaryOperation
+from pipeline.learning.versions import TwinVersions, Version, learning_folder
+from pipeline.recordings.metadata import recording_metadata
+from pipeline.runtime.stage import Context, Core, load_stage
+from schemas.messages import Action, Alarm, Header, Raw, Request, Score
+from schemas.units import NS_PER_S
+from stages.learner import LearnerCore
+
+NOTED_AFTER_D = 0.1
+"""so many days after a change that they made themselves, operators commission the fans again"""
+USED_AFTER_D = 1.0
+"""and so many days after a version was offered for it, they put it in force"""
+DAY_NS = round(DAY_S * NS_PER_S)
+
+
+@dataclass
+class RackMonth:
+    """What became of one rack, up to the end of a day."""
+
+    days: int = 0
+    alarms: list[Episode] = field(default_factory=list[Episode])
+    judged_fan_days: dict[int, float] = field(default_factory=dict[int, float])
+    """by day"""
+    in_force: dict[int, str] = field(default_factory=dict[int, str])
+    """the version at the end of each day"""
+    versions: list[Version] = field(default_factory=list[Version])
+    problems: dict[str, int] = field(default_factory=dict[str, int])
+    """what the learner reported, and the first day"""
+    learning_s: list[float] = field(default_factory=list[float])
+    """of the processor, for each version"""
+
+    def write(self, path: Path) -> None:
+        """Write it to a file."""
+        unfinished = path.with_suffix(".part")
+        unfinished.write_bytes(_MONTH.dump_json(self))
+        unfinished.replace(path)
+
+    @classmethod
+    def read(cls, path: Path) -> RackMonth:
+        """Read what `write` wrote."""
+        return _MONTH.validate_json(path.read_bytes())
+
+
+_MONTH = TypeAdapter(RackMonth)
+
+
+class LearningAtOnce:
+    """`fantwin learn` in this process: a version is there as soon as it is due."""
+
+    def __init__(self, folder: Path, tray: str, per_day: float) -> None:
+        self._of = folder, tray, per_day
+        self._ended: str | None = None
+        self.took_s: list[float] = []
+
+    seconds = None
+    is_free = True
+
+    def start(self) -> str:
+        """Make the next version."""
+        began_s = time.process_time()
+        try:
+            make_next_version(*self._of, lambda _line: None)
+            self._ended = ""
+        except UserError as error:
+            self._ended = str(error)
+        self.took_s.append(time.process_time() - began_s)
+        return ""
+
+    def poll(self) -> str | None:
+        """What went wrong, once."""
+        ended, self._ended = self._ended, None
+        return ended
+
+    def stop(self) -> None:
+        """It has ended already."""
+
+
+class RackSite:
+    """The stages of one rack."""
+
+    def __init__(self, folder: Path, name: str, changed_days: Sequence[float]) -> None:
+        """changed_days: when operators change all fans, as a filter or firmware does."""
+        config = _config(folder, name)
+        contexts = {stage: _context(config, stage) for stage in ("resampler", "twin_integrator", "scorer", "learner")}
+        of, tray = contexts["learner"], config.trays[0]
+        place = learning_folder(config.run_folder, name)
+        metadata, attachments = recording_metadata(of)
+        hold_back_s, kept_s = 60.0 * of.config.hold_back_minutes, 3600.0 * of.config.kept_hours
+        history = HealthyHistory(
+            place, config.site, name, metadata, attachments, hold_back_s=hold_back_s, kept_s=kept_s
+        )
+        self._name = name
+        self._versions = TwinVersions(place, name)
+        self._learning = LearningAtOnce(place, name, of.config.false_alarms_per_day)
+        self._learner = LearnerCore(
+            RACK_FANS, of.config, history, self._versions, OrdinaryOperation(tray), self._learning
+        )
+        self._stages: list[Core] = [
+            load_stage(stage).build(contexts[stage]).core for stage in ("resampler", "twin_integrator", "scorer")
+        ]
+        self._sent = 0
+        self._alarms: list[Alarm] = []
+        self._judged_fan_ns: Counter[int] = Counter()
+        self._in_force: dict[int, str] = {}
+        self._problems: dict[str, int] = {}
+        self._not_noted = list(changed_days)
+
+    def live(self, blocks: Iterable[Raw], written: Path) -> None:
+        """Take all lines, and write what became of the rack after each day."""
+        day = 0
+        for raw in blocks:
+            if not len(raw.host_receive_t_ns):
+                continue
+            day = (int(raw.host_receive_t_ns[-1]) - START_NS) // DAY_NS
+            if day > max(self._in_force, default=0):
+                self.month(day).write(written)
+            self._take(raw, day)
+        self.month(day + 1).write(written)
+
+    def month(self, days: int) -> RackMonth:
+        """What became of it in so many days."""
+        return RackMonth(
+            days=days,
+            alarms=episodes(self._alarms),
+            judged_fan_days={day: ns / DAY_NS for day, ns in self._judged_fan_ns.items()},
+            in_force=self._in_force,
+            versions=list(self._versions.all()),
+            problems=self._problems,
+            learning_s=self._learning.took_s,
+        )
+
+    def _take(self, raw: Raw, day: int) -> None:
+        """The next lines."""
+        now_ns = int(raw.host_receive_t_ns[-1])
+        raw = replace(raw, header=Header("acquisition", self._sent, self._name))
+        self._sent += 1
+        resampler, integrator, scorer = self._stages
+        self._learner.step(raw)
+        for grid in resampler.step(raw):
+            for made in integrator.step(grid):
+                for message in scorer.step(made):
+                    self._see(message, day)
+        for card in self._learner.tick(now_ns):
+            integrator.step(card)
+        self._operate((now_ns - START_NS) / DAY_NS, now_ns)
+        in_force = self._versions.in_force()
+        self._in_force[day] = in_force.name if in_force else ""
+        if problem := self._learner.problem():
+            self._problems.setdefault(problem, day)
+
+    def _operate(self, day: float, now_ns: int) -> None:
+        """What operators do about the changes that they made themselves."""
+        if self._not_noted and day >= self._not_noted[0] + NOTED_AFTER_D:
+            self._not_noted.pop(0)
+            header = Header("operator", len(self._not_noted), "")
+            request = Request(t_ns=now_ns, action=Action.COMMISSION, header=header)
+            self._learner.step(request)
+            for message in self._stages[-1].step(request):
+                self._see(message, int(day))
+        offered = [each for each in self._versions.all()[-1:] if each.outcome == "offered"]
+        in_force = self._versions.in_force()
+        for last in offered:
+            is_old = last.made_t_ns < now_ns - USED_AFTER_D * DAY_NS
+            is_used = in_force is not None and last.since_t_ns == in_force.since_t_ns
+            if is_old and last.why.startswith("all fans") and not is_used:
+                self._versions.use(last.name)
+
+    def _see(self, message: object, day: int) -> None:
+        if isinstance(message, Score):
+            self._learner.step(message)
+            self._judged_fan_ns[day] += int(message.valid.sum()) * message.period_ns
+        elif isinstance(message, Alarm):
+            self._alarms.append(message)
+
+
+def _config(folder: Path, tray: str) -> Config:
+    windows = ", ".join(f'{{ kind = "count", window_s = {tacho.window_s} }}' for tacho in TACHOS)
+    text = (
+        f'site = "bench"\nrun_folder = "{folder / "runs"}"\n'
+        f'[[tray]]\nname = "{tray}"\nfans = {RACK_FANS}\nspeed_unit = "rpm"\ntacho = [{windows}]\n'
+        "[resampler]\nblock_size = 512\n"
+    )
+    return parse_config(text, folder / "fantwin.toml", (), ("resampler", "twin_integrator", "scorer", "learner"))
+
+
+def _context(config: Config, stage: str) -> Context:
+    return Context(
+        site=config.site,
+        trays=config.trays,
+        config=config.sections[stage],
+        folder=config.folder,
+        run_folder=config.run_folder,
+        started_t_ns=START_NS,
+        configuration_text=config.text,
+    )
