@@ -14,14 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from typing import Literal
 
 from pydantic import Field
 
 from pipeline.errors import UserError
-from pipeline.learning.healthy_history import LEAST_S, HealthyHistory, recorded_raws
+from pipeline.learning.healthy_history import SHORTEST_RECORDING_S, HealthyHistory, recorded_raws
 from pipeline.learning.learning_process import Learning, LearningProcess
 from pipeline.learning.ordinary_operation import OrdinaryOperation
-from pipeline.learning.versions import Period, TwinVersions, Version, learning_folder
+from pipeline.learning.versions import TwinVersions, Version, VersionList, learning_folder
 from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
@@ -35,6 +36,8 @@ AGAIN_AFTER = 1.25
 """after a failure, learning starts again when the history is this many times as long"""
 LONGEST_WAIT_S = 7 * 24 * 3600.0
 """of healthy running between two versions"""
+CHECK_AFTER_S = 24 * 3600.0
+"""of healthy running between two checks of the fans against the reference"""
 AFTER_COMMISSIONING_S = 4 * 3600.0
 """of healthy running after fans were commissioned again: then the twin is compared with them"""
 
@@ -75,14 +78,13 @@ class LearnerCore(Core):
         self._looked_ns = 0
         self._seen_change: int | None = None
         self._is_list_read = False
-        """the versions could be read: otherwise nothing is learned, for nobody would know of it"""
+        """whether the list of versions could be read; if not, nothing is learned: a new version could not be listed"""
+        self._listed = VersionList()
+        """the versions when they were last read"""
         self._in_force: Version | None = None
-        self._last: Version | None = None
-        self._faulty: tuple[Period, ...] = ()
-        self._commissioned_t_ns = 0
-        """when fans were last commissioned again"""
+        """the one that was published"""
         self._failed_s = 0.0
-        """healthy running with which the last attempt failed; 0: it did not"""
+        """healthy running at the last attempt, if it failed; 0: it did not"""
         self._problem = ""
 
     def step(self, item: Raw | Score | Request) -> Sequence[Message]:
@@ -90,7 +92,7 @@ class LearnerCore(Core):
         if isinstance(item, Request):
             if item.action == Action.COMMISSION:
                 self._history.close()
-                self._commissioned_t_ns = item.t_ns
+                self._commission(item.t_ns)
             return []
         if isinstance(item, Score):
             if item.fans == self._fans and len(item.t_ns):
@@ -101,6 +103,12 @@ class LearnerCore(Core):
             if self._last is None:
                 self._operation.take(item)
         return []
+
+    def _commission(self, t_ns: int) -> None:
+        try:
+            self._versions.commission(t_ns)
+        except UserError as error:
+            self._problem = str(error)
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Publish the version in force when it has changed, and start learning when it is due."""
@@ -114,9 +122,10 @@ class LearnerCore(Core):
         elif ended is not None:
             self._problem, self._failed_s = "", 0.0
         cards = self._changed(now_ns)
-        if self._learning.is_free and self._is_due():
+        due = self._due() if self._learning.is_free else None
+        if due:
             self._history.finish()
-            if problem := self._learning.start():
+            if problem := self._learning.start(only_if_changed=due == "check"):
                 self._problem, self._failed_s = f"learning: {problem}", self._history.seconds
         return cards
 
@@ -140,11 +149,14 @@ class LearnerCore(Core):
 
     def problem(self) -> str:
         """Why nothing is learned, or that a version waits for the operator."""
-        offered = (
-            self._last if self._last and self._last.outcome == "offered" and self._last != self._in_force else None
-        )
+        offered = self._listed.waiting
         waits = f"{offered.name} is offered: {offered.why} (fantwin twins)" if offered else ""
         return "; ".join(filter(None, (self._problem, self._history.problem, waits)))
+
+    @property
+    def _last(self) -> Version | None:
+        """The newest version."""
+        return self._listed.versions[-1] if self._listed.versions else None
 
     def _changed(self, now_ns: int) -> list[NewTwin]:
         """The version in force, if it is another one than before.
@@ -156,58 +168,58 @@ class LearnerCore(Core):
         if changed == self._seen_change and self._is_list_read:
             return []
         try:
-            if self._has_alarm and not self._versions.is_chosen():
+            listed = self._versions.read()
+            if self._has_alarm and not listed.is_chosen:
                 return []
-            listed, in_force, faulty = self._versions.all(), self._versions.in_force(), self._versions.faulty()
+            in_force = listed.current
             content = self._versions.file(in_force.name).read_bytes() if in_force else b""
         except (OSError, UserError) as error:
             self._problem, self._is_list_read = str(error), False
             return []
         if not self._is_list_read:
             self._is_list_read, self._problem = True, ""
-        if faulty != self._faulty:
-            self._history.finish()  # what was called faulty must not be part of what is recorded from now on
-        self._faulty, self._seen_change, self._last = faulty, changed, listed[-1] if listed else None
+        if listed.faulty != self._listed.faulty:
+            self._history.finish()  # what was marked as faulty must not be part of what is recorded from now on
+        self._listed, self._seen_change = listed, changed
         if in_force is None or in_force == self._in_force:
             return []
         self._in_force = in_force
         return [NewTwin(t_ns=now_ns, twin=in_force.name, sha256=in_force.sha256, content=content)]
 
-    def _is_due(self) -> bool:
+    def _due(self) -> Literal["version", "check"] | None:
+        """What is due: a version, or a check of the fans against the reference."""
         if self._has_alarm or not self._is_list_read:
-            return False
+            return None
+        since, last = self._history.seconds_since, self._last
         if self._failed_s:
-            return self._history.seconds >= max(AGAIN_AFTER * self._failed_s, self._failed_s + LEAST_S)
-        if self._last is None:
-            return self._history.seconds >= 60.0 * self._config.first_minutes and not self._operation.missing()
-        if self._commissioned_t_ns > self._last.made_t_ns:
-            return self._history.seconds_since(self._commissioned_t_ns) >= AFTER_COMMISSIONING_S
-        learned_s = sum(last - first for first, last in self._last.periods) / NS_PER_S
-        return self._history.seconds_since(self._last.made_t_ns) >= min(learned_s, LONGEST_WAIT_S)
+            again_s = max(AGAIN_AFTER * self._failed_s, self._failed_s + SHORTEST_RECORDING_S)
+            return "version" if self._history.seconds >= again_s else None
+        if last is None:
+            is_enough = self._history.seconds >= 60.0 * self._config.first_minutes and not self._operation.missing()
+            return "version" if is_enough else None
+        if self._listed.commissioned_t_ns > last.made_t_ns:
+            return "version" if since(self._listed.commissioned_t_ns) >= AFTER_COMMISSIONING_S else None
+        if not self._listed.waiting and since(last.made_t_ns) >= min(last.learned_s, LONGEST_WAIT_S):
+            return "version"
+        checked_t_ns = max(last.made_t_ns, self._listed.check.t_ns if self._listed.check else 0)
+        return "check" if since(checked_t_ns) >= CHECK_AFTER_S else None
 
     def _waits_for(self) -> str:
         minutes = self._history.seconds / 60.0
         missing = self._operation.missing()
         lacks = f"; not moved enough yet: {'; '.join(missing)}; `fantwin sweep` moves the fans" if missing else ""
-        return f"no twin yet, nothing is judged; {minutes:.0f} of {self._config.first_minutes:g} min recorded{lacks}"
+        needed = f"{self._config.first_minutes:g} needed"
+        return f"no twin yet, nothing is judged; {minutes:.0f} min recorded ({needed}){lacks}"
 
 
 def _finds(version: Version) -> str:
     """What the limits of a version find at its middle speed, and their false-alarm rate."""
-    rate = f"{version.declared_per_day:g} false alarm(s) per fan and day"
-    declared = (
-        f"target: {rate}, which {version.hours:.2g} h of data cannot support"
-        if version.is_target
-        else f"{rate} declared"
-    )
     known = [drop for drop in version.drops if drop.within_a_minute is not None]
     if not known:
-        return declared
-    drop = known[len(known) // 2]
-    unit = version.speed_unit
-    return (
-        f"at {drop.speed:,.0f} {unit} it finds a drop of {drop.within_a_minute:,.0f} {unit} within a minute; {declared}"
-    )
+        return version.rate_text
+    drop, unit = known[len(known) // 2], version.speed_unit
+    found = f"at {drop.speed:,.0f} {unit} it finds a drop of {drop.within_a_minute:,.0f} {unit} within a minute"
+    return f"{found}; {version.rate_text}"
 
 
 class _NamesItsTwin(Core):

@@ -7,7 +7,8 @@ some hours.
     python -m bench.detection.first_month --racks 5 --days 30 --keep FOLDER
 
 All racks are simulated in one process, and each is watched in a process of its own. After each of its days a rack
-writes what became of it to FOLDER; `--show` prints the tables of the days that all racks have had so far.
+writes what became of it to FOLDER, where a month that was interrupted goes on; `--show` prints the tables of the days
+that all racks have had so far.
 """
 
 from __future__ import annotations
@@ -122,7 +123,7 @@ def run(of: Racks, rate_hz: float, folder: Path, console: Console) -> None:
 
 def _live(folder: Path, name: str, changed_days: Sequence[float], blocks: Queue[Raw | None]) -> None:
     """One rack, in a process of its own."""
-    RackSite(folder, name, changed_days).live(iter(blocks.get, None), folder / f"{name}.json")
+    RackSite(folder, name, changed_days).live(iter(blocks.get, None), folder)
 
 
 def found(of: Racks, folder: Path) -> dict[str, Any]:
@@ -196,7 +197,7 @@ def _is_learned(fault: Fault, month: RackMonth) -> bool:
     first_ns = START_NS + round((fault.start_s + 60.0) * NS_PER_S)
     last_ns = START_NS + round(fault.stop_s * NS_PER_S)
     taken = [version for version in month.versions if version.outcome == "taken"]
-    return any(since < last_ns and until > first_ns for version in taken for since, until in version.periods)
+    return any(since < last_ns and until > first_ns for version in taken for since, until in version.learned_spans)
 
 
 def tables(figures: dict[str, Any], console: Console) -> None:

@@ -1,10 +1,13 @@
 """One rack under `fantwin up` without a twin: the cores of its stages, what it learns, and what its operators do.
 
-The learner makes its versions by the function of `fantwin learn`, while no sample comes.
+The learner makes its versions by the function of `fantwin learn`, while no sample comes. After each day everything is
+kept, so that a month that was interrupted goes on from there: for the rack it is a restart of its site.
 """
 
 from __future__ import annotations
 
+import pickle
+import shutil
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -34,6 +37,7 @@ NOTED_AFTER_D = 0.1
 USED_AFTER_D = 1.0
 """and so many days after a version was offered for it, they put it in force"""
 DAY_NS = round(DAY_S * NS_PER_S)
+SEEN = "seen.pickle"
 
 
 @dataclass
@@ -50,7 +54,7 @@ class RackMonth:
     problems: dict[str, int] = field(default_factory=dict[str, int])
     """what the learner reported, and the first day"""
     learning_s: list[float] = field(default_factory=list[float])
-    """of the processor, for each version"""
+    """of the processor, for each version and check"""
 
     def write(self, path: Path) -> None:
         """Write it to a file."""
@@ -70,23 +74,24 @@ _MONTH = TypeAdapter(RackMonth)
 class LearningAtOnce:
     """`fantwin learn` in this process: a version is there as soon as it is due."""
 
-    def __init__(self, folder: Path, tray: str, per_day: float) -> None:
+    def __init__(self, folder: Path, tray: str, per_day: float, took_s: list[float]) -> None:
+        """took_s: what each version takes is added to it."""
         self._of = folder, tray, per_day
         self._ended: str | None = None
-        self.took_s: list[float] = []
+        self._took_s = took_s
 
     seconds = None
     is_free = True
 
-    def start(self) -> str:
+    def start(self, *, only_if_changed: bool) -> str:
         """Make the next version."""
         began_s = time.process_time()
         try:
-            make_next_version(*self._of, lambda _line: None)
+            make_next_version(*self._of, lambda _line: None, only_if_changed=only_if_changed)
             self._ended = ""
         except UserError as error:
             self._ended = str(error)
-        self.took_s.append(time.process_time() - began_s)
+        self._took_s.append(time.process_time() - began_s)
         return ""
 
     def poll(self) -> str | None:
@@ -98,65 +103,88 @@ class LearningAtOnce:
         """It has ended already."""
 
 
+@dataclass
+class _Seen:
+    """What was seen of a rack so far."""
+
+    not_noted: list[float]
+    """days of changes that operators have not noted yet"""
+    days: int = 0
+    """that are over"""
+    sent: int = 0
+    alarms: list[Alarm] = field(default_factory=list[Alarm])
+    judged_fan_ns: Counter[int] = field(default_factory=Counter[int])
+    in_force: dict[int, str] = field(default_factory=dict[int, str])
+    problems: dict[str, int] = field(default_factory=dict[str, int])
+    learning_s: list[float] = field(default_factory=list[float])
+
+
 class RackSite:
     """The stages of one rack."""
 
     def __init__(self, folder: Path, name: str, changed_days: Sequence[float]) -> None:
         """changed_days: when operators change all fans, as a filter or firmware does."""
-        config = _config(folder, name)
+        place = folder / name
+        shutil.rmtree(place, ignore_errors=True)
+        if (kept := folder / f"{name}.kept").exists():
+            shutil.copytree(kept, place)
+        config = _config(place, name)
         contexts = {stage: _context(config, stage) for stage in ("resampler", "twin_integrator", "scorer", "learner")}
         of, tray = contexts["learner"], config.trays[0]
-        place = learning_folder(config.run_folder, name)
+        learned = learning_folder(config.run_folder, name)
         metadata, attachments = recording_metadata(of)
         hold_back_s, kept_s = 60.0 * of.config.hold_back_minutes, 3600.0 * of.config.kept_hours
         history = HealthyHistory(
-            place, config.site, name, metadata, attachments, hold_back_s=hold_back_s, kept_s=kept_s
+            learned, config.site, name, metadata, attachments, hold_back_s=hold_back_s, kept_s=kept_s
         )
         self._name = name
-        self._versions = TwinVersions(place, name)
-        self._learning = LearningAtOnce(place, name, of.config.false_alarms_per_day)
-        self._learner = LearnerCore(
-            RACK_FANS, of.config, history, self._versions, OrdinaryOperation(tray), self._learning
-        )
+        self._versions = TwinVersions(learned, name)
+        self._seen = pickle.loads((place / SEEN).read_bytes()) if kept.exists() else _Seen(list(changed_days))
+        learning = LearningAtOnce(learned, name, of.config.false_alarms_per_day, self._seen.learning_s)
+        self._learner = LearnerCore(RACK_FANS, of.config, history, self._versions, OrdinaryOperation(tray), learning)
         self._stages: list[Core] = [
             load_stage(stage).build(contexts[stage]).core for stage in ("resampler", "twin_integrator", "scorer")
         ]
-        self._sent = 0
-        self._alarms: list[Alarm] = []
-        self._judged_fan_ns: Counter[int] = Counter()
-        self._in_force: dict[int, str] = {}
-        self._problems: dict[str, int] = {}
-        self._not_noted = list(changed_days)
 
-    def live(self, blocks: Iterable[Raw], written: Path) -> None:
-        """Take all lines, and write what became of the rack after each day."""
-        day = 0
+    def live(self, blocks: Iterable[Raw], folder: Path) -> None:
+        """Take the lines of the days that are not there yet; keep the site and what became of it after each."""
         for raw in blocks:
             if not len(raw.host_receive_t_ns):
                 continue
             day = (int(raw.host_receive_t_ns[-1]) - START_NS) // DAY_NS
-            if day > max(self._in_force, default=0):
-                self.month(day).write(written)
-            self._take(raw, day)
-        self.month(day + 1).write(written)
+            if day > self._seen.days:
+                self._keep(day, folder)
+            if day == self._seen.days:
+                self._take(raw, day)
+        self._keep(self._seen.days + 1, folder)
 
-    def month(self, days: int) -> RackMonth:
-        """What became of it in so many days."""
+    def _keep(self, days: int, folder: Path) -> None:
+        self._seen.days = days
+        self._month().write(folder / f"{self._name}.json")
+        unfinished = folder / f"{self._name}.part"
+        shutil.rmtree(unfinished, ignore_errors=True)
+        shutil.copytree(folder / self._name, unfinished)
+        (unfinished / SEEN).write_bytes(pickle.dumps(self._seen))
+        shutil.rmtree(kept := folder / f"{self._name}.kept", ignore_errors=True)
+        unfinished.rename(kept)
+
+    def _month(self) -> RackMonth:
+        seen = self._seen
         return RackMonth(
-            days=days,
-            alarms=episodes(self._alarms),
-            judged_fan_days={day: ns / DAY_NS for day, ns in self._judged_fan_ns.items()},
-            in_force=self._in_force,
+            days=seen.days,
+            alarms=episodes(seen.alarms),
+            judged_fan_days={day: ns / DAY_NS for day, ns in seen.judged_fan_ns.items()},
+            in_force=seen.in_force,
             versions=list(self._versions.all()),
-            problems=self._problems,
-            learning_s=self._learning.took_s,
+            problems=seen.problems,
+            learning_s=seen.learning_s,
         )
 
     def _take(self, raw: Raw, day: int) -> None:
         """The next lines."""
         now_ns = int(raw.host_receive_t_ns[-1])
-        raw = replace(raw, header=Header("acquisition", self._sent, self._name))
-        self._sent += 1
+        raw = replace(raw, header=Header("acquisition", self._seen.sent, self._name))
+        self._seen.sent += 1
         resampler, integrator, scorer = self._stages
         self._learner.step(raw)
         for grid in resampler.step(raw):
@@ -167,15 +195,15 @@ class RackSite:
             integrator.step(card)
         self._operate((now_ns - START_NS) / DAY_NS, now_ns)
         in_force = self._versions.in_force()
-        self._in_force[day] = in_force.name if in_force else ""
+        self._seen.in_force[day] = in_force.name if in_force else ""
         if problem := self._learner.problem():
-            self._problems.setdefault(problem, day)
+            self._seen.problems.setdefault(problem, day)
 
     def _operate(self, day: float, now_ns: int) -> None:
         """What operators do about the changes that they made themselves."""
-        if self._not_noted and day >= self._not_noted[0] + NOTED_AFTER_D:
-            self._not_noted.pop(0)
-            header = Header("operator", len(self._not_noted), "")
+        if self._seen.not_noted and day >= self._seen.not_noted[0] + NOTED_AFTER_D:
+            self._seen.not_noted.pop(0)
+            header = Header("operator", len(self._seen.not_noted), "")
             request = Request(t_ns=now_ns, action=Action.COMMISSION, header=header)
             self._learner.step(request)
             for message in self._stages[-1].step(request):
@@ -191,9 +219,9 @@ class RackSite:
     def _see(self, message: object, day: int) -> None:
         if isinstance(message, Score):
             self._learner.step(message)
-            self._judged_fan_ns[day] += int(message.valid.sum()) * message.period_ns
+            self._seen.judged_fan_ns[day] += int(message.valid.sum()) * message.period_ns
         elif isinstance(message, Alarm):
-            self._alarms.append(message)
+            self._seen.alarms.append(message)
 
 
 def _config(folder: Path, tray: str) -> Config:

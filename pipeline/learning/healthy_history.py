@@ -1,6 +1,6 @@
 """The healthy history of a tray: recordings of raw samples from times without an alarm, for learning.
 
-    FOLDER/healthy/FIRST-LAST.mcap   one stretch of healthy running; FIRST and LAST are times in ns since 1970
+    FOLDER/healthy/FIRST-LAST.mcap   one recording of healthy running; FIRST and LAST are times in ns since 1970
 
 A sample enters a recording only when `hold_back_ns` have passed after it without an alarm, since a fault begins before
 its alarm. Until there is a twin, nobody can raise an alarm, and nothing is held back: the fans must be healthy.
@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.learning.versions import Period, overlaps
+from pipeline.learning.versions import TimeSpan, overlap
 from pipeline.recordings.reading import RecordingError, read_recording
 from pipeline.recordings.records import ACTIVE_SUFFIX
 from pipeline.recordings.repair import repair_in_place
@@ -26,9 +26,9 @@ from schemas.units import NS_PER_S
 
 HEALTHY = "healthy"
 OPEN_NAME = "open.mcap"
-LEAST_S = 60.0
-"""a shorter stretch is no use for learning, and is dropped"""
-LONGEST_NS = 8 * 3600 * NS_PER_S
+SHORTEST_RECORDING_S = 60.0
+"""a shorter recording is of no use for learning, and is deleted"""
+LONGEST_RECORDING_NS = 8 * 3600 * NS_PER_S
 """of one recording"""
 LONGEST_GAP_NS = 60 * NS_PER_S
 """after a longer pause of the samples a new recording begins"""
@@ -36,28 +36,28 @@ _NAME = re.compile(r"(\d+)-(\d+)\.mcap")
 
 
 @dataclass(frozen=True)
-class Stretch:
+class HealthyRecording:
     """A finished recording of healthy running."""
 
     path: Path
-    period: Period
+    span: TimeSpan
 
     @property
     def seconds(self) -> float:
         """How long it is."""
-        return (self.period[1] - self.period[0]) / NS_PER_S
+        return (self.span[1] - self.span[0]) / NS_PER_S
 
 
-def stretches(folder: Path, faulty: Sequence[Period] = ()) -> list[Stretch]:
-    """The finished recordings of a tray, in order of time, without those that overlap a faulty period.
+def healthy_recordings(folder: Path, excluded: Sequence[TimeSpan] = ()) -> list[HealthyRecording]:
+    """The finished recordings of a tray, in order of time, without those that overlap an excluded time span.
 
     Raises:
         OSError: the folder cannot be read.
     """
     place = folder / HEALTHY
     names = [(_NAME.fullmatch(path.name), path) for path in place.iterdir()] if place.is_dir() else []
-    found = [Stretch(path, (int(match[1]), int(match[2]))) for match, path in names if match]
-    return sorted((each for each in found if not overlaps((each.period,), faulty)), key=lambda each: each.period)
+    found = [HealthyRecording(path, (int(match[1]), int(match[2]))) for match, path in names if match]
+    return sorted((each for each in found if not overlap((each.span,), excluded)), key=lambda each: each.span)
 
 
 class HealthyHistory:
@@ -82,7 +82,7 @@ class HealthyHistory:
         self._kept_ns = round(kept_s * NS_PER_S)
         self._waiting: deque[Raw] = deque()
         self._writer: RecordingWriter | None = None
-        self._period: Period = (0, 0)
+        self._span: TimeSpan = (0, 0)
         self._resumes_t_ns = 0
         """samples up to then are not healthy"""
         self.problem = ""
@@ -96,13 +96,13 @@ class HealthyHistory:
     def seconds_since(self, t_ns: int) -> float:
         """The same of those recordings that begin at a time or later."""
         with suppress(OSError):
-            finished = sum(each.seconds for each in stretches(self._folder) if each.period[0] >= t_ns)
-            return finished + (self._open_s if self._period[0] >= t_ns else 0.0)
+            finished = sum(each.seconds for each in healthy_recordings(self._folder) if each.span[0] >= t_ns)
+            return finished + (self._open_s if self._span[0] >= t_ns else 0.0)
         return 0.0
 
     @property
     def _open_s(self) -> float:
-        return (self._period[1] - self._period[0]) / NS_PER_S
+        return (self._span[1] - self._span[0]) / NS_PER_S
 
     def add(self, raw: Raw, *, has_alarm: bool, is_watched: bool) -> None:
         """Take samples. has_alarm: a fan of the tray has an alarm now. is_watched: there is a twin."""
@@ -123,15 +123,15 @@ class HealthyHistory:
     def finish(self) -> None:
         """End the open recording, so that it can be learned from; what is held back stays."""
         writer, self._writer = self._writer, None
-        period, self._period = self._period, (0, 0)
+        span, self._span = self._span, (0, 0)
         if writer is None:
             return
         try:
-            if (period[1] - period[0]) / NS_PER_S < LEAST_S:
+            if (span[1] - span[0]) / NS_PER_S < SHORTEST_RECORDING_S:
                 writer.discard()
                 return
             writer.finish()
-            writer.path.rename(self._path(period))
+            writer.path.rename(self._path(span))
             self._delete_oldest()
         except (OSError, RecordingError) as error:
             self.problem = f"{writer.path}: the healthy history cannot be kept: {error}"
@@ -151,8 +151,8 @@ class HealthyHistory:
 
     def _write(self, raw: Raw) -> None:
         first_t_ns, last_t_ns = int(raw.host_receive_t_ns[0]), _last_t_ns(raw)
-        is_apart = not 0 <= first_t_ns - self._period[1] <= LONGEST_GAP_NS
-        if self._writer and (is_apart or last_t_ns - self._period[0] > LONGEST_NS):
+        is_apart = not 0 <= first_t_ns - self._span[1] <= LONGEST_GAP_NS
+        if self._writer and (is_apart or last_t_ns - self._span[0] > LONGEST_RECORDING_NS):
             self.finish()
         try:
             if self._writer is None:
@@ -160,28 +160,28 @@ class HealthyHistory:
                 self._writer = RecordingWriter(
                     place, self._metadata, self._attachments, t_ns=first_t_ns, overwrite=True
                 )
-                self._period = (first_t_ns, last_t_ns)
+                self._span = (first_t_ns, last_t_ns)
             self._writer.add_message(self._key, raw, last_t_ns)
-            self._period = (self._period[0], last_t_ns)
+            self._span = (self._span[0], last_t_ns)
             self.problem = ""
         except RecordingError as error:
             self._fail(error)
 
     def _fail(self, error: RecordingError) -> None:
         """A write failed: the unfinished recording is deleted, and the next sample starts another."""
-        writer, self._writer, self._period = self._writer, None, (0, 0)
+        writer, self._writer, self._span = self._writer, None, (0, 0)
         if writer:
             with suppress(OSError, RecordingError):
                 writer.discard()
         self.problem = f"nothing is learned: {error}"
 
-    def _path(self, period: Period) -> Path:
-        return self._folder / HEALTHY / f"{period[0]}-{period[1]}.mcap"
+    def _path(self, span: TimeSpan) -> Path:
+        return self._folder / HEALTHY / f"{span[0]}-{span[1]}.mcap"
 
     def _delete_oldest(self) -> None:
         left_ns = self._kept_ns
-        for each in reversed(stretches(self._folder)[1:]):
-            left_ns -= each.period[1] - each.period[0]
+        for each in reversed(healthy_recordings(self._folder)[1:]):
+            left_ns -= each.span[1] - each.span[0]
             if left_ns < 0:
                 each.path.unlink()
 
@@ -199,7 +199,7 @@ class HealthyHistory:
 
     def _name(self, path: Path) -> None:
         times = _raw_times(path)
-        if not times or (times[-1] - times[0]) / NS_PER_S < LEAST_S:
+        if not times or (times[-1] - times[0]) / NS_PER_S < SHORTEST_RECORDING_S:
             path.unlink()
         else:
             path.rename(self._path((times[0], times[-1])))
@@ -211,7 +211,7 @@ def recorded_raws(folder: Path) -> Iterator[Raw]:
     Raises:
         RecordingError: a recording cannot be read.
     """
-    for each in stretches(folder):
+    for each in healthy_recordings(folder):
         yield from _raws(each.path)
 
 

@@ -1,4 +1,4 @@
-"""`fantwin learn` as a child process of the lowest priority, one at a time in this process."""
+"""`fantwin learn` as a child process that runs while nothing else does, one at a time in this process."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Learning(Protocol):
         """Whether no tray of this process is learning."""
         ...
 
-    def start(self) -> str:
-        """Begin, if it is free; returns what went wrong, or nothing."""
+    def start(self, *, only_if_changed: bool) -> str:
+        """Begin, if it is free; returns what went wrong, or nothing. only_if_changed: see make_next_version."""
         ...
 
     def poll(self) -> str | None:
@@ -60,8 +60,8 @@ class LearningProcess:
         """Whether no tray of this process is learning."""
         return not _TURN.locked()
 
-    def start(self) -> str:
-        """Begin, if it is free; returns what went wrong, or nothing."""
+    def start(self, *, only_if_changed: bool) -> str:
+        """Begin, if it is free; returns what went wrong, or nothing. only_if_changed: see `fantwin learn --check`."""
         if not is_installed("torch"):
             return f"no twin can be learned without the extra `train`; {how_to_install('train')}"
         if not _TURN.acquire(blocking=False):
@@ -70,7 +70,7 @@ class LearningProcess:
             self._log.parent.mkdir(parents=True, exist_ok=True)
             with self._log.open("wb") as log:
                 self._child = subprocess.Popen(
-                    [*self._command, "--until-stdin-closes"],
+                    [*self._command, "--until-stdin-closes", *(["--check"] if only_if_changed else [])],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=log,

@@ -15,9 +15,9 @@ from schemas.units import NS_PER_S
 RANGES = 10
 """equal parts of the commands of a tray"""
 NEEDED_RANGES, NEEDED_S = 4, 20.0
-"""a fan has been in so many of them, for so long each"""
+"""the command of each fan must have been in so many of these, for so long each"""
 NEEDED_CHANGES = 10
-"""of its command, by more than a range"""
+"""of the command of each fan, each by more than the width of such a part"""
 LONGEST_BETWEEN_SAMPLES_NS = 3 * NS_PER_S
 """a longer time is a gap, in which nothing is known"""
 
@@ -51,12 +51,12 @@ class OrdinaryOperation:
 
     def missing(self) -> list[str]:
         """What each fan has not done yet, a few words for each that lacks something."""
-        held = (self._seconds >= NEEDED_S).sum(axis=1)
+        visited = (self._seconds >= NEEDED_S).sum(axis=1)
         return [
-            f"fan {fan}: {self._range_of(fan)}, {NEEDED_S:.0f} s in {held[fan]} of {NEEDED_RANGES} tenths of the "
-            f"range, {min(self._changes[fan], NEEDED_CHANGES)} of {NEEDED_CHANGES} changes"
-            for fan in range(len(held))
-            if held[fan] < NEEDED_RANGES or self._changes[fan] < NEEDED_CHANGES
+            f"fan {fan}: {self._range_of(fan)}, {NEEDED_S:.0f} s each in {visited[fan]} tenths of the range "
+            f"({NEEDED_RANGES} needed), {self._changes[fan]} changes ({NEEDED_CHANGES} needed)"
+            for fan in range(len(visited))
+            if visited[fan] < NEEDED_RANGES or self._changes[fan] < NEEDED_CHANGES
         ]
 
     def held(self) -> list[str]:

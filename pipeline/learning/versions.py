@@ -13,18 +13,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import UserError
+from schemas.units import NS_PER_S
 
 LIST_NAME = "versions.json"
 Outcome: TypeAlias = Literal["taken", "offered"]
-Period: TypeAlias = tuple[int, int]
+TimeSpan: TypeAlias = tuple[int, int]
 """first and last time, ns since 1970"""
 
 
 class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore")  # of a newer fantwin, as after an update that is undone
+    # what is extra is of a newer fantwin, as after an update that is undone
+    model_config = ConfigDict(frozen=True, extra="ignore", validate_by_name=True, serialize_by_alias=True)
 
 
 class Drop(_Record):
@@ -41,23 +43,25 @@ class Drop(_Record):
 class Version(_Record):
     """One version, and why it took over or did not.
 
-    made_t_ns: the newest sample that it was learned from. hours: healthy running from which its limits were set.
-    periods: of the recordings from which it was learned. since_t_ns: earlier recordings are not used, because the fans
-    have changed since. error: of the free run over the newest recording, root mean square over all fans. reference: the
-    version against which changes of the fans' speeds are measured, the first one learned from 24 hours. change: of each
-    fan, how its speed in the newest recording differs from the reference's prediction, as a share. declared_per_day:
-    false alarms of a fan that the limits are for; is_target: the data are too few to show that they keep it. Speeds are
-    in the unit of the tray.
+    made_t_ns: time of the newest sample that it was learned from. hours: healthy running that its limits were set from.
+    learned_spans: of the recordings that it was learned from. since_t_ns: recordings from before this time are not
+    used, because the fans have changed since. error: root mean square of the free-run residual over a part of the
+    newest recording that it was not trained on, all fans together. error_before: the same of the version that was in
+    force. reference: the version that changes of the fans are measured against; its own name if there is none yet.
+    change: of each fan, its mean speed in the newest day of healthy running relative to the reference's prediction,
+    less one. declared_per_day: false alarms per fan and day that the limits were set for; is_target: the data are too
+    few to show that the limits keep it. Speeds are in the unit of the tray.
     """
 
     name: str
     how: Literal["trained", "new limits"]
     made_t_ns: int
     hours: float
-    periods: tuple[Period, ...]
+    learned_spans: tuple[TimeSpan, ...] = Field(validation_alias="periods", serialization_alias="periods")
     since_t_ns: int
     speed_unit: str
     error: float
+    error_before: float | None = None
     change: tuple[float, ...]
     reference: str
     drops: tuple[Drop, ...]
@@ -67,13 +71,73 @@ class Version(_Record):
     why: str
     sha256: str
 
+    @property
+    def learned_s(self) -> float:
+        """The healthy running that it was learned from."""
+        return sum(last - first for first, last in self.learned_spans) / NS_PER_S
 
-class _List(_Record):
+    @property
+    def rate_text(self) -> str:
+        """The false-alarm rate, and whether it is declared, for people."""
+        alarms = f"{self.declared_per_day:g} false alarm{'s' * (self.declared_per_day != 1)} per fan and day"
+        if self.is_target:
+            return f"target: {alarms} ({self.hours:.2g} h of data are too few to declare it)"
+        return f"declared: {alarms}"
+
+
+class Check(_Record):
+    """The fans beside the reference.
+
+    t_ns: time of the newest sample. reference: empty if there is none yet. change: of each fan, by which share its mean
+    speed over the newest day of healthy running has changed since the reference was made. found: what has changed more
+    than healthy fans do, in words; empty if nothing has. spans: then those of the recordings of that day.
+    """
+
+    t_ns: int
+    reference: str
+    change: tuple[float, ...]
+    found: str
+    spans: tuple[TimeSpan, ...]
+
+
+class VersionList(_Record):
+    """What the list holds."""
+
     in_force: str = ""
+    """name of the version; empty before the first"""
     is_chosen: bool = False
-    """an operator has put it in force"""
+    """an operator has put it in force, also by marking a time span as faulty"""
     versions: tuple[Version, ...] = ()
-    faulty: tuple[Period, ...] = ()
+    """in the order they were made"""
+    faulty: tuple[TimeSpan, ...] = ()
+    """marked by operators"""
+    check: Check | None = None
+    """the last one"""
+    changed: tuple[tuple[str, TimeSpan], ...] = ()
+    """the recordings in which the fans had changed since a reference, with its name"""
+    commissioned_t_ns: int = 0
+    """when operators last commissioned fans again"""
+
+    @property
+    def current(self) -> Version | None:
+        """The version in force, if there is one."""
+        return next((version for version in self.versions if version.name == self.in_force), None)
+
+    @property
+    def excluded_spans(self) -> tuple[TimeSpan, ...]:
+        """The time spans that are not learned from: those marked as faulty, those in which the fans had changed since
+        the reference of the version in force, and all before the change that this version was learned after."""
+        if self.current is None:
+            return self.faulty
+        changed = (span for reference, span in self.changed if reference == self.current.reference)
+        return (*self.faulty, *changed, (0, self.current.since_t_ns - 1))
+
+    @property
+    def waiting(self) -> Version | None:
+        """The newest version, if it is only offered and the fans are still as they were then."""
+        last = self.versions[-1] if self.versions else None
+        is_offer = last is not None and last.outcome == "offered" and last.name != self.in_force
+        return last if is_offer and self.check and self.check.found else None
 
 
 class TwinVersions:
@@ -93,40 +157,31 @@ class TwinVersions:
             return 0
         return status.st_mtime_ns ^ status.st_ino
 
-    def all(self) -> tuple[Version, ...]:
-        """All versions, in the order they were made.
+    def read(self) -> VersionList:
+        """The list as it is now.
 
         Raises:
-            UserError: the list cannot be read.
+            UserError: it cannot be read.
         """
-        return self._read().versions
+        try:
+            return VersionList.model_validate_json(self._path.read_bytes())
+        except FileNotFoundError:
+            return VersionList()
+        except (OSError, ValidationError) as error:
+            why = error.strerror if isinstance(error, OSError) else f"{error.errors()[0]['msg']}"
+            raise UserError(f"{self._path}: cannot read the versions of the twin: {why}; move it away") from error
+
+    def all(self) -> tuple[Version, ...]:
+        """All versions, in the order they were made. Raises as `read`."""
+        return self.read().versions
 
     def in_force(self) -> Version | None:
-        """The version in force, if there is one. Raises as `all`."""
-        listed = self._read()
-        return next((version for version in listed.versions if version.name == listed.in_force), None)
-
-    def is_chosen(self) -> bool:
-        """Whether an operator has put the version in force, also by calling a time faulty. Raises as `all`."""
-        return self._read().is_chosen
-
-    def faulty(self) -> tuple[Period, ...]:
-        """The periods that operators called faulty. Raises as `all`."""
-        return self._read().faulty
-
-    def not_learned(self) -> tuple[Period, ...]:
-        """The periods that are not learned from: faulty ones, those before the fans changed for the version in force,
-        and those of offered versions, which show another change. Raises as `all`."""
-        listed = self._read()
-        now = next((version for version in listed.versions if version.name == listed.in_force), None)
-        since_t_ns = now.since_t_ns if now else 0
-        offered = [v for v in listed.versions if v.outcome == "offered" and v.since_t_ns != since_t_ns]
-        periods = (period for version in offered for period in version.periods)
-        return (*listed.faulty, *periods, (0, since_t_ns - 1))
+        """The version in force, if there is one. Raises as `read`."""
+        return self.read().current
 
     def next_name(self) -> str:
-        """The name of the next version. Raises as `all`."""
-        return f"{self._tray}-{len(self._read().versions) + 1}"
+        """The name of the next version. Raises as `read`."""
+        return f"{self._tray}-{len(self.all()) + 1}"
 
     def file(self, name: str) -> Path:
         """The ONNX file of a version."""
@@ -142,6 +197,18 @@ class TwinVersions:
             taken = {"in_force": version.name, "is_chosen": False} if version.outcome == "taken" else {}
             self._write(listed.model_copy(update={**taken, "versions": (*listed.versions, version)}))
 
+    def add_check(self, check: Check) -> None:
+        """Keep a check of the fans against the reference. Raises as `add`."""
+        with self._changing() as listed:
+            found = ((check.reference, span) for span in check.spans)
+            changed = tuple(dict.fromkeys((*listed.changed, *found)))
+            self._write(listed.model_copy(update={"check": check, "changed": changed}))
+
+    def commission(self, t_ns: int) -> None:
+        """Operators commission fans again. Raises as `add`."""
+        with self._changing() as listed:
+            self._write(listed.model_copy(update={"commissioned_t_ns": t_ns}))
+
     def use(self, name: str) -> None:
         """Put a version in force, an earlier one or one that is offered.
 
@@ -154,36 +221,29 @@ class TwinVersions:
                 raise UserError(f"{self.folder}: no version {name!r}; there are {', '.join(names) or 'none yet'}")
             self._write(listed.model_copy(update={"in_force": name, "is_chosen": True}))
 
-    def call_faulty(self, period: Period) -> tuple[str, str]:
-        """Never learn from a period. A twin in force that did is replaced by the newest taken version that did not.
+    def mark_faulty(self, span: TimeSpan) -> tuple[str, str]:
+        """Mark a time span as faulty: it is never learned from.
+
+        If the version in force was learned from it, the newest taken version that was not replaces it.
 
         Returns:
-            the version that was in force and the one that is now; both empty where the one in force did not learn from
-            the period, the second empty where there is no other version.
+            the version that was in force and the one that is now; both empty where the one in force was not
+            learned from the span, the second empty where there is no other version.
 
         Raises:
             UserError: as `add`.
         """
         with self._changing() as listed:
-            tainted = {version.name for version in listed.versions if overlaps(version.periods, [period])}
+            tainted = {version.name for version in listed.versions if overlap(version.learned_spans, [span])}
             clean = [v.name for v in listed.versions if v.outcome == "taken" and v.name not in tainted]
             was, now = (listed.in_force, clean[-1] if clean else "") if listed.in_force in tainted else ("", "")
-            update = {"faulty": (*listed.faulty, period), "in_force": now or listed.in_force}
+            update = {"faulty": (*listed.faulty, span), "in_force": now or listed.in_force}
             update["is_chosen"] = bool(now) or listed.is_chosen
             self._write(listed.model_copy(update=update))
         return was, now
 
-    def _read(self) -> _List:
-        try:
-            return _List.model_validate_json(self._path.read_bytes())
-        except FileNotFoundError:
-            return _List()
-        except (OSError, ValidationError) as error:
-            why = error.strerror if isinstance(error, OSError) else f"{error.errors()[0]['msg']}"
-            raise UserError(f"{self._path}: cannot read the versions of the twin: {why}; move it away") from error
-
     @contextmanager
-    def _changing(self) -> Iterator[_List]:
+    def _changing(self) -> Iterator[VersionList]:
         """The list, while no other process changes it."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -192,11 +252,11 @@ class TwinVersions:
             raise self._cannot_write(error) from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
-            yield self._read()
+            yield self.read()
         finally:
             os.close(descriptor)
 
-    def _write(self, listed: _List) -> None:
+    def _write(self, listed: VersionList) -> None:
         unfinished = self._path.with_suffix(".new")
         try:
             with unfinished.open("w", encoding="utf-8") as file:
@@ -216,6 +276,6 @@ def learning_folder(run_folder: Path, tray: str) -> Path:
     return run_folder / "learned" / tray
 
 
-def overlaps(periods: Sequence[Period], others: Sequence[Period]) -> bool:
-    """Whether any of the periods has a moment in common with any of the others."""
-    return any(first <= until and since <= last for first, last in periods for since, until in others)
+def overlap(spans: Sequence[TimeSpan], others: Sequence[TimeSpan]) -> bool:
+    """Whether any of the spans has a moment in common with any of the others."""
+    return any(first <= until and since <= last for first, last in spans for since, until in others)

@@ -8,11 +8,12 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from pipeline.config.models import TrayConfig
-from pipeline.learning.healthy_history import HealthyHistory, stretches
+from pipeline.learning.healthy_history import HealthyHistory, healthy_recordings
 from pipeline.learning.ordinary_operation import OrdinaryOperation
-from pipeline.learning.versions import TwinVersions
+from pipeline.learning.versions import Check, TwinVersions
 from schemas.messages import Action, FanState, Message, NewTwin, Raw, Request, Score
 from schemas.units import NS_PER_S
 from stages.learner import LearnerConfig, LearnerCore
@@ -31,10 +32,17 @@ class FakeLearning:
         self.outcome = "taken"
         self.starts: list[int] = []
         """how many recordings there were"""
+        self.checks: list[float] = []
+        """how much healthy running there was"""
         self._is_working = False
 
-    def start(self) -> str:
-        self.starts.append(len(stretches(self.versions.folder)))
+    def start(self, *, only_if_changed: bool) -> str:
+        found = healthy_recordings(self.versions.folder)
+        if only_if_changed:
+            self.checks.append(sum(each.seconds for each in found))
+            self.versions.add_check(Check(t_ns=found[-1].span[1], reference="", change=(), found="", spans=()))
+            return ""
+        self.starts.append(len(found))
         self._is_working = True
         return ""
 
@@ -44,11 +52,16 @@ class FakeLearning:
         self._is_working = False
         if self.fails_with:
             return self.fails_with
-        found = stretches(self.versions.folder)
+        found = healthy_recordings(self.versions.folder)
         name = self.versions.next_name()
         self.versions.folder.mkdir(parents=True, exist_ok=True)
         self.versions.file(name).write_bytes(name.encode())
-        made = version(name, 2, made_t_ns=found[-1].period[1], periods=tuple(each.period for each in found))
+        made = version(name, 2, made_t_ns=found[-1].span[1], learned_spans=tuple(each.span for each in found))
+        if self.outcome == "offered":
+            spans = tuple(each.span for each in found[-1:])
+            self.versions.add_check(
+                Check(t_ns=made.made_t_ns, reference="tray1-1", change=(0.1,), found="changed", spans=spans)
+            )
         self.versions.add(made.model_copy(update={"outcome": self.outcome}))
         return ""
 
@@ -122,21 +135,21 @@ def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path
     assert learner.learning.starts == []
     (note,) = learner.core.notes()
     assert note.startswith(
-        "no twin yet, nothing is judged; 10 of 5 min recorded; not moved enough yet: fan 0: command 0.5,"
+        "no twin yet, nothing is judged; 10 min recorded (5 needed); not moved enough yet: fan 0: command 0.5,"
     )
     learner.run(600)
     assert learner.put_in_force == ["tray1-1"]
     (note,) = learner.core.notes()
     assert note == (
-        "tray1-1 is in force; at 1,000 rpm it finds a drop of 40 rpm within a minute; 1 false alarm(s) per fan and day "
-        "declared"
+        "tray1-1 is in force; at 1,000 rpm it finds a drop of 40 rpm within a minute; declared: 1 false alarm per "
+        "fan and day"
     )
 
 
 def test_later_versions_come_when_the_history_has_doubled(tmp_path: Path) -> None:
     learner = Learner(tmp_path)
     learner.run(5000)
-    made = [sum(last - first for first, last in each.periods) / NS_PER_S for each in learner.versions.all()]
+    made = [each.learned_s for each in learner.versions.all()]
     assert len(made) >= 4
     assert all(1.6 < after / before < 2.6 for before, after in pairwise(made)), made
     assert learner.put_in_force == [f"tray1-{number + 1}" for number in range(len(made))]
@@ -148,7 +161,7 @@ def test_nothing_is_learned_beside_an_alarm(tmp_path: Path) -> None:
     before = len(learner.learning.starts)
     learner.run(3000, state=FanState.ALARM)
     assert len(learner.learning.starts) == before
-    assert all(each.period[1] < START_NS + 600 * NS_PER_S for each in stretches(tmp_path))
+    assert all(each.span[1] < START_NS + 600 * NS_PER_S for each in healthy_recordings(tmp_path))
 
 
 def test_what_failed_is_said_and_tried_again_with_more_history(tmp_path: Path) -> None:
@@ -188,8 +201,33 @@ def test_after_fans_are_commissioned_again_the_twin_is_compared_with_them_within
     assert len(learner.versions.all()) == before
     learner.run(1000)
     assert len(learner.versions.all()) == before + 1
-    last = learner.versions.all()[-1].periods[-1]
+    last = learner.versions.all()[-1].learned_spans[-1]
     assert last[0] >= commissioned_t_ns, "the newest recording holds nothing from before"
+
+
+def test_that_fans_were_commissioned_again_is_not_forgotten_by_a_restart(tmp_path: Path) -> None:
+    first = Learner(tmp_path)
+    first.run(3000)
+    first.core.step(Request(t_ns=START_NS + first.now_s * NS_PER_S, action=Action.COMMISSION))
+    first.core.close()
+    before = len(first.versions.all())
+    second = Learner(tmp_path)
+    second.now_s = first.now_s
+    second.run(15_500)
+    assert len(second.versions.all()) == before + 1
+
+
+def test_between_versions_the_fans_are_checked_against_the_reference_each_healthy_day(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stages.learner.CHECK_AFTER_S", 1000.0)
+    learner = Learner(tmp_path)
+    learner.run(10_000)
+    versions = learner.versions.all()
+    assert versions[-1].learned_s > 4000.0
+    within = [checked_s for checked_s in learner.learning.checks if checked_s > versions[-2].learned_s]
+    assert len(within) >= 3
+    assert all(1000.0 <= after - before < 1200.0 for before, after in pairwise(within[:3])), within
 
 
 def test_a_restarted_learner_publishes_the_version_in_force_at_once(tmp_path: Path) -> None:

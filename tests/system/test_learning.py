@@ -12,7 +12,7 @@ from pipeline.learning.versions import TwinVersions, learning_folder
 from pipeline.recordings.reading import read_recording
 from schemas.messages import InvalidReason, ModelCard, Score
 from tests.support.fantwin_command import fantwin
-from tests.support.healthy_stretches import FANS, add_stretch
+from tests.support.healthy_recordings import FANS, add_recording
 from tests.support.running_chain import RunningCommand, eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
@@ -28,7 +28,7 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
         encoding="utf-8",
     )
     folder = learning_folder(tmp_path / "runs", "tray1")
-    add_stretch(folder, -100_000_000, 320.0, 1)
+    add_recording(folder, -100_000_000, 320.0, 1)
     return path
 
 

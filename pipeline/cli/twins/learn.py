@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import threading
@@ -12,16 +13,20 @@ import typer
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.progress import interruptible, working
 from pipeline.cli.twins.next_version import make_next_version
-from pipeline.cli.twins.versions_text import version_lines
+from pipeline.cli.twins.versions_text import NO_REFERENCE, check_line, version_lines
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UserError
-from pipeline.learning.versions import learning_folder
+from pipeline.learning.versions import TwinVersions, learning_folder
 
 
 def learn(
     config: ConfigOption = DEFAULT_CONFIG,
     tray: Annotated[str | None, typer.Option(help="Which tray, where several learn their twins.")] = None,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Only compare the fans with the reference, and make a version if they changed."),
+    ] = False,
     overrides: SetOption = None,
     json_output: JsonOption = False,
     until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
@@ -31,9 +36,11 @@ def learn(
     The new version takes over within seconds, also on a running site, unless it is only offered. `fantwin twins` lists
     the versions.
 
-    Exit codes: 0 a version was made; 1 error, such as too little history; 130 Ctrl-C.
+    Exit codes: 0 a version was made, or --check found no change; 1 error, such as too little history; 130 Ctrl-C.
 
     Example: fantwin learn -c fantwin.toml
+
+    Example: fantwin learn --check
     """
     if until_stdin_closes:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))  # it runs while no stage does
@@ -43,12 +50,22 @@ def learn(
     folder = learning_folder(settings.run_folder, of.name)
     section = settings.sections["learner"]
     with interruptible("no version was made"), working(f"learning the twin of {of.name}") as show:
-        version = make_next_version(folder, of.name, section.false_alarms_per_day, show)  # type: ignore[attr-defined]
+        version = make_next_version(
+            folder,
+            of.name,
+            section.false_alarms_per_day,  # type: ignore[attr-defined]
+            show,
+            only_if_changed=check,
+        )
+    listed = TwinVersions(folder, of.name).read()
     if json_output:
-        typer.echo(version.model_dump_json())
-    else:
-        for line in version_lines([version], version.name if version.outcome == "taken" else "", ()):
-            typer.echo(line)
+        last_check = listed.check.model_dump() if listed.check else None
+        typer.echo(json.dumps({"version": version and version.model_dump(), "check": last_check}))
+        return
+    if check:
+        typer.echo(check_line(listed.check) if listed.check else NO_REFERENCE)
+    for line in version_lines([version], listed.in_force, ()) if version else []:
+        typer.echo(line)
 
 
 def learning_tray(settings: Config, name: str | None) -> TrayConfig:
@@ -62,8 +79,8 @@ def learning_tray(settings: Config, name: str | None) -> TrayConfig:
     if len(chosen) > 1:
         raise UserError(f"several trays learn their twins: choose one with --tray: {', '.join(t.name for t in chosen)}")
     if not chosen or chosen[0] not in learning:
-        which = f"tray {chosen[0].name} has" if chosen else "every tray has"
-        raise UserError(f"{settings.path}: {which} a twin of its own: remove `twin` from [[tray]] to learn one")
+        which = f"tray {chosen[0].name} names" if chosen else "every tray names"
+        raise UserError(f"{settings.path}: {which} a twin: remove `twin` from [[tray]] to learn one")
     return chosen[0]
 
 

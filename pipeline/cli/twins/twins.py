@@ -10,10 +10,10 @@ import typer
 
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.twins.learn import learning_tray
-from pipeline.cli.twins.versions_text import version_lines
+from pipeline.cli.twins.versions_text import check_line, version_lines
 from pipeline.config.loading import load_config
 from pipeline.errors import UserError
-from pipeline.learning.versions import Period, TwinVersions, learning_folder
+from pipeline.learning.versions import TimeSpan, TwinVersions, learning_folder
 from schemas.units import NS_PER_S
 
 
@@ -25,21 +25,24 @@ def twins(
     ] = None,
     faulty_from: Annotated[
         str | None,
-        typer.Option("--faulty-from", metavar="TIME", help="Start of a time to mark as faulty; needs --faulty-to."),
+        typer.Option(
+            "--faulty-from", metavar="TIME", help="Start of a time span to mark as faulty; needs --faulty-to."
+        ),
     ] = None,
     faulty_to: Annotated[
         str | None,
         typer.Option(
-            "--faulty-to", metavar="TIME", help="End of the faulty time. Times are local; a date alone is 00:00."
+            "--faulty-to", metavar="TIME", help="End of that time span. Times are local; a date alone is 00:00."
         ),
     ] = None,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """List the versions of a learned twin, put one in force, or mark a time as faulty: it is never learned from.
+    """List the versions of a learned twin, put one in force, or mark a time span as faulty: it is never learned
+    from.
 
-    A running site changes to the version in force within seconds. If that was learned from a time that is marked as
-    faulty, the newest version that was not takes its place.
+    A running site changes to the version in force within seconds. If that version was learned from a faulty time
+    span, the newest version that was not takes its place.
 
     Example: fantwin twins -c fantwin.toml
 
@@ -54,33 +57,32 @@ def twins(
     if faulty_from or faulty_to:
         if not (faulty_from and faulty_to):
             raise UserError("a faulty time has two ends: give --faulty-from and --faulty-to")
-        was, now = versions.call_faulty(_period(faulty_from, faulty_to))
+        was, now = versions.mark_faulty(_time_span(faulty_from, faulty_to))
         if was:
-            said.append(f"{was} was learned from that time; in force now: {now}" if now else _no_other(was))
+            said.append(f"{was} was learned from that time span; in force now: {now}" if now else _no_other(was))
     if use:
         versions.use(use)
-    listed, in_force = versions.all(), versions.in_force()
-    name = in_force.name if in_force else ""
+    listed = versions.read()
     if json_output:
-        found = {"tray": of.name, "in_force": name, "faulty": versions.faulty()}
-        typer.echo(json.dumps({**found, "versions": [version.model_dump() for version in listed], "notes": said}))
+        typer.echo(json.dumps({"tray": of.name, **listed.model_dump(), "notes": said}))
         return
-    for line in [*said, *version_lines(listed, name, versions.faulty())]:
+    checked = [check_line(listed.check)] if listed.check else []
+    for line in [*said, *version_lines(listed.versions, listed.in_force, listed.faulty), *checked]:
         typer.echo(line)
-    if not listed:
+    if not listed.versions:
         typer.echo(f"{of.name} has no twin yet: `fantwin up` makes the first; `fantwin status` says what it waits for")
 
 
 def _no_other(name: str) -> str:
-    stays = f"{name} was learned from that time and stays in force: there is no other version"
-    return f"{stays}; the next will not use that time"
+    stays = f"{name} was learned from that time span and stays in force: no version can replace it"
+    return f"{stays}; the next will not use that time span"
 
 
-def _period(first: str, last: str) -> Period:
-    period = (_t_ns(first), _t_ns(last))
-    if period[0] >= period[1]:
+def _time_span(first: str, last: str) -> TimeSpan:
+    span = (_t_ns(first), _t_ns(last))
+    if span[0] >= span[1]:
         raise UserError(f"--faulty-from {first} is not before --faulty-to {last}")
-    return period
+    return span
 
 
 def _t_ns(text: str) -> int:

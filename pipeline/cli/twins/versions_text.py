@@ -2,35 +2,80 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
-from pipeline.learning.versions import Drop, Period, Version
+from pipeline.learning.versions import Check, Drop, TimeSpan, Version
 from pipeline.recordings.dates import format_local
 
+NO_REFERENCE = (
+    "no version was learned from 24 h of healthy running yet: there is no reference to check the fans against"
+)
 
-def version_lines(versions: Sequence[Version], in_force: str, faulty: Sequence[Period]) -> list[str]:
-    """A line for each version, more for the newest and for the one in force, and one for each faulty period."""
+
+def version_lines(versions: Sequence[Version], in_force: str, faulty_spans: Sequence[TimeSpan]) -> list[str]:
+    """A line for each version, more for the newest and for the one in force, and one for each faulty time span."""
     lines: list[str] = []
     for version in versions:
         of_version = _lines(version, is_in_force=version.name == in_force)
         lines += of_version if version.name == in_force or version is versions[-1] else of_version[:1]
-    return [*lines, *(f"marked as faulty: {format_local(first)} to {format_local(last)}" for first, last in faulty)]
+    marked = (f"marked as faulty: {format_local(first)} to {format_local(last)}" for first, last in faulty_spans)
+    return [*lines, *_side_by_side(versions, in_force), *marked]
+
+
+def check_line(check: Check) -> str:
+    """What the last check of the fans found."""
+    if not check.reference:
+        return NO_REFERENCE
+    changes = _percents(check.change)
+    return f"checked up to {format_local(check.t_ns)}: speed of the fans since {check.reference}: {changes}"
 
 
 def _lines(version: Version, *, is_in_force: bool) -> list[str]:
     state = "IN FORCE" if is_in_force else "offered" if version.outcome == "offered" else "not in force"
     unit = version.speed_unit
-    made = f"limits from {version.hours:.3g} h up to {format_local(version.made_t_ns)}"
-    rate = f"{version.declared_per_day:g} false alarm{'s' * (version.declared_per_day != 1)} per fan and day"
-    declared = f"target {rate}; too little data to support it" if version.is_target else f"declared {rate}"
-    change = ", ".join(f"{100 * each:+.1f} %" for each in version.change)
     return [
-        f"{version.name}: {state}: {version.how}; {made}",
+        f"{version.name}: {state}: {version.how}; {_limits_from(version)}",
         f"  why: {version.why}",
-        f"  error {version.error:.3g} {unit}; {declared}",
+        f"  error {version.error:.3g} {unit}; {version.rate_text}",
         *(f"  found at {drop.speed:,.0f} {unit}: {_found(drop, unit)}" for drop in version.drops),
-        f"  speed of the fans relative to {version.reference}: {change}",
+        f"  speed of the fans relative to the prediction of {version.reference}: {_percents(version.change)}",
     ]
+
+
+def _limits_from(version: Version) -> str:
+    return f"limits from {version.hours:.3g} h up to {format_local(version.made_t_ns)}"
+
+
+def _side_by_side(versions: Sequence[Version], in_force: str) -> list[str]:
+    """The version in force and the newest, if that is only offered: which fits the fans as they are now?"""
+    now = next((version for version in versions if version.name == in_force), None)
+    offered = versions[-1] if versions else None
+    if now is None or offered is None or offered.outcome != "offered" or offered is now:
+        return []
+    unit = offered.speed_unit
+    error_before = "unknown" if offered.error_before is None else f"{offered.error_before:.3g} {unit}"
+    rows = [
+        ("", f"{now.name}, in force", f"{offered.name}, offered"),
+        ("learned up to", format_local(now.made_t_ns), format_local(offered.made_t_ns)),
+        ("error over the newest recording", error_before, f"{offered.error:.3g} {unit}"),
+        ("limits from", f"{now.hours:.3g} h", f"{offered.hours:.3g} h"),
+        *(_drops_beside(before, after, unit) for before, after in zip(now.drops, offered.drops, strict=False)),
+    ]
+    widths = [max(len(row[column]) for row in rows) for column in range(3)]
+    return ["", *("  " + "   ".join(map(str.ljust, row, widths)).rstrip() for row in rows), ""]
+
+
+def _drops_beside(before: Drop, after: Drop, unit: str) -> tuple[str, str, str]:
+    return "drop found within a minute", _drop_of(before, unit), _drop_of(after, unit)
+
+
+def _drop_of(drop: Drop, unit: str) -> str:
+    found = "none" if drop.within_a_minute is None else f"{drop.within_a_minute:,.0f}"
+    return f"{found} of {drop.speed:,.0f} {unit}"
+
+
+def _percents(change: Iterable[float]) -> str:
+    return ", ".join(f"{100 * each:+.1f} %" for each in change)
 
 
 def _found(drop: Drop, unit: str) -> str:

@@ -9,32 +9,36 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli.twins import next_version
-from pipeline.cli.twins.next_version import make_next_version, newest
+from pipeline.cli.twins.next_version import make_next_version
+from pipeline.cli.twins.version_data import newest_recordings
 from pipeline.errors import UserError
-from pipeline.learning.healthy_history import Stretch, stretches
+from pipeline.learning.healthy_history import HealthyRecording, healthy_recordings
 from pipeline.learning.versions import TwinVersions, Version
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.units import NS_PER_S
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.healthy_stretches import FANS, add_stretch
+from tests.support.healthy_recordings import FANS, add_recording
 
 pytestmark = pytest.mark.slow
 
 
 def made(folder: Path) -> Version:
-    return make_next_version(folder, "tray1", 1.0, lambda _line: None)
+    version = make_next_version(folder, "tray1", 1.0, lambda _line: None)
+    assert version
+    return version
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The learning folder of a tray with two versions, and then with fans that have changed."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(next_version, "COMMISSIONED_S", 300.0)
+    patch.setattr(next_version, "REFERENCE_S", 300.0)
+    patch.setattr(next_version, "CHECKED_S", 100.0)
     patch.setattr(next_version, "MOST_TRAINING_SAMPLES", 1500)
     folder = tmp_path_factory.mktemp("site") / "runs" / "learned" / "tray1"
-    add_stretch(folder, 0, 120.0, 1)
+    add_recording(folder, 0, 120.0, 1)
     made(folder)
-    add_stretch(folder, 1000, 300.0, 2)
+    add_recording(folder, 1000, 300.0, 2)
     made(folder)
     yield folder
     patch.undo()
@@ -43,9 +47,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture(scope="module")
 def changed(site: Path) -> Path:
     """The same after all fans have become faster, and after one has become slower."""
-    add_stretch(site, 2000, 120.0, 3, (1.06, 1.05))
-    made(site)
-    add_stretch(site, 3000, 120.0, 4, (1.0, 0.92))
+    add_recording(site, 2000, 120.0, 3, (1.06, 1.05))
+    assert make_next_version(site, "tray1", 1.0, lambda _line: None, only_if_changed=True)
+    add_recording(site, 3000, 120.0, 4, (1.0, 0.92))
     made(site)
     return site
 
@@ -74,6 +78,17 @@ def test_more_healthy_running_tightens_the_limits(site: Path) -> None:
     assert not list(site.glob("learning-*")), "the working folder is gone"
 
 
+def test_fans_that_have_not_changed_pass_the_check_and_no_version_is_made(site: Path) -> None:
+    versions = TwinVersions(site, "tray1")
+    before = versions.all()
+    assert make_next_version(site, "tray1", 1.0, lambda _line: None, only_if_changed=True) is None
+    assert versions.all() == before
+    check = versions.read().check
+    assert check
+    assert check.reference == "tray1-2"
+    assert check.change == pytest.approx((0.0, 0.0), abs=0.01)
+
+
 def test_fans_that_have_all_changed_get_an_offer_and_nothing_is_taken(changed: Path) -> None:
     versions = TwinVersions(changed, "tray1")
     third = versions.all()[2]
@@ -84,6 +99,8 @@ def test_fans_that_have_all_changed_get_an_offer_and_nothing_is_taken(changed: P
     assert in_force
     assert in_force.name == "tray1-2"
     assert third.change[0] == pytest.approx(0.0, abs=0.02), "an offered version is its own reference"
+    assert third.error_before
+    assert third.error < 0.5 * third.error_before, "it fits the fans as they are now"
 
 
 def test_one_fan_that_has_changed_is_named_and_never_learned(changed: Path) -> None:
@@ -91,8 +108,8 @@ def test_one_fan_that_has_changed_is_named_and_never_learned(changed: Path) -> N
     fourth = versions.all()[3]
     assert fourth.outcome == "offered"
     assert fourth.why.startswith("fan 1 is ")
-    assert "% slower than when tray1-2 was made; inspect it, or put this version in force" in fourth.why
-    learned = [each.period for each in stretches(changed, versions.not_learned())]
+    assert "% slower than when tray1-2 was made; inspect it: if it is healthy, put this version in force" in fourth.why
+    learned = [each.span for each in healthy_recordings(changed, versions.read().excluded_spans)]
     assert len(learned) == 2, "the two before the fans changed"
 
 
@@ -102,13 +119,17 @@ def test_the_list_says_what_is_in_force_and_the_command_changes_it(changed: Path
     listed = fantwin("twins", "-c", config).stdout
     assert "tray1-2: IN FORCE: " in listed
     assert "tray1-3: offered: trained; limits from 0.0333 h" in listed
+    beside = [line.split() for line in listed.splitlines() if line.startswith("  error over the newest recording")]
+    (words,) = beside
+    assert float(words[5]) > 2.0 * float(words[7]), "of the version in force, and of the one that is offered"
+    assert "checked up to 2027-01-15" in listed
     assert fantwin("twins", "-c", config, "--use", "tray1-3").exit_code == 0
     assert json.loads(fantwin("twins", "-c", config, "--json").stdout)["in_force"] == "tray1-3"
     assert "no version 'tray1-9'; there are tray1-1, tray1-2" in error_of("twins", "-c", config, "--use", "tray1-9")
     fantwin("twins", "-c", config, "--use", "tray1-2")
     day = ("--faulty-from", "2027-01-14", "--faulty-to", "2027-01-17")
     said = fantwin("twins", "-c", config, *day).stdout
-    assert "tray1-2 was learned from that time and stays in force: there is no other version; the next" in said
+    assert "tray1-2 was learned from that time span and stays in force: no version can replace it; the next" in said
     assert "marked as faulty: 2027-01-14" in said
     assert "no healthy history to learn from yet" in error_of("learn", "-c", config)
 
@@ -116,9 +137,7 @@ def test_the_list_says_what_is_in_force_and_the_command_changes_it(changed: Path
 def test_a_tray_with_a_twin_of_its_own_and_wrong_times_are_refused_in_one_line(tmp_path: Path) -> None:
     config = tmp_path / "fantwin.toml"
     config.write_text('[[tray]]\nname = "tray1"\nfans = 2\ntwin = "a.onnx"\n', encoding="utf-8")
-    assert "every tray has a twin of its own: remove `twin` from [[tray]] to learn one" in error_of(
-        "twins", "-c", config
-    )
+    assert "every tray names a twin: remove `twin` from [[tray]] to learn one" in error_of("twins", "-c", config)
     config.write_text('[[tray]]\nname = "tray1"\nfans = 2\n', encoding="utf-8")
     assert "tray1 has no twin yet: `fantwin up` makes the first" in fantwin("twins", "-c", config).stdout
     assert "not a time: write 2026-11-24" in error_of("twins", "-c", config, "--faulty-from", "x", "--faulty-to", "y")
@@ -129,7 +148,7 @@ def test_a_tray_with_a_twin_of_its_own_and_wrong_times_are_refused_in_one_line(t
 
 def test_limits_are_from_as_many_of_the_newest_recordings_as_are_wanted_and_not_from_fewer() -> None:
     hours = [8, 8, 8, 8, 3]
-    history = [Stretch(Path(f"{k}.mcap"), (k, k + hours[k] * 3600 * NS_PER_S)) for k in range(len(hours))]
-    assert newest(history, 24 * 3600.0) == history[1:]
-    assert newest(history, 3600.0) == history[-1:]
-    assert newest(history, 100 * 3600.0) == history
+    history = [HealthyRecording(Path(f"{k}.mcap"), (k, k + hours[k] * 3600 * NS_PER_S)) for k in range(len(hours))]
+    assert newest_recordings(history, 24 * 3600.0) == history[1:]
+    assert newest_recordings(history, 3600.0) == history[-1:]
+    assert newest_recordings(history, 100 * 3600.0) == history

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.learning.healthy_history import HealthyHistory, recorded_raws, stretches
+from pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recorded_raws
 from pipeline.recordings.reading import read_metadata
 from schemas.messages import Header, Raw
 from schemas.units import NS_PER_S
@@ -48,7 +48,7 @@ def add(
 
 def kept_s(folder: Path) -> list[tuple[int, int]]:
     """First and last second of each recording."""
-    return [tuple(round(t_ns / NS_PER_S) - START_S for t_ns in each.period) for each in stretches(folder)]  # type: ignore[misc]
+    return [tuple(round(t_ns / NS_PER_S) - START_S for t_ns in each.span) for each in healthy_recordings(folder)]  # type: ignore[misc]
 
 
 def test_before_the_first_twin_all_is_kept_at_once(tmp_path: Path) -> None:
@@ -58,7 +58,7 @@ def test_before_the_first_twin_all_is_kept_at_once(tmp_path: Path) -> None:
     history.finish()
     assert kept_s(tmp_path) == [(0, 199)]
     assert sum(len(each.host_receive_t_ns) for each in recorded_raws(tmp_path)) == 200
-    assert read_metadata(stretches(tmp_path)[0].path).speed_unit("tray1") == "rpm"
+    assert read_metadata(healthy_recordings(tmp_path)[0].path).speed_unit("tray1") == "rpm"
 
 
 def test_what_came_shortly_before_an_alarm_and_after_it_is_never_kept(tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_what_came_shortly_before_an_alarm_and_after_it_is_never_kept(tmp_path: 
     assert after[1] <= 1100
 
 
-def test_a_short_stretch_is_dropped_and_a_pause_begins_a_new_one(tmp_path: Path) -> None:
+def test_a_short_recording_is_deleted_and_a_pause_begins_a_new_one(tmp_path: Path) -> None:
     history = history_in(tmp_path, hold_back_s=0.0)
     add(history, 0, 30)
     add(history, 1000, 1300)
@@ -81,13 +81,13 @@ def test_a_short_stretch_is_dropped_and_a_pause_begins_a_new_one(tmp_path: Path)
     assert kept_s(tmp_path) == [(1000, 1299)]
 
 
-def test_faulty_periods_are_left_out(tmp_path: Path) -> None:
+def test_recordings_in_excluded_time_spans_are_left_out(tmp_path: Path) -> None:
     history = history_in(tmp_path, hold_back_s=0.0)
     for first_s in (0, 1000, 2000):
         add(history, first_s, first_s + 300)
     history.close()
     faulty = ((START_S + 1299) * NS_PER_S, (START_S + 1500) * NS_PER_S)
-    assert [each.period[0] for each in stretches(tmp_path, [faulty])] == [
+    assert [each.span[0] for each in healthy_recordings(tmp_path, [faulty])] == [
         (START_S + 0) * NS_PER_S,
         (START_S + 2000) * NS_PER_S,
     ]
@@ -109,7 +109,7 @@ def test_what_a_killed_process_left_is_repaired(tmp_path: Path) -> None:
     active = next((tmp_path / "healthy").glob("*.active"))
     content = active.read_bytes()
     killed.close()
-    stretches(tmp_path)[0].path.unlink()
+    healthy_recordings(tmp_path)[0].path.unlink()
     active.write_bytes(content)
     next_one = history_in(tmp_path)
     assert next_one.problem == ""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pipeline.errors import UserError
-from pipeline.learning.versions import Drop, TwinVersions, Version
+from pipeline.learning.versions import Check, Drop, TwinVersions, Version
 from schemas.units import NS_PER_S
 
 DAY_NS = 86_400 * NS_PER_S
@@ -21,7 +22,7 @@ def version(name: str, day: int, **other: Any) -> Version:
         "how": "trained",
         "made_t_ns": day * DAY_NS,
         "hours": 24.0,
-        "periods": tuple((each * DAY_NS, (each + 1) * DAY_NS - 1) for each in range(1, day)),
+        "learned_spans": tuple((each * DAY_NS, (each + 1) * DAY_NS - 1) for each in range(1, day)),
         "since_t_ns": 0,
         "speed_unit": "rpm",
         "error": 10.0,
@@ -66,16 +67,16 @@ def test_a_version_that_learned_from_a_faulty_day_is_taken_back_to_the_newest_th
 ) -> None:
     for number, day in enumerate((2, 3, 4), 1):
         versions.add(version(f"tray1-{number}", day))
-    assert versions.call_faulty((5 * DAY_NS, 6 * DAY_NS)) == ("", "")
+    assert versions.mark_faulty((5 * DAY_NS, 6 * DAY_NS)) == ("", "")
     assert in_force(versions) == "tray1-3"
-    assert versions.call_faulty((2 * DAY_NS, 3 * DAY_NS)) == ("tray1-3", "tray1-1")
+    assert versions.mark_faulty((2 * DAY_NS, 3 * DAY_NS)) == ("tray1-3", "tray1-1")
     assert in_force(versions) == "tray1-1"
-    assert (2 * DAY_NS, 3 * DAY_NS) in versions.not_learned()
+    assert (2 * DAY_NS, 3 * DAY_NS) in versions.read().excluded_spans
 
 
 def test_where_every_version_learned_from_a_faulty_day_the_one_in_force_stays(versions: TwinVersions) -> None:
     versions.add(version("tray1-1", 2))
-    assert versions.call_faulty((DAY_NS, DAY_NS + 1)) == ("tray1-1", "")
+    assert versions.mark_faulty((DAY_NS, DAY_NS + 1)) == ("tray1-1", "")
     assert in_force(versions) == "tray1-1"
 
 
@@ -84,12 +85,40 @@ def test_of_changed_fans_nothing_is_learned_until_their_version_is_used_and_then
 ) -> None:
     versions.add(version("tray1-1", 2))
     since = 3 * DAY_NS
-    offered = version("tray1-2", 4, outcome="offered", since_t_ns=since, periods=((since, since + 5),))
-    versions.add(offered)
-    assert (since, since + 5) in versions.not_learned()
+    spans = ((since, since + 5),)
+    found = Check(t_ns=since + 5, reference="tray1-1", change=(0.04, 0.04), found="all fans are faster", spans=spans)
+    versions.add_check(found)
+    versions.add(version("tray1-2", 4, outcome="offered", since_t_ns=since, learned_spans=spans))
+    later = (since + 10, since + 20)
+    versions.add_check(found.model_copy(update={"spans": (*spans, later)}))
+    assert later in versions.read().excluded_spans
+    assert (since, since + 5) in versions.read().excluded_spans
     versions.use("tray1-2")
-    assert (since, since + 5) not in versions.not_learned()
-    assert (0, since - 1) in versions.not_learned()
+    assert (since, since + 5) not in versions.read().excluded_spans
+    assert later not in versions.read().excluded_spans
+    assert (0, since - 1) in versions.read().excluded_spans
+
+
+def test_an_offer_waits_until_it_is_used_or_the_fans_are_as_they_were(versions: TwinVersions) -> None:
+    versions.add(version("tray1-1", 2))
+    found = Check(t_ns=3, reference="tray1-1", change=(0.04, 0.04), found="all fans are faster", spans=((1, 2),))
+    versions.add_check(found)
+    assert versions.read().waiting is None
+    versions.add(version("tray1-2", 4, outcome="offered"))
+    waiting = versions.read().waiting
+    assert waiting
+    assert waiting.name == "tray1-2"
+    versions.add_check(found.model_copy(update={"found": "", "spans": ()}))
+    assert versions.read().waiting is None
+    versions.add_check(found)
+    versions.use("tray1-2")
+    assert versions.read().waiting is None
+
+
+def test_the_spans_that_a_version_was_learned_from_are_stored_as_periods(versions: TwinVersions) -> None:
+    versions.add(version("tray1-1", 2))
+    stored = json.loads((versions.folder / "versions.json").read_text())["versions"][0]
+    assert stored["periods"] == [[DAY_NS, 2 * DAY_NS - 1]]
 
 
 def test_an_unknown_version_and_a_damaged_list_are_refused_in_one_line(versions: TwinVersions) -> None:

@@ -17,7 +17,7 @@ KEPT_EVERY = 5
 """sample of the simulation: 20 Hz, so that training takes seconds"""
 
 
-def add_stretch(
+def add_recording(
     folder: Path, first_s: int, seconds: float, seed: int, factor: tuple[float, float] = (1.0, 1.0)
 ) -> None:
     """Two published fans under stairs from 0 to 100, from first_s after START_S on. factor: on their speeds."""
