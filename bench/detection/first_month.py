@@ -1,4 +1,4 @@
-"""The first month of racks without a twin under `fantwin up`: what is learned, promised, found and falsely raised.
+"""The first month of racks without a twin under `fantwin up`: versions, rates, faults found and false alarms.
 
 The cores of the stages are fed with the lines of the racks, as fast as they go (bench.detection.rack_site). Fans wear;
 their filter clogs and is changed; their firmware changes their speeds; and they have faults, which are repaired after
@@ -76,7 +76,7 @@ def ageing(columns: int, days: float) -> Any:
 
 
 def month_faults(of: Racks) -> list[Fault]:
-    """Kinds in turn, on fans and at times by chance; each begins while its fan is on, and no two of a rack together."""
+    """Kinds in turn, on random fans at random times; each begins while its fan is on, and no two overlap."""
     rng = np.random.default_rng([of.seed, 5])
     days = of.seconds / DAY_S
     count = round(FAULTS_PER_WEEK * max(0.0, days - FIRST_FAULT_DAY) / 7.0)

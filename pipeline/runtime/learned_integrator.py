@@ -1,4 +1,4 @@
-"""The twin integrator of a tray whose twins are learned while it runs: one core after the other, each of one twin.
+"""The twin integrator of a tray whose twin is learned while it runs: a core for each version, one at a time.
 
 A new twin takes over between two blocks, at the first sample that is newer than all before it. Its card, which is
 published then, carries the twin and the time of that sample, so that a replay changes the twin at the same sample.

@@ -1,4 +1,4 @@
-"""The scorer of a tray whose twins are learned while it runs: one core after the other, each of one twin.
+"""The scorer of a tray whose twin is learned while it runs: a core for each version, one at a time.
 
 Predictions name their twin, and the integrator publishes a twin before its first prediction. So the core changes at the
 same sample in a replay. Where only the limits are new, baselines, alarms and wear go on; with another twin they start
