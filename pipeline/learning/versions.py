@@ -117,6 +117,10 @@ class VersionList(_Record):
     """the recordings in which the fans had changed since a reference, with its name"""
     commissioned_t_ns: int = 0
     """when operators last commissioned fans again"""
+    published: str = ""
+    """the version that the stages had last"""
+    alarms_t_ns: tuple[int, ...] = ()
+    """when an alarm of a fan began, in the time of the history that is kept"""
 
     @property
     def current(self) -> Version | None:
@@ -208,6 +212,17 @@ class TwinVersions:
         """Operators commission fans again. Raises as `add`."""
         with self._changing() as listed:
             self._write(listed.model_copy(update={"commissioned_t_ns": t_ns}))
+
+    def publish(self, name: str) -> None:
+        """The stages get this version. Raises as `add`."""
+        with self._changing() as listed:
+            self._write(listed.model_copy(update={"published": name}))
+
+    def add_alarm(self, t_ns: int, forget_before_t_ns: int) -> None:
+        """An alarm of a fan began; earlier ones are forgotten. Raises as `add`."""
+        with self._changing() as listed:
+            kept = (each for each in (*listed.alarms_t_ns, t_ns) if each >= forget_before_t_ns)
+            self._write(listed.model_copy(update={"alarms_t_ns": tuple(kept)}))
 
     def use(self, name: str) -> None:
         """Put a version in force, an earlier one or one that is offered.
