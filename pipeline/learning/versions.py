@@ -128,6 +128,11 @@ class VersionList(_Record):
         return next((version for version in self.versions if version.name == self.in_force), None)
 
     @property
+    def is_tainted(self) -> bool:
+        """Whether the version in force was learned from a time that was marked as faulty."""
+        return self.current is not None and overlap(self.current.learned_spans, self.faulty)
+
+    @property
     def excluded_spans(self) -> tuple[TimeSpan, ...]:
         """The time spans that are not learned from: those marked as faulty, those in which the fans had changed since
         the reference of the version in force, and all before the change that this version was learned after."""
@@ -184,20 +189,48 @@ class TwinVersions:
         return self.read().current
 
     def next_name(self) -> str:
-        """The name of the next version. Raises as `read`."""
-        return f"{self._tray}-{len(self.all()) + 1}"
+        """The name of the next version; never that of a file that is there. Raises as `read`."""
+        number = len(self.all()) + 1
+        while self.file(f"{self._tray}-{number}").exists():
+            number += 1
+        return f"{self._tray}-{number}"
 
     def file(self, name: str) -> Path:
         """The ONNX file of a version."""
         return self.folder / f"{name}.onnx"
 
-    def add(self, version: Version) -> None:
-        """Add a version, whose file is there; if it was taken, it is in force now.
+    @contextmanager
+    def learning(self) -> Iterator[None]:
+        """While a version is made: one at a time.
 
         Raises:
-            UserError: the list cannot be read or written.
+            UserError: another process makes one, or the folder cannot be written.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with (self.folder / "learn.lock").open("ab") as lock:
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError as error:
+                    raise UserError(f"{self.folder}: another `fantwin learn` works here: wait for its end") from error
+                yield
+        except OSError as error:
+            raise self._cannot_write(error) from error
+
+    def add(self, version: Version, seen: VersionList | None = None) -> None:
+        """Add a version, whose file is there; if it was taken, it is in force now.
+
+        seen: the list when it was begun; None: as it is now.
+
+        Raises:
+            UserError: operators have put another version in force meanwhile, or marked a time as faulty that it was
+                learned from; the list cannot be read or written.
         """
         with self._changing() as listed:
+            if seen and listed.in_force != seen.in_force:
+                raise UserError(f"{version.name} is not used: {listed.in_force} was put in force while it was made")
+            if overlap(version.learned_spans, listed.faulty):
+                raise UserError(f"{version.name} is not used: it was learned from a time that is marked as faulty")
             taken = {"in_force": version.name, "is_chosen": False} if version.outcome == "taken" else {}
             self._write(listed.model_copy(update={**taken, "versions": (*listed.versions, version)}))
 
@@ -239,7 +272,8 @@ class TwinVersions:
     def mark_faulty(self, span: TimeSpan) -> tuple[str, str]:
         """Mark a time span as faulty: it is never learned from.
 
-        If the version in force was learned from it, the newest taken version that was not replaces it.
+        If the version in force was learned from it, the newest version of the same fans that was not replaces it:
+        neither one from before a change of the fans that operators accepted, nor one that is only offered.
 
         Returns:
             the version that was in force and the one that is now; both empty where the one in force was not
@@ -249,9 +283,12 @@ class TwinVersions:
             UserError: as `add`.
         """
         with self._changing() as listed:
-            tainted = {version.name for version in listed.versions if overlap(version.learned_spans, [span])}
-            clean = [v.name for v in listed.versions if v.outcome == "taken" and v.name not in tainted]
-            was, now = (listed.in_force, clean[-1] if clean else "") if listed.in_force in tainted else ("", "")
+            now_in_force, was, now = listed.current, "", ""
+            if now_in_force and overlap(now_in_force.learned_spans, [span]):
+                same_fans = [v for v in listed.versions if v.since_t_ns == now_in_force.since_t_ns]
+                faulty = (*listed.faulty, span)
+                clean = [v.name for v in same_fans if v != listed.waiting and not overlap(v.learned_spans, faulty)]
+                was, now = now_in_force.name, clean[-1] if clean else ""
             update = {"faulty": (*listed.faulty, span), "in_force": now or listed.in_force}
             update["is_chosen"] = bool(now) or listed.is_chosen
             self._write(listed.model_copy(update=update))

@@ -1,6 +1,6 @@
 """The next version of a learned twin, from the healthy history of its tray.
 
-First the speeds of the fans over the newest healthy day are checked against the reference. Where they have changed more
+First the speeds of the fans over the newest healthy hours are checked against the reference. Where they changed more
 than those of healthy fans do, the new version is trained on what came after, and is offered to the operator. Otherwise
 a new twin is compared with the one in force on what neither has seen. Unless it is clearly better, the new version is
 the twin in force with new limits.
@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -28,7 +30,7 @@ from pipeline.cli.twins.training_data import TrainingData, twin_errors
 from pipeline.cli.twins.version_data import Split, newest_long, newest_recordings, split, spread_parts
 from pipeline.errors import UserError
 from pipeline.learning.healthy_history import HealthyRecording, healthy_recordings
-from pipeline.learning.versions import Check, Drop, Outcome, TwinVersions, Version, VersionList
+from pipeline.learning.versions import Check, Drop, Outcome, TwinVersions, Version, VersionList, overlap
 from pipeline.recordings.runs import read_runs
 from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.calibration.calibration import too_little
@@ -47,8 +49,12 @@ BETTER = 0.98
 """times the error of the twin in force: a new one must be below it"""
 REFERENCE_S = 24 * 3600.0
 """of healthy running that a reference is learned from; until there is one, every change of speed is taken as healthy"""
-CHECKED_S = 24 * 3600.0
-"""of healthy running over which the speeds of the fans are compared with the reference"""
+CHECKED_S = 4 * 3600.0
+"""of healthy running over which the speeds of the fans are compared with the reference, the newest: longer than the
+air of a room varies, and not so long that a change is diluted by the time before it"""
+LEAST_CHECKED_S = 3600.0
+"""of healthy running since a version was offered: with less nothing is known about how the fans are since then"""
+WORK_PREFIX = "learning-"
 
 
 def make_next_version(
@@ -64,25 +70,46 @@ def make_next_version(
         UserError: there is nothing to learn from, or too little; a file cannot be read or written.
     """
     versions = TwinVersions(folder, tray)
-    listed, name = versions.read(), versions.next_name()
+    with versions.learning():
+        return _next_version(versions, per_day, say, only_if_changed=only_if_changed)
+
+
+def _next_version(
+    versions: TwinVersions, per_day: float, say: Callable[[str], None], *, only_if_changed: bool
+) -> Version | None:
+    folder, listed, name = versions.folder, versions.read(), versions.next_name()
     recordings = healthy_recordings(folder, listed.excluded_spans)
     if not recordings:
         raise UserError(f"{folder}: no healthy history to learn from yet")
-    with tempfile.TemporaryDirectory(prefix="learning-", dir=folder) as place:
+    for left in folder.glob(f"{WORK_PREFIX}*"):  # of a process that was killed
+        shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=WORK_PREFIX, dir=folder) as place:
         work = _Work(Path(place), name, versions.file, listed, recordings, per_day, say)
         check = work.checked()
         versions.add_check(check)
         if only_if_changed and not (check.found and work.needs_offer()):
             return None
         version, content = work.offered(check.found) if check.found else work.taken()
-    unfinished = folder / f"{name}.onnx.new"
+    _write(versions.file(name), content)
     try:
-        unfinished.write_bytes(content)
-        unfinished.replace(versions.file(name))
-    except OSError as error:
-        raise UserError(f"{versions.file(name)}: cannot be written: {error.strerror}") from error
-    versions.add(version)
+        versions.add(version, listed)
+    except UserError:
+        versions.file(name).unlink(missing_ok=True)
+        raise
     return version
+
+
+def _write(path: Path, content: bytes) -> None:
+    """The whole file or none, also after a power cut: the list must never name a file that is not there."""
+    unfinished = path.with_name(f"{path.name}.new")
+    try:
+        with unfinished.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 class _Work:
@@ -105,21 +132,31 @@ class _Work:
         self._most_s = MOST_TRAINING_SAMPLES / rate_hz
         needed_s = 3600.0 * too_little(0.0, per_day).needed_fan_hours / fans
         self._calibration_recordings = newest_recordings(recordings, max(WANTED_S, MARGIN * needed_s))
-        since = [each for each in recordings if each.span[0] >= listed.commissioned_t_ns] or recordings[-1:]
-        self._day = newest_recordings(since, CHECKED_S)
+        since_t_ns = max(listed.commissioned_t_ns, listed.waiting.made_t_ns if listed.waiting else 0)
+        since = [each for each in recordings if each.span[0] >= since_t_ns]
+        self._newest = newest_recordings(since or recordings[-1:], CHECKED_S)
 
     def checked(self) -> Check:
-        """The speeds of the fans over the newest day beside the reference. Without a reference nothing has changed."""
+        """The speeds of the fans over the newest hours beside the reference. Without a reference nothing has changed.
+        What was found stays while too little is known since then."""
         reference, newest_t_ns = self._reference(), self._recordings[-1].span[1]
+        last = self._listed.check
+        if last and self._listed.waiting and sum(each.seconds for each in self._newest) < LEAST_CHECKED_S:
+            return last
         if reference is None:
             return Check(t_ns=newest_t_ns, reference="", change=(), found="", spans=())
         self._say(f"{self._name}: checking the fans against {reference.name}")
         change = self._change_since(reference)
         found = changed_fans(change, reference.name)
-        spans = tuple(each.span for each in self._day) if found else ()
+        spans = tuple(each.span for each in self._recordings if found and each.span[1] > self._unchanged_t_ns())
         return Check(
             t_ns=newest_t_ns, reference=reference.name, change=tuple(change.tolist()), found=found, spans=spans
         )
+
+    def _unchanged_t_ns(self) -> int:
+        """Until then the fans are known to have been as when the reference was made."""
+        last, taken = self._listed.check, (v.made_t_ns for v in self._listed.versions if v.outcome == "taken")
+        return max(last.t_ns if last and not last.found else 0, *taken, 0)
 
     def needs_offer(self) -> bool:
         """Whether the fans have changed otherwise than when a version was last offered, or none is."""
@@ -127,14 +164,14 @@ class _Work:
         return last is None or bool(changed_fans(self._change_since(last), last.name))
 
     def _change_since(self, version: Version) -> Array:
-        """(fans,) by which share the mean speeds over the newest day have changed since a version was made."""
-        return mean_changes(self._file_of(version.name), spread_parts(self._day)) - np.array(version.change)
+        """(fans,) by which share the mean speeds over the newest hours have changed since a version was made."""
+        return mean_changes(self._file_of(version.name), spread_parts(self._newest)) - np.array(version.change)
 
     def offered(self, changed: str) -> tuple[Version, bytes]:
         """A version of the fans after their change. changed: it, in words."""
-        first = self._recordings.index(newest_long(self._day))
+        first = self._recordings.index(newest_long(self._newest))
         after = self._recordings[first:]
-        self._calibration_recordings = self._day = list(after)
+        self._calibration_recordings = self._newest = list(after)
         parts = split(after, self._most_s)
         return self._made(
             self._trained(parts),
@@ -155,7 +192,9 @@ class _Work:
         in_force, reference = self._file_of(before.name), self._reference()
         error, error_before = _error(trained, test), _error(in_force, test)
         compared = f"error {error:.3g} {test.speed_unit}, that of {before.name} {error_before:.3g}"
-        if error < BETTER * error_before:
+        if self._listed.is_tainted:
+            compared = f"{before.name} was learned from a time that is marked as faulty; {compared}"
+        if error < BETTER * error_before or self._listed.is_tainted:
             return self._made(trained, "trained", test, "taken", compared, reference)
         why = f"a newly trained twin is less than 2 % better: {compared}"
         return self._made(in_force, "new limits", test, "taken", why, reference)
@@ -165,7 +204,8 @@ class _Work:
         if self._before is None:
             return None
         named = next(version for version in self._listed.versions if version.name == self._before.reference)
-        return named if named.learned_s >= REFERENCE_S else None
+        is_tainted = overlap(named.learned_spans, self._listed.faulty)
+        return named if named.learned_s >= REFERENCE_S and not is_tainted else None
 
     def _made(
         self,
@@ -182,6 +222,9 @@ class _Work:
         """The version of a twin, with limits. reference: None: itself. learned, since_t_ns: None: all recordings, and
         as the version in force."""
         before = self._before
+        spans = {each.span for each in learned or self._recordings}
+        if before and how == "new limits":
+            spans |= set(before.learned_spans)  # of its weights
         limited = self._with_limits(twin, test)
         assert limited.limits.declared_rate
         of_reference = self._file_of(reference.name) if reference else twin
@@ -190,12 +233,12 @@ class _Work:
             how=how,
             made_t_ns=self._recordings[-1].span[1],
             hours=sum(each.seconds for each in self._calibration_recordings) / 3600.0,
-            learned_spans=tuple(each.span for each in learned or self._recordings),
+            learned_spans=tuple(sorted(spans)),
             since_t_ns=since_t_ns if since_t_ns is not None else before.since_t_ns if before else 0,
             speed_unit=test.speed_unit,
             error=_error(twin, test),
             error_before=_error(self._file_of(before.name), test) if before else None,
-            change=tuple(mean_changes(of_reference, spread_parts(self._day)).tolist()),
+            change=tuple(mean_changes(of_reference, spread_parts(self._newest)).tolist()),
             reference=reference.name if reference else self._name,
             drops=limited.drops,
             declared_per_day=self._per_day,

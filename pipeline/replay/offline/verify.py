@@ -1,7 +1,12 @@
-"""Comparing replayed scores and alarms with the recorded ones, to the bit."""
+"""Comparing replayed scores and alarms with the recorded ones, to the bit.
+
+Only the numbers of causes (probability, size and its interval) may differ by CAUSE_TOLERANCE: they come from a linear
+regression, whose last digits depend on the processor.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -17,6 +22,8 @@ from schemas.fast_decode import decode_header, decode_together
 from schemas.fields import columns
 from schemas.messages import Alarm, Array, Score, Transition
 
+CAUSE_TOLERANCE = 1e-6
+"""relative"""
 MAX_NAMED = 5
 """differences that are described"""
 _BLOCK_MESSAGES = 512
@@ -208,7 +215,7 @@ def compare_alarms(
     left = {(alarm.fan, alarm.t_ns, alarm.transition, alarm.request): alarm for alarm in recorded}
     for alarm in made:
         other = left.pop((alarm.fan, alarm.t_ns, alarm.transition, alarm.request), None)
-        if other is not None and _decided(alarm) == _decided(other):
+        if other is not None and _decided(alarm) == _decided(other) and _have_same_causes(alarm, other):
             found.alarms_equal += 1
         elif limit is not None and alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
@@ -264,8 +271,23 @@ def _name_first(
 
 def _decided(alarm: Alarm) -> tuple[Any, ...]:
     """What is compared. The line of a republished alarm is not: it follows from the flags, and was worded otherwise."""
-    left_out = {"header", "message"} if alarm.transition == Transition.REPUBLISHED else {"header"}
+    left_out = {"header", "causes", *(["message"] if alarm.transition == Transition.REPUBLISHED else [])}
     return tuple(getattr(alarm, f.name) for f in fields(alarm) if f.name not in left_out)
+
+
+def _have_same_causes(one: Alarm, other: Alarm) -> bool:
+    """Whether the same causes are named, in the same order and words, with the same numbers within the tolerance."""
+    return len(one.causes) == len(other.causes) and all(
+        _is_same(getattr(cause, f.name), getattr(beside, f.name))
+        for cause, beside in zip(one.causes, other.causes, strict=True)
+        for f in fields(cause)
+    )
+
+
+def _is_same(value: object, other: object) -> bool:
+    if isinstance(value, float) and isinstance(other, float):
+        return math.isclose(value, other, rel_tol=CAUSE_TOLERANCE, abs_tol=CAUSE_TOLERANCE**2)
+    return value == other
 
 
 def _describe(alarm: Alarm) -> str:

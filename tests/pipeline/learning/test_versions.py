@@ -130,3 +130,48 @@ def test_an_unknown_version_and_a_damaged_list_are_refused_in_one_line(versions:
     (versions.folder / "versions.json").write_text("{", encoding="utf-8")
     with pytest.raises(UserError, match=r"versions\.json: cannot read the versions of the twin: .*; move it away"):
         versions.all()
+
+
+def test_what_operators_do_while_a_version_is_made_is_kept(versions: TwinVersions) -> None:
+    versions.add(version("tray1-1", 2))
+    versions.add(version("tray1-2", 3))
+    seen = versions.read()
+    versions.use("tray1-1")
+    with pytest.raises(UserError, match="tray1-3 is not used: tray1-1 was put in force while it was made"):
+        versions.add(version("tray1-3", 4), seen)
+    seen = versions.read()
+    versions.mark_faulty((3 * DAY_NS, 3 * DAY_NS + 1))
+    with pytest.raises(UserError, match="tray1-3 is not used: it was learned from a time that is marked as faulty"):
+        versions.add(version("tray1-3", 4), seen)
+    assert in_force(versions) == "tray1-1"
+
+
+def test_one_version_is_made_at_a_time(versions: TwinVersions) -> None:
+    with (
+        versions.learning(),
+        pytest.raises(UserError, match="another `fantwin learn` works here"),
+        TwinVersions(versions.folder, "tray1").learning(),
+    ):
+        pass
+    with versions.learning():
+        assert versions.next_name() == "tray1-1"
+
+
+def test_the_name_of_a_file_that_is_there_is_never_given_again(versions: TwinVersions) -> None:
+    versions.add(version("tray1-1", 2))
+    for name in ("tray1-1", "tray1-2"):
+        versions.file(name).write_bytes(b"")
+    (versions.folder / "versions.json").unlink()
+    assert versions.next_name() == "tray1-3"
+
+
+def test_a_faulty_day_does_not_bring_back_a_twin_from_before_an_accepted_change(versions: TwinVersions) -> None:
+    since = 3 * DAY_NS
+    versions.add(version("tray1-1", 2))
+    versions.add(version("tray1-2", 4, outcome="offered", since_t_ns=since, learned_spans=((since, since + 5),)))
+    versions.use("tray1-2")
+    later = 9 * DAY_NS
+    versions.add(version("tray1-3", 10, since_t_ns=since, learned_spans=((since, since + 5), (later, later + 5))))
+    assert versions.mark_faulty((later, later + 1)) == ("tray1-3", "tray1-2")
+    assert versions.mark_faulty((since, since + 1)) == ("tray1-2", "")
+    assert versions.read().is_tainted
