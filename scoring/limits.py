@@ -57,7 +57,7 @@ class DeclaredRate(_Entry):
     fan_hours: float = Field(gt=0, description="length of the healthy runs, summed over fans")
     runs: int = Field(ge=1, description="number of runs")
     data: tuple[dict[str, Any], ...] = Field(
-        default=(), description="the recordings: name and SHA-256, and from_s, to_s of a part"
+        default=(), description="the recordings: name and SHA-256, from_s, to_s of a part, tray of several"
     )
     created: str = Field(default="", description="when, ISO 8601")
 

@@ -6,6 +6,7 @@ import json
 import re
 import signal
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -34,54 +35,58 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
     return path
 
 
-@pytest.fixture
-def tray(tmp_path: Path) -> Iterator[RunningCommand]:
-    words = (
-        "simulate",
-        "--fans",
-        FANS,
-        "--speed-unit",
-        "rpm",
-        "--link",
-        tmp_path / "line",
-        "--profile",
-        "prbs",
-        "--json",
-    )
+@contextmanager
+def playing(link: Path, fans: int) -> Iterator[RunningCommand]:
+    """A simulated tray, whose plant moves its fans."""
+    words = ("simulate", "--fans", fans, "--speed-unit", "rpm", "--link", link, "--profile", "prbs", "--json")
     tray = RunningCommand(words)
     try:
-        tray.line_with("fans on")
+        tray.line_with(" on ")
         yield tray
     finally:
         tray.kill()
 
 
+@pytest.fixture
+def tray(tmp_path: Path) -> Iterator[RunningCommand]:
+    with playing(tmp_path / "line", FANS) as tray:
+        yield tray
+
+
 @pytest.mark.timeout(400)
-def test_a_tray_that_its_plant_moves_gets_a_calibrated_twin(
+def test_trays_that_their_plant_moves_get_calibrated_twins(
     configuration: Path, tray: RunningCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(commission, "stop_on_signals", lambda _stop: None)  # this process has its own
     for name, least in (("NEEDED_RANGES", 2), ("NEEDED_S", 3.0), ("NEEDED_CHANGES", 2)):
         monkeypatch.setattr(ordinary_operation, name, least)
-    before = configuration.read_text(encoding="utf-8")
-    result = fantwin("commission", "-c", configuration, "--minutes", 0.6, "--json")
+    line = configuration.with_name("other-line")
+    other = f'[[tray]]  # other\nname = "b"\nfans = 1\nspeed_unit = "rpm"\nport = "{line}"\n'
+    before = configuration.read_text(encoding="utf-8") + other
+    configuration.write_text(before, encoding="utf-8")
+    with playing(line, 1):
+        result = fantwin("commission", "-c", configuration, "--minutes", 0.7, "--json")
     assert not result.exception, result.exception
     found = json.loads(result.stdout)
-    after = configuration.read_text(encoding="utf-8")
-    assert after == before.replace("# of the laboratory\n", '# of the laboratory\ntwin = "tray1.onnx"\n')
-    twin = load_tray_twin(configuration.with_name("tray1.onnx"), FANS)
-    declared = Limits.model_validate(twin.card.calibration).declared_rate
-    assert declared
-    assert declared.extrapolated
-    assert found["extrapolated"]
-    assert found["false_alarms_per_day"] == 1.0
-    assert load_config(configuration).trays[0].twin == Path("tray1.onnx")
+    after = before.replace("# of the laboratory\n", '# of the laboratory\ntwin = "tray1.onnx"\n')
+    after = after.replace("# other\n", '# other\ntwin = "b.onnx"\n')
+    assert configuration.read_text(encoding="utf-8") == after
+    assert [tray.twin for tray in load_config(configuration).trays] == [Path("tray1.onnx"), Path("b.onnx")]
+    for its, fans in zip(found["trays"], (FANS, 1), strict=True):
+        twin = load_tray_twin(configuration.with_name(its["entry"]), fans)
+        declared = Limits.model_validate(twin.card.calibration).declared_rate
+        assert declared
+        assert declared.extrapolated
+        assert its["extrapolated"]
+        assert its["false_alarms_per_day"] == 1.0
+        assert its["fan_hours"] == pytest.approx(fans * 2 * 0.7 / 60, rel=0.25)
+        assert twin.card.training.data[0].name == "recording.mcap"
+        assert twin.card.fans == fans
     assert [Path(name).name for name in found["recordings"]] == [
         "recording.mcap",
         "recording-2.mcap",
         "recording-3.mcap",
     ]
-    assert twin.card.training.data[0].name == "recording.mcap"
 
 
 def test_beside_a_running_site_it_is_refused_and_what_is_killed_leaves_no_recorder_behind(

@@ -45,6 +45,10 @@ def calibrate(
     ] = None,
     from_s: FromOption = 0.0,
     to_s: ToOption = math.inf,
+    tray: Annotated[
+        str | None,
+        typer.Option(help="Use only this tray of the recordings, also of those to verify. Without it all are used."),
+    ] = None,
     verify: Annotated[
         list[Path] | None,
         typer.Option(
@@ -92,7 +96,7 @@ def calibrate(
             raise UserError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
         with interruptible("nothing was written"):
             limits, warning, speed_unit = _calibrated(
-                twin, healthy, (from_s, to_s), false_alarms_per_day, extrapolate, overrides or [], seed
+                twin, healthy, (from_s, to_s), tray, false_alarms_per_day, extrapolate, overrides or [], seed
             )
         output = output or twin
         _write(twin, output, limits)
@@ -104,7 +108,7 @@ def calibrate(
             typer.echo(warning, err=True)
         if not json_output:
             _print(output, limits, drop_lines(drops, speed_unit))
-    check = check_declared_rate(output or twin, verify, overrides or []) if verify else None
+    check = check_declared_rate(output or twin, verify, overrides or [], tray) if verify else None
     if check:
         result["verify"] = check.as_json()
     if json_output:
@@ -119,6 +123,7 @@ def _calibrated(
     twin: Path,
     healthy: list[Path],
     part_s: tuple[float, float],
+    tray: str | None,
     per_day: float,
     extrapolate: bool,
     overrides: list[str],
@@ -130,7 +135,7 @@ def _calibrated(
     if top_speed_rad_s <= 0.0:
         raise UserError(f"{twin}: its training data have no speed above zero (speed_range_rad_s): train it again")
     with working("scoring healthy recordings") as show:
-        runs = HealthyRuns(healthy, twin, overrides, show, *part_s)
+        runs = HealthyRuns(healthy, twin, overrides, show, *part_s, tray)
         timing = runs.timing()
         try:
             longest_fan_s = runs.longest_fan_s()  # however much of it can be scored
@@ -148,17 +153,18 @@ def _calibrated(
     assert limits.declared_rate
     declared_rate = limits.declared_rate.model_copy(
         update={
-            "data": tuple({"name": path.name, "sha256": sha256_of(path), **_part(*part_s)} for path in healthy),
+            "data": tuple({"name": path.name, "sha256": sha256_of(path), **_part(*part_s, tray)} for path in healthy),
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         }
     )
     return limits.model_copy(update={"declared_rate": declared_rate}), warning, runs.speed_unit
 
 
-def _part(from_s: float, to_s: float) -> dict[str, float]:
+def _part(from_s: float, to_s: float, tray: str | None) -> dict[str, float | str]:
     """The part of each recording, for the card; empty for the whole."""
-    wanted = {"from_s": from_s} if from_s > 0.0 else {}
-    return wanted | ({"to_s": to_s} if to_s < math.inf else {})
+    wanted: dict[str, float | str] = {"from_s": from_s} if from_s > 0.0 else {}
+    wanted |= {"to_s": to_s} if to_s < math.inf else {}
+    return wanted | ({"tray": tray} if tray else {})
 
 
 def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path], overrides: list[str]) -> None:

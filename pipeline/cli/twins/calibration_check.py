@@ -73,8 +73,12 @@ class Check:
         }
 
 
-def check_declared_rate(twin: Path, recordings: Sequence[Path], overrides: Sequence[str]) -> Check:
+def check_declared_rate(
+    twin: Path, recordings: Sequence[Path], overrides: Sequence[str], tray: str | None = None
+) -> Check:
     """Count alarms on other healthy recordings, processed as by `fantwin replay --offline`.
+
+    tray: the only one that is used; without it all are.
 
     Raises:
         UserError: the twin declares no rate or was made from one of the recordings, a recording cannot be used, or none
@@ -90,12 +94,12 @@ def check_declared_rate(twin: Path, recordings: Sequence[Path], overrides: Seque
     with working("scoring other healthy recordings") as show:
         for path in recordings:
             show(f"verifying: {path}")
-            with open_replay_input([path], None, overrides, twin) as replay_input:
-                for tray, rescored in zip(replay_input.trays, rescore(replay_input, None, False), strict=True):
+            with open_replay_input([path], None, overrides, twin, tray=tray) as replay_input:
+                for each, rescored in zip(replay_input.trays, rescore(replay_input, None, False), strict=True):
                     if rescored.problem:
                         raise UserError(f"{path}: {rescored.problem}")
                     alarms += len(episodes(rescored.alarms))
-                    fan_samples = rescored.samples * tray.fans - rescored.not_judged.total()
+                    fan_samples = rescored.samples * each.fans - rescored.not_judged.total()
                     fan_hours += fan_samples * rescored.period_ns / NS_PER_HOUR
     return Check(alarms, fan_hours, declared.false_alarms_per_day)
 

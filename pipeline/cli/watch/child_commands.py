@@ -8,13 +8,13 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from pipeline.bus.session import Bus
-from pipeline.config.models import Config
+from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UserError
 from pipeline.selftest.scratch_site import FANTWIN
 from schemas.codec import CodecError, decode
@@ -54,7 +54,7 @@ class Commands:
         child = _started(line, stdout=STANDARD_ERROR if self.to_standard_error else None)
         self.wait(child, site)
         if child.returncode:
-            raise UserError(f"`fantwin {line[0]}` failed (exit code {child.returncode}); see the lines before this one")
+            raise UserError(f"`fantwin {line[0]}` failed (exit code {child.returncode}) and has said why")
 
     def wait(self, child: subprocess.Popen[str], site: RecordingSite | None = None) -> None:
         """Wait for its end, and end it early if its site ends or the user wants to stop."""
@@ -72,17 +72,20 @@ class Commands:
 
 
 class RecordingSite:
-    """`fantwin up` with only the stages that record, and the samples of its tray, while in its context."""
+    """`fantwin up` with only the stages that record, and the samples of some of its trays, while in its context."""
 
-    def __init__(self, commands: Commands, config: Config, configured: list[str], log: Path) -> None:
-        """configured: the words that give a command this configuration. log: what `up` says is added to it."""
+    def __init__(
+        self, commands: Commands, config: Config, configured: list[str], log: Path, trays: Sequence[TrayConfig]
+    ) -> None:
+        """configured: the words that give a command this configuration. log: what `up` says is added to it. trays:
+        those whose samples are wanted; all of the configuration are recorded."""
         self._commands = commands
         self._config = config
-        self._tray = config.trays[0]
+        self._fans = {tray.name: tray.fans for tray in trays}
         self._words = ["up", *configured, "--json", "--until-stdin-closes", *RECORDING_ONLY]
         self._log = log
         self._received: list[bytes] = []
-        self._last_sample_s = time.monotonic()
+        self._last_sample_s = dict.fromkeys(self._fans, time.monotonic())
         self._lock = threading.Lock()
         self.recordings: list[Path] = []
         """after the end"""
@@ -94,7 +97,8 @@ class RecordingSite:
             self._up = _started(self._words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
         try:
             self._bus = Bus(self._config.bus, listens=False)
-            self._bus.subscribe(tray_key(self._config.site, self._tray.name, "raw"), self._take)
+            for tray in self._fans:
+                self._bus.subscribe(tray_key(self._config.site, tray, "raw"), self._take)
         except BaseException:
             self._end()
             raise
@@ -132,7 +136,7 @@ class RecordingSite:
             pass
 
     def wait(self, seconds: float) -> list[Raw]:
-        """Wait; returns the samples that have arrived since the last call.
+        """Wait; returns the samples of the wanted trays that have arrived since the last call.
 
         Raises:
             Stopped: the user wants to stop.
@@ -144,14 +148,21 @@ class RecordingSite:
         with self._lock:
             received, self._received = self._received, []
         samples = [
-            message for message in map(_raw, received) if message is not None and message.fans == self._tray.fans
+            message
+            for message in map(_raw, received)
+            if message is not None and message.fans == self._fans.get(message.header.tray)
         ]
-        now_s = time.monotonic()
-        if samples:
-            self._last_sample_s = now_s
-        elif now_s - self._last_sample_s > SILENT_S:
-            raise UserError(f"no sample for {SILENT_S:.0f} s: {self._last_line()} (all lines: {self._log})")
+        self._last_sample_s |= dict.fromkeys((message.header.tray for message in samples), time.monotonic())
+        silences = [self.silence_of(tray) for tray in self._fans]
+        if all(silences):
+            raise UserError(silences[0])
         return samples
+
+    def silence_of(self, tray: str) -> str:
+        """That no sample of a tray has arrived for long, and the last line of `up`; empty if one has."""
+        if time.monotonic() - self._last_sample_s[tray] <= SILENT_S:
+            return ""
+        return f"no sample for {SILENT_S:.0f} s: {self._last_line()} (all lines: {self._log})"
 
     def _end(self) -> None:
         answer, _ = self._up.communicate()  # closes its standard input, at which it stops in order

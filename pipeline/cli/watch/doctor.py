@@ -9,7 +9,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Annotated
@@ -43,6 +43,10 @@ def doctor(
     listen_s: Annotated[
         float, typer.Option(min=0.0, max=600.0, help="How long to listen to the line of each tray; 0: not at all.")
     ] = 2.0,
+    trays: Annotated[
+        list[str] | None,
+        typer.Option("--tray", metavar="NAME", help="Check only the source and the line of this tray. Repeatable."),
+    ] = None,
 ) -> None:
     """Check the installation, and a configuration if one is given.
 
@@ -53,7 +57,7 @@ def doctor(
     Example: fantwin doctor -c fantwin.toml
     """
     problems, good = [], []
-    for ok, line in _findings(config, overrides, listen_s):
+    for ok, line in _findings(config, overrides, listen_s, trays or []):
         (good if ok else problems).append(line)
     if json_output:
         typer.echo(json.dumps({"ok": not problems, "problems": problems, "good": good}))
@@ -67,14 +71,17 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _findings(config: Path | None, overrides: list[str] | None, listen_s: float) -> Iterator[tuple[bool, str]]:
-    """(in order or not, one line) for each check."""
+def _findings(
+    config: Path | None, overrides: list[str] | None, listen_s: float, trays: list[str]
+) -> Iterator[tuple[bool, str]]:
+    """(in order or not, one line) for each check. trays: those whose lines are checked; empty for all."""
     yield True, f"Python {sys.version.split()[0]}"
     yield from _check_packages()
     if config is None:
         return
     try:
         settings = load_config(config, overrides or ())
+        lines = {settings.tray(name).name for name in trays} or {tray.name for tray in settings.trays}
     except ConfigError as error:
         yield False, str(error)
         return
@@ -82,7 +89,7 @@ def _findings(config: Path | None, overrides: list[str] | None, listen_s: float)
     yield from _check_run_folder(settings.run_folder)
     running: dict[str, Session] = {}
     yield from _check_bus(settings, running)
-    yield from _check_stages(settings, running, listen_s)
+    yield from _check_stages(settings, running, listen_s, lines)
 
 
 def _check_packages() -> Iterator[tuple[bool, str]]:
@@ -153,8 +160,11 @@ def running_sessions(settings: Config) -> dict[str, Session]:
     return {session.name: session for session in sessions}
 
 
-def _check_stages(config: Config, running: Mapping[str, Session], listen_s: float) -> Iterator[tuple[bool, str]]:
-    for row in process_list(config):
+def _check_stages(
+    config: Config, running: Mapping[str, Session], listen_s: float, lines: Collection[str]
+) -> Iterator[tuple[bool, str]]:
+    """lines: the trays whose own processes are checked."""
+    for row in (row for row in process_list(config) if row.tray is None or row.tray in lines):
         session = running.get(row.label)
         is_here = session is not None and session.host == Session.of_this_process(row.stage, row.instance, 0, "").host
         stage = load_stage(row.stage)

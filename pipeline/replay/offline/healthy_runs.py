@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
 from pipeline.recordings.length import longest_s
-from pipeline.replay.offline.replay_input import open_replay_input
+from pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
 from schemas.units import NS_PER_S, SpeedUnit
@@ -49,9 +50,12 @@ class HealthyRuns:
         progress: Callable[[str], None],
         from_s: float = 0.0,
         to_s: float = math.inf,
+        tray: str | None = None,
     ) -> None:
-        """from_s, to_s: the part of each recording, in seconds since the first sample of the tray."""
+        """from_s, to_s: the part of each recording, in seconds since the first sample of the tray. tray: the only one
+        of each recording that is used; without it all are."""
         self._from_s, self._to_s = from_s, to_s
+        self._tray = tray
         self._paths = paths
         self._twin = twin
         self._overrides = overrides
@@ -109,7 +113,7 @@ class HealthyRuns:
         scorers: dict[Path, Any] = {}
         trays: list[RecordedTray] = []
         for path in self._paths:
-            with open_replay_input([path], None, self._overrides, self._twin) as replay_input:
+            with self._opened(path) as replay_input:
                 scorers[path] = replay_input.config.sections["scorer"]
                 trays += [RecordedTray(path, tray.name, tray.fans) for tray in replay_input.trays]
         _refuse_one_fan_among_several(trays)
@@ -133,7 +137,7 @@ class HealthyRuns:
         """
         total_s = 0.0
         for path in self._paths:
-            with open_replay_input([path], None, self._overrides, self._twin) as replay_input:
+            with self._opened(path) as replay_input:
                 fans = sum(tray.fans for tray in replay_input.trays)
                 recorded_s = CLOCK_MARGIN * longest_s(path, replay_input.first_sample_t_ns) + 1.0
             part_s = min(recorded_s, self._to_s) - self._from_s
@@ -149,17 +153,19 @@ class HealthyRuns:
         Raises:
             UserError: it cannot be used.
         """
-        with open_replay_input([self._paths[0]], None, self._overrides, self._twin) as replay_input:
+        with self._opened(self._paths[0]) as replay_input:
             return replay_input.trays[0].speed_unit
 
     def _of(self, path: Path) -> Iterator[tuple[RecordedTray, Iterator[Samples]]]:
-        part_s = self._from_s, self._to_s
-        with open_replay_input([path], None, self._overrides, self._twin, *part_s) as replay_input:
+        with self._opened(path, self._from_s, self._to_s) as replay_input:
             for tray in replay_input.trays:
                 name = tray.name
                 predictions = replay_input.pipeline(name).predictions()
                 samples = (samples_of(block, self._unseen_error) for block in predictions)
                 yield RecordedTray(path, name, tray.fans), samples
+
+    def _opened(self, path: Path, from_s: float = 0.0, to_s: float = math.inf) -> AbstractContextManager[ReplayInput]:
+        return open_replay_input([path], None, self._overrides, self._twin, from_s, to_s, self._tray)
 
 
 def _refuse_one_fan_among_several(trays: Sequence[RecordedTray]) -> None:
@@ -174,7 +180,7 @@ def _refuse_one_fan_among_several(trays: Sequence[RecordedTray]) -> None:
         raise UserError(
             f"{alone.path} has a tray of one fan and {beside_others.path} one of {beside_others.fans}, and limits hold "
             "for one kind of tray, since fans beside others are compared with them: calibrate twice, and write one of "
-            "the twins to another file with -o"
+            "the twins to another file with -o; --tray chooses a tray of recordings with several"
         )
 
 

@@ -133,10 +133,12 @@ def open_replay_input(
     twin: Path | None,
     start_s: float = 0.0,
     end_s: float = math.inf,
+    tray: str | None = None,
 ) -> Iterator[ReplayInput]:
     """Open the parts of a recording, to be replayed with its own configuration and twins, or with others.
 
-    config: another configuration. overrides: keys set on top, as `key=value`. twin: for all trays.
+    config: another configuration. overrides: keys set on top, as `key=value`. twin: for all trays that are replayed.
+    tray: only this one is replayed.
 
     Raises:
         RecordingError: a part cannot be read, there are no raw samples, or there is no twin and none is given.
@@ -150,6 +152,8 @@ def open_replay_input(
     for path in ordered[1:]:
         _refuse_another_run(ordered[0], metadata, path)
     first = first_raw(ordered, metadata)
+    if tray is not None and tray not in first:
+        raise RecordingError(f"{ordered[0]}: no raw samples of tray {tray!r}; it has {', '.join(first)}")
     first_sample_t_ns = min(int(messages[0].host_receive_t_ns[0]) for messages in first.values())
     stages = decision_chain()
     with tempfile.TemporaryDirectory() as folder:
@@ -166,13 +170,13 @@ def open_replay_input(
             if any_twin is None:
                 raise RecordingError(f"{ordered[0]}: no twin in this recording: name one with --twin FILE.onnx")
             base = default_config(ordered[0], metadata, first, any_twin, overrides, stages.names)
-        trays = tuple(base.tray(name) for name in first)
+        trays = tuple(base.tray(name) for name in first if tray in (None, name))
         is_as_recorded = attached is not None and config is None and not overrides and twin is None
         yield ReplayInput(
             paths=ordered,
             metadata=metadata,
             config=replace(base, trays=trays),
-            twins={tray.name: _twin_of(tray, base, attached, recorded, twin, ordered) for tray in trays},
+            twins={each.name: _twin_of(each, base, attached, recorded, twin, ordered) for each in trays},
             started_t_ns=_started_t_ns(ordered[0], metadata, first_sample_t_ns),
             first_sample_t_ns=first_sample_t_ns,
             is_as_recorded=is_as_recorded,

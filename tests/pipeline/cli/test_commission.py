@@ -13,6 +13,8 @@ from schemas.messages import Raw
 from schemas.units import NS_PER_S
 from tests.support.fantwin_command import error_of
 
+OTHER = '[[tray]]\nname = "b"\nfans = 1\nport = "other"\ncommand_max = 0.1'
+THIRD = '[[tray]]\nname = "kept"\nfans = 1\nport = "third"'
 TRAY = TrayConfig.model_validate({"name": "tray1", "fans": 2, "command_max": 100.0})
 
 
@@ -76,11 +78,17 @@ def test_a_command_that_flickers_between_two_ranges_does_not_change_and_gaps_do_
             "launcher.stages leaves out twin_integrator, scorer",
         ),
         (
-            "",
-            '[[tray]]\nname = "b"\nfans = 1',
+            'twin = "old.onnx"',
+            '[[tray]]\nname = "b"\nfans = 1\ntwin = "b.onnx"',
             (),
-            "has trays tray1, b: commission each with a configuration of its own",
+            "tray tray1 has twin old.onnx, tray b has twin b.onnx already: remove `twin`",
         ),
+        ("", OTHER, ("-o", "new.onnx"), "-o names one twin, and trays tray1, b get one each: choose one with --tray"),
+        ("", OTHER, ("--tray", "c"), "fantwin.toml: no tray called 'c'; known: tray1, b"),
+        ('twin = "old.onnx"', OTHER, ("--tray", "tray1"), "tray tray1 has twin old.onnx already: remove `twin`"),
+        ("", OTHER, ("--sweep", "--low", "0.2"), "--low 0.2 --high 0.1: name a range within 0 to 0.1 of tray b"),
+        ("", OTHER, ("--sweep", "--safe", "0.5"), "the command must be within 0 to 0.1 of tray b"),
+        ("", f"{OTHER}\n{THIRD}", (), "kept.onnx: exists already: name another with --tray kept -o"),
         ("", "", ("-o", "kept.onnx"), "kept.onnx: exists already: name another with -o"),
         ("", "", ("-o", "twin.bin"), "name a file that ends in .onnx with -o"),
         ("", "", ("--low", "0.2"), "--low needs --sweep, which moves the fans: add --sweep"),

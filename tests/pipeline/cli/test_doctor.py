@@ -20,6 +20,7 @@ from pipeline.cli.watch import doctor as module
 from pipeline.cli.watch.doctor import doctor
 from pipeline.config.models import BusConfig
 from pipeline.runtime.sessions import Session
+from tests.support.fantwin_command import fantwin
 from tests.support.running_chain import DEMO
 
 
@@ -77,6 +78,23 @@ def test_each_problem_is_one_line_that_says_what_to_do(capsys, tmp_path, port, s
     assert not again or setting.startswith("run_folder")  # the recorder, too, says that it cannot write there
     for word in words:
         assert word in line
+
+
+def test_only_the_lines_of_the_named_trays_are_checked(tmp_path, port):
+    path = tmp_path / "fantwin.toml"
+    text = "".join(
+        f'[[tray]]\nname = "{name}"\nfans = 1\nport = "{line}"\n' for name, line in (("a", port), ("b", "none"))
+    )
+    path.write_text(text + '[launcher]\nstages = ["acquisition", "recorder"]\n', encoding="utf-8")
+
+    def problems(*words: str) -> list[str]:
+        return json.loads(fantwin("doctor", "-c", path, "--listen-s", 0, "--json", *words).stdout)["problems"]
+
+    (problem,) = problems()
+    assert problem.startswith("acquisition/b: ")
+    assert problems("--tray", "b") == [problem]
+    assert problems("--tray", "a") == []
+    assert problems("--tray", "c") == [f"{path}: no tray called 'c'; known: a, b"]
 
 
 def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(capsys, tmp_path, port, monkeypatch):
