@@ -84,7 +84,7 @@ class ScoredResidual:
     shared: Array
     """that part of it"""
     commissioned: Array
-    """the same at the end of commissioning; NaN before"""
+    """the fan's own baseline at the end of commissioning, at the reference speed; NaN before"""
     independent_intervals: Array
     at_limit: Array
     learned_scale: Array
@@ -192,7 +192,7 @@ class Residual:
             shift=shift,
             baseline=own + shared if self._shared else own,  # a sum would make -0.0 of older recordings 0.0
             shared=shared,
-            commissioned=np.where(baseline.is_commissioning, np.nan, baseline.commissioned * of.scaling),
+            commissioned=np.full(shape, np.where(baseline.is_commissioning, np.nan, baseline.commissioned)),
             independent_intervals=np.full(shape, self._independent_intervals),
             at_limit=np.full(shape, baseline.is_at_limit),
             learned_scale=np.full(shape, learned_scale),

@@ -33,7 +33,7 @@ class ScoredBlock:
     balance_shared: Array
     """what of the baseline the fans of the tray have in common"""
     balance_commissioned: Array
-    """the baseline at the end of commissioning; NaN before"""
+    """the fan's own baseline at the end of commissioning, at the reference speed; NaN before"""
     balance_at_limit: Array
     """whether the baseline is held at the adaptation limit"""
     speed_learned_scale: Array

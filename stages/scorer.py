@@ -50,6 +50,10 @@ SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
 NEW_START = "baselines, alarms and wear start from the beginning"
 OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
 ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
+FORMER_TWIN = (
+    "the snapshot is of the twin before: baselines and alarms start from the beginning, wear continues; "
+    f"{OPERATORS_KEPT}"
+)
 READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_KEPT}"
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
 NOT_CALIBRATED = (
@@ -74,14 +78,17 @@ class ScorerCore(Core):
         decision_rules: DecisionRules = CURRENT_RULES,
         started_t_ns: int | None = None,
         continues: ScorerSnapshot | None = None,
+        is_learned: bool = False,
     ) -> None:
         """snapshot_store: where snapshots are kept; None: nowhere, as in a replay. started_t_ns: the present time.
-        continues: the last snapshot of the twin before this one, instead of the one in the store."""
+        continues: the last snapshot of the twin before this one, instead of the one in the store. is_learned: the twin
+        is one of several of the same fans, so wear goes on from one to the next."""
         self._fans = fans
         self._twin = twin
         self._config = config
         self._text = AlarmText(speed_unit, twin.command_unit)
         self._decision_rules = decision_rules
+        self._is_learned = is_learned
         self._unscored = UnscoredMonitor(fans, max(1, round(config.not_judged_s * NS_PER_S)))
         self._snapshot_store = snapshot_store
         self._wrong_fans = 0
@@ -112,7 +119,8 @@ class ScorerCore(Core):
         """Continue from a snapshot. Returns the messages that report it.
 
         If it is of another twin, or its baselines or wear cannot be read, as after an update, only what belongs to
-        operators is restored: shelved, suppressed, out of service, and the requests already answered.
+        operators is restored: shelved, suppressed, out of service, and the requests already answered. Of a learned twin
+        the wear is restored as well.
         """
         try:
             state = current_keys(json.loads(snapshot.state_json), FORMER_SCORER_KEYS)
@@ -125,7 +133,7 @@ class ScorerCore(Core):
             return []
         if snapshot.twin_sha256 != self._twin.sha256:
             self._counts["snapshots_of_another_twin"] += 1
-            self._not_restored = ANOTHER_TWIN
+            self._not_restored = FORMER_TWIN if self._is_learned and self._restore_wear(state) else ANOTHER_TWIN
         else:
             try:
                 self._tray.restore_baselines(state)
@@ -140,13 +148,21 @@ class ScorerCore(Core):
             return [replace(snapshot, restored=True), *self._tray.alarms.discard_all(snapshot.t_ns, keep_silenced=True)]
         return [replace(snapshot, restored=True), *self._tray.alarms.republish()]
 
+    def _restore_wear(self, state: Mapping[str, Any]) -> bool:
+        """Continue the wear of the twin before; False if it cannot be read."""
+        try:
+            self._tray.wear.restore_of_former_twin(state["wear"])
+        except RESTORE_ERRORS:
+            return False
+        return True
+
     def _continued(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
-        """Take over from another core; returns what has changed. Of another twin, only what belongs to operators
-        stays."""
+        """Take over from another core; returns what has changed. Of another twin, only wear and what belongs to
+        operators stay."""
         _, *alarms = self.restore(snapshot)
         if not self._not_restored:
             return []
-        if self._not_restored == ANOTHER_TWIN:  # as it should be
+        if self._not_restored in (ANOTHER_TWIN, FORMER_TWIN):  # as it should be
             self._not_restored = ""
         return alarms
 
@@ -330,6 +346,7 @@ def build(context: Context) -> BuiltStage:
             decision_rules=context.decision_rules,
             started_t_ns=context.started_t_ns,
             continues=continues,
+            is_learned=tray.twin is None,
         )
 
     twin = load_tray_twin(twin_path(tray, context.folder), tray.fans) if tray.twin else None

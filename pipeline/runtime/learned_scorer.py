@@ -1,8 +1,8 @@
 """The scorer of a tray whose twin is learned while it runs: a core for each version, one at a time.
 
 Predictions name their twin, and the integrator publishes a twin before its first prediction. So the core changes at the
-same sample in a replay. Where only the limits are new, baselines, alarms and wear go on; with another twin they start
-from the beginning, except for what operators have set.
+same sample in a replay. Where only the limits are new, baselines, alarms and wear go on; with another twin baselines
+and alarms start from the beginning, except for what operators have set, and wear goes on.
 """
 
 from __future__ import annotations

@@ -30,6 +30,7 @@ from scoring.samples import Samples, among, arrived, samples_of
 from scoring.score_message import score_of
 from scoring.scored_block import ScoredBlock
 from scoring.wear.followed import followed_fans, shared_by_all
+from scoring.wear.reference import healthy_fans
 from scoring.wear.wear_monitor import WearMonitor
 
 DATA_LOST_AFTER_NS = 2 * NS_PER_S  # an active alarm is not confirmed by data after so long without a score
@@ -72,7 +73,8 @@ class TrayScorer:
             knows_falls=decision_rules >= DecisionRules.FALLS,
             plain_words=decision_rules >= DecisionRules.PLAIN_WORDS,
         )
-        self.wear = WearMonitor(twin.balances, self._diagnoser, config.wear_every_s, twin.command_unit)
+        healthy = healthy_fans(twin.balances, twin.limits.balance)
+        self.wear = WearMonitor(healthy, self._diagnoser, config.wear_every_s, twin.command_unit)
         off_delay_s = config.least_off_delay_s(twin.tachos)
         holding = holding_detectors(
             self.fan_scorer.detectors,

@@ -1,8 +1,10 @@
 """Slow wear of a tray: how far each fan's parameters have moved since commissioning, measured at regular intervals.
 
 Drag, friction and gain are identified again over the last seconds (scoring.wear.reidentification), each as if it alone
-had changed. `balance` is the baseline of the torque balance, which follows the fan within bounds; it is the only one
-with a limit, the value at which the alarm is raised. Each is a series with a trend per day (scoring.wear.trend).
+had changed. They refer to the twin with which the fan was commissioned, also when other twins have taken over
+(scoring.wear.reference). `balance` is the baseline of the torque balance, which follows the fan within bounds; it is
+the only one with a limit, the value at which the alarm is raised. Baseline and limit belong to the present twin, so its
+series starts again with each. Each is a series with a trend per day (scoring.wear.trend).
 See docs/explanation/wear.md.
 """
 
@@ -17,8 +19,8 @@ import numpy as np
 from schemas.messages import Array
 from schemas.units import NS_PER_S
 from scoring.diagnosis.diagnoser import Diagnoser
-from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.former_snapshot_keys import FORMER_WEAR_KEYS, current_keys
+from scoring.wear.reference import HealthyFan, WearReference
 from scoring.wear.reidentification import parameter_shifts
 from scoring.wear.slow_change import slow_changes
 from scoring.wear.trend import NS_PER_DAY, LimitForecast, Trend, WearSeries, forecast_limit
@@ -51,10 +53,9 @@ class ParameterWear:
 class WearMonitor:
     """The wear of one tray's fans. The result does not depend on how samples are cut into blocks."""
 
-    def __init__(
-        self, healthy: Sequence[HealthyBalance], diagnoser: Diagnoser, every_s: float, command_unit: str
-    ) -> None:
-        """diagnoser: holds the last seconds. every_s: interval between the points of a fan."""
+    def __init__(self, healthy: Sequence[HealthyFan], diagnoser: Diagnoser, every_s: float, command_unit: str) -> None:
+        """healthy: each fan by the present twin. diagnoser: holds the last seconds. every_s: interval between the
+        points of a fan."""
         self._healthy = healthy
         self._diagnoser = diagnoser
         self._every_ns = round(every_s * NS_PER_S)
@@ -81,10 +82,10 @@ class WearMonitor:
         """Process a block that the diagnoser has taken; (n, fans) each but t_ns, (n,), and limit_command, (fans,).
 
         eligible: a point may be taken at this sample. disturbed: this sample must not be within the window of a point.
-        commissioned_command: baseline of the balance at the end of commissioning, NaN before. shared_command: what of
-        the present one the fans of the tray have in common, which is no wear of one of them. held: the baseline is at
-        its bound, so that its value says nothing about wear. limit_command: the alarm comes at this distance from the
-        commissioned baseline.
+        commissioned_command: baseline of the balance at the end of commissioning, at the reference speed, NaN before.
+        shared_command: what of the present one the fans of the tray have in common, which is no wear of one of them.
+        held: the baseline is at its bound, so that its value says nothing about wear. limit_command: the alarm comes at
+        this distance from the commissioned baseline.
         """
         attempts = np.maximum((t_ns - origin_t_ns) // ATTEMPT_PERIOD_NS, self._last_attempt)
         for row in np.flatnonzero(np.diff(attempts, prepend=self._last_attempt) > 0).tolist():
@@ -156,17 +157,33 @@ class WearMonitor:
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a snapshot of the same number of fans. Nothing has changed if this raises.
+        """Continue from a snapshot of the same twin and number of fans. Nothing has changed if this raises.
 
         Raises:
             ValueError, KeyError, TypeError, AttributeError: it is not such a snapshot.
         """
+        last_attempt, disturbed_t_ns, fans = self._read(snapshot)
+        for fan, healthy in zip(fans, self._healthy, strict=True):
+            fan.keep_reference_unless_of(healthy)
+        self._last_attempt, self._disturbed_t_ns, self._fans = last_attempt, disturbed_t_ns, fans
+
+    def restore_of_former_twin(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a snapshot of the twin before: drag, friction and gain go on, the balance starts again.
+
+        A fan without a reference in the snapshot starts again as a whole. Nothing has changed if this raises.
+
+        Raises: as `restore`.
+        """
+        _, disturbed_t_ns, fans = self._read(snapshot)
+        self._disturbed_t_ns, self._fans = disturbed_t_ns, [fan.with_next_twin() for fan in fans]
+
+    def _read(self, snapshot: Mapping[str, Any]) -> tuple[int, Array, list[_FanWear]]:
         stored = current_keys(snapshot, FORMER_WEAR_KEYS)
         fans = [_FanWear.restore(fan) for fan in stored["fans"]]
         disturbed_t_ns = np.array(stored.get("disturbed_t_ns", self._disturbed_t_ns), np.int64)  # the first had none
         if len(fans) != len(self._fans) or disturbed_t_ns.shape != self._disturbed_t_ns.shape:
             raise ValueError("wear of another number of fans")
-        self._last_attempt, self._disturbed_t_ns, self._fans = int(stored["last_attempt"]), disturbed_t_ns, fans
+        return int(stored["last_attempt"]), disturbed_t_ns, fans
 
     def _last_disturbed(self, t_ns: Array, disturbed: Array) -> Array:
         """(fans,) time of the last disturbed sample of each fan, up to the end of these rows."""
@@ -177,14 +194,20 @@ class WearMonitor:
         window = self._diagnoser.window(fan, at_ns, at_ns, WINDOW_S)
         if window is None:
             return False
-        drifts = parameter_shifts(replace(window, fan_offset=commissioned), self._healthy[fan])
+        wear, present = self._fans[fan], WearReference(self._healthy[fan], commissioned)
+        reference = wear.reference if wear.reference and wear.reference.of_former_twin else present
+        drifts = parameter_shifts(reference.applied_to(window), reference.healthy.balance)
+        if not drifts:
+            return False
         points = {drift.parameter: (drift.change, drift.std_error) for drift in drifts}
-        if points and not held:
-            points["balance"] = window.fan_offset - shared - commissioned, window.fan_offset_std_error
+        if not held:
+            own_offset = present.offset_at(float(window.speed_rad_s[-1]))
+            points["balance"] = window.fan_offset - shared - own_offset, window.fan_offset_std_error
         for parameter, (change, std_error) in points.items():
             if max(abs(change), std_error) < MAX_CHANGE:
-                self._fans[fan].series[parameter].add(at_ns, change, std_error)
-        return bool(points)
+                wear.series[parameter].add(at_ns, change, std_error)
+        wear.reference = reference
+        return True
 
 
 class _FanWear:
@@ -194,6 +217,8 @@ class _FanWear:
         self.slot = -1
         self.t_ns = 0
         self.limit: float | None = None
+        self.reference: WearReference | None = None
+        """of the last point; None before the first one, and in snapshots of earlier versions"""
         self.series = {parameter: WearSeries() for parameter in UNITS}
         self.wear: dict[str, ParameterWear] = {}
 
@@ -202,6 +227,20 @@ class _FanWear:
         self.t_ns = t_ns
         self.limit = limit_command if np.isfinite(limit_command) else None
         self.wear = {parameter: self._wear(parameter) for parameter in UNITS if len(self.series[parameter])}
+
+    def keep_reference_unless_of(self, present: HealthyFan) -> None:
+        """Keep the reference of a twin that was calibrated again since."""
+        if self.reference and self.reference.healthy.snapshot() != present.snapshot():
+            self.reference = replace(self.reference, of_former_twin=True)
+
+    def with_next_twin(self) -> _FanWear:
+        """The wear of the fan when another twin takes over. Its points count from the first sample again."""
+        following = _FanWear()
+        if self.reference is not None:
+            following.reference = replace(self.reference, of_former_twin=True)
+            following.series |= {name: series for name, series in self.series.items() if name != "balance"}
+            following.evaluate(self.t_ns, np.inf)
+        return following
 
     def _wear(self, parameter: str) -> ParameterWear:
         series = self.series[parameter]
@@ -229,7 +268,13 @@ class _FanWear:
             }
             for parameter, series in self.series.items()
         }
-        return {"slot": self.slot, "t_ns": self.t_ns, "limit_command": self.limit, "parameters": parameters}
+        return {
+            "slot": self.slot,
+            "t_ns": self.t_ns,
+            "limit_command": self.limit,
+            "reference": self.reference and self.reference.snapshot(),
+            "parameters": parameters,
+        }
 
     @classmethod
     def restore(cls, snapshot: Mapping[str, Any]) -> _FanWear:
@@ -239,9 +284,12 @@ class _FanWear:
         for parameter in UNITS:
             series = {name: np.asarray(column) for name, column in snapshot["parameters"][parameter]["series"].items()}
             fan.series[parameter] = WearSeries.restore(series)
-        if fan.slot >= 0:
+        if snapshot.get("reference") is not None:
+            fan.reference = WearReference.restore(snapshot["reference"])
+        t_ns = int(snapshot["t_ns"])
+        if t_ns > 0:
             limit = np.inf if snapshot["limit_command"] is None else float(snapshot["limit_command"])
-            fan.evaluate(int(snapshot["t_ns"]), limit)
+            fan.evaluate(t_ns, limit)
         return fan
 
 

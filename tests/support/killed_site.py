@@ -214,12 +214,13 @@ class Site(Stages):
         calibrated: bool = False,
         remembers: bool = True,
         learns: bool = False,
+        scorer_settings: str = "",
     ) -> None:
         """remembers: whether a restarted scorer finds the snapshot of the one before it. learns: the configuration
-        names no twin."""
+        names no twin. scorer_settings: more lines of that section."""
         card = {"calibration": CALIBRATION} if calibrated else {}
         write_twin(folder / "twin.onnx", small_hybrid(), fans=FANS, **card)
-        text = CONFIGURATION % block_size
+        text = CONFIGURATION % block_size + scorer_settings
         (folder / "site.toml").write_text(text.replace('twin = "twin.onnx"\n', "") if learns else text)
         self.path = folder / "recording.mcap"
         super().__init__(load_config(folder / "site.toml"), self.path, EPOCH_NS, remembers=remembers)

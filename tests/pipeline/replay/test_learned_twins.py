@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ from pipeline.replay.offline.rescoring import rescore
 from schemas.messages import Action, FanState, InvalidReason, ModelCard, Score, Transition
 from tests.support.killed_site import CALIBRATION, FANS, Site
 from tests.support.offline_replay import made_equal, recorded, verified
-from tests.support.twin_files import small_hybrid, write_twin
+from tests.support.twin_files import made_up_card, small_hybrid, write_twin
 
 
 def twin_of(folder: Path, name: str, seed: int, *, calibrated: bool = False) -> bytes:
@@ -133,3 +135,28 @@ def test_with_new_limits_alone_baselines_and_alarms_go_on(tmp_path: Path) -> Non
     assert active
     assert not [alarm for alarm in alarms if alarm.transition == Transition.RAISED and alarm.t_ns > cards[1].t_ns]
     assert made_equal(verified(recording)) > 600
+
+
+def test_wear_goes_on_in_a_replay_as_it_did_when_a_twin_took_over(tmp_path: Path) -> None:
+    """The second twin takes one more of the command for healthy."""
+    settings = "limit_factor = 3.0\nwear_every_s = 10.0\n"
+    site = Site(tmp_path, 7, block_size=4, learns=True, scorer_settings=settings)
+    model = small_hybrid(1)
+    site.put_in_force("tray1-1", write_twin(tmp_path / "1.onnx", model, fans=FANS, name="tray1-1").read_bytes())
+    site.run(2300)
+    balance = asdict(made_up_card(model, FANS).balance) | {"friction": [1.0] * FANS}
+    second = write_twin(tmp_path / "2.onnx", model, fans=FANS, name="tray1-2", balance=balance)
+    site.put_in_force("tray1-2", second.read_bytes())
+    site.run(2300)
+    recording, replayed = site.finished(), tmp_path / "replayed.mcap"
+    with open_replay_input([recording], None, (), None) as replay_input:
+        (tray,) = rescore(replay_input, replayed, verify=True)
+    assert made_equal(tray) > 4400
+    of_recorded, of_replayed = (
+        json.loads(recorded(path, "snapshot")[-1].state_json)["wear"] for path in (recording, replayed)
+    )
+    assert of_replayed == of_recorded
+    fan = of_recorded["fans"][1]
+    assert fan["reference"]["of_former_twin"]
+    friction = fan["parameters"]["friction"]["series"]["value"]
+    assert len(friction) == 2 and abs(friction[1] - friction[0]) < 0.5

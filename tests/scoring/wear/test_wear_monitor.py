@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,7 @@ import pytest
 
 from schemas.blocks import cut
 from schemas.messages import Action, Alarm, Header, Prediction, ScorerSnapshot, Transition
+from scoring.diagnosis.regression_window import HealthyBalance
 from scoring.torque_balance import BalanceModel, TorqueBalance
 from scoring.wear.slow_change import WEAR_HINT
 from stages.scorer import ScorerCore
@@ -46,8 +47,13 @@ def burst(
     swing: float = DAY_AND_NIGHT,
     seconds: float = 15.0,
     speed: float | None = None,
+    by: Sequence[HealthyBalance] | None = None,
+    twin: str = "t",
 ) -> Prediction:
-    """Predictions of two fans at a held speed that differs from hour to hour; the friction of the second grows."""
+    """Predictions of two fans at a held speed that differs from hour to hour; the friction of the second grows.
+
+    by: the torque balance of the twin, of each fan; None: that of the fans without wear. twin: its name.
+    """
     rng = np.random.default_rng(round(hour * 4))
     fan, n = balance_of_a_fan(), round(seconds * 1e9 / STEP_NS)
     t_ns = EPOCH_NS + round(hour * HOUR_NS) + np.arange(n) * STEP_NS
@@ -56,7 +62,9 @@ def burst(
     needed = fan.viscous * twin_speed + fan.drag * twin_speed**2 + fan.friction
     command = np.broadcast_to(needed + friction, (n, 2))
     measured = twin_speed + rng.normal(0.0, 0.3, (n, 2))
-    columns = {name: np.full(2, getattr(fan, name)) for name in ("inertia", "viscous", "drag", "friction", "lag_s")}
+    of_twin = by or (fan, fan)
+    names = ("inertia", "viscous", "drag", "friction", "lag_s")
+    columns = {name: np.array([getattr(each, name) for each in of_twin]) for name in names}
     model = BalanceModel(
         **columns,
         filter_rate_per_s=fan.filter_rate_per_s,
@@ -74,7 +82,7 @@ def burst(
         sigma_rad_s=np.full(2, SIGMA),
         valid=np.ones((n, 2), np.bool_),
         invalid_reason=np.zeros((n, 2), np.uint8),
-        twin="t",
+        twin=twin,
         torque_balance_command=TorqueBalance(model).update(STEP_NS / 1e9, command, measured, np.ones((n, 2), np.bool_)),
         torque_balance_sigma_command=np.full(2, SIGMA_COMMAND),
     )
