@@ -174,6 +174,8 @@ class LearnedTwinScorer(Core):
         if self._snapshot:
             emitted += core.restore(self._snapshot)
         self._core, self._twin, self._snapshot, self._problem = core, name, None, ""
+        if continues:
+            emitted += core.last_snapshot()  # a scorer that is killed now continues with the new twin
         requests, self._requests = self._requests, []
         return [*emitted, *(message for request in requests for message in core.step(request))]
 

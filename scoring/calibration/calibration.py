@@ -40,6 +40,7 @@ from scoring.limits import DeclaredRate, Limits, Timing
 
 DAY_S = 86_400.0
 NEEDED_ALARMS = 3.0  # false alarms expected in the healthy runs, for their rate to be distinguished from others
+MOST_LEFT_OUT = 2.0 / 3.0  # of the expected alarms: some of those left out were of faults
 SURE_ALARMS = 10.0  # of a tacho that counts: limits of fewer have the margins of few data
 VARIATION_FAN_S = 5 * DAY_S  # enough to measure how residuals vary; the frequency of large values needs all data
 ENOUGH_BLOCKS = 8
@@ -97,6 +98,7 @@ def calibrate(
     has_drive: bool = False,
     sigma_shares: Mapping[Signal, Array] = MappingProxyType({}),
     sigma_rad_s: float | None = None,
+    alarms_left_out: int = 0,
 ) -> Limits:
     """Limits with a declared number of false alarms per fan and day.
 
@@ -104,6 +106,9 @@ def calibrate(
     has_drive: the fans have a drive of their own, see twin.models.drive.
     sigma_shares: (fans,) the sigmas of fans that the twin knows one by one, relative to what is the same for all.
     sigma_rad_s: of the speed, the mean over the fans; None: not known.
+    alarms_left_out: so many alarms, perhaps false ones, were raised while the runs were recorded, and the time around
+    them is not in the runs. Without counting them, each calibration on what was recorded under the limits of the one
+    before would have lower limits than that.
 
     Raises:
         TooLittleError: the runs are too short for the rate, and extrapolate is not set; or too short for any limit
@@ -127,7 +132,9 @@ def calibrate(
     for source, moments in found.moments.items():
         if moments.count.sum() and not moments.seconds:
             raise FragmentedError(source, float(moments.count.sum()) * found.period_s)
-    target = min(false_alarms_per_day / DAY_S * found.fan_s / found.windows, MAX_ALARM_SHARE)
+    expected_alarms = false_alarms_per_day * found.fan_s / DAY_S
+    left_alarms = expected_alarms - min(alarms_left_out, MOST_LEFT_OUT * expected_alarms)
+    target = min(left_alarms / found.windows, MAX_ALARM_SHARE)
     limits = _with(limits, LimitRule.FIXED, lambda row, settings: settings.fixed(found.observed[row.name]))
     limits = _with_shared(limits, found)
     is_long = found.fan_s > VARIATION_FAN_S
@@ -137,7 +144,6 @@ def calibrate(
     found = healthy_statistics(runs, limits, top_speed_rad_s)
     factors = _factors(found, target)
     limits = _scaled(limits, factors)
-    expected_alarms = false_alarms_per_day * found.fan_s / DAY_S
     if not is_enough or (count_std(limits, found) > 0.0 and expected_alarms < SURE_ALARMS):
         limits = cautious(limits, found, sigma_shares, knows_other_speeds=is_enough)
         if sigma_rad_s is not None:
@@ -146,7 +152,7 @@ def calibrate(
         factors = np.ones(len(calibrated_rows()))
     rate = DeclaredRate(
         false_alarms_per_day=false_alarms_per_day,
-        interval_95=_interval(found, factors, seed),
+        interval_95=_with_left_out(_interval(found, factors, seed), alarms_left_out, found.fan_s),
         extrapolated=not is_enough,
         fan_hours=found.fan_s / 3600,
         runs=len(found.maxima),
@@ -311,6 +317,11 @@ def _level(found: HealthyStatistics, row: int, share: float) -> float:
     tail = Tail.fit(seen, share)
     is_beyond = share * len(seen) < 1.0
     return max(tail.upper_confidence_level(share) if is_beyond else tail.level(share), MIN_LEVEL)
+
+
+def _with_left_out(interval: tuple[float, float], alarms: int, fan_s: float) -> tuple[float, float]:
+    """The interval of a rate, a day, if as many alarms that were left out were false, or none of them."""
+    return interval[0], interval[1] + alarms * DAY_S / fan_s
 
 
 def _score(run: WindowMaxima, factors: Array) -> Array:

@@ -64,6 +64,14 @@ def calibrate(
             help="Set limits by extrapolation if there are too few data for the rate, which is then only a target.",
         ),
     ] = False,
+    alarms_left_out: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="So many alarms, perhaps false ones, were raised while these were recorded, and the time around them "
+            "is not in the recordings.",
+        ),
+    ] = 0,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="OUT.onnx", help="Write to this file, not into TWIN.onnx.")
     ] = None,
@@ -86,7 +94,7 @@ def calibrate(
     _refuse_wrong_arguments(twin, healthy or [], verify or [], overrides or [])
     if not healthy:
         finding = {"--false-alarms-per-day": false_alarms_per_day, "--extrapolate": extrapolate, "--output": output}
-        finding |= {"--from": from_s > 0.0, "--to": to_s < math.inf}
+        finding |= {"--alarms-left-out": alarms_left_out, "--from": from_s > 0.0, "--to": to_s < math.inf}
         _refuse_without_healthy([name for name, value in finding.items() if value])
     if output and (output.is_dir() or not output.parent.is_dir()):  # before an hour of scoring
         raise UserError(f"{output}: cannot write the twin: name a file in an existing folder")
@@ -96,7 +104,15 @@ def calibrate(
             raise UserError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
         with interruptible("nothing was written"):
             limits, warning, speed_unit = _calibrated(
-                twin, healthy, (from_s, to_s), tray, false_alarms_per_day, extrapolate, overrides or [], seed
+                twin,
+                healthy,
+                (from_s, to_s),
+                tray,
+                false_alarms_per_day,
+                extrapolate,
+                alarms_left_out,
+                overrides or [],
+                seed,
             )
         output = output or twin
         _write(twin, output, limits)
@@ -126,6 +142,7 @@ def _calibrated(
     tray: str | None,
     per_day: float,
     extrapolate: bool,
+    alarms_left_out: int,
     overrides: list[str],
     seed: int,
 ) -> tuple[Limits, str, SpeedUnit]:
@@ -141,7 +158,9 @@ def _calibrated(
             longest_fan_s = runs.longest_fan_s()  # however much of it can be scored
             if not extrapolate and not supports(longest_fan_s, per_day):
                 raise too_little(longest_fan_s, per_day)
-            limits = find_limits([known], runs, timing, per_day, seed=seed, extrapolate=extrapolate)
+            limits = find_limits(
+                [known], runs, timing, per_day, seed=seed, extrapolate=extrapolate, alarms_left_out=alarms_left_out
+            )
         except TooLittleError as error:
             raise UserError(_too_little(error, per_day, extrapolate=extrapolate)) from error
         except MixedRatesError as error:

@@ -248,6 +248,12 @@ class _Work:
             sha256=hashlib.sha256(limited.file).hexdigest(),
         ), limited.file
 
+    def _alarms_since(self, t_ns: int) -> int:
+        """Alarms that began since then outside of what is marked as faulty: the time around them is not in the history,
+        so limits would become lower with each version."""
+        began = (each for each in self._listed.alarms_t_ns if each >= t_ns)
+        return sum(not overlap([(each, each)], self._listed.faulty) for each in began)
+
     def _trained(self, parts: Split) -> Path:
         """A newly trained twin, without limits."""
         training, validation = parts.training, parts.validation
@@ -276,7 +282,14 @@ class _Work:
             named.write_bytes(with_card_entries(twin.read_bytes(), {"name": self._name}))
         self._say(f"{self._name}: limits from {_hours(sum(each.seconds for each in of))} of healthy running")
         with _quietly():
-            calibrate(named, [each.path for each in of], self._per_day, extrapolate=True, output=done)
+            calibrate(
+                named,
+                [each.path for each in of],
+                self._per_day,
+                extrapolate=True,
+                alarms_left_out=self._alarms_since(of[0].span[0]),
+                output=done,
+            )
         calibration = load_tray_twin(done).card.calibration
         drops = tuple(
             Drop(speed=drop.speed, at_once=_finite(drop.at_once), within_a_minute=_finite(drop.within_a_minute))

@@ -23,10 +23,11 @@ def find_limits(
     *,
     seed: int = 0,
     extrapolate: bool = False,
+    alarms_left_out: int = 0,
 ) -> Limits:
     """Limits with a declared number of false alarms per fan and day, common to twins of one kind of fan.
 
-    Raises: as `calibrate`.
+    The options, and what is raised: as `calibrate`.
     """
     bends_rad_s = [twin.bend_rad_s for twin in twins]
     known_rad_s = [bend_rad_s for bend_rad_s in bends_rad_s if bend_rad_s is not None]
@@ -40,6 +41,7 @@ def find_limits(
         crossover_speed_rad_s=float(np.median(known_rad_s)) if len(known_rad_s) == len(bends_rad_s) else None,
         has_drive=all(twin.card.drive is not None for twin in twins),
         sigma_shares=_sigma_shares(twins[0]) if len(twins) == 1 else {},
+        alarms_left_out=alarms_left_out,
         sigma_rad_s=float(np.mean(alike(np.concatenate([twin.sigma_rad_s for twin in twins])))),
     )
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
+from schemas.messages import Array
 from schemas.units import NS_PER_S
 from scoring.calibration.alarm_rate import dispersion, poisson_interval, rate_interval
 from scoring.calibration.calibration import TooLittleError, _with_alarms_at_most, calibrate
@@ -26,6 +27,7 @@ from scoring.detectors.table import rows
 from scoring.detectors.tacho import TachoSettings
 from scoring.fan_scorer import FanScorer
 from scoring.limits import Limits, Timing
+from scoring.samples import Samples
 from tests.support.healthy_residuals import STEP_NS, Raised, alarms_of, autoregressive, in_blocks, samples_of
 
 TOP_RAD_S = 200.0
@@ -53,6 +55,14 @@ def healthy(
             yield HealthyRun(f"run {run}", fans, in_blocks(samples_of(speed, balance, period_ns=period_ns)))
 
     return each
+
+
+def of_fans(block: Samples, fans: Array) -> Samples:
+    """Some of the fans of a block."""
+    columns = {field.name: getattr(block, field.name) for field in fields(block)}
+    return replace(
+        block, **{name: column[:, fans] for name, column in columns.items() if name not in ("t_ns", "period_ns")}
+    )
 
 
 def coarse_and_short(memory_s: float, seed: int, runs: int = RUNS) -> Runs:
@@ -100,6 +110,27 @@ def test_fresh_healthy_fans_alarm_as_often_as_declared(memory_s: float) -> None:
     fresh_low, fresh_high = (count / FAN_DAYS for count in poisson_interval(alarms))
     assert fresh_low < 1.25 * high
     assert fresh_high > 0.75 * low
+
+
+def test_limits_from_what_is_left_beside_alarms_keep_the_rate_if_these_are_counted() -> None:
+    declared = 600.0
+    fresh = coarse_and_short(0.3, 3)
+    limits = calibrate(coarse_and_short(0.3, 2), TOP_RAD_S, Timing(), declared)
+    raised, left = 0, []
+    for run in coarse_and_short(0.3, 4)():
+        blocks = list(run.blocks)
+        alarms = alarms_of(limits, blocks, run.fans)
+        raised += len(alarms)
+        without = np.setdiff1d(np.arange(run.fans), [alarm.fan for alarm in alarms])
+        left.append(HealthyRun(run.name, len(without), [of_fans(block, without) for block in blocks]))
+    assert raised > 0.6 * declared * FAN_DAYS
+    rates = []
+    for count in (0, raised):
+        again = calibrate(lambda: left, TOP_RAD_S, Timing(), declared, alarms_left_out=count)
+        alarms = sum(len(alarms_of(again, blocks, fans)) for _, fans, blocks, *_ in fresh())
+        rates.append(alarms / FAN_DAYS)
+    assert rates[0] > 1.5 * declared, "limits fall with each calibration on what the ones before left"
+    assert rates[1] < 1.5 * declared
 
 
 def test_correlation_time_and_deviation_of_healthy_residuals_are_found() -> None:
