@@ -1,7 +1,7 @@
 """Learner: learns the twin of a tray that names none, and improves it as healthy running accumulates.
 
 Reads: topic `raw` (samples), `score` (whether a fan has an alarm), and `request` (fans that are commissioned again).
-Writes: topic `new_twin`: the version in force, at start and when it changes.
+Writes: topic `new_twin`: the version in force, at start and when it changes; while a fan has an alarm, the one before.
 Timing: a version is made when the healthy history has doubled, at least once in a week of healthy running, and after
 four hours of healthy running since an operator has commissioned fans again.
 
@@ -12,34 +12,32 @@ version in force: see `fantwin twins`. The learner may drop messages: it must ne
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Literal
+from functools import partial
 
 from pydantic import Field
 
 from pipeline.errors import UserError
-from pipeline.learning.healthy_history import SHORTEST_RECORDING_S, HealthyHistory, recorded_raws
+from pipeline.learning.fan_alarms import FanAlarms
+from pipeline.learning.healthy_history import HealthyHistory, recorded_raws
 from pipeline.learning.learning_process import Learning, LearningProcess
+from pipeline.learning.learning_schedule import LearningSchedule, Work
 from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.learning.versions import TwinVersions, Version, VersionList, learning_folder
 from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.recordings.dates import format_utc
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
-from schemas.messages import Action, FanState, Message, NewTwin, Raw, Request, Score
+from schemas.messages import Action, Message, NewTwin, Raw, Request, Score
 from schemas.units import NS_PER_S
-from scoring.samples import among
 
 LOOK_NS = NS_PER_S
 """how often the learner looks for what has changed"""
-AGAIN_AFTER = 1.25
-"""after a failure, learning starts again when the history is this many times as long"""
-LONGEST_WAIT_S = 7 * 24 * 3600.0
-"""of healthy running between two versions"""
-CHECK_AFTER_S = 24 * 3600.0
-"""of healthy running between two checks of the fans against the reference"""
-AFTER_COMMISSIONING_S = 4 * 3600.0
-"""of healthy running after fans were commissioned again: then the twin is compared with them"""
+FLUSH_NS = 10 * NS_PER_S
+"""how often the history is flushed to the disk: a crash loses as much"""
+AHEAD_NS = 60 * NS_PER_S
+"""the history may be so much ahead of the samples"""
 
 
 class LearnerConfig(StageConfig):
@@ -74,8 +72,8 @@ class LearnerCore(Core):
         self._versions = versions
         self._operation = operation
         self._learning = learning
-        self._has_alarm = False
-        self._looked_ns = 0
+        self._alarms = FanAlarms(fans)
+        self._looked_ns = self._flushed_ns = 0
         self._seen_change: int | None = None
         self._is_list_read = False
         """whether the list of versions could be read; if not, nothing is learned: a new version could not be listed"""
@@ -83,50 +81,40 @@ class LearnerCore(Core):
         """the versions when they were last read"""
         self._in_force: Version | None = None
         """the one that was published"""
-        self._failed_s = 0.0
-        """healthy running at the last attempt, if it failed; 0: it did not"""
-        self._problem = ""
+        self._schedule = LearningSchedule(history, operation, config.first_minutes)
+        self._problems: dict[str, str] = {}
+        """of the versions: what was done with them, and what went wrong"""
 
     def step(self, item: Raw | Score | Request) -> Sequence[Message]:
         """Add samples to the healthy history, or see whether a fan has an alarm or is commissioned again."""
         if isinstance(item, Request):
             if item.action == Action.COMMISSION:
                 self._history.close()
-                self._commission(item.t_ns)
-            return []
-        if isinstance(item, Score):
-            if item.fans == self._fans and len(item.t_ns):
-                self._has_alarm = bool(among(item.state, FanState.ALARM, FanState.RETURNING).any())
-            return []
-        if item.fans == self._fans:
-            self._history.add(item, has_alarm=self._has_alarm, is_watched=self._in_force is not None)
+                self._change_list(partial(self._versions.commission, item.t_ns))
+        elif item.fans != self._fans:
+            pass  # of a tray that is configured otherwise
+        elif isinstance(item, Score):
+            self._see(item)
+        else:
+            self._history.add(item, has_alarm=bool(self._alarms.fans), is_watched=self._is_watched)
             if self._last is None:
                 self._operation.take(item)
         return []
-
-    def _commission(self, t_ns: int) -> None:
-        try:
-            self._versions.commission(t_ns)
-        except UserError as error:
-            self._problem = str(error)
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Publish the version in force when it has changed, and start learning when it is due."""
         if 0 <= now_ns - self._looked_ns < LOOK_NS:
             return []
         self._looked_ns = now_ns
-        self._history.flush()
-        ended = self._learning.poll()
-        if ended:
-            self._problem, self._failed_s = f"learning: {ended}", self._history.seconds
-        elif ended is not None:
-            self._problem, self._failed_s = "", 0.0
-        cards = self._changed(now_ns)
-        due = self._due() if self._learning.is_free else None
-        if due:
-            self._history.finish()
-            if problem := self._learning.start(only_if_changed=due == "check"):
-                self._problem, self._failed_s = f"learning: {problem}", self._history.seconds
+        if not 0 <= now_ns - self._flushed_ns < FLUSH_NS:
+            self._flushed_ns = now_ns
+            self._history.flush()
+        self._take_outcome()
+        self._read_list()
+        cards = self._published(now_ns)
+        may_start = self._learning.is_free and self._is_list_read and not self._alarms.fans
+        if may_start and (due := self._schedule.due(self._listed)):
+            self._start(due)
         return cards
 
     def close(self) -> Sequence[Message]:
@@ -140,69 +128,134 @@ class LearnerCore(Core):
         self._learning.stop()
 
     def notes(self) -> Sequence[str]:
-        """The version in force and what it finds; or what the first one waits for."""
-        work = self._learning.seconds
-        making = [f"making the next version, for {work:.0f} s"] if work is not None else []
+        """The version in force and what it finds, or what the first one waits for; and what learning waits for."""
         if self._in_force is None:
-            return [self._waits_for(), *making]
-        return [f"{self._in_force.name} is in force; {_finds(self._in_force)}", *making]
+            found = [self._waits_for()]
+        else:
+            found = [f"{self._in_force.name} is in force; {_finds(self._in_force)}"]
+        current = self._listed.current
+        if self._in_force and current and current != self._in_force:
+            found.append(f"{current.name} waits: it takes over when no fan has an alarm, by the scores of all fans")
+        if fans := self._alarms.fans:
+            named = f"fan {fans[0]} has" if len(fans) == 1 else f"fans {', '.join(map(str, fans))} have"
+            found.append(f"no learning while {named} an alarm")
+        work_s = self._learning.seconds
+        return [*found, f"making the next version, for {work_s:.0f} s"] if work_s is not None else found
 
     def problem(self) -> str:
         """Why nothing is learned, or that a version waits for the operator."""
         offered = self._listed.waiting
-        waits = f"{offered.name} is offered: {offered.why} (fantwin twins)" if offered else ""
-        return "; ".join(filter(None, (self._problem, self._history.problem, waits)))
+        problems = [
+            *self._problems.values(),
+            *(f"learning: {why}" for why in self._schedule.failures),
+            self._history.problem,
+            self._ahead(),
+            f"{offered.name} is offered: {offered.why} (fantwin twins)" if offered else "",
+        ]
+        return "; ".join(dict.fromkeys(filter(None, problems)))
 
     @property
     def _last(self) -> Version | None:
         """The newest version."""
         return self._listed.versions[-1] if self._listed.versions else None
 
-    def _changed(self, now_ns: int) -> list[NewTwin]:
-        """The version in force, if it is another one than before.
+    @property
+    def _is_watched(self) -> bool:
+        """Whether samples wait until they are judged: there is a version, or it is not known whether there is one."""
+        return not self._is_list_read or self._last is not None
 
-        One that was not chosen by an operator waits while a fan has an alarm: with another twin the alarm would end,
-        and the fault would be part of the new baselines.
-        """
+    def _see(self, score: Score) -> None:
+        if not len(score.t_ns):
+            return
+        seen = self._alarms.update(score)
+        kept_ns = round(3600.0 * self._config.kept_hours * NS_PER_S)
+        for t_ns in seen.began_t_ns:
+            self._change_list(partial(self._versions.add_alarm, t_ns, forget_before_t_ns=t_ns - kept_ns))
+        self._history.judged(seen.judged_t_ns, had_alarm=seen.had_alarm)
+
+    def _change_list(self, change: Callable[[], None]) -> None:
+        try:
+            change()
+            self._problems["change"] = ""
+        except (OSError, UserError) as error:
+            self._problems["change"] = str(error)
+
+    def _read_list(self) -> None:
         changed = self._versions.change_id
         if changed == self._seen_change and self._is_list_read:
-            return []
+            return
         try:
             listed = self._versions.read()
-            if self._has_alarm and not listed.is_chosen:
-                return []
-            in_force = listed.current
-            content = self._versions.file(in_force.name).read_bytes() if in_force else b""
-        except (OSError, UserError) as error:
-            self._problem, self._is_list_read = str(error), False
-            return []
-        if not self._is_list_read:
-            self._is_list_read, self._problem = True, ""
+        except UserError as error:
+            self._problems["list"], self._is_list_read = str(error), False
+            return
         if listed.faulty != self._listed.faulty:
             self._history.finish()  # what was marked as faulty must not be part of what is recorded from now on
-        self._listed, self._seen_change = listed, changed
-        if in_force is None or in_force == self._in_force:
-            return []
-        self._in_force = in_force
-        return [NewTwin(t_ns=now_ns, twin=in_force.name, sha256=in_force.sha256, content=content)]
+        if not self._is_list_read:
+            self._problems.clear()
+        self._listed, self._seen_change, self._is_list_read = listed, changed, True
+        self._history.exclude(listed.excluded_spans)
 
-    def _due(self) -> Literal["version", "check"] | None:
-        """What is due: a version, or a check of the fans against the reference."""
-        if self._has_alarm or not self._is_list_read:
-            return None
-        since, last = self._history.seconds_since, self._last
-        if self._failed_s:
-            again_s = max(AGAIN_AFTER * self._failed_s, self._failed_s + SHORTEST_RECORDING_S)
-            return "version" if self._history.seconds >= again_s else None
-        if last is None:
-            is_enough = self._history.seconds >= 60.0 * self._config.first_minutes and not self._operation.missing()
-            return "version" if is_enough else None
-        if self._listed.commissioned_t_ns > last.made_t_ns:
-            return "version" if since(self._listed.commissioned_t_ns) >= AFTER_COMMISSIONING_S else None
-        if not self._listed.waiting and since(last.made_t_ns) >= min(last.learned_s, LONGEST_WAIT_S):
-            return "version"
-        checked_t_ns = max(last.made_t_ns, self._listed.check.t_ns if self._listed.check else 0)
-        return "check" if since(checked_t_ns) >= CHECK_AFTER_S else None
+    def _published(self, now_ns: int) -> list[NewTwin]:
+        """The version that the stages are to use, if it is another one than before."""
+        version = self._to_publish() if self._is_list_read else None
+        if version is None:
+            return []
+        cards = [] if version == self._in_force else self._cards(version, now_ns)
+        if self._in_force and self._in_force.name != self._listed.published:
+            self._change_list(partial(self._versions.publish, self._in_force.name))
+        return cards
+
+    def _cards(self, version: Version, now_ns: int) -> list[NewTwin]:
+        """The message of a version; none if its file cannot be read."""
+        path = self._versions.file(version.name)
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            self._problems["file"] = f"{path}: cannot be read: {error.strerror}"
+            return []
+        self._problems["file"], self._in_force = "", version
+        return [NewTwin(t_ns=now_ns, twin=version.name, sha256=version.sha256, content=content)]
+
+    def _to_publish(self) -> Version | None:
+        """The version in force, or while it has to wait, the one that the stages had before.
+
+        One that was not chosen by an operator waits while a fan has an alarm, or may have one after a restart: with
+        another twin the alarm would end, and the fault would be part of the new baselines.
+        """
+        current = self._listed.current
+        if current is None or self._listed.is_chosen or (self._alarms.are_known and not self._alarms.fans):
+            return current
+        return self._in_force or self._published_before() or current
+
+    def _published_before(self) -> Version | None:
+        """The version that the stages had before this process started, if its file is still there."""
+        named = (each for each in self._listed.versions if each.name == self._listed.published)
+        return next((each for each in named if self._versions.file(each.name).is_file()), None)
+
+    def _start(self, work: Work) -> None:
+        self._history.finish()
+        self._schedule.started = work
+        if problem := self._learning.start(only_if_changed=work == "check"):
+            self._schedule.failed(problem)
+
+    def _take_outcome(self) -> None:
+        """What became of the version or check that was started last."""
+        ended = self._learning.poll()
+        if ended:
+            self._schedule.failed(ended)
+        elif ended is not None:
+            self._schedule.succeeded()
+
+    def _ahead(self) -> str:
+        """That the history or the newest version is of later times than the samples."""
+        end_t_ns = max(self._history.end_t_ns, self._last.made_t_ns if self._last else 0)
+        if not self._history.newest_t_ns or end_t_ns - self._history.newest_t_ns <= AHEAD_NS:
+            return ""
+        return (
+            f"the healthy history goes up to {format_utc(end_t_ns)}, and the samples are older: was the clock set "
+            "back? Versions and checks may wait until this time has passed"
+        )
 
     def _waits_for(self) -> str:
         minutes = self._history.seconds / 60.0

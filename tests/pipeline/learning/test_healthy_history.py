@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recorded_raws
+from pipeline.learning import healthy_history
+from pipeline.learning.healthy_history import (
+    LONGEST_LAG_NS,
+    OPEN_NAME,
+    HealthyHistory,
+    healthy_recordings,
+    recorded_raws,
+)
+from pipeline.recordings.disk import AtomicAppendFile
 from pipeline.recordings.reading import read_metadata
 from schemas.messages import Header, Raw
 from schemas.units import NS_PER_S
@@ -39,11 +49,22 @@ def raw(second: float) -> Raw:
     )
 
 
-def add(
-    history: HealthyHistory, first_s: int, last_s: int, *, has_alarm: bool = False, is_watched: bool = True
-) -> None:
+def add(history: HealthyHistory, first_s: int, last_s: int) -> None:
+    """Samples before there is a twin."""
     for second in range(first_s, last_s, 10):
-        history.add(raw(second), has_alarm=has_alarm, is_watched=is_watched)
+        history.add(raw(second), has_alarm=False, is_watched=False)
+
+
+def watch(history: HealthyHistory, first_s: int, last_s: int, *, has_alarm: bool = False) -> None:
+    """Samples that are judged when they come."""
+    for second in range(first_s, last_s, 10):
+        history.add(raw(second), has_alarm=has_alarm, is_watched=True)
+        judge(history, second, second + 10, had_alarm=has_alarm)
+
+
+def judge(history: HealthyHistory, first_s: int, last_s: int, *, had_alarm: bool = False) -> None:
+    """Fans are judged once a second."""
+    history.judged((START_S + np.arange(first_s, last_s, dtype=np.int64)) * NS_PER_S, had_alarm=had_alarm)
 
 
 def kept_s(folder: Path) -> list[tuple[int, int]]:
@@ -53,7 +74,7 @@ def kept_s(folder: Path) -> list[tuple[int, int]]:
 
 def test_before_the_first_twin_all_is_kept_at_once(tmp_path: Path) -> None:
     history = history_in(tmp_path)
-    add(history, 0, 200, is_watched=False)
+    add(history, 0, 200)
     assert history.seconds == 199.0
     history.finish()
     assert kept_s(tmp_path) == [(0, 199)]
@@ -63,12 +84,12 @@ def test_before_the_first_twin_all_is_kept_at_once(tmp_path: Path) -> None:
 
 def test_what_came_shortly_before_an_alarm_and_after_it_is_never_kept(tmp_path: Path) -> None:
     history = history_in(tmp_path)
-    add(history, 0, 500)
-    add(history, 500, 600, has_alarm=True)
-    add(history, 600, 1200)
+    watch(history, 0, 500)
+    watch(history, 500, 600, has_alarm=True)
+    watch(history, 600, 1200)
     history.finish()
     (before, after) = kept_s(tmp_path)
-    assert before == (0, 399), "100 s before the alarm are left out"
+    assert before == (10, 399), "100 s before the alarm are left out"
     assert after[0] >= 690, "and 100 s after its end"
     assert after[1] <= 1100
 
@@ -92,6 +113,27 @@ def test_recordings_in_excluded_time_spans_are_left_out(tmp_path: Path) -> None:
         (START_S + 2000) * NS_PER_S,
     ]
     assert history.seconds_since((START_S + 500) * NS_PER_S) == 598.0
+    history.exclude([faulty])
+    assert history.seconds_since((START_S + 500) * NS_PER_S) == 299.0
+    assert history.seconds == 598.0
+
+
+def test_an_open_recording_in_an_excluded_time_span_does_not_count(tmp_path: Path) -> None:
+    history = history_in(tmp_path, hold_back_s=0.0)
+    add(history, 0, 300)
+    history.exclude([((START_S + 200) * NS_PER_S, (START_S + 5000) * NS_PER_S)])
+    assert history.seconds == 0.0
+    history.exclude([])
+    assert history.seconds == 299.0
+
+
+def test_where_an_excluded_time_span_ends_a_new_recording_begins(tmp_path: Path) -> None:
+    history = history_in(tmp_path, hold_back_s=0.0)
+    history.exclude([(START_S * NS_PER_S, (START_S + 300) * NS_PER_S)])
+    add(history, 0, 600)
+    assert history.seconds == 289.0
+    history.finish()
+    assert kept_s(tmp_path) == [(0, 309), (310, 599)]
 
 
 def test_the_oldest_are_deleted_but_for_the_first(tmp_path: Path) -> None:
@@ -114,3 +156,149 @@ def test_what_a_killed_process_left_is_repaired(tmp_path: Path) -> None:
     next_one = history_in(tmp_path)
     assert next_one.problem == ""
     assert kept_s(tmp_path) == [(0, 299)]
+
+
+def test_samples_that_nobody_judged_are_never_kept(tmp_path: Path) -> None:
+    history = history_in(tmp_path)
+    watch(history, 0, 500)
+    for second in range(500, 1000, 10):
+        history.add(raw(second), has_alarm=False, is_watched=True)
+    judge(history, 1000, 1010)
+    watch(history, 1010, 1500)
+    history.finish()
+    (before, after) = kept_s(tmp_path)
+    assert before == (10, 399), "only what was judged for as long as samples are held back"
+    assert after[0] >= 1000, "what nobody judged is not kept later either"
+    assert after[1] <= 1400
+
+
+def test_rows_of_one_score_may_have_a_pause_between_them(tmp_path: Path) -> None:
+    history = history_in(tmp_path)
+    for second in range(0, 1000, 10):
+        history.add(raw(second), has_alarm=False, is_watched=True)
+    rows_s = np.concatenate((np.arange(300), np.arange(400, 1000)))
+    history.judged((START_S + rows_s) * NS_PER_S, had_alarm=False)
+    history.finish()
+    assert kept_s(tmp_path) == [(410, 899)]
+
+
+def test_an_alarm_that_began_and_ended_in_one_score_discards_what_is_held(tmp_path: Path) -> None:
+    history = history_in(tmp_path)
+    watch(history, 0, 500)
+    judge(history, 490, 500, had_alarm=True)
+    watch(history, 500, 1000)
+    history.finish()
+    (before, after) = kept_s(tmp_path)
+    assert before == (10, 399)
+    assert after[0] >= 590
+
+
+def test_samples_that_are_never_judged_do_not_fill_the_memory(tmp_path: Path) -> None:
+    history = history_in(tmp_path)
+    for second in range(0, 20_000, 10):
+        history.add(raw(second), has_alarm=False, is_watched=True)
+    assert len(history._waiting) <= (LONGEST_LAG_NS // NS_PER_S + 100) / 10 + 1
+
+
+@pytest.mark.parametrize("had_alarm", [False, True])
+def test_a_clock_that_is_set_back_discards_what_is_held_and_begins_a_new_recording(
+    tmp_path: Path, had_alarm: bool
+) -> None:
+    history = history_in(tmp_path)
+    watch(history, 100_000, 100_500)
+    if had_alarm:
+        judge(history, 100_490, 100_500, had_alarm=True)
+    watch(history, 0, 500)
+    judge(history, 100_500, 100_510)  # still from before
+    watch(history, 500, 1000)
+    assert len(history._waiting) <= 11
+    history.finish()
+    (after, before) = kept_s(tmp_path)
+    assert before == (100_010, 100_399)
+    assert after[0] <= 120, "the alarm does not end only at its former time"
+    assert 850 <= after[1] <= 900
+
+
+def test_the_folder_is_not_read_for_each_sum(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    history = history_in(tmp_path, hold_back_s=0.0)
+    add(history, 0, 300)
+    history.finish()
+    monkeypatch.setattr(healthy_history, "healthy_recordings", lambda *_: pytest.fail("the folder is read"))
+    assert history.seconds == history.seconds_since(0) == 299.0
+
+
+def refuse_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(AtomicAppendFile, "write", refuse)
+
+
+def test_what_a_full_disk_has_is_kept_and_said_until_samples_are_on_the_disk_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    history = history_in(tmp_path, hold_back_s=0.0)
+    add(history, 0, 300)
+    history.flush()
+    add(history, 300, 350)
+    with monkeypatch.context() as full:
+        refuse_writes(full)
+        history.flush()
+        assert kept_s(tmp_path) == [(0, 299)]
+        assert history.seconds == 299.0
+        add(history, 350, 400)
+    assert "No space left on device" in history.problem
+    add(history, 400, 700)
+    assert "No space left on device" in history.problem, "nothing is on the disk yet"
+    history.flush()
+    assert history.problem == ""
+    history.finish()
+    assert kept_s(tmp_path) == [(0, 299), (400, 699)]
+
+
+def test_a_recording_that_a_full_disk_refused_to_finish_is_kept_and_said_until_the_next_one_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    history = history_in(tmp_path, hold_back_s=0.0)
+    add(history, 0, 300)
+    history.flush()
+    with monkeypatch.context() as full:
+        refuse_writes(full)
+        history.finish()
+    assert kept_s(tmp_path) == [(0, 299)]
+    add(history, 400, 700)
+    history.flush()
+    assert "the healthy history cannot be kept" in history.problem
+    history.finish()
+    assert history.problem == ""
+    assert kept_s(tmp_path) == [(0, 299), (400, 699)]
+
+
+def test_a_recording_that_could_not_be_repaired_is_said_until_the_next_one_is_finished(tmp_path: Path) -> None:
+    (tmp_path / "healthy").mkdir()
+    (tmp_path / "healthy" / OPEN_NAME).write_bytes(b"no recording")
+    history = history_in(tmp_path, hold_back_s=0.0)
+    add(history, 0, 300)
+    history.flush()
+    assert "cannot be repaired" in history.problem
+    history.finish()
+    assert history.problem == ""
+
+
+def test_recordings_that_were_finished_and_not_named_get_their_names_at_start(tmp_path: Path) -> None:
+    first = history_in(tmp_path, hold_back_s=0.0)
+    add(first, 0, 300)
+    add(first, 1000, 1300)
+    first.flush()
+    place = tmp_path / "healthy"
+    active = (place / f"{OPEN_NAME}.active").read_bytes()
+    first.close()
+    (finished, other) = (each.path for each in healthy_recordings(tmp_path))
+    finished.rename(place / OPEN_NAME)
+    other.unlink()
+    (place / f"{OPEN_NAME}.active").write_bytes(active)
+    second = history_in(tmp_path)
+    assert second.problem == ""
+    assert kept_s(tmp_path) == [(0, 299), (1000, 1299)]
+    assert second.seconds == 598.0
+    assert sorted(place.iterdir()) == [each.path for each in healthy_recordings(tmp_path)]

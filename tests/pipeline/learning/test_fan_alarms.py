@@ -1,0 +1,85 @@
+"""pipeline.learning.fan_alarms: what the states of scores say about alarms, and what they do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.learning.fan_alarms import LONGEST_UNKNOWN_NS, FanAlarms
+from schemas.messages import FanState, Score
+from schemas.units import NS_PER_S
+
+N, S, A, R = FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING
+SAY_NOTHING = [FanState.UNKNOWN, FanState.COMMISSIONING, FanState.STOPPED, FanState.STARTING]
+
+
+def score(*rows: list[FanState], first_s: int = 0) -> Score:
+    """One row a second; a row has the state of each fan."""
+    state = np.array([[int(each) for each in row] for row in rows], np.uint8)
+    zeros = np.zeros(state.shape)
+    arrays = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "lower_bound_rad_s", "upper_bound_rad_s")
+    more = ("band_variance", "residual_rad_s", "smoothed_residual_rad_s")
+    return Score(
+        fans=state.shape[1],
+        period_ns=NS_PER_S,
+        t_ns=(first_s + np.arange(len(state), dtype=np.int64)) * NS_PER_S,
+        outside=zeros.astype(bool),
+        state=state,
+        valid=zeros.astype(bool),
+        invalid_reason=zeros.astype(np.uint8),
+        **dict.fromkeys((*arrays, *more), zeros),
+    )
+
+
+@pytest.mark.parametrize("state", SAY_NOTHING)
+def test_an_alarm_lasts_through_samples_that_say_nothing(state: FanState) -> None:
+    alarms = FanAlarms(2)
+    alarms.update(score([N, A]))
+    seen = alarms.update(score([N, state]))
+    assert alarms.fans == [1]
+    assert seen.had_alarm
+    assert seen.began_t_ns == []
+    alarms.update(score([N, R]))
+    assert alarms.fans == [1]
+    alarms.update(score([N, S]))
+    assert alarms.fans == []
+
+
+def test_the_last_row_that_says_something_decides_for_each_fan() -> None:
+    alarms = FanAlarms(3)
+    seen = alarms.update(
+        score([A, N, N], [N, A, FanState.UNKNOWN], [FanState.STOPPED, FanState.UNKNOWN, FanState.UNKNOWN])
+    )
+    assert alarms.fans == [1]
+    assert seen.began_t_ns == [0, NS_PER_S]
+
+
+def test_an_alarm_that_ends_in_the_same_score_is_seen() -> None:
+    alarms = FanAlarms(1)
+    seen = alarms.update(score([N], [A], [N], [A], [R], [N]))
+    assert alarms.fans == []
+    assert seen.had_alarm
+    assert seen.began_t_ns == [NS_PER_S, 3 * NS_PER_S]
+
+
+def test_fans_are_judged_where_one_has_a_known_state_or_is_idle() -> None:
+    unknown, stopped, commissioning = FanState.UNKNOWN, FanState.STOPPED, FanState.COMMISSIONING
+    seen = FanAlarms(2).update(
+        score([unknown, unknown], [unknown, N], [commissioning, unknown], [stopped, unknown], [A, N])
+    )
+    assert seen.judged_t_ns.tolist() == [1 * NS_PER_S, 3 * NS_PER_S, 4 * NS_PER_S]
+
+
+def test_alarms_are_known_when_each_fan_was_judged_or_some_for_long() -> None:
+    alarms = FanAlarms(2)
+    assert not alarms.are_known
+    alarms.update(score([FanState.STOPPED, FanState.STOPPED]))
+    assert not alarms.are_known
+    alarms.update(score([N, FanState.STOPPED]))
+    assert not alarms.are_known
+    by_time = FanAlarms(2)
+    by_time.update(score([N, FanState.STOPPED]))
+    by_time.update(score([N, FanState.STOPPED], first_s=LONGEST_UNKNOWN_NS // NS_PER_S))
+    assert by_time.are_known
+    alarms.update(score([FanState.UNKNOWN, A]))
+    assert alarms.are_known

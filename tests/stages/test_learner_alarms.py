@@ -1,0 +1,184 @@
+"""stages.learner: while fans have alarms, or may have one, nothing is learned and no version takes over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.learning.healthy_history import healthy_recordings
+from schemas.messages import FanState, NewTwin
+from schemas.units import NS_PER_S
+from stages.learner import LearnerConfig
+from tests.support.one_learner import START_NS, Learner, raw, restarted
+
+SAY_NOTHING = [FanState.UNKNOWN, FanState.COMMISSIONING, FanState.STOPPED, FanState.STARTING]
+
+
+def test_nothing_is_learned_beside_an_alarm(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    before = len(learner.learning.starts)
+    learner.run(3000, state=FanState.ALARM)
+    assert len(learner.learning.starts) == before
+    assert all(each.span[1] < START_NS + 600 * NS_PER_S for each in healthy_recordings(tmp_path))
+
+
+def test_a_restarted_learner_publishes_the_version_in_force_at_once(tmp_path: Path) -> None:
+    first = Learner(tmp_path)
+    first.run(600)
+    first.core.close()
+    second = Learner(tmp_path)
+    second.emitted += second.core.tick(START_NS)
+    (message,) = second.emitted
+    assert isinstance(message, NewTwin)
+    assert (message.twin, message.content) == ("tray1-1", b"tray1-1")
+
+
+def test_a_version_waits_for_the_end_of_an_alarm_unless_an_operator_chose_it(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    assert learner.put_in_force == ["tray1-1"]
+    learner.add_version("tray1-2")
+    learner.run(100, state=FanState.ALARM)
+    assert learner.put_in_force == ["tray1-1"]
+    learner.versions.use("tray1-1")
+    learner.versions.use("tray1-2")
+    learner.run(100, state=FanState.ALARM)
+    assert learner.put_in_force == ["tray1-1", "tray1-2"]
+    learner.add_version("tray1-3")
+    learner.run(100, state=FanState.ALARM)
+    learner.run(20)
+    assert learner.put_in_force == ["tray1-1", "tray1-2", "tray1-3"]
+
+
+@pytest.mark.parametrize("state", SAY_NOTHING)
+def test_an_alarm_is_not_forgotten_while_scores_say_nothing_about_it(tmp_path: Path, state: FanState) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    made = len(learner.learning.starts)
+    learner.run(100, state=FanState.ALARM)
+    began_t_ns = START_NS + 600 * NS_PER_S
+    learner.add_version("tray1-2")
+    learner.run(3000, state=state)
+    assert learner.put_in_force == ["tray1-1"]
+    assert len(learner.learning.starts) == made
+    assert all(each.span[1] < began_t_ns for each in healthy_recordings(tmp_path))
+    learner.run(20)
+    assert learner.put_in_force == ["tray1-1", "tray1-2"]
+
+
+def test_while_a_fan_has_an_alarm_the_notes_say_that_nothing_is_learned(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    learner.run(20, state=FanState.ALARM)
+    learner.run(20, state=FanState.UNKNOWN)
+    assert learner.core.notes()[1:] == ["no learning while fan 0 has an alarm"]
+    learner.run(20)
+    assert len(learner.core.notes()) == 1
+
+
+def test_a_restarted_learner_publishes_the_version_before_while_a_fan_may_have_an_alarm(tmp_path: Path) -> None:
+    first = Learner(tmp_path)
+    first.run(600)
+    assert first.versions.read().published == "tray1-1"
+    first.run(20, state=FanState.ALARM)
+    first.add_version("tray1-2")
+    second = restarted(first)
+    second.run(100, state=None)
+    second.run(100, state=FanState.UNKNOWN)
+    second.run(100, state=FanState.STOPPED)
+    second.run(100, state=FanState.ALARM)
+    assert second.put_in_force == ["tray1-1"]
+    assert "tray1-2 waits: it takes over when no fan has an alarm, by the scores of all fans" in second.core.notes()
+    second.run(20)
+    assert second.put_in_force == ["tray1-1", "tray1-2"]
+    assert second.versions.read().published == "tray1-2"
+
+
+def test_a_restarted_learner_publishes_at_once_what_an_operator_chose(tmp_path: Path) -> None:
+    first = Learner(tmp_path)
+    first.run(600)
+    first.run(20, state=FanState.ALARM)
+    first.add_version("tray1-2")
+    first.versions.use("tray1-2")
+    second = restarted(first)
+    second.run(10, state=None)
+    assert second.put_in_force == ["tray1-2"]
+
+
+def test_a_restarted_learner_publishes_the_version_in_force_if_the_one_before_is_gone(tmp_path: Path) -> None:
+    first = Learner(tmp_path)
+    first.run(600)
+    first.run(20, state=FanState.ALARM)
+    first.add_version("tray1-2")
+    first.versions.file("tray1-1").unlink()
+    second = restarted(first)
+    second.run(10, state=None)
+    assert second.put_in_force == ["tray1-2"]
+
+
+@pytest.mark.parametrize("state", [None, FanState.UNKNOWN])
+def test_samples_that_no_score_judged_are_not_learned_from(tmp_path: Path, state: FanState | None) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    seconds = learner.history.seconds
+    learner.run(5000, state=state)
+    assert learner.history.seconds == seconds
+    learner.run(300)
+    learner.core.close()
+    assert all(
+        each.span[1] < START_NS + 600 * NS_PER_S or each.span[0] >= START_NS + 5600 * NS_PER_S
+        for each in healthy_recordings(tmp_path)
+    )
+    assert learner.history.seconds > seconds + 200.0
+
+
+def test_samples_of_stopped_fans_are_learned_from(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    seconds = learner.history.seconds
+    learner.run(500, state=FanState.STOPPED)
+    assert learner.history.seconds > seconds + 400.0
+
+
+def test_after_a_restart_samples_wait_for_scores_from_the_first_one_on(tmp_path: Path) -> None:
+    first = Learner(tmp_path)
+    first.run(600)
+    second = restarted(first)
+    seconds = second.history.seconds
+    for _ in range(20):
+        second.core.step(raw(second.now_s, moves=True))
+        second.now_s += 10
+    assert second.history.seconds == seconds
+
+
+def test_when_an_alarm_begins_its_time_is_listed(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    learner.run(100, state=FanState.ALARM)
+    learner.run(100, state=FanState.UNKNOWN)
+    learner.run(100, state=FanState.RETURNING)
+    learner.run(100)
+    learner.run(100, state=FanState.ALARM)
+    assert learner.versions.read().alarms_t_ns == tuple(START_NS + second * NS_PER_S for second in (600, 1000))
+    learner.run(10)
+    kept_s = round(3600 * LearnerConfig().kept_hours)
+    learner.now_s += kept_s
+    learner.run(10, state=FanState.ALARM)
+    assert learner.versions.read().alarms_t_ns == (START_NS + (1110 + kept_s) * NS_PER_S,)
+
+
+def test_an_alarm_that_cannot_be_listed_is_a_problem_and_nothing_more(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    lock = tmp_path / "versions.json.lock"
+    lock.unlink()
+    lock.mkdir()
+    learner.run(20, state=FanState.ALARM)
+    assert "cannot write the versions of the twin" in learner.core.problem()
+    assert "\n" not in learner.core.problem()
+    lock.rmdir()
+    learner.run(20)
+    learner.run(20, state=FanState.ALARM)
+    assert learner.core.problem() == ""
