@@ -80,6 +80,8 @@ class LearningSchedule:
         if not listed.versions:
             return self._history.seconds >= self._first_s and not self._operation.missing()
         last = listed.versions[-1]
+        if listed.is_tainted:
+            return self._history.seconds >= self._first_s
         if listed.commissioned_t_ns > last.made_t_ns:
             return since(listed.commissioned_t_ns) >= AFTER_COMMISSIONING_S
         return not listed.waiting and since(last.made_t_ns) >= min(last.learned_s, LONGEST_WAIT_S)
