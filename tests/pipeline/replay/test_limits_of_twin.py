@@ -36,10 +36,11 @@ def test_calibration_knows_top_speed_bend_and_drive_of_all_twins(
     monkeypatch.setattr(limits_of_twin, "calibrate", seen)
     faster = replace(plain, card=replace(plain.card, speed_range_rad_s=(0.0, 700.0)))
     for twins in ([plain], [with_a_drive(plain)], [with_a_drive(plain), faster]):
-        limits_of_twin.find_limits(twins, lambda: iter(()), Timing(), 1.0)
+        limits_of_twin.find_limits(twins, lambda: iter(()), Timing(), 1.0, alarms_left_out=2)
     bend_rad_s = plain.bend_rad_s
     assert bend_rad_s
     common = {"crossover_speed_rad_s": bend_rad_s, "sigma_rad_s": pytest.approx(plain.sigma_rad_s.mean())}
+    common |= {"alarms_left_out": 2}
     assert given == [
         {"top": 500.0, "has_drive": False, **common},
         {"top": 500.0, "has_drive": True, **common},
