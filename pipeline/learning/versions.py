@@ -49,8 +49,8 @@ class Version(_Record):
     newest recording that it was not trained on, all fans together. error_before: the same of the version that was in
     force. reference: the version that changes of the fans are measured against; its own name if there is none yet.
     change: of each fan, its mean speed in the newest day of healthy running relative to the reference's prediction,
-    less one. declared_per_day: false alarms per fan and day that the limits were set for; is_target: the data are too
-    few to show that the limits keep it. Speeds are in the unit of the tray.
+    less one; None where it is not comparable. declared_per_day: false alarms per fan and day that the limits were set
+    for; is_target: the data are too few to show that the limits keep it. Speeds are in the unit of the tray.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Version(_Record):
     speed_unit: str
     error: float
     error_before: float | None = None
-    change: tuple[float, ...]
+    change: tuple[float | None, ...]
     reference: str
     drops: tuple[Drop, ...]
     declared_per_day: float
@@ -89,13 +89,14 @@ class Check(_Record):
     """The fans beside the reference.
 
     t_ns: time of the newest sample. reference: empty if there is none yet. change: of each fan, by which share its mean
-    speed over the newest day of healthy running has changed since the reference was made. found: what has changed more
-    than healthy fans do, in words; empty if nothing has. spans: then those of the recordings of that day.
+    speed over the newest day of healthy running has changed since the reference was made; None where it is not
+    comparable. found: what has changed more than healthy fans do, in words; empty if nothing has. spans: then those of
+    the recordings of that day.
     """
 
     t_ns: int
     reference: str
-    change: tuple[float, ...]
+    change: tuple[float | None, ...]
     found: str
     spans: tuple[TimeSpan, ...]
 

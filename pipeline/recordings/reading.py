@@ -88,9 +88,9 @@ class Reading:
             self.damaged_chunks = corrupt + len(reader.damaged_ranges)
             try:
                 if isinstance(record.parsed, Chunk):
-                    envelopes = self._envelopes(chunk_data(record.parsed), channels)
+                    envelopes = self.envelopes_in(chunk_data(record.parsed), channels)
                 elif record.opcode in (Opcode.CHANNEL, Opcode.MESSAGE):
-                    envelopes = self._envelopes(record.data, channels)
+                    envelopes = self.envelopes_in(record.data, channels)
                 else:
                     continue
             except CORRUPT_DATA_ERRORS:
@@ -100,7 +100,7 @@ class Reading:
         self.truncated = not reader.is_complete
         self.damaged_chunks = corrupt + len(reader.damaged_ranges)
 
-    def _envelopes(self, data: bytes, channels: dict[int, tuple[str, str]]) -> list[Envelope]:
+    def envelopes_in(self, data: bytes, channels: dict[int, tuple[str, str]]) -> list[Envelope]:
         """The wanted messages in the records of a chunk; their channels are added to `channels`."""
         envelopes = []
         at, end = 0, len(data)
@@ -113,11 +113,12 @@ class Reading:
                     payload = data[at + MESSAGE.size : at + length]
                     envelopes.append(Envelope(*channels[channel], payload, received_t_ns, None, newest_t_ns))
             elif opcode == Opcode.CHANNEL:
-                self._add_channel(parse(Channel, data[at : at + length]), channels)
+                self.add_channel(parse(Channel, data[at : at + length]), channels)
             at += length
         return envelopes
 
-    def _add_channel(self, channel: Channel, channels: dict[int, tuple[str, str]]) -> None:
+    def add_channel(self, channel: Channel, channels: dict[int, tuple[str, str]]) -> None:
+        """Add a channel to `channels`, by its id, if its messages are wanted."""
         key = channel.topic
         try:
             topic = topic_of(key).name

@@ -7,8 +7,9 @@ The time of a sample is computed as in the pipeline, from the device clock if th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,9 @@ from pipeline.recordings.reading import RecordingError, read_metadata, read_reco
 from schemas.messages import Array, Raw
 from schemas.tacho import Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
+
+MERGED_MESSAGES = 1024
+"""so many are kept as one while a recording is read"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +51,11 @@ class RecordedTray:
     damage: str
     """what of the file could not be read, in one line; empty if all of it was read"""
 
+    def between(self, from_s: float, to_s: float) -> RecordedTray:
+        """The samples with from_s <= t_s < to_s, of runs that have at least two of them."""
+        parts = (_rows(run, (run.t_s >= from_s) & (run.t_s < to_s)) for run in self.runs)
+        return replace(self, runs=tuple(run for run in parts if len(run.t_s) > 1))
+
 
 def read_runs(
     path: Path,
@@ -56,6 +65,9 @@ def read_runs(
     to_s: float = math.inf,
 ) -> RecordedTray:
     """The raw samples of a tray with from_s <= t_s < to_s.
+
+    The whole recording is read, because the device clock is followed from its start; pipeline.recordings.excerpts reads
+    only what is around an excerpt.
 
     tray: needed only if the recording has several. fans: counted from 0; None for all.
 
@@ -67,77 +79,131 @@ def read_runs(
     for envelope in reading:
         assert isinstance(envelope.message, Raw)
         if tray is None or envelope.message.header.tray == tray:
-            by_tray.setdefault(envelope.message.header.tray, []).append(envelope.message)
+            messages = by_tray.setdefault(envelope.message.header.tray, [])
+            messages.append(envelope.message)
+            if len(messages) % MERGED_MESSAGES == 0:
+                messages[-MERGED_MESSAGES:] = merged(messages[-MERGED_MESSAGES:])
     if not by_tray:
         raise RecordingError(f"{path}: no raw samples{f' of tray {tray!r}' if tray else ''} in this recording")
     if len(by_tray) > 1:
         raise RecordingError(f"{path}: several trays, {', '.join(sorted(by_tray))}: choose one with --tray")
     ((name, messages),) = by_tray.items()
-    segments = [segment for segment in _segments(path, messages) if len(segment[0])]
-    start_ns = segments[0][0][0] if segments else 0
-    runs = [
-        _run(path, name, (t_ns - start_ns) / NS_PER_S, command, speed_rad_s, fans, from_s, to_s)
-        for t_ns, command, speed_rad_s in segments
-    ]
-    runs = [run for run in runs if len(run.t_s) > 1]
-    if not runs:
-        raise RecordingError(f"{path}: fewer than two raw samples from {from_s:g} s to {to_s:g} s; see --from and --to")
+    found = recorded_tray(path, name, messages, reading.damage, fans).between(from_s, to_s)
+    if not found.runs:
+        raise no_samples(path, from_s, to_s)
+    return found
+
+
+def merged(messages: Sequence[Raw]) -> list[Raw]:
+    """The same samples in as few messages as possible; the many arrays of small ones take more memory than samples."""
+    groups = groupby(messages, key=lambda raw: (raw.fans, len(raw.device_clock_us) > 0))
+    return [_one(list(group)) for _, group in groups]
+
+
+def _one(messages: Sequence[Raw]) -> Raw:
+    names = ("host_receive_t_ns", "device_clock_us", "command", "speed_rad_s")
+    columns = {name: np.concatenate([getattr(raw, name) for raw in messages]) for name in names}
+    return Raw(header=messages[0].header, fans=messages[0].fans, **columns)
+
+
+def no_samples(path: Path, from_s: float, to_s: float) -> RecordingError:
+    """The error of a part of a recording that has no two samples."""
+    return RecordingError(f"{path}: fewer than two raw samples from {from_s:g} s to {to_s:g} s; see --from and --to")
+
+
+def recorded_tray(
+    path: Path,
+    tray: str,
+    messages: Sequence[Raw],
+    damage: str,
+    fans: Sequence[int] | None = None,
+    start_t_ns: int | None = None,
+) -> RecordedTray:
+    """The runs of successive messages of a tray.
+
+    start_t_ns: time of the first sample of the recording; None: that of these messages.
+
+    Raises:
+        RecordingError: the number of fans changes, there is no such fan, or the metadata are damaged.
+    """
+    segments = segments_of(path, messages)
+    if start_t_ns is None:
+        start_t_ns = int(segments[0][0][0]) if segments else 0
+    runs = tuple(_run(path, tray, segment, start_t_ns, fans) for segment in segments)
     metadata = read_metadata(path)
     try:
-        tacho = tacho_of_each_fan(metadata.tacho(name), messages[0].fans)
+        tacho = tacho_of_each_fan(metadata.tacho(tray), messages[0].fans)
     except (ValueError, RecordingError) as error:
         raise RecordingError(f"{path}: {error}") from error
     chosen = tacho if fans is None else tuple(tacho[fan] for fan in fans)
-    return RecordedTray(tuple(runs), metadata.speed_unit(name), chosen, reading.damage)
+    return RecordedTray(runs, metadata.speed_unit(tray), chosen, damage)
 
 
 Columns = tuple[Array, Array, Array]
 """t_ns (n,), command (n, fans), speed_rad_s (n, fans)."""
 
 
-def _segments(path: Path, messages: Sequence[Raw]) -> list[Columns]:
-    """The samples by rising time, one item per segment of the device clock."""
+def segments_of(path: Path, messages: Sequence[Raw]) -> list[Columns]:
+    """The samples by rising time, one item per segment of the device clock that has any.
+
+    Raises:
+        RecordingError: the number of fans changes.
+    """
     fans = {message.fans for message in messages}
     if len(fans) > 1:
         raise RecordingError(
             f"{path}: the number of fans changes from {' to '.join(map(str, sorted(fans)))}: split the recording there"
         )
+    t_ns, segment = _times(messages)
+    command = np.concatenate([message.command for message in messages])
+    speed_rad_s = np.concatenate([message.speed_rad_s for message in messages])
+    firsts = [0, *(np.flatnonzero(np.diff(segment)) + 1).tolist(), len(t_ns)]
+    parts = (slice(first, last) for first, last in pairwise(firsts) if last > first)
+    segments = (_in_order(t_ns[part], command[part], speed_rad_s[part]) for part in parts)
+    return [each for each in segments if len(each[0])]
+
+
+def _times(messages: Iterable[Raw]) -> tuple[Array, Array]:
+    """(n,) the host time of each sample, and the number of its segment of the device clock."""
     clock = DeviceClock()
-    segments: list[tuple[list[int], list[Array], list[Array]]] = []
+    times: list[Array] = []
+    segments: list[Array] = []
     for message in messages:
-        clock_us = message.device_clock_us.tolist()
-        for k, received_ns in enumerate(message.host_receive_t_ns.tolist()):
-            t_ns = clock.to_host_ns(clock_us[k], received_ns) if clock_us else received_ns
-            if len(segments) < max(1, clock.segments):
-                segments.append(([], [], []))
-            times, commands, speeds = segments[-1]
-            times.append(t_ns)
-            commands.append(message.command[k])
-            speeds.append(message.speed_rad_s[k])
-    return [_in_order(np.array(t, np.int64), np.array(c), np.array(s)) for t, c, s in segments]
+        received = message.host_receive_t_ns
+        if len(message.device_clock_us):
+            mapped = [
+                (clock.to_host_ns(clock_us, received_ns), clock.segments)
+                for clock_us, received_ns in zip(message.device_clock_us.tolist(), received.tolist(), strict=True)
+            ]
+            both = np.array(mapped, np.int64)
+            times.append(both[:, 0])
+            segments.append(both[:, 1].astype(np.int32))
+        else:  # before the first segment of a clock, such samples belong to it
+            times.append(received)
+            segments.append(np.full(len(received), max(1, clock.segments), np.int32))
+    return np.concatenate(times), np.concatenate(segments)
 
 
 def _in_order(t_ns: Array, command: Array, speed_rad_s: Array) -> Columns:
     """Samples by rising time from the first known command on; of samples with the same time, the first received."""
+    if np.all(np.diff(t_ns) > 0) and not np.isnan(command).any():
+        return t_ns, command, speed_rad_s  # as nearly all are; saves copies
     t_ns, first = np.unique(t_ns, return_index=True)
     command = hold_last(command[first])
     known = ~np.any(np.isnan(command), axis=1)
     return t_ns[known], command[known], speed_rad_s[first][known]
 
 
-def _run(
-    path: Path,
-    tray: str,
-    t_s: Array,
-    command: Array,
-    speed_rad_s: Array,
-    fans: Sequence[int] | None,
-    from_s: float,
-    to_s: float,
-) -> RecordedRun:
-    if fans is None:
-        fans = range(command.shape[1])
-    if not all(0 <= fan < command.shape[1] for fan in fans):
-        raise RecordingError(f"{path}: the tray has fans 0 to {command.shape[1] - 1}; see --fans")
-    wanted = (t_s >= from_s) & (t_s < to_s)
-    return RecordedRun(path, tray, t_s[wanted], command[wanted][:, fans], speed_rad_s[wanted][:, fans])
+def _run(path: Path, tray: str, segment: Columns, start_t_ns: int, fans: Sequence[int] | None) -> RecordedRun:
+    t_ns, command, speed_rad_s = segment
+    if fans is not None:
+        if not all(0 <= fan < command.shape[1] for fan in fans):
+            raise RecordingError(f"{path}: the tray has fans 0 to {command.shape[1] - 1}; see --fans")
+        command, speed_rad_s = command[:, fans], speed_rad_s[:, fans]
+    return RecordedRun(path, tray, (t_ns - start_t_ns) / NS_PER_S, command, speed_rad_s)
+
+
+def _rows(run: RecordedRun, wanted: Array) -> RecordedRun:
+    if wanted.all():
+        return run
+    return replace(run, t_s=run.t_s[wanted], command=run.command[wanted], speed_rad_s=run.speed_rad_s[wanted])

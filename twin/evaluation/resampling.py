@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.errors import TwinError
 from twin.evaluation.accuracy import evaluation_pieces
@@ -57,6 +58,19 @@ def irregular(run: Run, seed: int = 0) -> Run:
     kept = kept[kept < run.samples]
     if len(kept) < 2:
         raise TwinError(f"run {run.name!r}: {run.samples} samples are too few to thin; give a longer run")
+    return _with_samples(run, kept)
+
+
+def thinned(run: Run, every: int) -> Run:
+    """Every so many samples of the run, from the first on; the run itself where fewer than two would remain.
+
+    Also for tachos that count: their readings are compared with the mean of a free run over the window, at any times.
+    """
+    kept = np.arange(0, run.samples, every)
+    return run if every == 1 or len(kept) < 2 else _with_samples(run, kept)
+
+
+def _with_samples(run: Run, kept: NDArray[np.intp]) -> Run:
     t_s = run.t_s[kept]
     return replace(run, t_s=t_s, command=_mean_command(run, t_s), speed_rad_s=run.speed_rad_s[kept])
 

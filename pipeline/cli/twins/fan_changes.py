@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.cli.twins.excerpts import Excerpt, each_excerpt
 from pipeline.cli.twins.training_data import TrainingData, twin_errors
-from pipeline.cli.twins.version_data import Excerpt
 
 if TYPE_CHECKING:
     from schemas.messages import Array
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 MOST_CHANGE = 0.03
 """of the speed of a fan since the reference that counts as healthy: about a seventh of what a blocked inlet or a lost
 blade takes"""
+LEAST_COMPARED = 0.1
+"""of the samples: a fan with fewer readings at commands that the reference was trained on is not comparable"""
 
 
 def residual_of(twin: Path, data: TrainingData, *, within_range: bool = False) -> tuple[Array, Array]:
@@ -37,28 +40,50 @@ def residual_of(twin: Path, data: TrainingData, *, within_range: bool = False) -
 
 
 def mean_changes(twin: Path, parts: Sequence[Excerpt]) -> Array:
-    """(fans,) how far the mean speed is from that of a twin, as a share of it; 0 where nothing was measured.
+    """(fans,) how far the mean speed is from that of a twin, as a share of it; NaN where a fan is not comparable.
 
-    parts: of the time over which the mean is taken.
+    parts: of the time over which the mean is taken; one at a time is in memory.
+
+    Raises:
+        UserError: they cannot be read.
     """
-    found = [residual_of(twin, part.read(), within_range=True) for part in parts]
-    residual, measured = (np.concatenate([each[k] for each in found]) for k in (0, 1))
+    of_parts = np.array([_sums(twin, data) for data in each_excerpt(parts)])
+    expected, moved, known, samples = of_parts.sum(axis=0)
+    comparable = (known >= LEAST_COMPARED * samples) & (expected > 0.0)
+    return np.divide(moved, expected, out=np.full(len(comparable), np.nan), where=comparable)
+
+
+def _sums(twin: Path, data: TrainingData) -> Array:
+    """(4, fans) the sums of expected speeds and of residuals, and the numbers of these and of all samples."""
+    residual, measured = residual_of(twin, data, within_range=True)
     known = np.isfinite(residual) & np.isfinite(measured)
     expected = np.where(known, measured - residual, 0.0).sum(axis=0)
     moved = np.where(known, residual, 0.0).sum(axis=0)
-    return np.divide(moved, expected, out=np.zeros(len(moved)), where=expected > 0.0)
+    return np.stack((expected, moved, known.sum(axis=0), np.full(len(moved), len(known))))
+
+
+def changes_to_list(change: Array) -> tuple[float | None, ...]:
+    """Changes of fans for the list of versions: None where a fan is not comparable."""
+    return tuple(each if math.isfinite(each) else None for each in change.tolist())
+
+
+def changes_from_list(change: Sequence[float | None]) -> Array:
+    """The inverse of `changes_to_list`."""
+    return np.array([math.nan if each is None else each for each in change])
 
 
 def changed_fans(change: Array, reference: str) -> str:
     """What has changed more than healthy fans do, in words; empty if nothing has. change: (fans,), since the
-    reference."""
+    reference; NaN for a fan that is not comparable."""
     far = np.flatnonzero(np.abs(change) > MOST_CHANGE)
     if not len(far):
         return ""
-    together = len(change) > 1 and np.all(np.sign(change) == np.sign(change[far[0]]))
-    if together and np.min(np.abs(change)) > 0.5 * np.max(np.abs(change)):
+    compared = change[np.isfinite(change)]
+    together = len(compared) > 1 and np.all(np.sign(compared) == np.sign(change[far[0]]))
+    if together and np.min(np.abs(compared)) > 0.5 * np.max(np.abs(compared)):
+        which = "all fans" if len(compared) == len(change) else f"all {len(compared)} fans that can be compared"
         return (
-            f"all fans are {_faster(float(np.mean(change)))} than when {reference} was made; if maintenance, a filter "
+            f"{which} are {_faster(float(np.mean(compared)))} than when {reference} was made; if maintenance, a filter "
             "or new firmware is the reason, put this version in force"
         )
     named = ", ".join(f"fan {fan} is {_faster(float(change[fan]))}" for fan in far.tolist())

@@ -24,14 +24,21 @@ import numpy as np
 
 from pipeline.cli.twins.calibrate import calibrate
 from pipeline.cli.twins.drops_found import drops_found
-from pipeline.cli.twins.fan_changes import changed_fans, mean_changes, residual_of
-from pipeline.cli.twins.train import train
+from pipeline.cli.twins.excerpts import read_excerpts
+from pipeline.cli.twins.fan_changes import (
+    changed_fans,
+    changes_from_list,
+    changes_to_list,
+    mean_changes,
+    residual_of,
+)
+from pipeline.cli.twins.train import fit_twin
 from pipeline.cli.twins.training_data import TrainingData, twin_errors
 from pipeline.cli.twins.version_data import Split, newest_long, newest_recordings, split, spread_parts
 from pipeline.errors import UserError
 from pipeline.learning.healthy_history import HealthyRecording, healthy_recordings
 from pipeline.learning.versions import Check, Drop, Outcome, TwinVersions, Version, VersionList, overlap
-from pipeline.recordings.runs import read_runs
+from pipeline.recordings.excerpts import ExcerptReader
 from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.calibration.calibration import too_little
 from scoring.limits import Limits
@@ -39,8 +46,6 @@ from scoring.limits import Limits
 if TYPE_CHECKING:
     from schemas.messages import Array
 
-MOST_TRAINING_SAMPLES = 10_000
-"""of a fan: so many are enough for small networks, and take a minute or two"""
 WANTED_S = 24 * 3600.0
 """of healthy running that limits are set from, unless the declared rate needs more; an hour takes about ten seconds"""
 MARGIN = 1.3
@@ -128,9 +133,8 @@ class _Work:
         """file_of: the file of a version. listed: the versions before this one."""
         self._place, self._name, self._file_of, self._listed = place, name, file_of, listed
         self._recordings, self._before, self._per_day, self._say = recordings, listed.current, per_day, say
-        rate_hz, fans = _rate_and_fan_count(recordings[-1])
-        self._most_s = MOST_TRAINING_SAMPLES / rate_hz
-        needed_s = 3600.0 * too_little(0.0, per_day).needed_fan_hours / fans
+        self._rate_hz, self._fans = _rate_and_fan_count(recordings[-1])
+        needed_s = 3600.0 * too_little(0.0, per_day).needed_fan_hours / self._fans
         self._calibration_recordings = newest_recordings(recordings, max(WANTED_S, MARGIN * needed_s))
         since_t_ns = max(listed.commissioned_t_ns, listed.waiting.made_t_ns if listed.waiting else 0)
         since = [each for each in recordings if each.span[0] >= since_t_ns]
@@ -150,7 +154,7 @@ class _Work:
         found = changed_fans(change, reference.name)
         spans = tuple(each.span for each in self._recordings if found and each.span[1] > self._unchanged_t_ns())
         return Check(
-            t_ns=newest_t_ns, reference=reference.name, change=tuple(change.tolist()), found=found, spans=spans
+            t_ns=newest_t_ns, reference=reference.name, change=changes_to_list(change), found=found, spans=spans
         )
 
     def _unchanged_t_ns(self) -> int:
@@ -165,18 +169,18 @@ class _Work:
 
     def _change_since(self, version: Version) -> Array:
         """(fans,) by which share the mean speeds over the newest hours have changed since a version was made."""
-        return mean_changes(self._file_of(version.name), spread_parts(self._newest)) - np.array(version.change)
+        return mean_changes(self._file_of(version.name), spread_parts(self._newest)) - changes_from_list(version.change)
 
     def offered(self, changed: str) -> tuple[Version, bytes]:
         """A version of the fans after their change. changed: it, in words."""
         first = self._recordings.index(newest_long(self._newest))
         after = self._recordings[first:]
         self._calibration_recordings = self._newest = list(after)
-        parts = split(after, self._most_s)
+        parts = split(after, self._rate_hz, self._fans)
         return self._made(
             self._trained(parts),
             "trained",
-            parts.comparison.read(),
+            read_excerpts(parts.comparison),
             "offered",
             changed,
             learned=after,
@@ -185,8 +189,8 @@ class _Work:
 
     def taken(self) -> tuple[Version, bytes]:
         """A version that takes over: a newly trained twin if it is better than the one in force, or new limits."""
-        parts, before = split(self._recordings, self._most_s), self._before
-        trained, test = self._trained(parts), parts.comparison.read()
+        parts, before = split(self._recordings, self._rate_hz, self._fans), self._before
+        trained, test = self._trained(parts), read_excerpts(parts.comparison)
         if before is None:
             return self._made(trained, "trained", test, "taken", "the first one")
         in_force, reference = self._file_of(before.name), self._reference()
@@ -238,7 +242,7 @@ class _Work:
             speed_unit=test.speed_unit,
             error=_error(twin, test),
             error_before=_error(self._file_of(before.name), test) if before else None,
-            change=tuple(mean_changes(of_reference, spread_parts(self._newest)).tolist()),
+            change=changes_to_list(mean_changes(of_reference, spread_parts(self._newest))),
             reference=reference.name if reference else self._name,
             drops=limited.drops,
             declared_per_day=self._per_day,
@@ -256,20 +260,11 @@ class _Work:
 
     def _trained(self, parts: Split) -> Path:
         """A newly trained twin, without limits."""
-        training, validation = parts.training, parts.validation
         twin = self._place / f"{self._name}.onnx"
         self._say(f"{self._name}: training")
-        with _quietly():
-            train(
-                training.paths,
-                twin,
-                validate=validation.paths,
-                from_s=training.from_s,
-                to_s=training.to_s,
-                validate_from_s=validation.from_s,
-                validate_to_s=validation.to_s,
-                name=self._name,
-            )
+        training, validation = read_excerpts(parts.training), read_excerpts(parts.validation)
+        with twin_errors():
+            fit_twin(training, validation, self._name).save(twin)
         return twin
 
     def _with_limits(self, twin: Path, test: TrainingData) -> _WithLimits:
@@ -311,7 +306,7 @@ def _finite(value: float) -> float | None:
 
 def _rate_and_fan_count(recording: HealthyRecording) -> tuple[float, int]:
     """Samples a second of a tray, from the first minute, and its number of fans."""
-    runs = read_runs(recording.path, to_s=60.0).runs
+    runs = ExcerptReader(recording.path).read(0.0, 60.0).runs
     seconds = sum(float(run.t_s[-1] - run.t_s[0]) for run in runs)
     return sum(len(run.t_s) for run in runs) / max(seconds, 1e-9), runs[0].command.shape[1]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
@@ -30,6 +31,7 @@ from pipeline.cli.twins.training_data import (
 
 if TYPE_CHECKING:
     from twin.build import TrainedTwin
+    from twin.progress import Progress
 
 
 Trainer: TypeAlias = Literal["levenberg-marquardt", "adam"]
@@ -39,6 +41,23 @@ NetworkInputs: TypeAlias = Literal["speed,command", "speed"]
 
 NETWORKS = 4
 """with so many, twins hardly depend on the seed: docs/reference/benchmarks.md"""
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How a twin is trained; see the options of the command."""
+
+    model: str = "hybrid"
+    seed: int = 0
+    trainer: Trainer = "levenberg-marquardt"
+    iterations: int | None = None
+    network_inputs: NetworkInputs = "speed,command"
+    physics: Physics = "refined"
+    networks: int | None = None
+    command_unit: str = ""
+
+
+DEFAULT_SETTINGS = TrainingSettings()
 
 
 def train(
@@ -89,10 +108,6 @@ def train(
     """
     not_written = "no twin was written; --iterations N ends after N iterations of each network and writes one"
     with interruptible(not_written), twin_errors():
-        from twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
-        from twin.kinds import find_kind  # noqa: PLC0415
-
-        can_average = find_kind(model).averages_networks and trainer == "levenberg-marquardt"
         check_writable(output, ".onnx")
         training_data = read_training_data(recordings, tray, fans, from_s, to_s, window_s)
         held_out = (
@@ -104,22 +119,12 @@ def train(
         if not json_output:
             show_hints(hints)
         with training_progress(training_data) as start:
-            trained = train_twin(
-                training_data.runs,
-                held_out.runs if held_out else [],
-                model,
-                name=name or output.stem,
-                seed=seed,
-                trainer=trainer,
-                max_iterations=iterations,
-                network_inputs=tuple(network_inputs.split(",")),
-                physics=physics,
-                networks=networks if networks is not None else NETWORKS if can_average else 1,
-                command_unit=command_unit,
-                fan_numbers=training_data.fans,
-                data=data_cards(training_data),
-                validation_data=data_cards(held_out) if held_out else (),
-                progress=start(""),
+            trained = fit_twin(
+                training_data,
+                held_out,
+                name or output.stem,
+                TrainingSettings(model, seed, trainer, iterations, network_inputs, physics, networks, command_unit),
+                start(""),
             )
         trained.save(output)
     result = as_json(trained, training_data, output, hints)
@@ -131,6 +136,42 @@ def train(
     typer.echo(f"  {balance_sentence(result)}")
     for warning in result["warnings"]:
         typer.echo(warning, err=True)
+
+
+def fit_twin(
+    training_data: TrainingData,
+    held_out: TrainingData | None,
+    name: str,
+    settings: TrainingSettings = DEFAULT_SETTINGS,
+    progress: Progress | None = None,
+) -> TrainedTwin:
+    """A twin of what was read. held_out: on which its weights are chosen and its band is measured.
+
+    Raises:
+        TwinError: the data do not suffice.
+    """
+    from twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
+    from twin.kinds import find_kind  # noqa: PLC0415
+    from twin.progress import unreported  # noqa: PLC0415
+
+    can_average = find_kind(settings.model).averages_networks and settings.trainer == "levenberg-marquardt"
+    return train_twin(
+        training_data.runs,
+        held_out.runs if held_out else [],
+        settings.model,
+        name=name,
+        seed=settings.seed,
+        trainer=settings.trainer,
+        max_iterations=settings.iterations,
+        network_inputs=tuple(settings.network_inputs.split(",")),
+        physics=settings.physics,
+        networks=settings.networks if settings.networks is not None else NETWORKS if can_average else 1,
+        command_unit=settings.command_unit,
+        fan_numbers=training_data.fans,
+        data=data_cards(training_data),
+        validation_data=data_cards(held_out) if held_out else (),
+        progress=progress or unreported,
+    )
 
 
 def balance_sentence(result: dict[str, Any]) -> str:

@@ -18,7 +18,7 @@ from pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT
 from pipeline.devices.tacho_evidence import tacho_hints
 from pipeline.errors import UserError
 from pipeline.optional_dependencies import how_to_install
-from pipeline.recordings.runs import RecordedRun, read_runs
+from pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
 from schemas.tacho import Tacho
 
 if TYPE_CHECKING:
@@ -112,26 +112,28 @@ def read_training_data(
     Raises:
         UserError: a recording cannot be used, or they are not in one unit.
     """
+    found = [read_runs(path, tray, fan_numbers(fans), from_s, to_s) for path in recordings]
+    for each in found:
+        if each.damage:
+            typer.echo(each.damage, err=True)
+    return training_data_of(found, fans, windows_s)
+
+
+def training_data_of(
+    found: Sequence[RecordedTray], fans: str | None = None, windows_s: Sequence[float] | None = None
+) -> TrainingData:
+    """The runs of what was read of recordings, their outliers left out. fans, windows_s: as for `read_training_data`.
+
+    Raises:
+        UserError: they are not in one unit.
+    """
     from twin.fitting.outliers import without_outliers  # noqa: PLC0415  the command line loads twin only when it is needed
     from twin.runs import Run  # noqa: PLC0415
 
     counted = counting_tachos(windows_s) if windows_s else None
-    recorded: list[RecordedRun] = []
-    tachos: list[tuple[Tacho, ...]] = []
-    units: dict[str, Path] = {}
-    for path in recordings:
-        found = read_runs(path, tray, fan_numbers(fans), from_s, to_s)
-        if found.damage:
-            typer.echo(found.damage, err=True)
-        recorded += found.runs
-        tachos += [counted or found.tacho] * len(found.runs)
-        units.setdefault(found.speed_unit, path)
-    if len(units) > 1:
-        found_units = " and ".join(f"{unit} ({path})" for unit, path in units.items())
-        raise UserError(f"recordings in different units, {found_units}: give recordings of one unit")
-    (unit,) = units
-    if unit not in RAD_S_PER_TABLE_UNIT:
-        raise UserError(f"{units[unit]}: unknown speed unit {unit!r}; known: {', '.join(RAD_S_PER_TABLE_UNIT)}")
+    recorded = [run for each in found for run in each.runs]
+    tachos = [counted or each.tacho for each in found for _ in each.runs]
+    unit = common_unit([(each.speed_unit, each.runs[0].path) for each in found])
     with twin_errors():
         cleaned = [
             without_outliers(Run(run.path.stem, run.t_s, run.command, run.speed_rad_s, tacho))
@@ -145,6 +147,24 @@ def read_training_data(
         if share > MANY_OUTLIERS
     )
     return TrainingData([run for run, _ in cleaned], recorded, unit, numbers, outliers)
+
+
+def common_unit(found: Sequence[tuple[str, Path]]) -> str:
+    """The speed unit of several recordings.
+
+    Raises:
+        UserError: they have different units, or one that is not known.
+    """
+    units: dict[str, Path] = {}
+    for unit, path in found:
+        units.setdefault(unit, path)
+    if len(units) > 1:
+        found_units = " and ".join(f"{unit} ({path})" for unit, path in units.items())
+        raise UserError(f"recordings in different units, {found_units}: give recordings of one unit")
+    ((unit, path),) = units.items()
+    if unit not in RAD_S_PER_TABLE_UNIT:
+        raise UserError(f"{path}: unknown speed unit {unit!r}; known: {', '.join(RAD_S_PER_TABLE_UNIT)}")
+    return unit
 
 
 def show_hints(hints: Sequence[str]) -> None:

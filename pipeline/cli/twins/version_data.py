@@ -2,71 +2,80 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-from pipeline.cli.twins.training_data import TrainingData, read_training_data
+import numpy as np
+
+from pipeline.cli.twins.excerpts import MOST_HZ, Excerpt
+from pipeline.cli.twins.windows import Windows, joined, windows_of
+from pipeline.errors import UserError
 from pipeline.learning.healthy_history import HealthyRecording
 
-MOST_RECORDINGS = 24
-"""the newest ones that a twin is trained on"""
+WINDOW_S = 60.0
+"""long enough for many time constants of a fan; windows are longer where samples are few"""
+MOST_WINDOWS, LEAST_WINDOWS = 24, 12
+"""that a twin is trained on"""
+MOST_READINGS = 600_000
+"""of all fans together that a twin is trained on, if LEAST_WINDOWS have no more: two or three minutes of a core"""
+HELD_OUT_WINDOWS = 12
+"""half of them for validation, half for comparison"""
+WANTED_SAMPLES = 10_000
+"""that are enough for small networks: on slow lines, windows are so long that they have as many together"""
+SHORTEST_RECORDING_IN_WINDOWS = 10
+"""the recording that is held out has at least so many windows, if need be shorter ones"""
 LEAST_COMPARED_S = 600.0
 """the newest recording that is as long is the one for validation and comparison"""
-HELD_OUT = 0.2
-"""share of the only recording that is kept for validation"""
+KEPT_OUT_EVERY = 5
+"""of the windows of that recording one is kept out of training, where the others are needed for it"""
+ENOUGH_OF_RANGE = 0.75
+"""of the tenths of the commands' range: if other recordings have fewer of each fan, they are not enough to train on"""
 CHECKED_PARTS, CHECKED_PART_S = 24, 120.0
 """of the newest healthy day, in which the speeds of the fans are checked: a mean over its hours and commands"""
 
 
 @dataclass(frozen=True)
-class Excerpt:
-    """A part of each of some recordings, in seconds since its first sample."""
-
-    paths: list[Path]
-    from_s: float
-    to_s: float
-
-    def read(self) -> TrainingData:
-        """Its samples.
-
-        Raises:
-            UserError: they cannot be read.
-        """
-        return read_training_data(self.paths, None, None, self.from_s, self.to_s)
-
-
-@dataclass(frozen=True)
 class Split:
     """training: what a twin is fitted to. validation: on which its weights are chosen, and its band is measured.
-    comparison: what it has not seen; the same as validation for a first twin, which is compared with no other."""
+    comparison: what it has not seen; the same as validation where the history is too short for both."""
 
-    training: Excerpt
-    validation: Excerpt
-    comparison: Excerpt
+    training: tuple[Excerpt, ...]
+    validation: tuple[Excerpt, ...]
+    comparison: tuple[Excerpt, ...]
 
 
-def split(recordings: Sequence[HealthyRecording], most_s: float) -> Split:
-    """The newest long recording for validation and comparison, others for training; or parts of the only one.
+def split(recordings: Sequence[HealthyRecording], rate_hz: float, fans: int) -> Split:
+    """Windows of the newest long recording for validation and comparison, of the others for training.
 
-    most_s: samples of so many seconds are enough for each.
+    Where the others are not enough, only every fifth window of that recording is held out. rate_hz, fans: of the line.
+
+    Raises:
+        UserError: a recording cannot be read, or lacks most of its samples.
     """
-    if len(recordings) == 1:
-        (only,) = recordings
-        border_s = (1.0 - HELD_OUT) * only.seconds
-        training = Excerpt([only.path], max(0.0, border_s - most_s), border_s)
-        held_out = Excerpt([only.path], border_s, math.inf)
-        return Split(training, held_out, held_out)
+    rate_hz = min(rate_hz, MOST_HZ)
     compared = newest_long(recordings)
-    others = [each.path for each in recordings if each != compared][-MOST_RECORDINGS:]
-    first_s = max(0.0, compared.seconds - most_s)
-    middle_s = (first_s + compared.seconds) / 2.0
-    return Split(
-        Excerpt(others, 0.0, most_s / len(others)),
-        Excerpt([compared.path], first_s, middle_s),
-        Excerpt([compared.path], middle_s, math.inf),
-    )
+    wanted_s = max(WINDOW_S, WANTED_SAMPLES / MOST_WINDOWS / rate_hz)
+    window_s = min(wanted_s, compared.seconds / SHORTEST_RECORDING_IN_WINDOWS)
+    windows = windows_of(recordings, window_s)
+    is_compared = np.array([each.path == compared.path for each in windows.excerpts])
+    others, newest = windows.of(~is_compared), windows.of(is_compared)
+    if len(newest) < KEPT_OUT_EVERY:
+        raise UserError(f"{compared.path}: most of its samples are missing: too few to learn from")
+    if len(others) and np.all(others.tenths >= ENOUGH_OF_RANGE * windows.tenths):
+        training, held_out = others, newest
+    else:
+        last = np.flatnonzero(is_compared)[KEPT_OUT_EVERY - 1 :: KEPT_OUT_EVERY]
+        is_kept_out = np.isin(np.arange(len(windows)), last)
+        training, held_out = windows.of(~is_kept_out), windows.of(is_kept_out)
+    most = int(MOST_READINGS / (fans * rate_hz * window_s))
+    trained = training.chosen(min(max(most, LEAST_WINDOWS), MOST_WINDOWS))
+    return Split(joined(trained.excerpts), *_halves(held_out))
+
+
+def _halves(held_out: Windows) -> tuple[tuple[Excerpt, ...], tuple[Excerpt, ...]]:
+    """Validation and comparison by turns, so that both are of the same hours and commands."""
+    chosen = held_out.chosen(HELD_OUT_WINDOWS).excerpts
+    return (chosen[::2], chosen[1::2]) if len(chosen) > 3 else (chosen, chosen)
 
 
 def newest_long(recordings: Sequence[HealthyRecording]) -> HealthyRecording:
@@ -85,14 +94,16 @@ def newest_recordings(recordings: Sequence[HealthyRecording], wanted_s: float) -
 
 
 def spread_parts(recordings: Sequence[HealthyRecording]) -> list[Excerpt]:
-    """Parts of CHECKED_PART_S evenly over the recordings, at most CHECKED_PARTS of them."""
-    total_s = sum(each.seconds for each in recordings)
-    apart_s = max(total_s / CHECKED_PARTS, CHECKED_PART_S)
+    """Parts of CHECKED_PART_S evenly over the recordings, at most CHECKED_PARTS of them; shorter only where all of a
+    recording is."""
+    ends_s = np.cumsum([each.seconds for each in recordings])
+    count = int(np.clip(ends_s[-1] / CHECKED_PART_S, 1, CHECKED_PARTS))
+    middles_s = (np.arange(count) + 0.5) * ends_s[-1] / count
+    counts = np.bincount(np.searchsorted(ends_s, middles_s), minlength=len(recordings)).tolist()
     parts: list[Excerpt] = []
-    for each in recordings:
-        count = max(1, round(each.seconds / apart_s))
-        length_s = min(CHECKED_PART_S, each.seconds / count)
-        for number in range(count):
-            middle_s = (number + 0.5) * each.seconds / count
-            parts.append(Excerpt([each.path], middle_s - length_s / 2.0, middle_s + length_s / 2.0))
+    for each, within in zip(recordings, counts, strict=True):
+        for number in range(within):
+            middle_s = (number + 0.5) * each.seconds / within
+            half_s = min(CHECKED_PART_S, each.seconds / within) / 2.0
+            parts.append(Excerpt(each.path, middle_s - half_s, middle_s + half_s))
     return parts

@@ -27,7 +27,8 @@ def check_line(check: Check) -> str:
     if not check.reference:
         return NO_REFERENCE
     changes = _percents(check.change)
-    return f"checked up to {format_local(check.t_ns)}: speed of the fans since {check.reference}: {changes}"
+    missing = _not_compared(check.change, check.reference)
+    return f"checked up to {format_local(check.t_ns)}: speed of the fans since {check.reference}: {changes}{missing}"
 
 
 def _lines(version: Version, *, is_in_force: bool) -> list[str]:
@@ -74,8 +75,17 @@ def _drop_of(drop: Drop, unit: str) -> str:
     return f"{found} of {drop.speed:,.0f} {unit}"
 
 
-def _percents(change: Iterable[float]) -> str:
-    return ", ".join(f"{100 * each:+.1f} %" for each in change)
+def _percents(change: Iterable[float | None]) -> str:
+    return ", ".join("not comparable" if each is None else f"{100 * each:+.1f} %" for each in change)
+
+
+def _not_compared(change: Sequence[float | None], reference: str) -> str:
+    """Which fans a check says nothing about, and why; empty if none."""
+    fans = [fan for fan, each in enumerate(change) if each is None]
+    if not fans:
+        return ""
+    named = f"fan{'s' * (len(fans) > 1)} {', '.join(map(str, fans))}"
+    return f"; {named}: too few readings at commands that {reference} was trained on"
 
 
 def _found(drop: Drop, unit: str) -> str:

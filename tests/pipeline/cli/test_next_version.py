@@ -35,7 +35,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     patch.setattr(next_version, "REFERENCE_S", 300.0)
     patch.setattr(next_version, "CHECKED_S", 100.0)
     patch.setattr(next_version, "LEAST_CHECKED_S", 60.0)
-    patch.setattr(next_version, "MOST_TRAINING_SAMPLES", 1500)
     folder = tmp_path_factory.mktemp("site") / "runs" / "learned" / "tray1"
     add_recording(folder, 0, 120.0, 1)
     made(folder)

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from schemas.tacho import Tacho
 from tests.support import fan_data
 from twin.build import train_twin
 from twin.errors import TwinError
 from twin.evaluation.accuracy import evaluate_model
-from twin.evaluation.resampling import Grid, irregular, on_grid, resampled
+from twin.evaluation.resampling import Grid, irregular, on_grid, resampled, thinned
 from twin.models.hybrid import UNITS, Hybrid
 from twin.models.model import TwinModel
 from twin.models.narx import INPUTS, ORDER, Narx
@@ -181,3 +182,23 @@ def test_a_trained_hybrid_holds_on_grids_that_it_was_not_trained_on() -> None:
     held_out = fan_data.rough_run(2, 30.0)
     errors = errors_in_noise(twin.model, twin.parameters, held_out)
     assert max(errors.values()) < 1.1 * errors["own"] < 2.0
+
+
+def test_a_thinned_run_keeps_its_readings_and_loses_no_impulse() -> None:
+    run = fan_data.published_run(5, 10.0, fans=2)
+    thin = thinned(run, 7)
+    np.testing.assert_array_equal(thin.speed_rad_s, run.speed_rad_s[::7])
+    for stop_s in thin.t_s[[1, 50, -1]]:
+        assert impulse(thin, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
+    assert thinned(run, 1) is run
+    assert thinned(run.rows(0, 4), 7).samples == 4, "a single sample is no run"
+
+
+@pytest.mark.parametrize("tacho", [Tacho(kind="count", window_s=0.5), Tacho(kind="count", window_s=1.0, update_s=0.25)])
+def test_the_readings_of_a_tacho_that_counts_are_predicted_as_well_when_thinned(tacho: Tacho) -> None:
+    run = fan_data.counted_run(6, tacho, rate_hz=100.0)
+    model, parameters = PhysicalModel(), np.array([[*fan_data.PUBLISHED_PARAMETERS, 0.0]])
+    whole, thin = (
+        evaluate_model(model, parameters, np.ones(1), [each]).pooled.rmse_rad_s for each in (run, thinned(run, 10))
+    )
+    assert thin == pytest.approx(whole, rel=0.05)

@@ -1,0 +1,73 @@
+"""Excerpts of the recordings of the healthy history as training data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import typer
+
+from pipeline.cli.twins.training_data import TrainingData, common_unit, training_data_of, twin_errors
+from pipeline.recordings.excerpts import ExcerptReader
+
+MOST_HZ = 100.0
+"""samples of faster lines are thinned to at most about this rate, that of the fastest grid by default"""
+NEARLY = 0.05
+"""a rate that is higher by this share is not thinned"""
+
+
+@dataclass(frozen=True)
+class Excerpt:
+    """A part of a recording, in seconds since its first sample."""
+
+    path: Path
+    from_s: float
+    to_s: float
+
+
+def read_excerpts(excerpts: Iterable[Excerpt]) -> TrainingData:
+    """The samples of excerpts together, those of fast lines thinned. Damage is reported on stderr.
+
+    Raises:
+        UserError: they cannot be read, or are not in one unit.
+    """
+    parts = list(each_excerpt(excerpts))
+    unit = common_unit([(part.speed_unit, part.recorded[0].path) for part in parts])
+    return TrainingData(
+        [run for part in parts for run in part.runs],
+        [run for part in parts for run in part.recorded],
+        unit,
+        parts[0].fans,
+        tuple(dict.fromkeys(line for part in parts for line in part.outliers)),
+    )
+
+
+def each_excerpt(excerpts: Iterable[Excerpt]) -> Iterator[TrainingData]:
+    """The samples of each excerpt by itself. Raises as `read_excerpts`."""
+    path, reader = None, None
+    for excerpt in excerpts:
+        if reader is None or excerpt.path != path:
+            path, reader = excerpt.path, ExcerptReader(excerpt.path)
+        found = reader.read(excerpt.from_s, excerpt.to_s)
+        if found.damage:
+            typer.echo(found.damage, err=True)
+        yield _thinned(training_data_of([found]))
+
+
+def _thinned(data: TrainingData) -> TrainingData:
+    with twin_errors():
+        from twin.evaluation.resampling import thinned  # noqa: PLC0415  the command line loads twin only when it is needed
+
+        runs = [thinned(run, every_of(1.0 / run.median_period_s)) for run in data.runs]
+    recorded = [
+        replace(of, t_s=run.t_s, command=run.command, speed_rad_s=run.speed_rad_s)
+        for of, run in zip(data.recorded, runs, strict=True)
+    ]
+    return replace(data, runs=runs, recorded=recorded)
+
+
+def every_of(rate_hz: float) -> int:
+    """Of how many samples of a line one is used."""
+    return max(1, math.ceil(rate_hz / MOST_HZ - NEARLY))

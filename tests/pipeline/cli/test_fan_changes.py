@@ -1,0 +1,61 @@
+"""How the speeds of fans have changed, and what is said of fans that cannot be compared."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.cli.twins.excerpts import Excerpt
+from pipeline.cli.twins.fan_changes import changed_fans, changes_from_list, changes_to_list, mean_changes
+from pipeline.cli.twins.versions_text import check_line
+from pipeline.learning.healthy_history import healthy_recordings
+from pipeline.learning.versions import Check
+from tests.support.commanded_fans import moving, recorded
+from tests.support.twin_files import COMMAND_RANGE, write_twin
+from twin.models.physical import PhysicalModel
+
+
+def test_a_fan_at_commands_that_the_reference_does_not_know_is_not_comparable(tmp_path: Path) -> None:
+    command = moving(120.0)
+    command[:, 1] = 2.0 * COMMAND_RANGE[1]
+    recorded(tmp_path, 0.0, command)
+    (recording,) = healthy_recordings(tmp_path)
+    twin = write_twin(tmp_path / "twin.onnx", PhysicalModel(), 2)
+    change = mean_changes(twin, [Excerpt(recording.path, 0.0, 60.0), Excerpt(recording.path, 60.0, 119.0)])
+    assert math.isfinite(change[0])
+    assert math.isnan(change[1])
+
+
+def test_a_fan_with_few_readings_is_not_comparable(tmp_path: Path) -> None:
+    command = moving(120.0)
+    command[10 : 9 * len(command) // 10, 1] = 2.0 * COMMAND_RANGE[1]
+    command[len(command) // 20 :, 1] = 2.0 * COMMAND_RANGE[1]
+    recorded(tmp_path, 0.0, command)
+    (recording,) = healthy_recordings(tmp_path)
+    twin = write_twin(tmp_path / "twin.onnx", PhysicalModel(), 2)
+    assert np.isnan(mean_changes(twin, [Excerpt(recording.path, 0.0, 119.0)])).tolist() == [False, True]
+
+
+def test_a_fan_that_is_not_comparable_is_no_change_and_does_not_hide_others() -> None:
+    assert changed_fans(np.array([0.01, np.nan]), "t-1") == ""
+    assert changed_fans(np.array([np.nan, np.nan]), "t-1") == ""
+    assert changed_fans(np.array([0.05, np.nan, 0.04]), "t-1").startswith(
+        "all 2 fans that can be compared are 4.5 % faster than when t-1 was made"
+    )
+    assert changed_fans(np.array([0.05, 0.04]), "t-1").startswith("all fans are 4.5 % faster")
+    assert changed_fans(np.array([-0.05, np.nan, 0.0]), "t-1").startswith("fan 0 is 5.0 % slower")
+    assert changed_fans(np.array([-0.05, np.nan]), "t-1").startswith("fan 0 is 5.0 % slower")
+
+
+def test_the_list_of_versions_holds_no_nan_and_the_text_names_the_fan() -> None:
+    change = changes_to_list(np.array([0.012, np.nan]))
+    assert change == (pytest.approx(0.012), None)
+    np.testing.assert_array_equal(changes_from_list(change), [0.012, np.nan])
+    check = Check(t_ns=0, reference="t-1", change=change, found="", spans=())
+    assert Check.model_validate_json(check.model_dump_json()) == check
+    assert check_line(check).endswith(
+        "since t-1: +1.2 %, not comparable; fan 1: too few readings at commands that t-1 was trained on"
+    )

@@ -1,0 +1,51 @@
+"""Healthy recordings of fans under commands that a test chooses, in the history that a learner keeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.learning.healthy_history import HealthyHistory
+from schemas.messages import Array, Header, Raw
+from schemas.units import NS_PER_S
+
+START_S = 1_800_000_000
+RATE_HZ = 5.0
+HELD = 40.0
+LEVEL_S = 10.0
+GAIN, NOISE_RAD_S = 3.0, 0.5
+SAMPLES_PER_MESSAGE = 50
+
+
+def held(seconds: float, fans: int = 2) -> Array:
+    """(samples, fans) one command."""
+    return np.full((round(seconds * RATE_HZ), fans), HELD)
+
+
+def moving(seconds: float, fans: int = 2, seed: int = 1) -> Array:
+    """(samples, fans) each fan at another command every ten seconds."""
+    levels = np.random.default_rng(seed).uniform(10.0, 100.0, (round(seconds / LEVEL_S), fans))
+    return np.repeat(levels, round(LEVEL_S * RATE_HZ), axis=0)
+
+
+def recorded(folder: Path, first_s: float, command: Array, rate_hz: float = RATE_HZ) -> None:
+    """Add a recording of fans with a time constant of a second, from first_s after START_S on."""
+    history = HealthyHistory(folder, "site", "tray1", {"trays": "tray1"}, {}, hold_back_s=0.0, kept_s=1e9)
+    speed = GAIN * command
+    decay = np.exp(-1.0 / rate_hz)
+    for k in range(1, len(command)):
+        speed[k] = GAIN * command[k - 1] + decay * (speed[k - 1] - GAIN * command[k - 1])
+    speed += np.random.default_rng(len(command)).normal(0.0, NOISE_RAD_S, speed.shape)
+    t_ns = round((START_S + first_s) * NS_PER_S) + (np.arange(len(command)) / rate_hz * NS_PER_S).astype(np.int64)
+    for number, first in enumerate(range(0, len(command), SAMPLES_PER_MESSAGE)):
+        rows = slice(first, first + SAMPLES_PER_MESSAGE)
+        raw = Raw(
+            header=Header("acquisition", number, "tray1"),
+            fans=command.shape[1],
+            host_receive_t_ns=t_ns[rows],
+            command=command[rows],
+            speed_rad_s=speed[rows],
+        )
+        history.add(raw, has_alarm=False, is_watched=False)
+    history.close()
