@@ -24,7 +24,7 @@ from pipeline.learning.healthy_history import HealthyHistory, recorded_raws
 from pipeline.learning.learning_process import Learning, LearningProcess
 from pipeline.learning.learning_schedule import LearningSchedule, Work
 from pipeline.learning.ordinary_operation import OrdinaryOperation
-from pipeline.learning.versions import TwinVersions, Version, VersionList, learning_folder
+from pipeline.learning.versions import TwinVersions, Version, VersionList, learning_folder, overlap
 from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.recordings.dates import format_utc
 from pipeline.recordings.metadata import recording_metadata
@@ -89,14 +89,14 @@ class LearnerCore(Core):
         """Add samples to the healthy history, or see whether a fan has an alarm or is commissioned again."""
         if isinstance(item, Request):
             if item.action == Action.COMMISSION:
-                self._history.close()
+                self._history.begin_after(item.t_ns)
                 self._change_list(partial(self._versions.commission, item.t_ns))
         elif item.fans != self._fans:
             pass  # of a tray that is configured otherwise
         elif isinstance(item, Score):
             self._see(item)
         else:
-            self._history.add(item, has_alarm=bool(self._alarms.fans), is_watched=self._is_watched)
+            self._history.add(item, has_alarm=bool(self._alarm_fans), is_watched=self._is_watched)
             if self._last is None:
                 self._operation.take(item)
         return []
@@ -112,7 +112,7 @@ class LearnerCore(Core):
         self._take_outcome()
         self._read_list()
         cards = self._published(now_ns)
-        may_start = self._learning.is_free and self._is_list_read and not self._alarms.fans
+        may_start = self._learning.is_free and self._is_list_read and not self._alarm_fans
         if may_start and (due := self._schedule.due(self._listed)):
             self._start(due)
         return cards
@@ -136,7 +136,7 @@ class LearnerCore(Core):
         current = self._listed.current
         if self._in_force and current and current != self._in_force:
             found.append(f"{current.name} waits: it takes over when no fan has an alarm, by the scores of all fans")
-        if fans := self._alarms.fans:
+        if fans := self._alarm_fans:
             named = f"fan {fans[0]} has" if len(fans) == 1 else f"fans {', '.join(map(str, fans))} have"
             found.append(f"no learning while {named} an alarm")
         work_s = self._learning.seconds
@@ -162,16 +162,26 @@ class LearnerCore(Core):
     @property
     def _is_watched(self) -> bool:
         """Whether samples wait until they are judged: there is a version, or it is not known whether there is one."""
-        return not self._is_list_read or self._last is not None
+        return not self._is_list_read or (self._last is not None and not self._is_tainted)
+
+    @property
+    def _alarm_fans(self) -> list[int]:
+        """The fans with an alarm. Those of a twin that was learned from a fault do not count: they would keep it from
+        being replaced."""
+        return [] if self._is_tainted else self._alarms.fans
+
+    @property
+    def _is_tainted(self) -> bool:
+        """Whether the twin that the stages have was learned from a time that was marked as faulty."""
+        return self._in_force is not None and overlap(self._in_force.learned_spans, self._listed.faulty)
 
     def _see(self, score: Score) -> None:
         if not len(score.t_ns):
             return
         seen = self._alarms.update(score)
-        kept_ns = round(3600.0 * self._config.kept_hours * NS_PER_S)
         for t_ns in seen.began_t_ns:
-            self._change_list(partial(self._versions.add_alarm, t_ns, forget_before_t_ns=t_ns - kept_ns))
-        self._history.judged(seen.judged_t_ns, had_alarm=seen.had_alarm)
+            self._change_list(partial(self._versions.add_alarm, t_ns, self._history.kept_since_t_ns))
+        self._history.judged(seen.judged_t_ns, had_alarm=seen.had_alarm and not self._is_tainted)
 
     def _change_list(self, change: Callable[[], None]) -> None:
         try:
@@ -224,7 +234,7 @@ class LearnerCore(Core):
         another twin the alarm would end, and the fault would be part of the new baselines.
         """
         current = self._listed.current
-        if current is None or self._listed.is_chosen or (self._alarms.are_known and not self._alarms.fans):
+        if current is None or self._listed.is_chosen or (self._alarms.are_known and not self._alarm_fans):
             return current
         return self._in_force or self._published_before() or current
 

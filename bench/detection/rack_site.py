@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 from pydantic import TypeAdapter
 
 from bench.detection.plant import START_NS
@@ -28,6 +29,7 @@ from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.learning.versions import TwinVersions, Version, learning_folder
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.runtime.stage import Context, Core, load_stage
+from schemas.blocks import select
 from schemas.messages import Action, Alarm, Header, Raw, Request, Score
 from schemas.units import NS_PER_S
 from stages.learner import LearnerCore
@@ -38,6 +40,8 @@ USED_AFTER_D = 1.0
 """and so many days after a version was offered for it, they put it in force"""
 DAY_NS = round(DAY_S * NS_PER_S)
 SEEN = "seen.pickle"
+PIECE = 60
+"""lines that the stages take at a time: scores must not lag behind the lines by minutes"""
 
 
 @dataclass
@@ -155,7 +159,8 @@ class RackSite:
             if day > self._seen.days:
                 self._keep(day, folder)
             if day == self._seen.days:
-                self._take(raw, day)
+                for first in range(0, len(raw.host_receive_t_ns), PIECE):
+                    self._take(select(raw, np.arange(first, min(first + PIECE, len(raw.host_receive_t_ns)))), day)
         self._keep(self._seen.days + 1, folder)
 
     def _keep(self, days: int, folder: Path) -> None:
@@ -229,7 +234,7 @@ def _config(folder: Path, tray: str) -> Config:
     text = (
         f'site = "bench"\nrun_folder = "{folder / "runs"}"\n'
         f'[[tray]]\nname = "{tray}"\nfans = {RACK_FANS}\nspeed_unit = "rpm"\ntacho = [{windows}]\n'
-        "[resampler]\nblock_size = 512\n"
+        "[resampler]\nblock_size = 60\n"
     )
     return parse_config(text, folder / "fantwin.toml", (), ("resampler", "twin_integrator", "scorer", "learner"))
 

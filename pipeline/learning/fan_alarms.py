@@ -59,12 +59,14 @@ class FanAlarms:
         with_alarm = among(score.state, *WITH_ALARM)
         is_known = with_alarm | among(score.state, *WITHOUT_ALARM)
         has_alarm = _last_known(with_alarm, is_known, self._has_alarm)
-        began = (has_alarm & ~np.vstack((self._has_alarm, has_alarm[:-1]))).any(axis=1)
+        was_known = np.vstack((self._is_known, self._is_known | np.logical_or.accumulate(is_known)[:-1]))
+        before = np.vstack((self._has_alarm, has_alarm[:-1]))
+        began = (has_alarm & ~before & was_known).sum(axis=1)  # others may have begun before a restart
         self._has_alarm = has_alarm[-1].copy()
         self._is_known |= is_known.any(axis=0)
         self._wait(score.t_ns[is_known.any(axis=1)])
         judged = (is_known | among(score.state, *IDLE)).any(axis=1)
-        return ScoredAlarms(score.t_ns[began].tolist(), bool(has_alarm.any()), score.t_ns[judged])
+        return ScoredAlarms(np.repeat(score.t_ns, began).tolist(), bool(has_alarm.any()), score.t_ns[judged])
 
     def _wait(self, known_t_ns: Array) -> None:
         if len(known_t_ns):

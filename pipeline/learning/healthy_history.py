@@ -37,7 +37,7 @@ LONGEST_RECORDING_NS = 8 * 3600 * NS_PER_S
 """of one recording"""
 LONGEST_GAP_NS = 60 * NS_PER_S
 """after a longer pause of the samples a new recording begins; samples in a longer pause of the scores are discarded"""
-LONGEST_LAG_NS = 600 * NS_PER_S
+LONGEST_LAG_NS = 1800 * NS_PER_S
 """of the scores behind the samples; samples that wait longer to be judged are discarded"""
 _NAME = re.compile(r"(\d+)-(\d+)\.mcap")
 
@@ -142,7 +142,7 @@ class HealthyHistory:
         self.newest_t_ns = t_ns
         if has_alarm:
             self._stop()
-        if t_ns <= self._resumes_t_ns:
+        if int(raw.host_receive_t_ns[0]) <= self._resumes_t_ns:
             return
         self._waiting.append(raw)
         if is_watched:
@@ -199,6 +199,16 @@ class HealthyHistory:
         """End the open recording; what is held back is dropped."""
         self._waiting.clear()
         self.finish()
+
+    def begin_after(self, t_ns: int) -> None:
+        """Samples up to then enter no recording any more: fans are commissioned again."""
+        self.close()
+        self._resumes_t_ns = max(self._resumes_t_ns, t_ns)
+
+    @property
+    def kept_since_t_ns(self) -> int:
+        """Beginning of the oldest recording but the first, which is kept for ever; 0 without one."""
+        return self._finished[1].span[0] if len(self._finished) > 1 else 0
 
     def _begin_again(self, t_ns: int) -> None:
         """The clock was set back: times from before say nothing about samples from now on."""

@@ -48,7 +48,7 @@ class Version(_Record):
     used, because the fans have changed since. error: root mean square of the free-run residual over a part of the
     newest recording that it was not trained on, all fans together. error_before: the same of the version that was in
     force. reference: the version that changes of the fans are measured against; its own name if there is none yet.
-    change: of each fan, its mean speed in the newest day of healthy running relative to the reference's prediction,
+    change: of each fan, its mean speed in the newest hours of healthy running relative to the reference's prediction,
     less one; None where it is not comparable. declared_per_day: false alarms per fan and day that the limits were set
     for; is_target: the data are too few to show that the limits keep it. Speeds are in the unit of the tray.
     """
@@ -89,9 +89,9 @@ class Check(_Record):
     """The fans beside the reference.
 
     t_ns: time of the newest sample. reference: empty if there is none yet. change: of each fan, by which share its mean
-    speed over the newest day of healthy running has changed since the reference was made; None where it is not
-    comparable. found: what has changed more than healthy fans do, in words; empty if nothing has. spans: then those of
-    the recordings of that day.
+    speed over the newest hours of healthy running has changed since the reference was made; None where that cannot be
+    compared. found: what has changed more than healthy fans do, in words; empty if nothing has. spans: then those of
+    the recordings since the last check that found nothing.
     """
 
     t_ns: int
@@ -127,6 +127,12 @@ class VersionList(_Record):
     def current(self) -> Version | None:
         """The version in force, if there is one."""
         return next((version for version in self.versions if version.name == self.in_force), None)
+
+    def with_check(self, check: Check) -> VersionList:
+        """The same with another check of the fans."""
+        found = ((check.reference, span) for span in check.spans)
+        changed = tuple(dict.fromkeys((*self.changed, *found)))
+        return self.model_copy(update={"check": check, "changed": changed})
 
     @property
     def is_tainted(self) -> bool:
@@ -209,19 +215,20 @@ class TwinVersions:
         """
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with (self.folder / "learn.lock").open("ab") as lock:
-                try:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError as error:
-                    raise UserError(f"{self.folder}: another `fantwin learn` works here: wait for its end") from error
-                yield
+            lock = (self.folder / "learn.lock").open("ab")
         except OSError as error:
             raise self._cannot_write(error) from error
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise UserError(f"{self.folder}: another `fantwin learn` works here: wait for its end") from error
+            yield
 
-    def add(self, version: Version, seen: VersionList | None = None) -> None:
+    def add(self, version: Version, seen: VersionList | None = None, check: Check | None = None) -> None:
         """Add a version, whose file is there; if it was taken, it is in force now.
 
-        seen: the list when it was begun; None: as it is now.
+        seen: the list when it was begun; None: as it is now. check: of the fans, before it was made.
 
         Raises:
             UserError: operators have put another version in force meanwhile, or marked a time as faulty that it was
@@ -233,14 +240,13 @@ class TwinVersions:
             if overlap(version.learned_spans, listed.faulty):
                 raise UserError(f"{version.name} is not used: it was learned from a time that is marked as faulty")
             taken = {"in_force": version.name, "is_chosen": False} if version.outcome == "taken" else {}
-            self._write(listed.model_copy(update={**taken, "versions": (*listed.versions, version)}))
+            now = listed.with_check(check) if check else listed
+            self._write(now.model_copy(update={**taken, "versions": (*listed.versions, version)}))
 
     def add_check(self, check: Check) -> None:
         """Keep a check of the fans against the reference. Raises as `add`."""
         with self._changing() as listed:
-            found = ((check.reference, span) for span in check.spans)
-            changed = tuple(dict.fromkeys((*listed.changed, *found)))
-            self._write(listed.model_copy(update={"check": check, "changed": changed}))
+            self._write(listed.with_check(check))
 
     def commission(self, t_ns: int) -> None:
         """Operators commission fans again. Raises as `add`."""

@@ -152,13 +152,12 @@ class _RawChunks:
         return (int(segments[0][0][0]), raws[0].header.tray) if segments else None
 
     def between(self, first_t_ns: int, last_t_ns: int) -> list[Raw]:
-        """The messages of the chunks with any message of this time span, and of the next chunk: a message may have
-        older samples than its time says."""
-        found = np.flatnonzero((self._last_t_ns >= first_t_ns) & (self._first_t_ns <= last_t_ns))
-        if not len(found):
-            return []
-        chosen = {*found.tolist(), min(int(found[-1]) + 1, len(self._chunks) - 1)}
-        return self._decoded([self._chunks[number] for number in sorted(chosen)])
+        """The messages of the chunks with any message of this time span, and of the first one after it: the time of a
+        message is that of its last sample."""
+        within = np.flatnonzero((self._last_t_ns >= first_t_ns) & (self._first_t_ns <= last_t_ns))
+        after = np.flatnonzero(self._first_t_ns > last_t_ns)[:1]
+        chosen = sorted({*within.tolist(), *after.tolist()})
+        return self._decoded([self._chunks[number] for number in chosen])
 
     def spaced(self, every_ns: int) -> Iterator[Raw]:
         """Messages at least so far apart; chunks in between are not read."""

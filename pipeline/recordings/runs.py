@@ -76,13 +76,19 @@ def read_runs(
     """
     reading = read_recording(path, topics=("raw",))
     by_tray: dict[str, list[Raw]] = {}
+    pending: dict[str, list[Raw]] = {}
+    """the newest of each tray, which are not merged yet"""
     for envelope in reading:
         assert isinstance(envelope.message, Raw)
         if tray is None or envelope.message.header.tray == tray:
-            messages = by_tray.setdefault(envelope.message.header.tray, [])
+            name = envelope.message.header.tray
+            messages = pending.setdefault(name, [])
             messages.append(envelope.message)
-            if len(messages) % MERGED_MESSAGES == 0:
-                messages[-MERGED_MESSAGES:] = merged(messages[-MERGED_MESSAGES:])
+            if len(messages) == MERGED_MESSAGES:
+                by_tray.setdefault(name, []).extend(merged(messages))
+                messages.clear()
+    for name, messages in pending.items():
+        by_tray.setdefault(name, []).extend(messages)
     if not by_tray:
         raise RecordingError(f"{path}: no raw samples{f' of tray {tray!r}' if tray else ''} in this recording")
     if len(by_tray) > 1:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.messages import Action, Message, Request
+from schemas.messages import Action, FanState, Message, Request
 from schemas.units import NS_PER_S
 from tests.support.one_learner import START_NS, Learner, raw
 
@@ -115,6 +115,16 @@ def test_where_every_version_was_learned_from_a_faulty_time_another_is_made_at_o
     learner.run(200)
     assert learner.put_in_force[-1] == before, "there is too little else"
     learner.run(300)
+    assert learner.put_in_force[-1] != before
+    assert not learner.versions.read().is_tainted
+
+
+def test_alarms_of_a_twin_that_was_learned_from_a_fault_do_not_keep_it_from_being_replaced(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(1000)
+    learner.versions.mark_faulty((START_NS, START_NS + learner.now_s * NS_PER_S))
+    before = learner.put_in_force[-1]
+    learner.run(500, state=FanState.ALARM)
     assert learner.put_in_force[-1] != before
     assert not learner.versions.read().is_tainted
 

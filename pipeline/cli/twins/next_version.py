@@ -91,13 +91,14 @@ def _next_version(
     with tempfile.TemporaryDirectory(prefix=WORK_PREFIX, dir=folder) as place:
         work = _Work(Path(place), name, versions.file, listed, recordings, per_day, say)
         check = work.checked()
-        versions.add_check(check)
-        if only_if_changed and not (check.found and work.needs_offer()):
+        is_needed = work.needs_offer() if check.found else not only_if_changed
+        if not is_needed:
+            versions.add_check(check)
             return None
         version, content = work.offered(check.found) if check.found else work.taken()
     _write(versions.file(name), content)
     try:
-        versions.add(version, listed)
+        versions.add(version, listed, check)
     except UserError:
         versions.file(name).unlink(missing_ok=True)
         raise
@@ -137,18 +138,25 @@ class _Work:
         needed_s = 3600.0 * too_little(0.0, per_day).needed_fan_hours / self._fans
         self._calibration_recordings = newest_recordings(recordings, max(WANTED_S, MARGIN * needed_s))
         since_t_ns = max(listed.commissioned_t_ns, listed.waiting.made_t_ns if listed.waiting else 0)
-        since = [each for each in recordings if each.span[0] >= since_t_ns]
-        self._newest = newest_recordings(since or recordings[-1:], CHECKED_S)
+        self._newest = newest_recordings([each for each in recordings if each.span[0] >= since_t_ns], CHECKED_S)
 
     def checked(self) -> Check:
         """The speeds of the fans over the newest hours beside the reference. Without a reference nothing has changed.
-        What was found stays while too little is known since then."""
+        What was found stays while too little is known since then.
+
+        Raises:
+            UserError: too little is known since fans were commissioned again.
+        """
         reference, newest_t_ns = self._reference(), self._recordings[-1].span[1]
-        last = self._listed.check
-        if last and self._listed.waiting and sum(each.seconds for each in self._newest) < LEAST_CHECKED_S:
-            return last
         if reference is None:
             return Check(t_ns=newest_t_ns, reference="", change=(), found="", spans=())
+        if not self._knows_enough:
+            if self._listed.waiting and self._listed.check:
+                return self._listed.check
+            raise UserError(
+                f"there is less than {_hours(LEAST_CHECKED_S)} of healthy running since fans were commissioned again: "
+                "too little to compare them with the reference; try again later"
+            )
         self._say(f"{self._name}: checking the fans against {reference.name}")
         change = self._change_since(reference)
         found = changed_fans(change, reference.name)
@@ -165,11 +173,17 @@ class _Work:
     def needs_offer(self) -> bool:
         """Whether the fans have changed otherwise than when a version was last offered, or none is."""
         last = self._listed.waiting
-        return last is None or bool(changed_fans(self._change_since(last), last.name))
+        return last is None or (self._knows_enough and bool(changed_fans(self._change_since(last), last.name)))
+
+    @property
+    def _knows_enough(self) -> bool:
+        """Whether there is enough since fans were commissioned again or a version was offered."""
+        return self._newest == self._recordings or sum(each.seconds for each in self._newest) >= LEAST_CHECKED_S
 
     def _change_since(self, version: Version) -> Array:
         """(fans,) by which share the mean speeds over the newest hours have changed since a version was made."""
-        return mean_changes(self._file_of(version.name), spread_parts(self._newest)) - changes_from_list(version.change)
+        parts = spread_parts(self._newest, CHECKED_S)
+        return mean_changes(self._file_of(version.name), parts) - changes_from_list(version.change)
 
     def offered(self, changed: str) -> tuple[Version, bytes]:
         """A version of the fans after their change. changed: it, in words."""
@@ -229,6 +243,7 @@ class _Work:
         spans = {each.span for each in learned or self._recordings}
         if before and how == "new limits":
             spans |= set(before.learned_spans)  # of its weights
+        newest_parts = spread_parts(self._newest or self._recordings[-1:], CHECKED_S)
         limited = self._with_limits(twin, test)
         assert limited.limits.declared_rate
         of_reference = self._file_of(reference.name) if reference else twin
@@ -242,7 +257,7 @@ class _Work:
             speed_unit=test.speed_unit,
             error=_error(twin, test),
             error_before=_error(self._file_of(before.name), test) if before else None,
-            change=changes_to_list(mean_changes(of_reference, spread_parts(self._newest))),
+            change=changes_to_list(mean_changes(of_reference, newest_parts)),
             reference=reference.name if reference else self._name,
             drops=limited.drops,
             declared_per_day=self._per_day,

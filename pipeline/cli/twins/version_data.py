@@ -31,7 +31,7 @@ KEPT_OUT_EVERY = 5
 ENOUGH_OF_RANGE = 0.75
 """of the tenths of the commands' range: if other recordings have fewer of each fan, they are not enough to train on"""
 CHECKED_PARTS, CHECKED_PART_S = 24, 120.0
-"""of the newest healthy day, in which the speeds of the fans are checked: a mean over its hours and commands"""
+"""of the newest healthy hours, in which the speeds of the fans are checked: a mean over these and their commands"""
 
 
 @dataclass(frozen=True)
@@ -93,17 +93,17 @@ def newest_recordings(recordings: Sequence[HealthyRecording], wanted_s: float) -
     return chosen
 
 
-def spread_parts(recordings: Sequence[HealthyRecording]) -> list[Excerpt]:
-    """Parts of CHECKED_PART_S evenly over the recordings, at most CHECKED_PARTS of them; shorter only where all of a
-    recording is."""
+def spread_parts(recordings: Sequence[HealthyRecording], last_s: float = np.inf) -> list[Excerpt]:
+    """Parts of CHECKED_PART_S evenly over the last seconds of the recordings, at most CHECKED_PARTS of them; shorter
+    where a recording begins or ends."""
     ends_s = np.cumsum([each.seconds for each in recordings])
-    count = int(np.clip(ends_s[-1] / CHECKED_PART_S, 1, CHECKED_PARTS))
-    middles_s = (np.arange(count) + 0.5) * ends_s[-1] / count
-    counts = np.bincount(np.searchsorted(ends_s, middles_s), minlength=len(recordings)).tolist()
+    whole_s = min(float(ends_s[-1]), last_s)
+    count = int(np.clip(whole_s / CHECKED_PART_S, 1, CHECKED_PARTS))
+    half_s = min(CHECKED_PART_S, whole_s / count) / 2.0
     parts: list[Excerpt] = []
-    for each, within in zip(recordings, counts, strict=True):
-        for number in range(within):
-            middle_s = (number + 0.5) * each.seconds / within
-            half_s = min(CHECKED_PART_S, each.seconds / within) / 2.0
-            parts.append(Excerpt(each.path, middle_s - half_s, middle_s + half_s))
+    for middle_s in (ends_s[-1] - whole_s + (np.arange(count) + 0.5) * whole_s / count).tolist():
+        number = int(np.searchsorted(ends_s, middle_s))
+        each = recordings[number]
+        within_s = middle_s - (ends_s[number] - each.seconds)
+        parts.append(Excerpt(each.path, max(0.0, within_s - half_s), min(each.seconds, within_s + half_s)))
     return parts

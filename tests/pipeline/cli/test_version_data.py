@@ -48,6 +48,16 @@ def test_the_checked_parts_are_never_too_many_and_lie_in_their_recordings(second
         assert len(parts) == CHECKED_PARTS
 
 
+def test_of_long_recordings_only_the_last_hours_are_checked() -> None:
+    recordings = spans([8 * HOUR_S, 8 * HOUR_S, 1 * HOUR_S])
+    parts = spread_parts(recordings, 4 * HOUR_S)
+    assert len(parts) == CHECKED_PARTS
+    before = [part for part in parts if part.path == recordings[1].path]
+    assert min(part.from_s for part in before) >= 5 * HOUR_S
+    assert 0.7 < len(before) / len(parts) < 0.8, "three of the four hours"
+    assert not any(part.path == recordings[0].path for part in parts)
+
+
 def test_training_finds_the_movement_in_the_middle_of_a_recording(tmp_path: Path) -> None:
     recorded(tmp_path, 0.0, np.concatenate((held(1.5 * HOUR_S), moving(600.0), held(1.5 * HOUR_S))))
     recorded(tmp_path, 20_000.0, np.concatenate((held(HOUR_S), moving(600.0, seed=2), held(HOUR_S))))

@@ -34,14 +34,16 @@ def clock_us() -> Array:
     return (since_us.astype(np.int64) + 2**32 - 600_000_000) % 2**32
 
 
-def written(path: Path, *, has_clock: bool, trays: tuple[str, ...] = ("tray1",), hidden: int = 0) -> Path:
-    """A long recording. hidden: so many first samples have no command."""
+def written(
+    path: Path, *, has_clock: bool, trays: tuple[str, ...] = ("tray1",), hidden: int = 0, block: int = BLOCK
+) -> Path:
+    """A long recording. hidden: so many first samples have no command. block: samples a message."""
     received, clock = times_ns(), clock_us()
     number = np.arange(SAMPLES, dtype=float)
     command = np.where(number < hidden, np.nan, number)
     with RecordingWriter(path, {"speed_unit": "rpm"}, overwrite=True) as writer:
-        for sequence, first in enumerate(range(0, SAMPLES, BLOCK)):
-            rows = slice(first, first + BLOCK)
+        for sequence, first in enumerate(range(0, SAMPLES, block)):
+            rows = slice(first, min(first + block, SAMPLES))
             for tray in trays:
                 raw = Raw(
                     header=Header("acquisition", sequence, tray),
@@ -52,7 +54,7 @@ def written(path: Path, *, has_clock: bool, trays: tuple[str, ...] = ("tray1",),
                     speed_rad_s=np.stack([number[rows]] * FANS, axis=1),
                 )
                 writer.add_message(tray_key("plant", tray, "raw"), raw, int(received[rows][-1]))
-            if sequence % 100 == 99:
+            if sequence % 100 == 99 or block > BLOCK:
                 writer.flush()
     return path
 
@@ -154,3 +156,10 @@ def test_the_commands_of_a_recording_are_found_from_few_of_its_messages(tmp_path
     assert len(decoded) < 0.06 * SAMPLES / BLOCK
     every_s, _ = reader.commands(1.0)
     assert len(every_s) == pytest.approx(SECONDS, rel=0.1)
+
+
+def test_an_excerpt_may_lie_within_one_long_message_whose_time_is_that_of_its_last_sample(tmp_path: Path) -> None:
+    reader = ExcerptReader(written(tmp_path / "long.mcap", has_clock=True, block=4000))  # 200 s
+    for from_s, to_s in ((0.0, 60.0), (250.0, 310.0), (390.0, 450.0)):
+        (run,) = reader.read(from_s, to_s).runs
+        assert len(run.t_s) == pytest.approx((to_s - from_s) * RATE_HZ, abs=1)
