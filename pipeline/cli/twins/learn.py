@@ -13,7 +13,7 @@ import typer
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.progress import interruptible, working
 from pipeline.cli.twins.next_version import make_next_version
-from pipeline.cli.twins.versions_text import NO_REFERENCE, check_line, version_lines
+from pipeline.cli.twins.versions_text import NO_REFERENCE, check_line, offer_lines, version_lines
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
 from pipeline.errors import UserError
@@ -64,8 +64,10 @@ def learn(
         return
     if check:
         typer.echo(check_line(listed.check) if listed.check else NO_REFERENCE)
-    for line in version_lines([version], listed.in_force, ()) if version else []:
+    for line in [*version_lines(version, listed), *offer_lines(listed)] if version else []:
         typer.echo(line)
+    if version is None and listed.waiting:
+        typer.echo(f"no version was made: {listed.waiting.name} is offered already (fantwin twins)")
 
 
 def learning_tray(settings: Config, name: str | None) -> TrayConfig:

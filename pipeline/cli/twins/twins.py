@@ -10,7 +10,7 @@ import typer
 
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.twins.learn import learning_tray
-from pipeline.cli.twins.versions_text import check_line, version_lines
+from pipeline.cli.twins.versions_text import list_lines
 from pipeline.config.loading import load_config
 from pipeline.errors import UserError
 from pipeline.learning.versions import TimeSpan, TwinVersions, learning_folder
@@ -66,8 +66,7 @@ def twins(
     if json_output:
         typer.echo(json.dumps({"tray": of.name, **listed.model_dump(), "notes": said}))
         return
-    checked = [check_line(listed.check)] if listed.check else []
-    for line in [*said, *version_lines(listed.versions, listed.in_force, listed.faulty), *checked]:
+    for line in [*said, *list_lines(listed)]:
         typer.echo(line)
     if not listed.versions:
         typer.echo(f"{of.name} has no twin yet: `fantwin up` makes the first; `fantwin status` says what it waits for")

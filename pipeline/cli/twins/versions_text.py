@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from pipeline.learning.versions import Check, Drop, TimeSpan, Version
+from pipeline.learning.versions import Check, Drop, Version, VersionList
 from pipeline.recordings.dates import format_local
 
 NO_REFERENCE = (
@@ -12,14 +12,15 @@ NO_REFERENCE = (
 )
 
 
-def version_lines(versions: Sequence[Version], in_force: str, faulty_spans: Sequence[TimeSpan]) -> list[str]:
-    """A line for each version, more for the newest and for the one in force, and one for each faulty time span."""
+def list_lines(listed: VersionList) -> list[str]:
+    """A line for each version, more for the newest and for the one in force; an offer beside the one in force; faulty
+    time spans; and the last check."""
     lines: list[str] = []
-    for version in versions:
-        of_version = _lines(version, is_in_force=version.name == in_force)
-        lines += of_version if version.name == in_force or version is versions[-1] else of_version[:1]
-    marked = (f"marked as faulty: {format_local(first)} to {format_local(last)}" for first, last in faulty_spans)
-    return [*lines, *_side_by_side(versions, in_force), *marked]
+    for version in listed.versions:
+        of_version = version_lines(version, listed)
+        lines += of_version if version in (listed.current, listed.versions[-1]) else of_version[:1]
+    marked = (f"marked as faulty: {format_local(first)} to {format_local(last)}" for first, last in listed.faulty)
+    return [*lines, *offer_lines(listed), *marked, *([check_line(listed.check)] if listed.check else [])]
 
 
 def check_line(check: Check) -> str:
@@ -31,8 +32,11 @@ def check_line(check: Check) -> str:
     return f"checked up to {format_local(check.t_ns)}: speed of the fans since {check.reference}: {changes}{missing}"
 
 
-def _lines(version: Version, *, is_in_force: bool) -> list[str]:
-    state = "IN FORCE" if is_in_force else "offered" if version.outcome == "offered" else "not in force"
+def version_lines(version: Version, listed: VersionList) -> list[str]:
+    """Lines about one version of the list."""
+    not_used = "was offered" if version.outcome == "offered" else "not in force"
+    not_used = "offered" if version == listed.waiting else not_used
+    state = "IN FORCE" if version.name == listed.in_force else not_used
     unit = version.speed_unit
     return [
         f"{version.name}: {state}: {version.how}; {_limits_from(version)}",
@@ -47,11 +51,10 @@ def _limits_from(version: Version) -> str:
     return f"limits from {version.hours:.3g} h up to {format_local(version.made_t_ns)}"
 
 
-def _side_by_side(versions: Sequence[Version], in_force: str) -> list[str]:
-    """The version in force and the newest, if that is only offered: which fits the fans as they are now?"""
-    now = next((version for version in versions if version.name == in_force), None)
-    offered = versions[-1] if versions else None
-    if now is None or offered is None or offered.outcome != "offered" or offered is now:
+def offer_lines(listed: VersionList) -> list[str]:
+    """The version in force beside one that is offered, if there is one: which fits the fans as they are now?"""
+    now, offered = listed.current, listed.waiting
+    if now is None or offered is None:
         return []
     unit = offered.speed_unit
     error_before = "unknown" if offered.error_before is None else f"{offered.error_before:.3g} {unit}"

@@ -118,7 +118,8 @@ def test_the_list_says_what_is_in_force_and_the_command_changes_it(changed: Path
     config.write_text('run_folder = "runs"\n[[tray]]\nname = "tray1"\nfans = 2\n', encoding="utf-8")
     listed = fantwin("twins", "-c", config).stdout
     assert "tray1-2: IN FORCE: " in listed
-    assert "tray1-3: offered: trained; limits from 0.0333 h" in listed
+    assert "tray1-3: was offered: trained; limits from 0.0333 h" in listed
+    assert "tray1-4: offered: trained; limits from 0.0333 h" in listed
     beside = [line.split() for line in listed.splitlines() if line.startswith("  error over the newest recording")]
     (words,) = beside
     assert float(words[5]) > 2.0 * float(words[7]), "of the version in force, and of the one that is offered"
