@@ -49,7 +49,10 @@ def learn(
     of = learning_tray(settings, tray)
     folder = learning_folder(settings.run_folder, of.name)
     section = settings.sections["learner"]
-    with interruptible("no version was made"), working(f"learning the twin of {of.name}") as show:
+    with (
+        interruptible("no version was made"),
+        working(f"{'checking' if check else 'learning'} the twin of {of.name}") as show,
+    ):
         version = make_next_version(
             folder,
             of.name,

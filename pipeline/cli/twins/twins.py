@@ -16,6 +16,8 @@ from pipeline.errors import UserError
 from pipeline.learning.versions import TimeSpan, TwinVersions, learning_folder
 from schemas.units import NS_PER_S
 
+CONSEQUENCE = "alarms are discarded and baselines start again, unless only the limits differ"
+
 
 def twins(
     config: ConfigOption = DEFAULT_CONFIG,
@@ -41,8 +43,9 @@ def twins(
     """List the versions of a learned twin, put one in force, or mark a time span as faulty: it is never learned
     from.
 
-    A running site changes to the version in force within seconds. If that version was learned from a faulty time
-    span, the newest version that was not takes its place.
+    A running site changes to the version in force within seconds. If the version in force was learned from a faulty
+    time span, the newest version that was not takes its place. With another twin, alarms are discarded and baselines
+    start again.
 
     Example: fantwin twins -c fantwin.toml
 
@@ -59,9 +62,13 @@ def twins(
             raise UserError("a faulty time has two ends: give --faulty-from and --faulty-to")
         was, now = versions.mark_faulty(_time_span(faulty_from, faulty_to))
         if was:
-            said.append(f"{was} was learned from that time span; in force now: {now}" if now else _no_other(was))
+            replaced = f"{was} was learned from that time span; in force now: {now}; on a running site {CONSEQUENCE}"
+            said.append(replaced if now else _no_other(was))
     if use:
         versions.use(use)
+        said.append(f"{use} is put in force: on a running site {CONSEQUENCE}, until the next version takes over")
+        if versions.read().is_tainted:
+            said.append(f"{use} was learned from a time span that is marked as faulty: another version will replace it")
     listed = versions.read()
     if json_output:
         typer.echo(json.dumps({"tray": of.name, **listed.model_dump(), "notes": said}))
