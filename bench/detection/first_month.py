@@ -8,7 +8,8 @@ some hours.
 
 All racks are simulated in one process, and each is watched in a process of its own. After each of its days a rack
 writes what became of it to FOLDER, where a month that was interrupted goes on; `--show` prints the tables of the days
-that all racks have had so far.
+that all racks have had so far. A rack takes about an hour of a core: `--only 1,2` watches two of them, and the tables
+are of the racks whose file `rackN.json` is in FOLDER.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import argparse
 import json
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from multiprocessing import get_context
 from multiprocessing.context import SpawnProcess
 from multiprocessing.queues import Queue
@@ -93,26 +94,26 @@ def month_faults(of: Racks) -> list[Fault]:
     return found
 
 
-def run(of: Racks, rate_hz: float, folder: Path, console: Console) -> None:
-    """Let the racks live; what becomes of each is in files of the folder."""
+def run(of: Racks, watched: Sequence[int], rate_hz: float, folder: Path, console: Console) -> None:
+    """Let the racks live; what becomes of those that are watched is in files of the folder."""
     days = of.seconds / DAY_S
-    queues: list[Queue[Raw | None]] = []
+    queues: dict[int, Queue[Raw | None]] = {}
     processes: list[SpawnProcess] = []
     context = get_context("spawn")
-    for rack in range(of.columns // RACK_FANS):
-        queues.append(context.Queue())
-        given = folder, run_of(rack), (FILTER_CHANGED * days, FIRMWARE * days), queues[-1]
+    for rack in watched:
+        queues[rack] = context.Queue()
+        given = folder, run_of(rack), (FILTER_CHANGED * days, FIRMWARE * days), queues[rack]
         processes.append(context.Process(target=_live, args=given, name=run_of(rack), daemon=True))
         processes[-1].start()
     began_s, shown_day = time.monotonic(), -1
     for number, blocks in enumerate(reports(of, rate_hz, month_faults(of), ageing=ageing(of.columns, days))):
-        for queue, raw in zip(queues, blocks, strict=True):
-            queue.put(raw)
+        for rack, queue in queues.items():
+            queue.put(blocks[rack])
         day = int(number * BLOCK / rate_hz / DAY_S)
         if day > shown_day:
             shown_day = day
             console.print(f"simulated up to day {day}, {time.monotonic() - began_s:.0f} s")
-    for queue in queues:
+    for queue in queues.values():
         queue.put(None)
     for process in processes:
         process.join()
@@ -127,24 +128,33 @@ def _live(folder: Path, name: str, changed_days: Sequence[float], blocks: Queue[
 
 
 def found(of: Racks, folder: Path) -> dict[str, Any]:
-    """What became of all racks, in the days that each of them has had."""
-    months = [RackMonth.read(folder / f"{run_of(rack)}.json") for rack in range(of.columns // RACK_FANS)]
-    days = min(month.days for month in months)
+    """What became of the racks that have a file in the folder, in the days that each of them has had.
+
+    Raises:
+        SystemExit: there is no such file.
+    """
+    files = {rack: folder / f"{run_of(rack)}.json" for rack in range(of.columns // RACK_FANS)}
+    months = {rack: RackMonth.read(file) for rack, file in files.items() if file.exists()}
+    if not months:
+        raise SystemExit(f"{folder}: no rack has had a day yet")
+    days = min(month.days for month in months.values())
     until_ns = START_NS + days * DAY_NS
-    alarms = [[each for each in month.alarms if each.raised_ns < until_ns] for month in months]
-    faults = [fault for fault in month_faults(of) if fault.start_s < days * DAY_S]
+    alarms = {rack: [each for each in month.alarms if each.raised_ns < until_ns] for rack, month in months.items()}
+    faults = [
+        fault for fault in month_faults(of) if fault.start_s < days * DAY_S and fault.fan // RACK_FANS in months
+    ]
     caught = [_caught(fault, alarms) for fault in faults]
     own = {id(alarm) for each in caught for alarm in each}
     by_day: list[dict[str, Any]] = []
     for day in range(days):
         first_ns, last_ns = START_NS + day * DAY_NS, START_NS + (day + 1) * DAY_NS
-        raised = [each for of_rack in alarms for each in of_rack if first_ns <= each.raised_ns < last_ns]
+        raised = [each for of_rack in alarms.values() for each in of_rack if first_ns <= each.raised_ns < last_ns]
         by_day.append(
             {
                 "day": day,
-                "fan_days_judged": sum(month.judged_fan_days.get(day, 0.0) for month in months),
-                "promised": Counter(_promise(month, day) for month in months),
-                "in_force": [month.in_force[day] for month in months],
+                "fan_days_judged": sum(month.judged_fan_days.get(day, 0.0) for month in months.values()),
+                "promised": Counter(_promise(month, day) for month in months.values()),
+                "in_force": [month.in_force[day] for month in months.values()],
                 "false_alarms": sum(id(each) not in own for each in raised),
                 "alarms": len(raised),
             }
@@ -164,16 +174,16 @@ def found(of: Racks, folder: Path) -> dict[str, Any]:
             }
             for fault, own_alarms in zip(faults, caught, strict=True)
         ],
-        "versions": [[version.model_dump() for version in month.versions] for month in months],
+        "versions": [[version.model_dump() for version in month.versions] for month in months.values()],
         "learned_from_faults": sum(_is_learned(fault, months[fault.fan // RACK_FANS]) for fault in faults),
         "false": [
             {"rack": rack, "day": (each.raised_ns - START_NS) / DAY_NS, **vars(each)}
-            for rack, of_rack in enumerate(alarms)
+            for rack, of_rack in alarms.items()
             for each in of_rack
             if id(each) not in own
         ],
-        "learning_s": [month.learning_s for month in months],
-        "problems": [month.problems for month in months],
+        "learning_s": [month.learning_s for month in months.values()],
+        "problems": [month.problems for month in months.values()],
     }
 
 
@@ -182,7 +192,7 @@ def _promise(month: RackMonth, day: int) -> str:
     return "none" if version is None else "target" if version.is_target else "declared"
 
 
-def _caught(fault: Fault, of_sites: Sequence[list[Episode]]) -> list[Episode]:
+def _caught(fault: Fault, of_sites: Mapping[int, list[Episode]]) -> list[Episode]:
     first_ns = START_NS + round(fault.start_s * NS_PER_S)
     last_ns = START_NS + round((fault.stop_s + AFTER_FAULT_S) * NS_PER_S)
     return [
@@ -229,6 +239,11 @@ def tables(figures: dict[str, Any], console: Console) -> None:
         console.print(f"learning: {len(took)} times, {sum(took):.0f} s of one core, the longest {max(took):.0f} s")
 
 
+def _numbers(text: str) -> list[int]:
+    """Racks by number, counted from 0."""
+    return [int(word) - 1 for word in text.split(",")]
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -237,13 +252,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=50)
     parser.add_argument("--report-hz", type=float, default=2.0)
     parser.add_argument("--keep", type=Path, required=True, help="folder for what is learned and the figures")
+    parser.add_argument("--only", type=_numbers, help="the racks to watch, from 1; default: all")
     parser.add_argument("--show", action="store_true", help="only print the tables of what is in FOLDER")
     given = parser.parse_args()
     console = Console(soft_wrap=True, highlight=False)
     given.keep.mkdir(parents=True, exist_ok=True)
     of = racks(given.racks, given.days * DAY_S, given.seed, fans_seed=given.seed)
     if not given.show:
-        run(of, given.report_hz, given.keep, console)
+        run(of, given.only or range(given.racks), given.report_hz, given.keep, console)
     figures = found(of, given.keep)
     (given.keep / "found.json").write_text(json.dumps(figures, indent=1))
     tables(figures, console)
