@@ -29,7 +29,7 @@ from scoring.former_snapshot_keys import current_fan_scorer
 from scoring.gaps import Gaps
 from scoring.limits import Limits
 from scoring.piece import Piece
-from scoring.residual import Residual, ScoredResidual
+from scoring.residual import JoinedResidual, Residual, ScoredResidual
 from scoring.samples import Samples
 from scoring.scored_block import Observation, ScoredBlock
 
@@ -328,8 +328,8 @@ class FanScorer:
                     scores.ratios[stretch, number][at_rest] = np.nan
 
     def _complete(self, piece: Piece) -> None:
-        scored: dict[Signal, ScoredResidual] = {
-            source: ScoredResidual.joined(parts) for source, parts in piece.scored.items()
+        scored: dict[Signal, JoinedResidual] = {
+            source: self.residuals[source].joined(parts) for source, parts in piece.scored.items()
         }
         smoothed: dict[Signal, Array] = {
             source: self.residuals[source].smooth(of, piece.period_s) for source, of in scored.items()

@@ -14,7 +14,7 @@ import numpy as np
 from schemas.messages import Array, Statistic
 from schemas.units import NS_PER_S
 from scoring.detectors.detector import DetectorInput, DetectorRow, Signal
-from scoring.residual import ResidualSamples, ScoredResidual
+from scoring.residual import JoinedResidual, ResidualSamples, ScoredResidual
 from scoring.samples import Samples
 from scoring.scored_block import Observation, ScoredBlock
 
@@ -67,7 +67,7 @@ class Piece:
 
     def complete(
         self,
-        scored: Mapping[Signal, ScoredResidual],
+        scored: Mapping[Signal, JoinedResidual],
         smoothed: Mapping[Signal, Array],
         in_use: Sequence[Signal],
         baseline_s: float,
@@ -99,7 +99,7 @@ class Piece:
         scores.balance_baseline_s[:] = balance.independent_intervals * baseline_s
         scores.balance_commissioned[:], scores.balance_at_limit[:] = balance.commissioned, balance.at_limit
 
-    def observation(self, scored: Mapping[Signal, ScoredResidual]) -> Observation:
+    def observation(self, scored: Mapping[Signal, JoinedResidual]) -> Observation:
         """What calibration needs about it."""
         return Observation(
             ratios=self._known_ratios,

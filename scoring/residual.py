@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from schemas.messages import Array
-from scoring.baseline.baseline import Baseline
+from scoring.baseline.baseline import Baseline, BaselineState
 from scoring.baseline.healthy_residual import FanOffsets
 from scoring.baseline.shared_offset import LEAST_FANS, SharedOffset
 from scoring.baseline.speed_scaling import speed_scaling
@@ -70,7 +70,7 @@ class ResidualSamples:
 
 @dataclass(frozen=True, eq=False)
 class ScoredResidual:
-    """A residual less its baseline, and the baseline, (n, fans) each."""
+    """A residual less its baseline in one interval, (n, fans) each; and the state of the baseline, (fans,) each."""
 
     scored: Array
     """valid, and with a baseline"""
@@ -83,19 +83,28 @@ class ScoredResidual:
     """at this speed, sigma, with what the fans share"""
     shared: Array
     """that part of it"""
+    state: BaselineState
+
+
+JOINED = ("scored", "persistent", "shift", "baseline", "shared")
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedResidual:
+    """A residual in successive intervals, (n, fans) each."""
+
+    scored: Array
+    """this and the next four: see ScoredResidual"""
+    persistent: Array
+    shift: Array
+    baseline: Array
+    shared: Array
     commissioned: Array
     """the fan's own baseline at the end of commissioning, at the reference speed; NaN before"""
     independent_intervals: Array
     at_limit: Array
     learned_scale: Array
     """see Baseline"""
-
-    @classmethod
-    def joined(cls, parts: Sequence[ScoredResidual]) -> ScoredResidual:
-        """That of successive samples."""
-        if len(parts) == 1:
-            return parts[0]
-        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
 
 
 class Residual:
@@ -171,20 +180,20 @@ class Residual:
 
         Samples far from the baseline are clipped, so that one outlier does not move it.
         """
-        baseline, shape = self.baseline, of.valid.shape
-        own, scored, learned_scale = baseline.value * of.scaling, of.valid & baseline.is_set, baseline.learned_scale
+        baseline, state, shape = self.baseline, self.baseline.state, of.valid.shape
+        own, scored, is_commissioning = state.value * of.scaling, of.valid & state.is_set, state.is_commissioning
         shared, residual = np.zeros(shape), of.residual
         if self._shared:
             shared = self._shared.at(of.speed_sigmas)
             residual = residual - shared
-            commissioned = baseline.commissioned * of.scaling
-            commissioned_now = scored & ~baseline.is_commissioning & of.seen
+            commissioned = state.commissioned * of.scaling
+            commissioned_now = scored & ~is_commissioning & of.seen
             self._shared.add(of.residual - commissioned, of.speed_sigmas, commissioned_now)
         learned = np.where(of.valid, residual, own).clip(own - of.reach, own + of.reach)
-        baseline.add(learned, of.valid & (of.seen | baseline.is_commissioning), of.scaling)
+        baseline.add(learned, of.valid & (of.seen | is_commissioning), of.scaling)
         shift = np.where(scored, residual - own, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
         standardised = shift / of.std
-        persistent = standardised / self._persistent_std(of.low_frequency_std, of.scaling, learned_scale)
+        persistent = standardised / self._persistent_std(of.low_frequency_std, of.scaling, state.learned_scale)
         return ScoredResidual(
             scored=scored,
             standardised=standardised.clip(-of.clip, of.clip),
@@ -192,10 +201,25 @@ class Residual:
             shift=shift,
             baseline=own + shared if self._shared else own,  # a sum would make -0.0 of older recordings 0.0
             shared=shared,
-            commissioned=np.full(shape, np.where(baseline.is_commissioning, np.nan, baseline.commissioned)),
-            independent_intervals=np.full(shape, self._independent_intervals),
-            at_limit=np.full(shape, baseline.is_at_limit),
-            learned_scale=np.full(shape, learned_scale),
+            state=state,
+        )
+
+    def joined(self, parts: Sequence[ScoredResidual]) -> JoinedResidual:
+        """What was scored in successive intervals."""
+        counts = [len(part.scored) for part in parts]
+        state = BaselineState(*(np.array(of) for of in zip(*(part.state for part in parts), strict=True)))
+        commissioned = np.where(state.is_commissioning, np.nan, state.commissioned)
+        return JoinedResidual(
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in JOINED),
+            *(
+                np.repeat(of, counts, axis=0)
+                for of in (
+                    commissioned,
+                    self._independent_intervals(state),
+                    self.baseline.at_limit(state),
+                    state.learned_scale,
+                )
+            ),
         )
 
     def end_interval(
@@ -224,15 +248,14 @@ class Residual:
         """What the fans shared when last compared, for each rad/s of their speed, in the unit of the residual."""
         return self._shared.compared if self._shared else 0.0
 
-    @property
-    def _independent_intervals(self) -> Array:
-        """(fans,) the number of independent intervals whose mean would vary as much as baseline and shared part do."""
-        own = self.baseline.independent_intervals
+    def _independent_intervals(self, state: BaselineState) -> Array:
+        """The number of independent intervals whose mean would vary as much as baseline and shared part do."""
+        own = self.baseline.independent_intervals(state)
         if self._shared is None:
             return own
         return own * self._shared.independent_intervals / (own + self._shared.independent_intervals)
 
-    def smooth(self, of: ScoredResidual, period_s: float) -> Array:
+    def smooth(self, of: JoinedResidual, period_s: float) -> Array:
         """(n, fans) the low-passed residual less its baseline, sigma, as displayed; NaN where not scored."""
         return np.where(of.scored, self._low_pass.update(of.shift, of.scored, period_s), np.nan)
 

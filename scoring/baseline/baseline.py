@@ -22,7 +22,7 @@ uncertainty.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,26 @@ ROUNDING = 1e-9
 OFFSET_RANGE_RMS = 3.0  # an offset may be so many times the root mean square of healthy ones
 FASTER_INFORMATION = 1.5  # times the least information kept: the baseline adapts faster to such an interval
 MIN_INFORMATION = 1e-12
+
+
+class BaselineState(NamedTuple):
+    """Baselines in one interval, (fans,) each, or in several, (intervals, fans): see Baseline."""
+
+    value: Array
+    commissioned: Array
+    intervals: Array
+    total_information: Array
+    learned_scale: Array
+
+    @property
+    def is_set(self) -> Array:
+        """Whether a fan has a baseline, so that its residual can be scored."""
+        return self.intervals > 0
+
+    @property
+    def is_commissioning(self) -> Array:
+        """Whether commissioning goes on."""
+        return self.intervals < COMMISSIONING_INTERVALS
 
 
 class Baseline(ColumnState):
@@ -84,17 +104,27 @@ class Baseline(ColumnState):
         return self.intervals < COMMISSIONING_INTERVALS
 
     @property
-    def is_at_limit(self) -> Array:
-        """(fans,) whether the baseline is held at the adaptation limit."""
-        limit = self._settings.adaptation_limit_sigmas
-        moved = np.abs(self.value - self.commissioned)
-        return self.is_set & (moved >= limit * (1.0 - ROUNDING)) & (limit > 0)
+    def state(self) -> BaselineState:
+        """Of the present interval; it stays as it is."""
+        return BaselineState(
+            self.value, self.commissioned, self.intervals.copy(), self.total_information.copy(), self.learned_scale
+        )
 
     @property
-    def independent_intervals(self) -> Array:
-        """(fans,) the number of independent intervals whose mean would vary as much as the baseline."""
+    def is_at_limit(self) -> Array:
+        """(fans,) whether the baseline is held at the adaptation limit."""
+        return self.at_limit(self.state)
+
+    def at_limit(self, state: BaselineState) -> Array:
+        """The same of a state."""
+        limit = self._settings.adaptation_limit_sigmas
+        moved = np.abs(state.value - state.commissioned)
+        return state.is_set & (moved >= limit * (1.0 - ROUNDING)) & (limit > 0)
+
+    def independent_intervals(self, state: BaselineState) -> Array:
+        """The number of independent intervals whose mean would vary as much as the baseline."""
         in_the_long_run = 2.0 * self._adaptation_intervals - 1.0
-        return np.minimum(self.total_information, in_the_long_run)
+        return np.minimum(state.total_information, in_the_long_run)
 
     def offset_uncertainty(self, scaling: Array, learned_scale: Array) -> Array:
         """(n, fans) how far the fan's offset at a scaling (n, fans) may be from the scaled baseline, sigma.

@@ -8,49 +8,59 @@ would take as long again to decay.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from schemas.messages import Array
 
 ONE = 1 << 24  # fixed-point value of one sigma second
 LARGEST_SIGMAS = 1e4  # larger residuals are clipped to this
+UNCAPPED = 1 << 62
 BOTH_SIDES = np.array([[1.0], [-1.0]])
 
 
 class Cusum:
-    """The sums of a tray's fans."""
+    """The sums of a tray's fans, with one reference value or several."""
 
-    def __init__(self, fans: int, reference: float, cap: float) -> None:
-        """reference: sigma. cap: sigma seconds; may be infinite."""
-        self._reference = reference
-        self._cap = round(cap * ONE) if np.isfinite(cap) else None
-        self.sums = np.zeros((2, fans), np.int64)
-        """(2, fans) C+ and C-, in fixed point"""
+    def __init__(self, fans: int, references: Sequence[float], caps: Sequence[float]) -> None:
+        """references: sigma. caps: of each, sigma seconds; may be infinite."""
+        self._references = np.array(references)[:, np.newaxis, np.newaxis]
+        of_each = [round(cap * ONE) if np.isfinite(cap) else UNCAPPED for cap in caps]
+        self._caps = np.array(of_each, np.int64)[:, np.newaxis, np.newaxis]
+        self.sums = np.zeros((len(references), 2, fans), np.int64)
+        """(references, 2, fans) C+ and C-, in fixed point"""
 
     def reset(self, fans: Array) -> None:
         """Start again for some fans, (fans,) of bool."""
-        self.sums[:, fans] = 0
+        self.sums[..., fans] = 0
 
     def update(self, z: Array, valid: Array, period_s: float) -> Array:
-        """Take a block, (n, fans) each; invalid samples leave the sums as they are. Returns max(C+, C-)."""
-        shift = np.where(valid, z, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
-        gains = (shift[:, np.newaxis] * BOTH_SIDES - self._reference) * (period_s * ONE)  # (n, 2, fans)
-        gains = np.where(valid[:, np.newaxis], np.rint(gains), 0.0).astype(np.int64)
-        sums = bounded_sums(gains.reshape(len(z), -1), self.sums.ravel(), self._cap).reshape(gains.shape)
-        self.sums = sums[-1].copy()
-        return sums.max(axis=1) / ONE
+        """Take a block, (n, fans) each; invalid samples leave the sums as they are.
+
+        Returns (n, references, fans) of max(C+, C-).
+        """
+        shift = np.where(valid, z, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)[:, np.newaxis, np.newaxis]
+        gains = np.rint((shift * BOTH_SIDES - self._references) * (period_s * ONE)).astype(np.int64)
+        gains *= valid[:, np.newaxis, np.newaxis]
+        sums = bounded_sums(gains, self.sums, self._caps)
+        self.sums[...] = sums[-1]
+        return sums.max(axis=2) / ONE
 
 
-def bounded_sums(gains: Array, before: Array, cap: int | None) -> Array:
-    """(n, fans) the sum after each sample, not below zero and not above the cap; all integers.
+def bounded_sums(gains: Array, before: Array, cap: Array | int) -> Array:
+    """(n, ...) each sum after each sample, not below zero and not above its cap; all integers.
 
-    gains: (n, fans). before: (fans,) the sums before the first. cap: None for none.
+    gains: (n, ...). before: (...), the sums before the first sample. cap: one for all, or of a shape like `before`.
     """
     totals = before + gains.cumsum(axis=0)
     sums = totals - np.minimum(np.minimum.accumulate(totals, axis=0), 0)
-    if cap is not None and (sums > cap).any():
-        for fan in np.flatnonzero((sums > cap).any(axis=0)).tolist():
-            sums[:, fan] = _capped(gains[:, fan], int(before[fan]), cap)
+    beyond = sums > cap
+    if np.count_nonzero(beyond):
+        caps = np.broadcast_to(cap, before.shape)
+        for place in np.argwhere(beyond.any(axis=0)).tolist():
+            at = tuple(place)
+            sums[:, *at] = _capped(gains[:, *at], int(before[at]), int(caps[at]))
     return sums
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -86,18 +87,11 @@ class DriftSettings(SingleLimit):
         return self.model_copy(update={"reference_sigmas": reference, "limit": limit, "large_limit": large_limit})
 
 
-class _Sum:
-    """One CUSUM, with its limit."""
+class DriftSum(NamedTuple):
+    """One of its sums."""
 
-    def __init__(self, context: DetectorContext, reference_sigmas: float, limit: float, period_s: float) -> None:
-        deviation = summed_deviation(context.autocorrelation_time_s, period_s)
-        self.reference_sigmas, self.limit_sigma_s = reference_sigmas, deviation * limit
-        cap = CAP_LIMITS * limit * deviation if context.capped else math.inf
-        self.cusum = Cusum(context.fans, reference_sigmas, cap)
-
-    def update(self, block: DetectorInput) -> Array:
-        """(n, fans) of a block."""
-        return self.cusum.update(block.persistent, block.valid, block.period_s) / self.limit_sigma_s
+    reference_sigmas: float
+    limit_sigma_s: float
 
 
 class Drift(Detector):
@@ -109,20 +103,28 @@ class Drift(Detector):
     def __init__(self, settings: DriftSettings, context: DetectorContext) -> None:
         self._settings = settings
         self._mean_residual_std = context.mean_residual_std
-        self.period_s, reference = settings.period_s, settings.reference_sigmas
-        self.sums = [_Sum(context, reference, settings.limit, self.period_s)]
+        references, limits = [settings.reference_sigmas], [settings.limit]
         if settings.large_limit is not None:
-            self.sums.append(_Sum(context, LARGE_SHARE * reference, settings.large_limit, self.period_s))
+            references.append(LARGE_SHARE * settings.reference_sigmas)
+            limits.append(settings.large_limit)
+        self.period_s = settings.period_s
+        deviation = summed_deviation(context.autocorrelation_time_s, self.period_s)
+        self.sums = [
+            DriftSum(*of_one) for of_one in zip(references, [deviation * limit for limit in limits], strict=True)
+        ]
+        self._limits_sigma_s = np.array([each.limit_sigma_s for each in self.sums])[:, np.newaxis]
+        caps = [CAP_LIMITS * limit * deviation if context.capped else math.inf for limit in limits]
+        self.cusum = Cusum(context.fans, references, caps)
 
     def update(self, block: DetectorInput) -> Array:
         """See Detector."""
-        ratios = [each.update(block) for each in self.sums]
-        return ratios[0] if len(ratios) == 1 else np.maximum(*ratios)
+        sums = self.cusum.update(block.persistent, block.valid, block.period_s)
+        ratios: Array = sums / self._limits_sigma_s
+        return ratios.max(axis=1)
 
     def reset(self, fans: Array) -> None:
         """See Detector."""
-        for each in self.sums:
-            each.cusum.reset(fans)
+        self.cusum.reset(fans)
 
     @property
     def memory_s(self) -> float:
@@ -135,8 +137,7 @@ class Drift(Detector):
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
-        names = ("sums", "large_sums")
-        return {name: each.cusum.sums for name, each in zip(names, self.sums, strict=False)}
+        return dict(zip(("sums", "large_sums"), self.cusum.sums, strict=False))
 
     @classmethod
     def text(cls, alarm: Alarm, source: Signal, units: AlarmUnits) -> str:

@@ -49,9 +49,14 @@ class LowPass(ColumnState):
 
     def _row_by_row(self, x: Array, valid: Array, keep: float) -> Array:
         """The same for a few rows, each in one go for all columns."""
-        taken, y = (1.0 - keep) * x, np.empty_like(x)
-        for row, is_valid in enumerate(valid):
-            self.value = y[row] = np.where(is_valid, taken[row] + keep * self.value, self.value)
+        y = (1.0 - keep) * x
+        if np.count_nonzero(valid) == valid.size:
+            for row in y:
+                self.value = np.add(row, keep * self.value, out=row)
+            self.value = self.value.copy()
+        else:
+            for row, is_valid in zip(y, valid, strict=True):
+                self.value = row[:] = np.where(is_valid, row + keep * self.value, self.value)
         return y
 
     def _partly_valid(self, x: Array, valid: Array, keep: float) -> Array:

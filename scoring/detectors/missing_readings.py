@@ -23,7 +23,7 @@ from pydantic import Field
 
 from schemas.messages import Alarm, Array
 from scoring.detectors.alarm_units import AlarmUnits
-from scoring.detectors.cusum import ONE, bounded_sums
+from scoring.detectors.cusum import ONE, UNCAPPED, bounded_sums
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, DetectorSettings, LimitRule, Signal
 from scoring.detectors.tacho import LOOSE_S, MIN_MISSING_SHARE, MISSING_MARGIN, Tacho, TachoSettings
 
@@ -97,7 +97,7 @@ class MissingReadings(Detector):
         self._interruptions += (counted & missing).sum(axis=0)
         gains = np.where(counted, np.where(missing, self._gain_of_missing, self._gain_of_reading), 0)
         limit = self._factor * math.log(max(FALSE_ALARM_EVERY_S / block.period_s, math.e))
-        sums = bounded_sums(gains, self._sums, round(CAP_LIMITS * limit * ONE) if self._is_capped else None)
+        sums = bounded_sums(gains, self._sums, round(CAP_LIMITS * limit * ONE) if self._is_capped else UNCAPPED)
         self._sums = sums[-1].copy()
         return sums / (limit * ONE)
 

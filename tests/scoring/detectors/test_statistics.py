@@ -34,8 +34,8 @@ def of_low_pass() -> Update:
 
 
 def of_cusum() -> Update:
-    cusum = Cusum(FANS, reference=0.25, cap=0.3)
-    return lambda x, valid: cusum.update(x, valid, STEP_S)
+    cusum = Cusum(FANS, [0.25], [0.3])
+    return lambda x, valid: cusum.update(x, valid, STEP_S)[:, 0]
 
 
 def context(fans: int = FANS, smoothing_s: float = 0.2) -> DetectorContext:
@@ -148,7 +148,7 @@ def test_a_low_pass_without_a_time_constant_passes_everything() -> None:
 
 def test_the_cusum_is_its_recursion_up_to_its_cap_and_finds_both_signs() -> None:
     x = np.random.default_rng(2).normal(0.0, 1.0, (500, 2)) + np.array([0.5, -0.5])
-    made = Cusum(2, reference=0.25, cap=0.5).update(x, np.ones(x.shape, np.bool_), STEP_S)
+    (made,) = Cusum(2, [0.25], [0.5]).update(x, np.ones(x.shape, np.bool_), STEP_S).swapaxes(0, 1)
     for fan in range(2):
         up = down = 0.0
         for row in range(500):
@@ -159,20 +159,20 @@ def test_the_cusum_is_its_recursion_up_to_its_cap_and_finds_both_signs() -> None
 
 
 def test_an_extreme_number_counts_as_the_largest() -> None:
-    made = Cusum(1, reference=0.0, cap=math.inf).update(np.array([[1e300]]), np.array([[True]]), STEP_S)
-    assert made[0, 0] == pytest.approx(LARGEST_SIGMAS * STEP_S)
+    made = Cusum(1, [0.0], [math.inf]).update(np.array([[1e300]]), np.array([[True]]), STEP_S)
+    assert made[0, 0, 0] == pytest.approx(LARGEST_SIGMAS * STEP_S)
 
 
 def average_run_length(z: np.ndarray, reference: float, limit: float) -> float:
     """Mean run length over streams z (n, streams), each of which must end in an alarm."""
-    cusum = Cusum(z.shape[1], reference, math.inf)
+    cusum = Cusum(z.shape[1], [reference], [math.inf])
     running, lengths = np.arange(z.shape[1]), np.zeros(z.shape[1])
     for first in range(0, len(z), 500):
         block = z[first : first + 500, running]
-        beyond = cusum.update(block, np.ones(block.shape, np.bool_), 1.0) > limit
+        beyond = cusum.update(block, np.ones(block.shape, np.bool_), 1.0)[:, 0] > limit
         ended = beyond.any(axis=0)
         lengths[running[ended]] = first + beyond.argmax(axis=0)[ended] + 1
-        running, cusum.sums = running[~ended], cusum.sums[:, ~ended]
+        running, cusum.sums = running[~ended], cusum.sums[..., ~ended]
     assert not len(running)
     return float(lengths.mean())
 
@@ -197,7 +197,7 @@ def test_a_shift_is_found_as_fast_as_the_textbook_says(shift: float, expected: f
 
 def test_a_shift_below_the_reference_value_is_never_found() -> None:
     z = np.full((100_000, 1), 0.49)
-    assert Cusum(1, 0.5, math.inf).update(z, np.ones(z.shape, np.bool_), STEP_S).max() == 0.0
+    assert Cusum(1, [0.5], [math.inf]).update(z, np.ones(z.shape, np.bool_), STEP_S).max() == 0.0
 
 
 def test_a_second_sum_finds_large_shifts_sooner_and_small_ones_no_sooner() -> None:
@@ -287,15 +287,15 @@ def test_some_fans_start_again_and_the_others_continue() -> None:
     x = np.random.default_rng(8).normal(0.5, 1.0, (200, 2))
     valid = np.ones(x.shape, np.bool_)
     first = np.array([True, False])
-    low_pass, cusum, growth = LowPass(2, 0.2), Cusum(2, 0.25, math.inf), growth_of(2, 0.2)
+    low_pass, cusum, growth = LowPass(2, 0.2), Cusum(2, [0.25], [math.inf]), growth_of(2, 0.2)
     growth.update(block_of(x, valid))
     growth.reset(first)
     for each in (low_pass, cusum):
         each.update(x, valid, STEP_S)
         each.reset(first)
-    assert low_pass.value[0] == cusum.sums[:, 0].max() == growth.columns()["square"][0] == 0.0
+    assert low_pass.value[0] == cusum.sums[..., 0].max() == growth.columns()["square"][0] == 0.0
     assert low_pass.value[1] != 0.0
-    assert cusum.sums[0, 1] > 0
+    assert cusum.sums[0, 0, 1] > 0
     assert growth.columns()["square"][1] > 0.0
 
 
