@@ -1,6 +1,7 @@
 """Simulated racks of 4-pin fans with counting tachos under a thermostat, all racks at once, and their faults.
 
-Each rack is a run of its own, with four fans; two of their tachos count over 1 s and two over 0.5 s. All racks are
+Each rack is a run of its own, with four fans (or a multiple of four); of four tachos two count over 1 s and two over
+0.5 s. All racks are
 advanced together, a column for each fan, in steps of 0.1 s (the fans' lags are exact within them, and the ends of
 windows are taken where they fall); reports are then made at their own rate, so that the same seed gives the same fans,
 commands and counts at each rate. Lines are lost, arrive late, and lack readings, as on a microcontroller's line.
@@ -30,7 +31,7 @@ from simulation.tacho import CountingTacho
 from simulation.thermostat import Thermostat
 
 TACHOS = tuple(Tacho(kind="count", window_s=window_s) for window_s in (1.0, 1.0, 0.5, 0.5))
-"""of the fans of a rack"""
+"""of four neighbouring fans of a rack"""
 RACK_FANS = len(TACHOS)
 RATES_HZ = (2.0, 10.0, 100.0)
 DAY_S = 86_400.0
@@ -77,18 +78,32 @@ class Racks:
     thermostat: Thermostat
     seconds: float
     seed: int
+    rack_fans: int = RACK_FANS
+    """of each rack"""
 
     @property
     def columns(self) -> int:
         """How many fans there are."""
         return len(np.asarray(self.parameters.speed_max_rad_s))
 
+    @property
+    def count(self) -> int:
+        """How many racks there are."""
+        return self.columns // self.rack_fans
 
-def racks(count: int, seconds: float, seed: int, fans_seed: int = FANS_SEED) -> Racks:
-    """So many racks for a time. The same fans_seed gives the same fans, the same seed the same commands and chances."""
-    columns = count * RACK_FANS
+    def place(self, column: int) -> tuple[int, int]:
+        """The rack of a column, and the fan in it, both counted from 0."""
+        return divmod(column, self.rack_fans)
+
+
+def racks(count: int, seconds: float, seed: int, fans_seed: int = FANS_SEED, *, rack_fans: int = RACK_FANS) -> Racks:
+    """So many racks for a time. The same fans_seed gives the same fans, the same seed the same commands and chances.
+
+    rack_fans: of each rack, a multiple of RACK_FANS.
+    """
+    columns = count * rack_fans
     thermostat = Thermostat(columns, seed, *DUTIES, period_s=seconds)
-    return Racks(four_pin_tray(columns, fans_seed), thermostat, seconds, seed)
+    return Racks(four_pin_tray(columns, fans_seed), thermostat, seconds, seed, rack_fans)
 
 
 def run_of(rack: int) -> str:
@@ -105,12 +120,12 @@ def fault_schedule(of: Racks) -> list[Fault]:
     rng = np.random.default_rng([of.seed, 1])
     part_s = of.seconds / len(FAULT_KINDS)
     return [
-        _fault(of, kind, rack * RACK_FANS + int(fan), part * part_s, part_s, rng)
-        for rack in range(of.columns // RACK_FANS)
+        _fault(of, kind, rack * of.rack_fans + int(fan), part * part_s, part_s, rng)
+        for rack in range(of.count)
         for part, (kind, fan) in enumerate(
             zip(
                 rng.permutation(list(FAULT_KINDS)).tolist(),
-                np.resize(rng.permutation(RACK_FANS), len(FAULT_KINDS)).tolist(),
+                np.resize(rng.permutation(of.rack_fans), len(FAULT_KINDS)).tolist(),
                 strict=True,
             )
         )
@@ -118,7 +133,7 @@ def fault_schedule(of: Racks) -> list[Fault]:
 
 
 def events(faults: list[Fault]) -> list[Event]:
-    """The truth about a schedule."""
+    """The truth about a schedule of racks of RACK_FANS."""
     return [
         Event(
             run_of(fault.fan // RACK_FANS),
@@ -161,7 +176,7 @@ def reports(
     while sent < rows:
         count = min(BLOCK, rows - sent)
         number = np.arange(sent, sent + count)
-        yield _lines(*course.until(number / rate_hz), number / rate_hz, number, chance)
+        yield _lines(of.rack_fans, *course.until(number / rate_hz), number / rate_hz, number, chance)
         sent += count
 
 
@@ -174,7 +189,7 @@ class _Course:
         self._aged_until_s = 0.0
         self._is_swept = is_swept
         self._faults = faults
-        self._fans = FourPinFans(of.parameters, np.random.default_rng([of.seed, 2]), RACK_FANS)
+        self._fans = FourPinFans(of.parameters, np.random.default_rng([of.seed, 2]), of.rack_fans)
         self._tacho = CountingTacho(TACHOS * (of.columns // RACK_FANS), 0.0, 0.0, np.random.default_rng([of.seed, 4]))
         self._step = 0
         self._active: list[Fault] = []
@@ -230,6 +245,7 @@ class _Course:
 
 
 def _lines(
+    rack_fans: int,
     duty: Array,
     reading: Array,
     missing: Array,
@@ -239,17 +255,17 @@ def _lines(
 ) -> list[Raw]:
     """The lines that arrive, for each rack."""
     speed = np.where(chance.random(reading.shape) < missing, np.nan, reading)
-    racks_count = reading.shape[1] // RACK_FANS
+    racks_count = reading.shape[1] // rack_fans
     arrives = chance.random((racks_count, len(number))) >= LOST_LINES
     late_s = chance.uniform(0.0, LATE_S, size=(racks_count, len(number)))
     clock_us = np.round(times_s * 1e6).astype(np.int64) % 2**32
     made = []
     for rack in range(racks_count):
         rows = np.flatnonzero(arrives[rack])
-        fans = slice(rack * RACK_FANS, (rack + 1) * RACK_FANS)
+        fans = slice(rack * rack_fans, (rack + 1) * rack_fans)
         made.append(
             Raw(
-                fans=RACK_FANS,
+                fans=rack_fans,
                 host_receive_t_ns=START_NS + np.round((times_s + late_s[rack])[rows] * NS_PER_S).astype(np.int64),
                 device_clock_us=clock_us[rows].astype(np.uint32),
                 device_sequence=(number[rows] % 2**32).astype(np.uint32),
