@@ -19,6 +19,7 @@ from schemas.messages import Array
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
 from scoring.baseline.baseline import MIN_STEADY_READINGS
+from scoring.baseline.intervals import Intervals, first_end
 from scoring.baseline.movement import Movement
 from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Signal
 from scoring.detectors.motion import HealthyMotion, Motion
@@ -29,7 +30,7 @@ from scoring.former_snapshot_keys import current_fan_scorer
 from scoring.gaps import Gaps
 from scoring.limits import Limits
 from scoring.piece import Piece
-from scoring.residual import JoinedResidual, Residual, ScoredResidual
+from scoring.residual import JoinedResidual, Residual, SampledResidual, ScoredResidual
 from scoring.samples import Samples
 from scoring.scored_block import Observation, ScoredBlock
 
@@ -126,34 +127,45 @@ class FanScorer:
             pass
         return scores
 
-    def stretches(self, block: Samples) -> tuple[ScoredBlock, Iterator[slice]]:
-        """Score a block of at least one sample in stretches within one interval of the baselines.
+    def stretches(
+        self, block: Samples, may_span: Callable[[], bool] | None = None
+    ) -> tuple[ScoredBlock, Iterator[slice]]:
+        """Score a block of at least one sample in stretches.
 
         Returns the scores, and the rows of each stretch. Going on to the next stretch fills in its `score`, `judged`
-        and `ratios`; all is filled in at the end. Between them the caller may decide what the interval is worth, see
-        `learn_nothing`.
+        and `ratios`; all is filled in at the end. Between them the caller may decide what the interval of the baselines
+        in which a stretch ends is worth, see `learn_nothing`.
+
+        may_span: called before each stretch: whether it may span several intervals, if no score in those before the
+        last exceeds 1. None: it may, whatever the scores are: the caller decides nothing.
         """
         scores = ScoredBlock.empty(len(block.t_ns), len(self._rows), block.alive.shape[1])
-        return scores, self._each_stretch(block, scores)
+        return scores, self._each_stretch(block, scores, may_span)
 
-    def _each_stretch(self, block: Samples, scores: ScoredBlock) -> Iterator[slice]:
+    def _each_stretch(
+        self, block: Samples, scores: ScoredBlock, may_span: Callable[[], bool] | None
+    ) -> Iterator[slice]:
         if self.origin_t_ns is None:
             self.origin_t_ns = int(block.t_ns[0])
-        intervals = (block.t_ns - self.origin_t_ns) // self._interval_ns
+        of_samples = (block.t_ns - self.origin_t_ns) // self._interval_ns
         missing_ns = self._missing_ns(block)
         after_gap: Array = np.any(missing_ns > self._shortest_memory_ns, axis=(1, 2))
         for first, last in _parts(after_gap[1:]):
             if after_gap[first]:
                 self._forget(missing_ns[first])
             piece = self._piece(block.rows(slice(first, last)), scores.rows(slice(first, last)))
-            numbers = intervals[first:last]
-            for begin, end in _parts(np.diff(numbers) != 0):
-                number = int(numbers[begin])
-                if number != self._interval:
+            numbers, begin = of_samples[first:last], 0
+            while begin < len(numbers):
+                if numbers[begin] != self._interval:
                     self._end_interval(block.period_ns)
-                    self._interval = number
-                self._score(piece, slice(begin, end))
+                    self._interval = int(numbers[begin])
+                intervals = Intervals.of(numbers[begin:], self._interval_ns // block.period_ns)
+                if may_span is not None and not may_span():
+                    intervals = intervals.first(1)
+                end = begin + self._score(piece, begin, intervals, None if may_span is None else 1.0)
+                self._interval = int(numbers[end - 1])
                 yield slice(first + begin, first + end)
+                begin = end
             self._complete(piece)
 
     def learn_nothing(self, fans: Array) -> None:
@@ -232,9 +244,7 @@ class FanScorer:
 
     def _end_interval(self, period_ns: int) -> None:
         expected = self._interval_ns // period_ns
-        speed, balance = (self.residuals[source].baseline for source in RESIDUALS)
-        commissioning = speed.is_commissioning | balance.is_commissioning
-        moving = self._movement.end_interval(commissioning) if self._movement else None
+        moving = self._movement.end_interval(self._commissioning) if self._movement else None
         few_readings = None
         if self._held_ns is not None:
             few_readings = self._interval_ns / np.maximum(self._held_ns, period_ns) < MIN_STEADY_READINGS
@@ -300,32 +310,110 @@ class FanScorer:
         for number, detector in self._detectors_of[source]:
             np.copyto(ratios[number], detector.update(given), where=given.valid)
 
-    def _score(self, piece: Piece, stretch: slice) -> None:
-        """Score samples of one interval."""
-        if self._movement and piece.movement is not None:
-            self._movement.add(piece.movement[:, stretch])
-        samples, scores, ratios = piece.samples, piece.scores, piece.ratios[:, stretch]
-        alive, at_rest = samples.alive[stretch], piece.at_rest[stretch]
-        scored_now = np.zeros(alive.shape, np.bool_)
+    def _score(self, piece: Piece, begin: int, intervals: Intervals, highest: float | None) -> int:
+        """Score the samples of the present interval, and of later ones, as far as they can be scored together.
+
+        begin: the row of the first. highest: the score that ends it, if it is exceeded in an interval: None for any.
+        Returns the number of rows.
+
+        What baselines learn from an interval depends on its scores, and later scores on what they learn. So it is
+        guessed that they learn from each interval, and the samples are scored again with what the scores say, until
+        it stays: the first interval is right at once, and each time at least one more.
+        """
+        sampled, moved = self._sampled(piece, begin, intervals)
+        together = self._together(sampled, intervals)
+        if together < len(intervals):
+            intervals = intervals.first(together)
+            sampled, moved = self._sampled(piece, begin, intervals)
+        below_half_limit = np.ones((len(intervals), len(self._below_half_limit)), np.bool_)
+        before = self._detector_columns() if together > 1 else []
+        while True:
+            of, score = self._scored(piece, slice(begin, begin + intervals.rows), sampled, below_half_limit)
+            largest = intervals.largest(score)
+            guessed, below_half_limit = below_half_limit, largest <= HALF_LIMIT
+            below_half_limit[0] &= self._below_half_limit
+            if not np.array_equal(guessed[:-1], below_half_limit[:-1]):
+                self._restore_detectors(before)
+                continue
+            ends = len(intervals) if highest is None else first_end(largest.max(axis=1) > highest)
+            if ends == len(intervals):
+                break
+            self._restore_detectors(before)
+            intervals = intervals.first(ends)
+            sampled, moved = self._sampled(piece, begin, intervals)
+            below_half_limit = below_half_limit[:ends]
+        within_limit = largest <= 1.0
+        within_limit[0] &= self._within_limit
+        self._below_half_limit, self._within_limit = below_half_limit[-1], within_limit[-1]
         for source, residual in self.residuals.items():
-            of = residual.score(piece.residuals[source].rows(stretch))
-            given = piece.given(of.scored, stretch, self._unsteadiness(of), of.persistent)
+            residual.take(sampled[source], of[source])
+            piece.scored[source].append(of[source])
+        if self._movement and moved is not None:
+            self._movement.take(moved, self._commissioning)
+        return intervals.rows
+
+    @property
+    def _commissioning(self) -> Array:
+        """(fans,) whether the baseline of a residual is being commissioned."""
+        speed, balance = (self.residuals[source].baseline for source in RESIDUALS)
+        return speed.is_commissioning | balance.is_commissioning
+
+    def _together(self, sampled: Mapping[Signal, SampledResidual], intervals: Intervals) -> int:
+        """How many of the intervals can be scored together."""
+        if len(intervals) == 1:
+            return 1
+        return min(residual.runs_up_to(sampled[source]) for source, residual in self.residuals.items())
+
+    def _detector_columns(self) -> list[dict[str, Array]]:
+        """Copies of the state of the detectors of residuals."""
+        return [
+            {name: column.copy() for name, column in detector.columns().items()}
+            for source in RESIDUALS
+            for _, detector in self._detectors_of[source]
+        ]
+
+    def _restore_detectors(self, states: Sequence[Mapping[str, Array]]) -> None:
+        detectors = [detector for source in RESIDUALS for _, detector in self._detectors_of[source]]
+        for detector, state in zip(detectors, states, strict=True):
+            detector.restore(state)
+
+    def _sampled(
+        self, piece: Piece, begin: int, intervals: Intervals
+    ) -> tuple[dict[Signal, SampledResidual], Array | None]:
+        """The residuals at these samples, and the sums of the fans' movement."""
+        rows, moved, moving = slice(begin, begin + intervals.rows), None, None
+        if self._movement and piece.movement is not None:
+            moved = self._movement.over(piece.movement[:, rows], intervals)
+            moving = self._movement.moving(moved, self._commissioning)
+        return {
+            source: residual.over(piece.residuals[source].rows(rows), intervals, moving)
+            for source, residual in self.residuals.items()
+        }, moved
+
+    def _scored(
+        self, piece: Piece, rows: slice, sampled: Mapping[Signal, SampledResidual], below_half_limit: Array
+    ) -> tuple[dict[Signal, ScoredResidual], Array]:
+        """The residuals less their baselines, and (n, fans) the score; both also in the piece."""
+        samples, scores, ratios = piece.samples, piece.scores, piece.ratios[:, rows]
+        alive, at_rest = samples.alive[rows], piece.at_rest[rows]
+        scored_now = np.zeros(alive.shape, np.bool_)
+        found: dict[Signal, ScoredResidual] = {}
+        for source, residual in self.residuals.items():
+            found[source] = of = residual.score(sampled[source], below_half_limit)
+            given = piece.given(of.scored, rows, self._unsteadiness(of), of.persistent)
             self._detect(source, given, ratios)
-            piece.scored[source].append(of)
             if source in self._in_use:
                 scored_now |= of.scored
         score = np.fmax.reduce(ratios, axis=0, initial=0.0)
-        highest = score.max(axis=0)
-        self._below_half_limit &= highest <= HALF_LIMIT
-        self._within_limit &= highest <= 1.0
         has_score = scored_now | (alive & (score > 1.0))
-        scores.score[stretch] = np.where(has_score, score, np.nan)
-        scores.judged[stretch] = has_score | (alive & at_rest)
-        scores.ratios[stretch] = ratios.swapaxes(0, 1)
+        scores.score[rows] = np.where(has_score, score, np.nan)
+        scores.judged[rows] = has_score | (alive & at_rest)
+        scores.ratios[rows] = ratios.swapaxes(0, 1)
         if at_rest.any():
             for number, row in enumerate(self._rows):
                 if row.source == "tacho" and not row.comes_first:
-                    scores.ratios[stretch, number][at_rest] = np.nan
+                    scores.ratios[rows, number][at_rest] = np.nan
+        return found, score
 
     def _complete(self, piece: Piece) -> None:
         scored: dict[Signal, JoinedResidual] = {

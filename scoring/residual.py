@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from schemas.messages import Array
-from scoring.baseline.baseline import Baseline, BaselineState
+from scoring.baseline.baseline import Baseline, BaselineState, IntervalSums
 from scoring.baseline.healthy_residual import FanOffsets
-from scoring.baseline.shared_offset import LEAST_FANS, SharedOffset
+from scoring.baseline.intervals import Intervals
+from scoring.baseline.shared_offset import LEAST_FANS, SharedOffset, SharedOverIntervals
 from scoring.baseline.speed_scaling import speed_scaling
 from scoring.detectors.detector import DetectorContext, Signal
 from scoring.detectors.deviation import smoothed_deviation
@@ -70,7 +71,7 @@ class ResidualSamples:
 
 @dataclass(frozen=True, eq=False)
 class ScoredResidual:
-    """A residual less its baseline in one interval, (n, fans) each; and the state of the baseline, (fans,) each."""
+    """A residual less its baseline, (n, fans) each; and the baselines of the intervals of these samples."""
 
     scored: Array
     """valid, and with a baseline"""
@@ -83,7 +84,26 @@ class ScoredResidual:
     """at this speed, sigma, with what the fans share"""
     shared: Array
     """that part of it"""
+    intervals: Intervals
     state: BaselineState
+    sums: IntervalSums
+    """of what the baselines learn from these intervals"""
+
+
+@dataclass(frozen=True, eq=False)
+class SampledResidual:
+    """A residual at the samples of some intervals, with what does not depend on what baselines learn from each."""
+
+    of: ResidualSamples
+    intervals: Intervals
+    over: SharedOverIntervals | None
+    """None where nothing is shared"""
+    shared: Array
+    """(n, fans) sigma"""
+    residual: Array
+    """(n, fans) less the expected one and what is shared, sigma"""
+    learned: Array
+    """(n, fans) where baselines learn from it"""
 
 
 JOINED = ("scored", "persistent", "shift", "baseline", "shared")
@@ -175,51 +195,93 @@ class Residual:
             ),
         )
 
-    def score(self, of: ResidualSamples) -> ScoredResidual:
-        """Compare samples of one interval with the baseline, and add them to what it learns from the interval.
+    def over(self, of: ResidualSamples, intervals: Intervals, moving: Array | None) -> SampledResidual:
+        """Samples of the present interval and later ones. moving: (intervals, fans) see Movement; None: no fan."""
+        baseline, scaling = self.baseline, of.scaling
+        is_set, is_commissioning = baseline.is_set, baseline.is_commissioning
+        learned = of.valid & (of.seen | is_commissioning)
+        if self._shared is None:
+            return SampledResidual(of, intervals, None, np.zeros(of.valid.shape), of.residual, learned)
+        commissioned = is_set & ~is_commissioning
+        offset, known = of.residual - baseline.commissioned * scaling, of.valid & commissioned & of.seen
+        over = self._shared.over(offset, of.speed_sigmas, known, intervals, commissioned, moving)
+        shared = intervals.spread(over.values[:, np.newaxis]) * of.speed_sigmas
+        return SampledResidual(of, intervals, over, shared, of.residual - shared, learned)
 
-        Samples far from the baseline are clipped, so that one outlier does not move it.
+    def runs_up_to(self, sampled: SampledResidual) -> int:
+        """How many of the intervals may be scored before the first of them has ended by `end_interval`."""
+        if not self.baseline.only_refined(sampled.of.valid):
+            return 1
+        sums = self.baseline.sums(sampled.residual, sampled.learned, sampled.of.scaling, sampled.intervals)
+        ends = self.baseline.refined_up_to(sums, sampled.intervals.expected)
+        return min(ends, sampled.over.ends) if sampled.over else ends
+
+    def score(self, sampled: SampledResidual, below_half_limit: Array) -> ScoredResidual:
+        """Compare samples with the baselines, which learn from each interval but the last.
+
+        below_half_limit: (intervals, fans) see `end_interval`.
         """
-        baseline, state, shape = self.baseline, self.baseline.state, of.valid.shape
-        own, scored, is_commissioning = state.value * of.scaling, of.valid & state.is_set, state.is_commissioning
-        shared, residual = np.zeros(shape), of.residual
-        if self._shared:
-            shared = self._shared.at(of.speed_sigmas)
-            residual = residual - shared
-            commissioned = state.commissioned * of.scaling
-            commissioned_now = scored & ~is_commissioning & of.seen
-            self._shared.add(of.residual - commissioned, of.speed_sigmas, commissioned_now)
-        learned = np.where(of.valid, residual, own).clip(own - of.reach, own + of.reach)
-        baseline.add(learned, of.valid & (of.seen | is_commissioning), of.scaling)
+        of, residual = sampled.of, sampled.residual
+        state, sums, own = self._learned(sampled, below_half_limit)
+        scored = of.valid & sampled.intervals.spread(state.is_set)
         shift = np.where(scored, residual - own, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
         standardised = shift / of.std
-        persistent = standardised / self._persistent_std(of.low_frequency_std, of.scaling, state.learned_scale)
+        persistent_std = self._persistent_std(of.low_frequency_std, of.scaling, self.baseline.learned_scale)
         return ScoredResidual(
             scored=scored,
             standardised=standardised.clip(-of.clip, of.clip),
-            persistent=persistent.clip(-of.clip, of.clip),
+            persistent=(standardised / persistent_std).clip(-of.clip, of.clip),
             shift=shift,
-            baseline=own + shared if self._shared else own,  # a sum would make -0.0 of older recordings 0.0
-            shared=shared,
+            baseline=own + sampled.shared if self._shared else own,  # a sum would make -0.0 of older recordings 0.0
+            shared=sampled.shared,
+            intervals=sampled.intervals,
             state=state,
+            sums=sums,
         )
 
+    def _learned(self, sampled: SampledResidual, below_half_limit: Array) -> tuple[BaselineState, IntervalSums, Array]:
+        """The baselines in each interval, the sums that they learn from, and (n, fans) the baselines at each sample.
+
+        Samples far from the baseline are clipped, so that one outlier does not move it. Where any is, what is learned
+        depends on the baseline that it is clipped by: then it is found again, until it stays. The first interval is
+        right at once, and each time one more.
+        """
+        of, intervals, baseline = sampled.of, sampled.intervals, self.baseline
+
+        def clipped(state: BaselineState) -> tuple[Array, Array]:
+            own = intervals.spread(state.value) * of.scaling
+            return np.where(of.valid, sampled.residual, own).clip(own - of.reach, own + of.reach), own
+
+        if len(intervals) == 1:
+            known, own = clipped(state := baseline.state)
+            return state, baseline.sums(known, sampled.learned, of.scaling, intervals), own
+        known = sampled.residual
+        while True:
+            sums = baseline.sums(known, sampled.learned, of.scaling, intervals)
+            state = baseline.refined(sums, intervals.expected, below_half_limit)
+            before, (known, own) = known, clipped(state)
+            if np.array_equal(known[sampled.learned], before[sampled.learned]):
+                return state, sums, own
+
+    def take(self, sampled: SampledResidual, scored: ScoredResidual) -> None:
+        """Go on in the last of the intervals."""
+        self.baseline.take(scored.state, scored.sums)
+        if self._shared and sampled.over:
+            self._shared.take(sampled.over)
+
     def joined(self, parts: Sequence[ScoredResidual]) -> JoinedResidual:
-        """What was scored in successive intervals."""
-        counts = [len(part.scored) for part in parts]
-        state = BaselineState(*(np.array(of) for of in zip(*(part.state for part in parts), strict=True)))
-        commissioned = np.where(state.is_commissioning, np.nan, state.commissioned)
+        """What was scored in successive parts."""
+        state = BaselineState(*(np.concatenate(of) for of in zip(*(part.state for part in parts), strict=True)))
+        counts = np.concatenate([part.intervals.lengths for part in parts])
+        of_intervals = (
+            np.where(state.is_commissioning, np.nan, state.commissioned),
+            self._independent_intervals(state),
+            self.baseline.at_limit(state),
+            state.learned_scale,
+        )
         return JoinedResidual(
             *(np.concatenate([getattr(part, name) for part in parts]) for name in JOINED),
-            *(
-                np.repeat(of, counts, axis=0)
-                for of in (
-                    commissioned,
-                    self._independent_intervals(state),
-                    self.baseline.at_limit(state),
-                    state.learned_scale,
-                )
-            ),
+            *(np.repeat(of, counts, axis=0) for of in of_intervals),
         )
 
     def end_interval(

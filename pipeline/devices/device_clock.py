@@ -159,21 +159,25 @@ def line_below(points: Sequence[Point], at_ns: int, drift: float) -> tuple[float
     if x[-1] < DRIFT_SPAN_NS:
         height = min(yi - drift * xi for xi, yi in zip(x, y, strict=True))
         return drift, base_ns + height + drift * (at_ns - first_ns)
-    hull: list[int] = []
-    for k in range(len(x)):
-        while len(hull) > 1 and not _turns_up(x, y, hull[-2], hull[-1], k):
-            hull.pop()
-        hull.append(k)
+    hull = _lower_hull(x, y)
     mean = sum(x) / len(x)
-    right = next(k for k in range(1, len(hull)) if x[hull[k]] >= mean)
-    a, b = hull[right - 1], hull[right]
-    slope = _clamp((y[b] - y[a]) / (x[b] - x[a]), MAX_DRIFT)
-    return slope, base_ns + y[a] + slope * (at_ns - first_ns - x[a])
+    right = next(k for k in range(1, len(hull)) if hull[k][0] >= mean)
+    (xa, ya), (xb, yb) = hull[right - 1 : right + 1]
+    slope = _clamp((yb - ya) / (xb - xa), MAX_DRIFT)
+    return slope, base_ns + ya + slope * (at_ns - first_ns - xa)
 
 
-def _turns_up(x: list[float], y: list[float], a: int, b: int, c: int) -> bool:
-    """Whether the slope of b-c is larger than that of a-b."""
-    return (y[b] - y[a]) * (x[c] - x[b]) < (y[c] - y[b]) * (x[b] - x[a])
+def _lower_hull(x: list[float], y: list[float]) -> list[tuple[float, float]]:
+    """The corners of the line below all points that turns up at each of them; x rising (Andrew's monotone chain)."""
+    hull: list[tuple[float, float]] = []
+    for xc, yc in zip(x, y, strict=True):
+        while len(hull) > 1:
+            (xa, ya), (xb, yb) = hull[-2], hull[-1]
+            if (yb - ya) * (xc - xb) < (yc - yb) * (xb - xa):
+                break
+            hull.pop()
+        hull.append((xc, yc))
+    return hull
 
 
 def _clamp(value: float, limit: float) -> float:

@@ -163,7 +163,7 @@ class TrayScorer:
         """The scores, the states (n, fans) and the alarms' events. While an alarm is active, baselines stay."""
         speed = np.where(np.isfinite(item.predicted_speed_rad_s), item.predicted_speed_rad_s, item.measured_speed_rad_s)
         events: list[AlarmEvent] = []
-        scored, stretches = self.fan_scorer.stretches(samples)
+        scored, stretches = self.fan_scorer.stretches(samples, (lambda: self.alarms.is_quiet) if self._holds else None)
         state = np.empty(scored.score.shape, np.uint8)
         for rows in stretches:
             was_active = self.alarms.active

@@ -68,6 +68,11 @@ class AlarmManager:
         """(fans,) whether each fan's alarm is active."""
         return self._conditions.active
 
+    @property
+    def is_quiet(self) -> bool:
+        """Whether no fan has an alarm or is about to have one."""
+        return self._conditions.is_quiet
+
     def update(
         self,
         t_ns: Array,

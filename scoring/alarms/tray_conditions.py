@@ -147,6 +147,11 @@ class TrayConditions:
         """(fans,) whether each fan's alarm is active."""
         return self._active.copy()
 
+    @property
+    def is_quiet(self) -> bool:
+        """Whether the state of each fan is normal, and no alarm is active."""
+        return not (self._not_normal.any() or self._active.any())
+
     def alarm_state(self, fan: int) -> AlarmState:
         """The present state of a fan's alarm."""
         return self._conditions[fan].alarm_state

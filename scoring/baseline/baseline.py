@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from schemas.messages import Array
+from scoring.baseline.intervals import Intervals, first_end
 from scoring.baseline.settings import BaselineSettings
 from scoring.detectors.state import ColumnState
 
@@ -44,7 +45,7 @@ MIN_INFORMATION = 1e-12
 
 
 class BaselineState(NamedTuple):
-    """Baselines in one interval, (fans,) each, or in several, (intervals, fans): see Baseline."""
+    """Baselines in successive intervals, (intervals, fans) each; see Baseline."""
 
     value: Array
     commissioned: Array
@@ -61,6 +62,15 @@ class BaselineState(NamedTuple):
     def is_commissioning(self) -> Array:
         """Whether commissioning goes on."""
         return self.intervals < COMMISSIONING_INTERVALS
+
+
+class IntervalSums(NamedTuple):
+    """Of the samples of some intervals."""
+
+    products: Array
+    """(3, intervals, fans) of the residual times the scaling, and of the squares of both; in fixed point"""
+    counts: Array
+    """(intervals, fans) of valid samples"""
 
 
 class Baseline(ColumnState):
@@ -105,15 +115,14 @@ class Baseline(ColumnState):
 
     @property
     def state(self) -> BaselineState:
-        """Of the present interval; it stays as it is."""
-        return BaselineState(
-            self.value, self.commissioned, self.intervals.copy(), self.total_information.copy(), self.learned_scale
-        )
+        """(1, fans) of the present interval."""
+        columns = (self.value, self.commissioned, self.intervals, self.total_information, self.learned_scale)
+        return BaselineState(*(column[np.newaxis].copy() for column in columns))
 
     @property
     def is_at_limit(self) -> Array:
         """(fans,) whether the baseline is held at the adaptation limit."""
-        return self.at_limit(self.state)
+        return self.at_limit(self.state)[0]
 
     def at_limit(self, state: BaselineState) -> Array:
         """The same of a state."""
@@ -140,12 +149,66 @@ class Baseline(ColumnState):
         self.interval_means[:, fans] = np.nan
         self._find_learned_scale()
 
-    def add(self, residual: Array, valid: Array, scaling: Array | float = 1.0) -> None:
-        """Take samples of the present interval, (n, fans) each; residual in sigma, scaling finite."""
+    def sums(self, residual: Array, valid: Array, scaling: Array, intervals: Intervals) -> IntervalSums:
+        """Of samples (n, fans) of the present interval and later ones; residual in sigma, scaling finite."""
         known = np.where(valid, residual, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
         products = np.array((known * scaling, np.where(valid, scaling * scaling, 0.0), known * known))
-        self._sums += np.rint(products * FIXED_POINT_ONE).astype(np.int64).sum(axis=1)
-        self._counts += valid.sum(axis=0)
+        of_each = intervals.sums(np.rint(products.swapaxes(0, 1) * FIXED_POINT_ONE).astype(np.int64)).swapaxes(0, 1)
+        counts = intervals.sums(valid.astype(np.int64))
+        of_each[:, 0] += self._sums
+        counts[0] += self._counts
+        return IntervalSums(of_each, counts)
+
+    def only_refined(self, valid: Array) -> bool:
+        """Whether intervals with these valid samples (n, fans) of bool only refine baselines that are commissioned."""
+        return bool(((self.intervals >= COMMISSIONING_INTERVALS) | ~valid.any(axis=0)).all())
+
+    def refined_up_to(self, sums: IntervalSums, expected: int) -> int:
+        """How many intervals come before the end of the first one to which a baseline adapts faster, itself counted."""
+        _, information, _ = sums.products / np.maximum(sums.counts, 1) / FIXED_POINT_ONE
+        faster = self._seen(sums.counts, expected) & (
+            information > FASTER_INFORMATION * self.interval_information.min(axis=0)
+        )
+        return first_end(faster.any(axis=1))
+
+    def refined(self, sums: IntervalSums, expected: int, below_half_limit: Array) -> BaselineState:
+        """(intervals, fans) the baselines in each interval, if each but the last ends as `end_interval` ends it.
+
+        Only where `only_refined`, and for `refined_up_to` intervals. below_half_limit: (intervals, fans).
+        """
+        product, information, _ = sums.products / np.maximum(sums.counts, 1) / FIXED_POINT_ONE
+        mean = product / np.maximum(information + self._settings.ridge, MIN_INFORMATION)
+        good = self._seen(sums.counts, expected) & below_half_limit
+        counted = np.minimum(information, 1.0)
+        learned = np.where(good, counted, 0.0)
+        total = np.add.accumulate(np.concatenate((self.total_information[np.newaxis], learned)), axis=0)
+        gain = counted / np.maximum(np.minimum(total[1:], self._adaptation_intervals), MIN_INFORMATION)
+        limit = self._settings.adaptation_limit_sigmas
+        low, high = self.commissioned - limit, self.commissioned + limit
+        values, value = np.empty(mean.shape), self.value
+        for k in range(len(values)):
+            values[k] = value
+            value = np.where(good[k], value + gain[k] * (mean[k] - value), value).clip(low, high)
+        before = np.concatenate((np.zeros((1, len(value)), np.int64), good[:-1].cumsum(axis=0)))
+        same = (len(values), len(value))
+        return BaselineState(
+            values,
+            np.broadcast_to(self.commissioned, same),
+            self.intervals + before,
+            total[:-1],
+            np.broadcast_to(self.learned_scale, same),
+        )
+
+    def take(self, state: BaselineState, sums: IntervalSums) -> None:
+        """Go on in the last of some intervals; state: of each, sums: with those before them in the first."""
+        self.value = state.value[-1].copy()
+        self.intervals[:], self.total_information[:] = state.intervals[-1], state.total_information[-1]
+        self._sums[:], self._counts[:] = sums.products[:, -1], sums.counts[-1]
+
+    @staticmethod
+    def _seen(counts: Array, expected: int) -> Array:
+        """Whether there are enough samples in an interval."""
+        return counts >= max(MIN_VALID_SHARE * expected, 1)
 
     def end_interval(
         self,
@@ -165,7 +228,7 @@ class Baseline(ColumnState):
         counts, is_set, commissioning = np.maximum(self._counts, 1), self.is_set, self.is_commissioning
         product, information, square = self._sums / counts / FIXED_POINT_ONE
         mean = product / np.maximum(information + self._settings.ridge, MIN_INFORMATION)
-        seen = self._counts >= max(MIN_VALID_SHARE * samples, 1)
+        seen = self._seen(self._counts, samples)
         good = seen & np.where(commissioning, within_limit, below_half_limit)
         if not is_set.all():
             explained = product * product / np.maximum(information, MIN_INFORMATION)

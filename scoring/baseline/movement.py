@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.messages import Array
+from scoring.baseline.intervals import Intervals
 from scoring.detectors.state import ColumnState
 
 MOVING_SHARE = 0.05  # of the speed
@@ -32,18 +33,35 @@ class Movement(ColumnState):
         speed_rad_s = np.where(np.isnan(speed_rad_s), 0.0, np.abs(speed_rad_s))
         return _fixed(np.array((motion_rad_s, speed_rad_s)))
 
-    def add(self, samples: Array) -> None:
-        """Add samples, see `samples`, to the interval."""
-        motions, speeds = samples.sum(axis=1)
-        self._motions += motions
-        self._speeds += speeds
+    def over(self, samples: Array, intervals: Intervals) -> Array:
+        """(2, intervals, fans) sums of samples, see `samples`, of the present interval and later ones."""
+        sums = intervals.sums(samples.swapaxes(0, 1)).swapaxes(0, 1)
+        sums[0, 0] += self._motions
+        sums[1, 0] += self._speeds
+        return sums
+
+    def moving(self, sums: Array, commissioning: Array) -> Array:
+        """(intervals, fans) what `end_interval` returns at the end of each. sums: see `over`."""
+        moved = self._moved(*sums)
+        before = np.concatenate((np.zeros((1, moved.shape[1]), np.int64), moved[:-1].cumsum(axis=0)))
+        return moved & (self._moving_intervals + np.where(commissioning, before, 0) < MAX_MOVING_INTERVALS)
+
+    def take(self, sums: Array, commissioning: Array) -> None:
+        """Go on in the last of some intervals; commissioning: (fans,), see `end_interval`."""
+        counted = self.moving(sums, commissioning)[:-1].sum(axis=0)
+        self._moving_intervals += np.where(commissioning, counted, 0)
+        self._motions[:], self._speeds[:] = sums[:, -1]
+
+    @staticmethod
+    def _moved(motions: Array, speeds: Array) -> Array:
+        return np.abs(motions) > MOVING_SHARE * speeds
 
     def end_interval(self, commissioning: Array) -> Array:
         """End the interval. Returns (fans,) whether fans are not to be commissioned from it, because they moved.
 
         commissioning: (fans,) whether fans are being commissioned.
         """
-        moving = np.abs(self._motions) > MOVING_SHARE * self._speeds
+        moving = self._moved(self._motions, self._speeds)
         moving &= self._moving_intervals < MAX_MOVING_INTERVALS
         self._moving_intervals += moving & commissioning
         self._motions[:] = self._speeds[:] = 0

@@ -12,9 +12,12 @@ again.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from schemas.messages import Array
+from scoring.baseline.intervals import Intervals, first_end
 from scoring.detectors.state import ColumnState
 
 SMOOTHING_S = 8.0  # longer than a tacho counts, shorter than supply and air take to change by much
@@ -22,6 +25,21 @@ LEAST_FANS = 2
 MIN_VALID_SHARE = 0.5  # of an interval's samples
 LARGEST_SIGMAS = 1e3  # larger offsets are clipped to this
 FIXED_POINT_ONE = 1 << 6  # integer sums do not depend on how samples are cut
+
+
+class SharedOverIntervals(NamedTuple):
+    """What fans share in successive intervals."""
+
+    values: Array
+    """(intervals,) the offset for each rad/s, in each"""
+    compared: Array
+    """(intervals,) the one when fans were last compared"""
+    products: Array
+    squares: Array
+    counts: Array
+    """(intervals, fans) the sums of each; in the first with those before"""
+    ends: int
+    """so many of the intervals these hold for"""
 
 
 class SharedOffset(ColumnState):
@@ -66,17 +84,68 @@ class SharedOffset(ColumnState):
         """The number of independent intervals of a fan whose mean would vary as much."""
         return (2.0 / self._gain - 1.0) * len(self._counts)
 
-    def at(self, speed_sigmas: Array) -> Array:
-        """(n, fans) the offset, sigma. speed_sigmas: (n, fans) the speed over sigma, with its sign."""
-        return self._value * speed_sigmas
+    def over(
+        self,
+        offset: Array,
+        speed_sigmas: Array,
+        valid: Array,
+        intervals: Intervals,
+        commissioned: Array,
+        moving: Array | None,
+    ) -> SharedOverIntervals:
+        """What is shared in the present interval and later ones, if each but the last ends as `end_interval` ends it.
 
-    def add(self, offset: Array, speed_sigmas: Array, valid: Array) -> None:
-        """Take samples of the present interval, (n, fans) each; offset: from the commissioned baseline, sigma."""
+        offset: (n, fans) from the commissioned baseline, sigma. speed_sigmas: (n, fans) the speed over sigma, with its
+        sign. commissioned: (fans,). moving: (intervals, fans); None: no fan. See `end_interval`.
+        """
         known = np.where(valid, offset, 0.0).clip(-LARGEST_SIGMAS, LARGEST_SIGMAS)
         speed = np.where(valid, speed_sigmas, 0.0)
-        self._products += np.rint(known * speed * FIXED_POINT_ONE).astype(np.int64).sum(axis=0)
-        self._squares += np.rint(speed * speed * FIXED_POINT_ONE).astype(np.int64).sum(axis=0)
-        self._counts += valid.sum(axis=0)
+        sums = np.array((known * speed, speed * speed)).swapaxes(0, 1)
+        products, squares = intervals.sums(np.rint(sums * FIXED_POINT_ONE).astype(np.int64)).swapaxes(0, 1)
+        counts = intervals.sums(valid.astype(np.int64))
+        products[0] += self._products
+        squares[0] += self._squares
+        counts[0] += self._counts
+        values, compared, ends = self._values(products, squares, counts, intervals.expected, commissioned, moving)
+        return SharedOverIntervals(values, compared, products, squares, counts, ends)
+
+    def _values(
+        self,
+        products: Array,
+        squares: Array,
+        counts: Array,
+        expected: int,
+        commissioned: Array,
+        moving: Array | None,
+    ) -> tuple[Array, Array, int]:
+        """(intervals,) the value in each, and the one when fans were last compared; and up to which these hold: until
+        the end of the first interval in which a fan turned alone, itself counted."""
+        if len(counts) == 1:
+            return self._value.copy(), self._compared.copy(), 1
+        known = (counts >= MIN_VALID_SHARE * expected) & (squares > 0)
+        if moving is not None:
+            known &= ~moving
+        number = known.sum(axis=1)
+        is_compared = number >= LEAST_FANS
+        alone = (number > 0) & ~is_compared & (commissioned.sum() >= LEAST_FANS)
+        ridge = self._ridge * FIXED_POINT_ONE * counts
+        divisor = np.where(known, squares + ridge, 1.0)
+        offsets = np.sort(np.where(known, products / divisor, np.inf), axis=1)
+        each, middle = np.arange(len(counts)), np.maximum(number - 1, 0) // 2
+        low, high = offsets[each, middle].tolist(), offsets[each, np.maximum(number - 1, 0) - middle].tolist()
+        value, last_compared = float(self._value[0]), float(self._compared[0])
+        values, compared = np.empty((2, len(counts)))
+        for k, compares in enumerate(is_compared.tolist()):
+            values[k], compared[k] = value, last_compared
+            if compares:
+                value += self._gain * (min(max(value, low[k]), high[k]) - value)
+                value = last_compared = min(max(value, -self._limit), self._limit)
+        return values, compared, first_end(alone)
+
+    def take(self, of: SharedOverIntervals) -> None:
+        """Go on in the last of some intervals."""
+        self._value[:], self._compared[:] = of.values[-1], of.compared[-1]
+        self._products[:], self._squares[:], self._counts[:] = of.products[-1], of.squares[-1], of.counts[-1]
 
     def end_interval(self, samples: int, commissioned: Array, learns: Array, moving: Array | None) -> Array:
         """End the present interval of so many samples.
