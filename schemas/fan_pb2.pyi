@@ -449,18 +449,20 @@ class ModelCard(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin: _Optional[str] = ..., kind: _Optional[str] = ..., sha256: _Optional[str] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., card_json: _Optional[str] = ..., content: _Optional[bytes] = ...) -> None: ...
 
 class NewTwin(_message.Message):
-    __slots__ = ("header", "t_ns", "twin", "sha256", "content")
+    __slots__ = ("header", "t_ns", "twin", "sha256", "content", "first_sample_t_ns")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     T_NS_FIELD_NUMBER: _ClassVar[int]
     TWIN_FIELD_NUMBER: _ClassVar[int]
     SHA256_FIELD_NUMBER: _ClassVar[int]
     CONTENT_FIELD_NUMBER: _ClassVar[int]
+    FIRST_SAMPLE_T_NS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     t_ns: int
     twin: str
     sha256: str
     content: bytes
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin: _Optional[str] = ..., sha256: _Optional[str] = ..., content: _Optional[bytes] = ...) -> None: ...
+    first_sample_t_ns: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., t_ns: _Optional[int] = ..., twin: _Optional[str] = ..., sha256: _Optional[str] = ..., content: _Optional[bytes] = ..., first_sample_t_ns: _Optional[int] = ...) -> None: ...
 
 class Clock(_message.Message):
     __slots__ = ("header", "t_ns", "rate")

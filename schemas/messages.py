@@ -339,13 +339,18 @@ class ModelCard:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class NewTwin:
-    """A learned twin that is to take over. content: its ONNX file."""
+    """A learned twin that is to take over.
+
+    content: its ONNX file. first_sample_t_ns: it takes over at the first sample that is not older; 0: with the next
+    block, as a twin that has just been learned.
+    """
 
     header: Header = Header()
     t_ns: int
     twin: str
     sha256: str
     content: bytes
+    first_sample_t_ns: int = 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -101,6 +101,11 @@ def tray_key(site: str, tray: str, topic: str) -> str:
     return f"{ROOT}/{site}/{tray}/{topic}"
 
 
+def tray_of(key: str) -> str:
+    """The tray in the key of a tray's topic."""
+    return key.split("/")[2]
+
+
 def health_key(site: str, stage: str, instance: str) -> str:
     """Key of a stage's health; `*` may stand for any part."""
     return f"{ROOT}/{site}/{HEALTH_CHUNK}/{stage}/{instance}"

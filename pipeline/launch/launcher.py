@@ -135,9 +135,10 @@ class Launcher:
     def _refuse_unusable_twins(self) -> None:
         """Refuse a twin that is missing or of other fans, by its card, before any stage has made a file.
 
-        A tray that names none learns one. The stages check the rest.
+        A tray that names none learns one. Where these stages read no device, a replay may publish its twin, or a
+        learner that runs elsewhere. The stages check the rest.
         """
-        learns = LEARNER in self._config.stages
+        learns = LEARNER in self._config.stages or not self._has_devices
         if any(STAGES[name].needs_twin for name in self._config.stages):
             for tray in (tray for tray in self._config.trays if tray.twin or not learns):
                 load_tray_twin(twin_path(tray, self._config.folder), tray.fans)
@@ -148,7 +149,6 @@ class Launcher:
         The process at the endpoint, if there is one, may belong to this site, to another, or be no stage at all.
         """
         ours = {alive_key(self._config.site, slot.row.stage, slot.row.instance): slot.row.label for slot in self._slots}
-        has_devices = any(not _listens_only(slot.row) for slot in self._slots)
         bus.wait_for_others(stop)
         until_s = time.monotonic() + _SEARCH_S
         while True:
@@ -158,13 +158,17 @@ class Launcher:
                     f"site {self._config.site!r} already runs at {self._config.bus.endpoint} ({', '.join(running)}): "
                     "stop that, or give this one another site or bus.endpoint"
                 )
-            if has_devices and alive_key(self._config.site, REPLAY, "all") in alive:
+            if self._has_devices and alive_key(self._config.site, REPLAY, "all") in alive:
                 raise UserError(
                     f"a replay presents site {self._config.site!r} at {self._config.bus.endpoint}: stop it, leave "
                     "acquisition out of launcher.stages, or give this one another site or bus.endpoint"
                 )
             if not bus.came_second or time.monotonic() >= until_s or stop.wait(_POLL_S):
                 return
+
+    @property
+    def _has_devices(self) -> bool:
+        return any(not _listens_only(slot.row) for slot in self._slots)
 
     def _parts(self) -> dict[int, Path]:
         """The parts of the recording that are there, by number and in order, under their names when finished."""

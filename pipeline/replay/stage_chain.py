@@ -8,6 +8,7 @@ from functools import cache
 
 from pipeline.config.registry import STAGES
 from pipeline.runtime.stage import Stage, load_stage
+from schemas.topics import BY_NAME
 
 SOURCE, RESULT = "raw", "score"
 
@@ -53,14 +54,22 @@ def derive_chain(stages: Iterable[Stage], source: str = SOURCE, result: str = RE
 
 
 def derive_starts(stages: Iterable[Stage]) -> dict[str, tuple[str, ...]]:
-    """Where a replay can start: the main input of each stage of the chain, and all topics that its writer publishes.
+    """Where a replay can start: the main input of each stage of the chain, all topics that its writer publishes, and
+    those that a stage after it needs first.
 
     The stages after a start need these topics; they make the later ones themselves.
     """
     stages = tuple(stages)
     writers = {topic: stage for stage in stages for topic in stage.writes}
-    topics = (stage.reads[0] for stage in derive_chain(stages).stages)
-    return {topic: writers[topic].writes for topic in topics}
+    chain = derive_chain(stages).stages
+    starts = {}
+    for number, stage in enumerate(chain):
+        after = chain[number:]
+        made = {topic for each in after for topic in each.writes}
+        needed_first = (topic for each in after for topic in each.reads if BY_NAME[topic].is_needed_first)
+        others = (topic for topic in needed_first if topic not in made)
+        starts[stage.reads[0]] = tuple(dict.fromkeys((*writers[stage.reads[0]].writes, *others)))
+    return starts
 
 
 @cache

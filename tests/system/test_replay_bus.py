@@ -24,6 +24,7 @@ from pipeline.recordings.writing import RecordingWriter
 from schemas.codec import decode
 from schemas.messages import Clock, Grid, Header, Health, Message, ModelCard, StageStatus
 from schemas.topics import health_key, tray_key
+from tests.support.killed_site import Site as RecordedSite
 from tests.support.replay_data import START_NS, STEP_NS, write_raw
 from tests.support.running_chain import (
     DEADLINE_S,
@@ -37,6 +38,7 @@ from tests.support.running_chain import (
     view_of,
 )
 from tests.support.score_data import made_up_tray
+from tests.support.twin_files import small_hybrid, write_twin
 
 pytestmark = pytest.mark.real_time
 WORKING = ["resampler", "twin_integrator", "scorer", "recorder"]
@@ -175,6 +177,47 @@ def test_at_full_speed_the_stages_take_every_message_and_decide_every_sample(tmp
     for topic in ("grid", "prediction", "score"):
         times = [t for m in found[topic] for t in m.t_ns.tolist() if t <= last_ns]  # type: ignore[union-attr]
         assert times == list(range(START_NS, last_ns + 1, STEP_NS)), topic
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", ["raw", "grid"])
+def test_stages_without_a_twin_of_their_own_change_to_the_learned_twins_at_the_recorded_samples(
+    tmp_path, endpoint, start
+):
+    recorded_site = RecordedSite(tmp_path, 7, block_size=4, learns=True)
+    recorded_site.run(300)
+    for number in (1, 2):
+        twin = write_twin(tmp_path / f"{number}.onnx", small_hybrid(number), fans=3, name=f"tray1-{number}")
+        recorded_site.put_in_force(f"tray1-{number}", twin.read_bytes())
+        recorded_site.run(200)
+    source = recorded_site.finished().rename(tmp_path / "source.mcap")
+    stages = WORKING[["raw", "grid"].index(start) :]
+    settings = [f"launcher.stages={json.dumps(stages)}", f"site='{SITE}'"]
+    chain = Chain(tmp_path / "run", endpoint, *settings, viewer=False, configuration=tmp_path / "site.toml")
+    try:
+        up = chain.start_up()
+        with chain.watcher() as watcher:
+            eventually(lambda: {v.health.stage for v in watcher.stages() if v.alive} == set(stages), "all are there")
+        done = fantwin("replay", source, "--rate", "max", "--from", start, "--json", *chain.words("")[1:])
+        status, account = up.end(), up.output()
+    finally:
+        chain.close()
+    assert (done.returncode, status) == (0, 0), (done.stdout, done.stderr, account)
+    assert json.loads(done.stdout)["messages"]["new_twin"] == 2
+    then, now = (messages_by_topic(path) for path in (source, tmp_path / "run" / "recording.mcap"))
+    changes = [[(card.twin, card.t_ns) for card in found["twin"]] for found in (then, now)]
+    assert changes[0] == changes[1]
+    assert [twin for twin, _ in changes[0]] == ["tray1-1", "tray1-2"]
+    for topic, column in (("prediction", "predicted_speed_rad_s"), ("score", "t_ns"), ("score", "score")):
+        before, after = (np.concatenate([getattr(each, column) for each in found[topic]]) for found in (then, now))
+        np.testing.assert_array_equal(before, after[: len(before)], f"{topic} {column}")  # then comes the silence
+
+
+def messages_by_topic(path: Path) -> dict[str, list[Any]]:
+    found: dict[str, list[Any]] = {}
+    for entry in read_recording(path):
+        found.setdefault(entry.topic, []).append(entry.message)
+    return found
 
 
 @pytest.mark.slow

@@ -68,7 +68,7 @@ def replay(
         typer.Option(
             "--from",
             metavar="TOPIC",
-            help="Publish only the input of the stages that read TOPIC (raw, grid or prediction).",
+            help="Publish only the input of the stages that read TOPIC (raw, grid or prediction), and learned twins.",
             rich_help_panel=_VIEWING,
         ),
     ] = None,
@@ -127,12 +127,11 @@ def replay(
             json_output=json_output,
         )
         return
-    chosen = _chosen_topics(topics, from_topic)
     pace = Pace(_rate(rate or "1"), paused=pause)
     keys = Keys()
     if pause and not keys.is_available:
         raise typer.BadParameter("needs a terminal, to continue with a key", param_hint="--pause")
-    playback = RecordingPlayback(files, chosen, start, end)
+    playback = RecordingPlayback(files, _chosen_topics(topics, from_topic), start, end)
     replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
     stop = threading.Event()
     stop_on_signals(stop)
@@ -140,7 +139,6 @@ def replay(
     with keys, _status_line(console, playback.end_s(), playback.seconds_at) as show:
         outcome = publish(
             playback,
-            chosen,
             pace,
             replay_config,
             stop,

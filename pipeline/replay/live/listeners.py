@@ -17,7 +17,7 @@ from pipeline.runtime.clock import REPLAY
 from pipeline.runtime.stage import Stage, load_stage
 from schemas.messages import Health
 from schemas.streams import StreamId, input_streams, output_streams
-from schemas.topics import alive_key
+from schemas.topics import BY_NAME, alive_key
 
 _POLL_S = 0.02
 _ANY_STAGE_S = 2.0  # to find any stage: one whose first peer has died tries its endpoint every second
@@ -67,10 +67,17 @@ def conflict(present: Collection[Present], topics: Collection[str], trays: Colle
     return ""
 
 
+def made_by_stages(present: Collection[Present], topics: Collection[str]) -> dict[str, str]:
+    """The topics that are not recorded, which the replay leaves to a running stage that writes them: by topic, its
+    label."""
+    of_replay = [topic for topic in topics if not BY_NAME[topic].recorded]
+    return {topic: each.label for topic in of_replay for each in present if topic in each.stage.writes}
+
+
 def _another_start(present: Collection[Present]) -> str:
     """The topic to start from so that running stages have input, and none of them writes what is replayed; or empty."""
     for start, topics in replay_starts().items():
-        written = any(topic in each.stage.writes for each in present for topic in topics)
+        written = any(topic in each.stage.writes for each in present for topic in topics if BY_NAME[topic].recorded)
         if not written and any(start in each.stage.reads for each in present if each.stage.writes):
             return start
     return ""

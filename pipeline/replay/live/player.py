@@ -11,8 +11,8 @@ from typing import Protocol
 from pipeline.replay.live.keyboard import Key
 from pipeline.replay.live.pace import Pace, faster, slower
 from schemas.envelope import Envelope
-from schemas.messages import Raw, StageStatus
-from schemas.topics import TOPICS
+from schemas.messages import NewTwin, Raw, StageStatus
+from schemas.topics import BY_NAME, TOPICS
 
 BEAT_S = 0.05
 HEALTH_PERIOD_S = 1.0
@@ -171,6 +171,8 @@ class Player:
 
     def _count_step(self, entry: Envelope) -> None:
         """Count a step down when it ends: with a message of the earliest topic, which is the next sample."""
+        if BY_NAME[entry.topic].is_needed_first:  # it only comes with that
+            return
         self._leading = min(self._leading, _RANK[entry.topic])
         if self._steps and _RANK[entry.topic] == self._leading:
             self._steps -= 1
@@ -179,8 +181,10 @@ class Player:
 
 
 def _latest_clock_ns(entry: Envelope) -> int:
-    """The time of a message's oldest raw sample, or of its receipt: the clock must not pass it before."""
+    """The time of a message's oldest raw sample, or of its receipt: the clock must not pass it before it is sent."""
     message = entry.message
     if isinstance(message, Raw) and len(message.host_receive_t_ns):
         return int(message.host_receive_t_ns[0])
+    if isinstance(message, NewTwin):
+        return message.t_ns  # it comes just before a message whose oldest sample this is
     return entry.received_t_ns

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -11,13 +11,14 @@ from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.errors import UserError
 from pipeline.replay.live.keyboard import Key
-from pipeline.replay.live.listeners import Listeners, conflict
+from pipeline.replay.live.listeners import Listeners, conflict, made_by_stages
 from pipeline.replay.live.pace import Pace
 from pipeline.replay.live.player import Player, Progress, RealTime, Stopped
 from pipeline.replay.live.recording_playback import RecordingPlayback
 from pipeline.replay.live.sender import Sender
 from pipeline.replay.resolve_config import trays_of
 from schemas.messages import StageStatus
+from schemas.topics import BY_NAME
 from schemas.units import NS_PER_S
 
 
@@ -51,7 +52,6 @@ class Outcome:
 
 def publish(
     playback: RecordingPlayback,
-    topics: Collection[str],
     pace: Pace,
     config: Config,
     stop: threading.Event,
@@ -70,6 +70,8 @@ def publish(
     for tray in sorted(recorded):
         config.tray(tray)
     trays = recorded or {tray.name for tray in config.trays}
+    topics = playback.topics
+    recorded_topics = [topic for topic in topics if BY_NAME[topic].recorded]
     outcome = Outcome(config.site)
     with Bus(config.bus, stop) as bus:
         listeners = Listeners(bus, config.site)
@@ -85,21 +87,26 @@ def publish(
         listeners.wait_for_discovery(stop)
         if listeners.is_replaying():
             raise UserError(f"a replay is running on site {config.site!r} at {config.bus.endpoint}: stop that first")
+        for topic, label in made_by_stages(listeners.present(), topics).items():
+            report(
+                f"{label} of site {config.site!r} is running and writes {topic} itself: recorded versions are left out"
+            )
+            topics = tuple(each for each in topics if each != topic)
         refuse_conflicts()
-        outcome.listeners = listeners.readers(topics)
+        outcome.listeners = listeners.readers(recorded_topics)
         if not outcome.listeners:
             where = f"site {config.site!r} at {config.bus.endpoint}"
-            report(f"no stage on {where} reads {', '.join(topics)}; publishing anyway")
+            report(f"no stage on {where} reads {', '.join(recorded_topics)}; publishing anyway")
         sender = Sender(bus, config.site, trays)
         player = Player(sender, pace, RealTime(stop), keys=keys, look=look)
         outcome.stopped = True
         try:
             with suppress(Stopped):
-                player.play(playback.rounds() if loop else ((0, entry) for entry in playback))
+                rounds = playback.rounds() if loop else ((0, entry) for entry in playback)
+                player.play((number, entry) for number, entry in rounds if entry.topic in topics)
                 if not sender.sent:
-                    raise UserError(
-                        f"{playback.files[0]}: it holds no {' or '.join(topics)}, or none between --start and --end"
-                    )
+                    none = f"it holds no {' or '.join(recorded_topics)}, or none between --start and --end"
+                    raise UserError(f"{playback.files[0]}: {none}")
                 outcome.behind = listeners.wait_until_drained(
                     sender.producer, sender.published(), stop, player.heartbeat_after_end
                 )

@@ -10,19 +10,18 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pipeline.recordings.order import Seen, in_order
 from pipeline.recordings.reading import RecordingError, read_recording
 from pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
+from pipeline.replay.live.recorded_versions import NEW_TWIN, TWIN, ComingVersions, read_versions
+from pipeline.replay.live.sample_times import sample_times
 from schemas.envelope import Envelope
-from schemas.messages import Array, Grid, Message, Prediction, Raw, Score
 from schemas.units import NS_PER_S
 
 LOOP_GAP_NS = 10_000_000  # between two rounds of a recording without a grid, whose period would say more
 OUT_OF_ORDER_NS = 10 * NS_PER_S
 """how much later than its followers a message may be recorded, because it was recovered from its producer"""
-LATCHED_TOPIC = "twin"
+LATCHED_TOPIC = TWIN
 """the topic whose last message before the stretch still holds at its start"""
 
 
@@ -34,6 +33,9 @@ class RecordingPlayback:
     ) -> None:
         """Read the first message of each file; `start_s` and `end_s` count from the first message of all.
 
+        With topic `new_twin`, which is not recorded, the learned versions of the twins are played too, if there are
+        any.
+
         Raises:
             RecordingError: a file is not a recording, or no file holds a message.
         """
@@ -41,11 +43,13 @@ class RecordingPlayback:
         if not firsts:
             raise RecordingError(f"{files[0]}: there is no message in it")
         self.files = list(firsts)
-        self._topics = topics
         first = self.first = firsts[self.files[0]]
         # with start_s = 0 everything is played, also messages that were recorded out of order
         self._start_ns = first.received_t_ns + round(start_s * NS_PER_S) if start_s else 0
         self._end_ns = first.received_t_ns + round(end_s * NS_PER_S) if math.isfinite(end_s) else None
+        self._versions = read_versions(self.files) if NEW_TWIN in topics else {}
+        self.topics = tuple(topic for topic in topics if topic != NEW_TWIN or self._versions)
+        """those that are played"""
         self.damage: tuple[str, ...] = ()
         """what could not be read of the files that were played, a line a file"""
 
@@ -62,11 +66,27 @@ class RecordingPlayback:
 
     def __iter__(self) -> Iterator[Envelope]:
         """One round."""
+        return self._round(is_first=True)
+
+    def rounds(self) -> Iterator[tuple[int, Envelope]]:
+        """Endless rounds, each message with its round's number; times are shifted so that they never go back."""
+        number, by_ns = 0, 0
+        while True:
+            extent = TimeExtent()
+            for entry in self._round(is_first=not number):
+                extent.add(entry)
+                yield number, shifted(entry, by_ns)
+            number, by_ns = number + 1, by_ns + extent.length_ns()
+            if not by_ns:
+                return
+
+    def _round(self, *, is_first: bool) -> Iterator[Envelope]:
+        versions = ComingVersions(self._versions, self._end_ns, is_first_round=is_first)
         seen: dict[tuple[str, str], Seen] = {}
         latched: dict[str, Envelope] = {}
         damage: list[str] = []
         for file in self.files:
-            reading = read_recording(file, self._topics)
+            reading = read_recording(file, self.topics)
             try:
                 for entry in reading:
                     header = entry.message.header
@@ -79,24 +99,13 @@ class RecordingPlayback:
                     if entry.received_t_ns >= self._start_ns:
                         yield from latched.values()
                         latched.clear()
+                        yield from versions.before(entry)
                         yield entry
                     elif entry.topic == LATCHED_TOPIC:
                         latched[entry.key] = entry.received_at(self._start_ns)
             finally:  # also when the stretch or the playback ends before the file
                 damage += filter(None, [reading.damage])
                 self.damage = tuple(damage)
-
-    def rounds(self) -> Iterator[tuple[int, Envelope]]:
-        """Endless rounds, each message with its round's number; times are shifted so that they never go back."""
-        number, by_ns = 0, 0
-        while True:
-            extent = TimeExtent()
-            for entry in self:
-                extent.add(entry)
-                yield number, shifted(entry, by_ns)
-            number, by_ns = number + 1, by_ns + extent.length_ns()
-            if not by_ns:
-                return
 
 
 class TimeExtent:
@@ -127,13 +136,6 @@ class TimeExtent:
     def _widen(self, span: str, t_ns: int) -> None:
         first, last = self._spans.get(span, (t_ns, t_ns))
         self._spans[span] = (min(first, t_ns), max(last, t_ns))
-
-
-def sample_times(message: Message) -> Array:
-    """(samples,) ns since the epoch; empty for a message without samples."""
-    if isinstance(message, Raw):
-        return message.host_receive_t_ns
-    return message.t_ns if isinstance(message, Grid | Prediction | Score) else np.zeros(0, np.int64)
 
 
 def shifted(entry: Envelope, by_ns: int) -> Envelope:

@@ -16,7 +16,7 @@ from pipeline.runtime.health import HealthBuilder
 from schemas.codec import encode, type_name
 from schemas.envelope import Envelope
 from schemas.messages import Clock, Header, Message, Output, StageStatus
-from schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from schemas.topics import BY_NAME, alive_key, health_key, tray_key, tray_of
 
 
 class Sender:
@@ -77,8 +77,3 @@ class Sender:
 
     def _put(self, publisher: Publisher, message: Message, tray: str) -> None:
         publisher.put(encode(replace(message, header=Header(self.producer, publisher.published, tray))))
-
-
-def tray_of(key: str) -> str:
-    """The tray in a key."""
-    return key.split("/")[2]

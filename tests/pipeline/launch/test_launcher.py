@@ -84,6 +84,19 @@ def test_a_site_that_only_records_needs_no_twin(no_bus):
         Launcher(load_config(DEMO / "demo.toml", settings), (), no_bus).run(threading.Event())
 
 
+@pytest.mark.parametrize("stages", [["acquisition", "scorer"], ["scorer"]])
+def test_without_a_learner_a_tray_needs_a_twin_where_its_device_is_read_and_not_beside_a_replay(
+    tmp_path, no_bus, stages
+):
+    file = tmp_path / "fantwin.toml"
+    file.write_text(f'[launcher]\nstages = {stages}\n[[tray]]\nname = "a"\nfans = 2\nport = "/dev/none"\n')
+    expected = pytest.raises(ConnectionError)
+    if "acquisition" in stages:
+        expected = pytest.raises(UserError, match="tray a has no twin")
+    with expected:
+        Launcher(load_config(file), (), no_bus).run(threading.Event())
+
+
 def test_the_process_list_has_one_acquisition_for_each_tray_in_the_order_of_the_data_flow(tmp_path):
     file = tmp_path / "two.toml"
     trays = "".join(f'[[tray]]\nname = "{name}"\nfans = 2\n' for name in ("a", "b"))

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
-from pipeline.replay.live.listeners import Listeners, Present, conflict
+from pipeline.replay.live.listeners import Listeners, Present, conflict, made_by_stages
 from pipeline.runtime.stage import load_stage
 from schemas.codec import encode, type_name
 from schemas.messages import Header, Health, Input, Output, StageStatus
@@ -51,6 +51,16 @@ def test_topics_that_a_running_stage_writes_and_past_requests_to_it_are_not_repl
     assert "\n" not in line
     for words in expected:
         assert words in line
+
+
+def test_recorded_versions_of_a_twin_are_left_to_a_learner_that_is_running_and_refused_if_it_comes_later():
+    topics, others = ("raw", "new_twin"), ("resampler", "twin_integrator", "scorer")
+    assert made_by_stages(there(*others), topics) == {}
+    assert conflict(there(*others), topics, {"a"}, "plant") == ""
+    assert made_by_stages(there(*others, "learner"), topics) == {"new_twin": "learner"}
+    line = conflict(there(*others, "learner"), topics, {"a"}, "plant")
+    assert line == ("learner of site 'plant' is running and writes new_twin itself: replay with --from raw, or stop it")
+    assert "--from raw" in conflict(there(*others, "learner"), ALL, {"a"}, "plant"), "a learner is no obstacle to that"
 
 
 class FakeStage:

@@ -13,7 +13,7 @@ from pipeline.replay.live.keyboard import Key
 from pipeline.replay.live.pace import Pace
 from pipeline.replay.live.player import BEAT_S, Player, Progress, Stopped
 from schemas.envelope import Envelope
-from schemas.messages import Alarm, Severity, StageStatus
+from schemas.messages import Alarm, NewTwin, Severity, StageStatus
 from tests.support.replay_data import START_NS, STEP_NS, raw_of
 
 
@@ -189,6 +189,14 @@ def test_a_step_is_one_message_of_the_first_topic_and_all_recorded_before_it():
     assert by_second == [["raw"], ["raw"], ["raw"], ["alarm", "raw"]]
     reported = [t_ns for at_s, t_ns, _ in sent.clocks if 4.1 < at_s < 4.9]
     assert set(reported) == {3 * STEP_NS}
+
+
+def test_a_twin_that_is_published_before_a_sample_is_no_step_of_its_own():
+    twin = NewTwin(t_ns=START_NS, twin="t", sha256="", content=b"")
+    first = (0, Envelope.of("fantwin/demo/tray1/new_twin", twin, START_NS))
+    sent, _ = play([first, *raws(5)], paused=True, keys=[(1, Key.STEP), (2, Key.STEP), (3, Key.PAUSE)])
+    by_second = [[topic for at_s, topic, _ in sent.messages if round(at_s) == second] for second in (1, 2)]
+    assert by_second == [["new_twin", "raw"], ["raw"]]
 
 
 def test_after_a_step_the_replay_continues_from_there():

@@ -42,8 +42,9 @@ def test_a_stage_beside_the_chain_changes_nothing(smoother):
     assert derive_chain([*REGISTERED, smoother]) == decision_chain()
 
 
-def test_a_replay_starts_with_all_topics_of_the_stage_that_it_replaces():
-    assert replay_starts() == {"raw": ("raw",), "grid": ("grid",), "prediction": ("prediction", "twin")}
+def test_a_replay_starts_with_all_topics_of_the_stage_that_it_replaces_and_the_twins_of_those_that_follow():
+    expected = {"raw": ("raw", "new_twin"), "grid": ("grid", "new_twin"), "prediction": ("prediction", "twin")}
+    assert replay_starts() == expected
 
 
 def test_stages_that_do_not_lead_from_raw_samples_to_scores_are_refused():

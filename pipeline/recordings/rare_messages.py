@@ -1,0 +1,43 @@
+"""The messages of a topic that a recording has few of, without reading the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from pipeline.recordings.reading import Reading, read_recording
+from pipeline.recordings.records import CORRUPT_DATA_ERRORS, chunk_at, indexed_reader
+from schemas.codec import CodecError
+from schemas.envelope import Envelope
+
+
+def rare_messages(path: Path, topic: str) -> list[Envelope]:
+    """The messages of a topic in the order they were recorded; those that cannot be decoded are left out.
+
+    They are found by the file's index. If it has none, as after a crash, or something is damaged, the whole file is
+    read.
+
+    Raises:
+        RecordingError: the file cannot be read or is not a recording.
+    """
+    try:
+        return list(_by_index(path, topic))
+    except (OSError, CodecError, *CORRUPT_DATA_ERRORS):
+        return list(read_recording(path, (topic,)))
+
+
+def _by_index(path: Path, topic: str) -> Iterator[Envelope]:
+    reading = Reading(path, (topic,), None)
+    channels: dict[int, tuple[str, str]] = {}
+    with path.open("rb") as file:
+        summary = indexed_reader(file).get_summary()
+        if summary is None or not summary.chunk_indexes:
+            raise ValueError("no index")
+        for channel in summary.channels.values():
+            reading.add_channel(channel, channels)
+        for chunk in summary.chunk_indexes:
+            if not channels.keys().isdisjoint(chunk.message_index_offsets):
+                data = chunk_at(file, chunk.chunk_start_offset, chunk.chunk_length)
+                for envelope in reading.envelopes_in(data, channels):
+                    _ = envelope.message
+                    yield envelope

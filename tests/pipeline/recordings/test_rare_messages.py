@@ -1,0 +1,80 @@
+"""Messages of a topic that a recording has few of: they are found by the index, and without it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+
+from pipeline.recordings.index import SHORT_ENDING
+from pipeline.recordings.rare_messages import rare_messages
+from pipeline.recordings.reading import RecordingError
+from pipeline.recordings.records import RecordReader
+from pipeline.recordings.writing import RecordingWriter
+from schemas.messages import Header, ModelCard
+from schemas.topics import tray_key
+from tests.support.replay_data import START_NS, STEP_NS, raw_of
+
+AT = (0, 1500, 2999)
+"""raw messages before which there is a card"""
+
+
+@pytest.fixture
+def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Of many chunks."""
+    monkeypatch.setattr("pipeline.recordings.writing.CHUNK_BYTES", 4096)
+    with RecordingWriter(tmp_path / "r.mcap", {"trays": "tray1"}) as writer:
+        for sample in range(3000):
+            if sample in AT:
+                card = ModelCard(header=Header("t", sample, "tray1"), t_ns=1, twin="a", kind="hybrid", sha256="")
+                writer.add_message(tray_key("demo", "tray1", "twin"), card, START_NS + sample * STEP_NS)
+            writer.add_message(tray_key("demo", "tray1", "raw"), raw_of(sample, 1), START_NS + sample * STEP_NS)
+    return tmp_path / "r.mcap"
+
+
+def found(path: Path) -> list[tuple[str, int, int]]:
+    return [(e.key, e.message.header.sequence, e.received_t_ns) for e in rare_messages(path, "twin")]
+
+
+CARDS = [(tray_key("demo", "tray1", "twin"), sample, START_NS + sample * STEP_NS) for sample in AT]
+
+
+def test_they_are_found_by_the_index_without_reading_the_rest(recording, monkeypatch):
+    def read(*_: object) -> None:
+        raise AssertionError("the whole file is read")
+
+    monkeypatch.setattr("pipeline.recordings.rare_messages.read_recording", read)
+    assert found(recording) == CARDS
+    assert rare_messages(recording, "grid") == []
+
+
+def test_in_a_truncated_file_they_are_found_as_far_as_it_can_be_read(recording):
+    content = recording.read_bytes()
+    recording.write_bytes(content[: len(content) // 4 * 3])
+    assert found(recording) == CARDS[:2]
+
+
+def test_in_a_file_without_an_index_they_are_found(recording):
+    (end,) = (record.offset for record in RecordReader(recording) if record.opcode == Opcode.DATA_END)
+    recording.write_bytes(recording.read_bytes()[:end] + SHORT_ENDING)
+    assert found(recording) == CARDS
+
+
+def test_beside_a_damaged_chunk_they_are_found(recording):
+    with recording.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary
+    t_ns = CARDS[1][2]
+    (damaged,) = (c for c in summary.chunk_indexes if c.message_start_time <= t_ns <= c.message_end_time)
+    content = bytearray(recording.read_bytes())
+    content[damaged.chunk_start_offset + 100] ^= 0xFF
+    recording.write_bytes(content)
+    assert found(recording) == [CARDS[0], CARDS[2]]
+
+
+def test_a_file_that_is_no_recording_is_refused(tmp_path):
+    (tmp_path / "text").write_text("no recording")
+    with pytest.raises(RecordingError, match="not a recording"):
+        rare_messages(tmp_path / "text", "twin")
