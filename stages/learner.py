@@ -21,11 +21,10 @@ from pydantic import Field
 from pipeline.errors import UserError
 from pipeline.learning.fan_alarms import FanAlarms
 from pipeline.learning.healthy_history import HealthyHistory, recorded_raws
-from pipeline.learning.learning_process import Learning, LearningProcess
+from pipeline.learning.learning_process import Learning, LearningProcess, missing_extra
 from pipeline.learning.learning_schedule import LearningSchedule, Work
 from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.learning.versions import TwinVersions, Version, VersionList, learning_folder, overlap
-from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.recordings.dates import format_utc
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
@@ -112,8 +111,7 @@ class LearnerCore(Core):
         self._take_outcome()
         self._read_list()
         cards = self._published(now_ns)
-        may_start = self._learning.is_free and self._is_list_read and not self._alarm_fans
-        if may_start and (due := self._schedule.due(self._listed)):
+        if self._may_start and (due := self._schedule.due(self._listed)):
             self._start(due)
         return cards
 
@@ -146,6 +144,7 @@ class LearnerCore(Core):
         """Why nothing is learned, or that a version waits for the operator."""
         offered = self._listed.waiting
         problems = [
+            self._learning.obstacle,
             *self._problems.values(),
             *(f"learning: {why}" for why in self._schedule.failures),
             self._history.problem,
@@ -153,6 +152,11 @@ class LearnerCore(Core):
             f"{offered.name} is offered: {offered.why} (fantwin twins)" if offered else "",
         ]
         return "; ".join(dict.fromkeys(filter(None, problems)))
+
+    @property
+    def _may_start(self) -> bool:
+        can_learn = self._learning.is_free and not self._learning.obstacle
+        return can_learn and self._is_list_read and not self._alarm_fans
 
     @property
     def _last(self) -> Version | None:
@@ -328,8 +332,8 @@ def build(context: Context) -> BuiltStage:
 
 def check(context: Context) -> list[str]:
     """What would keep it from learning."""
-    if context.tray.twin is None and not is_installed("torch"):
-        return [f"no twin can be learned without the extra `train`; {how_to_install('train')}"]
+    if context.tray.twin is None and (missing := missing_extra()):
+        return [missing]
     with suppress(UserError):
         TwinVersions(learning_folder(context.run_folder, context.tray.name), context.tray.name).all()
         return []
