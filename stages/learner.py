@@ -126,11 +126,12 @@ class LearnerCore(Core):
         self._learning.stop()
 
     def notes(self) -> Sequence[str]:
-        """The version in force and what it finds, or what the first one waits for; and what learning waits for."""
+        """The version in force, what it finds and when the next one is due, or what the first one waits for; and what
+        learning waits for."""
         if self._in_force is None:
             found = [self._waits_for()]
         else:
-            found = [f"{self._in_force.name} is in force; {_finds(self._in_force)}"]
+            found = [f"{self._in_force.name} is in force; {_finds(self._in_force)}{self._next_version()}"]
         current = self._listed.current
         if self._in_force and current and current != self._in_force:
             found.append(f"{current.name} waits: it takes over when no fan has an alarm, by the scores of all fans")
@@ -277,6 +278,19 @@ class LearnerCore(Core):
         lacks = f"; not moved enough yet: {'; '.join(missing)}; `fantwin sweep` moves the fans" if missing else ""
         needed = f"{self._config.first_minutes:g} needed"
         return f"no twin yet, nothing is judged; {minutes:.0f} min recorded ({needed}){lacks}"
+
+    def _next_version(self) -> str:
+        """When it is due, as the end of a sentence; empty where something else decides."""
+        wait_s = self._schedule.version_wait_s(self._listed)
+        if wait_s is None or self._learning.seconds is not None:
+            return ""
+        return (
+            f"; next version after {_duration(wait_s)} more of healthy running" if wait_s else "; next version is due"
+        )
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds / 60.0:.0f} min" if seconds < 2 * 3600.0 else f"{seconds / 3600.0:.1f} h"
 
 
 def _finds(version: Version) -> str:

@@ -66,25 +66,32 @@ class LearningSchedule:
 
     def due(self, listed: VersionList) -> Work | None:
         """What is due: a version, or a check of the fans against the reference."""
-        if self._is_version_due(listed) and self._may_try("version"):
+        if self.version_wait_s(listed) == 0.0:
             return "version"
-        return "check" if self._is_check_due(listed) and self._may_try("check") else None
+        return "check" if self._is_check_due(listed) and not self._retry_wait_s("check") else None
 
-    def _may_try(self, work: Work) -> bool:
-        """Whether there is enough healthy running since an attempt that failed."""
+    def version_wait_s(self, listed: VersionList) -> float | None:
+        """Healthy running until the next version is due; None if it waits for something else: for fans to be moved, or
+        for what becomes of one that is offered."""
+        needed_s = self._needed_s(listed)
+        return None if needed_s is None else max(needed_s, self._retry_wait_s("version"), 0.0)
+
+    def _retry_wait_s(self, work: Work) -> float:
+        """Healthy running before the next attempt at what failed; 0: it may be made now."""
         failure = self._failures.get(work)
-        return failure is None or self._history.seconds_since(failure.end_t_ns) >= failure.needed_s
+        return max(failure.needed_s - self._history.seconds_since(failure.end_t_ns), 0.0) if failure else 0.0
 
-    def _is_version_due(self, listed: VersionList) -> bool:
+    def _needed_s(self, listed: VersionList) -> float | None:
+        """As `version_wait_s`, but not above 0 where a version is due, and without failures."""
         since = self._history.seconds_since
         if not listed.versions:
-            return self._history.seconds >= self._first_s and not self._operation.missing()
+            return None if self._operation.missing() else self._first_s - self._history.seconds
         last = listed.versions[-1]
         if listed.is_tainted:
-            return self._history.seconds >= self._first_s
+            return self._first_s - self._history.seconds
         if listed.commissioned_t_ns > last.made_t_ns:
-            return since(listed.commissioned_t_ns) >= AFTER_COMMISSIONING_S
-        return not listed.waiting and since(last.made_t_ns) >= min(last.learned_s, LONGEST_WAIT_S)
+            return AFTER_COMMISSIONING_S - since(listed.commissioned_t_ns)
+        return None if listed.waiting else min(last.learned_s, LONGEST_WAIT_S) - since(last.made_t_ns)
 
     def _is_check_due(self, listed: VersionList) -> bool:
         if not listed.versions:

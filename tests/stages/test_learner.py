@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -29,7 +30,7 @@ def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path
     (note,) = learner.core.notes()
     assert note == (
         "tray1-1 is in force; at 1,000 rpm it finds a drop of 40 rpm within a minute; declared: 1 false alarm per "
-        "fan and day"
+        "fan and day; next version after 10 min more of healthy running"
     )
 
 
@@ -63,6 +64,41 @@ def test_later_versions_come_when_the_history_has_doubled(tmp_path: Path) -> Non
     assert len(made) >= 4
     assert all(1.6 < after / before < 2.6 for before, after in pairwise(made)), made
     assert learner.put_in_force == [f"tray1-{number + 1}" for number in range(len(made))]
+
+
+def announced_s(learner: Learner) -> float:
+    """After how much more healthy running the notes announce the next version."""
+    (words,) = re.findall(r"; next version after (\S+ \S+) more of healthy running$", learner.core.notes()[0])
+    number, unit = words.split()
+    return float(number) * {"min": 60.0, "h": 3600.0}[unit]
+
+
+@pytest.mark.parametrize("fails_with", ["", "a failure"])
+def test_the_notes_say_after_how_much_more_healthy_running_the_next_version_is_due(
+    tmp_path: Path, fails_with: str
+) -> None:
+    learner = Learner(tmp_path)
+    learner.run(7200)
+    if fails_with:
+        learner.learning.fails_with = fails_with
+        while not learner.core.problem():
+            learner.run(10)
+    started, wait_s = len(learner.learning.starts), announced_s(learner)
+    assert wait_s > 600.0
+    learner.run(round(wait_s) - 100)
+    assert len(learner.learning.starts) == started
+    assert announced_s(learner) < 200.0
+    learner.run(200)
+    assert len(learner.learning.starts) == started + 1
+
+
+def test_while_a_version_is_offered_no_other_one_is_announced(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    learner.learning.outcome = "offered"
+    learner.run(1500)
+    assert learner.versions.read().waiting
+    assert "next version" not in "; ".join(learner.core.notes())
 
 
 def test_what_failed_is_said_and_tried_again_with_more_history(tmp_path: Path) -> None:
