@@ -87,7 +87,7 @@ class HealthyHistory:
         self._key = tray_key(site, tray, "raw")
         self._metadata, self._attachments = metadata, attachments
         self._hold_back_ns = round(hold_back_s * NS_PER_S)
-        self._kept_ns = round(kept_s * NS_PER_S)
+        self.kept_s = kept_s
         self._waiting: deque[Raw] = deque()
         self._writer: RecordingWriter | None = None
         self._span: TimeSpan = (0, 0)
@@ -272,7 +272,7 @@ class HealthyHistory:
         self.exclude(self._excluded)
 
     def _delete_oldest(self) -> None:
-        left_ns = self._kept_ns
+        left_ns = round(self.kept_s * NS_PER_S)
         for each in reversed(self._finished[1:]):
             left_ns -= each.span[1] - each.span[0]
             if left_ns < 0:

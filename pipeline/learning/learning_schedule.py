@@ -91,7 +91,8 @@ class LearningSchedule:
             return self._first_s - self._history.seconds
         if listed.commissioned_t_ns > last.made_t_ns:
             return AFTER_COMMISSIONING_S - since(listed.commissioned_t_ns)
-        return None if listed.waiting else min(last.learned_s, LONGEST_WAIT_S) - since(last.made_t_ns)
+        at_most_s = min(LONGEST_WAIT_S, self._history.kept_s)  # no more than that is kept since a version
+        return None if listed.waiting else min(last.learned_s, at_most_s) - since(last.made_t_ns)
 
     def _is_check_due(self, listed: VersionList) -> bool:
         if not listed.versions:

@@ -14,6 +14,7 @@ import pytest
 from pipeline.learning.learning_process import LearningProcess
 from schemas.messages import Action, FanState, Message, Request
 from schemas.units import NS_PER_S
+from tests.pipeline.learning.test_versions import version
 from tests.support.one_learner import START_NS, Learner, raw
 
 
@@ -229,6 +230,23 @@ def test_learning_is_tried_again_when_the_history_grows_no_more(
     learner.learning.fails_with = ""
     learner.run(2000)
     assert learner.core.problem() == ""
+
+
+def test_a_version_is_due_at_the_latest_when_as_much_was_added_as_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.learning.healthy_history.LONGEST_RECORDING_NS", 200 * NS_PER_S)
+    learner = Learner(tmp_path, kept_s=1000.0)
+    learner.run(600)
+    made_t_ns = START_NS + learner.now_s * NS_PER_S
+    long_ago = tuple((day * 10_000 * NS_PER_S, (day * 10_000 + 5000) * NS_PER_S) for day in range(3))
+    learner.versions.file("tray1-2").write_bytes(b"tray1-2")
+    learner.versions.add(version("tray1-2", 2, learned_spans=long_ago, made_t_ns=made_t_ns))
+    before = len(learner.learning.starts)
+    learner.run(900)
+    assert len(learner.learning.starts) == before
+    learner.run(400)
+    assert len(learner.learning.starts) == before + 1
 
 
 def test_after_a_failure_learning_waits_for_a_quarter_of_the_history(tmp_path: Path) -> None:
