@@ -15,7 +15,7 @@ import typer
 
 from pipeline.bus.session import Bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of
+from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of, require_within_limits
 from pipeline.cli.watch.excitation import Excitation, Observed, StoppedError
 from pipeline.config.loading import load_config
 from pipeline.config.models import TrayConfig
@@ -106,7 +106,7 @@ def range_within(tray: TrayConfig, low: float | None, high: float | None, safe: 
         limits = f"{tray.command_min:g} to {tray.command_max:g}"
         raise UserError(f"--low {lowest:g} --high {highest:g}: name a range within {limits} of tray {tray.name}")
     if safe is not None:
-        command_of(tray, {0: safe})
+        require_within_limits(tray, safe, "--safe")
     return lowest, highest
 
 
@@ -155,7 +155,7 @@ class _BusLine:
     def send(self, values: Mapping[int, float]) -> None:
         """Send commands, by fan."""
         self._sender.stop = self.stop
-        self._sender.send(command_of(self._tray, dict(values)))
+        self._sender.send(command_of(self._tray, dict(values), named="fan"))
         self._sender.confirm()
         self._take()
         self._samples = self._samples[-1:]  # the speed from which the step begins

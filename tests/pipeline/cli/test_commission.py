@@ -87,7 +87,7 @@ def test_a_command_that_flickers_between_two_ranges_does_not_change_and_gaps_do_
         ("", OTHER, ("--tray", "c"), "fantwin.toml: no tray called 'c'; known: tray1, b"),
         ('twin = "old.onnx"', OTHER, ("--tray", "tray1"), "tray tray1 has twin old.onnx already: remove `twin`"),
         ("", OTHER, ("--sweep", "--low", "0.2"), "--low 0.2 --high 0.1: name a range within 0 to 0.1 of tray b"),
-        ("", OTHER, ("--sweep", "--safe", "0.5"), "the command must be within 0 to 0.1 of tray b"),
+        ("", OTHER, ("--sweep", "--safe", "0.5"), "--safe 0.5: the command must be within 0 to 0.1 of tray b"),
         ("", f"{OTHER}\n{THIRD}", (), "kept.onnx: exists already: name another with --tray kept -o"),
         ("", "", ("-o", "kept.onnx"), "kept.onnx: exists already: name another with -o"),
         ("", "", ("-o", "twin.bin"), "name a file that ends in .onnx with -o"),
