@@ -16,7 +16,7 @@ from pipeline.cli.twins.next_version import make_next_version
 from pipeline.cli.twins.versions_text import NO_REFERENCE, check_line, offer_lines, version_lines
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.learning.versions import TwinVersions, learning_folder
 
 
@@ -82,7 +82,8 @@ def learning_tray(settings: Config, name: str | None) -> TrayConfig:
     learning = [tray for tray in settings.trays if tray.twin is None]
     chosen = [settings.tray(name)] if name else learning
     if len(chosen) > 1:
-        raise UserError(f"several trays learn their twins: choose one with --tray: {', '.join(t.name for t in chosen)}")
+        names = ", ".join(each.name for each in chosen)
+        raise UsageError(f"several trays learn their twins: choose one with --tray: {names}")
     if not chosen or chosen[0] not in learning:
         which = f"tray {chosen[0].name} names" if chosen else "every tray names"
         raise UserError(f"{settings.path}: {which} a twin: remove `twin` from [[tray]] to learn one")
