@@ -10,7 +10,7 @@ import typer
 
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.twins.learn import learning_tray
-from pipeline.cli.twins.versions_text import list_lines
+from pipeline.cli.twins.versions_text import list_as_json, list_lines
 from pipeline.config.loading import load_config
 from pipeline.errors import UsageError
 from pipeline.learning.versions import TimeSpan, TwinVersions, learning_folder
@@ -71,7 +71,7 @@ def twins(
             said.append(f"{use} was learned from a time span that is marked as faulty: another version will replace it")
     listed = versions.read()
     if json_output:
-        typer.echo(json.dumps({"tray": of.name, **listed.model_dump(), "notes": said}))
+        typer.echo(json.dumps({"tray": of.name, **list_as_json(listed), "notes": said}))
         return
     for line in [*said, *list_lines(listed)]:
         typer.echo(line)
