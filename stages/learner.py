@@ -110,6 +110,7 @@ class LearnerCore(Core):
             self._history.flush()
         self._take_outcome()
         self._read_list()
+        self._schedule.forget_what_is_over(self._listed)
         cards = self._published(now_ns)
         if self._may_start and (due := self._schedule.due(self._listed)):
             self._start(due)
@@ -250,7 +251,7 @@ class LearnerCore(Core):
 
     def _start(self, work: Work) -> None:
         self._history.finish()
-        self._schedule.started = work
+        self._schedule.started(work, self._listed)
         if problem := self._learning.start(only_if_changed=work == "check"):
             self._schedule.failed(problem)
 

@@ -35,6 +35,8 @@ class _Failure:
     """of the history then"""
     needed_s: float
     """healthy running after that before the next attempt"""
+    listed: VersionList
+    """when it was begun"""
 
 
 class LearningSchedule:
@@ -46,8 +48,9 @@ class LearningSchedule:
         self._history = history
         self._operation = operation
         self._first_s = 60.0 * first_minutes
-        self.started: Work = "version"
-        """what was started last"""
+        self._started: Work = "version"
+        self._listed = VersionList()
+        """when that was started"""
         self._failures: dict[Work, _Failure] = {}
 
     @property
@@ -55,14 +58,26 @@ class LearningSchedule:
         """Why the last version and the last check failed, if they did."""
         return [failure.why for failure in self._failures.values()]
 
+    def started(self, work: Work, listed: VersionList) -> None:
+        """A version or a check is being made. listed: the versions before it."""
+        self._started, self._listed = work, listed
+
     def failed(self, why: str) -> None:
         """What was started last has failed."""
         needed_s = max(min(AGAIN_AFTER * self._history.seconds, AGAIN_AFTER_AT_MOST_S), SHORTEST_RECORDING_S)
-        self._failures[self.started] = _Failure(why, self._history.end_t_ns, needed_s)
+        self._failures[self._started] = _Failure(why, self._history.end_t_ns, needed_s, self._listed)
 
     def succeeded(self) -> None:
         """What was started last has been done."""
-        self._failures.pop(self.started, None)
+        self._failures.pop(self._started, None)
+
+    def forget_what_is_over(self, listed: VersionList) -> None:
+        """Forget failures that a later version has ended, or a later check, whoever has made it. A check is part of
+        each version."""
+        for work, failure in list(self._failures.items()):
+            has_version = len(listed.versions) > len(failure.listed.versions)
+            if has_version or (work == "check" and listed.check != failure.listed.check):
+                del self._failures[work]
 
     def due(self, listed: VersionList) -> Work | None:
         """What is due: a version, or a check of the fans against the reference."""

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline.learning.learning_process import LearningProcess
+from pipeline.learning.versions import Check
 from schemas.messages import Action, FanState, Message, Request
 from schemas.units import NS_PER_S
 from tests.pipeline.learning.test_versions import version
@@ -229,6 +230,41 @@ def test_learning_is_tried_again_when_the_history_grows_no_more(
     assert learner.core.problem() == "learning: a failure"
     learner.learning.fails_with = ""
     learner.run(2000)
+    assert learner.core.problem() == ""
+
+
+def test_a_failure_is_over_when_anybody_has_made_a_version(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(2000)
+    learner.learning.fails_with = "a failure"
+    while not learner.core.problem():
+        learner.run(10)
+    learner.add_version("tray1-9")  # as `fantwin learn` does
+    learner.run(10)
+    assert learner.core.problem() == ""
+
+
+def test_a_failure_is_over_although_the_version_was_made_before_the_failure_was_known(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(2000)
+    learner.learning.fails_with = "another `fantwin learn` works here: wait for its end"
+    before = len(learner.learning.starts)
+    while len(learner.learning.starts) == before:
+        learner.run(10)
+    learner.add_version("tray1-9")
+    learner.run(20)
+    assert learner.core.problem() == ""
+
+
+def test_a_check_that_failed_is_over_when_anybody_has_made_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.learning.learning_schedule.CHECK_AFTER_S", 1000.0)
+    learner = Learner(tmp_path)
+    learner.learning.checks_fail_with = "a check failed"
+    while not learner.core.problem():
+        learner.run(10)
+    until_t_ns = START_NS + learner.now_s * NS_PER_S
+    learner.versions.add_check(Check(t_ns=until_t_ns, reference="", change=(), found="", spans=()))
+    learner.run(10)
     assert learner.core.problem() == ""
 
 
