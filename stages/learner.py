@@ -49,7 +49,11 @@ class LearnerConfig(StageConfig):
     hold_back_minutes: float = Field(
         default=10.0, ge=0, description="samples are learned from if no alarm was raised for this long after them"
     )
-    kept_hours: float = Field(default=168.0, ge=48.0, description="healthy running to keep for learning")
+    kept_hours: float = Field(
+        default=168.0,
+        ge=48.0,
+        description="healthy running to keep for learning, and as many hours of what is excluded",
+    )
 
 
 class LearnerCore(Core):
