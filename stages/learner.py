@@ -21,11 +21,10 @@ from pydantic import Field
 from pipeline.errors import UserError
 from pipeline.learning.fan_alarms import FanAlarms
 from pipeline.learning.healthy_history import HealthyHistory, recorded_raws
-from pipeline.learning.learning_process import Learning, LearningProcess
+from pipeline.learning.learning_process import Learning, LearningProcess, missing_extra
 from pipeline.learning.learning_schedule import LearningSchedule, Work
 from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.learning.versions import TwinVersions, Version, VersionList, learning_folder, overlap
-from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.recordings.dates import format_utc
 from pipeline.recordings.metadata import recording_metadata
 from pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
@@ -50,7 +49,11 @@ class LearnerConfig(StageConfig):
     hold_back_minutes: float = Field(
         default=10.0, ge=0, description="samples are learned from if no alarm was raised for this long after them"
     )
-    kept_hours: float = Field(default=168.0, ge=48.0, description="healthy running to keep for learning")
+    kept_hours: float = Field(
+        default=168.0,
+        ge=48.0,
+        description="healthy running to keep for learning, and as many hours of what is excluded",
+    )
 
 
 class LearnerCore(Core):
@@ -111,9 +114,9 @@ class LearnerCore(Core):
             self._history.flush()
         self._take_outcome()
         self._read_list()
+        self._schedule.forget_what_is_over(self._listed)
         cards = self._published(now_ns)
-        may_start = self._learning.is_free and self._is_list_read and not self._alarm_fans
-        if may_start and (due := self._schedule.due(self._listed)):
+        if self._may_start and (due := self._schedule.due(self._listed)):
             self._start(due)
         return cards
 
@@ -128,11 +131,12 @@ class LearnerCore(Core):
         self._learning.stop()
 
     def notes(self) -> Sequence[str]:
-        """The version in force and what it finds, or what the first one waits for; and what learning waits for."""
+        """The version in force, what it finds and when the next one is due, or what the first one waits for; and what
+        learning waits for."""
         if self._in_force is None:
             found = [self._waits_for()]
         else:
-            found = [f"{self._in_force.name} is in force; {_finds(self._in_force)}"]
+            found = [f"{self._in_force.name} is in force; {_finds(self._in_force)}{self._next_version()}"]
         current = self._listed.current
         if self._in_force and current and current != self._in_force:
             found.append(f"{current.name} waits: it takes over when no fan has an alarm, by the scores of all fans")
@@ -146,6 +150,7 @@ class LearnerCore(Core):
         """Why nothing is learned, or that a version waits for the operator."""
         offered = self._listed.waiting
         problems = [
+            self._learning.obstacle,
             *self._problems.values(),
             *(f"learning: {why}" for why in self._schedule.failures),
             self._history.problem,
@@ -153,6 +158,11 @@ class LearnerCore(Core):
             f"{offered.name} is offered: {offered.why} (fantwin twins)" if offered else "",
         ]
         return "; ".join(dict.fromkeys(filter(None, problems)))
+
+    @property
+    def _may_start(self) -> bool:
+        can_learn = self._learning.is_free and not self._learning.obstacle
+        return can_learn and self._is_list_read and not self._alarm_fans
 
     @property
     def _last(self) -> Version | None:
@@ -245,7 +255,7 @@ class LearnerCore(Core):
 
     def _start(self, work: Work) -> None:
         self._history.finish()
-        self._schedule.started = work
+        self._schedule.started(work, self._listed)
         if problem := self._learning.start(only_if_changed=work == "check"):
             self._schedule.failed(problem)
 
@@ -273,6 +283,19 @@ class LearnerCore(Core):
         lacks = f"; not moved enough yet: {'; '.join(missing)}; `fantwin sweep` moves the fans" if missing else ""
         needed = f"{self._config.first_minutes:g} needed"
         return f"no twin yet, nothing is judged; {minutes:.0f} min recorded ({needed}){lacks}"
+
+    def _next_version(self) -> str:
+        """When it is due, as the end of a sentence; empty where something else decides."""
+        wait_s = self._schedule.version_wait_s(self._listed)
+        if wait_s is None or self._learning.seconds is not None:
+            return ""
+        return (
+            f"; next version after {_duration(wait_s)} more of healthy running" if wait_s else "; next version is due"
+        )
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds / 60.0:.0f} min" if seconds < 2 * 3600.0 else f"{seconds / 3600.0:.1f} h"
 
 
 def _finds(version: Version) -> str:
@@ -328,8 +351,8 @@ def build(context: Context) -> BuiltStage:
 
 def check(context: Context) -> list[str]:
     """What would keep it from learning."""
-    if context.tray.twin is None and not is_installed("torch"):
-        return [f"no twin can be learned without the extra `train`; {how_to_install('train')}"]
+    if context.tray.twin is None and (missing := missing_extra()):
+        return [missing]
     with suppress(UserError):
         TwinVersions(learning_folder(context.run_folder, context.tray.name), context.tray.name).all()
         return []

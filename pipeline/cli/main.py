@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 
 PANELS = {
     "watch": "Watch",
@@ -110,7 +110,7 @@ def expand_variadic(words: Sequence[str]) -> list[str]:
 
 
 def main() -> None:
-    """Entry point: runs a command, turns a `UserError` and a lack of memory into one line and exit code 1."""
+    """Entry point: runs a command, turns a `UserError` and a lack of memory into one line and an exit code."""
     words = expand_variadic(sys.argv[1:])
     named = [word for word in words[:1] if word in COMMANDS]
     _register(named or COMMANDS)  # a stage's process imports its own command only
@@ -121,7 +121,7 @@ def main() -> None:
         from rich.markup import escape  # noqa: PLC0415
 
         Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]fantwin:[/red] {escape(str(error))}")
-        sys.exit(1)
+        sys.exit(2 if isinstance(error, UsageError) else 1)
     except MemoryError:
         sys.stderr.write("fantwin: not enough memory for this; use smaller files, or a machine with more\n")
         sys.exit(1)

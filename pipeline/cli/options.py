@@ -7,7 +7,7 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from pipeline.errors import UserError
+from pipeline.errors import UsageError
 
 ConfigOption: TypeAlias = Annotated[Path, typer.Option("-c", "--config", help="Configuration file (TOML).")]
 SetOption: TypeAlias = Annotated[
@@ -23,14 +23,14 @@ def fan_numbers(text: str | None) -> list[int] | None:
     """The fans of an option such as `--fans 2,5`.
 
     Raises:
-        UserError: it is not an ascending list of fan numbers.
+        UsageError: it is not an ascending list of fan numbers.
     """
     if text is None:
         return None
     try:
         numbers = [int(part) for part in text.split(",")]
         if numbers != sorted(set(numbers)):
-            raise UserError(f"--fans {text}: give each fan once, in ascending order")
+            raise UsageError(f"--fans {text}: give each fan once, in ascending order")
         return numbers
     except ValueError as error:
-        raise UserError(f"--fans {text}: give fan numbers counted from 0, with commas: --fans 2,5") from error
+        raise UsageError(f"--fans {text}: give fan numbers counted from 0, with commas: --fans 2,5") from error

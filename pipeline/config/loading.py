@@ -15,7 +15,17 @@ from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError
 
-from pipeline.config.models import BusConfig, Config, ConfigError, LauncherConfig, Name, Section, TrayConfig, nearest
+from pipeline.config.models import (
+    BusConfig,
+    Config,
+    ConfigError,
+    ConfigUsageError,
+    LauncherConfig,
+    Name,
+    Section,
+    TrayConfig,
+    nearest,
+)
 from pipeline.config.registry import STAGES
 
 LARGEST_FILE_BYTES = 1 << 20
@@ -128,16 +138,17 @@ def enabled_stages(launcher: LauncherConfig, table: Mapping[str, Any]) -> tuple[
 def _override(table: dict[str, Any], override: str) -> None:
     """Set one dotted key; `tray.0.port` is the port of the first tray."""
     if len(override) > LONGEST_OVERRIDE:
-        raise ConfigError(f"--set {override[:LONGEST_SHOWN]}...: longer than {LONGEST_OVERRIDE:,} characters")
+        raise ConfigUsageError(f"--set {override[:LONGEST_SHOWN]}...: longer than {LONGEST_OVERRIDE:,} characters")
     dotted, equals, value_text = override.partition("=")
     if not equals:
-        raise ConfigError(f"--set {override}: write KEY=VALUE, for example --set scorer.on_delay_s=1.0")
+        raise ConfigUsageError(f"--set {override}: write KEY=VALUE, for example --set scorer.on_delay_s=1.0")
     try:
         value = tomllib.loads(f"value = {value_text}")["value"]
     except tomllib.TOMLDecodeError as error:
         value = value_text.strip()  # a bare word is a string
         if value.startswith(("'", '"')):
-            raise ConfigError(f"--set {override}: not a TOML string: {error}; write it in double quotes") from error
+            why = f"not a TOML string: {error}; write it in double quotes"
+            raise ConfigUsageError(f"--set {override}: {why}") from error
     here: Any = table
     *parents, last = dotted.strip().split(".")
     try:
@@ -145,7 +156,7 @@ def _override(table: dict[str, Any], override: str) -> None:
             here = here[int(part)] if isinstance(here, list) else here.setdefault(part, {})
         here[int(last) if isinstance(here, list) else last] = value
     except (IndexError, TypeError, AttributeError, ValueError) as error:
-        raise ConfigError(f"--set {override}: the configuration has no such key") from error
+        raise ConfigUsageError(f"--set {override}: the configuration has no such key") from error
 
 
 _Model = TypeVar("_Model", bound=BaseModel)

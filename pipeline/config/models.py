@@ -16,7 +16,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationIn
 from pipeline.config.registry import STAGES
 from pipeline.devices.sample_source import SourceConfig
 from pipeline.devices.source_kinds import parse_source
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from schemas.tacho import Tachos, tacho_of_each_fan
 from schemas.topics import RESERVED_TRAY_NAMES
 from schemas.units import SpeedUnit
@@ -32,6 +32,10 @@ Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 
 class ConfigError(UserError):
     """A configuration that cannot be used: one line that says which file, which key and what to do."""
+
+
+class ConfigUsageError(ConfigError, UsageError):
+    """The command line names a tray or a key that the configuration cannot have."""
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -189,9 +193,9 @@ class Config:
         """The tray called `name`.
 
         Raises:
-            ConfigError: no such tray.
+            ConfigUsageError: no such tray.
         """
         for tray in self.trays:
             if tray.name == name:
                 return tray
-        raise ConfigError(f"{self.path}: no tray called {name!r}{nearest(name, [t.name for t in self.trays])}")
+        raise ConfigUsageError(f"{self.path}: no tray called {name!r}{nearest(name, [t.name for t in self.trays])}")

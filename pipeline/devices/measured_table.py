@@ -23,7 +23,7 @@ from typing import TextIO
 import numpy as np
 
 from pipeline.devices.table_columns import DATE_UNIT, NS_PER_UNIT, NumberColumn, TimeColumn
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Array
 from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
@@ -126,14 +126,14 @@ def read_table(
         UserError: the file, a column or a unit cannot be used.
     """
     if not speed or len(command) not in (1, len(speed)):
-        raise UserError(
+        raise UsageError(
             f"{len(command)} command and {len(speed)} speed columns: give --speed once per fan, and --command "
             "once for all fans or once per fan"
         )
     if time and period:
-        raise UserError("--period is for tables without a time column: leave out --time or --period")
+        raise UsageError("--period is for tables without a time column: leave out --time or --period")
     if not (time or period):
-        raise UserError("a table needs --time COLUMN[:UNIT], or --period 10ms if it has no time column")
+        raise UsageError("a table needs --time COLUMN[:UNIT], or --period 10ms if it has no time column")
     rows = _rows(path)
     names = _names(path, next(rows, []))
     times = TimeColumn(path, *_column(path, time, names, (*NS_PER_UNIT, DATE_UNIT))) if time else None
@@ -141,7 +141,7 @@ def read_table(
     found = [_column(path, given, names, RAD_S_PER_TABLE_UNIT) for given in speed]
     units = {unit for _, _, unit in found}
     if len(units) > 1:
-        raise UserError(f"speeds in {', '.join(unit or 'no unit' for _, _, unit in found)}: give all in one unit")
+        raise UsageError(f"speeds in {', '.join(unit or 'no unit' for _, _, unit in found)}: give all in one unit")
     unit = found[0][2] or "rad/s"
     speeds = [NumberColumn(path, name, index) for name, index, _ in found]
     count = 0
@@ -213,7 +213,7 @@ def _column(path: Path, given: str, names: list[str], units: Iterable[str]) -> t
     unit, units = unit.strip().lower(), list(units)
     if unit and unit not in units:
         known = f"known: {', '.join(units)}" if units else "a command has no unit"
-        raise UserError(f"{given!r}: unknown unit {unit!r}; {known}")
+        raise UsageError(f"{given!r}: unknown unit {unit!r}; {known}")
     return name, names.index(name), unit
 
 
@@ -238,9 +238,9 @@ def _counted_times(rows: int, period: str) -> tuple[Array, Array]:
     match = re.fullmatch(r"(\d{1,9}\.?\d*|\.\d+)\s*(s|ms|us|ns)", period.strip())
     period_ns = round(float(match[1]) * NS_PER_UNIT[match[2]]) if match else 0
     if not 0 < period_ns <= LARGEST_PERIOD_NS:
-        raise UserError(f"--period {period}: give the time between samples with its unit, for example 10ms")
+        raise UsageError(f"--period {period}: give the time between samples with its unit, for example 10ms")
     if rows * period_ns >= FURTHEST_T_NS:
-        raise UserError(f"--period {period}: the table would end beyond the year 2116; give a shorter period")
+        raise UsageError(f"--period {period}: the table would end beyond the year 2116; give a shorter period")
     return np.arange(rows, dtype=np.int64) * period_ns, np.ones(rows, dtype=np.bool_)
 
 

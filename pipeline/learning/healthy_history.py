@@ -81,13 +81,14 @@ class HealthyHistory:
         hold_back_s: float,
         kept_s: float,
     ) -> None:
-        """hold_back_s: see above. kept_s: of healthy running; older recordings are deleted, except for the first."""
+        """hold_back_s: see above. kept_s: of healthy running in the recordings outside the excluded time spans, and as
+        much in the others; older ones are deleted, except for the first."""
         self._folder = folder
         self._place = folder / HEALTHY
         self._key = tray_key(site, tray, "raw")
         self._metadata, self._attachments = metadata, attachments
         self._hold_back_ns = round(hold_back_s * NS_PER_S)
-        self._kept_ns = round(kept_s * NS_PER_S)
+        self.kept_s = kept_s
         self._waiting: deque[Raw] = deque()
         self._writer: RecordingWriter | None = None
         self._span: TimeSpan = (0, 0)
@@ -272,12 +273,14 @@ class HealthyHistory:
         self.exclude(self._excluded)
 
     def _delete_oldest(self) -> None:
-        left_ns = self._kept_ns
+        """Excluded recordings take no place of others; of them as much is kept, since they may be used again."""
+        left_ns = dict.fromkeys((False, True), round(self.kept_s * NS_PER_S))
         for each in reversed(self._finished[1:]):
-            left_ns -= each.span[1] - each.span[0]
-            if left_ns < 0:
+            is_excluded = self._is_excluded(each.span)
+            left_ns[is_excluded] -= each.span[1] - each.span[0]
+            if left_ns[is_excluded] < 0:
                 each.path.unlink()
-        if left_ns < 0:
+        if min(left_ns.values()) < 0:
             self._list_finished()
 
     def _name_left(self) -> None:

@@ -18,12 +18,24 @@ _TURN = threading.Lock()
 STOP_S = 2.0
 
 
+def missing_extra() -> str:
+    """That the extra `train` is not installed, and how to install it; empty if it is."""
+    if is_installed("torch"):
+        return ""
+    return f"no twin can be learned without the extra `train`; {how_to_install('train')}"
+
+
 class Learning(Protocol):
     """Makes the next version of a tray's twin, beside all else."""
 
     @property
     def is_free(self) -> bool:
         """Whether no tray of this process is learning."""
+        ...
+
+    @property
+    def obstacle(self) -> str:
+        """Why no version can be made here at all, and what to do; empty if one can."""
         ...
 
     def start(self, *, only_if_changed: bool) -> str:
@@ -60,10 +72,13 @@ class LearningProcess:
         """Whether no tray of this process is learning."""
         return not _TURN.locked()
 
+    @property
+    def obstacle(self) -> str:
+        """Why no version can be made here at all, and what to do; empty if one can."""
+        return missing_extra()
+
     def start(self, *, only_if_changed: bool) -> str:
         """Begin, if it is free; returns what went wrong, or nothing. only_if_changed: see `fantwin learn --check`."""
-        if not is_installed("torch"):
-            return f"no twin can be learned without the extra `train`; {how_to_install('train')}"
         if not _TURN.acquire(blocking=False):
             return "another tray is learning"
         try:

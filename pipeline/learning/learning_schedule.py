@@ -35,6 +35,8 @@ class _Failure:
     """of the history then"""
     needed_s: float
     """healthy running after that before the next attempt"""
+    listed: VersionList
+    """when it was begun"""
 
 
 class LearningSchedule:
@@ -46,8 +48,9 @@ class LearningSchedule:
         self._history = history
         self._operation = operation
         self._first_s = 60.0 * first_minutes
-        self.started: Work = "version"
-        """what was started last"""
+        self._started: Work = "version"
+        self._listed = VersionList()
+        """when that was started"""
         self._failures: dict[Work, _Failure] = {}
 
     @property
@@ -55,36 +58,56 @@ class LearningSchedule:
         """Why the last version and the last check failed, if they did."""
         return [failure.why for failure in self._failures.values()]
 
+    def started(self, work: Work, listed: VersionList) -> None:
+        """A version or a check is being made. listed: the versions before it."""
+        self._started, self._listed = work, listed
+
     def failed(self, why: str) -> None:
         """What was started last has failed."""
         needed_s = max(min(AGAIN_AFTER * self._history.seconds, AGAIN_AFTER_AT_MOST_S), SHORTEST_RECORDING_S)
-        self._failures[self.started] = _Failure(why, self._history.end_t_ns, needed_s)
+        self._failures[self._started] = _Failure(why, self._history.end_t_ns, needed_s, self._listed)
 
     def succeeded(self) -> None:
         """What was started last has been done."""
-        self._failures.pop(self.started, None)
+        self._failures.pop(self._started, None)
+
+    def forget_what_is_over(self, listed: VersionList) -> None:
+        """Forget failures that a later version has ended, or a later check, whoever has made it. A check is part of
+        each version."""
+        for work, failure in list(self._failures.items()):
+            has_version = len(listed.versions) > len(failure.listed.versions)
+            if has_version or (work == "check" and listed.check != failure.listed.check):
+                del self._failures[work]
 
     def due(self, listed: VersionList) -> Work | None:
         """What is due: a version, or a check of the fans against the reference."""
-        if self._is_version_due(listed) and self._may_try("version"):
+        if self.version_wait_s(listed) == 0.0:
             return "version"
-        return "check" if self._is_check_due(listed) and self._may_try("check") else None
+        return "check" if self._is_check_due(listed) and not self._retry_wait_s("check") else None
 
-    def _may_try(self, work: Work) -> bool:
-        """Whether there is enough healthy running since an attempt that failed."""
+    def version_wait_s(self, listed: VersionList) -> float | None:
+        """Healthy running until the next version is due; None if it waits for something else: for fans to be moved, or
+        for what becomes of one that is offered."""
+        needed_s = self._needed_s(listed)
+        return None if needed_s is None else max(needed_s, self._retry_wait_s("version"), 0.0)
+
+    def _retry_wait_s(self, work: Work) -> float:
+        """Healthy running before the next attempt at what failed; 0: it may be made now."""
         failure = self._failures.get(work)
-        return failure is None or self._history.seconds_since(failure.end_t_ns) >= failure.needed_s
+        return max(failure.needed_s - self._history.seconds_since(failure.end_t_ns), 0.0) if failure else 0.0
 
-    def _is_version_due(self, listed: VersionList) -> bool:
+    def _needed_s(self, listed: VersionList) -> float | None:
+        """As `version_wait_s`, but not above 0 where a version is due, and without failures."""
         since = self._history.seconds_since
         if not listed.versions:
-            return self._history.seconds >= self._first_s and not self._operation.missing()
+            return None if self._operation.missing() else self._first_s - self._history.seconds
         last = listed.versions[-1]
         if listed.is_tainted:
-            return self._history.seconds >= self._first_s
+            return self._first_s - self._history.seconds
         if listed.commissioned_t_ns > last.made_t_ns:
-            return since(listed.commissioned_t_ns) >= AFTER_COMMISSIONING_S
-        return not listed.waiting and since(last.made_t_ns) >= min(last.learned_s, LONGEST_WAIT_S)
+            return AFTER_COMMISSIONING_S - since(listed.commissioned_t_ns)
+        at_most_s = min(LONGEST_WAIT_S, self._history.kept_s)  # no more than that is kept since a version
+        return None if listed.waiting else min(last.learned_s, at_most_s) - since(last.made_t_ns)
 
     def _is_check_due(self, listed: VersionList) -> bool:
         if not listed.versions:

@@ -20,6 +20,8 @@ from schemas.units import NS_PER_S
 
 LIST_NAME = "versions.json"
 Outcome: TypeAlias = Literal["taken", "offered"]
+REFERENCE_S = 24 * 3600.0
+"""of healthy running that a reference is learned from; until there is one, every change of speed is taken as healthy"""
 TimeSpan: TypeAlias = tuple[int, int]
 """first and last time, ns since 1970"""
 
@@ -147,6 +149,14 @@ class VersionList(_Record):
             return self.faulty
         changed = (span for reference, span in self.changed if reference == self.current.reference)
         return (*self.faulty, *changed, (0, self.current.since_t_ns - 1))
+
+    def reference_of(self, version: Version) -> Version | None:
+        """The reference that the changes of its fans are measured against; None if there was none yet, or it was
+        learned from a time that was marked as faulty."""
+        named = next((each for each in self.versions if each.name == version.reference), None)
+        if named is None or named.learned_s < REFERENCE_S or overlap(named.learned_spans, self.faulty):
+            return None
+        return named
 
     @property
     def waiting(self) -> Version | None:

@@ -20,7 +20,7 @@ from pipeline.bus.session import Bus
 from pipeline.config.models import Config
 from pipeline.config.registry import STAGES
 from pipeline.devices.host_clock import HOST_CLOCK
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.runtime.clock import REPLAY, StageClock, is_of_replay
 from pipeline.runtime.ending import Ending, Step
 from pipeline.runtime.health import HealthBuilder
@@ -71,7 +71,7 @@ class Runner:
         is_per_tray = STAGES[stage.name].scope == "tray"
         if is_per_tray and len(trays) != 1:
             names = ", ".join(t.name for t in trays)
-            raise UserError(f"{stage.name} runs one process for each tray: say which with --tray (one of {names})")
+            raise UsageError(f"{stage.name} runs one process for each tray: say which with --tray (one of {names})")
         self.stage = stage
         self.stop = stop
         self._on_health = on_health or (lambda _health: None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -10,8 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.learning.learning_process import LearningProcess
+from pipeline.learning.versions import Check
 from schemas.messages import Action, FanState, Message, Request
 from schemas.units import NS_PER_S
+from tests.pipeline.learning.test_versions import version
 from tests.support.one_learner import START_NS, Learner, raw
 
 
@@ -28,8 +32,31 @@ def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path
     (note,) = learner.core.notes()
     assert note == (
         "tray1-1 is in force; at 1,000 rpm it finds a drop of 40 rpm within a minute; declared: 1 false alarm per "
-        "fan and day"
+        "fan and day; next version after 10 min more of healthy running"
     )
+
+
+def test_what_keeps_any_version_from_being_made_is_a_problem_from_the_start_and_samples_are_kept(
+    tmp_path: Path,
+) -> None:
+    learner = Learner(tmp_path)
+    learner.learning.obstacle = "no twin can be learned without the extra `train`"
+    assert learner.core.problem() == "no twin can be learned without the extra `train`"
+    learner.run(1000)
+    assert learner.learning.starts == []
+    assert learner.core.problem() == "no twin can be learned without the extra `train`"
+    assert learner.history.seconds > 900.0
+    learner.learning.obstacle = ""
+    learner.run(20)
+    assert learner.put_in_force == ["tray1-1"]
+    assert learner.core.problem() == ""
+
+
+def test_without_the_extra_train_no_version_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    learning = LearningProcess(tmp_path / "fantwin.toml", (), "tray1", tmp_path / "learn.log")
+    assert learning.obstacle == ""
+    monkeypatch.setattr("pipeline.learning.learning_process.is_installed", lambda _module: False)
+    assert learning.obstacle.startswith("no twin can be learned without the extra `train`; in the checkout: ")
 
 
 def test_later_versions_come_when_the_history_has_doubled(tmp_path: Path) -> None:
@@ -39,6 +66,41 @@ def test_later_versions_come_when_the_history_has_doubled(tmp_path: Path) -> Non
     assert len(made) >= 4
     assert all(1.6 < after / before < 2.6 for before, after in pairwise(made)), made
     assert learner.put_in_force == [f"tray1-{number + 1}" for number in range(len(made))]
+
+
+def announced_s(learner: Learner) -> float:
+    """After how much more healthy running the notes announce the next version."""
+    (words,) = re.findall(r"; next version after (\S+ \S+) more of healthy running$", learner.core.notes()[0])
+    number, unit = words.split()
+    return float(number) * {"min": 60.0, "h": 3600.0}[unit]
+
+
+@pytest.mark.parametrize("fails_with", ["", "a failure"])
+def test_the_notes_say_after_how_much_more_healthy_running_the_next_version_is_due(
+    tmp_path: Path, fails_with: str
+) -> None:
+    learner = Learner(tmp_path)
+    learner.run(7200)
+    if fails_with:
+        learner.learning.fails_with = fails_with
+        while not learner.core.problem():
+            learner.run(10)
+    started, wait_s = len(learner.learning.starts), announced_s(learner)
+    assert wait_s > 600.0
+    learner.run(round(wait_s) - 100)
+    assert len(learner.learning.starts) == started
+    assert announced_s(learner) < 200.0
+    learner.run(200)
+    assert len(learner.learning.starts) == started + 1
+
+
+def test_while_a_version_is_offered_no_other_one_is_announced(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(600)
+    learner.learning.outcome = "offered"
+    learner.run(1500)
+    assert learner.versions.read().waiting
+    assert "next version" not in "; ".join(learner.core.notes())
 
 
 def test_what_failed_is_said_and_tried_again_with_more_history(tmp_path: Path) -> None:
@@ -169,6 +231,58 @@ def test_learning_is_tried_again_when_the_history_grows_no_more(
     learner.learning.fails_with = ""
     learner.run(2000)
     assert learner.core.problem() == ""
+
+
+def test_a_failure_is_over_when_anybody_has_made_a_version(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(2000)
+    learner.learning.fails_with = "a failure"
+    while not learner.core.problem():
+        learner.run(10)
+    learner.add_version("tray1-9")  # as `fantwin learn` does
+    learner.run(10)
+    assert learner.core.problem() == ""
+
+
+def test_a_failure_is_over_although_the_version_was_made_before_the_failure_was_known(tmp_path: Path) -> None:
+    learner = Learner(tmp_path)
+    learner.run(2000)
+    learner.learning.fails_with = "another `fantwin learn` works here: wait for its end"
+    before = len(learner.learning.starts)
+    while len(learner.learning.starts) == before:
+        learner.run(10)
+    learner.add_version("tray1-9")
+    learner.run(20)
+    assert learner.core.problem() == ""
+
+
+def test_a_check_that_failed_is_over_when_anybody_has_made_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.learning.learning_schedule.CHECK_AFTER_S", 1000.0)
+    learner = Learner(tmp_path)
+    learner.learning.checks_fail_with = "a check failed"
+    while not learner.core.problem():
+        learner.run(10)
+    until_t_ns = START_NS + learner.now_s * NS_PER_S
+    learner.versions.add_check(Check(t_ns=until_t_ns, reference="", change=(), found="", spans=()))
+    learner.run(10)
+    assert learner.core.problem() == ""
+
+
+def test_a_version_is_due_at_the_latest_when_as_much_was_added_as_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.learning.healthy_history.LONGEST_RECORDING_NS", 200 * NS_PER_S)
+    learner = Learner(tmp_path, kept_s=1000.0)
+    learner.run(600)
+    made_t_ns = START_NS + learner.now_s * NS_PER_S
+    long_ago = tuple((day * 10_000 * NS_PER_S, (day * 10_000 + 5000) * NS_PER_S) for day in range(3))
+    learner.versions.file("tray1-2").write_bytes(b"tray1-2")
+    learner.versions.add(version("tray1-2", 2, learned_spans=long_ago, made_t_ns=made_t_ns))
+    before = len(learner.learning.starts)
+    learner.run(900)
+    assert len(learner.learning.starts) == before
+    learner.run(400)
+    assert len(learner.learning.starts) == before + 1
 
 
 def test_after_a_failure_learning_waits_for_a_quarter_of_the_history(tmp_path: Path) -> None:

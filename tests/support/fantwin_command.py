@@ -6,7 +6,7 @@ import typer
 from typer.testing import CliRunner, Result
 
 from pipeline.cli.main import COMMANDS
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 
 
 def fantwin(name: str, *arguments: object) -> Result:
@@ -19,7 +19,16 @@ def fantwin(name: str, *arguments: object) -> Result:
 
 def error_of(name: str, *arguments: object) -> str:
     """The one-line error of a command that must fail."""
+    return _one_line_of(UserError, name, *arguments)
+
+
+def usage_error_of(name: str, *arguments: object) -> str:
+    """The same of a command that is called wrongly: the command line exits with 2."""
+    return _one_line_of(UsageError, name, *arguments)
+
+
+def _one_line_of(kind: type[UserError], name: str, *arguments: object) -> str:
     error = fantwin(name, *arguments).exception
-    assert isinstance(error, UserError), error
+    assert isinstance(error, kind), error
     assert "\n" not in str(error)
     return str(error)

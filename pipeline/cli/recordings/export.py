@@ -18,7 +18,7 @@ from rich.console import Console
 
 from pipeline.cli.options import JsonOption
 from pipeline.cli.twins.training_data import make_folder
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.arrays import Block, read_topics
 from pipeline.recordings.order import in_order
@@ -109,7 +109,7 @@ class _Tables:
     def __init__(self, parts: Sequence[Path], form: Form, output: Path, *, replace: bool) -> None:
         """`output` is a folder, or one file if its suffix says so. Raises UserError if it cannot be used."""
         if output.suffix in (".csv", ".parquet") and output.suffix != f".{form}":
-            raise UserError(f"{output}: name a file that ends in .{form} with -o, or a folder")
+            raise UsageError(f"{output}: name a file that ends in .{form} with -o, or a folder")
         self.begun: dict[Path, _Table] = {}
         self._metadata = read_metadata(parts[0])
         self._stem = parts[0].name.removesuffix(ACTIVE_SUFFIX).removesuffix(".mcap")

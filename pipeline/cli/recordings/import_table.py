@@ -17,7 +17,7 @@ from pipeline.cli.options import JsonOption
 from pipeline.config.models import NAME_PATTERN
 from pipeline.devices.measured_table import Table, read_table
 from pipeline.devices.tacho_evidence import tacho_hints
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.recordings.reading import TACHO_KEY
 from pipeline.recordings.writing import RecordingWriter
 from schemas.messages import Header, Raw
@@ -78,7 +78,7 @@ def import_table(
     Example: fantwin import FILE.csv --time t:s --command u --speed y:rpm --tacho count --window 1 -o REC.mcap
     """
     if not re.match(NAME_PATTERN, tray) or tray in RESERVED_TRAY_NAMES:
-        raise UserError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
+        raise UsageError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
     if output.exists() and not force:
         raise UserError(f"{output}: exists; name another file with -o, or replace it with --force")
     tachos = _tachos(tacho, pulses, window_s or [0.0], update_s, len(speed))
@@ -109,9 +109,9 @@ def _tachos(
         tacho_of_each_fan(tachos, fans)
     except ValidationError as error:
         first = error.errors()[0]
-        raise UserError(f"--tacho {kind}: {first['msg'].removeprefix('Value error, ')}; see --window") from error
+        raise UsageError(f"--tacho {kind}: {first['msg'].removeprefix('Value error, ')}; see --window") from error
     except ValueError as error:
-        raise UserError(f"--window: {error}") from error
+        raise UsageError(f"--window: {error}") from error
     return tuple(tachos)
 
 

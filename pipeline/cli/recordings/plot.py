@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from pipeline.cli.options import JsonOption, fan_numbers
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.optional_dependencies import how_to_install
 
 
@@ -38,7 +38,7 @@ def plot(
             raise
         raise UserError(f"plots need the extra `view`; {how_to_install('view')}") from error
     if unit not in ("rpm", "rad/s", None):
-        raise UserError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
+        raise UsageError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
     with Console(stderr=True).status(f"drawing {output}"):
         drawn = plot_recording(recordings, output, tray=tray, fans=fan_numbers(fans), speed_unit=unit, truth=truth)
     if json_output:

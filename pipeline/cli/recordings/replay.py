@@ -18,6 +18,7 @@ from rich.live import Live
 from rich.text import Text
 
 from pipeline.cli.options import JsonOption, SetOption
+from pipeline.errors import UsageError
 from pipeline.recordings.dates import format_utc
 from pipeline.replay.live.keyboard import Keys
 from pipeline.replay.live.pace import Pace
@@ -109,9 +110,9 @@ def replay(
     viewing = {"--rate": rate, "--pause": pause, "--loop": loop, "--topics": topics, "--from": from_topic}
     deciding = {"--twin": twin, "--output": output, "--verify": verify}
     for name in (name for name, value in (viewing if offline else deciding).items() if value):
-        raise typer.BadParameter(f"{name} {'cannot be used' if offline else 'can only be used'} with --offline")
+        raise UsageError(f"{name} {'cannot be used' if offline else 'can only be used'} with --offline")
     if not 0.0 <= start < min(end, LONGEST_S) or (end > LONGEST_S and not math.isinf(end)):
-        raise typer.BadParameter("0 <= --start < --end, in seconds", param_hint="--start, --end")
+        raise UsageError("--start and --end: give 0 <= --start < --end, in seconds")
     if offline:
         from pipeline.cli.recordings.replay_offline import run_offline  # noqa: PLC0415  loads the stages
 
@@ -130,7 +131,7 @@ def replay(
     pace = Pace(_rate(rate or "1"), paused=pause)
     keys = Keys()
     if pause and not keys.is_available:
-        raise typer.BadParameter("needs a terminal, to continue with a key", param_hint="--pause")
+        raise UsageError("--pause needs a terminal, to continue with a key")
     playback = RecordingPlayback(files, _chosen_topics(topics, from_topic), start, end)
     replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
     stop = threading.Event()
@@ -162,17 +163,17 @@ def replay(
 def _chosen_topics(topics: str | None, from_topic: str | None) -> tuple[str, ...]:
     if from_topic is not None:
         if topics is not None:
-            raise typer.BadParameter("give --topics or --from, not both", param_hint="--from")
+            raise UsageError("give --topics or --from, not both")
         starts = replay_starts()
         if from_topic not in starts:
-            raise typer.BadParameter(f"{from_topic!r} is not one of {', '.join(starts)}", param_hint="--from")
+            raise UsageError(f"--from {from_topic}: is not one of {', '.join(starts)}")
         return starts[from_topic]
     if topics is None:
         return REPLAYED
     chosen = tuple(topics.split(","))
     for name in chosen:
         if name not in REPLAYED:
-            raise typer.BadParameter(f"{name!r} is not one of {', '.join(REPLAYED)}", param_hint="--topics")
+            raise UsageError(f"--topics {name}: is not one of {', '.join(REPLAYED)}")
     return chosen
 
 
@@ -182,7 +183,7 @@ def _rate(text: str) -> float:
     except ValueError:
         rate = math.nan
     if text != "max" and not 0.0 < rate <= LARGEST_RATE:
-        raise typer.BadParameter(f"{text!r}: give a number above 0, to {LARGEST_RATE:g}, or max", param_hint="--rate")
+        raise UsageError(f"--rate {text}: give a number above 0, to {LARGEST_RATE:g}, or max")
     return rate
 
 

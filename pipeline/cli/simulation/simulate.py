@@ -19,7 +19,7 @@ from pipeline.cli.options import JsonOption
 from pipeline.devices.measured_table import read_table
 from pipeline.devices.simulated_device import PlaybackCounts, PseudoTerminal, play, wait_for_reader
 from pipeline.devices.table_device import TableDevice
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.recordings.simulated import record
 from pipeline.runtime.signals import stop_on_signals
 from schemas import wire
@@ -184,7 +184,7 @@ def simulate(
     tachos = INSTANTANEOUS
     if from_csv:
         if recording or fault:
-            raise UserError(
+            raise UsageError(
                 "--from-csv plays a file unchanged: leave out --fault; instead of --recording use `fantwin import`"
             )
         device = TableDevice(
@@ -193,7 +193,7 @@ def simulate(
         summary_of = partial(_summary_of_file, from_csv, device)
     else:
         if time or period or command or speed:
-            raise UserError("--time, --period, --command and --speed describe a file: name it with --from-csv FILE.csv")
+            raise UsageError("--time, --period, --command and --speed describe a file: name it with --from-csv FILE")
         tachos = tuple(
             _tacho(kind=tacho, pulses=pulses, window_s=one, update_s=update, delay_s=tacho_delay)
             for one in window or [0.0]
@@ -218,9 +218,9 @@ def simulate(
         summary_of = partial(_summary_of_tray, device)
     if recording:
         if duration is None or link or wait:
-            raise UserError("--recording needs --duration, and excludes --link and --wait-for-reader")
+            raise UsageError("--recording needs --duration, and excludes --link and --wait-for-reader")
         if not math.isfinite(duration):
-            raise UserError(f"--duration {duration}: a recording needs a finite number of seconds")
+            raise UsageError(f"--duration {duration}: a recording needs a finite number of seconds")
         if recording.exists() and not force:
             raise UserError(f"{recording}: exists; name another file with --recording, or replace it with --force")
         epoch_ns = clock.time_ns() if epoch_ns is None else epoch_ns
@@ -250,7 +250,7 @@ def _tacho(**settings: Any) -> Tacho:
     """The tacho with these settings; see `schemas.tacho.Tacho`.
 
     Raises:
-        UserError: they do not fit one another, or one is out of range.
+        UsageError: they do not fit one another, or one is out of range.
     """
     try:
         return Tacho(**settings)
@@ -260,7 +260,7 @@ def _tacho(**settings: Any) -> Tacho:
         text = first["msg"].removeprefix("Value error, ")
         for field in ("window_s", "update_s"):
             text = text.replace(field, _TACHO_OPTIONS[field])
-        raise UserError(where + text) from error
+        raise UsageError(where + text) from error
 
 
 def _tray(
@@ -275,7 +275,7 @@ def _tray(
     """The tray with these settings; see `simulation.tray.TraySettings`.
 
     Raises:
-        UserError: a setting is out of range, or a fault cannot be parsed.
+        UsageError: a setting is out of range, or a fault cannot be parsed.
     """
     from simulation.errors import SimulationError  # noqa: PLC0415  loaded only by the commands that need it
     from simulation.faults import parse_fault  # noqa: PLC0415
@@ -288,7 +288,7 @@ def _tray(
         schedule = tuple(map(parse_fault, faults))
         return SimulatedTray(TraySettings(faults=schedule, tacho=measured, clock=DeviceClock(**clock), **settings))
     except SimulationError as error:
-        raise UserError(str(error)) from error
+        raise UsageError(str(error)) from error
 
 
 def _counts(played: PlaybackCounts) -> Summary:

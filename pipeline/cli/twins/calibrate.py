@@ -19,7 +19,7 @@ from pipeline.cli.twins.calibration_check import check_declared_rate
 from pipeline.cli.twins.drops_found import drop_lines, drops_found
 from pipeline.cli.twins.outlier_run_check import outlier_warning
 from pipeline.cli.twins.training_data import FromOption, ToOption, sha256_of, twin_errors
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.replay.offline.healthy_runs import HealthyRuns
 from pipeline.replay.offline.limits_of_twin import find_limits
 from pipeline.runtime.tray_twin import load_tray_twin
@@ -101,7 +101,7 @@ def calibrate(
     result: dict[str, Any] = {}
     if healthy:
         if false_alarms_per_day is None:
-            raise UserError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
+            raise UsageError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
         with interruptible("nothing was written"):
             limits, warning, speed_unit = _calibrated(
                 twin,
@@ -190,15 +190,15 @@ def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path],
     if not twin.is_file():
         raise UserError(f"{twin}: there is no such twin: name the file that `fantwin train` wrote")
     if not healthy and not verify:
-        raise UserError(
+        raise UsageError(
             "nothing to calibrate on: name healthy recordings, or --verify OTHER.mcap to test the declared rate"
         )
     for path in (path for path in verify if path.suffix == ".onnx"):
-        raise UserError(f"{path}: --verify takes recordings, and all arguments after it: name TWIN.onnx before it")
+        raise UsageError(f"{path}: --verify takes recordings, and all arguments after it: name TWIN.onnx before it")
     _named_once([*healthy, *verify])
     for key in (override.partition("=")[0].strip() for override in overrides if healthy):
         if key.startswith("scorer.") and key.removeprefix("scorer.") not in Timing.model_fields:
-            raise UserError(
+            raise UsageError(
                 f"--set {key}: does not affect calibration; of [scorer] these do: {', '.join(Timing.model_fields)}"
             )
 
@@ -206,7 +206,7 @@ def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path],
 def _refuse_without_healthy(names: list[str]) -> None:
     """names: options that were given and are for calibrating."""
     if names:
-        raise UserError(
+        raise UsageError(
             f"{names[0]} needs recordings to calibrate on, and there are none: those after --verify only test; "
             "name HEALTHY.mcap... before it"
         )
@@ -217,7 +217,7 @@ def _named_once(recordings: list[Path]) -> None:
     seen: set[Path] = set()
     for path in recordings:
         if path.resolve() in seen:
-            raise UserError(f"{path}: named twice: every recording counts once, and --verify takes others")
+            raise UsageError(f"{path}: named twice: every recording counts once, and --verify takes others")
         seen.add(path.resolve())
 
 

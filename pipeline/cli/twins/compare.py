@@ -30,7 +30,7 @@ from pipeline.cli.twins.training_data import (
     read_training_data,
     twin_errors,
 )
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 
 if TYPE_CHECKING:
     from twin.comparison import Candidate, Contender
@@ -205,7 +205,7 @@ def _chosen(names: str | None) -> list[Candidate]:
     wanted = list(by_name) if names is None else [name.strip() for name in names.split(",")]
     for name in wanted:
         if name not in by_name:
-            raise UserError(f"--model {name}: no such model; known: {', '.join(by_name)}")
+            raise UsageError(f"--model {name}: no such model; known: {', '.join(by_name)}")
     return [by_name[name] for name in dict.fromkeys(wanted)]
 
 

@@ -26,7 +26,7 @@ from pipeline.cli.twins.training_data import (
     read_training_data,
     twin_errors,
 )
-from pipeline.errors import UserError
+from pipeline.errors import UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -151,7 +151,7 @@ def _grid(text: str) -> Grid:
     except ValueError:
         rate_hz = math.nan
     if not (math.isfinite(rate_hz) and rate_hz > 0.0):
-        raise UserError(f"--rate {text}: give a rate in Hz, e.g. --rate 50, or --rate irregular")
+        raise UsageError(f"--rate {text}: give a rate in Hz, e.g. --rate 50, or --rate irregular")
     return rate_hz
 
 

@@ -13,10 +13,17 @@ import typer
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.progress import interruptible, working
 from pipeline.cli.twins.next_version import make_next_version
-from pipeline.cli.twins.versions_text import NO_REFERENCE, check_line, offer_lines, version_lines
+from pipeline.cli.twins.versions_text import (
+    NO_REFERENCE,
+    check_as_json,
+    check_line,
+    offer_lines,
+    version_as_json,
+    version_lines,
+)
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.learning.versions import TwinVersions, learning_folder
 
 
@@ -62,8 +69,8 @@ def learn(
         )
     listed = TwinVersions(folder, of.name).read()
     if json_output:
-        last_check = listed.check.model_dump() if listed.check else None
-        typer.echo(json.dumps({"version": version and version.model_dump(), "check": last_check}))
+        made, last_check = version and version_as_json(version, listed), listed.check and check_as_json(listed.check)
+        typer.echo(json.dumps({"version": made, "check": last_check}))
         return
     if check:
         typer.echo(check_line(listed.check) if listed.check else NO_REFERENCE)
@@ -82,7 +89,8 @@ def learning_tray(settings: Config, name: str | None) -> TrayConfig:
     learning = [tray for tray in settings.trays if tray.twin is None]
     chosen = [settings.tray(name)] if name else learning
     if len(chosen) > 1:
-        raise UserError(f"several trays learn their twins: choose one with --tray: {', '.join(t.name for t in chosen)}")
+        names = ", ".join(each.name for each in chosen)
+        raise UsageError(f"several trays learn their twins: choose one with --tray: {names}")
     if not chosen or chosen[0] not in learning:
         which = f"tray {chosen[0].name} names" if chosen else "every tray names"
         raise UserError(f"{settings.path}: {which} a twin: remove `twin` from [[tray]] to learn one")

@@ -52,8 +52,6 @@ MARGIN = 1.3
 """times the healthy running that the rate needs, because not all of it can be scored"""
 BETTER = 0.98
 """times the error of the twin in force: a new one must be below it"""
-REFERENCE_S = 24 * 3600.0
-"""of healthy running that a reference is learned from; until there is one, every change of speed is taken as healthy"""
 CHECKED_S = 4 * 3600.0
 """of healthy running over which the speeds of the fans are compared with the reference, the newest: longer than the
 air of a room varies, and not so long that a change is diluted by the time before it"""
@@ -219,11 +217,7 @@ class _Work:
 
     def _reference(self) -> Version | None:
         """The version that changes of the fans are measured against, if there is one."""
-        if self._before is None:
-            return None
-        named = next(version for version in self._listed.versions if version.name == self._before.reference)
-        is_tainted = overlap(named.learned_spans, self._listed.faulty)
-        return named if named.learned_s >= REFERENCE_S and not is_tainted else None
+        return self._listed.reference_of(self._before) if self._before else None
 
     def _made(
         self,

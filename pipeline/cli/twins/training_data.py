@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from pipeline.cli.options import fan_numbers
 from pipeline.devices.measured_table import RAD_S_PER_TABLE_UNIT
 from pipeline.devices.tacho_evidence import tacho_hints
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.optional_dependencies import how_to_install
 from pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
 from schemas.tacho import Tacho
@@ -179,12 +179,12 @@ def counting_tachos(windows_s: Sequence[float]) -> tuple[Tacho, ...]:
     """Tachos that count the usual two pulses a revolution over these windows.
 
     Raises:
-        UserError: a window is not possible.
+        UsageError: a window is not possible.
     """
     try:
         return tuple(Tacho(kind="count", window_s=window_s) for window_s in windows_s)
     except ValidationError as error:
-        raise UserError(f"--window: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+        raise UsageError(f"--window: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
 
 
 @contextmanager
@@ -258,7 +258,7 @@ def check_writable(output: Path, suffix: str) -> None:
         UserError: it cannot be written, or the name has another suffix.
     """
     if output.suffix != suffix:
-        raise UserError(f"{output}: name a file that ends in {suffix} with -o")
+        raise UsageError(f"{output}: name a file that ends in {suffix} with -o")
     make_folder(output.parent)
     existed = output.exists()
     try:

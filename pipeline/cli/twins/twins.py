@@ -10,9 +10,9 @@ import typer
 
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.cli.twins.learn import learning_tray
-from pipeline.cli.twins.versions_text import list_lines
+from pipeline.cli.twins.versions_text import list_as_json, list_lines
 from pipeline.config.loading import load_config
-from pipeline.errors import UserError
+from pipeline.errors import UsageError
 from pipeline.learning.versions import TimeSpan, TwinVersions, learning_folder
 from schemas.units import NS_PER_S
 
@@ -59,7 +59,7 @@ def twins(
     said: list[str] = []
     if faulty_from or faulty_to:
         if not (faulty_from and faulty_to):
-            raise UserError("a faulty time has two ends: give --faulty-from and --faulty-to")
+            raise UsageError("a faulty time has two ends: give --faulty-from and --faulty-to")
         was, now = versions.mark_faulty(_time_span(faulty_from, faulty_to))
         if was:
             replaced = f"{was} was learned from that time span; in force now: {now}; on a running site {CONSEQUENCE}"
@@ -71,7 +71,7 @@ def twins(
             said.append(f"{use} was learned from a time span that is marked as faulty: another version will replace it")
     listed = versions.read()
     if json_output:
-        typer.echo(json.dumps({"tray": of.name, **listed.model_dump(), "notes": said}))
+        typer.echo(json.dumps({"tray": of.name, **list_as_json(listed), "notes": said}))
         return
     for line in [*said, *list_lines(listed)]:
         typer.echo(line)
@@ -85,14 +85,14 @@ def _no_other(name: str) -> str:
 
 
 def _time_span(first: str, last: str) -> TimeSpan:
-    span = (_t_ns(first), _t_ns(last))
+    span = (_t_ns("--faulty-from", first), _t_ns("--faulty-to", last))
     if span[0] >= span[1]:
-        raise UserError(f"--faulty-from {first} is not before --faulty-to {last}")
+        raise UsageError(f"--faulty-from {first} is not before --faulty-to {last}")
     return span
 
 
-def _t_ns(text: str) -> int:
+def _t_ns(option: str, text: str) -> int:
     try:
         return round(datetime.fromisoformat(text).astimezone().timestamp() * NS_PER_S)
     except (ValueError, OverflowError, OSError) as error:
-        raise UserError(f"{text}: not a time: write 2026-11-24 or 2026-11-24T18:00") from error
+        raise UsageError(f"{option} {text}: not a time: write 2026-11-24 or 2026-11-24T18:00") from error

@@ -1,8 +1,9 @@
-"""The versions of a learned twin, for people."""
+"""The versions of a learned twin, for people and for machines."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from pipeline.learning.versions import Check, Drop, Version, VersionList
 from pipeline.recordings.dates import format_local
@@ -21,6 +22,26 @@ def list_lines(listed: VersionList) -> list[str]:
         lines += of_version if version in (listed.current, listed.versions[-1]) else of_version[:1]
     marked = (f"marked as faulty: {format_local(first)} to {format_local(last)}" for first, last in listed.faulty)
     return [*lines, *offer_lines(listed), *marked, *([check_line(listed.check)] if listed.check else [])]
+
+
+def list_as_json(listed: VersionList) -> dict[str, Any]:
+    """The list. What has no reference yet names none."""
+    return {
+        **listed.model_dump(),
+        "versions": [version_as_json(version, listed) for version in listed.versions],
+        "check": listed.check and check_as_json(listed.check),
+    }
+
+
+def version_as_json(version: Version, listed: VersionList) -> dict[str, Any]:
+    """One version of the list."""
+    reference = listed.reference_of(version)
+    return {**version.model_dump(), "reference": reference and reference.name}
+
+
+def check_as_json(check: Check) -> dict[str, Any]:
+    """A check of the fans."""
+    return {**check.model_dump(), "reference": check.reference or None}
 
 
 def check_line(check: Check) -> str:

@@ -23,7 +23,7 @@ from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOp
 from pipeline.cli.watch.request import ask
 from pipeline.config.loading import load_config
 from pipeline.config.models import Config
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.launch.judged_fans import JudgedChanges, JudgedFans, Unjudged
 from pipeline.launch.processes import process_list
 from pipeline.launch.site_state import site_states
@@ -98,13 +98,13 @@ def alarms(
     stop = threading.Event()
     if asked is None:
         if duration or comment or operator:
-            raise UserError("--for, --comment and --operator need an action: fantwin alarms ack TRAY FAN")
+            raise UsageError("--for, --comment and --operator need an action: fantwin alarms ack TRAY FAN")
         stop_on_signals(stop)
         with Bus(settings.bus, stop, listens=False) as bus:
             _list(bus, settings, stop, show_all=show_all, watch=watch, json_output=json_output)
         return
     if show_all or watch:
-        raise UserError(f"--all and --watch apply to the list only: leave them out with {asked}")
+        raise UsageError(f"--all and --watch apply to the list only: leave them out with {asked}")
     number, name = _named(settings, asked, tray, fan)
     request = Request(
         t_ns=time.time_ns(),
@@ -243,10 +243,10 @@ def _named(config: Config, asked: OperatorAction, tray: str | None, fan: int | N
     """The number of the fan, -1 for all, and the tray."""
     names = ", ".join(each.name for each in config.trays)
     if tray is None:
-        raise UserError(f"name a tray: fantwin alarms {asked} TRAY [FAN] (trays: {names})")
+        raise UsageError(f"name a tray: fantwin alarms {asked} TRAY [FAN] (trays: {names})")
     fans = config.tray(tray).fans
     if fan is not None and not 0 <= fan < fans:
-        raise UserError(f"fan {fan}: tray {tray} has fans 0 to {fans - 1}")
+        raise UsageError(f"fan {fan}: tray {tray} has fans 0 to {fans - 1}")
     return -1 if fan is None else fan, tray
 
 
@@ -254,10 +254,10 @@ def _seconds(asked: OperatorAction, duration: str | None) -> float:
     if duration is None:
         return 0.0
     if asked is not OperatorAction.SHELVE:
-        raise UserError(f"--for can be used with shelve only, not with {asked}")
+        raise UsageError(f"--for can be used with shelve only, not with {asked}")
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", duration)
     if not match or float(match[1]) == 0:
-        raise UserError(f"--for {duration}: give a time such as 90s, 30m, 8h or 2d")
+        raise UsageError(f"--for {duration}: give a time such as 90s, 30m, 8h or 2d")
     return float(match[1]) * _SECONDS[match[2]]
 
 

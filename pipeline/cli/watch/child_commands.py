@@ -10,8 +10,11 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import TracebackType
 from typing import Any, Self
+
+import typer
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config, TrayConfig
@@ -49,9 +52,26 @@ class Commands:
             Stopped: the user wants to stop.
             UserError: it failed, and has said why.
         """
+        self._run(words, STANDARD_ERROR if self.to_standard_error else None, site)
+
+    def check(self, *words: object) -> None:
+        """Run a command that prints what it finds; if it fails, that is the reason, and goes to standard error.
+
+        Raises as `run`.
+        """
+        with TemporaryFile("w+", encoding="utf-8") as findings:
+            failed = True
+            try:
+                self._run(words, findings)
+                failed = False
+            finally:
+                findings.seek(0)
+                typer.echo(findings.read(), nl=False, err=failed or self.to_standard_error)
+
+    def _run(self, words: Sequence[object], stdout: Any, site: RecordingSite | None = None) -> None:
         line = [str(word) for word in words]
         self.say(f"fantwin {shlex.join(line)}")
-        child = _started(line, stdout=STANDARD_ERROR if self.to_standard_error else None)
+        child = _started(line, stdout=stdout)
         self.wait(child, site)
         if child.returncode:
             raise UserError(f"`fantwin {line[0]}` failed (exit code {child.returncode}) and has said why")

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.bus.session import Bus
 from pipeline.config.models import Config, TrayConfig
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from schemas.codec import CodecError, decode, encode, type_name
 from schemas.messages import Command, Header, Health
 from schemas.topics import BY_NAME, alive_key, health_key, sessions_key, tray_key
@@ -33,31 +33,42 @@ def chosen_tray(config: Config, name: str | None) -> TrayConfig:
     """The tray that `--tray` names; the only one if it is not given.
 
     Raises:
-        UserError: there are several, or none of this name.
+        UsageError: there are several, or none of this name.
     """
     names = [each.name for each in config.trays]
     if name is None and len(names) > 1:
-        raise UserError(f"name the tray with --tray (trays: {', '.join(names)})")
+        raise UsageError(f"name the tray with --tray (trays: {', '.join(names)})")
     return config.tray(name or names[0])
 
 
-def command_of(tray: TrayConfig, values: dict[int, float], *, is_set_point: bool = False) -> Command:
-    """A command without a header. values: by fan; the other fans stay as they are.
+def command_of(
+    tray: TrayConfig, values: dict[int, float], *, is_set_point: bool = False, named: str = "--fan"
+) -> Command:
+    """A command without a header. values: by fan; the other fans stay as they are. named: how errors name a fan.
 
     Raises:
-        UserError: the tray has no such fan, or a value is outside its limits.
+        UsageError: the tray has no such fan, or a value is outside its limits.
     """
     wanted, unchanged = np.full((2, tray.fans), np.nan)
-    low, high = (-tray.speed_max, tray.speed_max) if is_set_point else (tray.command_min, tray.command_max)
     for fan, value in values.items():
         if not 0 <= fan < tray.fans:
-            raise UserError(f"--fan {fan}: tray {tray.name} has fans 0 to {tray.fans - 1}")
-        if not low <= value <= high:  # NaN is in no range
-            what = f"set-point, {tray.speed_unit}," if is_set_point else "command"
-            raise UserError(f"--fan {fan} {value:g}: the {what} must be within {low:g} to {high:g} of tray {tray.name}")
+            raise UsageError(f"{named} {fan}: tray {tray.name} has fans 0 to {tray.fans - 1}")
+        require_within_limits(tray, value, f"{named} {fan}", is_set_point=is_set_point)
         wanted[fan] = value * RAD_S_PER_UNIT[tray.speed_unit] if is_set_point else value
     columns = (unchanged, wanted) if is_set_point else (wanted, unchanged)
     return Command(fans=tray.fans, t_ns=time.time_ns(), command=columns[0], set_point_rad_s=columns[1])
+
+
+def require_within_limits(tray: TrayConfig, value: float, named: str, *, is_set_point: bool = False) -> None:
+    """Refuse a command, or a set-point in the tray's unit, outside its limits. named: the option that gave it.
+
+    Raises:
+        UsageError: it is outside.
+    """
+    low, high = (-tray.speed_max, tray.speed_max) if is_set_point else (tray.command_min, tray.command_max)
+    if not low <= value <= high:  # NaN is in no range
+        what = f"set-point, {tray.speed_unit}," if is_set_point else "command"
+        raise UsageError(f"{named} {value:g}: the {what} must be within {low:g} to {high:g} of tray {tray.name}")
 
 
 def share_note(tray: TrayConfig, command: float) -> str:

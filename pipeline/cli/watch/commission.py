@@ -26,7 +26,7 @@ from pipeline.config.loading import load_config
 from pipeline.config.models import Config, TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.config.twin_entry import with_twin
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.runtime.signals import stop_on_signals
 from pipeline.runtime.tray_twin import load_tray_twin
 from pipeline.selftest.scratch_site import FANTWIN
@@ -139,7 +139,7 @@ def _works(settings: Config, chosen: Sequence[TrayConfig], output: Path | None) 
         raise UserError(f"{settings.path}: {named} already: remove `twin`, then start again")
     if output and len(works) > 1:
         names = ", ".join(work.name for work in works)
-        raise UserError(f"-o names one twin, and trays {names} get one each: choose one with --tray, or leave out -o")
+        raise UsageError(f"-o names one twin, and trays {names} get one each: choose one with --tray, or leave out -o")
     return works
 
 
@@ -160,7 +160,7 @@ def _refuse_wrong_range(
     if sweep:
         range_within(tray, low, high, safe)
     elif given := [name for name, value in (("--low", low), ("--high", high), ("--safe", safe)) if value is not None]:
-        raise UserError(f"{given[0]} needs --sweep, which moves the fans: add --sweep")
+        raise UsageError(f"{given[0]} needs --sweep, which moves the fans: add --sweep")
 
 
 def _refuse_what_cannot_end_well(settings: Config, works: Sequence[TrayWork]) -> None:

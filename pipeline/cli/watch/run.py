@@ -14,7 +14,7 @@ import typer
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from pipeline.config.loading import load_config
 from pipeline.config.registry import STAGES
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.launch.event_log import without_figures
 from pipeline.launch.processes import EXIT_CANNOT_START
 from pipeline.runtime.notifier import starting
@@ -40,7 +40,7 @@ def run(
     Example: fantwin run scorer -c fantwin.toml
     """
     if stage not in STAGES:
-        raise UserError(f"no stage called {stage!r}; known: {', '.join(STAGES)}")
+        raise UsageError(f"no stage called {stage!r}; known: {', '.join(STAGES)}")
     settings = load_config(config, overrides or (), stages=(stage,))
     stop = threading.Event()
     stop_on_signals(stop)

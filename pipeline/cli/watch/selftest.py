@@ -16,7 +16,7 @@ from rich.text import Text
 
 from pipeline.cli.options import JsonOption
 from pipeline.config.models import nearest
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.selftest.scenarios import SCENARIOS, Scenario
 from pipeline.selftest.selftest import Row, run_scenarios
 
@@ -68,7 +68,7 @@ def _chosen(names: list[str] | tuple[str, ...]) -> list[Scenario]:
     by_name = {scenario.name: scenario for scenario in SCENARIOS}
     for name in names:
         if name not in by_name:
-            raise UserError(f"no scenario {name!r}{nearest(name, by_name)}")
+            raise UsageError(f"no scenario {name!r}{nearest(name, by_name)}")
     return [by_name[name] for name in names] or list(SCENARIOS)
 
 

@@ -15,11 +15,11 @@ import typer
 
 from pipeline.bus.session import Bus
 from pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of
+from pipeline.cli.watch.commanding import CommandSender, chosen_tray, command_of, require_within_limits
 from pipeline.cli.watch.excitation import Excitation, Observed, StoppedError
 from pipeline.config.loading import load_config
 from pipeline.config.models import TrayConfig
-from pipeline.errors import UserError
+from pipeline.errors import UsageError, UserError
 from pipeline.runtime.signals import stop_on_signals
 from schemas.codec import CodecError, decode
 from schemas.messages import Raw
@@ -99,14 +99,14 @@ def range_within(tray: TrayConfig, low: float | None, high: float | None, safe: 
     """The commands of a sweep, lowest and highest: the limits of the tray where none is given.
 
     Raises:
-        UserError: one of them, or the safe command, is outside those limits.
+        UsageError: one of them, or the safe command, is outside those limits.
     """
     lowest, highest = tray.command_min if low is None else low, tray.command_max if high is None else high
     if not tray.command_min <= lowest < highest <= tray.command_max:
         limits = f"{tray.command_min:g} to {tray.command_max:g}"
-        raise UserError(f"--low {lowest:g} --high {highest:g}: name a range within {limits} of tray {tray.name}")
+        raise UsageError(f"--low {lowest:g} --high {highest:g}: name a range within {limits} of tray {tray.name}")
     if safe is not None:
-        command_of(tray, {0: safe})
+        require_within_limits(tray, safe, "--safe")
     return lowest, highest
 
 
@@ -125,9 +125,9 @@ def _fans(words: str, tray: TrayConfig) -> list[int]:
     try:
         numbers = sorted({int(word) for word in words.split(",")})
     except ValueError as error:
-        raise UserError(f"--fans {words}: write all, or numbers with commas: --fans 0,2") from error
+        raise UsageError(f"--fans {words}: write all, or numbers with commas: --fans 0,2") from error
     if not all(0 <= number < tray.fans for number in numbers):
-        raise UserError(f"--fans {words}: tray {tray.name} has fans 0 to {tray.fans - 1}")
+        raise UsageError(f"--fans {words}: tray {tray.name} has fans 0 to {tray.fans - 1}")
     return numbers
 
 
@@ -155,7 +155,7 @@ class _BusLine:
     def send(self, values: Mapping[int, float]) -> None:
         """Send commands, by fan."""
         self._sender.stop = self.stop
-        self._sender.send(command_of(self._tray, dict(values)))
+        self._sender.send(command_of(self._tray, dict(values), named="fan"))
         self._sender.confirm()
         self._take()
         self._samples = self._samples[-1:]  # the speed from which the step begins

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.cli.watch.child_commands import Commands
 from pipeline.config.models import TrayConfig
 from pipeline.learning.ordinary_operation import OrdinaryOperation
 from schemas.messages import Raw
 from schemas.units import NS_PER_S
 from tests.support.fantwin_command import error_of
+from tests.support.running_chain import fantwin
 
 OTHER = '[[tray]]\nname = "b"\nfans = 1\nport = "other"\ncommand_max = 0.1'
 THIRD = '[[tray]]\nname = "kept"\nfans = 1\nport = "third"'
@@ -87,7 +90,7 @@ def test_a_command_that_flickers_between_two_ranges_does_not_change_and_gaps_do_
         ("", OTHER, ("--tray", "c"), "fantwin.toml: no tray called 'c'; known: tray1, b"),
         ('twin = "old.onnx"', OTHER, ("--tray", "tray1"), "tray tray1 has twin old.onnx already: remove `twin`"),
         ("", OTHER, ("--sweep", "--low", "0.2"), "--low 0.2 --high 0.1: name a range within 0 to 0.1 of tray b"),
-        ("", OTHER, ("--sweep", "--safe", "0.5"), "the command must be within 0 to 0.1 of tray b"),
+        ("", OTHER, ("--sweep", "--safe", "0.5"), "--safe 0.5: the command must be within 0 to 0.1 of tray b"),
         ("", f"{OTHER}\n{THIRD}", (), "kept.onnx: exists already: name another with --tray kept -o"),
         ("", "", ("-o", "kept.onnx"), "kept.onnx: exists already: name another with -o"),
         ("", "", ("-o", "twin.bin"), "name a file that ends in .onnx with -o"),
@@ -106,3 +109,22 @@ def test_what_cannot_end_well_is_refused_before_anything_is_recorded(
     assert error in error_of("commission", *words)
     assert Path("fantwin.toml").read_text(encoding="utf-8") == text
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fantwin.toml", "kept.onnx"]
+
+
+def test_why_its_doctor_step_fails_is_on_standard_error(tmp_path: Path, endpoint: str) -> None:
+    configuration = tmp_path / "fantwin.toml"
+    text = f'[bus]\nendpoint = "{endpoint}"\n[[tray]]\nname = "tray1"\nfans = 1\nport = "none"\n'
+    configuration.write_text(text, encoding="utf-8")
+    done = fantwin("commission", "-c", configuration)
+    assert done.returncode == 1
+    assert "FIX  acquisition/tray1: " in done.stderr
+    assert done.stderr.rstrip().endswith("fantwin: `fantwin doctor` failed (exit code 1) and has said why")
+    (line,) = done.stdout.splitlines()
+    assert line.startswith("fantwin doctor -c ")
+
+
+def test_what_its_doctor_step_finds_in_order_is_on_standard_output(capfd: pytest.CaptureFixture[str]) -> None:
+    Commands(threading.Event(), print, to_standard_error=False).check("doctor")
+    printed = capfd.readouterr()
+    assert "ok   Python " in printed.out
+    assert printed.err == ""

@@ -130,7 +130,8 @@ def played(tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Pl
     monkeypatch.setattr(commission, "stop_on_signals", lambda _stop: None)  # this process has its own
     monkeypatch.setattr(commissioning, "RecordingSite", PlayedSite)
     monkeypatch.setattr(commissioning, "time", SimpleNamespace(monotonic=lambda: PlayedSite.now_s))
-    monkeypatch.setattr(Commands, "run", played.run)
+    for name in ("run", "check"):
+        monkeypatch.setattr(Commands, name, played.run)
     return played
 
 

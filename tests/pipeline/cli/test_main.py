@@ -101,10 +101,8 @@ def assert_one_line(done: subprocess.CompletedProcess[str], code: int, words: Se
     ("command", "words"),
     [
         ("up -c none.toml", ["none.toml", "cannot read the configuration", "-c FILE"]),
-        (f"run scorr -c {CONFIG}", ["'scorr'", "known: acquisition"]),
         (f"run scorer -c {CONFIG} --set scorer.on_dealy_s=1", ["scorer.on_dealy_s", "did you mean 'on_delay_s'"]),
         (f"run acquisition -c {CONFIG} --set tray.0.port=''", ["port is missing", "/dev/ttyUSB0"]),
-        (f"run acquisition -c {CONFIG} --tray nobody", ["no tray called 'nobody'", "tray1"]),
         (f"run twin_integrator -c {CONFIG} --set tray.0.twin=none.onnx", ["none.onnx", "correct [[tray]] twin"]),
         (f"run twin_integrator -c {CONFIG} --set tray.0.fans=3", ["a twin of 8 fans", "choose a twin that fits"]),
         (f"run scorer -c {CONFIG} --set bus.endpoint=nowhere", ["bus.endpoint = 'nowhere'", "<protocol>/<address>"]),
@@ -115,13 +113,81 @@ def assert_one_line(done: subprocess.CompletedProcess[str], code: int, words: Se
         (f"evaluate {DEMO / 'twin.onnx'} {README}", ["not a recording"]),
         ("picture none.rrd", ["none.rrd", "no such file"]),
         ("import none.csv --time t:s --command u --speed y:rpm -o x.mcap", ["none.csv", "cannot read the table"]),
-        ("simulate --fans 99", ["fans = 99", "1 to 64"]),
         ("demo -o /proc/demo", ["/proc/demo", "name another with -o"]),
     ],
 )
 def test_a_mistake_is_one_line_with_what_to_do(command, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert_one_line(fantwin(*command.split()), 1, words)
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("alarms CONFIG --for 5m", "--for, --comment and --operator need an action"),
+        ("alarms shelve tray1 3 CONFIG --for soon", "--for soon: give a time such as 90s"),
+        ("alarms ack tray1 9 CONFIG", "fan 9: tray tray1 has fans 0 to 7"),
+        ("calibrate TWIN RECORDING", "declare a rate: --false-alarms-per-day"),
+        ("calibrate TWIN RECORDING RECORDING --false-alarms-per-day 1", "named twice"),
+        ("command CONFIG --fan 9 0.5", "--fan 9: tray tray1 has fans 0 to 7"),
+        ("command CONFIG --fan 0 2", "--fan 0 2: the command must be within 0 to 1"),
+        ("commission CONFIG --set tray.0.twin=a --tray nobody", "no tray called 'nobody'; known: tray1"),
+        ("compare RECORDING --model spline", "--model spline: no such model"),
+        ("evaluate TWIN RECORDING --rate fast", "--rate fast: give a rate in Hz"),
+        ("evaluate TWIN RECORDING --fans 3,1", "--fans 3,1: give each fan once"),
+        ("export RECORDING --to csv -o table.parquet", "table.parquet: name a file that ends in .csv"),
+        ("identify RECORDING --window -1", "--window: "),
+        ("import x.csv --time t --period 1s --command u --speed y -o y.mcap", "leave out --time or --period"),
+        ("import x.csv --time t --command u --speed y -o y.mcap --tray a/b", "--tray a/b: use letters"),
+        ("learn TRAYS", "choose one with --tray: a, b"),
+        ("plot RECORDING --unit mph", "--unit mph: no such unit"),
+        ("replay RECORDING --rate quick", "--rate quick: give a number above 0"),
+        ("run scorr CONFIG", "no stage called 'scorr'; known: acquisition"),
+        ("run acquisition CONFIG --tray nobody", "no tray called 'nobody'"),
+        ("run acquisition TRAYS", "say which with --tray (one of a, b)"),
+        ("selftest kil", "no scenario 'kil'"),
+        ("simulate --fans 99", "fans = 99; give one from 1 to 64"),
+        ("simulate --fault melt:fan=1", "melt"),
+        ("simulate --recording x.mcap", "--recording needs --duration"),
+        ("simulate --tacho count --window -1", "--window -1.0: "),
+        ("sweep CONFIG --safe 2", "--safe 2: the command must be within 0 to 1"),
+        ("sweep CONFIG --low 0.9 --high 0.1", "--low 0.9 --high 0.1: name a range"),
+        ("sweep TRAYS", "name the tray with --tray (trays: a, b)"),
+        ("train RECORDING -o twin.bin", "twin.bin: name a file that ends in .onnx"),
+        ("twins TRAYS --tray a --faulty-from 2026-11-24", "give --faulty-from and --faulty-to"),
+        ("twins TRAYS --tray a --faulty-from 2026-11-24 --faulty-to then", "--faulty-to then: not a time"),
+        ("up CONFIG --set scorer", "--set scorer: write KEY=VALUE"),
+    ],
+)
+def test_a_wrong_option_is_one_line_and_wrong_usage(
+    command: str,
+    words: str,
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    trays = tmp_path / "trays.toml"
+    trays.write_text("".join(f'[[tray]]\nname = "{name}"\nfans = 1\nport = "{name}"\n' for name in "ab"))
+    (tmp_path / "x.csv").write_text("t,u,y\n0,1,2\n")
+    stand_for = {
+        "RECORDING": [recording],
+        "TWIN": [DEMO / "twin.onnx"],
+        "CONFIG": ["-c", CONFIG],
+        "TRAYS": ["-c", trays],
+    }
+    arguments = [str(each) for word in command.split() for each in stand_for.get(word, [word])]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(command_line, "_register", lambda _: None)  # they are registered already
+    monkeypatch.setattr(sys, "argv", ["fantwin", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    printed = capsys.readouterr()
+    assert ended.value.code == 2, printed.err
+    assert words in printed.err
+    assert printed.err.startswith("fantwin: ")
+    assert printed.err.count("\n") == 1
+    assert printed.out == ""
 
 
 @pytest.mark.parametrize(

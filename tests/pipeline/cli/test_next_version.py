@@ -32,7 +32,7 @@ def made(folder: Path) -> Version:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The learning folder of a tray with two versions, and then with fans that have changed."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(next_version, "REFERENCE_S", 300.0)
+    patch.setattr("pipeline.learning.versions.REFERENCE_S", 300.0)
     patch.setattr(next_version, "CHECKED_S", 100.0)
     patch.setattr(next_version, "LEAST_CHECKED_S", 60.0)
     folder = tmp_path_factory.mktemp("site") / "runs" / "learned" / "tray1"

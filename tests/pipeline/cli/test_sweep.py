@@ -140,7 +140,7 @@ def test_where_something_else_sets_the_command_it_says_so() -> None:
         ("--high 255", "name a range within 0 to 1 of tray tray1"),
         ("--fans 0,8", "tray tray1 has fans 0 to 7"),
         ("--fans both", "write all, or numbers with commas"),
-        ("--safe 2", "the command must be within 0 to 1"),
+        ("--safe 2", "--safe 2: the command must be within 0 to 1"),
     ],
 )
 def test_what_the_tray_cannot_do_is_refused_in_one_line(words: str, expected: str) -> None:

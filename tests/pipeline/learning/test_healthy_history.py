@@ -144,6 +144,22 @@ def test_the_oldest_are_deleted_but_for_the_first(tmp_path: Path) -> None:
     assert [first for first, _ in kept_s(tmp_path)] == [0, 3000, 4000]
 
 
+@pytest.mark.parametrize(
+    ("excluded_s", "kept"),
+    [((1900, 4900), [0, 1000, 3000, 4000, 5000]), ((0, 3900), [0, 2000, 3000, 4000, 5000])],
+)
+def test_excluded_recordings_take_no_place_of_others_and_of_them_as_much_is_kept(
+    tmp_path: Path, excluded_s: tuple[int, int], kept: list[int]
+) -> None:
+    history = history_in(tmp_path, hold_back_s=0.0, kept_s=650.0)
+    first_s, last_s = excluded_s
+    history.exclude([((START_S + first_s) * NS_PER_S, (START_S + last_s) * NS_PER_S)])
+    for second in range(0, 6000, 1000):
+        add(history, second, second + 300)
+    history.close()
+    assert [first for first, _ in kept_s(tmp_path)] == kept
+
+
 def test_what_a_killed_process_left_is_repaired(tmp_path: Path) -> None:
     killed = history_in(tmp_path, hold_back_s=0.0)
     add(killed, 0, 300)

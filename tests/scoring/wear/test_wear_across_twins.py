@@ -20,9 +20,12 @@ from pipeline.config.loading import load_config
 from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.stage import Context, load_stage
 from pipeline.runtime.tray_twin import load_tray_twin
+from schemas.blocks import select
 from schemas.messages import Action, Alarm, Header, Message, ModelCard, ScorerSnapshot
 from schemas.topics import tray_key
-from scoring.diagnosis.regression_window import HealthyBalance
+from schemas.units import NS_PER_S
+from scoring.diagnosis.regression_window import HealthyBalance, Window
+from scoring.wear.reidentification import ParameterShift, parameter_shifts
 from tests.scoring.wear.test_wear_monitor import DAY_NS, GROWTH_PER_DAY, HEALTHY, WORN, burst
 from tests.support.fantwin_command import fantwin
 from tests.support.scored_blocks import (
@@ -238,6 +241,27 @@ def test_new_limits_for_the_same_twin_make_no_step(tmp_path: Path) -> None:
     assert min(found["balance"]["series"]["t_ns"]) < TAKEOVER_NS, "the baselines go on"
     for parameter in OF_REFERENCE:
         assert abs(step_in_errors(found[parameter], 0.0)) < 1.0, parameter
+
+
+def test_no_point_looks_back_across_a_takeover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Limits that are new take over in the middle of a burst; the fans stay commissioned, and a point is due."""
+    tray, twin = Tray(tmp_path, 0.0), first_twin(tmp_path)
+    next_twin = twin_of(tmp_path / "tray1-2.onnx", twin.balances, 0.1)
+    tray.live(twin, 0.0, 1.0)
+    lengths_s: list[float] = []
+
+    def recorded(window: Window, healthy: HealthyBalance) -> tuple[ParameterShift, ...]:
+        lengths_s.append(len(window.command) * window.period_s)
+        return parameter_shifts(window, healthy)
+
+    monkeypatch.setattr("scoring.wear.wear_monitor.parameter_shifts", recorded)
+    block = burst(24, 0.0, swing=0.0, by=twin.balances, twin=twin.card.twin)
+    since_s = (block.t_ns - block.t_ns[0]) / NS_PER_S
+    tray.core.step(select(block, since_s < 4.0))
+    tray.core.step(next_twin.card)
+    tray.core.step(replace(select(block, since_s >= 4.0), twin=next_twin.card.twin))
+    assert lengths_s, "points are taken"
+    assert max(lengths_s) < 10.0 - 4.0 + 0.5, "of the time since the takeover, 10 s after the beginning of the burst"
 
 
 @pytest.fixture
