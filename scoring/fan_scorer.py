@@ -18,23 +18,21 @@ import numpy as np
 from schemas.messages import Array
 from schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from schemas.units import NS_PER_S
-from scoring.baseline.baseline import MIN_STEADY_READINGS
-from scoring.baseline.intervals import Intervals, first_end
 from scoring.baseline.movement import Movement
-from scoring.detectors.detector import Detector, DetectorContext, DetectorInput, Signal
+from scoring.detectors.detector import Detector, DetectorContext, Signal
 from scoring.detectors.motion import HealthyMotion, Motion
 from scoring.detectors.smoothed import SmoothedSettings
-from scoring.detectors.state import restore_column
 from scoring.detectors.table import rows
 from scoring.former_snapshot_keys import current_fan_scorer
 from scoring.gaps import Gaps
+from scoring.interval_scorer import IntervalScorer, detect
 from scoring.limits import Limits
 from scoring.piece import Piece
-from scoring.residual import JoinedResidual, Residual, SampledResidual, ScoredResidual
+from scoring.residual import Residual
+from scoring.residual_samples import JoinedResidual
 from scoring.samples import Samples
 from scoring.scored_block import Observation, ScoredBlock
 
-HALF_LIMIT = 0.5  # once a fan is commissioned, baselines learn only below this score
 RESIDUALS: tuple[Signal, ...] = ("speed", "balance")
 INPUTS: tuple[Signal, ...] = (*RESIDUALS, "tacho")
 
@@ -70,8 +68,6 @@ class FanScorer:
             source: residual.context(fans, capped=not for_calibration) for source, residual in self.residuals.items()
         }
         of_each_fan = tacho_of_each_fan(tachos, fans)
-        self._counts = np.array([allows_for_counts and tacho.held_s > 0.0 for tacho in of_each_fan])
-        """(fans,) whose readings go up and down in steps as the speed changes"""
         of_tacho = DetectorContext(
             fans=fans,
             smoothing_s=limits.timing.smoothing_s,
@@ -95,29 +91,29 @@ class FanScorer:
             for source in INPUTS
         }
         """the detectors of each input, and their places in the table"""
-        self._in_use: list[Signal] = [source for source in RESIDUALS if self._detectors_of[source]]
-        """residuals with detectors"""
+        self._movement = Movement(fans) if skips_transients else None
+        self._intervals = IntervalScorer(
+            fans,
+            self.residuals,
+            {source: self._detectors_of[source] for source in RESIDUALS},
+            interval_ns=max(1, round(limits.timing.baseline_s * NS_PER_S)),
+            counts=np.array([allows_for_counts and tacho.held_s > 0.0 for tacho in of_each_fan]),
+            held_ns=np.array([tacho.held_s * NS_PER_S for tacho in of_each_fan]) if begins_still else None,
+            movement=self._movement,
+        )
         self._judges_rest = any(row.only_at_rest and row.name in self.detectors for row in self._rows)
         self._motion = Motion(fans)
         self._healthy_motion = HealthyMotion(fans) if limits_motion else None
-        self._movement = Movement(fans) if skips_transients else None
-        self._held_ns = np.array([tacho.held_s * NS_PER_S for tacho in of_each_fan]) if begins_still else None
         self._gaps = Gaps(len(INPUTS), fans) if forgets_over_gaps else None
         self._memories = self._memories_ns()
         self._shortest_memory_ns = min(memory_ns for _, _, memory_ns in self._memories)
-        self._below_half_limit = np.ones(fans, np.bool_)
-        """(fans,) whether every statistic stayed below half of its limit in the present interval so far"""
-        self._within_limit = np.ones(fans, np.bool_)
-        """(fans,) whether none exceeded its limit"""
         self.origin_t_ns: int | None = None
-        self._interval = 0
-        self._interval_ns = max(1, round(limits.timing.baseline_s * NS_PER_S))
         self._observations: list[Observation] | None = [] if for_calibration else None
 
     @property
     def held_baselines(self) -> Array:
         """(fans,) whether a baseline of a scored residual is held at its adaptation limit."""
-        at_limit = [self.residuals[source].baseline.is_at_limit for source in self._in_use]
+        at_limit = [self.residuals[source].baseline.is_at_limit for source in self._intervals.in_use]
         return np.any(at_limit, axis=0)
 
     def update(self, block: Samples) -> ScoredBlock:
@@ -147,7 +143,7 @@ class FanScorer:
     ) -> Iterator[slice]:
         if self.origin_t_ns is None:
             self.origin_t_ns = int(block.t_ns[0])
-        of_samples = (block.t_ns - self.origin_t_ns) // self._interval_ns
+        of_samples = (block.t_ns - self.origin_t_ns) // self._intervals.interval_ns
         missing_ns = self._missing_ns(block)
         after_gap: Array = np.any(missing_ns > self._shortest_memory_ns, axis=(1, 2))
         for first, last in _parts(after_gap[1:]):
@@ -156,25 +152,15 @@ class FanScorer:
             piece = self._piece(block.rows(slice(first, last)), scores.rows(slice(first, last)))
             numbers, begin = of_samples[first:last], 0
             while begin < len(numbers):
-                if numbers[begin] != self._interval:
-                    self._end_interval(block.period_ns)
-                    self._interval = int(numbers[begin])
-                intervals = Intervals.of(numbers[begin:], self._interval_ns // block.period_ns)
-                if may_span is not None and not may_span():
-                    intervals = intervals.first(1)
-                end = begin + self._score(piece, begin, intervals, None if may_span is None else 1.0)
-                self._interval = int(numbers[end - 1])
-                yield slice(first + begin, first + end)
-                begin = end
+                spans, highest = (True, None) if may_span is None else (may_span(), 1.0)
+                rows = self._intervals.score(piece, begin, numbers[begin:], spans=spans, highest=highest)
+                yield slice(first + begin, first + begin + rows)
+                begin += rows
             self._complete(piece)
 
     def learn_nothing(self, fans: Array) -> None:
-        """The baselines of some fans, (fans,) of bool, learn nothing from the present interval: those with an alarm. A
-        fan without a baseline gets one.
-        """
-        if fans.any():
-            has_one = np.any([self.residuals[source].baseline.is_set for source in RESIDUALS], axis=0)
-            self._below_half_limit[fans & has_one] = self._within_limit[fans & has_one] = False
+        """See IntervalScorer."""
+        self._intervals.learn_nothing(fans)
 
     def observed(self) -> list[Observation]:
         """Observations since the last call, in the order of their samples; only if `for_calibration`."""
@@ -191,7 +177,7 @@ class FanScorer:
             detector.reset(fans)
         if self._movement:
             self._movement.restart(fans)
-        self._below_half_limit[fans] = self._within_limit[fans] = True
+        self._intervals.restart(fans)
 
     @property
     def longest_memory_ns(self) -> int:
@@ -241,16 +227,6 @@ class FanScorer:
         ]
         adaptation = self.limits.residual(source).baseline.adaptation_limit_sigmas
         return adaptation + min(limits, default=np.inf)
-
-    def _end_interval(self, period_ns: int) -> None:
-        expected = self._interval_ns // period_ns
-        moving = self._movement.end_interval(self._commissioning) if self._movement else None
-        few_readings = None
-        if self._held_ns is not None:
-            few_readings = self._interval_ns / np.maximum(self._held_ns, period_ns) < MIN_STEADY_READINGS
-        for residual in self.residuals.values():
-            residual.end_interval(expected, self._within_limit, self._below_half_limit, moving, few_readings)
-        self._below_half_limit[:] = self._within_limit[:] = True
 
     def _memories_ns(self) -> list[tuple[int, Callable[[Array], None], int]]:
         """What is forgotten over a gap: the number of its input, how to start it again, and its memory, ns."""
@@ -302,118 +278,8 @@ class FanScorer:
             scored={source: [] for source in RESIDUALS},
             scores=scores,
         )
-        self._detect("tacho", piece.given(samples.alive), piece.ratios)
+        detect(self._detectors_of["tacho"], piece.given(samples.alive), piece.ratios)
         return piece
-
-    def _detect(self, source: Signal, given: DetectorInput, ratios: Array) -> None:
-        """Write the ratios of the detectors of one input into (rows of the table, n, fans), where it is valid."""
-        for number, detector in self._detectors_of[source]:
-            np.copyto(ratios[number], detector.update(given), where=given.valid)
-
-    def _score(self, piece: Piece, begin: int, intervals: Intervals, highest: float | None) -> int:
-        """Score the samples of the present interval, and of later ones, as far as they can be scored together.
-
-        begin: the row of the first. highest: the score that ends it, if it is exceeded in an interval: None for any.
-        Returns the number of rows.
-
-        What baselines learn from an interval depends on its scores, and later scores on what they learn. So it is
-        guessed that they learn from each interval, and the samples are scored again with what the scores say, until
-        it stays: the first interval is right at once, and each time at least one more.
-        """
-        sampled, moved = self._sampled(piece, begin, intervals)
-        together = self._together(sampled, intervals)
-        if together < len(intervals):
-            intervals = intervals.first(together)
-            sampled, moved = self._sampled(piece, begin, intervals)
-        below_half_limit = np.ones((len(intervals), len(self._below_half_limit)), np.bool_)
-        before = self._detector_columns() if together > 1 else []
-        while True:
-            of, score = self._scored(piece, slice(begin, begin + intervals.rows), sampled, below_half_limit)
-            largest = intervals.largest(score)
-            guessed, below_half_limit = below_half_limit, largest <= HALF_LIMIT
-            below_half_limit[0] &= self._below_half_limit
-            if not np.array_equal(guessed[:-1], below_half_limit[:-1]):
-                self._restore_detectors(before)
-                continue
-            ends = len(intervals) if highest is None else first_end(largest.max(axis=1) > highest)
-            if ends == len(intervals):
-                break
-            self._restore_detectors(before)
-            intervals = intervals.first(ends)
-            sampled, moved = self._sampled(piece, begin, intervals)
-            below_half_limit = below_half_limit[:ends]
-        within_limit = largest <= 1.0
-        within_limit[0] &= self._within_limit
-        self._below_half_limit, self._within_limit = below_half_limit[-1], within_limit[-1]
-        for source, residual in self.residuals.items():
-            residual.take(sampled[source], of[source])
-            piece.scored[source].append(of[source])
-        if self._movement and moved is not None:
-            self._movement.take(moved, self._commissioning)
-        return intervals.rows
-
-    @property
-    def _commissioning(self) -> Array:
-        """(fans,) whether the baseline of a residual is being commissioned."""
-        speed, balance = (self.residuals[source].baseline for source in RESIDUALS)
-        return speed.is_commissioning | balance.is_commissioning
-
-    def _together(self, sampled: Mapping[Signal, SampledResidual], intervals: Intervals) -> int:
-        """How many of the intervals can be scored together."""
-        if len(intervals) == 1:
-            return 1
-        return min(residual.runs_up_to(sampled[source]) for source, residual in self.residuals.items())
-
-    def _detector_columns(self) -> list[dict[str, Array]]:
-        """Copies of the state of the detectors of residuals."""
-        return [
-            {name: column.copy() for name, column in detector.columns().items()}
-            for source in RESIDUALS
-            for _, detector in self._detectors_of[source]
-        ]
-
-    def _restore_detectors(self, states: Sequence[Mapping[str, Array]]) -> None:
-        detectors = [detector for source in RESIDUALS for _, detector in self._detectors_of[source]]
-        for detector, state in zip(detectors, states, strict=True):
-            detector.restore(state)
-
-    def _sampled(
-        self, piece: Piece, begin: int, intervals: Intervals
-    ) -> tuple[dict[Signal, SampledResidual], Array | None]:
-        """The residuals at these samples, and the sums of the fans' movement."""
-        rows, moved, moving = slice(begin, begin + intervals.rows), None, None
-        if self._movement and piece.movement is not None:
-            moved = self._movement.over(piece.movement[:, rows], intervals)
-            moving = self._movement.moving(moved, self._commissioning)
-        return {
-            source: residual.over(piece.residuals[source].rows(rows), intervals, moving)
-            for source, residual in self.residuals.items()
-        }, moved
-
-    def _scored(
-        self, piece: Piece, rows: slice, sampled: Mapping[Signal, SampledResidual], below_half_limit: Array
-    ) -> tuple[dict[Signal, ScoredResidual], Array]:
-        """The residuals less their baselines, and (n, fans) the score; both also in the piece."""
-        samples, scores, ratios = piece.samples, piece.scores, piece.ratios[:, rows]
-        alive, at_rest = samples.alive[rows], piece.at_rest[rows]
-        scored_now = np.zeros(alive.shape, np.bool_)
-        found: dict[Signal, ScoredResidual] = {}
-        for source, residual in self.residuals.items():
-            found[source] = of = residual.score(sampled[source], below_half_limit)
-            given = piece.given(of.scored, rows, self._unsteadiness(of), of.persistent)
-            self._detect(source, given, ratios)
-            if source in self._in_use:
-                scored_now |= of.scored
-        score = np.fmax.reduce(ratios, axis=0, initial=0.0)
-        has_score = scored_now | (alive & (score > 1.0))
-        scores.score[rows] = np.where(has_score, score, np.nan)
-        scores.judged[rows] = has_score | (alive & at_rest)
-        scores.ratios[rows] = ratios.swapaxes(0, 1)
-        if at_rest.any():
-            for number, row in enumerate(self._rows):
-                if row.source == "tacho" and not row.comes_first:
-                    scores.ratios[rows, number][at_rest] = np.nan
-        return found, score
 
     def _complete(self, piece: Piece) -> None:
         scored: dict[Signal, JoinedResidual] = {
@@ -422,21 +288,15 @@ class FanScorer:
         smoothed: dict[Signal, Array] = {
             source: self.residuals[source].smooth(of, piece.period_s) for source, of in scored.items()
         }
-        piece.complete(scored, smoothed, self._in_use, self.limits.timing.baseline_s)
+        piece.complete(scored, smoothed, self._intervals.in_use, self.limits.timing.baseline_s)
         if self._observations is not None:
             self._observations.append(piece.observation(scored))
-
-    def _unsteadiness(self, of: ScoredResidual) -> Array:
-        """(n, fans) the residual in standard deviations; of a tacho that counts, in those of this motion."""
-        return np.where(self._counts, of.persistent, of.standardised) if self._counts.any() else of.standardised
 
     def snapshot(self) -> dict[str, Any]:
         """The state as JSON can hold it."""
         return {
             "origin_t_ns": self.origin_t_ns,
-            "interval": self._interval,
-            "below_half_limit": self._below_half_limit.tolist(),
-            "within_limit": self._within_limit.tolist(),
+            **self._intervals.snapshot(),
             "motion": self._motion.snapshot(),
             **({"healthy_motion": self._healthy_motion.snapshot()} if self._healthy_motion else {}),
             **({"movement": self._movement.snapshot()} if self._movement else {}),
@@ -461,8 +321,7 @@ class FanScorer:
             raise
 
     def _restore(self, state: Mapping[str, Any]) -> None:
-        for flags, name in ((self._below_half_limit, "below_half_limit"), (self._within_limit, "within_limit")):
-            restore_column(flags, name, state[name])
+        self._intervals.restore(state)
         self._motion.restore(state["motion"])
         if self._healthy_motion and "healthy_motion" in state:
             self._healthy_motion.restore(state["healthy_motion"])
@@ -477,7 +336,6 @@ class FanScorer:
                 detector.restore(state["detectors"][name])
         origin_t_ns = state["origin_t_ns"]
         self.origin_t_ns = None if origin_t_ns is None else int(origin_t_ns)
-        self._interval = int(state["interval"])
 
 
 def _parts(ends: Array) -> Iterator[tuple[int, int]]:

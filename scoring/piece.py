@@ -14,7 +14,7 @@ import numpy as np
 from schemas.messages import Array, Statistic
 from schemas.units import NS_PER_S
 from scoring.detectors.detector import DetectorInput, DetectorRow, Signal
-from scoring.residual import JoinedResidual, ResidualSamples, ScoredResidual
+from scoring.residual_samples import JoinedResidual, ResidualSamples, ScoredResidual
 from scoring.samples import Samples
 from scoring.scored_block import Observation, ScoredBlock
 

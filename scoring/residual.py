@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from schemas.messages import Array
 from scoring.baseline.baseline import Baseline, BaselineState, IntervalSums
 from scoring.baseline.healthy_residual import FanOffsets
 from scoring.baseline.intervals import Intervals
-from scoring.baseline.shared_offset import LEAST_FANS, SharedOffset, SharedOverIntervals
+from scoring.baseline.shared_offset import LEAST_FANS, SharedOffset
 from scoring.baseline.speed_scaling import speed_scaling
 from scoring.detectors.detector import DetectorContext, Signal
 from scoring.detectors.deviation import smoothed_deviation
@@ -20,111 +19,13 @@ from scoring.detectors.drift import DEFAULT_REFERENCE_SIGMAS, DriftSettings
 from scoring.detectors.low_pass import LowPass
 from scoring.detectors.smoothed import SmoothedSettings
 from scoring.limits import Limits
+from scoring.residual_samples import JOINED, JoinedResidual, ResidualSamples, SampledResidual, ScoredResidual
 from scoring.unseen_error import RANGE_STDS
 
 CLIP_LIMITS = 2.0  # residuals are clipped to this many limits of the smoothed one: one outlier raises no alarm
 MIN_CLIP_STDS = 5.0
 SEEN_SIGMAS = 0.5  # where its own error may be larger, baselines do not learn
 LARGEST_SIGMAS = 1e6  # so that sums and squares stay finite
-
-
-@dataclass(frozen=True, eq=False)
-class ResidualSamples:
-    """A residual at some samples, (n, fans) each, and all that follows from it without the baselines."""
-
-    valid: Array
-    residual: Array
-    """less the expected one, sigma"""
-    expected: Array
-    """the mean healthy residual at these speeds, sigma"""
-    scaling: Array
-    """the baseline at these speeds, relative to that at the reference speed"""
-    std: Array
-    """standard deviation of the healthy residual, sigma"""
-    low_frequency_std: Array
-    """of its low frequencies at this speed and in this motion, relative to their median; more where the twin may be
-    wrong because it was not trained there"""
-    seen: Array
-    """where the twin was trained: elsewhere its own error is no offset of the fan to be learned"""
-    clip: float
-    """how far samples count, standard deviations"""
-    reach: Array
-    """how far from the baseline they are learned, sigma"""
-    speed_sigmas: Array
-    """the speed over sigma, with its sign: a shared offset is in proportion to it"""
-
-    def rows(self, rows: slice) -> ResidualSamples:
-        """Some of the samples."""
-        return ResidualSamples(
-            self.valid[rows],
-            self.residual[rows],
-            self.expected[rows],
-            self.scaling[rows],
-            self.std[rows],
-            self.low_frequency_std[rows],
-            self.seen[rows],
-            self.clip,
-            self.reach[rows],
-            self.speed_sigmas[rows],
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class ScoredResidual:
-    """A residual less its baseline, (n, fans) each; and the baselines of the intervals of these samples."""
-
-    scored: Array
-    """valid, and with a baseline"""
-    standardised: Array
-    persistent: Array
-    """see DetectorInput"""
-    shift: Array
-    """the residual less the expected one and the baseline, sigma; 0 where not scored"""
-    baseline: Array
-    """at this speed, sigma, with what the fans share"""
-    shared: Array
-    """that part of it"""
-    intervals: Intervals
-    state: BaselineState
-    sums: IntervalSums
-    """of what the baselines learn from these intervals"""
-
-
-@dataclass(frozen=True, eq=False)
-class SampledResidual:
-    """A residual at the samples of some intervals, with what does not depend on what baselines learn from each."""
-
-    of: ResidualSamples
-    intervals: Intervals
-    over: SharedOverIntervals | None
-    """None where nothing is shared"""
-    shared: Array
-    """(n, fans) sigma"""
-    residual: Array
-    """(n, fans) less the expected one and what is shared, sigma"""
-    learned: Array
-    """(n, fans) where baselines learn from it"""
-
-
-JOINED = ("scored", "persistent", "shift", "baseline", "shared")
-
-
-@dataclass(frozen=True, eq=False)
-class JoinedResidual:
-    """A residual in successive intervals, (n, fans) each."""
-
-    scored: Array
-    """this and the next four: see ScoredResidual"""
-    persistent: Array
-    shift: Array
-    baseline: Array
-    shared: Array
-    commissioned: Array
-    """the fan's own baseline at the end of commissioning, at the reference speed; NaN before"""
-    independent_intervals: Array
-    at_limit: Array
-    learned_scale: Array
-    """see Baseline"""
 
 
 class Residual:
@@ -210,8 +111,6 @@ class Residual:
 
     def runs_up_to(self, sampled: SampledResidual) -> int:
         """How many of the intervals may be scored before the first of them has ended by `end_interval`."""
-        if not self.baseline.only_refined(sampled.of.valid):
-            return 1
         sums = self.baseline.sums(sampled.residual, sampled.learned, sampled.of.scaling, sampled.intervals)
         ends = self.baseline.refined_up_to(sums, sampled.intervals.expected)
         return min(ends, sampled.over.ends) if sampled.over else ends

@@ -25,7 +25,8 @@ from scoring.alarms.holding import holding_detectors
 from scoring.alarms.tray_conditions import AlarmEvent
 from scoring.diagnosis.advice import Advice
 from scoring.diagnosis.diagnoser import Diagnoser
-from scoring.fan_scorer import HALF_LIMIT, FanScorer
+from scoring.fan_scorer import FanScorer
+from scoring.interval_scorer import HALF_LIMIT
 from scoring.samples import Samples, among, arrived, samples_of
 from scoring.score_message import score_of
 from scoring.scored_block import ScoredBlock

@@ -18,7 +18,8 @@ from scoring.detectors.drift import Drift
 from scoring.detectors.smoothed import Smoothed
 from scoring.detectors.table import rows
 from scoring.diagnosis.regression_window import HealthyBalance
-from scoring.fan_scorer import HALF_LIMIT, FanScorer
+from scoring.fan_scorer import FanScorer
+from scoring.interval_scorer import HALF_LIMIT
 from scoring.limits import Limits
 
 MINUTE_S = 60.0

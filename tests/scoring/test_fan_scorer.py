@@ -33,11 +33,13 @@ FANS = 3
 RESIDUAL = HealthyResidual(baseline=BaselineSettings(commissioning_limit_sigmas=1.0, adaptation_limit_sigmas=0.7))
 
 
-def detectors(stuck_s: float) -> dict[str, DetectorSettings]:
+def detectors(
+    stuck_s: float, smoothed: float = 6.0, drift: float = 10.0, reference: float = 0.25, variance: float = 1.4
+) -> dict[str, DetectorSettings]:
     kinds: dict[str, DetectorSettings] = {
-        "smoothed": SmoothedSettings(limit=6.0),
-        "drift": DriftSettings(limit=10.0, reference_sigmas=0.25, period_s=0.01),
-        "variance_growth": VarianceGrowthSettings(limit=1.4, healthy=0.97),
+        "smoothed": SmoothedSettings(limit=smoothed),
+        "drift": DriftSettings(limit=drift, reference_sigmas=reference, period_s=0.01),
+        "variance_growth": VarianceGrowthSettings(limit=variance, healthy=0.97),
     }
     of_residuals = {f"{source}_{kind}": kinds[kind] for source in ("speed", "balance") for kind in kinds}
     return of_residuals | {"sensor": TachoSettings(stuck_s=stuck_s)}
@@ -56,6 +58,20 @@ CURVED = Limits(
     detectors=detectors(0.3),
     timing=Timing(baseline_s=0.5, adaptation_s=5.0),
 )
+SHORT_INTERVALS = Limits(
+    speed=CURVED.speed.model_copy(
+        update={
+            "shared_limit": 0.02,
+            "baseline": RESIDUAL.baseline.model_copy(
+                update={"speed_exponent": 1, "reference_speed_rad_s": 100.0, "ridge": 0.1, "rms_sigmas": 0.2}
+            ),
+        }
+    ),
+    balance=RESIDUAL.model_copy(update={"shared_limit": 0.02}),
+    detectors=detectors(1e3, smoothed=8.0, drift=60.0, reference=1.0, variance=9.0),
+    timing=Timing(baseline_s=0.05, adaptation_s=2.0),
+)
+"""many intervals in a block: those after commissioning are scored together"""
 
 
 def white(samples: int, fans: int = FANS, seed: int = 1) -> Samples:
@@ -105,7 +121,7 @@ def troubled(samples: int, seed: int) -> Samples:
 @given(
     seed=st.integers(0, 100_000),
     cuts=st.lists(st.integers(1, 399), max_size=10),
-    limits=st.sampled_from([LIMITS, CURVED]),
+    limits=st.sampled_from([LIMITS, CURVED, SHORT_INTERVALS]),
 )
 def test_cuts_change_no_bit_of_scores_and_snapshots(seed: int, cuts: list[int], limits: Limits) -> None:
     samples = troubled(400, seed)
@@ -115,6 +131,39 @@ def test_cuts_change_no_bit_of_scores_and_snapshots(seed: int, cuts: list[int], 
         scorer = FanScorer(FANS, limits)
         assert_same(scored_of(scorer, samples, each), scored)
         assert json.dumps(scorer.snapshot()) == json.dumps(whole.snapshot())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_intervals_together_give_the_bits_of_one_after_the_other(seed: int) -> None:
+    """Speeds that change, fans that turn alone, outliers, and scores around half of their limits."""
+    rng = np.random.default_rng(seed)
+    one = np.ones((1200, FANS))
+    samples = replace(white(1200, seed=seed), speed_sigma_rad_s=one, balance_sigma=one)
+    samples.speed_residual[:] += np.repeat(rng.normal(0.0, 0.3, (12, FANS)), 100, axis=0)
+    samples.speed_residual[rng.random((1200, FANS)) < 0.003] = 1e3
+    samples.speed_rad_s[:] = 100.0 * np.repeat(rng.choice([0.4, 1.0, 1.5], (12, FANS)), 100, axis=0)
+    off = np.repeat(rng.random((12, FANS)) < 0.2, 100, axis=0) & (np.arange(1200) >= 100)[:, np.newaxis]
+    samples.speed_valid[off] = samples.balance_valid[off] = False
+    whole, single = FanScorer(FANS, SHORT_INTERVALS), FanScorer(FANS, SHORT_INTERVALS)
+    assert_same(scored_of(whole, samples), scored_of(single, samples, range(0, 1200, 5)))
+    assert json.dumps(whole.snapshot()) == json.dumps(single.snapshot())
+
+
+def test_intervals_that_only_refine_the_baselines_are_scored_together_up_to_the_first_high_score() -> None:
+    samples = white(900)
+    samples.speed_residual[700:730, 0] += 30.0
+    scorer = FanScorer(FANS, SHORT_INTERVALS)
+    scores, stretches = scorer.stretches(samples, lambda: True)
+    ends = [stretch.stop for stretch in stretches]
+    one_by_one = FanScorer(FANS, SHORT_INTERVALS)
+    expected = scored_of(one_by_one, samples, range(900))
+    assert_same(scores, expected)
+    assert json.dumps(scorer.snapshot()) == json.dumps(one_by_one.snapshot())
+    assert [end - 5 for end in ends if end <= 50] == list(range(0, 50, 5)), "commissioning goes by intervals"
+    high = int(np.flatnonzero((expected.score > 1.0).any(axis=1))[0])
+    (last,) = [end for end in ends if end - 5 <= high < end]
+    assert last % 5 == 0, "the caller may decide what the interval of that score is worth"
+    assert len([end for end in ends if 50 < end < last]) <= 5
 
 
 @settings(max_examples=20, deadline=None)

@@ -7,6 +7,7 @@ import pytest
 
 from scoring.baseline.baseline import COMMISSIONING_INTERVALS, MAX_UNSTEADY_INTERVALS, Baseline
 from scoring.baseline.settings import BaselineSettings
+from tests.support.one_interval import one_interval
 
 SAMPLES = 100
 GOOD = np.array([True, True])
@@ -19,17 +20,23 @@ def baseline_of(settings: BaselineSettings = SETTINGS, **changes: float) -> Base
     return Baseline(2, settings.model_copy(update=changes), ADAPTATION_INTERVALS)
 
 
+def add(baseline: Baseline, residual: np.ndarray, valid: np.ndarray, scaling: np.ndarray | None = None) -> None:
+    """Samples of the present interval."""
+    scaling = np.ones(residual.shape) if scaling is None else scaling
+    baseline.take(baseline.state, baseline.sums(residual, valid, scaling, one_interval(len(residual))))
+
+
 def feed(baseline: Baseline, level: float, intervals: int, good: np.ndarray = GOOD) -> None:
     """good: whether each fan is within its limits, and also below half of them."""
     for _ in range(intervals):
-        baseline.add(np.full((SAMPLES, 2), level), np.ones((SAMPLES, 2), np.bool_))
+        add(baseline, np.full((SAMPLES, 2), level), np.ones((SAMPLES, 2), np.bool_))
         baseline.end_interval(SAMPLES, good, good)
 
 
 def test_the_first_good_interval_gives_the_baseline() -> None:
     baseline = baseline_of()
     assert not baseline.is_set.any()
-    baseline.add(np.full((SAMPLES, 2), 1.5), np.ones((SAMPLES, 2), np.bool_) & np.array([True, False]))
+    add(baseline, np.full((SAMPLES, 2), 1.5), np.ones((SAMPLES, 2), np.bool_) & np.array([True, False]))
     baseline.end_interval(SAMPLES, GOOD, GOOD)
     np.testing.assert_array_equal(baseline.is_set, [True, False])
     np.testing.assert_allclose(baseline.value, [1.5, 0.0])
@@ -40,7 +47,7 @@ def test_on_a_slow_line_a_fan_that_still_moves_has_no_baseline(per_interval: int
     def baseline_after(levels: list[float], moving: list[bool], few_readings: bool = True) -> float:
         baseline = baseline_of(commissioning_limit_sigmas=30.0)
         for level, moves in zip(levels, moving, strict=True):
-            baseline.add(np.full((per_interval, 2), level), np.ones((per_interval, 2), np.bool_))
+            add(baseline, np.full((per_interval, 2), level), np.ones((per_interval, 2), np.bool_))
             baseline.end_interval(per_interval, GOOD, GOOD, np.array([moves, moves]), np.full(2, few_readings))
         return float(baseline.value[0])
 
@@ -73,7 +80,7 @@ def test_an_interval_with_too_few_samples_is_ignored(valid_share: float) -> None
     baseline = baseline_of()
     valid = np.zeros((SAMPLES, 2), np.bool_)
     valid[: round(valid_share * SAMPLES)] = True
-    baseline.add(np.full((SAMPLES, 2), 1.0), valid)
+    add(baseline, np.full((SAMPLES, 2), 1.0), valid)
     baseline.end_interval(SAMPLES, GOOD, GOOD)
     assert not baseline.is_set.any()
 
@@ -126,9 +133,9 @@ def test_a_sum_does_not_depend_on_how_it_was_cut() -> None:
     x = np.random.default_rng(2).normal(size=(SAMPLES, 2))
     valid = np.ones(x.shape, np.bool_)
     whole, cut = baseline_of(), baseline_of()
-    whole.add(x, valid)
+    add(whole, x, valid)
     for row in range(SAMPLES):
-        cut.add(x[row : row + 1], valid[row : row + 1])
+        add(cut, x[row : row + 1], valid[row : row + 1])
     for baseline in (whole, cut):
         baseline.end_interval(SAMPLES, GOOD, GOOD)
     np.testing.assert_array_equal(whole.value, cut.value)
@@ -142,7 +149,7 @@ def test_unsteady_intervals_are_skipped_but_not_for_ever() -> None:
     baseline = baseline_of()
     for number in range(MAX_UNSTEADY_INTERVALS + 1):
         assert not baseline.is_set.any(), number
-        baseline.add(swing, np.ones((SAMPLES, 2), np.bool_))
+        add(baseline, swing, np.ones((SAMPLES, 2), np.bool_))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
     assert baseline.is_set.all()
 
@@ -166,7 +173,7 @@ def test_a_long_anomaly_never_becomes_the_baseline() -> None:
 def test_once_commissioned_it_learns_only_below_half_of_the_limits() -> None:
     baseline = baseline_of()
     feed(baseline, 0.0, COMMISSIONING_INTERVALS)
-    baseline.add(np.full((SAMPLES, 2), 1.0), np.ones((SAMPLES, 2), np.bool_))
+    add(baseline, np.full((SAMPLES, 2), 1.0), np.ones((SAMPLES, 2), np.bool_))
     baseline.end_interval(SAMPLES, GOOD, np.array([False, True]))
     assert baseline.value[0] == 0.0
     assert baseline.value[1] > 0.0
@@ -187,7 +194,7 @@ def scaled(levels: np.ndarray, seed: int, noise: float) -> tuple[np.ndarray, np.
 def test_an_offset_that_changes_with_the_speed_is_found_while_the_speed_changes() -> None:
     baseline = baseline_of(SCALED, ridge=0.0, rms_sigmas=0.0)
     for seed in range(COMMISSIONING_INTERVALS):
-        baseline.add(*_with(EVERY, scaled(np.linspace(0.3, 1.5, SAMPLES), seed, 0.2)))
+        add(baseline, *_with(EVERY, scaled(np.linspace(0.3, 1.5, SAMPLES), seed, 0.2)))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
     np.testing.assert_allclose(baseline.value, 2.0, atol=0.05)
 
@@ -195,7 +202,7 @@ def test_an_offset_that_changes_with_the_speed_is_found_while_the_speed_changes(
 def test_a_fan_too_slow_to_show_its_offset_gets_a_baseline_near_zero() -> None:
     baseline = baseline_of(SCALED)
     for seed in range(5 * COMMISSIONING_INTERVALS):
-        baseline.add(*_with(EVERY, scaled(np.full(SAMPLES, 0.02), seed, 1.0)))
+        add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, 0.02), seed, 1.0)))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
         assert baseline.is_set.all()
         assert np.abs(baseline.value).max() < 0.5
@@ -205,7 +212,7 @@ def test_an_offset_is_certain_at_the_scaling_where_it_was_learned() -> None:
     baseline = baseline_of(SCALED)
     for level, unknown in ((0.2, 3.0 * 0.5 * 0.8), (1.0, 0.0)):
         for seed in range(COMMISSIONING_INTERVALS):
-            baseline.add(*_with(EVERY, scaled(np.full(SAMPLES, level), seed, 0.2)))
+            add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, level), seed, 0.2)))
             baseline.end_interval(SAMPLES, GOOD, GOOD)
         np.testing.assert_allclose(
             baseline.offset_uncertainty(np.ones((1, 2)), baseline.learned_scale), unknown, atol=1e-6
@@ -216,10 +223,10 @@ def test_an_offset_is_certain_at_the_scaling_where_it_was_learned() -> None:
 def test_intervals_with_more_information_replace_those_with_little() -> None:
     baseline = baseline_of(SCALED)
     for seed in range(COMMISSIONING_INTERVALS):
-        baseline.add(*_with(EVERY, scaled(np.full(SAMPLES, 0.02), seed, 1.0)))
+        add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, 0.02), seed, 1.0)))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
     for seed in range(2):
-        baseline.add(*_with(EVERY, scaled(np.full(SAMPLES, 1.0), seed, 0.2)))
+        add(baseline, *_with(EVERY, scaled(np.full(SAMPLES, 1.0), seed, 0.2)))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
     assert not baseline.is_commissioning.any()
     np.testing.assert_allclose(baseline.value, 2.0 * 1.0 / 1.25, rtol=0.05)
@@ -233,11 +240,11 @@ def test_a_moment_at_a_higher_speed_does_not_undo_the_adaptation() -> None:
     """The baseline follows to that level; the commissioned one moves by at most the uncertainty."""
     baseline = baseline_of(SCALED, adaptation_limit_sigmas=4.5, ridge=0.01, rms_sigmas=0.1)
     for level in np.linspace(0.0, 4.0, 600):
-        baseline.add(np.full((SAMPLES, 2), level), EVERY, np.ones((SAMPLES, 2)))
+        add(baseline, np.full((SAMPLES, 2), level), EVERY, np.ones((SAMPLES, 2)))
         baseline.end_interval(SAMPLES, GOOD, GOOD)
     followed, commissioned = baseline.value.copy(), baseline.commissioned.copy()
     assert followed.min() > 3.0
-    baseline.add(np.full((SAMPLES, 2), 1.5 * 4.0), EVERY, np.full((SAMPLES, 2), 1.5))
+    add(baseline, np.full((SAMPLES, 2), 1.5 * 4.0), EVERY, np.full((SAMPLES, 2), 1.5))
     baseline.end_interval(SAMPLES, GOOD, GOOD)
     assert (baseline.value > followed).all()
     assert (np.abs(baseline.commissioned - commissioned) <= 3.0 * 0.1 * 0.5).all()
@@ -247,7 +254,7 @@ def test_a_worn_fan_is_held_at_its_limit_at_a_higher_speed_too() -> None:
     baseline = baseline_of(SCALED, adaptation_limit_sigmas=1.0, ridge=0.01, rms_sigmas=0.1)
     for level, scaling in ((0.0, 1.0), (3.0, 1.0), (3.0 * 1.25, 1.25)):
         for _ in range(300):
-            baseline.add(np.full((SAMPLES, 2), level), EVERY, np.full((SAMPLES, 2), scaling))
+            add(baseline, np.full((SAMPLES, 2), level), EVERY, np.full((SAMPLES, 2), scaling))
             baseline.end_interval(SAMPLES, GOOD, GOOD)
     assert baseline.is_at_limit.all()
     assert (baseline.value <= 1.0 + 3.0 * 0.1 * 0.25 + 1e-6).all()
