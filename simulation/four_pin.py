@@ -120,17 +120,20 @@ class FourPinFans:
 
     longest_step_s = 0.1
 
-    def __init__(self, parameters: FourPinParameters, rng: np.random.Generator, fans_per_supply: int) -> None:
+    def __init__(
+        self, parameters: FourPinParameters, rng: np.random.Generator, fans_per_supply: int, copies: int = 1
+    ) -> None:
         """Prepare.
 
         parameters: each field (fans,). rng: of the wandering and of the phase of the air. fans_per_supply: so many
-        neighbours share a supply and a room.
+        neighbours share a supply and a room. copies: the fans are so many times the same ones, in the same air.
         """
         self.parameters = parameters
         self._rng = rng
         fans = len(np.asarray(parameters.speed_max_rad_s))
         self._per_supply = fans_per_supply
-        self._phase = np.repeat(rng.uniform(0.0, 2.0 * np.pi, size=fans // fans_per_supply), fans_per_supply)
+        rooms = fans // fans_per_supply // copies
+        self._phase = np.tile(np.repeat(rng.uniform(0.0, 2.0 * np.pi, size=rooms), fans_per_supply), copies)
         self._wander = np.zeros(fans)
         self._was_on = np.zeros(fans, np.bool_)
         self._kick_left_s = np.zeros(fans)

@@ -8,6 +8,8 @@ controllers have it, ten times a second.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from typing import TypeAlias
 
 import numpy as np
@@ -48,6 +50,14 @@ class Thermostat:
     def command(self, t_s: float) -> Array:
         """(fans,) duty in force at t_s."""
         return self._steps[int(t_s * UPDATES_HZ + 1e-6) % len(self._steps)] / STEPS
+
+    def side_by_side(self, starts_s: Sequence[float], seconds: float) -> Thermostat:
+        """A thermostat of as many times the fans, which have the commands from each of these times on, for a time."""
+        found = copy(self)
+        numbers = np.arange(round(seconds * UPDATES_HZ))
+        parts = [self._steps[(round(start_s * UPDATES_HZ) + numbers) % len(self._steps)] for start_s in starts_s]
+        found._steps = np.concatenate(parts, axis=1)
+        return found
 
     def is_on(self, times_s: Array, fan: int) -> NDArray[np.bool_]:
         """Whether a fan has a duty at times; same shape."""

@@ -6,11 +6,10 @@ some hours.
 
     python -m bench.detection.first_month --racks 5 --days 30 --keep FOLDER
 
-All racks are simulated in one process, and each is watched in a process of its own. After each of its days a rack
-writes what became of it to FOLDER, where a month that was interrupted goes on; `--show` prints the tables of the days
-that all racks have had so far. A rack takes about an hour of a core: `--only 1,2` watches two of them, and the tables
-are of the racks whose file `rackN.json` is in FOLDER. A rack of many fans costs little more than one of four:
-`--racks 1 --fans 20`.
+All racks are simulated in one process, in minutes, and each is watched in a process of its own. After each of its days
+a rack writes what became of it to FOLDER, where a month that was interrupted goes on; `--show` prints the tables of the
+days that all racks have had so far. A rack takes about half an hour of a core: `--only 1,2` watches two of them, and
+the tables are of the racks whose file `rackN.json` is in FOLDER.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from multiprocessing import get_context
 from multiprocessing.context import SpawnProcess
 from multiprocessing.queues import Queue
@@ -29,9 +29,11 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 from bench.detection.plant import START_NS
+from bench.detection.rack_days import reports_by_days
 from bench.detection.rack_scoring import Episode
 from bench.detection.rack_site import DAY_NS, RackMonth, RackSite
 from bench.detection.racks import (
@@ -44,7 +46,6 @@ from bench.detection.racks import (
     SIZES,
     Racks,
     racks,
-    reports,
     run_of,
 )
 from schemas.messages import Array, Raw
@@ -107,18 +108,29 @@ def run(of: Racks, watched: Sequence[int], rate_hz: float, folder: Path, console
     context = get_context("spawn")
     for rack in watched:
         queue: Queue[Raw | None] = context.Queue(QUEUED_BLOCKS)
-        given = folder, run_of(rack), of.rack_fans, (FILTER_CHANGED * days, FIRMWARE * days), queue
+        given = folder, run_of(rack), (FILTER_CHANGED * days, FIRMWARE * days), queue
         process = context.Process(target=_live, args=given, name=run_of(rack), daemon=True)
         process.start()
         of_racks[rack] = queue, process
     began_s, shown_day = time.monotonic(), -1
-    for number, blocks in enumerate(reports(of, rate_hz, month_faults(of), ageing=ageing(of.columns, days))):
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("simulating all days", total=1.0)
+        months = reports_by_days(
+            of,
+            rate_hz,
+            month_faults(of),
+            ageing(of.columns, days),
+            lambda share: progress.update(task, completed=share),
+        )
+        first = next(months)
+    console.print(f"all days are simulated, {time.monotonic() - began_s:.0f} s")
+    for number, blocks in enumerate(chain([first], months)):
         for rack, (queue, process) in of_racks.items():
             _put(queue, process, blocks[rack])
         day = int(number * BLOCK / rate_hz / DAY_S)
         if day > shown_day:
             shown_day = day
-            console.print(f"simulated up to day {day}, {time.monotonic() - began_s:.0f} s")
+            console.print(f"lines up to day {day} are out, {time.monotonic() - began_s:.0f} s")
     for queue, process in of_racks.values():
         _put(queue, process, None)
         process.join()
@@ -137,9 +149,9 @@ def _put(queue: Queue[Raw | None], process: SpawnProcess, raw: Raw | None) -> No
                 raise SystemExit(f"{process.name} ended with status {process.exitcode}: see above") from None
 
 
-def _live(folder: Path, name: str, fans: int, changed_days: Sequence[float], blocks: Queue[Raw | None]) -> None:
+def _live(folder: Path, name: str, changed_days: Sequence[float], blocks: Queue[Raw | None]) -> None:
     """One rack, in a process of its own."""
-    RackSite(folder, name, fans, changed_days).live(iter(blocks.get, None), folder)
+    RackSite(folder, name, changed_days).live(iter(blocks.get, None), folder)
 
 
 def found(of: Racks, folder: Path) -> dict[str, Any]:
@@ -155,8 +167,8 @@ def found(of: Racks, folder: Path) -> dict[str, Any]:
     days = min(month.days for month in months.values())
     until_ns = START_NS + days * DAY_NS
     alarms = {rack: [each for each in month.alarms if each.raised_ns < until_ns] for rack, month in months.items()}
-    faults = [fault for fault in month_faults(of) if fault.start_s < days * DAY_S and of.place(fault.fan)[0] in months]
-    caught = [_caught(fault, *of.place(fault.fan), alarms) for fault in faults]
+    faults = [fault for fault in month_faults(of) if fault.start_s < days * DAY_S and fault.fan // RACK_FANS in months]
+    caught = [_caught(fault, alarms) for fault in faults]
     own = {id(alarm) for each in caught for alarm in each}
     by_day: list[dict[str, Any]] = []
     for day in range(days):
@@ -177,8 +189,8 @@ def found(of: Racks, folder: Path) -> dict[str, Any]:
         "faults": [
             {
                 "kind": fault.kind,
-                "rack": of.place(fault.fan)[0],
-                "fan": of.place(fault.fan)[1],
+                "rack": fault.fan // RACK_FANS,
+                "fan": fault.fan % RACK_FANS,
                 "day": fault.start_s / DAY_S,
                 "found_after_s": (own_alarms[0].raised_ns - START_NS) / NS_PER_S - fault.start_s
                 if own_alarms
@@ -188,7 +200,7 @@ def found(of: Racks, folder: Path) -> dict[str, Any]:
             for fault, own_alarms in zip(faults, caught, strict=True)
         ],
         "versions": [[version.model_dump() for version in month.versions] for month in months.values()],
-        "learned_from_faults": sum(_is_learned(fault, months[of.place(fault.fan)[0]]) for fault in faults),
+        "learned_from_faults": sum(_is_learned(fault, months[fault.fan // RACK_FANS]) for fault in faults),
         "false": [
             {"rack": rack, "day": (each.raised_ns - START_NS) / DAY_NS, **vars(each)}
             for rack, of_rack in alarms.items()
@@ -205,9 +217,10 @@ def _promise(month: RackMonth, day: int) -> str:
     return "none" if version is None else "target" if version.is_target else "declared"
 
 
-def _caught(fault: Fault, rack: int, fan: int, of_racks: Mapping[int, list[Episode]]) -> list[Episode]:
+def _caught(fault: Fault, of_racks: Mapping[int, list[Episode]]) -> list[Episode]:
     first_ns = START_NS + round(fault.start_s * NS_PER_S)
     last_ns = START_NS + round((fault.stop_s + AFTER_FAULT_S) * NS_PER_S)
+    rack, fan = divmod(fault.fan, RACK_FANS)
     return [each for each in of_racks[rack] if each.fan == fan and first_ns <= each.raised_ns < last_ns]
 
 
@@ -257,8 +270,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--racks", type=int, default=5)
-    parser.add_argument("--fans", type=int, default=RACK_FANS, help="of each rack")
-    parser.add_argument("--days", type=float, default=30.0)
+    parser.add_argument("--days", type=int, default=30)
     parser.add_argument("--seed", type=int, default=50)
     parser.add_argument("--report-hz", type=float, default=2.0)
     parser.add_argument("--keep", type=Path, required=True, help="folder for what is learned and the figures")
@@ -267,7 +279,7 @@ def main() -> None:
     given = parser.parse_args()
     console = Console(soft_wrap=True, highlight=False)
     given.keep.mkdir(parents=True, exist_ok=True)
-    of = racks(given.racks, given.days * DAY_S, given.seed, fans_seed=given.seed, rack_fans=given.fans)
+    of = racks(given.racks, given.days * DAY_S, given.seed, fans_seed=given.seed)
     if not given.show:
         run(of, given.only or range(given.racks), given.report_hz, given.keep, console)
     figures = found(of, given.keep)

@@ -127,14 +127,13 @@ class _Seen:
 class RackSite:
     """The stages of one rack."""
 
-    def __init__(self, folder: Path, name: str, fans: int, changed_days: Sequence[float]) -> None:
-        """fans: of the rack, a multiple of RACK_FANS. changed_days: when operators change all fans, as a filter or
-        firmware does."""
+    def __init__(self, folder: Path, name: str, changed_days: Sequence[float]) -> None:
+        """changed_days: when operators change all fans, as a filter or firmware does."""
         place = folder / name
         shutil.rmtree(place, ignore_errors=True)
         if (kept := folder / f"{name}.kept").exists():
             shutil.copytree(kept, place)
-        config = _config(place, name, fans)
+        config = _config(place, name)
         contexts = {stage: _context(config, stage) for stage in ("resampler", "twin_integrator", "scorer", "learner")}
         of, tray = contexts["learner"], config.trays[0]
         learned = learning_folder(config.run_folder, name)
@@ -147,7 +146,7 @@ class RackSite:
         self._versions = TwinVersions(learned, name)
         self._seen = pickle.loads((place / SEEN).read_bytes()) if kept.exists() else _Seen(list(changed_days))
         learning = LearningAtOnce(learned, name, of.config.false_alarms_per_day, self._seen.learning_s)
-        self._learner = LearnerCore(fans, of.config, history, self._versions, OrdinaryOperation(tray), learning)
+        self._learner = LearnerCore(RACK_FANS, of.config, history, self._versions, OrdinaryOperation(tray), learning)
         self._stages: list[Core] = [
             load_stage(stage).build(contexts[stage]).core for stage in ("resampler", "twin_integrator", "scorer")
         ]
@@ -231,12 +230,11 @@ class RackSite:
             self._seen.alarms.append(message)
 
 
-def _config(folder: Path, tray: str, fans: int) -> Config:
-    tachos = TACHOS * (fans // RACK_FANS)
-    windows = ", ".join(f'{{ kind = "count", window_s = {tacho.window_s} }}' for tacho in tachos)
+def _config(folder: Path, tray: str) -> Config:
+    windows = ", ".join(f'{{ kind = "count", window_s = {tacho.window_s} }}' for tacho in TACHOS)
     text = (
         f'site = "bench"\nrun_folder = "{folder / "runs"}"\n'
-        f'[[tray]]\nname = "{tray}"\nfans = {fans}\nspeed_unit = "rpm"\ntacho = [{windows}]\n'
+        f'[[tray]]\nname = "{tray}"\nfans = {RACK_FANS}\nspeed_unit = "rpm"\ntacho = [{windows}]\n'
         "[resampler]\nblock_size = 60\n"
     )
     return parse_config(text, folder / "fantwin.toml", (), ("resampler", "twin_integrator", "scorer", "learner"))

@@ -1,7 +1,6 @@
 """Simulated racks of 4-pin fans with counting tachos under a thermostat, all racks at once, and their faults.
 
-Each rack is a run of its own, with four fans (or a multiple of four); of four tachos two count over 1 s and two over
-0.5 s. All racks are
+Each rack is a run of its own, with four fans; two of their tachos count over 1 s and two over 0.5 s. All racks are
 advanced together, a column for each fan, in steps of 0.1 s (the fans' lags are exact within them, and the ends of
 windows are taken where they fall); reports are then made at their own rate, so that the same seed gives the same fans,
 commands and counts at each rate. Lines are lost, arrive late, and lack readings, as on a microcontroller's line.
@@ -31,7 +30,7 @@ from simulation.tacho import CountingTacho
 from simulation.thermostat import Thermostat
 
 TACHOS = tuple(Tacho(kind="count", window_s=window_s) for window_s in (1.0, 1.0, 0.5, 0.5))
-"""of four neighbouring fans of a rack"""
+"""of the fans of a rack"""
 RACK_FANS = len(TACHOS)
 RATES_HZ = (2.0, 10.0, 100.0)
 DAY_S = 86_400.0
@@ -78,8 +77,8 @@ class Racks:
     thermostat: Thermostat
     seconds: float
     seed: int
-    rack_fans: int = RACK_FANS
-    """of each rack"""
+    copies: int = 1
+    """the racks are so many times the same ones, as at different times"""
 
     @property
     def columns(self) -> int:
@@ -89,21 +88,14 @@ class Racks:
     @property
     def count(self) -> int:
         """How many racks there are."""
-        return self.columns // self.rack_fans
-
-    def place(self, column: int) -> tuple[int, int]:
-        """The rack of a column, and the fan in it, both counted from 0."""
-        return divmod(column, self.rack_fans)
+        return self.columns // RACK_FANS
 
 
-def racks(count: int, seconds: float, seed: int, fans_seed: int = FANS_SEED, *, rack_fans: int = RACK_FANS) -> Racks:
-    """So many racks for a time. The same fans_seed gives the same fans, the same seed the same commands and chances.
-
-    rack_fans: of each rack, a multiple of RACK_FANS.
-    """
-    columns = count * rack_fans
+def racks(count: int, seconds: float, seed: int, fans_seed: int = FANS_SEED) -> Racks:
+    """So many racks for a time. The same fans_seed gives the same fans, the same seed the same commands and chances."""
+    columns = count * RACK_FANS
     thermostat = Thermostat(columns, seed, *DUTIES, period_s=seconds)
-    return Racks(four_pin_tray(columns, fans_seed), thermostat, seconds, seed, rack_fans)
+    return Racks(four_pin_tray(columns, fans_seed), thermostat, seconds, seed)
 
 
 def run_of(rack: int) -> str:
@@ -120,12 +112,12 @@ def fault_schedule(of: Racks) -> list[Fault]:
     rng = np.random.default_rng([of.seed, 1])
     part_s = of.seconds / len(FAULT_KINDS)
     return [
-        _fault(of, kind, rack * of.rack_fans + int(fan), part * part_s, part_s, rng)
+        _fault(of, kind, rack * RACK_FANS + int(fan), part * part_s, part_s, rng)
         for rack in range(of.count)
         for part, (kind, fan) in enumerate(
             zip(
                 rng.permutation(list(FAULT_KINDS)).tolist(),
-                np.resize(rng.permutation(of.rack_fans), len(FAULT_KINDS)).tolist(),
+                np.resize(rng.permutation(RACK_FANS), len(FAULT_KINDS)).tolist(),
                 strict=True,
             )
         )
@@ -170,17 +162,17 @@ def reports(
     rate_hz: one of RATES_HZ. is_swept: under `swept_duty` instead of the thermostat. ageing: slow changes that are no
     faults of the schedule.
     """
-    course = _Course(of, faults or [], ageing, is_swept=is_swept)
+    course = Course(of, faults or [], ageing, is_swept=is_swept)
     chance = np.random.default_rng([of.seed, 3, round(rate_hz)])
     rows, sent = round(of.seconds * rate_hz), 0
     while sent < rows:
         count = min(BLOCK, rows - sent)
         number = np.arange(sent, sent + count)
-        yield _lines(of.rack_fans, *course.until(number / rate_hz), number / rate_hz, number, chance)
+        yield lines(*course.until(number / rate_hz), number / rate_hz, number, chance)
         sent += count
 
 
-class _Course:
+class Course:
     """Fans and tachos as time goes on."""
 
     def __init__(self, of: Racks, faults: list[Fault], ageing: Ageing | None, *, is_swept: bool) -> None:
@@ -189,7 +181,7 @@ class _Course:
         self._aged_until_s = 0.0
         self._is_swept = is_swept
         self._faults = faults
-        self._fans = FourPinFans(of.parameters, np.random.default_rng([of.seed, 2]), of.rack_fans)
+        self._fans = FourPinFans(of.parameters, np.random.default_rng([of.seed, 2]), RACK_FANS, of.copies)
         self._tacho = CountingTacho(TACHOS * (of.columns // RACK_FANS), 0.0, 0.0, np.random.default_rng([of.seed, 4]))
         self._step = 0
         self._active: list[Fault] = []
@@ -244,8 +236,7 @@ class _Course:
         self._fans.damage = damage
 
 
-def _lines(
-    rack_fans: int,
+def lines(
     duty: Array,
     reading: Array,
     missing: Array,
@@ -253,19 +244,19 @@ def _lines(
     number: NDArray[np.int64],
     chance: np.random.Generator,
 ) -> list[Raw]:
-    """The lines that arrive, for each rack."""
+    """The lines that arrive, for each rack. duty, reading, missing: (n, columns). times_s, number: (n,) of lines."""
     speed = np.where(chance.random(reading.shape) < missing, np.nan, reading)
-    racks_count = reading.shape[1] // rack_fans
+    racks_count = reading.shape[1] // RACK_FANS
     arrives = chance.random((racks_count, len(number))) >= LOST_LINES
     late_s = chance.uniform(0.0, LATE_S, size=(racks_count, len(number)))
     clock_us = np.round(times_s * 1e6).astype(np.int64) % 2**32
     made = []
     for rack in range(racks_count):
         rows = np.flatnonzero(arrives[rack])
-        fans = slice(rack * rack_fans, (rack + 1) * rack_fans)
+        fans = slice(rack * RACK_FANS, (rack + 1) * RACK_FANS)
         made.append(
             Raw(
-                fans=rack_fans,
+                fans=RACK_FANS,
                 host_receive_t_ns=START_NS + np.round((times_s + late_s[rack])[rows] * NS_PER_S).astype(np.int64),
                 device_clock_us=clock_us[rows].astype(np.uint32),
                 device_sequence=(number[rows] % 2**32).astype(np.uint32),

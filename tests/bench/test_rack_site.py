@@ -39,11 +39,11 @@ def lines(days: int) -> list[Raw]:
 def test_an_interrupted_month_goes_on_from_its_last_whole_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rack_site, "DAY_NS", DAY_S * NS_PER_S)
     whole = lines(3)
-    first = RackSite(tmp_path, "rack1", 4, ())
+    first = RackSite(tmp_path, "rack1", ())
     with pytest.raises(InterruptedError):
         first.live(_interrupted(whole[: round(2.5 * DAY_S / BLOCK_S)]), tmp_path)
     assert RackMonth.read(tmp_path / "rack1.json").days == 2
-    RackSite(tmp_path, "rack1", 4, ()).live(whole, tmp_path)
+    RackSite(tmp_path, "rack1", ()).live(whole, tmp_path)
     month = RackMonth.read(tmp_path / "rack1.json")
     assert month.days == 3
     assert sorted(month.in_force) == [0, 1, 2]
