@@ -94,12 +94,12 @@ def draw_picture(
     Raises:
         PictureError: no driver, no such file, tray, fan or view, or the viewer did not draw it in time.
     """
+    contents = _read(rrd)
+    layout = _layout(rrd, contents, tray, fans)
     if not has_vulkan_driver():
         raise PictureError(
             "no Vulkan driver found, which the headless viewer needs: apt-get install mesa-vulkan-drivers"
         )
-    contents = _read(rrd)
-    layout = _layout(rrd, contents, tray, fans)
     end_ns = contents.last_ns
     if at_s is not None:
         end_ns = contents.first_ns + round(at_s * NS_PER_S)
