@@ -114,8 +114,8 @@ def _without_large_limit(cautious: Any) -> Any:
 
 def _never_valid(field: str) -> Change:
     def change(stretches: Any) -> Any:
-        def silenced(scorer: Any, block: Any) -> Any:
-            return stretches(scorer, replace(block, **{field: np.zeros_like(getattr(block, field))}))
+        def silenced(scorer: Any, block: Any, may_span: Any = None) -> Any:
+            return stretches(scorer, replace(block, **{field: np.zeros_like(getattr(block, field))}), may_span)
 
         return silenced
 
@@ -247,7 +247,7 @@ MECHANISMS: Sequence[Mechanism] = (
     Mechanism(
         "counts-in-motion",
         "readings of a tacho that counts may be unsteady while the fan changes its speed",
-        (("scoring.fan_scorer:FanScorer._unsteadiness", lambda _: lambda _scorer, of: of.standardised),),
+        (("scoring.interval_scorer:IntervalScorer._unsteadiness", lambda _: lambda _scorer, of: of.standardised),),
     ),
     Mechanism(
         "correlation",
@@ -327,7 +327,7 @@ MECHANISMS: Sequence[Mechanism] = (
     Mechanism(
         "half-limit",
         "commissioned baselines learn only below half of every limit, not below the limit",
-        (("scoring.fan_scorer:HALF_LIMIT", _by(1.0)),),
+        (("scoring.interval_scorer:HALF_LIMIT", _by(1.0)),),
     ),
     Mechanism(
         "no-learning-in-alarm",

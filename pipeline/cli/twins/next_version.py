@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from schemas.messages import Array
 
 WANTED_S = 24 * 3600.0
-"""of healthy running that limits are set from, unless the declared rate needs more; an hour takes about ten seconds"""
+"""of healthy running that limits are set from, unless the declared rate needs more; an hour takes about five seconds"""
 MARGIN = 1.3
 """times the healthy running that the rate needs, because not all of it can be scored"""
 BETTER = 0.98
