@@ -12,7 +12,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from bench.detection.racks import BLOCK, DAY_S, Ageing, Course, Racks, lines
+from bench.detection.racks import BLOCK, DAY_S, Ageing, RackSimulation, Racks, lines
 from schemas.messages import Array, Raw
 from simulation.faults import Fault
 from simulation.four_pin import FourPinParameters
@@ -32,14 +32,14 @@ def reports_by_days(
     days = round(of.seconds / DAY_S)
     starts_s = DAY_S * np.arange(days) - WARM_UP_S
     per_day = round(DAY_S * rate_hz)
-    course = Course(
+    simulation = RackSimulation(
         _side_by_side(of, starts_s), _of_days(of, faults, starts_s), _aged(ageing, starts_s), is_swept=False
     )
     duty = np.empty((per_day, days, of.columns), np.uint8)
     reading, missing = np.empty((2, per_day, days, of.columns), np.float32)
     for first in range(0, per_day, BLOCK):
         rows = slice(first, min(first + BLOCK, per_day))
-        found = course.until(WARM_UP_S + np.arange(rows.start, rows.stop) / rate_hz)
+        found = simulation.until(WARM_UP_S + np.arange(rows.start, rows.stop) / rate_hz)
         for stored, values in zip((duty, reading, missing), (found[0] * DUTY_STEPS, *found[1:]), strict=True):
             stored[rows] = (np.round(values) if stored is duty else values).reshape(-1, days, of.columns)
         day_done(rows.stop / per_day)

@@ -162,17 +162,17 @@ def reports(
     rate_hz: one of RATES_HZ. is_swept: under `swept_duty` instead of the thermostat. ageing: slow changes that are no
     faults of the schedule.
     """
-    course = Course(of, faults or [], ageing, is_swept=is_swept)
+    simulation = RackSimulation(of, faults or [], ageing, is_swept=is_swept)
     chance = np.random.default_rng([of.seed, 3, round(rate_hz)])
     rows, sent = round(of.seconds * rate_hz), 0
     while sent < rows:
         count = min(BLOCK, rows - sent)
         number = np.arange(sent, sent + count)
-        yield lines(*course.until(number / rate_hz), number / rate_hz, number, chance)
+        yield lines(*simulation.until(number / rate_hz), number / rate_hz, number, chance)
         sent += count
 
 
-class Course:
+class RackSimulation:
     """Fans and tachos as time goes on."""
 
     def __init__(self, of: Racks, faults: list[Fault], ageing: Ageing | None, *, is_swept: bool) -> None:
