@@ -1,7 +1,7 @@
 """Samples without a gap between them while they are scored.
 
-What does not depend on the baselines is found for the whole piece at once. The rest is scored in stretches, each within
-one interval of the baselines: what they learn from one stretch counts in the next.
+What does not depend on the baselines is found for the whole piece at once. The rest is scored in stretches
+of whole intervals of the baselines: what they learn from one interval counts in the next.
 """
 
 from __future__ import annotations

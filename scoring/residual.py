@@ -159,7 +159,7 @@ class Residual:
             sums = baseline.sums(known, sampled.learned, of.scaling, intervals)
             state = baseline.refined(sums, intervals.expected, below_half_limit)
             before, (known, own) = known, clipped(state)
-            if np.array_equal(known[sampled.learned], before[sampled.learned]):
+            if np.array_equal(known[sampled.learned], before[sampled.learned], equal_nan=True):
                 return state, sums, own
 
     def take(self, sampled: SampledResidual, scored: ScoredResidual) -> None:

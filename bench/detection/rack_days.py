@@ -12,7 +12,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from bench.detection.racks import BLOCK, DAY_S, Ageing, RackSimulation, Racks, lines
+from bench.detection.racks import BLOCK, DAY_S, Ageing, Racks, RackSimulation, lines
 from schemas.messages import Array, Raw
 from simulation.faults import Fault
 from simulation.four_pin import FourPinParameters

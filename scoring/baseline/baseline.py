@@ -161,7 +161,8 @@ class Baseline(ColumnState):
 
     def only_refined(self, valid: Array) -> bool:
         """Whether intervals with these valid samples (n, fans) of bool only refine baselines that are commissioned."""
-        return bool(((self.intervals >= COMMISSIONING_INTERVALS) | ~valid.any(axis=0)).all())
+        nothing = ~valid.any(axis=0) & (self._counts == 0)
+        return bool(((self.intervals >= COMMISSIONING_INTERVALS) | nothing).all())
 
     def refined_up_to(self, sums: IntervalSums, expected: int) -> int:
         """How many intervals come before the end of the first one to which a baseline adapts faster, itself counted."""
@@ -184,7 +185,9 @@ class Baseline(ColumnState):
         total = np.add.accumulate(np.concatenate((self.total_information[np.newaxis], learned)), axis=0)
         gain = counted / np.maximum(np.minimum(total[1:], self._adaptation_intervals), MIN_INFORMATION)
         limit = self._settings.adaptation_limit_sigmas
-        low, high = self.commissioned - limit, self.commissioned + limit
+        commissioned = np.repeat(self.commissioned[np.newaxis], len(mean), axis=0)
+        commissioned[1:] += 0.0  # no -0.0 after `end_interval`
+        low, high = commissioned[-1] - limit, commissioned[-1] + limit
         values, value = np.empty(mean.shape), self.value
         for k in range(len(values)):
             values[k] = value
@@ -193,7 +196,7 @@ class Baseline(ColumnState):
         same = (len(values), len(value))
         return BaselineState(
             values,
-            np.broadcast_to(self.commissioned, same),
+            commissioned,
             self.intervals + before,
             total[:-1],
             np.broadcast_to(self.learned_scale, same),
@@ -201,7 +204,7 @@ class Baseline(ColumnState):
 
     def take(self, state: BaselineState, sums: IntervalSums) -> None:
         """Go on in the last of some intervals; state: of each, sums: with those before them in the first."""
-        self.value = state.value[-1].copy()
+        self.value, self.commissioned = state.value[-1].copy(), state.commissioned[-1].copy()
         self.intervals[:], self.total_information[:] = state.intervals[-1], state.total_information[-1]
         self._sums[:], self._counts[:] = sums.products[:, -1], sums.counts[-1]
 
