@@ -149,6 +149,41 @@ def test_intervals_together_give_the_bits_of_one_after_the_other(seed: int) -> N
     assert json.dumps(whole.snapshot()) == json.dumps(single.snapshot())
 
 
+def one_fan(**baseline: float) -> Limits:
+    of = HealthyResidual(baseline=BaselineSettings(**baseline))
+    smoothed: dict[str, DetectorSettings] = {"speed_smoothed": SmoothedSettings(limit=8.0)}
+    return Limits(speed=of, balance=of, detectors=smoothed, timing=Timing(baseline_s=0.05))
+
+
+def snapshot_after(samples: Samples, limits: Limits, cuts: Sequence[int]) -> str:
+    scorer = FanScorer(1, limits)
+    scored_of(scorer, samples, cuts)
+    return json.dumps(scorer.snapshot())
+
+
+def test_an_interval_that_commissions_a_fan_counts_also_when_its_last_samples_are_not_valid() -> None:
+    samples = white(100, fans=1)
+    samples.speed_rad_s[20:] = 2.0
+    samples.speed_valid[23:] = samples.balance_valid[23:] = False
+    limits = one_fan(speed_exponent=2, reference_speed_rad_s=100.0)
+    assert snapshot_after(samples, limits, [23]) == snapshot_after(samples, limits, range(100))
+
+
+def test_a_baseline_that_may_not_be_learned_has_the_same_sign_of_zero_however_samples_are_cut() -> None:
+    limits = one_fan(commissioning_limit_sigmas=0.0)
+    assert snapshot_after(white(200, fans=1), limits, []) == snapshot_after(
+        white(200, fans=1), limits, range(0, 200, 5)
+    )
+
+
+def test_a_valid_sample_that_is_no_number_does_not_stop_the_scorer() -> None:
+    samples = white(200, fans=1)
+    samples.speed_residual[120] = np.nan
+    with np.errstate(invalid="ignore"):
+        scored = scored_of(FanScorer(1, one_fan()), samples)
+    assert np.isfinite(scored.score[:120][50:]).all()
+
+
 def test_intervals_that_only_refine_the_baselines_are_scored_together_up_to_the_first_high_score() -> None:
     samples = white(900)
     samples.speed_residual[700:730, 0] += 30.0
