@@ -69,7 +69,7 @@ class IntervalScorer:
         if numbers[0] != self._interval:
             self._end_interval(piece.samples.period_ns)
         intervals = Intervals.of(numbers, self.interval_ns // piece.samples.period_ns)
-        if not (spans and self._only_refines(piece, slice(begin, begin + intervals.rows))):
+        if len(intervals) > 1 and not (spans and self._only_refines(piece, slice(begin, begin + intervals.rows))):
             intervals = intervals.first(1)
         rows = self._score(piece, begin, intervals, highest)
         self._interval = int(numbers[rows - 1])
@@ -129,6 +129,8 @@ class IntervalScorer:
             largest = intervals.largest(score)
             guessed, below_half_limit = below_half_limit, largest <= HALF_LIMIT
             below_half_limit[0] &= self._below_half_limit
+            if len(intervals) == 1:
+                break
             if not np.array_equal(guessed[:-1], below_half_limit[:-1]):
                 self._restore_detectors(before)
                 continue
@@ -187,7 +189,7 @@ class IntervalScorer:
         rows, moved, moving = slice(begin, begin + intervals.rows), None, None
         if self._movement and piece.movement is not None:
             moved = self._movement.over(piece.movement[:, rows], intervals)
-            moving = self._movement.moving(moved, self._commissioning)
+            moving = self._movement.moving(moved, self._commissioning) if len(intervals) > 1 else None
         return {
             source: residual.over(piece.residuals[source].rows(rows), intervals, moving)
             for source, residual in self._residuals.items()

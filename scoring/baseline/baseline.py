@@ -204,8 +204,9 @@ class Baseline(ColumnState):
 
     def take(self, state: BaselineState, sums: IntervalSums) -> None:
         """Go on in the last of some intervals; state: of each, sums: with those before them in the first."""
-        self.value, self.commissioned = state.value[-1].copy(), state.commissioned[-1].copy()
-        self.intervals[:], self.total_information[:] = state.intervals[-1], state.total_information[-1]
+        if len(state.value) > 1:
+            self.value, self.commissioned = state.value[-1].copy(), state.commissioned[-1].copy()
+            self.intervals[:], self.total_information[:] = state.intervals[-1], state.total_information[-1]
         self._sums[:], self._counts[:] = sums.products[:, -1], sums.counts[-1]
 
     @staticmethod

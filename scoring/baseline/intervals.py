@@ -8,6 +8,7 @@ import numpy as np
 
 from schemas.messages import Array
 
+ONE_START = np.zeros(1, np.int64)
 MOST = 60  # scored together: of more, much would be scored again where the run has to end early
 
 
@@ -25,6 +26,8 @@ class Intervals:
     @classmethod
     def of(cls, numbers: Array, expected: int) -> Intervals:
         """The first MOST intervals of samples; numbers: (n,) the interval of each, rising."""
+        if numbers[0] == numbers[-1]:
+            return cls(ONE_START, len(numbers), expected)
         starts = np.concatenate(([0], np.flatnonzero(np.diff(numbers)) + 1))
         return cls(starts, len(numbers), expected).first(MOST)
 
@@ -44,14 +47,20 @@ class Intervals:
 
     def sums(self, values: Array) -> Array:
         """(intervals, ...) sums of integers (rows, ...) over each."""
+        if self.rows == 1:
+            return values.copy()
         return np.add.reduceat(values, self.starts, axis=0)
 
     def largest(self, values: Array) -> Array:
         """(intervals, ...) the largest of values (rows, ...) in each."""
+        if self.rows == 1:
+            return values
         return np.maximum.reduceat(values, self.starts, axis=0)
 
     def spread(self, of_each: Array) -> Array:
         """(rows, ...) for each sample what is (intervals, ...) of its interval."""
+        if self.rows == 1:
+            return of_each
         if len(self.starts) == 1:
             return np.broadcast_to(of_each, (self.rows, *of_each.shape[1:]))
         return np.repeat(of_each, self.lengths, axis=0)

@@ -48,8 +48,9 @@ class Movement(ColumnState):
 
     def take(self, sums: Array, commissioning: Array) -> None:
         """Go on in the last of some intervals; commissioning: (fans,), see `end_interval`."""
-        counted = self.moving(sums, commissioning)[:-1].sum(axis=0)
-        self._moving_intervals += np.where(commissioning, counted, 0)
+        if sums.shape[1] > 1:
+            counted = self.moving(sums, commissioning)[:-1].sum(axis=0)
+            self._moving_intervals += np.where(commissioning, counted, 0)
         self._motions[:], self._speeds[:] = sums[:, -1]
 
     @staticmethod
