@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -170,18 +171,18 @@ class Residual:
 
     def joined(self, parts: Sequence[ScoredResidual]) -> JoinedResidual:
         """What was scored in successive parts."""
-        state = BaselineState(*(np.concatenate(of) for of in zip(*(part.state for part in parts), strict=True)))
-        counts = np.concatenate([part.intervals.lengths for part in parts])
+        state, columns, spread = parts[0].state, [getattr(parts[0], name) for name in JOINED], parts[0].intervals.spread
+        if len(parts) > 1:
+            state = BaselineState(*(np.concatenate(of) for of in zip(*(part.state for part in parts), strict=True)))
+            columns = [np.concatenate([getattr(part, name) for part in parts]) for name in JOINED]
+            spread = partial(np.repeat, repeats=np.concatenate([part.intervals.lengths for part in parts]), axis=0)
         of_intervals = (
             np.where(state.is_commissioning, np.nan, state.commissioned),
             self._independent_intervals(state),
             self.baseline.at_limit(state),
             state.learned_scale,
         )
-        return JoinedResidual(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in JOINED),
-            *(np.repeat(of, counts, axis=0) for of in of_intervals),
-        )
+        return JoinedResidual(*columns, *map(spread, of_intervals))
 
     def end_interval(
         self,
