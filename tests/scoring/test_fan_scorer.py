@@ -149,8 +149,8 @@ def test_intervals_together_give_the_bits_of_one_after_the_other(seed: int) -> N
     assert json.dumps(whole.snapshot()) == json.dumps(single.snapshot())
 
 
-def one_fan(**baseline: float) -> Limits:
-    of = HealthyResidual(baseline=BaselineSettings(**baseline))
+def one_fan(baseline: BaselineSettings) -> Limits:
+    of = HealthyResidual(baseline=baseline)
     smoothed: dict[str, DetectorSettings] = {"speed_smoothed": SmoothedSettings(limit=8.0)}
     return Limits(speed=of, balance=of, detectors=smoothed, timing=Timing(baseline_s=0.05))
 
@@ -165,12 +165,12 @@ def test_an_interval_that_commissions_a_fan_counts_also_when_its_last_samples_ar
     samples = white(100, fans=1)
     samples.speed_rad_s[20:] = 2.0
     samples.speed_valid[23:] = samples.balance_valid[23:] = False
-    limits = one_fan(speed_exponent=2, reference_speed_rad_s=100.0)
+    limits = one_fan(BaselineSettings(speed_exponent=2, reference_speed_rad_s=100.0))
     assert snapshot_after(samples, limits, [23]) == snapshot_after(samples, limits, range(100))
 
 
 def test_a_baseline_that_may_not_be_learned_has_the_same_sign_of_zero_however_samples_are_cut() -> None:
-    limits = one_fan(commissioning_limit_sigmas=0.0)
+    limits = one_fan(BaselineSettings(commissioning_limit_sigmas=0.0))
     assert snapshot_after(white(200, fans=1), limits, []) == snapshot_after(
         white(200, fans=1), limits, range(0, 200, 5)
     )
@@ -180,7 +180,7 @@ def test_a_valid_sample_that_is_no_number_does_not_stop_the_scorer() -> None:
     samples = white(200, fans=1)
     samples.speed_residual[120] = np.nan
     with np.errstate(invalid="ignore"):
-        scored = scored_of(FanScorer(1, one_fan()), samples)
+        scored = scored_of(FanScorer(1, one_fan(BaselineSettings())), samples)
     assert np.isfinite(scored.score[:120][50:]).all()
 
 
