@@ -264,12 +264,13 @@ class FanScorer:
         if self._healthy_motion:
             healthy_rad_s = self._healthy_motion.update(samples.command, samples.predicted_rad_s, speed_rad_s, period_s)
             transient_rad_s = np.minimum(transient_rad_s, healthy_rad_s)
+        operating_rad_s = samples.operating_speed_rad_s(is_predicted=self.limits.over_predicted_speed)
         piece = Piece(
             samples=samples,
             transient_rad_s=transient_rad_s,
             movement=self._movement.samples(motion_rad_s, speed_rad_s) if self._movement else None,
             residuals={
-                source: residual.samples(*samples.residual(source), speed_rad_s, transient_rad_s, period_s)
+                source: residual.samples(*samples.residual(source), operating_rad_s, transient_rad_s, period_s)
                 for source, residual in self.residuals.items()
             },
             table=self._rows,

@@ -71,6 +71,9 @@ class Limits(_Entry):
     detectors: dict[str, SerializeAsAny[DetectorSettings]] = Field(
         default_factory=dict, description="settings of each detector by its name; one that is missing is not used"
     )
+    over_predicted_speed: bool = Field(
+        default=False, description="all that depends on the speed is by the predicted speed, not by the readings"
+    )
     timing: Timing = Field(default=Timing(), description="the times for which the limits are valid")
     declared_rate: DeclaredRate | None = Field(default=None, description="null where these limits have none")
 

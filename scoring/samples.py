@@ -52,6 +52,16 @@ class Samples:
             return self.speed_residual, self.speed_sigma_rad_s, self.speed_valid, self.speed_unseen
         return self.balance, self.balance_sigma, self.balance_valid, self.balance_unseen
 
+    def operating_speed_rad_s(self, *, is_predicted: bool) -> Array:
+        """(n, fans) the speed that healthy residuals depend on: the reading, or what is predicted where it is known.
+
+        Readings of a tacho that counts are steps. The mean residual of all samples with one reading says which speeds
+        are rounded to it, and not how the fan differs from its twin.
+        """
+        if not is_predicted:
+            return self.speed_rad_s
+        return np.where(np.isfinite(self.predicted_rad_s), self.predicted_rad_s, self.speed_rad_s)
+
     def rows(self, rows: slice) -> Samples:
         """Some of the samples."""
         columns = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "period_ns"}

@@ -40,7 +40,7 @@ USED_AFTER_D = 1.0
 """and so many days after a version was offered for it, they put it in force"""
 DAY_NS = round(DAY_S * NS_PER_S)
 SEEN = "seen.pickle"
-PIECE = 60
+PIECE = 120
 """lines that the stages take at a time: scores must not lag behind the lines by minutes"""
 
 

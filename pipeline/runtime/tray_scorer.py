@@ -153,7 +153,8 @@ class TrayScorer:
         period_s = item.period_ns / NS_PER_S
         if not self._holds:
             return self.fan_scorer.limit_sigmas("speed", period_s), self.fan_scorer.limit_sigmas("balance", period_s)
-        speed, limit_at = item.measured_speed_rad_s[row], self.fan_scorer.limit_at
+        limits, limit_at = self.fan_scorer.limits, self.fan_scorer.limit_at
+        speed = samples.operating_speed_rad_s(is_predicted=limits.over_predicted_speed)[row]
         of_speed, of_balance = scored.speed_learned_scale[row], scored.balance_learned_scale[row]
         return (
             limit_at("speed", speed, statistic, period_s, of_speed, samples.speed_unseen[row]),

@@ -11,6 +11,7 @@ end of the confidence interval of the extrapolated tail.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import islice
 from types import MappingProxyType
 
 import numpy as np
@@ -121,6 +122,7 @@ def calibrate(
         speed=unlimited,
         balance=unlimited,
         detectors={row.name: row.detector.settings.unreached() for row in calibrated_rows()},
+        over_predicted_speed=any(tacho.held_s > 0.0 for run in islice(runs(), 1) for tacho in run.tachos),
         timing=timing,
     )
     found = healthy_statistics(runs, limits, top_speed_rad_s)

@@ -188,7 +188,8 @@ class _RunStatistics:
         if not use.any():
             return
         found, moments = self._found, self._found.moments[source]
-        speed = np.abs(block.speed_rad_s) / found.top_speed_rad_s * SPEED_BINS
+        operating_rad_s = block.operating_speed_rad_s(is_predicted=self._scorer.limits.over_predicted_speed)
+        speed = np.abs(operating_rad_s) / found.top_speed_rad_s * SPEED_BINS
         bins = np.clip(speed, 0, SPEED_BINS - 1)
         transient_rad_s = np.concatenate([one.transient_rad_s for one in seen])
         octave = np.log2(np.maximum(transient_rad_s / found.top_speed_rad_s, 1e-9))
