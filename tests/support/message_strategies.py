@@ -30,7 +30,15 @@ TEXT = st.text(max_size=20)
 FLOAT = st.floats(width=64)
 POSITION = st.builds(InputPosition, TEXT, TEXT, UINT64, UINT64, UINT64, st.booleans())
 HEADER = st.builds(Header, TEXT, UINT64, TEXT, st.none() | POSITION)
-_TIMES = ("t_ns", "onset_t_ns", "shelved_until_t_ns", "since_t_ns", "newest_input_t_ns", "newest_output_t_ns")
+_TIMES = (
+    "t_ns",
+    "onset_t_ns",
+    "shelved_until_t_ns",
+    "since_t_ns",
+    "newest_input_t_ns",
+    "newest_output_t_ns",
+    "first_sample_t_ns",
+)
 SCALARS: dict[str, st.SearchStrategy[Any]] = {
     **dict.fromkeys(_TIMES, INT64),
     "period_ns": PERIOD_NS,
