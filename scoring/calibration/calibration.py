@@ -11,7 +11,6 @@ end of the confidence interval of the extrapolated tail.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from itertools import islice
 from types import MappingProxyType
 
 import numpy as np
@@ -100,6 +99,7 @@ def calibrate(
     sigma_shares: Mapping[Signal, Array] = MappingProxyType({}),
     sigma_rad_s: float | None = None,
     alarms_left_out: int = 0,
+    over_predicted_speed: bool = False,
 ) -> Limits:
     """Limits with a declared number of false alarms per fan and day.
 
@@ -110,6 +110,7 @@ def calibrate(
     alarms_left_out: so many alarms, perhaps false ones, were raised while the runs were recorded, and the time around
     them is not in the runs. Without counting them, each calibration on what was recorded under the limits of the one
     before would have lower limits than that.
+    over_predicted_speed: see Limits; for tachos that count.
 
     Raises:
         TooLittleError: the runs are too short for the rate, and extrapolate is not set; or too short for any limit
@@ -122,7 +123,7 @@ def calibrate(
         speed=unlimited,
         balance=unlimited,
         detectors={row.name: row.detector.settings.unreached() for row in calibrated_rows()},
-        over_predicted_speed=any(tacho.held_s > 0.0 for run in islice(runs(), 1) for tacho in run.tachos),
+        over_predicted_speed=over_predicted_speed,
         timing=timing,
     )
     found = healthy_statistics(runs, limits, top_speed_rad_s)

@@ -42,6 +42,7 @@ def find_limits(
         has_drive=all(twin.card.drive is not None for twin in twins),
         sigma_shares=_sigma_shares(twins[0]) if len(twins) == 1 else {},
         alarms_left_out=alarms_left_out,
+        over_predicted_speed=any(tacho.held_s > 0.0 for twin in twins for tacho in twin.card.tacho),
         sigma_rad_s=float(np.mean(alike(np.concatenate([twin.sigma_rad_s for twin in twins])))),
     )
 
