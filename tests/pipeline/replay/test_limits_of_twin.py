@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.replay.offline import limits_of_twin
 from pipeline.runtime.tray_twin import TrayTwin, load_tray_twin
+from schemas.tacho import Tacho
 from schemas.twin_card import DriveCard
 from scoring.limits import Timing
 from tests.support.twin_files import write_twin
@@ -25,7 +26,7 @@ def with_a_drive(twin: TrayTwin) -> TrayTwin:
     return replace(twin, card=replace(twin.card, drive=drive))
 
 
-def test_calibration_knows_top_speed_bend_and_drive_of_all_twins(
+def test_calibration_knows_top_speed_bend_drive_and_tachos_of_all_twins(
     plain: TrayTwin, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: list[dict[str, Any]] = []
@@ -35,16 +36,18 @@ def test_calibration_knows_top_speed_bend_and_drive_of_all_twins(
 
     monkeypatch.setattr(limits_of_twin, "calibrate", seen)
     faster = replace(plain, card=replace(plain.card, speed_range_rad_s=(0.0, 700.0)))
-    for twins in ([plain], [with_a_drive(plain)], [with_a_drive(plain), faster]):
+    counting = replace(plain, card=replace(plain.card, tacho=(Tacho(kind="count", window_s=0.5),)))
+    for twins in ([plain], [with_a_drive(plain)], [with_a_drive(plain), faster], [plain, counting]):
         limits_of_twin.find_limits(twins, lambda: iter(()), Timing(), 1.0, alarms_left_out=2)
     bend_rad_s = plain.bend_rad_s
     assert bend_rad_s
     common = {"crossover_speed_rad_s": bend_rad_s, "sigma_rad_s": pytest.approx(plain.sigma_rad_s.mean())}
     common |= {"alarms_left_out": 2}
     assert given == [
-        {"top": 500.0, "has_drive": False, **common},
-        {"top": 500.0, "has_drive": True, **common},
-        {"top": 700.0, "has_drive": False, **common},
+        {"top": 500.0, "has_drive": False, "over_predicted_speed": False, **common},
+        {"top": 500.0, "has_drive": True, "over_predicted_speed": False, **common},
+        {"top": 700.0, "has_drive": False, "over_predicted_speed": False, **common},
+        {"top": 500.0, "has_drive": False, "over_predicted_speed": True, **common},
     ]
 
 
