@@ -22,6 +22,8 @@ BEGINNING = -(2**63)
 RAW_MISSING = "{raw_missing}"
 """in a reason: their number, which is known only at the end"""
 
+_NEVER_REACHED = "raw messages never reached {}, and the recording does not say which"
+
 
 class Limit(NamedTuple):
     """Up to where the outputs of a session can be reproduced."""
@@ -249,6 +251,8 @@ def _extend_by_messages(session: Session, position: fan_pb2.InputPosition, envel
     if before is None:
         first = max(0, position.sequence - position.consumed_count + 1)
         session.spans.append(Span(position.producer, first, position.sequence))
+        if position.contiguous_from > first:
+            session.set_limit(BEGINNING, _NEVER_REACHED.format(session.producer))
     elif _continues(before, position):
         session.spans[-1].last = position.sequence
     else:
@@ -257,10 +261,7 @@ def _extend_by_messages(session: Session, position: fan_pb2.InputPosition, envel
         newly_contiguous = position.sequence - position.contiguous_from + 1
         earlier = position.consumed_count - before.consumed_count - newly_contiguous
         if earlier != 0:
-            session.set_limit(
-                session.last_t_ns,
-                f"raw messages never reached {session.producer}, and the recording does not say which",
-            )
+            session.set_limit(session.last_t_ns, _NEVER_REACHED.format(session.producer))
         session.spans[-1].last = before.sequence + max(earlier, 0)
         session.spans.append(Span(position.producer, position.contiguous_from, position.sequence))
     session.spans[-1].last_known = position.sequence

@@ -201,6 +201,18 @@ def test_samples_that_never_reached_the_resampler_are_not_invented(tmp_path):
     assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
 
 
+def test_samples_that_never_reached_a_resampler_before_its_first_output_are_no_difference(tmp_path):
+    site = Site(tmp_path, seed=5)
+    site.run(150)
+    site.restart_source()
+    site.kill("resampler")
+    site.run(5)  # it does not know the rate of its line yet
+    site.loses(3)
+    site.run(150)
+    (reason,) = verified_in_part(site.finished()).reasons
+    assert "raw messages never reached resampler" in reason
+
+
 def test_an_undecodable_alarm_costs_that_alarm_only(undisturbed):
     alarms = recorded(undisturbed, "alarm")
     with open_replay_input([undisturbed], None, (), None) as replay_input:
