@@ -52,6 +52,7 @@ class FanScorer:
         allows_for_counts: bool = True,
         limits_motion: bool = True,
         begins_still: bool = True,
+        keeps_shared: bool = True,
     ) -> None:
         """for_calibration: keep what calibration needs, for `observed`; statistics then grow beyond their limits.
 
@@ -61,6 +62,8 @@ class FanScorer:
         allowed to be unsteady while the fan changes its speed, and to repeat where a healthy fan would read the same.
         limits_motion: False only to decide as for recordings made when limits widened with any motion of the readings.
         begins_still: False only to decide as for recordings made when a single reading could be the first baseline.
+        keeps_shared: False only to decide as for recordings made when fans that were commissioned again, all of them,
+        shared nothing at first.
         """
         self.limits = limits
         self.residuals: dict[Signal, Residual] = {source: Residual(fans, source, limits) for source in RESIDUALS}
@@ -92,6 +95,7 @@ class FanScorer:
         }
         """the detectors of each input, and their places in the table"""
         self._movement = Movement(fans) if skips_transients else None
+        self._keeps_shared = keeps_shared
         self._intervals = IntervalScorer(
             fans,
             self.residuals,
@@ -171,7 +175,7 @@ class FanScorer:
     def recommission(self, fans: Array) -> None:
         """Learn new baselines for some fans, (fans,) of bool."""
         for residual in self.residuals.values():
-            residual.restart(fans)
+            residual.restart(fans, keeps_shared=self._keeps_shared)
             residual.reset(fans)
         for detector in self.detectors.values():
             detector.reset(fans)

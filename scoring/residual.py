@@ -199,16 +199,17 @@ class Residual:
             below_half_limit = below_half_limit & ~alone
         self.baseline.end_interval(samples, within_limit, below_half_limit, moving, few_readings)
 
-    def restart(self, fans: Array) -> None:
-        """Commission some fans again, (fans,) of bool."""
+    def restart(self, fans: Array, *, keeps_shared: bool) -> None:
+        """Commission some fans again, (fans,) of bool. keeps_shared: see SharedOffset.restart."""
         self.baseline.restart(fans)
         if self._shared:
-            self._shared.restart(fans)
+            self._shared.restart(fans, keeps_value=keeps_shared)
 
     @property
     def shared_offset(self) -> float:
-        """What the fans shared when last compared, for each rad/s of their speed, in the unit of the residual."""
-        return self._shared.compared if self._shared else 0.0
+        """What the fans have come to share since they were commissioned, for each rad/s of their speed, in the unit of
+        the residual."""
+        return self._shared.since_commissioning if self._shared else 0.0
 
     def _independent_intervals(self, state: BaselineState) -> Array:
         """The number of independent intervals whose mean would vary as much as baseline and shared part do."""

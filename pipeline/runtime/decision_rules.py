@@ -68,6 +68,9 @@ class DecisionRules(IntEnum):
     which a healthy fan slows down; one that turns again after it has been at rest, a second after its tacho's reach.
     Before, both took three times the longest coast. Residuals that exceed their limits with a standstill return at any
     speed. Before, they returned like others."""
+    SHARED_STAYS = 18
+    """What the fans of a tray share stays when all of them are commissioned again. Before, it began at zero, and their
+    baselines took it as an offset that does not depend on the speed."""
 
 
 CURRENT_RULES = max(DecisionRules)

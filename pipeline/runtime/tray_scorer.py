@@ -60,6 +60,7 @@ class TrayScorer:
             allows_for_counts=decision_rules >= DecisionRules.ONE_ALARM,
             limits_motion=decision_rules >= DecisionRules.HEALTHY_MOTION,
             begins_still=decision_rules >= DecisionRules.FIRST_BASELINE,
+            keeps_shared=decision_rules >= DecisionRules.SHARED_STAYS,
         )
         advice = Advice(twin.command_unit) if self._holds else None
         if judges_rest:

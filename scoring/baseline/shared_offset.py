@@ -12,7 +12,8 @@ again.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -68,16 +69,18 @@ class SharedOffset(ColumnState):
         self._value = np.zeros(1)
         self._compared = np.zeros(1)
         """the value when fans were last compared"""
+        self._commissioned = np.zeros(1)
+        """the value when all fans were last commissioned again; the limit is from there"""
         self._products = np.zeros(fans, np.int64)
         self._squares = np.zeros(fans, np.int64)
         self._counts = np.zeros(fans, np.int64)
 
     @property
-    def compared(self) -> float:
-        """The offset when fans were last compared, for each rad/s, in the unit of the residual: what only one fan that
-        turned alone has added since is not shared.
+    def since_commissioning(self) -> float:
+        """How far the offset was from that of the last commissioning of all fans when fans were last compared, for each
+        rad/s, in the unit of the residual: what only one fan that turned alone has added since is not shared.
         """
-        return float(self._compared[0])
+        return float(self._compared[0] - self._commissioned[0])
 
     @property
     def independent_intervals(self) -> float:
@@ -134,12 +137,13 @@ class SharedOffset(ColumnState):
         each, middle = np.arange(len(counts)), np.maximum(number - 1, 0) // 2
         low, high = offsets[each, middle].tolist(), offsets[each, np.maximum(number - 1, 0) - middle].tolist()
         value, last_compared = float(self._value[0]), float(self._compared[0])
+        least, most = self._range
         values, compared = np.empty((2, len(counts)))
         for k, compares in enumerate(is_compared.tolist()):
             values[k], compared[k] = value, last_compared
             if compares:
                 value += self._gain * (min(max(value, low[k]), high[k]) - value)
-                value = last_compared = min(max(value, -self._limit), self._limit)
+                value = last_compared = min(max(value, least), most)
         return values, compared, first_end(alone)
 
     def take(self, of: SharedOverIntervals) -> None:
@@ -166,7 +170,7 @@ class SharedOffset(ColumnState):
             offsets = np.sort(self._products[used] / (self._squares[used] + ridge))
             middle = (len(offsets) - 1) // 2
             self._value += gain * (self._value.clip(offsets[middle], offsets[-1 - middle]) - self._value)
-            self._value[:] = self._value.clip(-self._limit, self._limit)
+            self._value[:] = self._value.clip(*self._range)
             if is_compared:
                 self._compared[:] = self._value
             else:
@@ -176,17 +180,34 @@ class SharedOffset(ColumnState):
         self._products[:] = self._squares[:] = self._counts[:] = 0
         return alone
 
-    def restart(self, fans: Array) -> None:
-        """Some fans, (fans,) of bool, are commissioned again; all of them: then nothing is shared yet."""
+    def restart(self, fans: Array, *, keeps_value: bool) -> None:
+        """Some fans, (fans,) of bool, are commissioned again.
+
+        keeps_value: also where these are all fans. What they share is a share of the speed; baselines that are learned
+        without it take it as an offset, which is wrong at all other speeds.
+        """
         self._products[fans] = self._squares[fans] = self._counts[fans] = 0
-        if fans.all():
+        if not fans.all():
+            return
+        if not keeps_value:
             self._value[:] = self._compared[:] = 0.0
+        self._commissioned[:] = self._compared[:] = self._value
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """See ColumnState. Earlier snapshots do not say what was shared when fans were commissioned."""
+        super().restore({"commissioned": [0.0], **state})
+
+    @property
+    def _range(self) -> tuple[float, float]:
+        commissioned = float(self._commissioned[0])
+        return commissioned - self._limit, commissioned + self._limit
 
     def columns(self) -> dict[str, Array]:
         """See ColumnState."""
         return {
             "value": self._value,
             "compared": self._compared,
+            "commissioned": self._commissioned,
             "products": self._products,
             "squares": self._squares,
             "counts": self._counts,

@@ -127,6 +127,23 @@ def test_a_snapshot_of_a_card_without_a_shared_part_is_continued() -> None:
     assert second.snapshot()["speed"]["shared"]["value"][0] < -0.005
 
 
+@pytest.mark.parametrize("keeps_shared", [True, False])
+def test_fans_that_all_became_slower_and_are_commissioned_again_are_healthy_at_all_speeds(keeps_shared: bool) -> None:
+    scorer = FanScorer(FANS, limits(), keeps_shared=keeps_shared)
+    speed_rad_s = np.repeat(np.tile([50.0, 200.0], 5), 12 * PER_S)[:, np.newaxis] * np.ones(FANS)  # for 12 s each
+    residual = 0.2 * autoregressive(len(speed_rad_s), FANS, 0.0, 1)
+    residual[24 * PER_S :] += WEATHER * speed_rad_s[24 * PER_S :] / SIGMA_RAD_S
+    made = samples_of(residual, np.zeros(residual.shape), period_ns=PERIOD_NS)
+    made = replace(made, speed_rad_s=speed_rad_s, predicted_rad_s=speed_rad_s)
+    made = replace(made, speed_sigma_rad_s=np.full(residual.shape, SIGMA_RAD_S))
+    scorer.update(rows_of(made, slice(0, 73 * PER_S)))
+    scorer.recommission(np.ones(FANS, np.bool_))  # at the low speed, where it is half a sigma
+    scored = scorer.update(rows_of(made, slice(73 * PER_S, len(speed_rad_s))))
+    at_high_speed = slice(13 * PER_S, 23 * PER_S)
+    off = np.abs(scored.speed_smoothed[at_high_speed].mean(axis=0))
+    assert (off < 0.1).all() if keeps_shared else (off > 0.1).all()
+
+
 def test_the_baseline_of_a_fan_that_turns_alone_learns_nothing_and_all_start_again_together() -> None:
     scorer, samples = FanScorer(FANS, limits()), tray()
     learned: dict[int, float] = {}
@@ -137,5 +154,10 @@ def test_the_baseline_of_a_fan_that_turns_alone_learns_nothing_and_all_start_aga
     assert learned[36] == learned[46]
     scorer.recommission(np.array([True, False, False]))
     assert scorer.snapshot()["speed"]["shared"]["value"][0] < -0.01
+    shared = scorer.snapshot()["speed"]["shared"]["value"]
     scorer.recommission(np.ones(FANS, np.bool_))
-    assert scorer.snapshot()["speed"]["shared"]["value"] == [0.0]
+    assert scorer.snapshot()["speed"]["shared"]["value"] == shared
+    former = FanScorer(FANS, limits(), keeps_shared=False)
+    former.update(rows_of(samples, slice(0, 30 * PER_S)))
+    former.recommission(np.ones(FANS, np.bool_))
+    assert former.snapshot()["speed"]["shared"]["value"] == [0.0]

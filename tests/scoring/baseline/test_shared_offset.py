@@ -116,9 +116,9 @@ def test_a_fan_alone_is_followed_slowly_in_place_of_its_baseline_and_only_while_
     _take(shared, np.full(3, 1.0), ALL[:3])
     assert not shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None).any()
     assert at(shared, one)[0, 0] > followed + 0.03  # with others at once
-    shared.restart(first)
+    shared.restart(first, keeps_value=False)
     assert at(shared, one)[0, 0] > followed
-    shared.restart(ALL[:3])
+    shared.restart(ALL[:3], keeps_value=False)
     assert at(shared, one)[0, 0] == 0.0
 
 
@@ -135,6 +135,24 @@ def test_the_only_fan_of_a_tray_with_several_channels_keeps_its_own_baseline() -
     _take(shared, np.full(3, -1.0), only)
     assert not shared.end_interval(SAMPLES, only, ALL[:3], None).any()
     assert at(shared, np.full((1, 1), 50.0))[0, 0] == 0.0
+
+
+def test_it_stays_when_all_fans_are_commissioned_again_and_its_limit_is_from_there() -> None:
+    shared, too_much = shared_offset(3), 2.5 * LIMIT * 50.0
+
+    def settle() -> float:
+        for _ in range(120):
+            _take(shared, np.full(3, too_much), ALL[:3])
+            shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None)
+        return float(shared.columns()["value"][0])
+
+    assert settle() == LIMIT == pytest.approx(shared.since_commissioning)
+    shared.restart(np.array([True, True, False]), keeps_value=True)
+    assert settle() == LIMIT, "some of the fans"
+    shared.restart(ALL[:3], keeps_value=True)
+    assert (shared.columns()["value"][0], shared.since_commissioning) == (LIMIT, 0.0)
+    assert settle() == 2 * LIMIT
+    assert shared.since_commissioning == pytest.approx(LIMIT)
 
 
 def test_turning_backwards_is_slowed_by_the_same_air() -> None:
@@ -160,3 +178,8 @@ def test_it_continues_from_a_snapshot() -> None:
         shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None)
     np.testing.assert_array_equal(at(before, np.ones((1, 1))), at(after, np.ones((1, 1))))
     assert at(before, np.ones((1, 1)))[0, 0] > 0.0
+    earlier = before.snapshot()
+    del earlier["commissioned"]
+    after.restart(ALL[:3], keeps_value=True)
+    after.restore(earlier)
+    assert after.snapshot() == before.snapshot()
