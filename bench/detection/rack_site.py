@@ -219,7 +219,7 @@ class RackSite:
         for last in offered:
             is_old = last.made_t_ns < now_ns - USED_AFTER_D * DAY_NS
             is_used = in_force is not None and last.since_t_ns == in_force.since_t_ns
-            if is_old and last.why.startswith("all fans") and not is_used:
+            if is_old and "if maintenance" in last.why and not is_used:
                 self._versions.use(last.name)
 
     def _see(self, message: object, day: int) -> None:

@@ -78,13 +78,18 @@ def changed_fans(change: Array, reference: str) -> str:
     far = np.flatnonzero(np.abs(change) > MOST_CHANGE)
     if not len(far):
         return ""
-    compared = change[np.isfinite(change)]
-    together = len(compared) > 1 and np.all(np.sign(compared) == np.sign(change[far[0]]))
-    if together and np.min(np.abs(compared)) > 0.5 * np.max(np.abs(compared)):
+    compared = np.flatnonzero(np.isfinite(change))
+    most = change[far[np.argmax(np.abs(change[far]))]]
+    alike = compared[change[compared] / most > 0.5]
+    if len(alike) > 1 and 2 * len(alike) > len(compared):
         which = "all fans" if len(compared) == len(change) else f"all {len(compared)} fans that can be compared"
+        others = [f"fan {fan} is {_faster(float(change[fan]))}" for fan in compared.tolist() if fan not in alike]
+        if others:
+            which = f"{len(alike)} of {len(compared)} fans"
         return (
-            f"{which} are {_faster(float(np.mean(compared)))} than when {reference} was made; if maintenance, a filter "
-            "or new firmware is the reason, put this version in force"
+            f"{which} are {_faster(float(np.mean(change[alike])))} than when {reference} was made"
+            f"{''.join(f', {other}' for other in others)}; if maintenance, a filter or new firmware is the reason, "
+            "put this version in force"
         )
     named = ", ".join(f"fan {fan} is {_faster(float(change[fan]))}" for fan in far.tolist())
     inspected = "inspect it: if it is" if len(far) == 1 else "inspect them: if they are"

@@ -47,6 +47,9 @@ def test_a_fan_that_is_not_comparable_is_no_change_and_does_not_hide_others() ->
     )
     assert changed_fans(np.array([0.05, 0.04]), "t-1").startswith("all fans are 4.5 % faster")
     assert changed_fans(np.array([-0.05, np.nan, 0.0]), "t-1").startswith("fan 0 is 5.0 % slower")
+    worn = changed_fans(np.array([0.01, 0.04, 0.032, 0.03]), "t-1")  # all were changed, and the first is worn
+    assert worn.startswith("3 of 4 fans are 3.4 % faster than when t-1 was made, fan 0 is 1.0 % faster; if maintenance")
+    assert changed_fans(np.array([-0.04, 0.0, 0.001, -0.04]), "t-1").startswith("fan 0 is 4.0 % slower, fan 3 is 4.0")
     assert changed_fans(np.array([-0.05, np.nan]), "t-1").startswith("fan 0 is 5.0 % slower")
 
 
