@@ -18,8 +18,11 @@ LONGEST_WAIT_S = 7 * 24 * 3600.0
 """of healthy running between two versions"""
 CHECK_AFTER_S = 24 * 3600.0
 """of healthy running between two checks of the fans against the reference"""
+COMMISSIONED_CHECK_S = 4000.0
+"""of healthy running after fans were commissioned again until they are checked: a little more than a check needs. If
+the twin no longer fits them, they have one alarm after the other"""
 AFTER_COMMISSIONING_S = 4 * 3600.0
-"""of healthy running after fans were commissioned again: then the twin is compared with them"""
+"""of healthy running after fans were commissioned again until a version is made"""
 AGAIN_AFTER = 0.25
 """after a failure, healthy running before the next attempt, as a share of the history"""
 AGAIN_AFTER_AT_MOST_S = 24 * 3600.0
@@ -114,4 +117,5 @@ class LearningSchedule:
             return False
         checked_t_ns = listed.check.t_ns if listed.check else 0
         newest_t_ns = max(listed.versions[-1].made_t_ns, listed.commissioned_t_ns, checked_t_ns)
-        return self._history.seconds_since(newest_t_ns) >= CHECK_AFTER_S
+        needed_s = COMMISSIONED_CHECK_S if newest_t_ns == listed.commissioned_t_ns else CHECK_AFTER_S
+        return self._history.seconds_since(newest_t_ns) >= needed_s

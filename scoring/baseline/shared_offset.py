@@ -59,8 +59,9 @@ class SharedOffset(ColumnState):
         """limit: of the offset, for each rad/s. residual_std: of the healthy residual, sigma. interval_s: length of an
         interval. adaptation_s, reach_sigmas: how slowly, and how far, the baseline of a fan may move.
 
-        Offsets at low speed are drawn towards zero (ridge regression): errors of the twin there, as large as half of
-        its residual, must not become large offsets at high speed. `limit` is two standard deviations of the shared one.
+        Offsets at low speed are drawn towards zero, or what was shared when all fans were commissioned again (ridge
+        regression): errors of the twin there, as large as half of its residual, must not become large offsets at high
+        speed. `limit` is two standard deviations of the shared one.
         """
         self._limit = limit
         self._ridge = (residual_std / limit) ** 2
@@ -133,7 +134,7 @@ class SharedOffset(ColumnState):
         alone = (number > 0) & ~is_compared & (commissioned.sum() >= LEAST_FANS)
         ridge = self._ridge * FIXED_POINT_ONE * counts
         divisor = np.where(known, squares + ridge, 1.0)
-        offsets = np.sort(np.where(known, products / divisor, np.inf), axis=1)
+        offsets = np.sort(np.where(known, self._towards_commissioned(products, ridge) / divisor, np.inf), axis=1)
         each, middle = np.arange(len(counts)), np.maximum(number - 1, 0) // 2
         low, high = offsets[each, middle].tolist(), offsets[each, np.maximum(number - 1, 0) - middle].tolist()
         value, last_compared = float(self._value[0]), float(self._compared[0])
@@ -167,7 +168,8 @@ class SharedOffset(ColumnState):
         used, gain = (known, self._gain) if is_compared else (alone & learns, self._gain_alone)
         if used.any():
             ridge = self._ridge * FIXED_POINT_ONE * self._counts[used]
-            offsets = np.sort(self._products[used] / (self._squares[used] + ridge))
+            products = self._towards_commissioned(self._products[used], ridge)
+            offsets = np.sort(products / (self._squares[used] + ridge))
             middle = (len(offsets) - 1) // 2
             self._value += gain * (self._value.clip(offsets[middle], offsets[-1 - middle]) - self._value)
             self._value[:] = self._value.clip(*self._range)
@@ -196,6 +198,11 @@ class SharedOffset(ColumnState):
     def restore(self, state: Mapping[str, Any]) -> None:
         """See ColumnState. Earlier snapshots do not say what was shared when fans were commissioned."""
         super().restore({"commissioned": [0.0], **state})
+
+    def _towards_commissioned(self, products: Array, ridge: Array) -> Array:
+        """The products, such that the ridge draws towards the value at the last commissioning of all fans, or zero."""
+        commissioned = float(self._commissioned[0])
+        return products + commissioned * ridge if commissioned else products
 
     @property
     def _range(self) -> tuple[float, float]:

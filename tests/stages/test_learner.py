@@ -136,7 +136,12 @@ def test_after_fans_are_commissioned_again_the_twin_is_compared_with_them_within
     assert before > 1
     commissioned_t_ns = START_NS + learner.now_s * NS_PER_S
     learner.core.step(Request(t_ns=commissioned_t_ns, action=Action.COMMISSION))
-    learner.run(14_000)
+    checks = len(learner.learning.checks)
+    learner.run(3900)
+    assert len(learner.learning.checks) == checks
+    learner.run(1000)
+    assert len(learner.learning.checks) == checks + 1, "after little more than an hour"
+    learner.run(9_100)
     assert len(learner.versions.all()) == before
     learner.run(1000)
     assert len(learner.versions.all()) == before + 1
