@@ -4,7 +4,8 @@ Reads: topic `command` (fan commands in the tray's command unit, set-points in r
 the [[tray]] names (pipeline/devices/source_kinds.py; speed in the tray's speed unit).
 Writes: topic `raw`: device clock (us, wraps), device sequence (wraps), host time of receipt (ns), command, speed
 (rad/s).
-Timing: a message as soon as it has `block_size` samples; an incomplete block waits at most `block_wait_s`.
+Timing: a message holds what arrives within `block_s`. It is sent as soon as the next samples, by the time between the
+last two arrivals, would come later than that: a line that is slower than `block_s` waits for nothing.
 
 One process and one core per tray. What is done here is the same for all sources: check ranges, count lost and
 repeated samples, convert units, put samples into messages.
@@ -43,13 +44,16 @@ from schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
 STEP_SHOWN_NS = 60 * NS_PER_S  # how long health says that the host clock was set
 FLOAT32_TOLERANCE = 1e-6
+MOST_SAMPLES = 4096
+"""in a message, however fast a line is"""
 
 
 class AcquisitionConfig(StageConfig):
     """Section `[acquisition]`. The source itself is described by the tray."""
 
-    block_size: int = Field(default=1, ge=1, le=4096, description="samples a message; 1 has the lowest latency")
-    block_wait_s: float = Field(default=0.5, gt=0, description="how long an incomplete block waits for its last sample")
+    block_s: float = Field(
+        default=0.05, ge=0, le=1, description="a message holds the samples of this time; 0: those of one read"
+    )
     silence_s: float = Field(
         default=2.0, gt=0, description="health reports a problem after this long without a valid sample"
     )
@@ -114,6 +118,9 @@ class AcquisitionCore(Core):
         self._source = source
         self._sequence = DeviceSequence()
         self._block: list[_Received] = []
+        self._block_ns = round(config.block_s * NS_PER_S)
+        self._arrived_t_ns = started_t_ns
+        """the newest samples"""
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
         self._now_ns = started_t_ns
@@ -141,9 +148,7 @@ class AcquisitionCore(Core):
         """Publish a block that has waited long enough."""
         self._follow_host_clock()
         self._now_ns = now_ns
-        if self._block and now_ns - self._block[0].t_ns >= self._config.block_wait_s * NS_PER_S:
-            return self._flush()
-        return []
+        return self._flush() if self._block and now_ns - self._block[0].t_ns >= self._block_ns else []
 
     def close(self) -> list[Raw]:
         """Publish the rest of a block."""
@@ -204,9 +209,17 @@ class AcquisitionCore(Core):
             if self._block and received.columns != self._block[0].columns:
                 messages += self._flush()
             self._block.append(received)
-            if len(self._block) >= self._config.block_size:
+            if len(self._block) >= MOST_SAMPLES:
                 messages += self._flush()
-        return messages
+        return messages + self._flush_if_next_is_late(batch.received_t_ns)
+
+    def _flush_if_next_is_late(self, received_t_ns: int) -> list[Raw]:
+        """Publish the block unless samples are expected that still belong to it: as soon as those before them."""
+        if not self._block:
+            return []
+        next_t_ns = 2 * received_t_ns - self._arrived_t_ns
+        self._arrived_t_ns = received_t_ns
+        return self._flush() if next_t_ns - self._block[0].t_ns >= self._block_ns else []
 
     def _plausible(self, item: Reading | Rejected) -> Reading | None:
         """The reading, without implausible speeds; None, and counted, if it cannot be used."""

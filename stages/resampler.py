@@ -3,8 +3,9 @@
 Reads: topic `raw` (device clock us, host time of receipt ns, command, speed rad/s).
 Writes: topic `grid`: samples at absolute multiples of the period (t_ns % period_ns == 0), speed interpolated linearly,
 command held (that of the last sample at or before the grid time). The readings of a counting tacho are held, too.
-Timing: a grid sample is published as soon as a raw sample at or after its time has arrived. If one fan has no reading,
-all fans wait for its next one, at most `gap_limit_s`. If no samples arrive, the wait is at most `watermark_s`.
+Timing: a grid sample is published as soon as a raw sample at or after its time has arrived, in one message with the
+others that the same raw message completes. If one fan has no reading, all fans wait for its next one, at most
+`gap_limit_s`. If no samples arrive, the wait is at most `watermark_s`.
 
 Without `rate_hz`, the rate of the grid follows from the line: samples are kept until its rate is known, after one to
 five seconds, and are then put on the grid. The rate stays until the resampler is started again. Of the samples that are
@@ -58,7 +59,6 @@ class ResamplerConfig(StageConfig):
         le=100_000,
         description="samples a second on the grid; without it that of the line, rounded, at most 100",
     )
-    block_size: int = Field(default=1, ge=1, le=4096, description="samples a message; 1 has the lowest latency")
     gap_limit_s: float | None = Field(
         default=None,
         gt=0,
@@ -204,7 +204,7 @@ class ResamplerCore(Core):
         if self._line_hz is not None and is_too_slow(self._line_hz):
             config = config.model_copy(update={"gap_limit_s": config.gap_limit_s or 1.0 / rate_hz})
         self._timing = config.timing(rate_hz)
-        self._grid = SampleGrid(self._tachos, self._timing, config.block_size, self._decision_rules)
+        self._grid = SampleGrid(self._tachos, self._timing, self._decision_rules)
         return self._grid
 
 

@@ -235,7 +235,6 @@ def _config(folder: Path, tray: str) -> Config:
     text = (
         f'site = "bench"\nrun_folder = "{folder / "runs"}"\n'
         f'[[tray]]\nname = "{tray}"\nfans = {RACK_FANS}\nspeed_unit = "rpm"\ntacho = [{windows}]\n'
-        "[resampler]\nblock_size = 60\n"
     )
     return parse_config(text, folder / "fantwin.toml", (), ("resampler", "twin_integrator", "scorer", "learner"))
 

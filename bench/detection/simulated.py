@@ -82,7 +82,7 @@ def healthy_runs(fans: FanParameters, seed: int, seconds: float) -> list[Run]:
 
 def stage(name: str, twin: Path) -> Core:
     """The core of a stage for one tray, as the replay builds it."""
-    text = f'[resampler]\nrate_hz = {RATE_HZ}\nblock_size = 512\n[[tray]]\nname = "tray"\nfans = {TRAY_FANS}\n'
+    text = f'[resampler]\nrate_hz = {RATE_HZ}\n[[tray]]\nname = "tray"\nfans = {TRAY_FANS}\n'
     config = parse_config(text, twin)
     tray = config.trays[0].model_copy(update={"twin": twin.resolve()})
     declared = load_stage(name)

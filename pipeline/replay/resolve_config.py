@@ -11,7 +11,7 @@ from pipeline.config.loading import load_config, parse_config
 from pipeline.config.models import Config
 from pipeline.recordings.metadata import CONFIGURATION
 from pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
-from pipeline.runtime.decision_rules import FORMER_DEFAULTS, DecisionRules
+from pipeline.runtime.decision_rules import FORMER_DEFAULTS, FORMER_KEYS, DecisionRules
 from schemas.envelope import Envelope
 
 
@@ -89,14 +89,15 @@ def _former_defaults(file: Path, metadata: RecordingMetadata) -> list[str]:
 
 def _parsed(file: Path, metadata: RecordingMetadata, overrides: Iterable[str], stages: Iterable[str]) -> Config:
     text = metadata.attachments[CONFIGURATION].decode(errors="replace")
-    return parse_config(text, Path(f"{file}:{CONFIGURATION}"), overrides, stages)
+    return parse_config(text, Path(f"{file}:{CONFIGURATION}"), overrides, stages, FORMER_KEYS)
 
 
 def _recorded_overrides(file: Path, metadata: RecordingMetadata) -> list[str]:
     try:
-        return [str(override) for override in json.loads(metadata.metadata.get("overrides", "[]"))]
+        overrides = [str(override) for override in json.loads(metadata.metadata.get("overrides", "[]"))]
     except (ValueError, TypeError) as error:
         raise RecordingError(f"{file}: its metadata are damaged: overrides are not a list") from error
+    return [override for override in overrides if override.partition("=")[0].strip() not in FORMER_KEYS]
 
 
 def trays_of(files: Iterable[Path]) -> set[str]:

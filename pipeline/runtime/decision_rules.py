@@ -81,3 +81,5 @@ FORMER_DEFAULTS = {
     DecisionRules.ONE_ALARM: {"scorer": {"deadband": 0.25, "off_delay_s": 1.0}},
 }
 """before each version, the settings of a section where a configuration says nothing"""
+FORMER_KEYS = ("resampler.block_size",)
+"""settings of before that decided nothing: a recorded configuration may have them"""

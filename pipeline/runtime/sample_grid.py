@@ -26,6 +26,7 @@ from schemas.units import NS_PER_S
 LONGEST_TICK_NS = NS_PER_S // 10  # a longer pause between ticks is a host that stalled, not a silent source
 SET_BACK_NS = NS_PER_S  # a new sample this much older than the newest: a replay was restarted
 MAX_ENDED_PRODUCERS = 64
+MOST_SAMPLES = 4096  # in a message: those of a long gap are published at once
 GAP, STALE, NO_SPEED, CLOCK_RESTARTED = (
     np.uint8(reason)
     for reason in (InvalidReason.GAP, InvalidReason.STALE, InvalidReason.NO_SPEED, InvalidReason.CLOCK_RESTARTED)
@@ -40,14 +41,10 @@ def first_grid_time(t_ns: int, period_ns: int) -> int:
 class SampleGrid:
     """The grid of one tray. Samples that are dropped and gaps are counted."""
 
-    def __init__(
-        self, tachos: Sequence[Tacho], timing: GridTiming, block_size: int, decision_rules: DecisionRules
-    ) -> None:
-        """tachos: one for each fan; readings that a tacho shows until the next one are held. block_size: samples a
-        message."""
+    def __init__(self, tachos: Sequence[Tacho], timing: GridTiming, decision_rules: DecisionRules) -> None:
+        """tachos: one for each fan; readings that a tacho shows until the next one are held."""
         self._fans = fans = len(tachos)
         self._is_held = np.array([tacho.held_s > 0.0 for tacho in tachos])
-        self._block_size = block_size
         self._period_ns = timing.period_ns
         self._gap_limit_ns = timing.gap_limit_ns
         self._watermark_ns = timing.watermark_ns
@@ -65,7 +62,6 @@ class SampleGrid:
         self._next_t_ns = NEVER_NS
         self._not_before_t_ns = NEVER_NS  # earlier samples are not accepted: the clock has restarted
         self._pending: list[Grid] = []  # not yet published
-        self._pending_rows = 0
         self._in_gap = False
         self._silence_ns = 0
         self._tick_t_ns: int | None = None
@@ -81,10 +77,10 @@ class SampleGrid:
         self._counts["samples_in"] += len(item.host_receive_t_ns)
         if self._guard is None or is_of_replay(item.header.producer) or self._is_repeated(item):
             self._add(item, self._is_new(item))
-            return self._blocks()
+            return self._published()
         for message in self._guard.admit(item, is_of_ended=item.header.producer in self._ended_producers):
             self._add(message, is_new=message.header.producer == self._guard.producer)
-        return self._blocks()
+        return self._published()
 
     def tick(self, now_ns: int) -> list[Grid]:
         """Add up how long no samples have arrived; past the watermark, publish the grid without them."""
@@ -98,7 +94,7 @@ class SampleGrid:
     def publish_until(self, t_ns: int) -> list[Grid]:
         """Publish the grid up to `t_ns` without waiting for more samples."""
         self._fill(t_ns, final=True)
-        return self._blocks(flush=True)
+        return self._published()
 
     def close(self) -> list[Grid]:
         """Publish the grid up to the newest raw sample."""
@@ -300,16 +296,14 @@ class SampleGrid:
             reading_missing=reading_missing if self._marks_missing else np.zeros(0, np.bool_),
         )
         self._pending.append(grid)
-        self._pending_rows += len(t_ns)
         self._counts["grid_samples"] += len(t_ns)
         self._next_t_ns = t_ns.item(-1) + self._period_ns
 
-    def _blocks(self, flush: bool = False) -> list[Grid]:
-        size, rows = self._block_size, self._pending_rows
-        count = rows if flush else rows - rows % size
-        if not count:
+    def _published(self) -> list[Grid]:
+        if not self._pending:
             return []
-        grid = join(self._pending)
-        self._pending = [cut(grid, count, rows)] if count < rows else []
-        self._pending_rows = rows - count
-        return [grid] if rows == size else [cut(grid, k, min(k + size, count)) for k in range(0, count, size)]
+        grid, self._pending = join(self._pending), []
+        rows = len(grid.t_ns)
+        if rows <= MOST_SAMPLES:
+            return [grid]
+        return [cut(grid, first, min(first + MOST_SAMPLES, rows)) for first in range(0, rows, MOST_SAMPLES)]

@@ -28,10 +28,10 @@ S = NS_PER_S
 PROTOCOLS: tuple[Protocol, ...] = ("binary", "text")
 
 
-def make_core(link: FakeLink | None = None, block_size: int = 1, **tray: object) -> SerialCore:
+def make_core(link: FakeLink | None = None, block_s: float = 0.0, **tray: object) -> SerialCore:
     """A core of two fans, its line opened at time 0."""
     values: dict[str, object] = {"name": "bench", "fans": 2, "port": "/dev/ttyTEST"} | tray
-    config = AcquisitionConfig(block_size=block_size)
+    config = AcquisitionConfig(block_s=block_s)
     core = SerialCore(TrayConfig.model_validate(values), config, link or FakeLink())
     assert core.step(LinkUp()) == []
     return core
@@ -76,35 +76,56 @@ def test_samples_that_arrive_together_share_the_time_at_which_they_arrived() -> 
     data = b"".join(encode("binary", sample(i)) for i in range(3))
     assert core.step(ReceivedBytes(data[:10], S)) == []
     messages = core.step(ReceivedBytes(data[10:], 2 * S))
-    assert [raw.host_receive_t_ns.tolist() for raw in messages] == [[2 * S]] * 3
+    assert [raw.host_receive_t_ns.tolist() for raw in messages] == [[2 * S] * 3]
 
 
-def test_a_block_holds_as_many_samples_as_asked_for_and_the_rest_comes_at_the_end() -> None:
-    core = make_core(block_size=4)
-    messages = feed(core, map(sample, range(10)))
-    assert [raw.device_sequence.tolist() for raw in messages] == [[0, 1, 2, 3], [4, 5, 6, 7]]
-    assert messages[0].speed_rad_s.shape == (4, 2)
-    assert [raw.device_sequence.tolist() for raw in core.close()] == [[8, 9]]
+def feed_times(core: SerialCore, times_ms: Iterable[int]) -> list[tuple[int, list[int]]]:
+    """Feed a sample at each of these times; returns when messages came out, and the samples in each."""
+    return [
+        (t_ms, raw.device_sequence.tolist())
+        for number, t_ms in enumerate(times_ms)
+        for raw in feed(core, [sample(number)], t_ns=S + t_ms * S // 1000)
+    ]
+
+
+def test_a_message_holds_the_samples_of_a_time_and_ends_with_the_last_that_is_expected_in_it() -> None:
+    core = make_core(block_s=0.05)
+    messages = feed_times(core, range(0, 130, 10))
+    assert messages == [(0, [0]), (50, [1, 2, 3, 4, 5]), (100, [6, 7, 8, 9, 10])]
+    assert [raw.device_sequence.tolist() for raw in core.close()] == [[11, 12]]
     assert core.close() == []
 
 
-def test_an_incomplete_block_waits_for_a_limited_time() -> None:
-    core = make_core(block_size=4)
-    feed(core, [sample(0)], t_ns=S)
-    assert core.tick(S + S // 4) == []
-    assert [raw.device_sequence.tolist() for raw in core.tick(S + S // 2)] == [[0]]
+@pytest.mark.parametrize(("block_s", "period_ms"), [(0.05, 50), (0.05, 500), (0.0, 1)])
+def test_a_line_without_a_second_sample_in_that_time_waits_for_nothing(block_s: float, period_ms: int) -> None:
+    times_ms = range(0, 10 * period_ms, period_ms)
+    assert [t_ms for t_ms, _ in feed_times(make_core(block_s=block_s), times_ms)] == [*times_ms]
+
+
+def test_a_message_whose_samples_stay_away_is_sent_after_its_time() -> None:
+    core = make_core(block_s=0.05)
+    assert feed_times(core, [0, 10, 20]) == [(0, [0])]
+    assert core.tick(S + 59 * S // 1000) == []
+    assert [raw.device_sequence.tolist() for raw in core.tick(S + 60 * S // 1000)] == [[1, 2]]
     assert core.tick(9 * S) == []
 
 
-def test_an_incomplete_block_is_published_when_the_line_goes_down() -> None:
-    core = make_core(block_size=4)
-    feed(core, [sample(0)])
-    assert [raw.device_sequence.tolist() for raw in core.step(LinkDown("gone"))] == [[0]]
+def test_what_waits_is_published_when_the_line_goes_down() -> None:
+    core = make_core(block_s=0.05)
+    feed_times(core, [0, 10])
+    assert [raw.device_sequence.tolist() for raw in core.step(LinkDown("gone"))] == [[1]]
+
+
+def test_a_message_of_a_fast_line_has_4096_samples_at_most() -> None:
+    core = make_core(block_s=1.0)
+    data = b"".join(encode("binary", sample(i)) for i in range(5000))
+    assert [len(raw.host_receive_t_ns) for raw in core.step(ReceivedBytes(data, S))] == [4096, 904]
 
 
 def test_a_device_without_clock_and_sequence_has_empty_columns_and_loses_nothing() -> None:
-    core = make_core(protocol="text", block_size=3)
-    messages = feed(core, [sample(None), sample(None), sample(5), sample(6), sample(7)], "text")
+    core = make_core(protocol="text", block_s=0.05)
+    frames = sample(None), sample(None), sample(5), sample(6), sample(7)
+    messages = core.step(ReceivedBytes(b"".join(encode("text", frame) for frame in frames), S))
     assert [len(raw.host_receive_t_ns) for raw in messages] == [2, 3]
     assert [len(raw.device_sequence) for raw in messages] == [0, 3]
     assert [len(raw.device_clock_us) for raw in messages] == [0, 3]

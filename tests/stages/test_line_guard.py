@@ -54,7 +54,7 @@ def after_stall(from_s: float, until_s: float, received_s: float | None = None) 
 
 
 def core_of(rules: DecisionRules = max(DecisionRules)) -> ResamplerCore:
-    return ResamplerCore(1, FIXED.model_copy(update={"block_size": 512}), decision_rules=rules)
+    return ResamplerCore(1, FIXED, decision_rules=rules)
 
 
 def grid_of(core: ResamplerCore, *parts: Iterable[Raw]) -> Grid:

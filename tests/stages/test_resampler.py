@@ -115,11 +115,10 @@ def test_a_grid_sample_is_published_with_the_first_raw_sample_at_or_after_it() -
     assert [[seconds_of(g.t_ns).round(3).tolist() for g in grids] for grids in steps] == [[], [], [[0.01]], [[0.02]]]
 
 
-def test_blocks_have_the_size_asked_for() -> None:
-    core = ResamplerCore(1, FIXED.model_copy(update={"block_size": 7}))
-    grids = core.step(raw(at(*np.arange(0.0, 0.2, 0.01)), np.zeros(20)))
-    assert [len(grid.t_ns) for grid in grids] == [7, 7]
-    assert [len(grid.t_ns) for grid in core.close()] == [6]
+def test_what_a_message_completes_is_one_message_unless_it_is_very_long() -> None:
+    core = ResamplerCore(1, FIXED.model_copy(update={"gap_limit_s": 1.0, "watermark_s": 1.0, "stale_for_s": 100.0}))
+    assert [len(grid.t_ns) for grid in core.step(raw(at(*np.arange(0.0, 0.2, 0.01)), np.zeros(20)))] == [20]
+    assert [len(grid.t_ns) for grid in core.step(raw(at(90.0), np.zeros(1)))] == [4096, 4096, 9001 - 20 - 8192]
 
 
 @settings(max_examples=60, deadline=None)
@@ -215,12 +214,6 @@ def test_new_samples_end_a_silence() -> None:
     assert _ticks(core, 0.0, 0.4) == []
     core.step(raw(at(0.4), np.ones(1)))
     assert _ticks(core, 0.4, 0.85) == []
-
-
-def test_an_incomplete_block_is_published_at_the_watermark() -> None:
-    core = ResamplerCore(1, FIXED.model_copy(update={"block_size": 50}))
-    assert core.step(raw(at(0.0, 0.01), np.ones(2))) == []
-    assert joined(_ticks(core, 0.0, 0.56)).t_ns[:2].tolist() == at(0.0, 0.01).tolist()
 
 
 def test_a_sample_that_arrives_after_its_grid_time_was_published_is_counted_as_lost() -> None:

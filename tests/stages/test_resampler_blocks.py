@@ -141,22 +141,20 @@ def driven(items: Iterable[Raw | ByTime], **config: float | None) -> tuple[list[
     happenings=st.lists(st.tuples(st.sampled_from(WHAT_HAPPENS), st.integers(1, 30)), min_size=1, max_size=12),
     seed=st.integers(0, 1000),
     sizes=st.lists(st.integers(1, 64), min_size=1, max_size=4),
-    out_block=st.sampled_from([1, 7, 512]),
     clock_us=st.sampled_from([None, 0, 2**32 - 10_300_000]),
     rate_hz=st.sampled_from([None, 7.0, 50.0, 100.0, 1000.0]),
 )
 @example(  # a former producer becomes the line's again within a message, and its last sample counts
-    [("regular", 1), ("another time", 8), ("regular", 160), ("another time", 8)], 1, [64], 1, None, 7.0
+    [("regular", 1), ("another time", 8), ("regular", 160), ("another time", 8)], 1, [64], None, 7.0
 )
 def test_blocks_of_any_size_give_the_same_grid_to_the_bit(
     happenings: list[tuple[str, int]],
     seed: int,
     sizes: list[int],
-    out_block: int,
     clock_us: int | None,
     rate_hz: float | None,
 ) -> None:
     line = ScriptedLink(seed, clock_us)
     items = [item for what, count in happenings for item in line.items(what, count)]
     single = driven(items, rate_hz=rate_hz)
-    assert driven(in_blocks(items, sizes), rate_hz=rate_hz, block_size=out_block) == single
+    assert driven(in_blocks(items, sizes), rate_hz=rate_hz) == single

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from pipeline.recordings.writing import RecordingWriter
 from pipeline.runtime.decision_rules import CURRENT_RULES
 from pipeline.runtime.stage import Context, Core, load_stage
 from pipeline.runtime.twin_file import TwinFile
+from schemas.blocks import join
 from schemas.messages import Action, Header, InputPosition, Message, NewTwin, Raw, Request
 from schemas.topics import BY_NAME, TOPICS, tray_key
 from schemas.units import NS_PER_S
@@ -45,8 +46,6 @@ name = "{TRAY}"
 fans = {FANS}
 command_max = 100.0
 twin = "twin.onnx"
-[resampler]
-block_size = %d
 [twin_integrator]
 warm_up_s = 0.5
 [scorer]
@@ -209,22 +208,24 @@ class Site(Stages):
         self,
         folder: Path,
         seed: int,
-        block_size: int = 1,
+        raw_samples: int = 1,
         *,
         calibrated: bool = False,
         remembers: bool = True,
         learns: bool = False,
         scorer_settings: str = "",
     ) -> None:
-        """remembers: whether a restarted scorer finds the snapshot of the one before it. learns: the configuration
-        names no twin. scorer_settings: more lines of that section."""
+        """raw_samples: in a message of acquisition. remembers: whether a restarted scorer finds the snapshot of the one
+        before it. learns: the configuration names no twin. scorer_settings: more lines of that section."""
         card = {"calibration": CALIBRATION} if calibrated else {}
         write_twin(folder / "twin.onnx", small_hybrid(), fans=FANS, **card)
-        text = CONFIGURATION % block_size + scorer_settings
+        text = CONFIGURATION + scorer_settings
         (folder / "site.toml").write_text(text.replace('twin = "twin.onnx"\n', "") if learns else text)
         self.path = folder / "recording.mcap"
         super().__init__(load_config(folder / "site.toml"), self.path, EPOCH_NS, remembers=remembers)
         self.rng = np.random.default_rng(seed)
+        self._raw_samples = raw_samples
+        self._block: list[Raw] = []
         self._device_us = 0
         self._device_sequence = 0
         self._healthy = TwinFile.load(folder / "twin.onnx", FANS)
@@ -238,8 +239,7 @@ class Site(Stages):
             waiting.append(self._raw())
             if self.rng.random() < 0.03:
                 continue  # held back; it comes together with the next one
-            for raw in waiting:
-                self.take(raw)
+            self._take_raw(waiting)
             waiting = []
             self.tick()
 
@@ -250,13 +250,21 @@ class Site(Stages):
             self.now_ns += 10_000_000
             late.append(self._raw())
             self.tick()
-        for raw in late[len(late) // 2 :]:
-            self.take(raw)
+        self._take_raw(late[len(late) // 2 :])
 
     def finished(self) -> Path:
         """Stop cleanly; returns the recording."""
+        if self._block:
+            self.take(join(self._block))
         self.end()
         return self.path
+
+    def _take_raw(self, samples: Iterable[Raw]) -> None:
+        for raw in samples:
+            self._block.append(raw)
+            if len(self._block) == self._raw_samples:
+                self.take(join(self._block))
+                self._block = []
 
     def _raw(self) -> Raw:
         self._device_us += 10_000

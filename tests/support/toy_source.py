@@ -17,7 +17,7 @@ class ToyConfig(SourceConfig, frozen=True):
 
 
 class ToySource:
-    """Delivers one reading a second, each with the next of the given speeds for every fan; accepts every command."""
+    """Delivers a reading for each of the given speeds, all in the first second; accepts every command."""
 
     name = "toy"
     settings_to_check = "speeds"
@@ -28,9 +28,11 @@ class ToySource:
 
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:
         deliver(LinkUp())
-        for number, speed in enumerate(self._config.speeds):
-            reading = Reading((0.5,) * self._fans, (speed,) * self._fans, sequence=2 * number)
-            deliver(ReadingBatch((number + 1) * NS_PER_S, (reading,)))
+        readings = (
+            Reading((0.5,) * self._fans, (speed,) * self._fans, sequence=2 * number)
+            for number, speed in enumerate(self._config.speeds)
+        )
+        deliver(ReadingBatch(NS_PER_S, tuple(readings)))
 
     def stop(self) -> None:
         pass

@@ -184,7 +184,7 @@ def test_at_full_speed_the_stages_take_every_message_and_decide_every_sample(tmp
 def test_stages_without_a_twin_of_their_own_change_to_the_learned_twins_at_the_recorded_samples(
     tmp_path, endpoint, start
 ):
-    recorded_site = RecordedSite(tmp_path, 7, block_size=4, learns=True)
+    recorded_site = RecordedSite(tmp_path, 7, raw_samples=4, learns=True)
     recorded_site.run(300)
     for number in (1, 2):
         twin = write_twin(tmp_path / f"{number}.onnx", small_hybrid(number), fans=3, name=f"tray1-{number}")

@@ -78,7 +78,7 @@ def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str]:
 
 def listening_settings(config: Any, seconds: float) -> Any:
     """`[acquisition]` while a line is listened to: it is silent after the pause between two samples of the slowest."""
-    return config.model_copy(update={"block_size": 1, "silence_s": seconds + SLOWEST_S})
+    return config.model_copy(update={"block_s": 0.0, "silence_s": seconds + SLOWEST_S})
 
 
 def refusal(counters: Mapping[str, int]) -> str:

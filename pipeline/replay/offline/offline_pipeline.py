@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.replay.offline.plan import BEGINNING, RAW_MISSING, Limit, Session, TrayPlan, limit_through
-from pipeline.replay.offline.raw_blocks import BLOCK_SIZE, RawBlocks
+from pipeline.replay.offline.raw_blocks import RawBlocks
 from pipeline.replay.offline.sample_stream import SampleStream
 from pipeline.replay.stage_chain import StageChain
 from pipeline.runtime.stage import Context, Core, Stage
@@ -46,8 +46,7 @@ class OfflinePipeline:
     ) -> None:
         """contexts: of this tray, one for each stage. observe: is given what each stage makes and a later one consumes,
         the requests, and what the last stage makes."""
-        named = zip(stages.stages, contexts, strict=True)
-        self._contexts = {stage.name: _with_large_blocks(context) for stage, context in named}
+        self._contexts = {stage.name: context for stage, context in zip(stages.stages, contexts, strict=True)}
         self._raw = raw
         self._plan = plan
         self._observe = observe
@@ -137,13 +136,11 @@ class OfflinePipeline:
                 if counters is None and session.producer in self._raw.is_past_known:
                     counters = dict(core.counters())
                 if self._begins_to_lack(session):
-                    yield from main_output(core.publish_until(BEGINNING))  # what it has made already
                     self._limit_by_gap(session, newest_t_ns)
                 yield from main_output(core.step(block))
                 if until_t_ns is not None:
                     yield from main_output(core.publish_until(until_t_ns))
             if self._begins_to_lack(session):
-                yield from main_output(core.publish_until(BEGINNING))
                 self._limit_by_gap(session, newest_t_ns)
         is_last = session is self._plan.first[-1]  # another one consumes what this one is given beyond that
         yield from main_output(self._close(core, None if is_last else counters))
@@ -206,9 +203,3 @@ class OfflinePipeline:
         closing = list(core.close())
         self.counts.update(core.counters() if counters is None else counters)
         return closing
-
-
-def _with_large_blocks(context: Context) -> Context:
-    if "block_size" not in type(context.config).model_fields:
-        return context
-    return replace(context, config=context.config.model_copy(update={"block_size": BLOCK_SIZE}))

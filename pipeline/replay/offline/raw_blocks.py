@@ -14,8 +14,10 @@ from schemas.fast_decode import decode_header, decode_together
 from schemas.messages import Message, Raw
 from schemas.units import NS_PER_S
 
-BLOCK_SIZE = 512
-"""messages or samples that a stage is given at once"""
+MOST_MESSAGES = 512
+"""that a stage is given at once"""
+LARGEST_BLOCK_BYTES = 2**20
+"""of these messages together, unless one is larger"""
 
 
 class RawBlocks:
@@ -53,31 +55,34 @@ class RawBlocks:
     def of(self, session: Session) -> Iterator[tuple[Raw, int | None]]:
         """The blocks of a session. A block ends where a timer made the session emit samples; then until which time."""
         waiting: list[bytes] = []
+        waiting_bytes = 0
         kind: tuple[str, bool] | None = None  # of the waiting messages: their producer, and whether they are new
         for producer, sequence, payload, after_gap in self._messages(session.spans):
             if after_gap:
                 yield from self._decoded(waiting, kind)
-                waiting = []
+                waiting, waiting_bytes = [], 0
                 self.has_gap.add(session.producer)
             if not payload:
                 break
             is_new = sequence >= self._next_new.get(producer, 0)
-            if (producer, is_new) != kind or len(waiting) >= BLOCK_SIZE:
+            is_full = len(waiting) >= MOST_MESSAGES or waiting_bytes + len(payload) > LARGEST_BLOCK_BYTES
+            if (producer, is_new) != kind or is_full:
                 yield from self._decoded(waiting, kind)
-                waiting, kind = [], (producer, is_new)
+                waiting, waiting_bytes, kind = [], 0, (producer, is_new)
             if is_new:
                 self._next_new[producer] = sequence + 1
             waiting.append(payload)
+            waiting_bytes += len(payload)
             is_last_known = (producer, sequence) == (session.spans[-1].producer, session.spans[-1].last_known)
             until_t_ns = session.timer_outputs.get((producer, sequence))
             if until_t_ns is not None:
                 *blocks, (last, _) = self._decoded(waiting, kind)
                 yield from blocks
                 yield last, until_t_ns
-                waiting = []
+                waiting, waiting_bytes = [], 0
             if is_last_known:
                 yield from self._decoded(waiting, kind)
-                waiting = []
+                waiting, waiting_bytes = [], 0
                 self.is_past_known.add(session.producer)
         yield from self._decoded(waiting, kind)
 

@@ -28,7 +28,7 @@ speed_unit = "rpm"
 speed_max = 1000
 source = { kind = "toy", speeds = [60.0, 2000.0, 120.0] }
 [acquisition]
-block_size = 3
+block_s = 0.1
 """
 
 

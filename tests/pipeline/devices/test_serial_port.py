@@ -253,7 +253,7 @@ def test_samples_continue_after_the_device_was_away_and_health_reports_it_meanwh
     device: Device, line: SerialPort
 ) -> None:
     tray = TrayConfig(name="bench", fans=1, source=SerialConfig(port=str(device.path)))
-    core = SerialCore(tray, AcquisitionConfig(), line, started_t_ns=time.time_ns())
+    core = SerialCore(tray, AcquisitionConfig(block_s=0.0), line, started_t_ns=time.time_ns())
     items = Items()
     sequences: list[int] = []
 
@@ -262,7 +262,8 @@ def test_samples_continue_after_the_device_was_away_and_health_reports_it_meanwh
 
     def step_until(wanted: int) -> None:
         while wanted not in sequences:
-            sequences.extend(int(raw.device_sequence[0]) for raw in core.step(items.queue.get(timeout=TIMEOUT_S)))
+            for raw in core.step(items.queue.get(timeout=TIMEOUT_S)):
+                sequences.extend(raw.device_sequence.tolist())
 
     device.plug_in()
     line.start(items.queue.put)

@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def learned(folder: Path) -> Path:
     """No twin, then one, then another one with an alarm active and a fan out of service, then killed stages."""
-    site = Site(folder, 7, block_size=4, learns=True)
+    site = Site(folder, 7, raw_samples=4, learns=True)
     first, second = twin_of(folder, "tray1-1", 1), twin_of(folder, "tray1-2", 2, calibrated=True)
     site.run(300)
     site.ask(Action.OUT_OF_SERVICE, fan=2)
@@ -140,7 +140,7 @@ def test_with_new_limits_alone_baselines_and_alarms_go_on(tmp_path: Path) -> Non
 def test_wear_goes_on_in_a_replay_as_it_did_when_a_twin_took_over(tmp_path: Path) -> None:
     """The second twin takes one more of the command for healthy."""
     settings = "limit_factor = 3.0\nwear_every_s = 10.0\n"
-    site = Site(tmp_path, 7, block_size=4, learns=True, scorer_settings=settings)
+    site = Site(tmp_path, 7, raw_samples=4, learns=True, scorer_settings=settings)
     model = small_hybrid(1)
     site.put_in_force("tray1-1", write_twin(tmp_path / "1.onnx", model, fans=FANS, name="tray1-1").read_bytes())
     site.run(2300)

@@ -49,7 +49,7 @@ ASKED = (Action.ACKNOWLEDGE, Action.SHELVE, Action.COMMISSION, Action.OUT_OF_SER
 @settings(deadline=None, max_examples=20)
 @given(
     seed=st.integers(0, 1000),
-    block_size=st.sampled_from([1, 1, 4]),
+    raw_samples=st.sampled_from([1, 1, 4]),
     calibrated=st.booleans(),
     remembers=st.sampled_from([True, True, False]),
     events=st.lists(
@@ -59,9 +59,9 @@ ASKED = (Action.ACKNOWLEDGE, Action.SHELVE, Action.COMMISSION, Action.OUT_OF_SER
     ),
 )
 def test_a_replay_decides_the_same_after_any_kills_and_requests(
-    tmp_path_factory, seed, block_size, calibrated, remembers, events
+    tmp_path_factory, seed, raw_samples, calibrated, remembers, events
 ):
-    site = Site(tmp_path_factory.mktemp("site"), seed, block_size, calibrated=calibrated, remembers=remembers)
+    site = Site(tmp_path_factory.mktemp("site"), seed, raw_samples, calibrated=calibrated, remembers=remembers)
     for samples, event in events:
         site.run(samples)
         if isinstance(event, Action):
@@ -88,9 +88,9 @@ def test_a_replay_decides_the_same_after_any_kills_and_requests(
     assert has_loss or not not_comparable
 
 
-@pytest.mark.parametrize("block_size", [1, 4])
-def test_requests_of_operators_are_replayed_at_the_same_samples(tmp_path, block_size):
-    site = Site(tmp_path, 1, block_size, calibrated=True)
+@pytest.mark.parametrize("raw_samples", [1, 4])
+def test_requests_of_operators_are_replayed_at_the_same_samples(tmp_path, raw_samples):
+    site = Site(tmp_path, 1, raw_samples, calibrated=True)
     site.run(210)
     site.ask(Action.ACKNOWLEDGE, 0)
     site.ask(Action.SHELVE, 0, duration_s=1.0)

@@ -193,7 +193,7 @@ def test_grids_of_a_session_that_are_nowhere_leave_nothing_to_compare(short, tmp
 
 
 def test_samples_that_never_reached_the_resampler_are_not_invented(tmp_path):
-    site = Site(tmp_path, seed=5, block_size=10)
+    site = Site(tmp_path, seed=5, raw_samples=10)
     site.run(205)
     site.loses(3)
     site.run(300)

@@ -73,7 +73,7 @@ class Learned:
 def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
     """No twin for 3 s, then two of them, in blocks of four samples."""
     folder = tmp_path_factory.mktemp("learned")
-    site = Site(folder, 7, block_size=4, learns=True)
+    site = Site(folder, 7, raw_samples=4, learns=True)
     site.run(300)
     for number in (1, 2):
         twin = write_twin(folder / f"{number}.onnx", small_hybrid(number), fans=FANS, name=f"tray1-{number}")
@@ -181,7 +181,9 @@ def test_each_round_of_a_loop_changes_the_twins_at_the_same_samples(learned, sta
     named = [twin.first_sample_t_ns for twin in stages.new_twins if twin.twin == "tray1-1"]
     assert named[1:] == begins[1:], "not a sample of the round before, which stages may still have to predict"
     late_ns = [t_ns - begin for (_, t_ns), begin in zip(found[2::2], begins[1:], strict=True)]
-    assert late_ns == pytest.approx([0, 0], abs=0 if start == "grid" else 2 * STEP_NS), "it begins with its round"
+    assert late_ns == pytest.approx([0, 0], abs=0 if start == "grid" else 4 * STEP_NS), (
+        "with the first message of its round"
+    )
 
 
 def test_the_clock_does_not_pass_the_samples_that_follow_a_twin(learned):
@@ -216,7 +218,7 @@ def test_a_learner_that_is_running_is_the_only_one_to_publish_new_twins(learned,
         )
     expected = "learner of site 'plant' is running and writes new_twin itself: recorded versions are left out"
     assert (expected in lines) == learner_runs
-    assert outcome.messages == {"raw": 700} | ({} if learner_runs else {"new_twin": 2})
+    assert outcome.messages == {"raw": 700 // 4} | ({} if learner_runs else {"new_twin": 2})
 
 
 def card_of(producer: str, sequence: int, twin: str, t_ns: int) -> ModelCard:

@@ -78,12 +78,25 @@ def test_an_older_recording_keeps_the_grid_it_was_recorded_with(tmp_path, rules,
     toml = f"{TOML}[resampler]\ngap_limit_s = {gap_limit_s}\n"
     metadata = {"trays": "tray1"} | ({"decision_rules": rules} if rules else {})
     path = recording(tmp_path / "r.mcap", metadata, {"configuration.toml": toml.encode()})
-    found = attached_config(path, read_metadata(path), ("resampler",), ["resampler.block_size=512"])
+    found = attached_config(path, read_metadata(path), ("resampler",), ["resampler.watermark_s=0.7"])
     assert found
     section = found.sections["resampler"]
     assert isinstance(section, ResamplerConfig)
-    assert (section.rate_hz, section.gap_limit_s, section.block_size) == (rate_hz, gap_limit_s, 512)
+    assert (section.rate_hz, section.gap_limit_s, section.watermark_s) == (rate_hz, gap_limit_s, 0.7)
     assert section.stale_for_s == (5.0 if rate_hz else None)
+
+
+def test_a_recorded_setting_of_before_is_left_out_and_one_that_is_given_now_is_refused(tmp_path):
+    toml = f"{TOML}[resampler]\nrate_hz = 20\nblock_size = 10\n"
+    metadata = {"trays": "tray1", "overrides": json.dumps(["resampler.block_size=4", "resampler.watermark_s=0.7"])}
+    path = recording(tmp_path / "r.mcap", metadata, {"configuration.toml": toml.encode()})
+    found = attached_config(path, read_metadata(path), ("resampler",))
+    assert found
+    section = found.sections["resampler"]
+    assert isinstance(section, ResamplerConfig)
+    assert (section.rate_hz, section.watermark_s) == (20.0, 0.7)
+    with pytest.raises(ConfigError, match="block_size"):
+        attached_config(path, read_metadata(path), ("resampler",), ["resampler.block_size=4"])
 
 
 @pytest.mark.parametrize(("rules", "off_delay_s", "deadband"), [("7", 1.0, 0.3), ("8", None, 0.3)])
