@@ -20,6 +20,8 @@ from schemas import fan_pb2
 from schemas.fields import Array, Column, OpenEnum, columns, other_fields, time_column
 from schemas.messages import LARGEST_PERIOD_NS, Message
 
+FORMER = "former_"
+"""begins the name of a field with the values of a column in older recordings"""
 _LENGTH_DELIMITED = 2
 _SHORT = 48  # values; up to this length a list is a faster way into an array than the protobuf field itself
 
@@ -107,12 +109,17 @@ def _record(kind: type[Any]) -> _Record:
 
 @dataclass(frozen=True, slots=True)
 class _PackedColumn:
-    """A column with the dtype of its packed bytes, and the key of its field."""
+    """A column with the dtype of its packed bytes, and the key of its field.
+
+    Attributes:
+        former: name of the field with its values in older recordings; "": there is none.
+    """
 
     name: str
     declared: Column
     dtype: np.dtype[Any]
     key: bytes
+    former: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +140,13 @@ def _layout(message_type: type[Message]) -> _Layout:
     numbers = {f.name: f.number for f in proto.DESCRIPTOR.fields}
     declared = columns(message_type)
     packed = tuple(
-        _PackedColumn(name, column, column.dtype.newbyteorder("<"), _varint(numbers[name] << 3 | _LENGTH_DELIMITED))
+        _PackedColumn(
+            name,
+            column,
+            column.dtype.newbyteorder("<"),
+            _varint(numbers[name] << 3 | _LENGTH_DELIMITED),
+            former if (former := f"{FORMER}{name}") in numbers else "",
+        )
         for name, column in declared.items()
     )
     time = time_column(message_type)
@@ -193,6 +206,8 @@ def decode(message_type: type[AnyMessage], data: bytes) -> AnyMessage:
     samples = len(getattr(proto, layout.time)) if layout.time else -1
     for column in layout.columns:
         array = _array(layout, column, getattr(proto, column.name))
+        if not array.size and column.former:
+            array = _array(layout, column, getattr(proto, column.former))
         if not array.size and column.declared.added_later and samples > 0:
             array = _absent(column.declared, samples, fans)
         elif column.declared.shape == "samples x fans":

@@ -263,7 +263,7 @@ class Prediction(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., sigma_rad_s: _Optional[_Iterable[float]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., twin: _Optional[str] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., torque_balance_sigma_command: _Optional[_Iterable[float]] = ..., reading_range_rad_s: _Optional[_Iterable[float]] = ..., averaged_command: _Optional[_Iterable[float]] = ..., reading_missing: _Optional[_Iterable[bool]] = ...) -> None: ...
 
 class Score(_message.Message):
-    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "lower_bound_rad_s", "upper_bound_rad_s", "band_variance", "residual_rad_s", "smoothed_residual_rad_s", "outside", "state", "valid", "invalid_reason", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic")
+    __slots__ = ("header", "fans", "period_ns", "t_ns", "command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s", "state", "valid", "invalid_reason", "torque_balance_command", "speed_baseline_rad_s", "balance_baseline_command", "score", "statistic", "former_command", "former_measured_speed_rad_s", "former_predicted_speed_rad_s", "former_band_variance", "former_smoothed_residual_rad_s", "former_torque_balance_command", "former_speed_baseline_rad_s", "former_balance_baseline_command", "former_score")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
@@ -271,12 +271,8 @@ class Score(_message.Message):
     COMMAND_FIELD_NUMBER: _ClassVar[int]
     MEASURED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
     PREDICTED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
-    LOWER_BOUND_RAD_S_FIELD_NUMBER: _ClassVar[int]
-    UPPER_BOUND_RAD_S_FIELD_NUMBER: _ClassVar[int]
     BAND_VARIANCE_FIELD_NUMBER: _ClassVar[int]
-    RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
     SMOOTHED_RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
-    OUTSIDE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
     VALID_FIELD_NUMBER: _ClassVar[int]
     INVALID_REASON_FIELD_NUMBER: _ClassVar[int]
@@ -285,6 +281,15 @@ class Score(_message.Message):
     BALANCE_BASELINE_COMMAND_FIELD_NUMBER: _ClassVar[int]
     SCORE_FIELD_NUMBER: _ClassVar[int]
     STATISTIC_FIELD_NUMBER: _ClassVar[int]
+    FORMER_COMMAND_FIELD_NUMBER: _ClassVar[int]
+    FORMER_MEASURED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    FORMER_PREDICTED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    FORMER_BAND_VARIANCE_FIELD_NUMBER: _ClassVar[int]
+    FORMER_SMOOTHED_RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    FORMER_TORQUE_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
+    FORMER_SPEED_BASELINE_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    FORMER_BALANCE_BASELINE_COMMAND_FIELD_NUMBER: _ClassVar[int]
+    FORMER_SCORE_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fans: int
     period_ns: int
@@ -292,12 +297,8 @@ class Score(_message.Message):
     command: _containers.RepeatedScalarFieldContainer[float]
     measured_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
     predicted_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
-    lower_bound_rad_s: _containers.RepeatedScalarFieldContainer[float]
-    upper_bound_rad_s: _containers.RepeatedScalarFieldContainer[float]
     band_variance: _containers.RepeatedScalarFieldContainer[float]
-    residual_rad_s: _containers.RepeatedScalarFieldContainer[float]
     smoothed_residual_rad_s: _containers.RepeatedScalarFieldContainer[float]
-    outside: _containers.RepeatedScalarFieldContainer[bool]
     state: _containers.RepeatedScalarFieldContainer[FanState]
     valid: _containers.RepeatedScalarFieldContainer[bool]
     invalid_reason: _containers.RepeatedScalarFieldContainer[InvalidReason]
@@ -306,7 +307,16 @@ class Score(_message.Message):
     balance_baseline_command: _containers.RepeatedScalarFieldContainer[float]
     score: _containers.RepeatedScalarFieldContainer[float]
     statistic: _containers.RepeatedScalarFieldContainer[Statistic]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., lower_bound_rad_s: _Optional[_Iterable[float]] = ..., upper_bound_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., residual_rad_s: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., outside: _Optional[_Iterable[bool]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ...) -> None: ...
+    former_command: _containers.RepeatedScalarFieldContainer[float]
+    former_measured_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    former_predicted_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    former_band_variance: _containers.RepeatedScalarFieldContainer[float]
+    former_smoothed_residual_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    former_torque_balance_command: _containers.RepeatedScalarFieldContainer[float]
+    former_speed_baseline_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    former_balance_baseline_command: _containers.RepeatedScalarFieldContainer[float]
+    former_score: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., balance_baseline_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., former_command: _Optional[_Iterable[float]] = ..., former_measured_speed_rad_s: _Optional[_Iterable[float]] = ..., former_predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., former_band_variance: _Optional[_Iterable[float]] = ..., former_smoothed_residual_rad_s: _Optional[_Iterable[float]] = ..., former_torque_balance_command: _Optional[_Iterable[float]] = ..., former_speed_baseline_rad_s: _Optional[_Iterable[float]] = ..., former_balance_baseline_command: _Optional[_Iterable[float]] = ..., former_score: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Diagnosis(_message.Message):
     __slots__ = ("cause", "probability", "parameter", "change", "change_low", "change_high", "unit", "evidence")

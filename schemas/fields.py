@@ -5,6 +5,7 @@ Codec, export and tests derive everything they need from these declarations and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from functools import cache
@@ -100,6 +101,30 @@ def column(
         limits = (0, LARGEST_ENUM_VALUE)
     declared = Column(shape, dtype, enum, optional, added_later, limits)
     return field(default_factory=lambda: np.zeros(0, dtype), metadata={"column": declared})
+
+
+class DerivedColumn:
+    """A column `samples x fans` that follows from others: it does not travel, and tables have it."""
+
+    def __init__(self, compute: Callable[[Any], Array], kind: type) -> None:
+        self.declared = Column("samples x fans", np.dtype(kind))
+        self._compute = compute
+        self.__doc__ = compute.__doc__
+
+    def __get__(self, message: Any, owner: type) -> Array:
+        return self._compute(message)
+
+
+def derived(kind: type) -> Callable[[Callable[[Any], Array]], DerivedColumn]:
+    """Declare a column that a method computes from others; `kind` is a NumPy type."""
+    return lambda compute: DerivedColumn(compute, kind)
+
+
+@cache
+def derived_columns(message_type: type) -> dict[str, Column]:
+    """The derived columns of a message type by name, in its order."""
+    found = {name: value for kind in reversed(message_type.__mro__) for name, value in vars(kind).items()}
+    return {name: value.declared for name, value in found.items() if isinstance(value, DerivedColumn)}
 
 
 @cache

@@ -11,7 +11,7 @@ from typing import TypeAlias, get_args
 
 import numpy as np
 
-from schemas.fields import Array, OpenEnum, column, time_column
+from schemas.fields import Array, OpenEnum, column, derived, time_column
 
 LARGEST_PERIOD_NS = 86_400_000_000_000  # a day
 FURTHEST_T_NS = (1 << 62) - LARGEST_PERIOD_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits
@@ -214,29 +214,49 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Score:
-    """Scored samples, with everything a viewer needs to draw them."""
+    """Scored samples, with everything a viewer needs to draw them.
+
+    Nothing is decided by these numbers, so that they travel with seven digits.
+    """
 
     header: Header = Header()
     fans: int
     period_ns: int
     t_ns: Array = column("samples", np.int64, limits=GRID_TIMES)
-    command: Array = column("samples x fans", np.float64)
-    measured_speed_rad_s: Array = column("samples x fans", np.float64)
-    predicted_speed_rad_s: Array = column("samples x fans", np.float64)
-    lower_bound_rad_s: Array = column("samples x fans", np.float64)
-    upper_bound_rad_s: Array = column("samples x fans", np.float64)
-    band_variance: Array = column("samples x fans", np.float64)
-    residual_rad_s: Array = column("samples x fans", np.float64)
-    smoothed_residual_rad_s: Array = column("samples x fans", np.float64)
-    outside: Array = column("samples x fans", np.bool_)
+    command: Array = column("samples x fans", np.float32)
+    measured_speed_rad_s: Array = column("samples x fans", np.float32)
+    predicted_speed_rad_s: Array = column("samples x fans", np.float32)
+    band_variance: Array = column("samples x fans", np.float32)
+    """the square of half the width of the band"""
+    smoothed_residual_rad_s: Array = column("samples x fans", np.float32)
     state: Array = column("samples x fans", FanState)
     valid: Array = column("samples x fans", np.bool_)
     invalid_reason: Array = column("samples x fans", InvalidReason)
-    torque_balance_command: Array = column("samples x fans", np.float64, added_later=True)
-    speed_baseline_rad_s: Array = column("samples x fans", np.float64, added_later=True)
-    balance_baseline_command: Array = column("samples x fans", np.float64, added_later=True)
-    score: Array = column("samples x fans", np.float64, added_later=True)
+    torque_balance_command: Array = column("samples x fans", np.float32, added_later=True)
+    speed_baseline_rad_s: Array = column("samples x fans", np.float32, added_later=True)
+    balance_baseline_command: Array = column("samples x fans", np.float32, added_later=True)
+    score: Array = column("samples x fans", np.float32, added_later=True)
     statistic: Array = column("samples x fans", Statistic, added_later=True)
+
+    @derived(np.float32)
+    def residual_rad_s(self) -> Array:
+        """Measured minus predicted."""
+        return self.measured_speed_rad_s - self.predicted_speed_rad_s
+
+    @derived(np.float32)
+    def lower_bound_rad_s(self) -> Array:
+        """Of the band."""
+        return self.predicted_speed_rad_s - np.sqrt(self.band_variance)
+
+    @derived(np.float32)
+    def upper_bound_rad_s(self) -> Array:
+        """Of the band."""
+        return self.predicted_speed_rad_s + np.sqrt(self.band_variance)
+
+    @derived(np.bool_)
+    def outside(self) -> Array:
+        """Whether the sample lies outside the band."""
+        return np.abs(self.residual_rad_s) > np.sqrt(self.band_variance)
 
 
 @dataclass(frozen=True, kw_only=True)

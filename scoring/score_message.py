@@ -13,7 +13,6 @@ BAND_SIGMAS = 2.0
 def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array) -> Score:
     """The message of a block that was scored. state: (n, fans) of FanState. unseen: (n, fans), see Samples."""
     valid, sigma = np.isfinite(scored.score), item.sigma_rad_s
-    residual = item.measured_speed_rad_s - item.predicted_speed_rad_s
     band = BAND_SIGMAS * sigma * np.hypot(1.0, unseen)
     if len(item.reading_range_rad_s):
         band = band + item.reading_range_rad_s
@@ -29,12 +28,8 @@ def score_of(item: Prediction, scored: ScoredBlock, state: Array, unseen: Array)
         command=item.command,
         measured_speed_rad_s=item.measured_speed_rad_s,
         predicted_speed_rad_s=item.predicted_speed_rad_s,
-        lower_bound_rad_s=item.predicted_speed_rad_s - band,
-        upper_bound_rad_s=item.predicted_speed_rad_s + band,
         band_variance=band**2,
-        residual_rad_s=residual,
         smoothed_residual_rad_s=scored.speed_smoothed * sigma,
-        outside=np.abs(residual) > band,
         state=np.where(scored.commissioning & ~valid, int(FanState.COMMISSIONING), state).astype(np.uint8),
         valid=valid,
         invalid_reason=np.where(valid, InvalidReason.NONE, why).astype(np.uint8),
@@ -57,12 +52,8 @@ def unscored(item: Prediction) -> Score:
         command=item.command,
         measured_speed_rad_s=item.measured_speed_rad_s,
         predicted_speed_rad_s=unknown,
-        lower_bound_rad_s=unknown,
-        upper_bound_rad_s=unknown,
         band_variance=unknown,
-        residual_rad_s=unknown,
         smoothed_residual_rad_s=unknown,
-        outside=np.zeros(unknown.shape, np.bool_),
         state=np.full(unknown.shape, int(FanState.UNKNOWN), np.uint8),
         valid=np.zeros(unknown.shape, np.bool_),
         invalid_reason=why.astype(np.uint8),

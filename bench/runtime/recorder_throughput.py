@@ -98,12 +98,8 @@ def _packets(first: int, block: int) -> list[Envelope]:
             header=header,
             **judged,
             predicted_speed_rad_s=noise + 1.0,
-            lower_bound_rad_s=noise - 5.0,
-            upper_bound_rad_s=noise + 7.0,
             band_variance=np.full((block, FANS), 36.0),
-            residual_rad_s=-np.ones((block, FANS)),
             smoothed_residual_rad_s=noise - 100.0,
-            outside=~ones,
             state=zeros + 1,
         ),
     }

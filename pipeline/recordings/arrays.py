@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.recordings.order import Seen, in_order
 from pipeline.recordings.reading import RecordingError, read_recording
 from schemas.envelope import Envelope
-from schemas.fields import LARGEST_ENUM_VALUE, Array, OpenEnum, columns, other_fields, time_column
+from schemas.fields import LARGEST_ENUM_VALUE, Array, OpenEnum, columns, derived_columns, other_fields, time_column
 from schemas.messages import Message
 from schemas.topics import BY_NAME, HEALTH_CHUNK, TOPICS, current_name
 
@@ -168,9 +168,11 @@ def block_columns(message_type: type[Message]) -> Mapping[str, BlockColumn]:
     Nested records are left out; `read_recording` gives them.
     """
     kinds = {bool: np.bool_, int: np.int64, float: np.float64, str: np.object_}
-    declared, others = columns(message_type), other_fields(message_type)
+    declared = columns(message_type) | derived_columns(message_type)
+    others = other_fields(message_type)
     found = {time_column(message_type): BlockColumn(np.dtype(np.int64))}
-    for name in (f.name for f in fields(message_type) if f.name != "fans"):
+    own = (f.name for f in fields(message_type) if f.name != "fans")
+    for name in (*own, *derived_columns(message_type)):
         if column := declared.get(name):
             found[name] = BlockColumn(column.dtype, column.by_fan, not column.by_sample, column.enum)
         elif others[name] in kinds:

@@ -139,8 +139,9 @@ def _texts(enum: type[OpenEnum] | None, values: Array, rows: int) -> list[Any]:
         return enum_names(enum)[values].tolist()
     if values.dtype == np.bool_:
         return np.where(values, "true", "false").tolist()
-    if values.dtype == np.float64:
-        return np.where(np.isnan(values), "", values.astype(np.object_)).tolist()
+    if values.dtype.kind == "f":  # a float32 as text, with the digits that it has
+        shown = values.astype(np.object_ if values.dtype == np.float64 else np.str_)
+        return np.where(np.isnan(values), "", shown).tolist()
     return values.tolist()
 
 

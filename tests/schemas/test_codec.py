@@ -17,7 +17,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from schemas import fan_pb2, messages
-from schemas.codec import CodecError, decode, encode, proto_type, type_name
+from schemas.codec import FORMER, CodecError, decode, encode, proto_type, type_name
 from schemas.fields import OpenEnum, columns, other_fields
 from schemas.messages import (
     MESSAGE_TYPES,
@@ -107,7 +107,8 @@ def test_any_bytes_are_refused_or_decoded(message_type, payload):
 
 @pytest.mark.parametrize("message_type", MESSAGE_TYPES, ids=lambda t: t.__name__)
 def test_a_message_has_the_fields_of_its_schema_in_order(message_type):
-    assert [f.name for f in fields(message_type)] == [f.name for f in proto_type(message_type).DESCRIPTOR.fields]
+    declared = [f.name for f in proto_type(message_type).DESCRIPTOR.fields]
+    assert [f.name for f in fields(message_type)] == [name for name in declared if not name.startswith(FORMER)]
 
 
 @pytest.mark.parametrize("record", RECORDS, ids=lambda t: t.__name__)
@@ -119,6 +120,7 @@ def test_a_nested_record_has_the_fields_of_its_schema_in_order(record):
 def test_a_column_has_the_type_of_its_schema(message_type):
     wire_types = {
         FieldDescriptor.TYPE_DOUBLE: np.dtype(np.float64),
+        FieldDescriptor.TYPE_FLOAT: np.dtype(np.float32),
         FieldDescriptor.TYPE_SFIXED64: np.dtype(np.int64),
         FieldDescriptor.TYPE_FIXED32: np.dtype(np.uint32),
         FieldDescriptor.TYPE_BOOL: np.dtype(np.bool_),
@@ -127,7 +129,7 @@ def test_a_column_has_the_type_of_its_schema(message_type):
     repeated = {
         f.name: wire_types[f.type]
         for f in proto_type(message_type).DESCRIPTOR.fields
-        if f.is_repeated and f.type in wire_types
+        if f.is_repeated and f.type in wire_types and not f.name.startswith(FORMER)
     }
     assert {name: column.dtype for name, column in columns(message_type).items()} == repeated
 
@@ -277,6 +279,22 @@ def test_a_column_added_later_reads_as_nan_or_0_in_older_recordings(kind, data):
         assert np.isnan(values).all() if column.dtype.kind == "f" else (values == 0).all()
     again = decode(kind, encode(back))
     assert all(same(getattr(back, name), getattr(again, name)) for name in columns(kind))
+
+
+@given(data=st.data())
+def test_numbers_of_64_bits_of_older_recordings_are_read_with_32(data):
+    message: Any = data.draw(any_message(Score))
+    proto: Any = proto_type(Score).FromString(encode(message))
+    former = [f.name for f in proto.DESCRIPTOR.fields if f.name.startswith(FORMER)]
+    assert [name.removeprefix(FORMER) for name in former] == [
+        n for n, c in columns(Score).items() if c.dtype.kind == "f"
+    ]
+    for name in former:
+        now = name.removeprefix(FORMER)
+        getattr(proto, name).extend(np.float64(getattr(message, now)).ravel())
+        proto.ClearField(now)
+    back = decode(Score, proto.SerializeToString())
+    assert all(same(getattr(message, name), getattr(back, name)) for name in columns(Score))
 
 
 def test_an_absurd_number_of_fans_without_columns_is_refused():

@@ -207,7 +207,7 @@ def test_a_steady_state_is_sent_again_for_viewers_that_join_late() -> None:
 def test_a_sample_without_a_score_has_no_band_and_is_never_outside_it() -> None:
     sink = FakeSink()
     scores, _ = made_up_tray(seconds=4, fans=2, faulty_fan=None, gap_fan=1, gap_s=(1.0, 2.0))
-    lying = [changed(score, outside=np.ones_like(score.outside)) for score in scores]
+    lying = [changed(score, band_variance=np.zeros_like(score.band_variance)) for score in scores]
     core = core_of(sink, fans=2)
     play(core, lying)
     core.close()

@@ -123,17 +123,15 @@ def raw(second: int, *, moves: bool) -> Raw:
 
 def score(second: int, state: FanState) -> Score:
     one = np.zeros((1, 1))
-    arrays = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "lower_bound_rad_s", "upper_bound_rad_s")
-    more = ("band_variance", "residual_rad_s", "smoothed_residual_rad_s")
+    arrays = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s")
     return Score(
         fans=1,
         period_ns=NS_PER_S,
         t_ns=np.array([START_NS + second * NS_PER_S]),
-        outside=one.astype(bool),
         state=np.full((1, 1), int(state), np.uint8),
         valid=one.astype(bool),
         invalid_reason=one.astype(np.uint8),
-        **dict.fromkeys((*arrays, *more), one),
+        **dict.fromkeys(arrays, one),
     )
 
 

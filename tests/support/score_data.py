@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from schemas.fields import columns as columns_of
 from schemas.messages import Alarm, FanState, Header, InvalidReason, Score, Severity, Statistic, Transition
 
 START_NS = 1_700_000_000_000_000_000
@@ -50,12 +51,8 @@ def made_up_tray(
         "command": np.full(predicted.shape, 0.5),
         "measured_speed_rad_s": measured,
         "predicted_speed_rad_s": predicted,
-        "lower_bound_rad_s": predicted - 2 * SIGMA,
-        "upper_bound_rad_s": predicted + 2 * SIGMA,
         "band_variance": np.full(predicted.shape, (2 * SIGMA) ** 2),
-        "residual_rad_s": residual,
         "smoothed_residual_rad_s": residual,
-        "outside": np.abs(np.nan_to_num(residual)) > 2 * SIGMA,
         "state": state,
         "valid": valid,
         "invalid_reason": invalid_reason,
@@ -65,6 +62,7 @@ def made_up_tray(
         "score": np.abs(residual) / (2 * SIGMA),
         "statistic": np.where(valid, Statistic.SPEED_SMOOTHED, Statistic.NONE).astype(np.uint8),
     }
+    columns = {name: values.astype(columns_of(Score)[name].dtype) for name, values in columns.items()}
     t_ns = START_NS + np.arange(len(t_s)) * STEP_NS
     scores = [
         Score(
@@ -102,14 +100,13 @@ def one_sample(fans: int, *reasons: InvalidReason) -> Score:
     """A score of one sample. reasons: why the fans are not judged, beginning with fan 0; the rest are judged."""
     invalid = np.array([[*reasons, *[InvalidReason.NONE] * (fans - len(reasons))]], np.uint8)
     valid, column = invalid == InvalidReason.NONE, np.zeros(invalid.shape)
-    measured = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "lower_bound_rad_s", "upper_bound_rad_s")
-    derived = ("band_variance", "residual_rad_s", "smoothed_residual_rad_s", "torque_balance_command", "score")
+    measured = ("command", "measured_speed_rad_s", "predicted_speed_rad_s")
+    derived = ("band_variance", "smoothed_residual_rad_s", "torque_balance_command", "score")
     baselines = ("speed_baseline_rad_s", "balance_baseline_command")
     return Score(
         fans=fans,
         period_ns=STEP_NS,
         t_ns=np.array([START_NS]),
-        outside=column != 0,
         state=invalid * 0,
         statistic=invalid * 0,
         valid=valid,

@@ -27,7 +27,7 @@ CAUSE_TOLERANCE = 1e-6
 MAX_NAMED = 5
 """differences that are described"""
 _BLOCK_MESSAGES = 512
-_SAMPLE_COLUMNS = tuple(name for name, column in columns(Score).items() if column.by_sample and name != "t_ns")
+_SAMPLE_COLUMNS = {name: column.dtype for name, column in columns(Score).items() if column.by_sample and name != "t_ns"}
 
 
 class CannotCompareError(UserError):
@@ -173,8 +173,8 @@ def compare_scores(made: Score, recorded: RecordedSession, found: Comparison, li
             different[:] = True
             found.name(f"{found.tray}: {made.fans} fans replayed, {block.fans} recorded")
         else:
-            for name in _SAMPLE_COLUMNS:
-                differs = _differ(getattr(made, name)[rows], getattr(block, name)[is_made])
+            for name, dtype in _SAMPLE_COLUMNS.items():
+                differs = _differ(getattr(made, name)[rows].astype(dtype), getattr(block, name)[is_made])
                 different |= differs.any(axis=1)
                 differs &= within[:, np.newaxis]
                 if differs.any():
@@ -250,19 +250,20 @@ def _scores(envelopes: Iterable[Envelope], producer: str) -> Iterator[Score]:
 
 
 def _differ(one: Array, other: Array) -> Array:
-    """(n, fans): which values differ in any bit; all NaN are equal."""
+    """(n, fans): which values differ in any bit as they were recorded; all NaN are equal."""
     if one.dtype.kind != "f":
         return one != other
-    bits = np.ascontiguousarray(one).view(np.int64) != np.ascontiguousarray(other).view(np.int64)
-    return bits & ~(np.isnan(one) & np.isnan(other))
+    bits = np.dtype(f"i{one.itemsize}")
+    differ = np.ascontiguousarray(one).view(bits) != np.ascontiguousarray(other).view(bits)
+    return differ & ~(np.isnan(one) & np.isnan(other))
 
 
 def _name_first(
     found: Comparison, name: str, t_ns: Array, differs: Array, made: Score, block: Score, rows: Array, is_made: Array
 ) -> None:
     row, fan = np.argwhere(differs)[0].tolist()
-    one = getattr(made, name)[rows][row, fan]
     other = getattr(block, name)[is_made][row, fan]
+    one = getattr(made, name)[rows][row, fan].astype(other.dtype)
     found.name(
         f"{found.tray}: {format_utc(int(t_ns[row]))}, fan {fan}: {name} {one!s} replayed, {other!s} recorded "
         f"(in {int(differs.any(axis=1).sum())} of {len(rows)} samples from here on)"

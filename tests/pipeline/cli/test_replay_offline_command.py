@@ -61,13 +61,13 @@ def test_equal_is_exit_code_0():
 def test_a_difference_is_exit_code_1_and_named(tmp_path):
     def doubled(entry):
         if entry.topic == "score":
-            entry.message.residual_rad_s.setflags(write=True)
-            entry.message.residual_rad_s[:] *= 2
+            entry.message.smoothed_residual_rad_s.setflags(write=True)
+            entry.message.smoothed_residual_rad_s[:] *= 2
         return entry.message
 
     result = replay("--verify", changed(GOLDEN, tmp_path / "doubled.mcap", doubled))
     assert result.exit_code == 1
-    assert "DIFFERS" in result.stdout and "residual_rad_s" in result.stdout
+    assert "DIFFERS" in result.stdout and "smoothed_residual_rad_s" in result.stdout
 
 
 @pytest.mark.parametrize("words", [("--twin",), ("--set", "scorer.on_delay_s=1"), ("--start", "2")])

@@ -17,17 +17,15 @@ def score(*rows: list[FanState], first_s: int = 0) -> Score:
     """One row a second; a row has the state of each fan."""
     state = np.array([[int(each) for each in row] for row in rows], np.uint8)
     zeros = np.zeros(state.shape)
-    arrays = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "lower_bound_rad_s", "upper_bound_rad_s")
-    more = ("band_variance", "residual_rad_s", "smoothed_residual_rad_s")
+    arrays = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "smoothed_residual_rad_s")
     return Score(
         fans=state.shape[1],
         period_ns=NS_PER_S,
         t_ns=(first_s + np.arange(len(state), dtype=np.int64)) * NS_PER_S,
-        outside=zeros.astype(bool),
         state=state,
         valid=zeros.astype(bool),
         invalid_reason=zeros.astype(np.uint8),
-        **dict.fromkeys((*arrays, *more), zeros),
+        **dict.fromkeys(arrays, zeros),
     )
 
 

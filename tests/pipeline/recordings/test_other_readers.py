@@ -136,7 +136,7 @@ from mcap_protobuf.decoder import DecoderFactory
 with open(sys.argv[1], "rb") as file:
     for _, channel, message, proto in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
         if channel.topic.endswith(("/score", "/alarm")):
-            values = {name: list(getattr(proto, name)) for name in ("t_ns", "residual_rad_s", "state")
+            values = {name: list(getattr(proto, name)) for name in ("t_ns", "score", "state")
                       if channel.topic.endswith("/score")} or {"t_ns": proto.t_ns, "message": proto.message}
             print(json.dumps({"type": type(proto).DESCRIPTOR.full_name, "sequence": message.sequence, **values}))
 assert not {"schemas", "pipeline"} & set(sys.modules)
@@ -151,7 +151,7 @@ def test_mcap_protobuf_support_decodes_without_our_code(files):
         assert (line["type"], line["sequence"]) == (f"fantwin.{type(message).__name__}", message.header.sequence)
         if isinstance(message, Score):
             assert line["t_ns"] == message.t_ns.tolist()
-            np.testing.assert_array_equal(line["residual_rad_s"], message.residual_rad_s.ravel())
+            np.testing.assert_array_equal(line["score"], message.score.ravel())
             assert line["state"] == message.state.ravel().tolist()
         else:
             assert (line["t_ns"], line["message"]) == (message.t_ns, message.message)

@@ -91,7 +91,7 @@ def test_the_embedded_schema_needs_no_other_file(tmp_path):
     pool = DescriptorPool()
     for file_descriptor in files.file:
         pool.Add(file_descriptor)  # type: ignore[attr-defined]
-    assert pool.FindMessageTypeByName("fantwin.Score").fields_by_name["band_variance"].number == 10
+    assert pool.FindMessageTypeByName("fantwin.Score").fields_by_name["band_variance"].number == 25
 
 
 def test_a_recording_is_called_active_until_it_is_finished(tmp_path):

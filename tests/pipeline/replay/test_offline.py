@@ -160,15 +160,15 @@ def test_one_bit_is_found_and_named(short, tmp_path):
     def flip(entry):
         if entry.topic != "score" or entry.message.header.sequence != 200:
             return entry.message
-        residual = entry.message.residual_rad_s.copy()
-        residual[0, 1] = np.nextafter(residual[0, 1], np.inf)
-        return replace(entry.message, residual_rad_s=residual)
+        speed = entry.message.predicted_speed_rad_s.copy()
+        speed[0, 1] = np.nextafter(speed[0, 1], np.float32(np.inf))
+        return replace(entry.message, predicted_speed_rad_s=speed)
 
     found = verified(changed(short, tmp_path / "flipped.mcap", flip)).comparison
     assert found and not found.is_equal
     assert (found.different, found.not_made, found.alarms_different) == (1, 0, 0)
     (line,) = found.named
-    assert "fan 1: residual_rad_s" in line
+    assert "fan 1: predicted_speed_rad_s" in line
 
 
 def test_an_alarm_that_was_never_raised_is_found(undisturbed, tmp_path):
