@@ -47,12 +47,8 @@ def messages(fans: int, number: int) -> dict[str, Message]:
         "score": Score(
             **judged,
             predicted_speed_rad_s=speed * 1.01,
-            lower_bound_rad_s=speed * 0.95,
-            upper_bound_rad_s=speed * 1.05,
             band_variance=np.full((1, fans), 36.0),
-            residual_rad_s=speed * 0.01,
             smoothed_residual_rad_s=speed * 0.007,
-            outside=~ones,
             state=zeros + 1,
             torque_balance_command=speed * 1e-4,
             speed_baseline_rad_s=speed * 0.0,
