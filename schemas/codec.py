@@ -175,7 +175,8 @@ def encode(message: Message) -> bytes:
     parts = [proto.SerializeToString()]
     samples, fans = _sample_count(layout, message), getattr(message, "fans", -1)
     for column in layout.columns:
-        values = np.asarray(getattr(message, column.name), dtype=column.dtype)
+        with np.errstate(over="ignore"):  # beyond the range of float32 is infinite
+            values = np.asarray(getattr(message, column.name), dtype=column.dtype)
         _check_shape(layout, column, values, samples, values.size if fans < 0 else fans)
         if values.size == 0:
             continue
