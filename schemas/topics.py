@@ -122,9 +122,9 @@ def sessions_key(site: str, stage: str = "*", instance: str = "*") -> str:
 
 
 def key_in_words(key: str) -> str:
-    """A tray's topic for people: `grid of tray1`."""
-    tray, topic = key.split("/")[-2:]
-    return f"{topic} of {tray}"
+    """A tray's topic for people: `grid of tray1`. What is no key, as another program may send it, stays as it is."""
+    *_, tray, topic = ["", *key.split("/")]
+    return f"{topic} of {tray}" if tray else key
 
 
 def topic_of(key: str) -> Topic:

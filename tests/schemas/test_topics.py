@@ -7,7 +7,17 @@ import pytest
 from pipeline.config.registry import STAGES
 from pipeline.runtime.stage import load_stage
 from schemas.messages import MESSAGE_TYPES
-from schemas.topics import BY_NAME, FORMER_NAMES, RESERVED_TRAY_NAMES, TOPICS, alive_key, health_key, topic_of, tray_key
+from schemas.topics import (
+    BY_NAME,
+    FORMER_NAMES,
+    RESERVED_TRAY_NAMES,
+    TOPICS,
+    alive_key,
+    health_key,
+    key_in_words,
+    topic_of,
+    tray_key,
+)
 
 CONTRACT = Path(__file__).parents[2] / "docs" / "reference" / "messages.md"
 
@@ -46,6 +56,11 @@ def test_the_topic_of_a_key_in_an_older_recording_is_found(former, topic):
 def test_a_foreign_key_is_no_topic(key):
     with pytest.raises(KeyError):
         topic_of(key)
+
+
+def test_a_key_is_told_in_words_and_what_is_none_stays_as_it_is():
+    assert key_in_words(tray_key("lab", "tray1", "grid")) == "grid of tray1"
+    assert (key_in_words("grid"), key_in_words("")) == ("grid", "")
 
 
 def test_the_fixed_parts_of_keys_are_reserved_tray_names():
