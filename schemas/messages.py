@@ -216,7 +216,7 @@ class Prediction:
 class Score:
     """Scored samples, with everything a viewer needs to draw them.
 
-    Nothing is decided by these numbers, so that they travel with seven digits.
+    No alarm is decided by these numbers, so they travel with seven digits.
     """
 
     header: Header = Header()

@@ -82,14 +82,14 @@ def changed_fans(change: Array, reference: str) -> str:
     most = change[far[np.argmax(np.abs(change[far]))]]
     alike = compared[change[compared] / most > 0.5]
     if len(alike) > 1 and 2 * len(alike) > len(compared):
-        which = "all fans" if len(compared) == len(change) else f"all {len(compared)} fans that can be compared"
-        others = [f"fan {fan} is {_faster(float(change[fan]))}" for fan in compared.tolist() if fan not in alike]
+        others = "".join(f", fan {fan} is {_faster(float(change[fan]))}" for fan in compared if fan not in alike)
         if others:
             which = f"{len(alike)} of {len(compared)} fans"
+        else:
+            which = "all fans" if len(compared) == len(change) else f"all {len(compared)} fans that can be compared"
         return (
-            f"{which} are {_faster(float(np.mean(change[alike])))} than when {reference} was made"
-            f"{''.join(f', {other}' for other in others)}; if maintenance, a filter or new firmware is the reason, "
-            "put this version in force"
+            f"{which} are {_faster(float(np.mean(change[alike])))} than when {reference} was made{others}; if "
+            "maintenance, a filter or new firmware is the reason, put this version in force"
         )
     named = ", ".join(f"fan {fan} is {_faster(float(change[fan]))}" for fan in far.tolist())
     inspected = "inspect it: if it is" if len(far) == 1 else "inspect them: if they are"
