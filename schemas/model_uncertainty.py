@@ -2,74 +2,138 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
-from pydantic import ConfigDict, model_validator
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, ConfigDict, model_validator
 from pydantic.dataclasses import dataclass
 
 from schemas.fields import Array
 
+Table: TypeAlias = tuple[tuple[float, ...], ...]
+
+
+def _one_for_all(ndim: int) -> BeforeValidator:
+    """Early cards have one value, of so many dimensions, for all fans, and may have none."""
+
+    def of_each(value: Any) -> Any:
+        return () if value is None else (value,) if np.ndim(value) == ndim else value
+
+    return BeforeValidator(of_each)
+
 
 @dataclass(frozen=True, config=ConfigDict(extra="ignore", allow_inf_nan=False))
 class ModelUncertainty:
-    """Standard deviation of the twin's own error, as a table.
+    """Standard deviation of the twin's own error, as a table of each fan.
 
-    speeds_rad_s, commands: rising. std_rad_s: (speeds, commands). With a drive, a command on its plateau is the end of
-    the plateau. seen_std_rad_s: where the twin was trained the standard deviation is hardly ever above this one; None
-    in early cards.
+    speeds_rad_s, commands: rising; the commands are relative to those at which a fan settles at the speeds, so that the
+    table has points where fans are most of the time. settled_command: (fans, speeds) these; empty in early cards, whose
+    commands are as they are. std_rad_s: (fans, speeds, commands); one table holds for any fan. With a drive, a command
+    on its plateau is the end of the plateau. seen_std_rad_s: (fans,) where a fan was held in training the standard
+    deviation is hardly ever above this one; empty in early cards.
     """
 
     speeds_rad_s: tuple[float, ...]
     commands: tuple[float, ...]
-    std_rad_s: tuple[tuple[float, ...], ...]
-    seen_std_rad_s: float | None = None
+    std_rad_s: Annotated[tuple[Table, ...], _one_for_all(2)]
+    seen_std_rad_s: Annotated[tuple[float, ...], _one_for_all(0)] = ()
+    settled_command: tuple[tuple[float, ...], ...] = ()
 
     @model_validator(mode="after")
     def _check(self) -> ModelUncertainty:
         if any(len(axis) < 2 or np.diff(axis).min() <= 0.0 for axis in (self.speeds_rad_s, self.commands)):
             raise ValueError("speeds_rad_s and commands must be rising, two of each at least")
         shape = (len(self.speeds_rad_s), len(self.commands))
-        if [len(row) for row in self.std_rad_s] != [shape[1]] * shape[0] or np.min(self.std_rad_s) < 0.0:
+        rows = [[len(row) for row in table] for table in self.std_rad_s]
+        if not rows or rows != [[shape[1]] * shape[0]] * len(rows) or np.min(self.std_rad_s) < 0.0:
             raise ValueError("std_rad_s must have a row for each speed with a value for each command, none below zero")
-        if self.seen_std_rad_s is not None and self.seen_std_rad_s < 0.0:
-            raise ValueError("seen_std_rad_s must not be below zero")
+        if self.settled_command and [len(row) for row in self.settled_command] != [shape[0]] * len(rows):
+            raise ValueError("settled_command must have a command for each speed of each fan")
+        if self.seen_std_rad_s and (len(self.seen_std_rad_s) != len(rows) or min(self.seen_std_rad_s) < 0.0):
+            raise ValueError("seen_std_rad_s must have a value for each table, none below zero")
         return self
 
+    def of_fans(self, rows: Sequence[int]) -> ModelUncertainty:
+        """That of some of the fans."""
+        if len(self.std_rad_s) == 1:
+            return self
+        names = "std_rad_s", "seen_std_rad_s", "settled_command"
+        of_all = {name: getattr(self, name) for name in names}
+        return replace(self, **{name: tuple(of[row] for row in rows) for name, of in of_all.items() if of})
+
     def std_at(self, speed_rad_s: Array, command: Array) -> Array:
-        """Standard deviation, rad/s, at speeds and commands of one shape; NaN where either is.
+        """Standard deviation, rad/s, at speeds and commands of one shape, whose last axis is over the fans; NaN where
+        either is.
 
         Linear between the points of the table, constant beyond its edges.
         """
-        return self._between(_place(speed_rad_s, *self._speed_axis), _place(command, *self._command_axis))
+        return self._between(*self._places(speed_rad_s, command))
+
+    def over(self, speeds_rad_s: Array, commands: Array) -> Array:
+        """(speeds, commands) of one fan at all pairs of speeds and commands, (n,) each."""
+        speed_rad_s, command = np.meshgrid(speeds_rad_s, commands, indexing="ij")
+        return self.std_at(speed_rad_s[..., np.newaxis], command[..., np.newaxis])[..., 0]
 
     def unseen_std_at(self, speed_rad_s: Array, command: Array) -> Array:
         """What of it adds to the errors that training has seen, rad/s: 0 where the twin was trained."""
-        row, column = _place(speed_rad_s, *self._speed_axis), _place(command, *self._command_axis)
-        if self.seen_std_rad_s is None or not self._has_unseen.take(row.before * self._cells + column.before).any():
+        row, column = self._places(speed_rad_s, command)
+        cell = self._first_cell + row.before * (len(self.commands) - 1) + column.before
+        if not self.seen_std_rad_s or not self._has_unseen.take(cell).any():
             return np.zeros(speed_rad_s.shape)  # as nearly always
-        return np.sqrt(np.maximum(self._between(row, column) ** 2 - self.seen_std_rad_s**2, 0.0))
+        return np.sqrt(np.maximum(self._between(row, column) ** 2 - np.square(self._seen), 0.0))
+
+    def _places(self, speed_rad_s: Array, command: Array) -> tuple[_Place, _Place]:
+        row = _place(speed_rad_s, *self._speed_axis)
+        if self.settled_command:
+            at = self._first_row + row.before
+            before = self._settled.take(at)
+            command = command - before - row.share * (self._settled.take(at + 1) - before)
+        return row, _place(command, *self._command_axis)
 
     def _between(self, row: _Place, column: _Place) -> Array:
-        at, width, table = row.before * len(self.commands) + column.before, len(self.commands), self._table
+        width, table = len(self.commands), self._tables
+        at = self._first_point + row.before * width + column.before
         lower = table.take(at) + column.share * (table.take(at + 1) - table.take(at))
         upper = table.take(at + width) + column.share * (table.take(at + width + 1) - table.take(at + width))
         return lower + row.share * (upper - lower)
 
     @cached_property
-    def _table(self) -> Array:
+    def _tables(self) -> Array:
         return np.array(self.std_rad_s)
 
     @cached_property
-    def _has_unseen(self) -> Array:
-        """(cells,) whether a corner of the cell between four points of the table is above what training has seen."""
-        above = self._table > (self.seen_std_rad_s or 0.0)
-        return (above[1:, 1:] | above[1:, :-1] | above[:-1, 1:] | above[:-1, :-1]).ravel()
+    def _seen(self) -> Array:
+        return np.array(self.seen_std_rad_s)
 
-    @property
-    def _cells(self) -> int:
-        return len(self.commands) - 1
+    @cached_property
+    def _settled(self) -> Array:
+        return np.array(self.settled_command)
+
+    @cached_property
+    def _first_row(self) -> NDArray[np.intp]:
+        """(fans or 1,) where the speeds of each table begin."""
+        return np.arange(len(self._tables)) * len(self.speeds_rad_s)
+
+    @cached_property
+    def _first_point(self) -> NDArray[np.intp]:
+        """(fans or 1,) where the table of each fan begins."""
+        return self._first_row * len(self.commands)
+
+    @cached_property
+    def _first_cell(self) -> NDArray[np.intp]:
+        """(fans or 1,) where the cells between the points of each table begin."""
+        return np.arange(len(self._tables)) * (len(self.speeds_rad_s) - 1) * (len(self.commands) - 1)
+
+    @cached_property
+    def _has_unseen(self) -> NDArray[np.bool_]:
+        """(cells,) whether a corner of the cell between four points of a table is above what training has seen."""
+        above = self._tables > self._seen[:, np.newaxis, np.newaxis]
+        of_cells = above[:, 1:, 1:] | above[:, 1:, :-1] | above[:, :-1, 1:] | above[:, :-1, :-1]
+        return of_cells.ravel()
 
     @cached_property
     def _speed_axis(self) -> tuple[Array, Array]:

@@ -219,8 +219,8 @@ class TwinCard:
     of fans that control their own speed; None: the command acts as it is. reading_sigma_rad_s: per fan, root mean
     square of the distance of healthy readings from those that the tachos may show of the free run, of fans that neither
     start nor stand; empty in early cards and where tachos are instantaneous: it is sigma_rad_s there.
-    model_uncertainty: how far the twin itself may be wrong at each speed and command, for the fans together; of hybrids
-    whose network is used, None in early cards.
+    model_uncertainty: how far the twin itself may be wrong at each speed and command, for each fan; of hybrids, None in
+    early cards.
     """
 
     kind: str
@@ -274,6 +274,8 @@ class TwinCard:
         tacho_of_each_fan(self.tacho, self.fans)
         if self.drive is not None and len(self.drive.lowest_command) != self.fans:
             raise ValueError("drive.lowest_command must have one value for each fan")
+        if self.model_uncertainty is not None and len(self.model_uncertainty.std_rad_s) not in (1, self.fans):
+            raise ValueError("model_uncertainty.std_rad_s must have one table for each fan, or one for all")
         if not self.command_range[0] < self.command_range[1]:
             raise ValueError("command_range must be in ascending order")
         return self

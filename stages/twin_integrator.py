@@ -47,6 +47,8 @@ from scoring.expected_reading import AveragedCommand
 from scoring.torque_balance import BalanceModel, TorqueBalance
 
 RANGE_MARGIN = 0.05  # of the width of the training range: so far beyond it a twin is used at least
+RANGE_MARGIN_OF_TABLE = 0.25
+"""the same of one whose card says how wrong it may be there"""
 LONGEST_BRIDGE = (
     1 << 16
 )  # grid samples; above half a second at 100 kHz a new start is faster than running through the loss
@@ -342,11 +344,9 @@ def _off_below(twin: TwinFile, standstill: Standstill) -> Array:
 def _usable_commands(twin: TwinFile) -> tuple[float, float]:
     """The lowest and the highest command for which the twin is used: as far as its card says how wrong it may be."""
     low, high = twin.card.command_range
-    margin = RANGE_MARGIN * (high - low)
-    table = twin.unseen_error.table if twin.unseen_error else None
-    if table is None:
-        return low - margin, high + margin
-    return min(table.commands[0], low - margin), max(table.commands[-1], high + margin)
+    has_table = twin.unseen_error is not None and twin.unseen_error.table is not None
+    margin = (RANGE_MARGIN_OF_TABLE if has_table else RANGE_MARGIN) * (high - low)
+    return low - margin, high + margin
 
 
 def _balance_of(twin: TwinFile, off_below: Array) -> TorqueBalance:

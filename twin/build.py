@@ -158,7 +158,7 @@ def train_twin(
             f"the {kind} model of {name!r} diverges when run freely; record more levels, or try another kind"
         )
     uncertainty = None
-    if isinstance(model, NetworkOde) and model.has_physics and np.any(model.theta):
+    if isinstance(model, NetworkOde) and model.has_physics:
         commanded = drive.raised(runs) if drive else runs
         of_physics = parameters[:, : len(PARAMETER_NAMES)]
         uncertainty = model_uncertainty(model, of_physics, commanded, acting, identification)
@@ -227,7 +227,9 @@ def evaluate(
     rows = fan_rows(loaded.card, common_fans(runs), fan_numbers)
     runs = measured_as_in_card(loaded.card, rows, runs)
     sigma_rad_s = np.array(loaded.card.sigma_rad_s)[rows]
-    unseen_std = _unseen_std(loaded.card.model_uncertainty, drive_of_fans(loaded.card, rows))
+    unseen_std = _unseen_std(
+        table.of_fans(rows) if (table := loaded.card.model_uncertainty) else None, drive_of_fans(loaded.card, rows)
+    )
     return evaluate_model(model, loaded.parameters[rows], sigma_rad_s, runs, unseen_std)
 
 

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.printing import progress
 from bench.runtime.stage_memory import free_endpoint, memory_mb
 from pipeline.bus.session import Bus
 from pipeline.config.models import BusConfig
@@ -105,18 +106,26 @@ def measured(folder: Path) -> dict[str, float]:
     place = learning_folder(folder / "runs", TRAY)
     write_history(place)
     versions = TwinVersions(place, TRAY)
-    tray = _started([*FANTWIN, "simulate", "--fans", str(FANS), "--link", str(folder / "line")])
+    # Fans that do not move teach nothing: the first version waits until they have.
+    tray = _started(
+        [*FANTWIN, "simulate", "--fans", str(FANS), "--profile", "staircase", "--link", str(folder / "line")]
+    )
     up = _started([*FANTWIN, "up", "-c", str(config)])
     try:
         with Bus(BusConfig(endpoint=endpoint), listens=False) as bus:
             latencies = Latencies(SiteWatcher(bus, SITE))
             began_s = time.monotonic()
+            progress("a site that learns its first twin: some minutes")
             while not versions.all():
+                for name, process in (("simulate", tray), ("up", up)):
+                    if process.poll() is not None:
+                        raise SystemExit(f"fantwin {name} has ended, status {process.returncode}")
                 time.sleep(SAMPLED_S)
             first_s = time.monotonic() - began_s
             time.sleep(15.0)  # the twin takes over
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             began_s = time.monotonic()
+            progress("learning beside the site, and as long without")
             learn = _started([*FANTWIN, "learn", "-c", str(config), "--until-stdin-closes"])
             peak_mb = [0.0]
 

@@ -112,7 +112,7 @@ class TrayTwin:
     def unseen_error(self) -> UnseenError | None:
         """How far it may be wrong where healthy runs do not show it; None where the card says nothing about it."""
         card, table = self.card, self.card.model_uncertainty
-        if table is not None and table.seen_std_rad_s is None:
+        if table is not None and not table.seen_std_rad_s:
             table = None
         if table is None and card.drive is None:
             return None

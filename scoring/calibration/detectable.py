@@ -4,6 +4,7 @@ At once: beyond the limit of a smoothed residual. Within a minute: also what the
 baseline follows the fan as long as every statistic is below half of its limit. A drop of the speed at a constant
 command is a shift of the torque balance by the slope of the needed command over speed, viscous + 2 drag w; the residual
 that finds the smaller drop counts. Noise is left out: a drop of this size is found about every second time so soon.
+The baseline of the fan has learned at the mean speed of calibration.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from scoring.limits import Limits
 MINUTE_S = 60.0
 ROUNDS = 30
 DEFAULT_PERIOD_S = 0.01
+LEARNED_SCALE = np.ones(1)
+"""of speed_scaling, at the mean speed of calibration"""
 SHARES = (0.25, 0.5, 0.75, 1.0)
 """of the top speed, where drops are given"""
 
@@ -57,7 +60,7 @@ def _drops(scorer: FanScorer, source: Signal, speed_rad_s: float, rad_s_per_sigm
     """The drops by one residual, at once and within a minute, rad/s."""
     drifts, smoothed = [], np.inf
     limits = scorer.limits.residual(source)
-    unit = float(scorer.residuals[source].limit_std(np.array([speed_rad_s]))[0])
+    unit = float(scorer.residuals[source].limit_std(np.array([speed_rad_s]), LEARNED_SCALE)[0])
     """of the limits at this speed, sigma"""
     for row in rows():
         detector = scorer.detectors.get(row.name)

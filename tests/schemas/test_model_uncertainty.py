@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from schemas.model_uncertainty import ModelUncertainty
 
-TABLE = ModelUncertainty((0.0, 100.0, 200.0), (0.0, 1.0), ((1.0, 2.0), (3.0, 4.0), (5.0, 10.0)))
+STD_RAD_S = ((1.0, 2.0), (3.0, 4.0), (5.0, 10.0))
+TABLE = ModelUncertainty((0.0, 100.0, 200.0), (0.0, 1.0), (STD_RAD_S,))
 
 
 @pytest.mark.parametrize(
@@ -22,12 +23,16 @@ TABLE = ModelUncertainty((0.0, 100.0, 200.0), (0.0, 1.0), ((1.0, 2.0), (3.0, 4.0
 )
 def test_another_table_is_refused(speeds_rad_s, commands, std_rad_s, words: str) -> None:
     with pytest.raises(ValidationError, match=words):
-        ModelUncertainty(speeds_rad_s, commands, std_rad_s)
+        ModelUncertainty(speeds_rad_s, commands, (std_rad_s,))
 
 
-def test_a_level_below_zero_is_refused() -> None:
-    with pytest.raises(ValidationError, match="seen_std_rad_s must not be below zero"):
-        replace(TABLE, seen_std_rad_s=-1.0)
+def test_values_that_do_not_fit_the_tables_are_refused() -> None:
+    with pytest.raises(ValidationError, match="seen_std_rad_s must have a value for each table, none below zero"):
+        replace(TABLE, seen_std_rad_s=(-1.0,))
+    with pytest.raises(ValidationError, match="seen_std_rad_s must have a value for each table"):
+        replace(TABLE, seen_std_rad_s=(1.0, 1.0))
+    with pytest.raises(ValidationError, match="settled_command must have a command for each speed of each fan"):
+        replace(TABLE, settled_command=((0.0, 0.5),))
 
 
 @pytest.mark.parametrize(
@@ -44,6 +49,36 @@ def test_it_knows_nothing_of_an_unknown_speed() -> None:
 
 
 def test_only_what_training_has_not_shown_is_unseen() -> None:
-    table, speeds_rad_s, command = replace(TABLE, seen_std_rad_s=3.0), np.array([50.0, 100.0, 200.0]), np.zeros(3)
-    np.testing.assert_allclose(table.unseen_std_at(speeds_rad_s, command), [0.0, 0.0, 4.0])  # of 2, 3 and 5
+    table, speeds_rad_s, command = (
+        replace(TABLE, seen_std_rad_s=(3.0,)),
+        np.array([[50.0], [100.0], [200.0]]),
+        np.zeros((3, 1)),
+    )
+    np.testing.assert_allclose(table.unseen_std_at(speeds_rad_s, command), [[0.0], [0.0], [4.0]])  # of 2, 3 and 5
     np.testing.assert_array_equal(TABLE.unseen_std_at(speeds_rad_s, command), 0.0, "early cards do not say")
+
+
+def test_each_fan_has_its_own_around_the_commands_at_which_it_settles() -> None:
+    twice = tuple(tuple(2.0 * value for value in row) for row in STD_RAD_S)
+    table = ModelUncertainty(
+        TABLE.speeds_rad_s,
+        TABLE.commands,
+        (STD_RAD_S, twice),
+        seen_std_rad_s=(3.0, 9.0),
+        settled_command=((0.0, 0.2, 0.4), (0.0, 10.0, 20.0)),
+    )
+    speed_rad_s, command = np.full((3, 2), 150.0), np.array([[0.3, 15.0], [0.8, 15.5], [1.3, 99.0]])
+    expected = np.array([[4.0, 8.0], [5.5, 11.0], [7.0, 14.0]])
+    np.testing.assert_allclose(table.std_at(speed_rad_s, command), expected)
+    np.testing.assert_allclose(
+        table.unseen_std_at(speed_rad_s, command), np.sqrt(np.maximum(expected**2 - np.square((3.0, 9.0)), 0.0))
+    )
+    np.testing.assert_allclose(table.of_fans([1]).std_at(speed_rad_s[:, 1:], command[:, 1:]), expected[:, 1:])
+    assert TABLE.of_fans([0, 0, 0]).std_at(np.zeros((1, 3)), np.ones((1, 3))).shape == (1, 3), "one holds for any fan"
+
+
+def test_the_table_of_an_early_card_is_that_of_all_fans() -> None:
+    of_card = {"speeds_rad_s": TABLE.speeds_rad_s, "commands": TABLE.commands, "std_rad_s": STD_RAD_S}
+    read = TypeAdapter(ModelUncertainty).validate_python
+    assert read(of_card) == read(of_card | {"seen_std_rad_s": None}) == TABLE
+    assert read(of_card | {"seen_std_rad_s": 3.0}) == replace(TABLE, seen_std_rad_s=(3.0,))

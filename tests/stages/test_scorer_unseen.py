@@ -12,7 +12,7 @@ from scoring.unseen_error import UnseenError
 from stages.scorer import NOT_CALIBRATED, ScorerCore
 from tests.support.scored_blocks import CALIBRATION, SIGMA, balance_of_a_fan, feed, prediction_of
 
-EVERYWHERE = ModelUncertainty((0.0, 600.0), (0.0, 100.0), ((20.0, 20.0), (20.0, 20.0)), seen_std_rad_s=0.0)
+EVERYWHERE = ModelUncertainty((0.0, 600.0), (0.0, 100.0), (((20.0, 20.0), (20.0, 20.0)),), seen_std_rad_s=(0.0,))
 
 
 @pytest.mark.parametrize("is_calibrated", [True, False])

@@ -6,11 +6,14 @@ for Machine Learning, chapter 2), smooth over a quarter of the recorded range. I
 (twin.fitting.filtering). Their covariance after the runs gives the standard deviation of the acceleration that is left.
 Held for long, an error of the acceleration becomes that error times the fan's time constant in the speed.
 
-The fans of a tray are taken together: what one of them has shown is known of all.
+What the fans of a tray have in common is known from all of them. How one differs from them is such a process too, of a
+smaller deviation, and known from its own runs alone. While a fan changes its speed a model misses more: what it passes
+quickly says less than what it holds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -31,15 +34,23 @@ from twin.runs import Array, Run
 PRIOR_STD = 0.3
 """of the acceleration where nothing was recorded, in its scale: held for long, 0.15 of the range of speeds for a fan of
 the typical time constant"""
+OWN_VARIANCE = 1.0 / 9.0
+"""share of the prior variance in which fans differ"""
 LENGTH = 0.5
 """over which what the model misses changes, in half recorded ranges"""
 COSINES, SEED = 400, 0
-POINTS, REACH = 13, 1.5
-"""of the table along each axis, and how far it reaches, in half recorded ranges"""
+SPEEDS, REACH = 37, 1.5
+"""of the table, and how far it reaches, in half recorded ranges"""
+OFFSETS = (0.03, 0.1, 0.3, 1.0, 2.5)
+"""of its commands from that at which a fan settles, in half recorded ranges: dense where fans nearly always are"""
 SLOWEST = 3.0
 """time constants are limited to so many of the typical one: they grow without limit where a fan hardly turns"""
-SEEN_QUANTILE = 0.95
-"""of the standard deviations at the samples of training"""
+HELD = 2.0
+"""times the standard deviation of what a model misses while a fan moves least: above it the fan is not held"""
+STANDS_BELOW = 0.05
+"""of half the recorded range of speeds"""
+SEEN_QUANTILE = 0.9
+"""of the standard deviations where a fan was held in training"""
 LEAST_NOISE = 1e-4
 """of a reading, in half the recorded range of speeds: data without noise determine no more than numbers can hold"""
 
@@ -57,30 +68,77 @@ def model_uncertainty(
     scale = data_scaling(runs, identification)
     typical_s = float(np.median(identification.time_constant_s))
     basis = _cosines(scale)
-    information = np.eye(COSINES)
-    least = (LEAST_NOISE * scale.speed_scale_rad_s) ** 2
-    for missed, squares in _of_each_fan(model, parameters, runs, acting_runs, basis, 1.0 / typical_s):
-        information += squares / max(variance_of_independent(missed), least)
-    root = cholesky(information, lower=True)
-    side = np.linspace(-REACH, REACH, POINTS)
-    speeds_rad_s = scale.speed_offset_rad_s + scale.speed_scale_rad_s * side
-    commands = scale.command_offset + scale.command_scale * side
-    speed_rad_s, command = (values.ravel() for values in np.meshgrid(speeds_rad_s, commands, indexing="ij"))
-    values = basis(speed_rad_s, command)
-    std_rad_s2 = np.linalg.norm(solve_triangular(root, values.T, lower=True), axis=0)
-    held_s = _held_s(parameters, speed_rad_s, SLOWEST * typical_s)
-    std_rad_s = (std_rad_s2 * held_s).reshape(POINTS, POINTS)
+    speeds_rad_s = scale.speed_offset_rad_s + scale.speed_scale_rad_s * np.linspace(-REACH, REACH, SPEEDS)
+    offsets = scale.command_scale * np.array((*(-each for each in reversed(OFFSETS)), 0.0, *OFFSETS))
+    shown = _shown_by_each_fan(model, parameters, runs, acting_runs, basis, 1.0 / typical_s, scale)
+    settled = [
+        _settled_command(model, own, speeds_rad_s, scale) + each.friction
+        for own, each in zip(parameters, shown, strict=True)
+    ]
+    held_s = _held_s(parameters, speeds_rad_s, SLOWEST * typical_s)
+    std_rad_s = [
+        _left_rad_s2(root, basis, speeds_rad_s, commands[:, np.newaxis] + offsets) * held_s[:, fan, np.newaxis]
+        for fan, (commands, root) in enumerate(zip(settled, _roots([each.squares for each in shown]), strict=True))
+    ]
     table = ModelUncertainty(
-        tuple(speeds_rad_s.tolist()), tuple(commands.tolist()), tuple(map(tuple, np.round(std_rad_s, 4).tolist()))
+        tuple(np.round(speeds_rad_s, 4).tolist()),
+        tuple(np.round(offsets, 6).tolist()),
+        tuple(tuple(map(tuple, np.round(each, 3).tolist())) for each in std_rad_s),
+        settled_command=tuple(map(tuple, np.round(settled, 6).tolist())),
     )
-    seen_rad_s = np.concatenate([table.std_at(run.speed_rad_s, run.command).ravel() for run in runs])
-    return replace(table, seen_std_rad_s=round(float(np.nanquantile(seen_rad_s, SEEN_QUANTILE)), 4))
+    seen = tuple(
+        _seen_std_rad_s(table.of_fans([fan]), each.held_command, commands, STANDS_BELOW * scale.speed_scale_rad_s)
+        for fan, (each, commands) in enumerate(zip(shown, settled, strict=True))
+    )
+    return replace(table, seen_std_rad_s=seen)
+
+
+def _seen_std_rad_s(
+    table: ModelUncertainty, held_command: Array, settled_command: Array, stands_below_rad_s: float
+) -> float:
+    """Of one fan, where its twin settles, and turns, at the commands at which it was held."""
+    speed_rad_s = np.interp(held_command, settled_command, table.speeds_rad_s)
+    std_rad_s = table.std_at(speed_rad_s, held_command)[np.abs(speed_rad_s) > stands_below_rad_s]
+    return round(float(np.quantile(std_rad_s, SEEN_QUANTILE)), 4) if std_rad_s.size else 0.0
+
+
+def _settled_command(model: OdeModel, own: Array, speeds_rad_s: Array, scale: Scaling) -> Array:
+    """(n,) the commands that, as they act, hold a fan at speeds, as far as the table reaches."""
+    commands = scale.command_offset + scale.command_scale * np.linspace(-2.0 * REACH, 2.0 * REACH, 1000)
+    speed_rad_s, command = (values.ravel() for values in np.meshgrid(speeds_rad_s, commands, indexing="ij"))
+    acceleration = _acceleration(model, own)(speed_rad_s, command).reshape(len(speeds_rad_s), -1)
+    rising = np.maximum.accumulate(acceleration, axis=1)
+    return np.array([np.interp(0.0, of_speed, commands) for of_speed in rising])
+
+
+def _left_rad_s2(root: Array, basis: Basis, speeds_rad_s: Array, commands: Array) -> Array:
+    """(speeds, commands) the standard deviation of the acceleration. commands: (speeds, commands) at each speed."""
+    values = basis(np.repeat(speeds_rad_s, commands.shape[1]), commands.ravel())
+    return np.linalg.norm(solve_triangular(root, values.T, lower=True), axis=0).reshape(commands.shape)
 
 
 def _held_s(parameters: Array, speed_rad_s: Array, slowest_s: float) -> Array:
-    """(n,) mean over the fans of the time constants of their physics, none longer than the slowest."""
+    """(n, fans) the time constants of their physics, none longer than the slowest."""
     by_speed_per_s = acceleration_by_speed(speed_rad_s[:, np.newaxis], parameters)
-    return (-1.0 / np.minimum(by_speed_per_s, -1.0 / slowest_s)).mean(axis=1)
+    return -1.0 / np.minimum(by_speed_per_s, -1.0 / slowest_s)
+
+
+def _roots(squares: Sequence[Array]) -> Iterator[Array]:
+    """(C, C) of each fan: the lower Cholesky factor of the information about the sum of what the fans have in common
+    and what is its own. squares: (C, C) of each fan, of its runs.
+    """
+    prior = np.eye(COSINES) / (1.0 - OWN_VARIANCE)
+    of_common = [_of_others(each) for each in squares]
+    for number, each in enumerate(squares):
+        others = sum((its for other, its in enumerate(of_common) if other != number), prior)
+        yield cholesky(_of_others(others) + each, lower=True)
+
+
+def _of_others(information: Array) -> Array:
+    """(C, C) what information about some fans is worth to one that differs from them."""
+    values, vectors = np.linalg.eigh(information)
+    values = np.maximum(values, 0.0)
+    return (vectors * (values / (1.0 + OWN_VARIANCE * values))) @ vectors.T
 
 
 def _cosines(scale: Scaling) -> Basis:
@@ -98,34 +156,79 @@ def _cosines(scale: Scaling) -> Basis:
     return basis
 
 
-def _of_each_fan(
+class _Shown(NamedTuple):
+    """What its runs show of a fan."""
+
+    squares: Array
+    """(C, C) of the filtered cosines, relative to the variance of what the model misses"""
+    held_command: Array
+    """(m, 1) after the lag, where it turned and was held"""
+    friction: float
+    """what a drive takes of the command before it acts"""
+
+
+def _shown_by_each_fan(
     model: OdeModel,
     parameters: Array,
     runs: Sequence[Run],
     acting_runs: Sequence[Run],
     basis: Basis,
     lambda_per_s: float,
-) -> list[tuple[Array, Array]]:
-    """Of each fan what the model misses (m,), and the squares of the cosines (C, C), filtered.
+    scale: Scaling,
+) -> list[_Shown]:
+    """Of each fan.
 
     Runs are processed in parts, so that memory does not grow with them.
     """
-    missed: list[list[Array]] = [[] for _ in parameters]
-    squares = np.zeros((len(parameters), COSINES, COSINES))
-    for run, acting_run in zip(evaluation_pieces(runs), evaluation_pieces(acting_runs), strict=True):
-        command, acting = (_lagged(piece, parameters[:, LAG]) for piece in (run, acting_run))
-        for first, end in run.equal_parts(MAX_SAMPLES):
-            part = slice(first, end)
-            for fan, own in enumerate(parameters):
-                t_s, speed_rad_s = run.t_s[part], run.speed_rad_s[part, fan]
-                if np.isfinite(speed_rad_s).sum() < 2:
-                    continue
-                known = _acceleration(model, own)
-                target, explained = filtered_regression(t_s, speed_rad_s, acting[part, fan], known, lambda_per_s)
-                _, cosines = filtered_regression(t_s, speed_rad_s, command[part, fan], basis, lambda_per_s)
-                missed[fan].append(target - explained[:, 0])
-                squares[fan] += cosines.T @ cosines
-    return [(np.concatenate(of), squares[fan]) for fan, of in enumerate(missed) if of]
+    least, stands_below_rad_s = (LEAST_NOISE * scale.speed_scale_rad_s) ** 2, STANDS_BELOW * scale.speed_scale_rad_s
+    commands, acting = (
+        [_lagged(piece, parameters[:, LAG]) for piece in evaluation_pieces(each)] for each in (runs, acting_runs)
+    )
+    pieces = list(zip(evaluation_pieces(runs), commands, acting, strict=True))
+    found = []
+    for fan, own in enumerate(parameters):
+        measured = [
+            (run.t_s[part], run.speed_rad_s[part, fan], command[part, fan], acts[part, fan])
+            for run, command, acts in pieces
+            for part in (slice(first, end) for first, end in run.equal_parts(MAX_SAMPLES))
+            if np.isfinite(run.speed_rad_s[part, fan]).sum() >= 2
+        ]
+        squares = np.zeros((COSINES, COSINES))
+        if not measured:
+            found.append(_Shown(squares, np.zeros((0, 1)), 0.0))
+            continue
+        equation = _acceleration(model, own)
+        both = [filtered_regression(t_s, speed, acts, equation, lambda_per_s) for t_s, speed, _, acts in measured]
+        missed = np.concatenate([target - explained[:, 0] for target, explained in both])
+        std = _relative_std(missed, np.concatenate([target for target, _ in both]))
+        first = 0
+        for t_s, speed, command, _ in measured:
+            _, cosines = filtered_regression(t_s, speed, command, basis, lambda_per_s)
+            cosines /= std[first : (first := first + len(cosines)), np.newaxis]
+            squares += cosines.T @ cosines
+        squares /= max(variance_of_independent(missed / std), least)
+        speed_rad_s, command, acts = (
+            np.concatenate([each[column][np.isfinite(each[1])] for each in measured]) for column in (1, 2, 3)
+        )
+        held = (std < HELD) & (np.abs(speed_rad_s) > stands_below_rad_s)
+        friction = float(np.median((command - acts)[held])) if held.any() else 0.0
+        found.append(_Shown(squares, command[held, np.newaxis], friction))
+    return found
+
+
+def _relative_std(missed: Array, motion_rad_s: Array) -> Array:
+    """(m,) the standard deviation of what a model misses at each sample, relative to that of the half that moves least.
+
+    motion_rad_s: (m,) the distance of the speed from its low-pass, which is the target of the filtered regression.
+    """
+    motions, squares = np.square(motion_rad_s), np.square(missed)
+    excess = np.maximum(motions - np.median(motions), 0.0)
+    is_moving = excess > 0.0
+    least = squares[~is_moving].mean()
+    if least <= 0.0 or not is_moving.any():
+        return np.ones(len(missed))
+    rise = max(float((squares[is_moving] - least).sum() / excess.sum()), 0.0)
+    return np.sqrt(1.0 + rise * excess / least)
 
 
 def _lagged(piece: Run, lag_s: Array) -> Array:

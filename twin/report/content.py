@@ -42,12 +42,13 @@ class Parameter:
 class FanContent:
     """One fan. Arrays (n,) are in rad/s or command units, over all pieces one after the other.
 
-    column: of the runs. number: as the recording counts fans. predicted_rad_s: the readings expected of the free run,
-    NaN where it diverged. error_rad_s: measured minus that, NaN where nothing is compared, infinite where the free run
-    diverged.
+    column: of the runs. row: of the twin. number: as the recording counts fans. predicted_rad_s: the readings expected
+    of the free run, NaN where it diverged. error_rad_s: measured minus that, NaN where nothing is compared, infinite
+    where the free run diverged.
     """
 
     column: int
+    row: int
     number: int
     figures: Figures
     sigma_rad_s: float
@@ -129,6 +130,7 @@ def report_content(
         fans=tuple(
             FanContent(
                 column=fan,
+                row=rows[fan],
                 number=fan_numbers[fan] if fan_numbers is not None else fan,
                 figures=evaluation.per_fan[fan],
                 sigma_rad_s=float(sigma_rad_s[fan]),

@@ -40,6 +40,7 @@ MOST_TICKS = 5
 AROUND_PEAK_SAMPLES = 300
 MOST_MARKS = 500
 CONTOURS = 8
+KNOWN_POINTS = 61
 HISTOGRAM_SIGMAS = 5.0
 HISTOGRAM_BINS = 50
 LONG_DECIMALS = re.compile(r"(\.\d\d)\d+")
@@ -158,18 +159,19 @@ def static_curve(content: Content, fan: FanContent, curve: StaticCurve) -> str:
 def what_is_known(content: Content, fan: FanContent, uncertainty: ModelUncertainty) -> str:
     """How far the twin itself may be wrong over speed and command, and where the recordings were."""
     each, unit = content.unit.rad_s, content.card.command_unit
-    speeds = np.array(uncertainty.speeds_rad_s) / each
-    std = np.array(uncertainty.std_rad_s) / each
+    commands = _around(content.card.command_range, fan.raised_command)
+    speeds_rad_s = _around(content.card.speed_range_rad_s, fan.measured_rad_s)
+    speeds, std = speeds_rad_s / each, uncertainty.over(speeds_rad_s, commands) / each
     kept = slice(None, None, max(1, len(fan.command) // MOST_MARKS))
     with _small_figure() as (figure, axes):
-        filled = axes.contourf(uncertainty.commands, speeds, std, levels=CONTOURS, cmap="Greens", vmin=0.0)
+        filled = axes.contourf(commands, speeds, std, levels=CONTOURS, cmap="Greens", vmin=0.0)
         axes.plot(
             fan.raised_command[kept], fan.measured_rad_s[kept] / each, ".", ms=1.5, color=COMMAND, label="measured"
         )
         figure.colorbar(filled, ax=axes, label=f"standard deviation ({content.unit.name})")
         sigma = fan.sigma_rad_s / each
         if std.min() < sigma < std.max():
-            axes.contour(uncertainty.commands, speeds, std, levels=[sigma], colors=OUTSIDE, linewidths=1.0)
+            axes.contour(commands, speeds, std, levels=[sigma], colors=OUTSIDE, linewidths=1.0)
             axes.plot([], [], color=OUTSIDE, lw=1.0, label="as large as σ")
         if content.card.command_range[0] >= 0.0:
             axes.set_xlim(left=0.0)
@@ -180,6 +182,14 @@ def what_is_known(content: Content, fan: FanContent, uncertainty: ModelUncertain
         axes.set_ylabel(f"speed ({content.unit.name})")
         _legend_above(axes, 2)
         return _svg(figure, f"fan{fan.number}-known", "How far the twin may be wrong over speed and command")
+
+
+def _around(trained: tuple[float, float], measured: Array) -> Array:
+    """Points over what the twin was trained on and a quarter of its width beyond, and over what was measured."""
+    low, high = trained
+    margin = 0.25 * (high - low)
+    lowest, highest = np.nanmin(measured, initial=low - margin), np.nanmax(measured, initial=high + margin)
+    return np.linspace(lowest, highest, KNOWN_POINTS)
 
 
 def error_over_speed(content: Content, fan: FanContent) -> str:

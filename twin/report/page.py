@@ -136,10 +136,10 @@ def fan_figures(content: Content, fan: FanContent) -> list[Figure]:
 
 
 def _what_is_known(content: Content, fan: FanContent, curve: StaticCurve) -> list[Figure]:
-    known = content.card.model_uncertainty
-    if known is None:
+    if content.card.model_uncertainty is None:
         return []
-    std_rad_s = known.std_at(fan.predicted_rad_s, fan.raised_command)
+    known = content.card.model_uncertainty.of_fans([fan.row])
+    std_rad_s = known.std_at(fan.predicted_rad_s[:, np.newaxis], fan.raised_command[:, np.newaxis])
     beyond = std_rad_s[np.isfinite(std_rad_s)] > fan.sigma_rad_s
     share = f" So are {100.0 * beyond.mean():.3g} % of the samples here." if beyond.size else ""
     return [
@@ -153,7 +153,7 @@ def _what_is_known(content: Content, fan: FanContent, curve: StaticCurve) -> lis
 
 
 def _record_next(content: Content, fan: FanContent, known: ModelUncertainty, curve: StaticCurve) -> str:
-    if known.seen_std_rad_s is None:
+    if not known.seen_std_rad_s:
         return "Record where it may be most wrong, and train again to rely on it."
     least = least_known(known, curve, fan.drive)
     if least is None:
@@ -165,7 +165,7 @@ def _record_next(content: Content, fan: FanContent, known: ModelUncertainty, cur
     unit = f" {content.card.command_unit}" if content.card.command_unit else ""
     speed, std, seen = (
         f"{float(f'{value / each:.3g}'):,g} {name}"
-        for value in (least.speed_rad_s, least.std_rad_s, known.seen_std_rad_s)
+        for value in (least.speed_rad_s, least.std_rad_s, known.seen_std_rad_s[0])
     )
     command = f"{least.command:.3g}{unit}"
     start = "rest" if least.speed_rad_s < AT_REST_SHARE * content.card.top_speed_rad_s else speed

@@ -27,17 +27,17 @@ class LeastKnown:
 def least_known(known: ModelUncertainty, curve: StaticCurve, drive: DriveCard | None) -> LeastKnown | None:
     """The held command, or else the step from one settled speed, at which the twin may be most wrong.
 
-    curve: of the fan, over the commands that are possible. drive: of that fan. None: nothing within these commands is
+    known, curve, drive: of the fan; curve over the commands that are possible. None: nothing within these commands is
     much less known than what training has seen, or the card does not say what that is.
     """
     settled = curve.twin[np.isfinite(curve.twin).all(axis=1)]
-    if known.seen_std_rad_s is None or not len(settled):
+    if not known.seen_std_rad_s or not len(settled):
         return None
     commands, speeds_rad_s = settled.T
     raised = drive.raised(commands[:, np.newaxis])[:, 0] if drive else commands
-    of_steps = known.std_at(*np.meshgrid(speeds_rad_s, raised, indexing="ij"))
+    of_steps = known.over(speeds_rad_s, raised)
     of_holds = np.diag(of_steps)
-    least = LEAST_RATIO * known.seen_std_rad_s
+    least = LEAST_RATIO * known.seen_std_rad_s[0]
     if of_holds.max() >= least:
         at = int(of_holds.argmax())
         return LeastKnown(float(speeds_rad_s[at]), float(commands[at]), float(of_holds[at]), held=True)

@@ -55,6 +55,17 @@ def test_a_drop_that_is_said_to_be_found_is_found_in_that_time_and_a_smaller_one
     assert found_after_s(0.93 * drop.within_a_minute_rad_s) == np.inf
 
 
+def test_it_is_of_a_fan_whose_offset_is_known_at_the_mean_speed_of_calibration() -> None:
+    """An offset that follows the speed is not known above that; before a fan has been heard it is not known at all."""
+    follows = {"speed_exponent": 1, "reference_speed_rad_s": SPEED, "rms_sigmas": 2.0}
+    baseline = RESIDUAL.baseline.model_copy(update=follows)
+    limits = LIMITS.model_copy(update={"speed": RESIDUAL.model_copy(update={"baseline": baseline})})
+    at_mean, above = detectable_drops(limits, SIGMA, balance_of_a_fan(), [SPEED, 2.0 * SPEED])
+    known_at_mean, known_above = detectable_drops(LIMITS, SIGMA, balance_of_a_fan(), [SPEED, 2.0 * SPEED])
+    assert at_mean.at_once_rad_s == known_at_mean.at_once_rad_s
+    assert above.at_once_rad_s > 1.5 * known_above.at_once_rad_s
+
+
 def test_what_no_limit_watches_is_not_found() -> None:
     (drop,) = detectable_drops(LIMITS.model_copy(update={"detectors": {}}), SIGMA, balance_of_a_fan(), [SPEED])
     assert drop.at_once_rad_s == drop.within_a_minute_rad_s == np.inf
