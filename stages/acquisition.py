@@ -223,6 +223,9 @@ class AcquisitionCore(Core):
 
     def _plausible(self, item: Reading | Rejected) -> Reading | None:
         """The reading, without implausible speeds; None, and counted, if it cannot be used."""
+        if isinstance(item, Reading) and self._is_ordinary(item):
+            self._quality.add_valid()
+            return item
         rejected = item if isinstance(item, Rejected) else self._why_refused(item)
         if rejected is None:
             assert isinstance(item, Reading)
@@ -233,6 +236,18 @@ class AcquisitionCore(Core):
             self._counts["refused_input"] += 1
             self._quality.add_fault(rejected)
         return None
+
+    def _is_ordinary(self, reading: Reading) -> bool:
+        """Whether all its values are there and plausible, as of nearly all readings; a sum shows any that is no number."""
+        command, speed, tray = reading.command, reading.speed, self._tray
+        return (
+            len(command) == len(speed) == tray.fans
+            and math.isfinite(sum(command) + sum(speed))
+            and tray.command_min <= min(command)
+            and max(command) <= tray.command_max
+            and -tray.speed_max <= min(speed)
+            and max(speed) <= tray.speed_max
+        )
 
     def _why_refused(self, reading: Reading) -> Rejected | None:
         tray = self._tray

@@ -22,8 +22,10 @@ class InputQuality:
         """silence_s: a source without a valid sample for longer is a problem."""
         self._silence_s = silence_s
         self._input_t_ns = self._valid_t_ns = started_t_ns
-        self._recent: deque[str] = deque(maxlen=WINDOW)
-        """kinds of fault; empty: a valid sample"""
+        self._recent: deque[str] = deque()
+        """of the newest WINDOW pieces; kinds of fault; empty: a valid sample"""
+        self._faulty = 0
+        """of these"""
         self._examples: dict[str, Rejected] = {}
         """by kind: the first since the source was last in order, so that the report of one problem stays the same"""
         self._mostly_faulty = False
@@ -31,6 +33,7 @@ class InputQuality:
     def connection_changed(self) -> None:
         """The source was connected or disconnected: what came before says nothing about what follows."""
         self._recent.clear()
+        self._faulty = 0
         self._examples.clear()
         self._mostly_faulty = False
 
@@ -76,11 +79,13 @@ class InputQuality:
 
     def _add(self, kind: str) -> None:
         self._recent.append(kind)
-        faulty = sum(map(bool, self._recent))
-        if not faulty:
+        self._faulty += bool(kind)
+        if len(self._recent) > WINDOW:
+            self._faulty -= bool(self._recent.popleft())
+        if not self._faulty:
             self._examples.clear()
         limit = GOOD_AGAIN if self._mostly_faulty else 0.5
-        self._mostly_faulty = len(self._recent) >= JUDGED_FROM and faulty > limit * len(self._recent)
+        self._mostly_faulty = len(self._recent) >= JUDGED_FROM and self._faulty > limit * len(self._recent)
 
     def _fault(self) -> Rejected | None:
         """An example of the fault that is most frequent."""
