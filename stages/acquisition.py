@@ -238,7 +238,7 @@ class AcquisitionCore(Core):
         return None
 
     def _is_ordinary(self, reading: Reading) -> bool:
-        """Whether all its values are there and plausible, as of nearly all readings; a sum shows any that is no number."""
+        """Whether all values are there and plausible, as of nearly all readings; a sum shows any that is no number."""
         command, speed, tray = reading.command, reading.speed, self._tray
         return (
             len(command) == len(speed) == tray.fans
