@@ -18,7 +18,7 @@ Table: TypeAlias = tuple[tuple[float, ...], ...]
 
 
 def _one_for_all(ndim: int) -> BeforeValidator:
-    """Early cards have one value, of so many dimensions, for all fans, and may have none."""
+    """Accepts the value of an early card: one for all fans, of so many dimensions, becomes a tuple of one; None, ()."""
 
     def of_each(value: Any) -> Any:
         return () if value is None else (value,) if np.ndim(value) == ndim else value
@@ -28,46 +28,64 @@ def _one_for_all(ndim: int) -> BeforeValidator:
 
 @dataclass(frozen=True, config=ConfigDict(extra="ignore", allow_inf_nan=False))
 class ModelUncertainty:
-    """Standard deviation of the twin's own error, as a table of each fan.
+    """Standard deviation of the twin's own error, one table for each fan.
 
-    speeds_rad_s, commands: rising; the commands are relative to those at which a fan settles at the speeds, so that the
-    table has points where fans are most of the time. settled_command: (fans, speeds) these; empty in early cards, whose
-    commands are as they are. std_rad_s: (fans, speeds, commands); one table holds for any fan. With a drive, a command
-    on its plateau is the end of the plateau. seen_std_rad_s: (fans,) where a fan was held in training the standard
-    deviation is hardly ever above this one; empty in early cards.
+    speeds_rad_s, commands: rising; the speeds are relative to those at which a fan settles at the commands, so that the
+    table has points where fans are most of the time. settled_speed_rad_s: (fans, commands) the speeds at which each fan
+    settles. std_rad_s: (fans, commands, speeds), rad/s; a card with a single table uses it for all fans. With a drive,
+    a command on its plateau is the end of the plateau. seen_std_rad_s: (fans,) where a fan was held in training the
+    standard deviation is hardly ever above this one.
+
+    Early cards have no settled_speed_rad_s: their speeds are absolute, their one table is (1, speeds, commands), and
+    seen_std_rad_s may be empty.
     """
 
     speeds_rad_s: tuple[float, ...]
     commands: tuple[float, ...]
     std_rad_s: Annotated[tuple[Table, ...], _one_for_all(2)]
     seen_std_rad_s: Annotated[tuple[float, ...], _one_for_all(0)] = ()
-    settled_command: tuple[tuple[float, ...], ...] = ()
+    settled_speed_rad_s: tuple[tuple[float, ...], ...] = ()
 
     @model_validator(mode="after")
     def _check(self) -> ModelUncertainty:
         if any(len(axis) < 2 or np.diff(axis).min() <= 0.0 for axis in (self.speeds_rad_s, self.commands)):
             raise ValueError("speeds_rad_s and commands must be rising, two of each at least")
-        shape = (len(self.speeds_rad_s), len(self.commands))
-        rows = [[len(row) for row in table] for table in self.std_rad_s]
-        if not rows or rows != [[shape[1]] * shape[0]] * len(rows) or np.min(self.std_rad_s) < 0.0:
-            raise ValueError("std_rad_s must have a row for each speed with a value for each command, none below zero")
-        if self.settled_command and [len(row) for row in self.settled_command] != [shape[0]] * len(rows):
-            raise ValueError("settled_command must have a command for each speed of each fan")
-        if self.seen_std_rad_s and (len(self.seen_std_rad_s) != len(rows) or min(self.seen_std_rad_s) < 0.0):
+        shape = len(self.rows), len(self.columns)
+        found = [[len(row) for row in table] for table in self.std_rad_s]
+        if not found or found != [[shape[1]] * shape[0]] * len(found) or np.min(self.std_rad_s) < 0.0:
+            raise ValueError("std_rad_s must have a value for each command and speed, none below zero")
+        if self.settled_speed_rad_s and [len(row) for row in self.settled_speed_rad_s] != [shape[0]] * len(found):
+            raise ValueError("settled_speed_rad_s must have a speed for each command of each fan")
+        if self.seen_std_rad_s and (len(self.seen_std_rad_s) != len(found) or min(self.seen_std_rad_s) < 0.0):
             raise ValueError("seen_std_rad_s must have a value for each table, none below zero")
         return self
 
+    @property
+    def is_early(self) -> bool:
+        """Whether it is of an early card."""
+        return not self.settled_speed_rad_s
+
+    @property
+    def rows(self) -> tuple[float, ...]:
+        """The axis of the rows of each table."""
+        return self.speeds_rad_s if self.is_early else self.commands
+
+    @property
+    def columns(self) -> tuple[float, ...]:
+        """The axis of their columns."""
+        return self.commands if self.is_early else self.speeds_rad_s
+
     def of_fans(self, rows: Sequence[int]) -> ModelUncertainty:
-        """That of some of the fans."""
+        """The tables of the fans in these rows; a single table for all fans is returned as it is."""
         if len(self.std_rad_s) == 1:
             return self
-        names = "std_rad_s", "seen_std_rad_s", "settled_command"
+        names = "std_rad_s", "seen_std_rad_s", "settled_speed_rad_s"
         of_all = {name: getattr(self, name) for name in names}
         return replace(self, **{name: tuple(of[row] for row in rows) for name, of in of_all.items() if of})
 
     def std_at(self, speed_rad_s: Array, command: Array) -> Array:
         """Standard deviation, rad/s, at speeds and commands of one shape, whose last axis is over the fans; NaN where
-        either is.
+        either is NaN.
 
         Linear between the points of the table, constant beyond its edges.
         """
@@ -79,23 +97,25 @@ class ModelUncertainty:
         return self.std_at(speed_rad_s[..., np.newaxis], command[..., np.newaxis])[..., 0]
 
     def unseen_std_at(self, speed_rad_s: Array, command: Array) -> Array:
-        """What of it adds to the errors that training has seen, rad/s: 0 where the twin was trained."""
+        """What of it adds to the errors that training has seen, rad/s: 0 at most samples at which the fan was held."""
         row, column = self._places(speed_rad_s, command)
-        cell = self._first_cell + row.before * (len(self.commands) - 1) + column.before
+        cell = self._first_cell + row.before * (len(self.columns) - 1) + column.before
         if not self.seen_std_rad_s or not self._has_unseen.take(cell).any():
             return np.zeros(speed_rad_s.shape)  # as nearly always
-        return np.sqrt(np.maximum(self._between(row, column) ** 2 - np.square(self._seen), 0.0))
+        return np.sqrt(np.maximum(self._between(row, column) ** 2 - self._seen_squared, 0.0))
 
     def _places(self, speed_rad_s: Array, command: Array) -> tuple[_Place, _Place]:
-        row = _place(speed_rad_s, *self._speed_axis)
-        if self.settled_command:
-            at = self._first_row + row.before
-            before = self._settled.take(at)
-            command = command - before - row.share * (self._settled.take(at + 1) - before)
-        return row, _place(command, *self._command_axis)
+        """On the axes of rows and of columns."""
+        if self.is_early:
+            return _place(speed_rad_s, *self._row_axis), _place(command, *self._column_axis)
+        row = _place(command, *self._row_axis)
+        at = self._first_row + row.before
+        before = self._settled.take(at)
+        settled_rad_s = before + row.share * (self._settled.take(at + 1) - before)
+        return row, _place(speed_rad_s - settled_rad_s, *self._column_axis)
 
     def _between(self, row: _Place, column: _Place) -> Array:
-        width, table = len(self.commands), self._tables
+        width, table = len(self.columns), self._tables
         at = self._first_point + row.before * width + column.before
         lower = table.take(at) + column.share * (table.take(at + 1) - table.take(at))
         upper = table.take(at + width) + column.share * (table.take(at + width + 1) - table.take(at + width))
@@ -106,42 +126,42 @@ class ModelUncertainty:
         return np.array(self.std_rad_s)
 
     @cached_property
-    def _seen(self) -> Array:
-        return np.array(self.seen_std_rad_s)
+    def _seen_squared(self) -> Array:
+        return np.array([each**2 for each in self.seen_std_rad_s])  # np.square differs in the last digit
 
     @cached_property
     def _settled(self) -> Array:
-        return np.array(self.settled_command)
+        return np.array(self.settled_speed_rad_s)
 
     @cached_property
     def _first_row(self) -> NDArray[np.intp]:
-        """(fans or 1,) where the speeds of each table begin."""
-        return np.arange(len(self._tables)) * len(self.speeds_rad_s)
+        """(fans or 1,) where the rows of each table begin."""
+        return np.arange(len(self._tables)) * len(self.rows)
 
     @cached_property
     def _first_point(self) -> NDArray[np.intp]:
         """(fans or 1,) where the table of each fan begins."""
-        return self._first_row * len(self.commands)
+        return self._first_row * len(self.columns)
 
     @cached_property
     def _first_cell(self) -> NDArray[np.intp]:
         """(fans or 1,) where the cells between the points of each table begin."""
-        return np.arange(len(self._tables)) * (len(self.speeds_rad_s) - 1) * (len(self.commands) - 1)
+        return np.arange(len(self._tables)) * (len(self.rows) - 1) * (len(self.columns) - 1)
 
     @cached_property
     def _has_unseen(self) -> NDArray[np.bool_]:
         """(cells,) whether a corner of the cell between four points of a table is above what training has seen."""
-        above = self._tables > self._seen[:, np.newaxis, np.newaxis]
+        above = self._tables > np.array(self.seen_std_rad_s)[:, np.newaxis, np.newaxis]
         of_cells = above[:, 1:, 1:] | above[:, 1:, :-1] | above[:, :-1, 1:] | above[:, :-1, :-1]
         return of_cells.ravel()
 
     @cached_property
-    def _speed_axis(self) -> tuple[Array, Array]:
-        return _axis(self.speeds_rad_s)
+    def _row_axis(self) -> tuple[Array, Array]:
+        return _axis(self.rows)
 
     @cached_property
-    def _command_axis(self) -> tuple[Array, Array]:
-        return _axis(self.commands)
+    def _column_axis(self) -> tuple[Array, Array]:
+        return _axis(self.columns)
 
 
 class _Place(NamedTuple):

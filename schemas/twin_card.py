@@ -219,8 +219,8 @@ class TwinCard:
     of fans that control their own speed; None: the command acts as it is. reading_sigma_rad_s: per fan, root mean
     square of the distance of healthy readings from those that the tachos may show of the free run, of fans that neither
     start nor stand; empty in early cards and where tachos are instantaneous: it is sigma_rad_s there.
-    model_uncertainty: how far the twin itself may be wrong at each speed and command, for each fan; of hybrids, None in
-    early cards.
+    model_uncertainty: how far the twin itself may be wrong at each speed and command, for each fan; of hybrids only,
+    None for other kinds and in early cards.
     """
 
     kind: str

@@ -224,6 +224,7 @@ class AcquisitionCore(Core):
     def _plausible(self, item: Reading | Rejected) -> Reading | None:
         """The reading, without implausible speeds; None, and counted, if it cannot be used."""
         if isinstance(item, Reading) and self._is_ordinary(item):
+            self._counts["no_speed"] += 0  # shown from the first reading on
             self._quality.add_valid()
             return item
         rejected = item if isinstance(item, Rejected) else self._why_refused(item)
@@ -238,7 +239,7 @@ class AcquisitionCore(Core):
         return None
 
     def _is_ordinary(self, reading: Reading) -> bool:
-        """Whether all values are there and plausible, as of nearly all readings; a sum shows any that is no number."""
+        """Whether all values are there and plausible, as in nearly all readings; a sum shows any not finite."""
         command, speed, tray = reading.command, reading.speed, self._tray
         return (
             len(command) == len(speed) == tray.fans

@@ -46,9 +46,9 @@ from schemas.units import NS_PER_S
 from scoring.expected_reading import AveragedCommand
 from scoring.torque_balance import BalanceModel, TorqueBalance
 
-RANGE_MARGIN = 0.05  # of the width of the training range: so far beyond it a twin is used at least
+RANGE_MARGIN = 0.05  # of the width of the training range: so far beyond it a twin is used
 RANGE_MARGIN_OF_TABLE = 0.25
-"""the same of one whose card says how wrong it may be there"""
+"""the same for a twin whose card has the table of its own error"""
 LONGEST_BRIDGE = (
     1 << 16
 )  # grid samples; above half a second at 100 kHz a new start is faster than running through the loss
@@ -342,11 +342,14 @@ def _off_below(twin: TwinFile, standstill: Standstill) -> Array:
 
 
 def _usable_commands(twin: TwinFile) -> tuple[float, float]:
-    """The lowest and the highest command for which the twin is used: as far as its card says how wrong it may be."""
+    """The lowest and the highest command for which the twin is used."""
     low, high = twin.card.command_range
-    has_table = twin.unseen_error is not None and twin.unseen_error.table is not None
-    margin = (RANGE_MARGIN_OF_TABLE if has_table else RANGE_MARGIN) * (high - low)
-    return low - margin, high + margin
+    width, table = high - low, twin.unseen_error.table if twin.unseen_error else None
+    if table is None:
+        return low - RANGE_MARGIN * width, high + RANGE_MARGIN * width
+    if table.is_early:  # as recordings of these cards were judged, to the last digit
+        return min(table.commands[0], low - RANGE_MARGIN * width), max(table.commands[-1], high + RANGE_MARGIN * width)
+    return low - RANGE_MARGIN_OF_TABLE * width, high + RANGE_MARGIN_OF_TABLE * width
 
 
 def _balance_of(twin: TwinFile, off_below: Array) -> TorqueBalance:

@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
+import sys
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -277,6 +279,7 @@ def main() -> None:
     parser.add_argument("--only", type=_numbers, help="the racks to watch, from 1; default: all")
     parser.add_argument("--show", action="store_true", help="only print the tables of what is in FOLDER")
     given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the processes of the racks end with this one
     console = Console(soft_wrap=True, highlight=False)
     given.keep.mkdir(parents=True, exist_ok=True)
     of = racks(given.racks, given.days * DAY_S, given.seed, fans_seed=given.seed)

@@ -106,16 +106,13 @@ def measured(folder: Path) -> dict[str, float]:
     place = learning_folder(folder / "runs", TRAY)
     write_history(place)
     versions = TwinVersions(place, TRAY)
-    # Fans that do not move teach nothing: the first version waits until they have.
-    tray = _started(
-        [*FANTWIN, "simulate", "--fans", str(FANS), "--profile", "staircase", "--link", str(folder / "line")]
-    )
+    tray = _started([*FANTWIN, "simulate", "--fans", str(FANS), "--link", str(folder / "line")])
     up = _started([*FANTWIN, "up", "-c", str(config)])
     try:
         with Bus(BusConfig(endpoint=endpoint), listens=False) as bus:
             latencies = Latencies(SiteWatcher(bus, SITE))
             began_s = time.monotonic()
-            progress("a site that learns its first twin: some minutes")
+            progress("waiting for the first twin of the site: a few minutes")
             while not versions.all():
                 for name, process in (("simulate", tray), ("up", up)):
                     if process.poll() is not None:
@@ -125,7 +122,7 @@ def measured(folder: Path) -> dict[str, float]:
             time.sleep(15.0)  # the twin takes over
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             began_s = time.monotonic()
-            progress("learning beside the site, and as long without")
+            progress("latency beside fantwin learn, and for as long without it")
             learn = _started([*FANTWIN, "learn", "-c", str(config), "--until-stdin-closes"])
             peak_mb = [0.0]
 

@@ -23,9 +23,9 @@ class InputQuality:
         self._silence_s = silence_s
         self._input_t_ns = self._valid_t_ns = started_t_ns
         self._recent: deque[str] = deque()
-        """of the newest WINDOW pieces; kinds of fault; empty: a valid sample"""
+        """kind of fault of each of the newest WINDOW pieces; empty: a valid sample"""
         self._faulty = 0
-        """of these"""
+        """number of faulty pieces in `_recent`"""
         self._examples: dict[str, Rejected] = {}
         """by kind: the first since the source was last in order, so that the report of one problem stays the same"""
         self._mostly_faulty = False

@@ -10,6 +10,14 @@ from schemas.model_uncertainty import ModelUncertainty
 
 STD_RAD_S = ((1.0, 2.0), (3.0, 4.0), (5.0, 10.0))
 TABLE = ModelUncertainty((0.0, 100.0, 200.0), (0.0, 1.0), (STD_RAD_S,))
+"""of an early card"""
+OF_FANS = ModelUncertainty(
+    (0.0, 1.0),
+    (0.0, 100.0, 200.0),
+    (STD_RAD_S, tuple(tuple(2.0 * value for value in row) for row in STD_RAD_S)),
+    seen_std_rad_s=(3.0, 9.0),
+    settled_speed_rad_s=((0.0, 0.2, 0.4), (0.0, 10.0, 20.0)),
+)
 
 
 @pytest.mark.parametrize(
@@ -17,7 +25,7 @@ TABLE = ModelUncertainty((0.0, 100.0, 200.0), (0.0, 1.0), (STD_RAD_S,))
     [
         ((0.0,), (0.0, 1.0), ((1.0, 1.0),), "two of each at least"),
         ((1.0, 0.0), (0.0, 1.0), ((1.0, 1.0), (1.0, 1.0)), "rising"),
-        ((0.0, 1.0), (0.0, 1.0), ((1.0, 1.0),), "a row for each speed"),
+        ((0.0, 1.0), (0.0, 1.0), ((1.0, 1.0),), "a value for each command and speed"),
         ((0.0, 1.0), (0.0, 1.0), ((1.0, -1.0), (1.0, 1.0)), "none below zero"),
     ],
 )
@@ -31,8 +39,8 @@ def test_values_that_do_not_fit_the_tables_are_refused() -> None:
         replace(TABLE, seen_std_rad_s=(-1.0,))
     with pytest.raises(ValidationError, match="seen_std_rad_s must have a value for each table"):
         replace(TABLE, seen_std_rad_s=(1.0, 1.0))
-    with pytest.raises(ValidationError, match="settled_command must have a command for each speed of each fan"):
-        replace(TABLE, settled_command=((0.0, 0.5),))
+    with pytest.raises(ValidationError, match="settled_speed_rad_s must have a speed for each command of each fan"):
+        replace(OF_FANS, settled_speed_rad_s=((0.0, 0.2, 0.4), (0.0, 10.0)))
 
 
 @pytest.mark.parametrize(
@@ -58,23 +66,27 @@ def test_only_what_training_has_not_shown_is_unseen() -> None:
     np.testing.assert_array_equal(TABLE.unseen_std_at(speeds_rad_s, command), 0.0, "early cards do not say")
 
 
-def test_each_fan_has_its_own_around_the_commands_at_which_it_settles() -> None:
-    twice = tuple(tuple(2.0 * value for value in row) for row in STD_RAD_S)
-    table = ModelUncertainty(
-        TABLE.speeds_rad_s,
-        TABLE.commands,
-        (STD_RAD_S, twice),
-        seen_std_rad_s=(3.0, 9.0),
-        settled_command=((0.0, 0.2, 0.4), (0.0, 10.0, 20.0)),
-    )
-    speed_rad_s, command = np.full((3, 2), 150.0), np.array([[0.3, 15.0], [0.8, 15.5], [1.3, 99.0]])
+def test_each_fan_has_its_own_around_the_speeds_at_which_it_settles() -> None:
+    command, speed_rad_s = np.full((3, 2), 150.0), np.array([[0.3, 15.0], [0.8, 15.5], [1.3, 99.0]])
     expected = np.array([[4.0, 8.0], [5.5, 11.0], [7.0, 14.0]])
-    np.testing.assert_allclose(table.std_at(speed_rad_s, command), expected)
+    np.testing.assert_allclose(OF_FANS.std_at(speed_rad_s, command), expected)
     np.testing.assert_allclose(
-        table.unseen_std_at(speed_rad_s, command), np.sqrt(np.maximum(expected**2 - np.square((3.0, 9.0)), 0.0))
+        OF_FANS.unseen_std_at(speed_rad_s, command), np.sqrt(np.maximum(expected**2 - np.square((3.0, 9.0)), 0.0))
     )
-    np.testing.assert_allclose(table.of_fans([1]).std_at(speed_rad_s[:, 1:], command[:, 1:]), expected[:, 1:])
+    np.testing.assert_allclose(OF_FANS.of_fans([1]).std_at(speed_rad_s[:, 1:], command[:, 1:]), expected[:, 1:])
     assert TABLE.of_fans([0, 0, 0]).std_at(np.zeros((1, 3)), np.ones((1, 3))).shape == (1, 3), "one holds for any fan"
+
+
+def test_of_one_fan_all_may_be_seen_and_of_another_not() -> None:
+    table = replace(OF_FANS, seen_std_rad_s=(10.0, 0.0))
+    found = table.unseen_std_at(np.array([[0.3, 15.0]]), np.full((1, 2), 150.0))
+    np.testing.assert_allclose(found, [[0.0, 8.0]])
+    np.testing.assert_allclose(table.over(np.array([0.3, 0.8]), np.array([150.0]))[:, 0], [4.0, 5.5])
+
+
+def test_the_unseen_error_of_an_early_card_is_that_of_its_recordings_to_the_last_digit() -> None:
+    table = ModelUncertainty((0.0, 1.0), (0.0, 1.0), (((0.05, 0.05), (0.05, 0.05)),), (0.0397,))
+    assert table.unseen_std_at(np.zeros((1, 1)), np.zeros((1, 1)))[0, 0] == np.sqrt(0.05**2 - 0.0397**2)
 
 
 def test_the_table_of_an_early_card_is_that_of_all_fans() -> None:

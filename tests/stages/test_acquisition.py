@@ -13,7 +13,7 @@ import pytest
 from pipeline.config.models import TrayConfig
 from pipeline.config.registry import STAGES
 from pipeline.devices.host_clock import HostClock
-from pipeline.devices.sample_source import LinkDown, LinkUp
+from pipeline.devices.sample_source import LinkDown, LinkUp, Reading, ReadingBatch
 from pipeline.devices.serial_config import SerialConfig
 from pipeline.devices.serial_port import ReceivedBytes
 from pipeline.devices.serial_source import SerialSource
@@ -132,11 +132,19 @@ def test_a_device_without_clock_and_sequence_has_empty_columns_and_loses_nothing
     assert core.counters().get("lost_on_line", 0) == 0
 
 
-def test_a_missing_reading_stays_missing_and_is_counted() -> None:
+@pytest.mark.parametrize("fan", [0, 1])
+def test_a_missing_reading_stays_missing_and_is_counted(fan: int) -> None:
     core = make_core()
-    (raw,) = feed(core, [sample(0, speed=math.nan)])
-    assert np.isnan(raw.speed_rad_s).tolist() == [[True, False]]
+    (raw,) = feed(core, [Sample(0, 0, (0.5, 0.25), (math.nan, 50.0) if fan == 0 else (50.0, math.nan))])
+    assert np.isnan(raw.speed_rad_s).tolist() == [[fan == 0, fan == 1]]
     assert core.counters()["no_speed"] == 1
+
+
+@pytest.mark.parametrize("command", [(0.5, math.nan), (math.nan, 0.5), (0.5, math.inf)])
+def test_a_reading_of_any_source_whose_command_is_no_number_is_refused(command: tuple[float, float]) -> None:
+    core = make_core()
+    assert core.step(ReadingBatch(S, (Reading(command, (50.0, 50.0)),))) == []
+    assert core.counters()["absurd_command"] == 1
 
 
 @pytest.mark.parametrize("speed", [1001.0, -1001.0, math.inf, -math.inf])

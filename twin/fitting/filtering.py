@@ -54,5 +54,6 @@ def filtered_regression(
     filtered = filter_between_samples(start, end, step_s, lambda_per_s)
     rows = np.column_stack((speed - lambda_per_s * filtered[:, 0], filtered[:, 1:]))[measured]
     initial = np.exp(-lambda_per_s * (t_s - t_s[0]))[measured]
-    rows -= np.outer(initial, initial @ rows / (initial @ initial))
+    if square := float(initial @ initial):  # 0 where the first reading comes so late that no start is left in it
+        rows -= np.outer(initial, initial @ rows / square)
     return rows[:, 0], rows[:, 1:]

@@ -56,7 +56,7 @@ def test_a_drop_that_is_said_to_be_found_is_found_in_that_time_and_a_smaller_one
 
 
 def test_it_is_of_a_fan_whose_offset_is_known_at_the_mean_speed_of_calibration() -> None:
-    """An offset that follows the speed is not known above that; before a fan has been heard it is not known at all."""
+    """An offset that follows the speed is not known above that speed."""
     follows = {"speed_exponent": 1, "reference_speed_rad_s": SPEED, "rms_sigmas": 2.0}
     baseline = RESIDUAL.baseline.model_copy(update=follows)
     limits = LIMITS.model_copy(update={"speed": RESIDUAL.model_copy(update={"baseline": baseline})})

@@ -117,6 +117,20 @@ def test_missing_and_jittered_samples_do_not_bias(published) -> None:
     np.testing.assert_allclose(found.parameters[:, 0], 0.15, rtol=0.08)
 
 
+def test_a_first_reading_long_after_the_beginning_shows_nothing_of_the_start(published) -> None:
+    """Of the start nothing is left then: its share underflows to zero."""
+    run = published[0].between(0.0, 20.0)
+    before_s = np.arange(40_000) / 100.0
+    later = Run(
+        "later",
+        np.concatenate((before_s, before_s[-1] + 0.01 + run.t_s - run.t_s[0])),
+        np.vstack((np.full((len(before_s), run.fans), 20.0), run.command)),
+        np.vstack((np.full((len(before_s), run.fans), np.nan), run.speed_rad_s)),
+    )
+    found = identify([later], with_lag=False)
+    np.testing.assert_allclose(found.parameters[:, 0], identify([run], with_lag=False).parameters[:, 0], rtol=0.1)
+
+
 def test_a_command_that_never_changes_is_refused() -> None:
     rng = np.random.default_rng(1)
     run = Run("constant", np.arange(500) / 100.0, np.full(500, 50.0), 140.0 + rng.normal(size=500))

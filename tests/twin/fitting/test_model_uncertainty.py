@@ -8,8 +8,9 @@ from tests.support import fan_data
 from tests.twin.fitting.test_drive_fit import DRIVE, run_of
 from twin.build import TrainedTwin, train_twin
 from twin.evaluation.accuracy import compared_readings, free_run_readings
+from twin.fitting.fan_evidence import variance_of_independent
 from twin.fitting.identification import identify
-from twin.fitting.model_uncertainty import model_uncertainty, variance_of_independent
+from twin.fitting.model_uncertainty import model_uncertainty
 from twin.models.physical import PhysicalModel
 from twin.models.recursion import linear_recursion
 from twin.runs import Array, Run
@@ -63,8 +64,8 @@ def test_only_hybrids_have_one() -> None:
         assert train_twin([run], [], kind, name="x", max_iterations=1).card.model_uncertainty is None
 
 
-def test_its_commands_are_around_those_at_which_fans_with_a_drive_settle() -> None:
-    """The friction of the drive is a part of them, and the plateau is raised."""
+def test_its_speeds_are_around_those_at_which_fans_with_a_drive_settle() -> None:
+    """The friction of the drive takes its part, and the plateau is raised."""
     run = run_of(DRIVE, 1)
     twin = train_twin([run], [run_of(DRIVE, 2)], "hybrid", name="x", max_iterations=5)
     assert twin.card.drive is not None
@@ -72,9 +73,9 @@ def test_its_commands_are_around_those_at_which_fans_with_a_drive_settle() -> No
     predicted_rad_s = free_run_readings(twin.model, twin.parameters, run)
     settled = np.flatnonzero(np.diff(run.command[:, 0]) != 0.0)  # the end of each level
     settled = settled[run.command[settled, 0] >= twin.card.drive.turning_command]
-    (commands,) = known(twin).settled_command
-    at_speed = np.interp(predicted_rad_s[settled, 0], known(twin).speeds_rad_s, commands)
-    off = np.abs(at_speed - raised[settled, 0]) / np.ptp(raised)
+    (speeds_rad_s,) = known(twin).settled_speed_rad_s
+    at_command = np.interp(raised[settled, 0], known(twin).commands, speeds_rad_s)
+    off = np.abs(at_command - predicted_rad_s[settled, 0]) / np.ptp(predicted_rad_s)
     assert np.median(off) < 0.01
 
 
@@ -91,7 +92,7 @@ def test_what_one_fan_has_shown_is_not_all_known_of_another() -> None:
     whole, upper_half = fan_data.rough_run(5, 60.0), fan_data.rough_run(6, 60.0, low=50.0)
     table = known(train_twin([two_fans(whole, upper_half)], [], "hybrid", name="x", max_iterations=20))
     command = np.full((1, 2), 25.0)
-    speed_rad_s = np.array([[np.interp(25.0, of_fan, table.speeds_rad_s) for of_fan in table.settled_command]])
+    speed_rad_s = np.array([[np.interp(25.0, table.commands, of_fan) for of_fan in table.settled_speed_rad_s]])
     shown, not_shown = table.std_at(speed_rad_s, command)[0]
     alone = train_twin([upper_half], [], "hybrid", name="x", max_iterations=20)
     alone = known(alone).std_at(speed_rad_s[:, 1:], command[:, 1:])
@@ -121,6 +122,51 @@ def ratio_passed_to_held(late_s: float) -> float:
     found = model_uncertainty(PhysicalModel(), parameters, [run], [run], identify([run]))
     held, passed = found.std_at(np.array([[30.0], [60.0]]), np.array([[0.3], [0.6]]))[:, 0]
     return float(passed / held)
+
+
+LEVELS = (0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
+
+
+def held_run(standing: int = 0, saturates_at: float = np.inf, unit: float = 1.0) -> Run:
+    """A linear fan held at each of the levels in turn for 8 s, and as often as given at rest, with noise."""
+    levels = [level for level in (*LEVELS, *LEVELS[::-1]) for level in (level, *(0.0,) * standing)]
+    command = np.repeat(levels * 3, 80)[:, np.newaxis]
+    acts = np.minimum(command, saturates_at)
+    kept = np.full((len(command) - 1, 1), 0.8)
+    speed_rad_s = linear_recursion(kept, np.vstack((300.0 * acts[:1], 60.0 * acts[:-1])))
+    noise = np.where(speed_rad_s > 1.0, np.random.default_rng(1).normal(size=speed_rad_s.shape), 0.0)
+    return Run("held", np.arange(len(command)) / 10.0, unit * command, speed_rad_s + noise)
+
+
+def at_levels(table: ModelUncertainty, unit: float = 1.0) -> tuple[Array, Array]:
+    """The standard deviations where a fan settles under the levels, and what of them is unseen, rad/s."""
+    command = unit * np.array(LEVELS)
+    speed_rad_s = np.interp(command, table.commands, table.settled_speed_rad_s[0])
+    pairs = speed_rad_s[:, np.newaxis], command[:, np.newaxis]
+    return table.std_at(*pairs)[:, 0], table.unseen_std_at(*pairs)[:, 0]
+
+
+@pytest.mark.parametrize("standing", [0, 2, 9])
+def test_what_is_held_is_known_however_long_a_fan_stands(standing: int) -> None:
+    twin = train_twin([held_run(standing)], [], "hybrid", name="x", max_iterations=5)
+    std_rad_s, unseen_rad_s = at_levels(known(twin))
+    assert std_rad_s.max() < 0.3 * twin.card.sigma_rad_s[0]
+    assert unseen_rad_s.max() < 0.3 * twin.card.sigma_rad_s[0]
+    assert known(twin).seen_std_rad_s[0] > 0.0
+
+
+def test_what_is_held_where_a_fan_turns_no_faster_is_known() -> None:
+    twin = train_twin([held_run(saturates_at=0.7)], [], "hybrid", name="x")
+    _, unseen_rad_s = at_levels(known(twin))
+    assert unseen_rad_s.max() < 0.3 * twin.card.sigma_rad_s[0]
+
+
+def test_commands_may_be_in_any_unit() -> None:
+    of_one, of_millionths = (
+        at_levels(known(train_twin([held_run(unit=unit)], [], "hybrid", name="x", max_iterations=5)), unit)[0]
+        for unit in (1.0, 1e-6)
+    )
+    np.testing.assert_allclose(of_one, of_millionths, rtol=0.05)
 
 
 def test_a_recording_without_noise_has_one() -> None:
