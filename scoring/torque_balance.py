@@ -89,10 +89,13 @@ class TorqueBalance:
         return filtered[:, : excess.shape[1]], filtered[:, excess.shape[1] :]
 
     def _some(self, excess: Array, linked: Array, keep: float) -> tuple[Array, Array]:
-        if len(excess) == 1:
-            filtered = np.where(linked, (1.0 - keep) * excess + keep * self._filtered, 0.0)
-            return filtered, np.where(linked, (1.0 - keep) + keep * self._weight, 0.0)
         filtered, weight = np.zeros_like(excess), np.zeros_like(excess)
+        if len(excess) <= FEW_ROWS:
+            before, weight_before = self._filtered, self._weight
+            for row, is_linked in enumerate(linked):
+                before = filtered[row] = np.where(is_linked, (1.0 - keep) * excess[row] + keep * before, 0.0)
+                weight_before = weight[row] = np.where(is_linked, (1.0 - keep) + keep * weight_before, 0.0)
+            return filtered, weight
         for fan in np.flatnonzero(linked.any(axis=0)).tolist():
             state = np.array([[self._filtered[fan], self._weight[fan]]])
             for rows in stretches(linked[:, fan]):
@@ -108,8 +111,8 @@ class TorqueBalance:
         lag_s = self._model.lag_s
         if not lag_s.any():
             return given
-        if len(given) == 1:
-            return self._acting_once(period_s, given[0])[np.newaxis]
+        if len(given) <= FEW_ROWS:
+            return np.array([self._acting_once(period_s, row) for row in given])
         acting = given.copy()
         keeps, shares = self._lagging(period_s)
         for fan in np.flatnonzero(lag_s).tolist():
@@ -142,6 +145,8 @@ class TorqueBalance:
         return self._lag_shares
 
 
+FEW_ROWS = 8
+"""filtered row by row, all fans at once: a call of a library costs as much as these"""
 SETTLED = 0.6
 """weight of the samples in the filter from which on the balance is valid: one time constant"""
 

@@ -8,10 +8,9 @@ import numpy as np
 
 from schemas.messages import Array
 from scoring.detectors.state import ColumnState
-from scoring.torque_balance import filter_rows
+from scoring.torque_balance import FEW_ROWS, filter_rows
 
 MEMORY_TIME_CONSTANTS = 5.0  # after these, less than one percent of an output is left
-FEW_ROWS = 8  # filtered row by row: a call of a library costs as much as these
 
 
 class LowPass(ColumnState):
