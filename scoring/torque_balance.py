@@ -90,7 +90,7 @@ class TorqueBalance:
 
     def _some(self, excess: Array, linked: Array, keep: float) -> tuple[Array, Array]:
         filtered, weight = np.zeros_like(excess), np.zeros_like(excess)
-        if len(excess) <= FEW_ROWS:
+        if by_rows(*excess.shape):
             before, weight_before = self._filtered, self._weight
             for row, is_linked in enumerate(linked):
                 before = filtered[row] = np.where(is_linked, (1.0 - keep) * excess[row] + keep * before, 0.0)
@@ -111,7 +111,7 @@ class TorqueBalance:
         lag_s = self._model.lag_s
         if not lag_s.any():
             return given
-        if len(given) <= FEW_ROWS:
+        if by_rows(*given.shape):
             return np.array([self._acting_once(period_s, row) for row in given])
         acting = given.copy()
         keeps, shares = self._lagging(period_s)
@@ -145,10 +145,15 @@ class TorqueBalance:
         return self._lag_shares
 
 
-FEW_ROWS = 8
-"""filtered row by row, all fans at once: a call of a library costs as much as these"""
+FEW_ROWS, ROWS_OF_FAN = 8, 2
+"""filtered row by row: a call of a library for all fans, or for one of them, costs as much as these"""
 SETTLED = 0.6
 """weight of the samples in the filter from which on the balance is valid: one time constant"""
+
+
+def by_rows(rows: int, fans: int) -> bool:
+    """Whether to filter row by row, all fans at once, where each fan needs a call of its own otherwise."""
+    return rows <= max(FEW_ROWS, ROWS_OF_FAN * fans)
 
 
 def filter_rows(keep: float, rows: Array, state: Array) -> tuple[Array, Array]:

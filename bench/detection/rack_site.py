@@ -20,6 +20,7 @@ from pydantic import TypeAdapter
 from bench.detection.plant import START_NS
 from bench.detection.rack_scoring import Episode, episodes
 from bench.detection.racks import DAY_S, RACK_FANS, TACHOS
+from bench.stage_context import stage_context
 from pipeline.cli.twins.next_version import make_next_version
 from pipeline.config.loading import parse_config
 from pipeline.config.models import Config
@@ -28,7 +29,7 @@ from pipeline.learning.healthy_history import HealthyHistory
 from pipeline.learning.ordinary_operation import OrdinaryOperation
 from pipeline.learning.versions import TwinVersions, Version, learning_folder
 from pipeline.recordings.metadata import recording_metadata
-from pipeline.runtime.stage import Context, Core, load_stage
+from pipeline.runtime.stage import Core, load_stage
 from schemas.blocks import select
 from schemas.messages import Action, Alarm, Header, Raw, Request, Score
 from schemas.units import NS_PER_S
@@ -134,7 +135,9 @@ class RackSite:
         if (kept := folder / f"{name}.kept").exists():
             shutil.copytree(kept, place)
         config = _config(place, name)
-        contexts = {stage: _context(config, stage) for stage in ("resampler", "twin_integrator", "scorer", "learner")}
+        contexts = {
+            stage: stage_context(config, stage) for stage in ("resampler", "twin_integrator", "scorer", "learner")
+        }
         of, tray = contexts["learner"], config.trays[0]
         learned = learning_folder(config.run_folder, name)
         metadata, attachments = recording_metadata(of)
@@ -237,15 +240,3 @@ def _config(folder: Path, tray: str) -> Config:
         f'[[tray]]\nname = "{tray}"\nfans = {RACK_FANS}\nspeed_unit = "rpm"\ntacho = [{windows}]\n'
     )
     return parse_config(text, folder / "fantwin.toml", (), ("resampler", "twin_integrator", "scorer", "learner"))
-
-
-def _context(config: Config, stage: str) -> Context:
-    return Context(
-        site=config.site,
-        trays=config.trays,
-        config=config.sections[stage],
-        folder=config.folder,
-        run_folder=config.run_folder,
-        started_t_ns=START_NS,
-        configuration_text=config.text,
-    )

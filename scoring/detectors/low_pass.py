@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.messages import Array
 from scoring.detectors.state import ColumnState
-from scoring.torque_balance import FEW_ROWS, filter_rows
+from scoring.torque_balance import FEW_ROWS, by_rows, filter_rows
 
 MEMORY_TIME_CONSTANTS = 5.0  # after these, less than one percent of an output is left
 
@@ -37,9 +37,10 @@ class LowPass(ColumnState):
     def update(self, x: Array, valid: Array, period_s: float) -> Array:
         """Take a block, (n, columns) each, and return the output after each sample."""
         keep = self.keep(period_s)
-        if len(x) <= FEW_ROWS:
+        is_whole = bool(valid.all())
+        if len(x) <= FEW_ROWS or (not is_whole and by_rows(*x.shape)):
             return self._row_by_row(x, valid, keep)
-        if valid.all():
+        if is_whole:
             y, _ = filter_rows(keep, x, keep * self.value[np.newaxis])
         else:
             y = self._partly_valid(x, valid, keep)
