@@ -53,6 +53,7 @@ class FanScorer:
         limits_motion: bool = True,
         begins_still: bool = True,
         keeps_shared: bool = True,
+        shares_at_first: bool = True,
     ) -> None:
         """for_calibration: keep what calibration needs, for `observed`; statistics then grow beyond their limits.
 
@@ -64,9 +65,12 @@ class FanScorer:
         begins_still: False only to decide as for recordings made when a single reading could be the first baseline.
         keeps_shared: False only to decide as for recordings made when fans that were commissioned again, all of them,
         shared nothing at first.
+        shares_at_first: False only to decide as for recordings made when nothing was shared before fans had baselines.
         """
         self.limits = limits
-        self.residuals: dict[Signal, Residual] = {source: Residual(fans, source, limits) for source in RESIDUALS}
+        self.residuals: dict[Signal, Residual] = {
+            source: Residual(fans, source, limits, shares_at_first=shares_at_first) for source in RESIDUALS
+        }
         contexts = {
             source: residual.context(fans, capped=not for_calibration) for source, residual in self.residuals.items()
         }

@@ -32,7 +32,8 @@ LARGEST_SIGMAS = 1e6  # so that sums and squares stay finite
 class Residual:
     """The speed residual or the torque balance, with the baseline of every fan."""
 
-    def __init__(self, fans: int, source: Signal, limits: Limits) -> None:
+    def __init__(self, fans: int, source: Signal, limits: Limits, *, shares_at_first: bool) -> None:
+        """shares_at_first: what fans share is found before they have baselines; see SharedOffset."""
         healthy = limits.residual(source)
         offsets = healthy.fan_offsets
         self._fan_offsets = np.array(offsets.offset_sigmas).T if offsets else np.zeros((1, fans))
@@ -56,6 +57,7 @@ class Residual:
                 adaptation_s=limits.timing.adaptation_s,
                 reach_sigmas=healthy.baseline.adaptation_limit_sigmas,
             )
+        self._shares_at_first = shares_at_first
         self._low_pass = LowPass(fans, self._smoothing_s)
 
     def context(self, fans: int, *, capped: bool) -> DetectorContext:
@@ -99,13 +101,14 @@ class Residual:
 
     def over(self, of: ResidualSamples, intervals: Intervals, moving: Array | None) -> SampledResidual:
         """Samples of the present interval and later ones. moving: (intervals, fans) see Movement; None: no fan."""
-        baseline, scaling = self.baseline, of.scaling
-        is_set, is_commissioning = baseline.is_set, baseline.is_commissioning
-        learned = of.valid & (of.seen | is_commissioning)
+        baseline, scaling, commissioned = self.baseline, of.scaling, self._commissioned
+        learned = of.valid & (of.seen | baseline.is_commissioning)
         if self._shared is None:
             return SampledResidual(of, intervals, None, np.zeros(of.valid.shape), of.residual, learned)
-        commissioned = is_set & ~is_commissioning
-        offset, known = of.residual - baseline.commissioned * scaling, of.valid & commissioned & of.seen
+        if self._shares_at_first and not commissioned.any():
+            offset, known = of.residual, of.valid & of.seen
+        else:
+            offset, known = of.residual - baseline.commissioned * scaling, of.valid & commissioned & of.seen
         over = self._shared.over(offset, of.speed_sigmas, known, intervals, commissioned, moving)
         shared = intervals.spread(over.values[:, np.newaxis]) * of.speed_sigmas
         return SampledResidual(of, intervals, over, shared, of.residual - shared, learned)
@@ -193,11 +196,21 @@ class Residual:
         few_readings: Array | None = None,
     ) -> None:
         """End the interval; see Baseline.end_interval."""
+        at_first = self._shares_at_first and not self._commissioned.any()
         if self._shared:
-            commissioned = self.baseline.is_set & ~self.baseline.is_commissioning
-            alone = self._shared.end_interval(samples, commissioned, below_half_limit, moving)
+            is_known = self._shared.is_known
+            alone = self._shared.end_interval(samples, self._commissioned, below_half_limit, moving, at_first=at_first)
             below_half_limit = below_half_limit & ~alone
+            if at_first and self._shared.is_known and not is_known:
+                within_limit = np.zeros_like(within_limit)  # this interval does not know yet what is shared
         self.baseline.end_interval(samples, within_limit, below_half_limit, moving, few_readings)
+        if self._shared and at_first and self._commissioned.any():
+            self._shared.begin_from_here()
+
+    @property
+    def _commissioned(self) -> Array:
+        """(fans,) which fans have a baseline to be measured against."""
+        return self.baseline.is_set & ~self.baseline.is_commissioning
 
     def restart(self, fans: Array, *, keeps_shared: bool) -> None:
         """Commission some fans again, (fans,) of bool. keeps_shared: see SharedOffset.restart."""

@@ -71,6 +71,9 @@ class DecisionRules(IntEnum):
     SHARED_STAYS = 18
     """What the fans of a tray share stays when all of them are commissioned again. Before, it began at zero, and their
     baselines took it as an offset that does not depend on the speed."""
+    SHARED_AT_FIRST = 19
+    """What the fans share is found while they are commissioned, from their residuals, and their baselines are found
+    without it. Before, nothing was shared until fans had baselines, which took it as their own."""
 
 
 CURRENT_RULES = max(DecisionRules)

@@ -61,6 +61,7 @@ class TrayScorer:
             limits_motion=decision_rules >= DecisionRules.HEALTHY_MOTION,
             begins_still=decision_rules >= DecisionRules.FIRST_BASELINE,
             keeps_shared=decision_rules >= DecisionRules.SHARED_STAYS,
+            shares_at_first=decision_rules >= DecisionRules.SHARED_AT_FIRST,
         )
         advice = Advice(twin.command_unit) if self._holds else None
         if judges_rest:

@@ -5,6 +5,10 @@ moves no further than to the nearer of the two offsets in the middle: of three f
 if it lies outside of the (inner) two. So one fan that is off by itself does not take it along. It is limited
 (HealthyResidual.shared_limit): more than weather is left in the residual of every fan.
 
+Until the first fan has its baseline, offsets are residuals as they are, and the shared one follows their mean at once:
+baselines are then found without it. A baseline that took a share of the speed as its own would be wrong at all other
+speeds.
+
 While only one of the fans turns it cannot be compared. Then the shared offset takes the place of the fan's own
 baseline, as slow and with as short a reach: otherwise both would have followed the same weather when the others turn
 again.
@@ -71,7 +75,9 @@ class SharedOffset(ColumnState):
         self._compared = np.zeros(1)
         """the value when fans were last compared"""
         self._commissioned = np.zeros(1)
-        """the value when all fans were last commissioned again; the limit is from there"""
+        """the value when fans had their baselines, or all were commissioned again; the limit is from there"""
+        self._first = np.zeros(1, np.int64)
+        """intervals in which fans were compared before any of them had a baseline"""
         self._products = np.zeros(fans, np.int64)
         self._squares = np.zeros(fans, np.int64)
         self._counts = np.zeros(fans, np.int64)
@@ -82,6 +88,11 @@ class SharedOffset(ColumnState):
         rad/s, in the unit of the residual: what only one fan that turned alone has added since is not shared.
         """
         return float(self._compared[0] - self._commissioned[0])
+
+    @property
+    def is_known(self) -> bool:
+        """Whether fans were compared before any of them had a baseline."""
+        return bool(self._first[0])
 
     @property
     def independent_intervals(self) -> float:
@@ -152,8 +163,10 @@ class SharedOffset(ColumnState):
         self._value[:], self._compared[:] = of.values[-1], of.compared[-1]
         self._products[:], self._squares[:], self._counts[:] = of.products[-1], of.squares[-1], of.counts[-1]
 
-    def end_interval(self, samples: int, commissioned: Array, learns: Array, moving: Array | None) -> Array:
-        """End the present interval of so many samples.
+    def end_interval(
+        self, samples: int, commissioned: Array, learns: Array, moving: Array | None, *, at_first: bool
+    ) -> Array:
+        """End the present interval of so many samples. at_first: no fan has a baseline yet, and offsets are residuals.
 
         commissioned: (fans,) which fans have a baseline to be measured against. learns: (fans,) whether a fan's
         baseline may learn from the interval. moving: (fans,) whether the fan moved; None: no fan.
@@ -166,6 +179,9 @@ class SharedOffset(ColumnState):
         is_compared = known.sum() >= LEAST_FANS
         alone = known & (not is_compared) & (commissioned.sum() >= LEAST_FANS)
         used, gain = (known, self._gain) if is_compared else (alone & learns, self._gain_alone)
+        if at_first and is_compared:
+            self._first += 1
+            gain = max(gain, 1.0 / float(self._first[0]))
         if used.any():
             ridge = self._ridge * FIXED_POINT_ONE * self._counts[used]
             products = self._towards_commissioned(self._products[used], ridge)
@@ -182,6 +198,10 @@ class SharedOffset(ColumnState):
         self._products[:] = self._squares[:] = self._counts[:] = 0
         return alone
 
+    def begin_from_here(self) -> None:
+        """The first fan has its baseline, found without what is shared now."""
+        self._commissioned[:], self._first[:] = self._value, 0
+
     def restart(self, fans: Array, *, keeps_value: bool) -> None:
         """Some fans, (fans,) of bool, are commissioned again.
 
@@ -194,10 +214,11 @@ class SharedOffset(ColumnState):
         if not keeps_value:
             self._value[:] = self._compared[:] = 0.0
         self._commissioned[:] = self._compared[:] = self._value
+        self._first[:] = 0
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """See ColumnState. Earlier snapshots do not say what was shared when fans were commissioned."""
-        super().restore({"commissioned": [0.0], **state})
+        """See ColumnState. Earlier snapshots do not say what was shared when fans were commissioned, or at first."""
+        super().restore({"commissioned": [0.0], "first": [0], **state})
 
     def _towards_commissioned(self, products: Array, ridge: Array) -> Array:
         """The products, such that the ridge draws towards the value at the last commissioning of all fans, or zero."""
@@ -215,6 +236,7 @@ class SharedOffset(ColumnState):
             "value": self._value,
             "compared": self._compared,
             "commissioned": self._commissioned,
+            "first": self._first,
             "products": self._products,
             "squares": self._squares,
             "counts": self._counts,

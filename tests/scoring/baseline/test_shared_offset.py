@@ -43,7 +43,11 @@ def settled(offsets: list[float], *, valid: list[bool] | None = None, moving: li
     for _ in range(60):
         _take(shared, np.array(offsets), np.array(valid or [True] * len(offsets)))
         shared.end_interval(
-            SAMPLES, ALL[: len(offsets)], ALL[: len(offsets)], None if moving is None else np.array(moving)
+            SAMPLES,
+            ALL[: len(offsets)],
+            ALL[: len(offsets)],
+            None if moving is None else np.array(moving),
+            at_first=False,
         )
     return float(at(shared, np.full((1, 1), 50.0))[0, 0])
 
@@ -84,11 +88,11 @@ def test_a_fan_that_becomes_faulty_leaves_the_other_as_it_was() -> None:
     shared = shared_offset(2)
     for _ in range(60):
         _take(shared, np.array([1.0, 1.2]), ALL[:2])
-        shared.end_interval(SAMPLES, ALL[:2], ALL[:2], None)
+        shared.end_interval(SAMPLES, ALL[:2], ALL[:2], None, at_first=False)
     before = at(shared, np.full((1, 1), 50.0))[0, 0]
     for _ in range(60):
         _take(shared, np.array([1.0, -9.0]), ALL[:2])
-        shared.end_interval(SAMPLES, ALL[:2], ALL[:2], None)
+        shared.end_interval(SAMPLES, ALL[:2], ALL[:2], None, at_first=False)
     assert before == pytest.approx(1.0, abs=0.01)
     assert at(shared, np.full((1, 1), 50.0))[0, 0] == pytest.approx(before, abs=0.01)
 
@@ -98,7 +102,7 @@ def test_errors_at_low_speed_are_not_taken_for_a_share_of_a_high_one() -> None:
     shared = of_residual_std(4, 1.0)
     for _ in range(60):
         add(shared, np.full((SAMPLES, 4), -0.5), np.full((SAMPLES, 4), low), np.ones((SAMPLES, 4), np.bool_))
-        shared.end_interval(SAMPLES, ALL[:4], ALL[:4], None)
+        shared.end_interval(SAMPLES, ALL[:4], ALL[:4], None, at_first=False)
     assert abs(at(shared, np.full((1, 1), high))[0, 0]) < 0.5  # and not -5
 
 
@@ -106,15 +110,15 @@ def test_a_fan_alone_is_followed_slowly_in_place_of_its_baseline_and_only_while_
     shared, one, first = shared_offset(3), np.full((1, 1), 50.0), np.array([True, False, False])
     for _ in range(round(ADAPTATION_S)):
         _take(shared, np.full(3, 1.0), first)
-        assert shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None).tolist() == [True, False, False]
+        assert shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None, at_first=False).tolist() == [True, False, False]
     followed = at(shared, one)[0, 0]
     assert followed == pytest.approx(1.0 - np.exp(-1.0), abs=0.01)
     for _ in range(100):
         _take(shared, np.full(3, 1.0), first)
-        shared.end_interval(SAMPLES, ALL[:3], ~ALL[:3], None)
+        shared.end_interval(SAMPLES, ALL[:3], ~ALL[:3], None, at_first=False)
     assert at(shared, one)[0, 0] == followed
     _take(shared, np.full(3, 1.0), ALL[:3])
-    assert not shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None).any()
+    assert not shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None, at_first=False).any()
     assert at(shared, one)[0, 0] > followed + 0.03  # with others at once
     shared.restart(first, keeps_value=False)
     assert at(shared, one)[0, 0] > followed
@@ -126,14 +130,14 @@ def test_a_fan_alone_is_followed_no_further_than_its_baseline_would_be() -> None
     shared = shared_offset(3)
     for _ in range(round(10 * ADAPTATION_S)):
         _take(shared, np.full(3, -9.0), np.array([True, False, False]))
-        shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None)
+        shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None, at_first=False)
     assert at(shared, np.full((1, 1), 50.0))[0, 0] == pytest.approx(-REACH_SIGMAS)
 
 
 def test_the_only_fan_of_a_tray_with_several_channels_keeps_its_own_baseline() -> None:
     shared, only = shared_offset(3), np.array([True, False, False])
     _take(shared, np.full(3, -1.0), only)
-    assert not shared.end_interval(SAMPLES, only, ALL[:3], None).any()
+    assert not shared.end_interval(SAMPLES, only, ALL[:3], None, at_first=False).any()
     assert at(shared, np.full((1, 1), 50.0))[0, 0] == 0.0
 
 
@@ -143,7 +147,7 @@ def test_it_stays_when_all_fans_are_commissioned_again_and_its_limit_is_from_the
     def settle() -> float:
         for _ in range(120):
             _take(shared, np.full(3, too_much), ALL[:3])
-            shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None)
+            shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None, at_first=False)
         return float(shared.columns()["value"][0])
 
     assert settle() == LIMIT == pytest.approx(shared.since_commissioning)
@@ -164,18 +168,18 @@ def test_turning_backwards_is_slowed_by_the_same_air() -> None:
             np.tile([50.0, -50.0], (SAMPLES, 1)),
             np.ones((SAMPLES, 2), bool),
         )
-        shared.end_interval(SAMPLES, ALL[:2], ALL[:2], None)
+        shared.end_interval(SAMPLES, ALL[:2], ALL[:2], None, at_first=False)
     np.testing.assert_allclose(at(shared, np.array([[50.0, -50.0]])), [[-1.0, 1.0]], atol=0.01)
 
 
 def test_it_continues_from_a_snapshot() -> None:
     before, after = shared_offset(3), shared_offset(3)
     _take(before, np.full(3, 1.0), np.ones(3, np.bool_))
-    before.end_interval(SAMPLES, ALL[:3], ALL[:3], None)
+    before.end_interval(SAMPLES, ALL[:3], ALL[:3], None, at_first=False)
     _take(before, np.full(3, 1.0), np.ones(3, np.bool_))
     after.restore(before.snapshot())
     for shared in (before, after):
-        shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None)
+        shared.end_interval(SAMPLES, ALL[:3], ALL[:3], None, at_first=False)
     np.testing.assert_array_equal(at(before, np.ones((1, 1))), at(after, np.ones((1, 1))))
     assert at(before, np.ones((1, 1)))[0, 0] > 0.0
     earlier = before.snapshot()
