@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -79,6 +80,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     as_json = parser.parse_args().json
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the site that it started ends with it
     with tempfile.TemporaryDirectory(prefix="fantwin-learning-") as name:
         found = measured(Path(name))
     if as_json:
