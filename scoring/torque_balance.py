@@ -52,6 +52,7 @@ class TorqueBalance:
         self._lagged = np.full(fans, np.nan)
         self._lag_step_s = np.nan
         self._lag_shares = (np.zeros(fans), np.zeros(fans))
+        _lfilter()  # now, not when the first long block comes: it takes a second and 40 MB
         self._filtered = np.zeros(fans)
         self._weight = np.zeros(fans)
 
@@ -161,11 +162,15 @@ def filter_rows(keep: float, rows: Array, state: Array) -> tuple[Array, Array]:
 
     rows: (n, m). state: (1, m), keep times the y before the first. Returns y (n, m) and the state after.
     """
+    made: Any = _lfilter()([1.0 - keep], [1.0, -keep], rows, axis=0, zi=state)
+    return made[0], made[1]
+
+
+def _lfilter() -> Any:
     # a process that only shows alarms never filters, and this import takes longer than all its others
     from scipy.signal import lfilter  # noqa: PLC0415
 
-    made: Any = lfilter([1.0 - keep], [1.0, -keep], rows, axis=0, zi=state)
-    return made[0], made[1]
+    return lfilter
 
 
 def stretches(flags: Array) -> Sequence[slice]:
