@@ -52,7 +52,7 @@ class TorqueBalance:
         self._lagged = np.full(fans, np.nan)
         self._lag_step_s = np.nan
         self._lag_shares = (np.zeros(fans), np.zeros(fans))
-        _lfilter()  # now, not when the first long block comes: it takes a second and 40 MB
+        _lfilter()  # now, not under load with the first long block: it is large
         self._filtered = np.zeros(fans)
         self._weight = np.zeros(fans)
 

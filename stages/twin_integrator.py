@@ -46,9 +46,6 @@ from schemas.units import NS_PER_S
 from scoring.expected_reading import AveragedCommand
 from scoring.torque_balance import BalanceModel, TorqueBalance
 
-RANGE_MARGIN = 0.05  # of the width of the training range: so far beyond it a twin is used
-RANGE_MARGIN_OF_TABLE = 0.25
-"""the same for a twin whose card has the table of its own error"""
 LONGEST_BRIDGE = (
     1 << 16
 )  # grid samples; above half a second at 100 kHz a new start is faster than running through the loss
@@ -86,7 +83,7 @@ class TwinIntegratorCore(Core):
         self._hold_limit_ns = round(config.hold_limit_s * NS_PER_S)
         low, high = twin.card.command_range
         self._largest_move = LARGEST_MOVE_S * (high - low)
-        self._lowest_command, self._highest_command = _usable_commands(twin)
+        self._lowest_command, self._highest_command = twin.usable_commands
         self._standstill = twin.card.standstill
         self._off_below = twin.off_below if self._standstill is None else _off_below(twin, self._standstill)
         self._run = FreeRun(twin, config.start_samples)
@@ -339,17 +336,6 @@ class TwinIntegratorCore(Core):
 def _off_below(twin: TwinFile, standstill: Standstill) -> Array:
     """(fans,) as TrayTwin.off_below, where the friction of a fan is not above a command that turns it."""
     return np.minimum(twin.off_below, standstill.turning_command)
-
-
-def _usable_commands(twin: TwinFile) -> tuple[float, float]:
-    """The lowest and the highest command for which the twin is used."""
-    low, high = twin.card.command_range
-    width, table = high - low, twin.unseen_error.table if twin.unseen_error else None
-    if table is None:
-        return low - RANGE_MARGIN * width, high + RANGE_MARGIN * width
-    if table.is_early:  # as recordings of these cards were judged, to the last digit
-        return min(table.commands[0], low - RANGE_MARGIN * width), max(table.commands[-1], high + RANGE_MARGIN * width)
-    return low - RANGE_MARGIN_OF_TABLE * width, high + RANGE_MARGIN_OF_TABLE * width
 
 
 def _balance_of(twin: TwinFile, off_below: Array) -> TorqueBalance:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 LARGEST_TWIN_BYTES = 64 << 20
 """of a twin's file; the demo's has 28 kB"""
+RANGE_MARGIN, RANGE_MARGIN_OF_TABLE = 0.05, 0.25
+"""of the width of the training range: so far beyond it a twin is used; one whose card has a table of its own error"""
 DEAD_ZONE = 0.25
 """of the command range; a larger friction is not taken for a dead zone"""
 
@@ -85,6 +87,18 @@ class TrayTwin:
         low, high = self.card.command_range
         friction = self.balance.friction
         return np.where((friction > 0.0) & (friction < low + DEAD_ZONE * (high - low)), friction, -np.inf)
+
+    @property
+    def usable_commands(self) -> tuple[float, float]:
+        """The lowest and the highest command for which the twin is used."""
+        low, high = self.card.command_range
+        width, table = high - low, self.unseen_error.table if self.unseen_error else None
+        if table is None:
+            return low - RANGE_MARGIN * width, high + RANGE_MARGIN * width
+        if table.is_early:  # as recordings of these cards were judged, to the last digit
+            near = low - RANGE_MARGIN * width, high + RANGE_MARGIN * width
+            return min(table.commands[0], near[0]), max(table.commands[-1], near[1])
+        return low - RANGE_MARGIN_OF_TABLE * width, high + RANGE_MARGIN_OF_TABLE * width
 
     @property
     def bend_rad_s(self) -> float | None:
