@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.messages import Array
+from scoring.baseline.intervals import Intervals
 from scoring.baseline.shared_offset import SharedOffset
 from tests.support.one_interval import one_interval
 
@@ -13,10 +14,11 @@ LIMIT, ADAPTATION_S, REACH_SIGMAS = 0.03, 300.0, 1.2
 
 
 def shared_offset(fans: int) -> SharedOffset:
-    return of_residual_std(fans, 1e-3)  # hardly drawn towards zero
+    """Hardly drawn towards zero; the fans were commissioned at a high speed, and shared nothing."""
+    return commissioned(of_residual_std(fans, 1e-3), 50.0)
 
 
-def of_residual_std(fans: int, residual_std: float) -> SharedOffset:
+def of_residual_std(fans: int, residual_std: float, *, compares_fast: bool = True) -> SharedOffset:
     return SharedOffset(
         fans,
         limit=LIMIT,
@@ -24,7 +26,24 @@ def of_residual_std(fans: int, residual_std: float) -> SharedOffset:
         interval_s=1.0,
         adaptation_s=ADAPTATION_S,
         reach_sigmas=REACH_SIGMAS,
+        compares_fast=compares_fast,
     )
+
+
+def commissioned(shared: SharedOffset, speed_sigmas: float, share: float = 0.0) -> SharedOffset:
+    """After the fans got their baselines at this speed."""
+    fans = len(shared.columns()["counts"])
+    for _ in range(10):
+        turn(shared, np.full(fans, speed_sigmas), share, at_first=True)
+    shared.begin_from_here()
+    return shared
+
+
+def turn(shared: SharedOffset, speed_sigmas: Array, share: float, *, at_first: bool = False) -> None:
+    """An interval in which all fans, (fans,), turn, and share this."""
+    speed, fans = np.tile(speed_sigmas, (SAMPLES, 1)), ALL[: len(speed_sigmas)]
+    add(shared, share * speed, speed, np.ones(speed.shape, np.bool_))
+    shared.end_interval(SAMPLES, fans, fans, None, at_first=at_first)
 
 
 def add(shared: SharedOffset, offset: Array, speed_sigmas: Array, valid: Array) -> None:
@@ -155,8 +174,55 @@ def test_it_stays_when_all_fans_are_commissioned_again_and_its_limit_is_from_the
     assert settle() == LIMIT, "some of the fans"
     shared.restart(ALL[:3], keeps_value=True)
     assert (shared.columns()["value"][0], shared.since_commissioning) == (LIMIT, 0.0)
+    commissioned(shared, 50.0, LIMIT)
     assert settle() == 2 * LIMIT
     assert shared.since_commissioning == pytest.approx(LIMIT)
+
+
+@pytest.mark.parametrize("compares_fast", [True, False])
+def test_idling_fans_say_nothing_about_what_fast_ones_share(compares_fast: bool) -> None:
+    shared = commissioned(of_residual_std(4, 1.0, compares_fast=compares_fast), 100.0)
+    speed_sigmas = np.array([10.0, 10.0, 100.0, 100.0])
+    for _ in range(60):
+        turn(shared, speed_sigmas, 0.02)
+    found = shared.columns()["value"][0]
+    assert found == pytest.approx(0.02, rel=0.15) if compares_fast else found < 0.005
+
+
+@pytest.mark.parametrize("compares_fast", [True, False])
+def test_what_fans_shared_when_they_were_commissioned_idling_is_found_when_they_turn_fast(compares_fast: bool) -> None:
+    shared, share = of_residual_std(4, 1.0, compares_fast=compares_fast), 1.8 * LIMIT
+    commissioned(shared, 20.0, share)
+    for _ in range(1000):
+        turn(shared, np.full(4, 100.0), share)
+    found = shared.columns()["value"][0]
+    assert found == pytest.approx(share, rel=0.1) if compares_fast else found < 1.55 * LIMIT
+    before = shared.columns()["commissioned"][0]
+    for _ in range(1000):
+        turn(shared, np.full(4, 100.0), 4.0 * LIMIT)
+    assert shared.columns()["commissioned"][0] == before, "once it is known, it stays"
+    assert shared.columns()["value"][0] == pytest.approx(before + LIMIT)
+
+
+def test_many_intervals_at_once_are_the_same_as_one_after_the_other() -> None:
+    rng, intervals, fans = np.random.default_rng(1), 60, 4
+    speed = np.repeat(rng.choice([15.0, 90.0], (intervals, fans)), SAMPLES, axis=0)
+    offset = 0.02 * speed + rng.normal(0.0, 0.3, speed.shape)
+    valid = np.repeat(rng.random((intervals, fans)) < 0.9, SAMPLES, axis=0)
+    one, many = (commissioned(of_residual_std(fans, 1.0), 15.0, 0.02) for _ in range(2))
+    once = many.over(
+        offset, speed, valid, Intervals(np.arange(intervals) * SAMPLES, len(speed), SAMPLES), ALL[:fans], None
+    )
+    states = []
+    for k in range(once.ends):
+        states.append([float(one.columns()[name][0]) for name in ("value", "compared", "commissioned", "informed")])
+        rows = slice(k * SAMPLES, (k + 1) * SAMPLES)
+        add(one, offset[rows], speed[rows], valid[rows])
+        one.end_interval(SAMPLES, ALL[:fans], ALL[:fans], None, at_first=False)
+    assert once.ends > 20
+    together = np.array([once.values, once.compared, once.commissioned, once.informed]).T[: once.ends]
+    np.testing.assert_array_equal(together, states)
+    assert states[-1][3] > states[0][3], "it becomes better known meanwhile"
 
 
 def test_turning_backwards_is_slowed_by_the_same_air() -> None:
