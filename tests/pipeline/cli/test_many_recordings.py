@@ -10,19 +10,18 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import onnx
 import pytest
 from typer.testing import Result
 
 from pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from pipeline.cli.twins.training_data import Part, read_recording_data
 from pipeline.errors import UserError
-from schemas.twin_card import CARD_PROPERTY
+from tests.support.but_for_times import but_for_times, content_of
+from tests.support.fan_data import published_run
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.written_recordings import write_run
 
-TIMES = {"created", "duration_s", "training_s", "took_s", "times_real_time"}
 RECORDINGS = ("a.mcap", "b.mcap", "c.mcap")
 BAD = "bad.mcap"
 
@@ -32,11 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three recordings of a healthy tray, a file that is none, and a twin."""
     path = tmp_path_factory.mktemp("many")
     for seed, name in enumerate(RECORDINGS, start=1):
-        made = fantwin(
-            "simulate", "--fans", 2, "--profile", "multisine", "--seed", seed, "--duration", 40 + 5 * seed,
-            "--epoch-ns", 0, "--recording", path / name,
-        )  # fmt: skip
-        assert made.exit_code == 0, made.output
+        write_run(path / name, published_run(seed, 40.0 + 5.0 * seed, fans=2))
     (path / BAD).write_bytes(b"nothing that was recorded")
     trained = fantwin("train", path / "a.mcap", "--model", "physical", "-o", path / "twin.onnx")
     assert trained.exit_code == 0, trained.output
@@ -51,33 +46,21 @@ def words_of(command: str, folder: Path, recordings: list[Path], output: Path) -
         "train": [*recordings, "--model", "physical", "-o", output / "trained.onnx"],
         "compare": [*recordings, "--model", "physical", "-o", output],
         "evaluate": [twin, *recordings, "--rate", 50, "--rate", "irregular"],
-        "calibrate": [twin, *recordings, "--false-alarms-per-day", 1500, "-o", output / "calibrated.onnx"],
+        "calibrate": [
+            twin,
+            *recordings,
+            "--false-alarms-per-day",
+            1500,
+            "--extrapolate",
+            "-o",
+            output / "calibrated.onnx",
+        ],
         "replay": ["--offline", *recordings, "--twin", twin, "-o", output],
     }
     return [command, *words[command], "--json"]
 
 
 COMMANDS = ("identify", "train", "compare", "evaluate", "calibrate", "replay")
-
-
-def but_for_times(value: Any) -> Any:
-    """A JSON value without the times that the work took."""
-    if isinstance(value, dict):
-        return {key: but_for_times(of_key) for key, of_key in value.items() if key not in TIMES}
-    return [but_for_times(item) for item in value] if isinstance(value, list) else value
-
-
-def content_of(path: Path) -> bytes:
-    """A file that a command wrote, but for times."""
-    if path.suffix == ".json":
-        return json.dumps(but_for_times(json.loads(path.read_text(encoding="utf-8")))).encode()
-    if path.suffix != ".onnx":
-        return path.read_bytes()
-    file = onnx.load(path)
-    properties = {entry.key: entry.value for entry in file.metadata_props}
-    properties[CARD_PROPERTY] = json.dumps(but_for_times(json.loads(properties[CARD_PROPERTY])))
-    onnx.helper.set_model_props(file, properties)
-    return file.SerializeToString(deterministic=True)
 
 
 def outcome_of(result: Result, output: Path) -> tuple[str, dict[str, bytes]]:

@@ -11,8 +11,9 @@ import pytest
 from pipeline.errors import UserError
 from pipeline.recordings.reading import RecordingError, read_metadata
 from pipeline.recordings.remote import RemotePath, local_copies, matching, recording_path
+from tests.support.fan_data import published_run
 from tests.support.running_chain import fantwin
-from tests.support.written_recordings import sequences, write
+from tests.support.written_recordings import sequences, write, write_run
 
 fsspec = pytest.importorskip("fsspec", reason="the extra `remote` is not installed")
 
@@ -86,11 +87,7 @@ def test_a_command_works_on_recordings_in_s3_as_on_files(store: str, tmp_path: P
     pipes.mkdir("fleet")
     names = ("a.mcap", "b.mcap")
     for seed, name in enumerate(names, start=1):
-        made = fantwin(
-            "simulate", "--fans", "1", "--profile", "multisine", "--seed", str(seed), "--duration", "30",
-            "--epoch-ns", "0", "--recording", str(tmp_path / name),
-        )  # fmt: skip
-        assert made.returncode == 0, made.stderr
+        write_run(tmp_path / name, published_run(seed, 20.0))
         pipes.put(str(tmp_path / name), f"fleet/{name}")
     of_files = fantwin("identify", *(str(tmp_path / name) for name in names), "--json", "--jobs", "1")
     in_store = fantwin("identify", f"{store}/*.mcap", "--json", "--jobs", "2")

@@ -17,6 +17,7 @@ from pipeline.recordings.reading import read_metadata
 from pipeline.replay.offline import healthy_runs
 from pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
 from pipeline.replay.offline.kept_samples import KeptSamples
+from pipeline.runtime.tray_twin import load_tray_twin
 from scoring.calibration.healthy_statistics import HealthyRun, statistics_of_run
 from scoring.limits import Limits
 from scoring.samples import Samples
@@ -89,10 +90,11 @@ def test_a_pass_that_ends_early_is_not_taken_for_a_whole_recording(part: Healthy
 
 
 def test_many_recordings_take_no_more_memory_than_one(part: HealthyPart, tmp_path: Path) -> None:
+    limits = Limits.model_validate(load_tray_twin(part.twin).card.calibration)
     copies = [shutil.copy(GOLDEN, tmp_path / f"{number}.mcap") for number in range(4)]
 
     def peak_of(recordings: list[Path]) -> int:
-        score: Callable[[HealthyRun], Any] = partial(statistics_of_run, limits=Limits(), top_speed_rad_s=200.0)
+        score: Callable[[HealthyRun], Any] = partial(statistics_of_run, limits=limits, top_speed_rad_s=200.0)
         tracemalloc.start()
         found = list(HealthyRuns(recordings, part)(score))
         _, peak = tracemalloc.get_traced_memory()
