@@ -141,11 +141,11 @@ def compare(
         "best": winner.candidate.name,
         "models": [as_json(contender, training_data, folder) for contender in contenders],
         "warnings": training_data.with_fan_numbers(winner.twin.identification.warnings if winner.twin else []),
-    } | pool.as_json()
+    }
     if folder:
         _write(folder / "comparison.json", json.dumps(result, indent=2) + "\n")
     if json_output:
-        typer.echo(json.dumps(result))
+        typer.echo(json.dumps(result | pool.as_json()))
     else:
         _print(result, folder)
     pool.end()
