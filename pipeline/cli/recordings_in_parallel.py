@@ -1,0 +1,228 @@
+"""Work on many recordings, on the cores of this host or of a cluster: the same for each, with results in their order.
+
+A recording is the unit. What is done with one is a function of it that another process can be given: a function of a
+module, or a `partial` of one. Its result is small, or is needed whole; the command joins the results in the order of
+its arguments, so it does not matter how many jobs there were.
+"""
+
+from __future__ import annotations
+
+import signal
+import warnings
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar
+
+import typer
+from joblib import Parallel, cpu_count, delayed, parallel_config
+from joblib.externals.loky import BrokenProcessPool
+
+from pipeline.cli.progress import recordings_progress
+from pipeline.errors import UsageError, UserError
+from pipeline.optional_dependencies import how_to_install, is_installed
+from pipeline.recordings.remote import local_copies
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+JobsOption: TypeAlias = Annotated[
+    int | None,
+    typer.Option("--jobs", "-j", min=1, help="Recordings to work on at a time. Default: one for each core."),
+]
+SchedulerOption: TypeAlias = Annotated[
+    str | None,
+    typer.Option(metavar="tcp://HOST:PORT", help="Work on the cluster of this Dask scheduler (extra `cluster`)."),
+]
+SkipBadOption: TypeAlias = Annotated[
+    bool,
+    typer.Option("--skip-bad", help="Go on without recordings that cannot be used; exit code 4 if there were any."),
+]
+
+EXIT_SKIPPED = 4
+CONNECT_S = 10.0
+"""for a scheduler to answer, and for its first worker"""
+SAME_VERSIONS = ("fantwin", "numpy", "onnxruntime")
+"""of workers and of the command: results depend on them"""
+
+Recording = TypeVar("Recording", Path, tuple[Path, ...])
+"""a file, or the parts of one recording"""
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A recording that was left out, and why."""
+
+    recording: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class _Bad:
+    """What is returned in place of a result: an error that crosses processes as it is."""
+
+    error: UserError
+
+
+class RecordingsInParallel:
+    """The processes of one command, and the recordings that it skipped. A context manager."""
+
+    def __init__(self, jobs: int | None = None, scheduler: str | None = None, skip_bad: bool = False) -> None:
+        """jobs: None: one for each core. scheduler: of a cluster, whose workers take the place of jobs.
+
+        Raises:
+            UserError: there is no such scheduler, or no worker.
+            UsageError: jobs and a scheduler.
+        """
+        if jobs and scheduler:
+            raise UsageError("--jobs and --scheduler: give one; a cluster has as many jobs as its workers have threads")
+        self._jobs = jobs or cpu_count()
+        self._scheduler = scheduler
+        self._skip_bad = skip_bad
+        self._resources = ExitStack()
+        self._backend: dict[str, Any] = {
+            "backend": "loky",
+            "inner_max_num_threads": 1,
+            "initializer": _leave_ctrl_c_to_the_command,
+        }
+        self._lost: tuple[type[Exception], ...] = (BrokenProcessPool,)
+        self.skipped: list[Skipped] = []
+
+    def __enter__(self) -> RecordingsInParallel:
+        if self._scheduler:
+            client = self._resources.enter_context(_connected(self._scheduler))
+            self._backend = {"backend": "dask", "client": client}
+            threads: Any = client.nthreads()
+            self._jobs = sum(threads.values())
+            from distributed import KilledWorker  # noqa: PLC0415  an extra, which is there now
+            from distributed.comm import CommClosedError  # noqa: PLC0415
+
+            self._lost = (KilledWorker, CommClosedError, TimeoutError)
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._resources.close()
+
+    def map(self, work: Callable[[Recording], Result], recordings: Sequence[Recording], doing: str) -> Iterator[Result]:
+        """What `work` returns for each recording, in their order, as results come; those skipped before stay left out.
+
+        doing: what is done, for people.
+
+        Raises:
+            UserError: of the first recording that `work` raises it for, unless bad ones are skipped or none is left.
+        """
+        known_as_bad = {each.recording: UserError(each.reason) for each in self.skipped}
+        left = [recording for recording in recordings if name_of(recording) not in known_as_bad]
+        errors = [known_as_bad[name_of(recording)] for recording in recordings if recording not in left]
+        with recordings_progress(doing, len(left)) as advance, closing(self._outcomes(work, left)) as outcomes:
+            for recording, outcome in zip(left, outcomes, strict=True):
+                if isinstance(outcome, _Bad):
+                    if not self._skip_bad:
+                        raise outcome.error
+                    errors.append(outcome.error)
+                    self.skipped.append(Skipped(name_of(recording), str(outcome.error)))
+                else:
+                    yield outcome
+                advance()
+        if errors and len(errors) == len(recordings):
+            raise errors[0]
+
+    def _outcomes(
+        self, work: Callable[[Recording], Result], recordings: Sequence[Recording]
+    ) -> Generator[Result | _Bad]:
+        """In the order of the recordings. When it is closed early, the processes are ended."""
+        jobs = min(self._jobs, max(len(recordings), 1))
+        try:
+            with parallel_config(n_jobs=jobs, **self._backend):
+                options: Any = {"batch_size": 1, "return_as": "generator"}
+                parallel = Parallel(**options)
+            outcomes: Any = parallel(delayed(_attempt)(work, recording) for recording in recordings)
+            try:
+                for outcome in outcomes:  # noqa: UP028  the end below must come before they are closed
+                    yield outcome
+            finally:
+                with warnings.catch_warnings():  # of tasks that are cancelled, as is wanted
+                    warnings.simplefilter("ignore")
+                    outcomes.close()
+        except self._lost as error:
+            raise UserError(
+                "a process that worked on recordings was ended from outside, as the system does when memory is short: "
+                + (f"fewer --jobs than {jobs} need less" if self._scheduler is None else f"see {self._scheduler}")
+            ) from error
+
+    def as_json(self) -> dict[str, list[dict[str, str]]]:
+        """The skipped recordings, for --json; empty where none are to be skipped."""
+        return {"skipped": [asdict(each) for each in self.skipped]} if self._skip_bad else {}
+
+    def end(self, exit_code: int = 0) -> None:
+        """Name the recordings that were skipped, on stderr, and end the command.
+
+        exit_code: another one, which counts more.
+
+        Raises:
+            typer.Exit: the code is not 0.
+        """
+        for each in self.skipped:
+            typer.secho(f"skipped: {each.reason}", fg=typer.colors.YELLOW, err=True)
+        if exit_code or self.skipped:
+            raise typer.Exit(exit_code or EXIT_SKIPPED)
+
+
+def name_of(recording: Path | tuple[Path, ...]) -> str:
+    """The name of a recording for people: of several parts, that of the first."""
+    return str(recording[0] if isinstance(recording, tuple) else recording)
+
+
+def _attempt(work: Callable[[Recording], Result], recording: Recording) -> Result | _Bad:
+    """Runs in any process."""
+    try:
+        with local_copies():
+            return work(recording)
+    except UsageError:
+        raise
+    except UserError as error:
+        files = recording if isinstance(recording, tuple) else (recording,)
+        is_named = any(str(file) in str(error) for file in files)
+        return _Bad(error if is_named else UserError(f"{name_of(recording)}: {error}"))
+
+
+def _leave_ctrl_c_to_the_command() -> None:
+    """A terminal sends it to all processes; the command ends its workers itself."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextmanager
+def _connected(scheduler: str) -> Iterator[Client]:
+    """A client of a cluster that has workers, all with the versions of this process.
+
+    Raises:
+        UserError: there is none, or the extra is missing.
+    """
+    if not is_installed("distributed"):
+        raise UserError(f"--scheduler needs the extra `cluster`; {how_to_install('cluster')}")
+    from distributed import Client  # noqa: PLC0415  an extra
+
+    try:
+        client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise UserError(f"--scheduler {scheduler}: no Dask scheduler answers there") from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=CONNECT_S)
+        except TimeoutError as error:
+            raise UserError(
+                f"--scheduler {scheduler}: it has no workers; start some: dask worker {scheduler} --nthreads 1"
+            ) from error
+        own = _versions()
+        versions: Any = client.run(_versions, on_error="return")
+        for worker, found in versions.items():
+            if found != own:
+                raise UserError(f"worker {worker} has {found}, this command {own}: install the same everywhere")
+        yield client
+
+
+def _versions() -> str:
+    return ", ".join(f"{package} {version(package)}" for package in SAME_VERSIONS)
