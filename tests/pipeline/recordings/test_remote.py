@@ -66,7 +66,9 @@ def test_without_the_extra_it_is_one_line(monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.fixture
 def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """The address of an S3 server on this host."""
+    """The address of an S3 server on this host: of `pip install 'moto[s3,server]' s3fs`. It needs a python-dateutil
+    that is older than the one of matplotlib in requirements-dev.lock, so it is not installed with what tests need.
+    """
     pytest.importorskip("s3fs", reason="the extra `remote` is not installed")
     moto = pytest.importorskip("moto.server", reason="moto is not installed")
     server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
