@@ -76,8 +76,8 @@ class DecisionRules(IntEnum):
     without it. Before, nothing was shared until fans had baselines, which took it as their own."""
     FAST_FANS = 20
     """What the fans share, a share of their speed, is found from those that turn at least half as fast as the second
-    fastest one, and its limit from where it is once they have turned fast. Before, fans that idled, of which it can
-    hardly be known, held it where it was."""
+    fastest one, and its limit is measured from its value once they have turned fast. Before, idling fans, which say
+    little about it, held it back."""
 
 
 CURRENT_RULES = max(DecisionRules)

@@ -7,8 +7,9 @@ if it lies outside of the (inner) two. So one fan that is off by itself does not
 
 Until the first fan has its baseline, offsets are residuals as they are, and the shared one follows their mean at once:
 baselines are then found without it. A baseline that took a share of the speed as its own would be wrong at all other
-speeds. Idling fans say little about a share of the speed. Where others turn fast, only these are compared; and if all
-were commissioned at low speed, the offset that the limit is from is found when they first turn faster.
+speeds. Idling fans say little about a share of the speed. Where at least two others turn fast, only these are compared.
+And if all were commissioned at low speed, the offset from which the limit is measured is found again, within bounds,
+when they first turn faster.
 
 While only one of the fans turns it cannot be compared. Then the shared offset takes the place of the fan's own
 baseline, as slow and with as short a reach: otherwise both would have followed the same weather when the others turn
@@ -28,13 +29,14 @@ from scoring.detectors.state import ColumnState
 
 SMOOTHING_S = 8.0  # longer than a tacho counts, shorter than supply and air take to change by much
 LEAST_FANS = 2
-MIN_RELATIVE_SPEED = 0.5  # of the second fastest fan: the residual of a slower one is mostly the error of its twin
+MIN_RELATIVE_SPEED = 0.5  # of the second fastest fan, in sigmas: residuals of slower ones are mostly errors of the twin
 MIN_VALID_SHARE = 0.5  # of an interval's samples
-WELL_KNOWN = 0.8  # of what fans share when they are commissioned: the rest is not looked for
-HALF_INFORMATION = 0.5  # fans that turn slower say more about the error of their twin than about what they share
-INFORMED_INTERVALS = (
-    200.0  # of full information, in which it becomes known what fans shared when they were commissioned
-)
+# Information, 0 to 1, is what an interval says of a share of the speed beside the ridge: 0.5 where both say as much.
+WELL_KNOWN = 0.8  # information at the commissioning from which its value is not looked for again
+LEAST_INFORMATION = 0.5  # of an interval in which it is looked for
+MORE_INFORMATION = 0.1  # at least so much more than at the commissioning
+ENOUGH_INFORMATION = 60.0  # the sum, beyond these, after which it stays
+SEARCHED_S = 86400.0  # and it stays after so long with fans that could be compared
 LARGEST_SIGMAS = 1e3  # larger offsets are clipped to this
 FIXED_POINT_ONE = 1 << 6  # integer sums do not depend on how samples are cut
 
@@ -49,7 +51,9 @@ class SharedOverIntervals(NamedTuple):
     commissioned: Array
     """(intervals,) the one of the commissioning, as far as it is known"""
     informed: Array
-    """(intervals,) of full information that it is known from"""
+    """(intervals,) the sum of the information from which it was found again"""
+    searched: Array
+    """(intervals,) in how many intervals it was looked for"""
     products: Array
     squares: Array
     counts: Array
@@ -65,6 +69,7 @@ class _State(NamedTuple):
     compared: float
     commissioned: float
     informed: float
+    searched: float
 
 
 class SharedOffset(ColumnState):
@@ -94,15 +99,17 @@ class SharedOffset(ColumnState):
         self._gain, self._gain_alone = (-np.expm1(-interval_s / time_s) for time_s in (SMOOTHING_S, adaptation_s))
         self._reach_sigmas = reach_sigmas
         self._compares_fast = compares_fast
+        self._most_searched = SEARCHED_S / interval_s
         self._value = np.zeros(1)
         self._compared = np.zeros(1)
         """the value when fans were last compared"""
         self._commissioned = np.zeros(1)
-        """what fans shared when they had their baselines, or all were commissioned again; the limit is from there"""
-        self._informed = np.zeros(1)
-        """intervals of full information that it is known from since then"""
-        self._begun, self._begun_information = np.zeros(1), np.zeros(1)
-        """what it was taken for then; and how much of that was known, 0 to 1: the rest is how far it may still move"""
+        """what fans shared when the first of them got its baseline, or all were commissioned again, as far as it is
+        known; the limit is from there"""
+        self._informed, self._searched = np.zeros((2, 1))
+        """since then: the sum of the information from which it was found again, and the intervals searched"""
+        self._begun, self._begun_information = np.zeros((2, 1))
+        """its value at that time, and how much of it was known, 0 to 1: it may still move by the rest, in limits"""
         self._first = np.zeros(1, np.int64)
         """intervals in which fans were compared before any of them had a baseline"""
         self._products = np.zeros(fans, np.int64)
@@ -149,8 +156,10 @@ class SharedOffset(ColumnState):
         squares[0] += self._squares
         counts[0] += self._counts
         states, ends = self._states(products, squares, counts, intervals.expected, commissioned, moving)
-        values, compared, at_commissioning, informed = states.T
-        return SharedOverIntervals(values, compared, at_commissioning, informed, products, squares, counts, ends)
+        values, compared, at_commissioning, informed, searched = states.T
+        return SharedOverIntervals(
+            values, compared, at_commissioning, informed, searched, products, squares, counts, ends
+        )
 
     def _states(
         self,
@@ -161,9 +170,8 @@ class SharedOffset(ColumnState):
         commissioned: Array,
         moving: Array | None,
     ) -> tuple[Array, int]:
-        """(intervals, 4) the state in each: the value, the one when fans were last compared, that of the commissioning
-        and how well that is known. And up to which these hold: until the end of the first interval in which a fan
-        turned alone, itself counted."""
+        """(intervals, 5) the state in each, see _State; and up to which these hold: until the end of the first interval
+        in which a fan turned alone, itself counted."""
         state = self._now
         if len(counts) == 1:
             return np.array([state]), 1
@@ -192,11 +200,14 @@ class SharedOffset(ColumnState):
         if not self._is_becoming_known(state):
             return state._replace(value=value, compared=value)
         begun, known = float(self._begun[0]), float(self._begun_information[0])
-        weight = max(_information(squares, ridge) - max(known, HALF_INFORMATION), 0.0)
+        least = max(known + MORE_INFORMATION, LEAST_INFORMATION)
+        weight = max(_information(squares, ridge) - least, 0.0)
         informed = state.informed + weight
         commissioned = state.commissioned + weight / (1.0 + informed) * (value - state.commissioned)
         reach = self._limit * (1.0 - known)
-        return _State(value, value, _between(commissioned, begun - reach, begun + reach), informed)
+        return _State(
+            value, value, _between(commissioned, begun - reach, begun + reach), informed, state.searched + 1.0
+        )
 
     def _moved(self, state: _State, gain: float, products: Array, squares: Array, ridge: Array) -> float:
         """The value, moved towards the offsets in the middle."""
@@ -209,7 +220,7 @@ class SharedOffset(ColumnState):
     def _compared_often(
         self, state: _State, is_compared: Array, fast: Array, products: Array, squares: Array, ridge: Array
     ) -> Array:
-        """(intervals, 4) the state in each interval, once it is known what was shared at the commissioning."""
+        """(intervals, 5) the state in each interval, once it is known what was shared at the commissioning."""
         number = fast.sum(axis=1)
         divisor = np.where(fast, squares + ridge, 1.0)
         offsets = np.sort(np.where(fast, _drawn(products, ridge, state.commissioned) / divisor, np.inf), axis=1)
@@ -226,7 +237,9 @@ class SharedOffset(ColumnState):
 
     def take(self, of: SharedOverIntervals) -> None:
         """Go on in the last of some intervals."""
-        self._set(_State(of.values[-1], of.compared[-1], of.commissioned[-1], of.informed[-1]))
+        self._set(
+            _State(*(column[-1] for column in (of.values, of.compared, of.commissioned, of.informed, of.searched)))
+        )
         self._products[:], self._squares[:], self._counts[:] = of.products[-1], of.squares[-1], of.counts[-1]
 
     def end_interval(
@@ -249,9 +262,8 @@ class SharedOffset(ColumnState):
         if at_first and is_compared:
             self._first += 1
             gain = max(gain, 1.0 / float(self._first[0]))
-            self._begun_information += _information(
-                self._squares[used], self._ridge * FIXED_POINT_ONE * self._counts[used]
-            )
+            information = _information(self._squares[used], self._ridge * FIXED_POINT_ONE * self._counts[used])
+            self._begun_information += gain * (information - self._begun_information)
         if used.any():
             products, squares, counts = self._products[used], self._squares[used], self._counts[used]
             ridge = self._ridge * FIXED_POINT_ONE * counts
@@ -266,10 +278,10 @@ class SharedOffset(ColumnState):
         return alone
 
     def _is_becoming_known(self, state: _State) -> bool:
-        """Whether it is still found what fans shared when they were commissioned: idling fans say little about that."""
+        """Whether it is still being found what fans shared when they were commissioned."""
         if not self._compares_fast or self.is_known or self._begun_information[0] >= WELL_KNOWN:
             return False
-        return state.informed < INFORMED_INTERVALS
+        return state.informed < ENOUGH_INFORMATION and state.searched < self._most_searched
 
     @property
     def _now(self) -> _State:
@@ -280,13 +292,13 @@ class SharedOffset(ColumnState):
             column[:] = value
 
     @property
-    def _columns_of_state(self) -> tuple[Array, Array, Array, Array]:
-        return self._value, self._compared, self._commissioned, self._informed
+    def _columns_of_state(self) -> tuple[Array, ...]:
+        return self._value, self._compared, self._commissioned, self._informed, self._searched
 
     def begin_from_here(self) -> None:
         """The first fan has its baseline, found without what is shared now."""
         self._commissioned[:] = self._begun[:] = self._value
-        self._begun_information /= np.maximum(self._first, 1)
+        self._informed[:] = self._searched[:] = 0.0
         self._first[:] = 0
 
     def restart(self, fans: Array, *, keeps_value: bool) -> None:
@@ -303,11 +315,11 @@ class SharedOffset(ColumnState):
         self._commissioned[:] = self._compared[:] = self._value
         self._begun[:] = self._value
         self._first[:] = 0
-        self._informed[:] = self._begun_information[:] = 0.0
+        self._informed[:] = self._searched[:] = self._begun_information[:] = 0.0
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """See ColumnState. Earlier snapshots do not say what was shared at first, or how well that is known."""
-        known = {"informed": [INFORMED_INTERVALS], "begun": [0.0], "begun_information": [1.0]}
+        known = {"informed": [0.0], "searched": [0.0], "begun": [0.0], "begun_information": [1.0]}
         super().restore({"commissioned": [0.0], "first": [0], **known, **state})
 
     def _fast(self, known: Array, squares: Array, counts: Array) -> Array:
@@ -326,6 +338,7 @@ class SharedOffset(ColumnState):
             "commissioned": self._commissioned,
             "first": self._first,
             "informed": self._informed,
+            "searched": self._searched,
             "begun": self._begun,
             "begun_information": self._begun_information,
             "products": self._products,

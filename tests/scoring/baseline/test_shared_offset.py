@@ -11,6 +11,7 @@ from tests.support.one_interval import one_interval
 SAMPLES = 10
 ALL = np.ones(8, np.bool_)
 LIMIT, ADAPTATION_S, REACH_SIGMAS = 0.03, 300.0, 1.2
+STATE = ("value", "compared", "commissioned", "informed", "searched")
 
 
 def shared_offset(fans: int) -> SharedOffset:
@@ -205,24 +206,56 @@ def test_what_fans_shared_when_they_were_commissioned_idling_is_found_when_they_
 
 
 def test_many_intervals_at_once_are_the_same_as_one_after_the_other() -> None:
-    rng, intervals, fans = np.random.default_rng(1), 60, 4
+    rng, intervals, fans = np.random.default_rng(1), 900, 4
     speed = np.repeat(rng.choice([15.0, 90.0], (intervals, fans)), SAMPLES, axis=0)
     offset = 0.02 * speed + rng.normal(0.0, 0.3, speed.shape)
     valid = np.repeat(rng.random((intervals, fans)) < 0.9, SAMPLES, axis=0)
+    valid[:, :2] = True
     one, many = (commissioned(of_residual_std(fans, 1.0), 15.0, 0.02) for _ in range(2))
     once = many.over(
         offset, speed, valid, Intervals(np.arange(intervals) * SAMPLES, len(speed), SAMPLES), ALL[:fans], None
     )
     states = []
     for k in range(once.ends):
-        states.append([float(one.columns()[name][0]) for name in ("value", "compared", "commissioned", "informed")])
+        states.append([float(one.columns()[name][0]) for name in STATE])
         rows = slice(k * SAMPLES, (k + 1) * SAMPLES)
         add(one, offset[rows], speed[rows], valid[rows])
         one.end_interval(SAMPLES, ALL[:fans], ALL[:fans], None, at_first=False)
-    assert once.ends > 20
-    together = np.array([once.values, once.compared, once.commissioned, once.informed]).T[: once.ends]
+    assert once.ends == intervals
+    together = np.array([once.values, once.compared, once.commissioned, once.informed, once.searched]).T[: once.ends]
     np.testing.assert_array_equal(together, states)
-    assert states[-1][3] > states[0][3], "it becomes better known meanwhile"
+    assert states[0][3] == 0.0, "it is still being found at first"
+    assert states[-1][3] == states[-100][3] >= 60.0, "and known at last"
+
+
+def test_fans_commissioned_again_one_by_one_begin_from_where_they_are_then() -> None:
+    shared = commissioned(of_residual_std(4, 1.0), 100.0, 0.01)
+    for fan in range(4):
+        shared.restart(np.arange(4) == fan, keeps_value=True)
+    commissioned(shared, 15.0, 0.02)
+    begun = shared.columns()["begun_information"][0]
+    assert 0.1 < begun < 0.3, "of the last commissioning only"
+    for _ in range(600):
+        turn(shared, np.full(4, 100.0), 0.02)
+    assert shared.columns()["commissioned"][0] == pytest.approx(0.02, rel=0.15)
+    assert shared.since_commissioning == pytest.approx(0.0, abs=0.003)
+
+
+def test_a_snapshot_of_before_it_was_found_again_continues_and_begins_with_the_next_commissioning() -> None:
+    before = commissioned(of_residual_std(4, 1.0), 15.0, 0.02)
+    earlier = {
+        key: value for key, value in before.snapshot().items() if not key.startswith(("begun", "informed", "sea"))
+    }
+    after = of_residual_std(4, 1.0)
+    after.restore(earlier)
+    for _ in range(600):
+        turn(after, np.full(4, 100.0), 0.02)
+    assert after.columns()["commissioned"][0] == before.columns()["commissioned"][0], "as it was decided then"
+    after.restart(ALL[:4], keeps_value=True)
+    commissioned(after, 15.0, 0.0)
+    for _ in range(600):
+        turn(after, np.full(4, 100.0), 0.0)
+    assert after.columns()["commissioned"][0] == pytest.approx(0.0, abs=0.003)
 
 
 def test_turning_backwards_is_slowed_by_the_same_air() -> None:
