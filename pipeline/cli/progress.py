@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,12 +26,18 @@ _SHOW_PART: ContextVar[Callable[[str], None] | None] = ContextVar("show_part", d
 
 @contextmanager
 def interruptible(outcome: str) -> Iterator[None]:
-    """Around work whose result is written at its end: Ctrl-C ends the command with one line, which says the outcome."""
+    """Around work whose result is written at its end: Ctrl-C ends the command with one line, which says the outcome.
+
+    So does SIGTERM, so that temporary files are removed: they may be as large as recordings.
+    """
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     except KeyboardInterrupt:
         typer.echo(f"interrupted: {outcome}", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

@@ -9,16 +9,20 @@ from __future__ import annotations
 
 import signal
 import warnings
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar
 
 import typer
 from joblib import Parallel, cpu_count, delayed, parallel_config
-from joblib.externals.loky import BrokenProcessPool
+from joblib.externals.loky import BrokenProcessPool, get_reusable_executor
+from threadpoolctl import threadpool_limits
 
 from pipeline.cli.progress import recordings_progress
 from pipeline.errors import UsageError, UserError
@@ -44,8 +48,9 @@ SkipBadOption: TypeAlias = Annotated[
 EXIT_SKIPPED = 4
 CONNECT_S = 10.0
 """for a scheduler to answer, and for its first worker"""
-SAME_VERSIONS = ("fantwin", "numpy", "onnxruntime")
+SAME_VERSIONS = ("fantwin", "numpy", "onnxruntime", "scipy")
 """of workers and of the command: results depend on them"""
+ENDED_FROM_OUTSIDE = "a process that worked on recordings was ended from outside, as the system does if memory is short"
 
 Recording = TypeVar("Recording", Path, tuple[Path, ...])
 """a file, or the parts of one recording"""
@@ -68,13 +73,12 @@ class _Bad:
 
 
 class RecordingsInParallel:
-    """The processes of one command, and the recordings that it skipped. A context manager."""
+    """The processes of one command, and the recordings that it skipped. A context manager: its end is theirs."""
 
     def __init__(self, jobs: int | None = None, scheduler: str | None = None, skip_bad: bool = False) -> None:
         """jobs: None: one for each core. scheduler: of a cluster, whose workers take the place of jobs.
 
         Raises:
-            UserError: there is no such scheduler, or no worker.
             UsageError: jobs and a scheduler.
         """
         if jobs and scheduler:
@@ -83,27 +87,21 @@ class RecordingsInParallel:
         self._scheduler = scheduler
         self._skip_bad = skip_bad
         self._resources = ExitStack()
-        self._backend: dict[str, Any] = {
-            "backend": "loky",
-            "inner_max_num_threads": 1,
-            "initializer": _leave_ctrl_c_to_the_command,
-        }
-        self._lost: tuple[type[Exception], ...] = (BrokenProcessPool,)
-        self.skipped: list[Skipped] = []
+        self._client: Client | None = None
+        self._copies: Path | None = None
+        self._bad: dict[Path | tuple[Path, ...], UserError] = {}
 
     def __enter__(self) -> RecordingsInParallel:
+        """Raises UserError: there is no such scheduler, or no worker."""
+        folder = TemporaryDirectory(prefix="fantwin-copies-", ignore_cleanup_errors=True)
+        self._copies = Path(self._resources.enter_context(folder))
         if self._scheduler:
-            client = self._resources.enter_context(_connected(self._scheduler))
-            self._backend = {"backend": "dask", "client": client}
-            threads: Any = client.nthreads()
-            self._jobs = sum(threads.values())
-            from distributed import KilledWorker  # noqa: PLC0415  an extra, which is there now
-            from distributed.comm import CommClosedError  # noqa: PLC0415
-
-            self._lost = (KilledWorker, CommClosedError, TimeoutError)
+            self._client = self._resources.enter_context(_connected(self._scheduler))
         return self
 
     def __exit__(self, *_error: object) -> None:
+        if self._client is None and self._jobs > 1:
+            get_reusable_executor(reuse=True).shutdown(kill_workers=True)  # a fit that follows needs their memory
         self._resources.close()
 
     def map(self, work: Callable[[Recording], Result], recordings: Sequence[Recording], doing: str) -> Iterator[Result]:
@@ -114,32 +112,28 @@ class RecordingsInParallel:
         Raises:
             UserError: of the first recording that `work` raises it for, unless bad ones are skipped or none is left.
         """
-        known_as_bad = {each.recording: UserError(each.reason) for each in self.skipped}
-        left = [recording for recording in recordings if name_of(recording) not in known_as_bad]
-        errors = [known_as_bad[name_of(recording)] for recording in recordings if recording not in left]
-        with recordings_progress(doing, len(left)) as advance, closing(self._outcomes(work, left)) as outcomes:
+        left = [recording for recording in recordings if recording not in self._bad]
+        attempt = partial(_attempt, work=work, copies=self._copies)
+        begun = self._on_cluster(attempt, left) if self._client else self._here(attempt, left)
+        with recordings_progress(doing, len(left)) as advance, closing(begun) as outcomes:
             for recording, outcome in zip(left, outcomes, strict=True):
                 if isinstance(outcome, _Bad):
                     if not self._skip_bad:
                         raise outcome.error
-                    errors.append(outcome.error)
-                    self.skipped.append(Skipped(name_of(recording), str(outcome.error)))
+                    self._bad[recording] = outcome.error
                 else:
                     yield outcome
                 advance()
-        if errors and len(errors) == len(recordings):
-            raise errors[0]
+        if recordings and all(recording in self._bad for recording in recordings):
+            raise self._bad[recordings[0]]
 
-    def _outcomes(
-        self, work: Callable[[Recording], Result], recordings: Sequence[Recording]
-    ) -> Generator[Result | _Bad]:
-        """In the order of the recordings. When it is closed early, the processes are ended."""
+    def _here(self, attempt: Callable[[Recording], Any], recordings: Sequence[Recording]) -> Generator[Any]:
+        """The outcomes in the order of the recordings. When it is closed early, the processes are ended."""
         jobs = min(self._jobs, max(len(recordings), 1))
+        with parallel_config("loky", initializer=_leave_ctrl_c_to_the_command):
+            parallel: Any = Parallel(jobs, return_as="generator", batch_size=1)
         try:
-            with parallel_config(n_jobs=jobs, **self._backend):
-                options: Any = {"batch_size": 1, "return_as": "generator"}
-                parallel = Parallel(**options)
-            outcomes: Any = parallel(delayed(_attempt)(work, recording) for recording in recordings)
+            outcomes = parallel(delayed(attempt)(recording) for recording in recordings)
             try:
                 for outcome in outcomes:  # noqa: UP028  the end below must come before they are closed
                     yield outcome
@@ -147,11 +141,33 @@ class RecordingsInParallel:
                 with warnings.catch_warnings():  # of tasks that are cancelled, as is wanted
                     warnings.simplefilter("ignore")
                     outcomes.close()
-        except self._lost as error:
-            raise UserError(
-                "a process that worked on recordings was ended from outside, as the system does when memory is short: "
-                + (f"fewer --jobs than {jobs} need less" if self._scheduler is None else f"see {self._scheduler}")
-            ) from error
+        except BrokenProcessPool as error:
+            raise UserError(f"{ENDED_FROM_OUTSIDE}: fewer --jobs than {jobs} need less") from error
+
+    def _on_cluster(self, attempt: Callable[[Recording], Any], recordings: Sequence[Recording]) -> Generator[Any]:
+        """The same on the workers of a cluster. When it is closed early, what has not begun is cancelled.
+
+        joblib's Dask backend is not used: with joblib 1.6 it waits for ever for the task of a worker that was killed.
+        """
+        from distributed import CancelledError, KilledWorker  # noqa: PLC0415  an extra, which is there now
+        from distributed.comm import CommClosedError  # noqa: PLC0415
+
+        assert self._client
+        futures = deque(self._client.map(attempt, recordings, pure=False))
+        try:
+            while futures:
+                yield futures.popleft().result()  # a result that is held nowhere else is forgotten by the cluster
+        except KilledWorker as error:
+            raise UserError(f"{ENDED_FROM_OUTSIDE}: see {self._scheduler}") from error
+        except (CancelledError, CommClosedError, TimeoutError) as error:
+            raise UserError(f"--scheduler {self._scheduler}: the connection to it was lost") from error
+        finally:
+            self._client.cancel(list(futures))
+
+    @property
+    def skipped(self) -> list[Skipped]:
+        """The recordings that were left out so far."""
+        return [Skipped(name_of(recording), str(error)) for recording, error in self._bad.items()]
 
     def as_json(self) -> dict[str, list[dict[str, str]]]:
         """The skipped recordings, for --json; empty where none are to be skipped."""
@@ -176,10 +192,10 @@ def name_of(recording: Path | tuple[Path, ...]) -> str:
     return str(recording[0] if isinstance(recording, tuple) else recording)
 
 
-def _attempt(work: Callable[[Recording], Result], recording: Recording) -> Result | _Bad:
-    """Runs in any process."""
+def _attempt(recording: Recording, work: Callable[[Recording], Result], copies: Path | None) -> Result | _Bad:
+    """Runs in any process. With several threads, linear algebra rounds in another order: there is one everywhere."""
     try:
-        with local_copies():
+        with local_copies(copies), threadpool_limits(1):
             return work(recording)
     except UsageError:
         raise

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,6 +23,8 @@ from pipeline.recordings.records import RecordingError
 
 _BLOCK_BYTES = 1 << 20
 """fetched at a time where no copy is made"""
+_MAY_BE_SECRET = re.compile(r"://[^/@]*:[^/@]*@|https?://[^/@]*@|\?")
+"""a password, a token, or a query, such as a signature"""
 _COPIES: ContextVar[Path | None] = ContextVar("copies", default=None)
 """the folder of local copies; None: there are none"""
 
@@ -30,12 +33,17 @@ def recording_path(text: str) -> Path:
     """The path of a recording on the command line: a file, or a URL.
 
     Raises:
-        UsageError: the extra for URLs is missing.
+        UsageError: the extra for URLs is missing, or the URL may hold a secret.
     """
     if "://" not in text:
         return Path(text)
     if text.startswith("file://"):
         return Path(text.removeprefix("file://"))
+    if _MAY_BE_SECRET.search(text):
+        raise UsageError(
+            f"{text.partition('://')[0]}://...: names of recordings are printed and written into cards, so a URL "
+            "may hold no password and no `?`: give credentials as the tools of the store take them"
+        )
     if not is_installed("fsspec"):
         raise UsageError(f"{text}: recordings at URLs need the extra `remote`; {how_to_install('remote')}")
     return RemotePath(text)
@@ -64,9 +72,13 @@ def _matches(path: Path) -> list[Path]:
 
 
 @contextmanager
-def local_copies() -> Iterator[None]:
-    """Inside, each recording at a URL is fetched once, to the disk of this host, and deleted at the end."""
-    with TemporaryDirectory(prefix="fantwin-copies-") as folder:
+def local_copies(place: Path | None = None) -> Iterator[None]:
+    """Inside, each recording at a URL is fetched once, to the disk of this host, and deleted at the end.
+
+    place: a folder for the copies, whose owner deletes it even if this process is killed; another host has none.
+    """
+    folder_of_host = place if place and place.is_dir() else None
+    with TemporaryDirectory(prefix="fantwin-copies-", dir=folder_of_host) as folder:
         token = _COPIES.set(Path(folder))
         try:
             yield
@@ -111,14 +123,6 @@ class RemotePath(PosixPath):
                     raise self.unreadable(error) from error
             fetched.rename(copy)
         return copy.open("rb")
-
-    def exists(self, **_options: Any) -> bool:
-        """Whether it can be opened."""
-        try:
-            self._remote().close()
-        except RecordingError:
-            return False
-        return True
 
     def place(self) -> tuple[Any, str]:
         """The file system of fsspec, and the path in it.

@@ -24,6 +24,7 @@ from pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from pipeline.errors import UsageError, UserError
 from pipeline.recordings.dates import format_utc, has_date
 from pipeline.recordings.grouping import describe, recordings_of
+from pipeline.recordings.records import active_path
 from schemas.messages import Diagnosis
 from schemas.units import NS_PER_S
 from scoring.diagnosis.shown_causes import most_probable
@@ -50,8 +51,8 @@ def run_offline(
     try:
         with interruptible("nothing was written"), pool:
             recordings = recordings_of(pool.map(describe, list(dict.fromkeys(files)), "opening recordings"))
-            with written_at_the_end(output, recordings) as where:
-                scored = list(pool.map(partial(score_again, again=again, output=where), recordings, "scoring"))
+            with written_at_the_end(output, recordings) as folder:
+                scored = list(pool.map(partial(score_again, again=again, folder=folder), recordings, "scoring"))
     except UserError as error:
         if not again.verify:
             raise
@@ -70,28 +71,41 @@ def run_offline(
 
 @contextmanager
 def written_at_the_end(output: Path | None, recordings: Sequence[tuple[Path, ...]]) -> Iterator[Path | None]:
-    """Yields where outputs are written: a file for that of one recording, a folder for those of many. They get their
-    names in `output` at the end: if the work fails, it stays as it was.
+    """Yields a folder for the outputs of recordings, each under the name of the first part. Those that are there at the
+    end get their places: `output` is that of one recording, or the folder of several. If the work fails, none does.
 
     Raises:
-        UserError: there is such a file already, or `output` is no folder for many.
+        UserError: a place is taken, or nothing can be written there.
     """
-    if output is None or (len(recordings) == 1 and not output.is_dir()):
-        yield output
+    if output is None:
+        yield None
         return
-    if output.suffix == ".mcap":
+    if len(recordings) > 1 and output.suffix == ".mcap":
         raise UsageError(f"-o {output}: these are {len(recordings)} recordings: name a folder")
-    named: dict[str, Path] = {}
+    is_folder = len(recordings) > 1 or output.is_dir()
+    places: dict[str, Path] = {}
     for path, *_ in recordings:
-        if path.name in named:
-            raise UserError(f"{named[path.name]} and {path}: both would be written to {output / path.name}")
-        if (output / path.name).exists():
-            raise UserError(f"{output / path.name}: exists already; name another folder with -o, or remove it")
-        named[path.name] = path
-    with TemporaryDirectory(dir=make_folder(output), prefix=".replay-") as folder:
-        yield Path(folder)
-        for path in Path(folder).iterdir():
-            path.rename(output / path.name)
+        place = output / path.name if is_folder else output
+        if path.name in places:
+            raise UserError(f"{path}: another recording has its name, and both would be written to {place}")
+        _refuse_taken(place)
+        places[path.name] = place
+    folder = make_folder(output if is_folder else output.parent)
+    try:
+        unfinished = TemporaryDirectory(dir=folder, prefix=".replay-")
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written: {error.strerror}; name another folder with -o") from error
+    with unfinished as name:
+        yield Path(name)
+        for path in Path(name).iterdir():
+            _refuse_taken(places[path.name])
+            path.rename(places[path.name])
+
+
+def _refuse_taken(place: Path) -> None:
+    for path in (place, active_path(place)):
+        if path.exists():
+            raise UserError(f"{path}: exists already; give another name with -o, or remove it")
 
 
 def print_result(result: dict[str, Any], output: Path | None) -> None:

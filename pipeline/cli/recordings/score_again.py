@@ -34,14 +34,13 @@ class Again:
     end_s: float = math.inf
 
 
-def score_again(files: tuple[Path, ...], again: Again, output: Path | None) -> dict[str, Any]:
-    """The result for one recording as JSON fields. output: a new recording to write, or a folder for it.
+def score_again(files: tuple[Path, ...], again: Again, folder: Path | None) -> dict[str, Any]:
+    """The result for one recording as JSON fields. folder: where a new recording is written, under its name.
 
     Raises:
         UserError: it cannot be scored, or with `verify` not be compared.
     """
-    if output and output.is_dir():
-        output = output / files[0].name
+    output = folder / files[0].name if folder else None
     with open_replay_input(
         files, again.config, again.overrides, again.twin, again.start_s, again.end_s
     ) as replay_input:
@@ -53,6 +52,8 @@ def score_again(files: tuple[Path, ...], again: Again, output: Path | None) -> d
         trays = _rescored(replay_input, output, verify=again.verify)
         result = _result(replay_input, trays)
     if result["not_scored"] and not again.verify and not any(tray.scored for tray in trays):
+        if output:
+            output.unlink()
         raise UserError(f"{files[0]}: {'; '.join(result['not_scored'])}")
     return result
 

@@ -252,7 +252,7 @@ def _mixed_rates(error: MixedRatesError) -> str:
     (first, first_ns), (other, other_ns) = error.first, error.other
     rates = f"{NS_PER_S / first_ns:g} Hz and {NS_PER_S / other_ns:g} Hz"
     if first == other:
-        return f"{first}: its grid changes between {rates}, and limits hold for one rate: calibrate without it"
+        return f"{first}: its trays have grids of different rates, {rates}, and limits hold for one: choose with --tray"
     return (
         f"{first} and {other} have grids of different rates, {rates}, and limits hold for one: calibrate on recordings "
         "of one rate, or choose one with --set resampler.rate_hz=..."

@@ -101,16 +101,17 @@ def compare(
     """
     not_compared = f"no comparison; the twins that were finished are in {output}" if output else "no comparison"
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
-    with interruptible(not_compared), twin_errors(), pool:
+    with interruptible(not_compared), twin_errors():
         from twin.comparison import best, contend, source_of  # noqa: PLC0415  loads twin only when it is needed
 
         chosen = _chosen(model)
         part = Part(tray, fans, from_s, to_s, tuple(window_s or ()))
         validation_part = replace(part, from_s=validate_from_s, to_s=validate_to_s)
         test_part = replace(part, from_s=test_from_s, to_s=test_to_s)
-        training_data = read_training_data(recordings, part, pool)
-        held_out = read_held_out(training_data, validate, validation_part, pool) if validate else None
-        untouched = read_held_out(training_data, test, test_part, pool) if test else None
+        with pool:
+            training_data = read_training_data(recordings, part, pool)
+            held_out = read_held_out(training_data, validate, validation_part, pool) if validate else None
+            untouched = read_held_out(training_data, test, test_part, pool) if test else None
         folder = make_folder(output) if output else None
         validation_runs, test_runs = (part.runs if part else [] for part in (held_out, untouched))
         data, validation_data = data_cards(training_data), data_cards(held_out) if held_out else ()

@@ -60,11 +60,12 @@ def identify(
     Example: fantwin identify REC.mcap --json
     """
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
-    with interruptible("nothing was identified"), twin_errors(), pool:
+    with interruptible("nothing was identified"), twin_errors():
         from twin.fitting.identification import identify as identify_fans  # noqa: PLC0415  loads twin only when it is needed
 
         part = Part(tray, fans, from_s, to_s, tuple(window_s or ()))
-        training_data = read_training_data(recordings, part, pool)
+        with pool:
+            training_data = read_training_data(recordings, part, pool)
         if not json_output:
             show_hints(training_data.hints)
         with training_progress(training_data) as start:

@@ -119,12 +119,13 @@ def train(
     """
     not_written = "no twin was written; --iterations N ends after N iterations of each network and writes one"
     pool = RecordingsInParallel(jobs, scheduler, skip_bad)
-    with interruptible(not_written), twin_errors(), pool:
+    with interruptible(not_written), twin_errors():
         check_writable(output, ".onnx")
         part = Part(tray, fans, from_s, to_s, tuple(window_s or ()))
-        training_data = read_training_data(recordings, part, pool)
         validation_part = replace(part, from_s=validate_from_s, to_s=validate_to_s)
-        held_out = read_held_out(training_data, validate, validation_part, pool) if validate else None
+        with pool:
+            training_data = read_training_data(recordings, part, pool)
+            held_out = read_held_out(training_data, validate, validation_part, pool) if validate else None
         if not json_output:
             show_hints(training_data.hints)
         with training_progress(training_data) as start:

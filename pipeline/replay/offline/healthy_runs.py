@@ -20,7 +20,7 @@ from pipeline.runtime.tray_twin import load_tray_twin
 from schemas.codec import CodecError
 from schemas.units import NS_PER_S, SpeedUnit
 from scoring.baseline.shared_offset import LEAST_FANS
-from scoring.calibration.healthy_statistics import HealthyRun, HealthyStatistics, RunWork
+from scoring.calibration.healthy_statistics import HealthyRun, HealthyStatistics, MixedRatesError, RunWork
 from scoring.limits import Timing, default_timing
 from scoring.samples import Samples, samples_of
 
@@ -185,6 +185,11 @@ def _work_on(
             found.append((tray, work(run)))
     except CodecError as error:
         raise UserError(f"{path}: a message cannot be decoded: {error}; see `fantwin info`") from error
+    except MixedRatesError as error:
+        rates = f"{NS_PER_S / error.first[1]:g} Hz and {NS_PER_S / error.other[1]:g} Hz"
+        raise UserError(
+            f"{path}: its grid changes between {rates}, and limits hold for one rate: calibrate without it"
+        ) from error
     return found
 
 

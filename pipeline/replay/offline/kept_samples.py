@@ -11,7 +11,6 @@ import pickle
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 from scoring.samples import Samples
 
@@ -35,7 +34,7 @@ class KeptSamples:
 
     folder: Path
     room: int
-    """samples of fans, about 85 bytes each, that are kept of one recording; of a longer one, none are"""
+    """samples of fans, about 85 bytes each, that are kept of one recording: none of a longer one, or on a full disk"""
 
     def of(self, recording: Path) -> TrayRuns | None:
         """The runs of a recording that has been read to its end; None where they are not kept."""
@@ -55,30 +54,27 @@ class KeptSamples:
         trays: list[RecordedTray] = []
         room, unfinished = self.room, 0
 
-        def written(blocks: Iterable[Samples], file: BinaryIO) -> Iterator[Samples]:
+        def written(blocks: Iterable[Samples], path: Path) -> Iterator[Samples]:
             nonlocal room, unfinished
             unfinished += 1
+            path.unlink(missing_ok=True)  # of a pass that ended early
             for block in blocks:
                 room -= block.speed_rad_s.size
-                if room >= 0:
-                    pickle.dump(block, file)
-                else:
-                    file.seek(0)
-                    file.truncate()
+                if room < 0 or not _appended(block, path):
+                    room = -1
+                    path.unlink(missing_ok=True)
                 yield block
             unfinished -= 1
 
         for number, (tray, blocks) in enumerate(runs):
             trays.append(tray)
-            with self._blocks(recording, number).open("wb") as file:
-                yield tray, written(blocks, file)
-        if not unfinished:
-            complete = self.folder / f"{self._name(recording)}.new"
-            complete.write_bytes(pickle.dumps(trays if room >= 0 else []))
+            yield tray, written(blocks, self._blocks(recording, number))
+        complete = self.folder / f"{self._name(recording)}.new"
+        if not unfinished and _appended(trays if room >= 0 else [], complete):
             complete.rename(self._index(recording))
 
     def _index(self, recording: Path) -> Path:
-        """Lists the trays of a recording; none if it is too long."""
+        """Lists the trays of a recording; none if its samples are not kept."""
         return self.folder / f"{self._name(recording)}.trays"
 
     def _blocks(self, recording: Path, number: int) -> Path:
@@ -87,6 +83,16 @@ class KeptSamples:
     @staticmethod
     def _name(recording: Path) -> str:
         return hashlib.sha256(str(recording).encode()).hexdigest()
+
+
+def _appended(content: object, path: Path) -> bool:
+    """Whether the disk took it. What is kept only saves time, so it may refuse."""
+    try:
+        with path.open("ab") as file:
+            pickle.dump(content, file)
+    except OSError:
+        return False
+    return True
 
 
 def _blocks_in(path: Path) -> Iterator[Samples]:

@@ -8,10 +8,13 @@ import select
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 from typer.testing import Result
 
 from pipeline.cli.recordings_in_parallel import RecordingsInParallel
@@ -38,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def words_of(command: str, folder: Path, recordings: list[Path], output: Path) -> list[object]:
+def words_of(command: str, folder: Path, recordings: Sequence[Path | str], output: Path) -> list[object]:
     """The words of each command, which writes into the folder `output` if it writes anything."""
     twin = folder / "twin.onnx"
     words: dict[str, list[object]] = {
@@ -87,6 +90,24 @@ def test_one_process_and_two_print_and_write_the_same(folder: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("command", COMMANDS)
+def test_recordings_at_urls_give_what_files_give(folder: Path, tmp_path: Path, command: str) -> None:
+    memory = pytest.importorskip("fsspec", reason="the extra `remote` is not installed").filesystem("memory")
+    for name in RECORDINGS:
+        memory.pipe_file(f"/many/{name}", (folder / name).read_bytes())
+    outputs = [tmp_path / "files", tmp_path / "urls"]
+    outcomes = []
+    for output, place in zip(outputs, (str(folder), "memory://many"), strict=True):
+        output.mkdir()
+        words = words_of(command, folder, [f"{place}/{name}" for name in RECORDINGS], output)
+        result = fantwin(*words, "--jobs", 1)
+        assert result.exit_code == 0, result.output
+        printed, written = outcome_of(result, output)
+        outcomes.append((printed.replace(place, "PLACE"), written))
+    memory.store.clear()
+    assert outcomes[0] == outcomes[1]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_a_bad_recording_stops_all_before_anything_is_written_or_is_skipped_and_named(
     folder: Path, tmp_path: Path, command: str
 ) -> None:
@@ -117,6 +138,16 @@ def test_the_error_of_another_process_is_that_of_one_and_of_several_the_first_ar
     assert error_of("identify", *bad, "--jobs", 2, "--skip-bad") == alone, "where none is left, that is an error"
 
 
+def test_a_recording_of_which_nothing_can_be_scored_is_bad_and_leaves_no_output(folder: Path, tmp_path: Path) -> None:
+    short = write_run(tmp_path / "short.mcap", published_run(9, 0.05, fans=2))
+    words = ("replay", "--offline", folder / "a.mcap", short, "--twin", folder / "twin.onnx", "-o", tmp_path / "out")
+    result = fantwin(*words, "--jobs", 1, "--skip-bad", "--json")
+    assert result.exit_code == 4, result.output
+    (skipped,) = json.loads(result.stdout)["skipped"]
+    assert skipped["recording"] == str(short) and "no sample could be scored" in skipped["reason"]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.mcap"]
+
+
 def test_a_recording_that_was_skipped_stays_so_in_all_that_follows(folder: Path) -> None:
     paths = [folder / name for name in (BAD, "a.mcap")]
     pool = RecordingsInParallel(jobs=1, skip_bad=True)
@@ -138,6 +169,15 @@ def test_processes_that_read_recordings_do_not_load_torch(folder: Path) -> None:
     paths = [folder / name for name in RECORDINGS[:2]]
     read = loaded_by(lambda path: read_recording_data(path, Part()))
     assert list(RecordingsInParallel(jobs=2).map(read, paths, "reading")) == [False, False]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_linear_algebra_has_one_thread_in_every_process(folder: Path, jobs: int) -> None:
+    """With more it rounds in another order, so results would depend on the number of cores."""
+    paths = [folder / name for name in RECORDINGS[:2]]
+    with threadpool_limits(2), RecordingsInParallel(jobs) as pool:
+        found = pool.map(lambda _path: {each["num_threads"] for each in threadpool_info()}, paths, "counting")
+        assert list(found) == [{1}, {1}]
 
 
 def test_a_process_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
@@ -168,6 +208,48 @@ def test_ctrl_c_ends_all_processes_with_one_line(tmp_path: Path) -> None:
         assert closed.poll(60_000), "the worker that read it has not ended"
         closed.unregister(end)
         os.close(end)
+
+
+def test_a_command_that_is_ended_while_it_fetches_a_recording_leaves_no_copy(tmp_path: Path) -> None:
+    pytest.importorskip("s3fs", reason="the extra `remote` is not installed")
+    begun, ended = threading.Semaphore(0), threading.Event()
+
+    class Endless(BaseHTTPRequestHandler):
+        """Sends the beginning of a file, and no more."""
+
+        def do_HEAD(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Length", "1000000")
+            self.send_header("Accept-Ranges", "none")
+            self.end_headers()
+
+        def do_GET(self) -> None:
+            self.do_HEAD()
+            self.wfile.write(bytes(1000))
+            self.wfile.flush()
+            begun.release()
+            ended.wait()
+
+        def log_message(self, *_args: object) -> None:
+            """Nothing."""
+
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    with ThreadingHTTPServer(("127.0.0.1", 0), Endless) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        urls = [f"http://127.0.0.1:{server.server_port}/{name}" for name in RECORDINGS[:2]]
+        command = subprocess.Popen(
+            [sys.executable, "-m", "pipeline", "identify", *urls, "--jobs", "2"],
+            stderr=subprocess.PIPE, text=True, env=os.environ | {"TMPDIR": str(temporary)},
+        )  # fmt: skip
+        assert begun.acquire(timeout=120) and begun.acquire(timeout=120)
+        assert len([*temporary.glob("fantwin-copies-*/fantwin-copies-*")]) == 2
+        command.terminate()
+        _, errors = command.communicate(timeout=60)
+        ended.set()
+        server.shutdown()
+    assert (command.returncode, errors) == (130, "interrupted: nothing was identified\n")
+    assert [*temporary.iterdir()] == []
 
 
 def test_jobs_and_a_cluster_are_not_both_wanted_and_no_cluster_is_one_line(folder: Path) -> None:

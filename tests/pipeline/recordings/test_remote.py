@@ -58,6 +58,14 @@ def test_wildcards_stand_for_what_is_there_in_order(at_url: str, tmp_path: Path)
         matching([RemotePath(f"{at_url}/none-*.mcap")])
 
 
+@pytest.mark.parametrize(
+    "url", ["ftp://me:pass@host/a.mcap", "https://pass@host/a.mcap", "https://host/a.mcap?signature=pass"]
+)
+def test_a_url_with_a_secret_is_refused_without_showing_it(url: str) -> None:
+    error = error_of("identify", url)
+    assert "may hold no password" in error and "pass@" not in error and "signature" not in error
+
+
 def test_without_the_extra_it_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.recordings.remote.is_installed", lambda _module: False)
     with pytest.raises(UserError, match=r"need the extra `remote`; in the checkout: .*\[remote\]"):
@@ -66,9 +74,7 @@ def test_without_the_extra_it_is_one_line(monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.fixture
 def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """The address of an S3 server on this host: of `pip install 'moto[s3,server]' s3fs`. It needs a python-dateutil
-    that is older than the one of matplotlib in requirements-dev.lock, so it is not installed with what tests need.
-    """
+    """The address of an S3 server on this host."""
     pytest.importorskip("s3fs", reason="the extra `remote` is not installed")
     moto = pytest.importorskip("moto.server", reason="moto is not installed")
     server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
