@@ -7,6 +7,7 @@ its arguments, so it does not matter how many jobs there were.
 
 from __future__ import annotations
 
+import logging
 import signal
 import warnings
 from collections import deque
@@ -101,7 +102,8 @@ class RecordingsInParallel:
 
     def __exit__(self, *_error: object) -> None:
         if self._client is None and self._jobs > 1:
-            get_reusable_executor(reuse=True).shutdown(kill_workers=True)  # a fit that follows needs their memory
+            running: Any = {"reuse": True}
+            get_reusable_executor(**running).shutdown(kill_workers=True)  # a fit that follows needs their memory
         self._resources.close()
 
     def map(self, work: Callable[[Recording], Result], recordings: Sequence[Recording], doing: str) -> Iterator[Result]:
@@ -131,7 +133,8 @@ class RecordingsInParallel:
         """The outcomes in the order of the recordings. When it is closed early, the processes are ended."""
         jobs = min(self._jobs, max(len(recordings), 1))
         with parallel_config("loky", initializer=_leave_ctrl_c_to_the_command):
-            parallel: Any = Parallel(jobs, return_as="generator", batch_size=1)
+            options: Any = {"batch_size": 1, "return_as": "generator"}
+            parallel: Any = Parallel(jobs, **options)
         try:
             outcomes = parallel(delayed(attempt)(recording) for recording in recordings)
             try:
@@ -150,7 +153,7 @@ class RecordingsInParallel:
         joblib's Dask backend is not used: with joblib 1.6 it waits for ever for the task of a worker that was killed.
         """
         from distributed import CancelledError, KilledWorker  # noqa: PLC0415  an extra, which is there now
-        from distributed.comm import CommClosedError  # noqa: PLC0415
+        from distributed.comm.core import CommClosedError  # noqa: PLC0415
 
         assert self._client
         futures = deque(self._client.map(attempt, recordings, pure=False))
@@ -221,6 +224,8 @@ def _connected(scheduler: str) -> Iterator[Client]:
         raise UserError(f"--scheduler needs the extra `cluster`; {how_to_install('cluster')}")
     from distributed import Client  # noqa: PLC0415  an extra
 
+    for name in ("asyncio", "distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is raised as well, and is one line then
     try:
         client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -102,8 +102,8 @@ class RemotePath(PosixPath):
     def __str__(self) -> str:
         return super().__str__().replace(":/", "://", 1)
 
-    def open(self, mode: str = "r", *_args: Any, **_options: Any) -> IO[Any]:
-        """Open the file for reading bytes.
+    def open(self, mode: str = "r", *_args: Any, **_options: Any) -> Any:
+        """Open the file for reading bytes: a binary file.
 
         Raises:
             RecordingError: it cannot be fetched.
