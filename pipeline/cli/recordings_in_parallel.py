@@ -94,10 +94,10 @@ class RecordingsInParallel:
 
     def __enter__(self) -> RecordingsInParallel:
         """Raises UserError: there is no such scheduler, or no worker."""
-        folder = TemporaryDirectory(prefix="fantwin-copies-", ignore_cleanup_errors=True)
-        self._copies = Path(self._resources.enter_context(folder))
         if self._scheduler:
             self._client = self._resources.enter_context(_connected(self._scheduler))
+        folder = TemporaryDirectory(prefix="fantwin-copies-", ignore_cleanup_errors=True)
+        self._copies = Path(self._resources.enter_context(folder))
         return self
 
     def __exit__(self, *_error: object) -> None:

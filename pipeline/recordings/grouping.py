@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.recordings.reading import read_metadata
-from pipeline.recordings.remote import without_copies
 
 OF_A_RUN = ("site", "overrides", "decision_rules")
 """metadata that all parts of a recording have in common, as they have their attachments"""
@@ -42,8 +41,7 @@ def describe(path: Path) -> File:
     Raises:
         RecordingError: it cannot be read.
     """
-    with without_copies():
-        found = read_metadata(path)
+    found = read_metadata(path)
     about = found.metadata
     attached = hashlib.sha256()
     for name, content in sorted(found.attachments.items()):

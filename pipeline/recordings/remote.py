@@ -1,7 +1,7 @@
 """Recordings at URLs, such as s3://bucket/site/day.mcap, wherever fsspec can read (extra `remote`).
 
-A path whose bytes are elsewhere: its text is the URL, and everything that reads a recording opens it like a file.
-Inside `local_copies` a recording is fetched once and read from there, since most work reads it several times.
+A path whose bytes are elsewhere: its text is the URL, and all that reads recordings opens it like a file. It does so
+inside `local_copies`, where a recording is fetched once, since most work reads it several times.
 """
 
 from __future__ import annotations
@@ -9,24 +9,21 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path, PosixPath
 from tempfile import TemporaryDirectory
-from typing import IO, Any
+from typing import Any
 
 from pipeline.errors import UsageError
 from pipeline.optional_dependencies import how_to_install, is_installed
 from pipeline.recordings.records import RecordingError
 
-_BLOCK_BYTES = 1 << 20
-"""fetched at a time where no copy is made"""
 _MAY_BE_SECRET = re.compile(r"://[^/@]*:[^/@]*@|https?://[^/@]*@|\?")
 """a password, a token, or a query, such as a signature"""
-_COPIES: ContextVar[Path | None] = ContextVar("copies", default=None)
-"""the folder of local copies; None: there are none"""
+_COPIES: ContextVar[Path] = ContextVar("copies")
+"""the folder of local copies"""
 
 
 def recording_path(text: str) -> Path:
@@ -86,16 +83,6 @@ def local_copies(place: Path | None = None) -> Iterator[None]:
             _COPIES.reset(token)
 
 
-@contextmanager
-def without_copies() -> Iterator[None]:
-    """Inside, files at URLs are read where they are, for work that needs only their beginning."""
-    token = _COPIES.set(None)
-    try:
-        yield
-    finally:
-        _COPIES.reset(token)
-
-
 class RemotePath(PosixPath):
     """The path of a file at a URL. It can be opened for reading, and nothing else."""
 
@@ -103,24 +90,21 @@ class RemotePath(PosixPath):
         return super().__str__().replace(":/", "://", 1)
 
     def open(self, mode: str = "r", *_args: Any, **_options: Any) -> Any:
-        """Open the file for reading bytes: a binary file.
+        """Open a copy for reading bytes, inside `local_copies`: a binary file.
 
         Raises:
             RecordingError: it cannot be fetched.
         """
         if mode != "rb":
             raise io.UnsupportedOperation(f"{self}: mode {mode!r}")
-        copies = _COPIES.get()
-        if copies is None:
-            return self._remote()
-        copy = copies / hashlib.sha256(str(self).encode()).hexdigest()
+        copy = _COPIES.get() / hashlib.sha256(str(self).encode()).hexdigest()
         if not copy.exists():
+            filesystem, path = self.place()
             fetched = copy.with_suffix(".part")
-            with self._remote() as source, fetched.open("wb") as target:
-                try:
-                    shutil.copyfileobj(source, target, 16 * _BLOCK_BYTES)
-                except Exception as error:
-                    raise self.unreadable(error) from error
+            try:
+                filesystem.get_file(path, str(fetched))
+            except Exception as error:
+                raise self.unreadable(error) from error
             fetched.rename(copy)
         return copy.open("rb")
 
@@ -141,10 +125,3 @@ class RemotePath(PosixPath):
         """Any error of a store as one line."""
         reason = "there is no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
         return RecordingError(f"{self}: cannot read the recording: {reason or type(error).__name__}")
-
-    def _remote(self) -> IO[bytes]:
-        filesystem, path = self.place()
-        try:
-            return filesystem.open(path, "rb", block_size=_BLOCK_BYTES)
-        except Exception as error:
-            raise self.unreadable(error) from error

@@ -21,7 +21,7 @@ from pipeline.cli.options import JsonOption, SetOption
 from pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SchedulerOption, SkipBadOption
 from pipeline.errors import UsageError
 from pipeline.recordings.dates import format_utc
-from pipeline.recordings.remote import matching, recording_path
+from pipeline.recordings.remote import local_copies, matching, recording_path
 from pipeline.replay.live.keyboard import Keys
 from pipeline.replay.live.pace import Pace
 from pipeline.replay.live.player import Progress
@@ -142,26 +142,27 @@ def replay(
     keys = Keys()
     if pause and not keys.is_available:
         raise UsageError("--pause needs a terminal, to continue with a key")
-    playback = RecordingPlayback(files, _chosen_topics(topics, from_topic), start, end)
-    replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
-    stop = threading.Event()
-    stop_on_signals(stop)
-    console = Console(stderr=True, highlight=False)
-    with keys, _status_line(console, playback.end_s(), playback.seconds_at) as show:
-        outcome = publish(
-            playback,
-            pace,
-            replay_config,
-            stop,
-            loop=loop,
-            keys=keys.pressed,
-            show=show,
-            report=lambda line: console.print(line, markup=False, soft_wrap=True),
-        )
-    for line in outcome.damage:
-        console.print(line, markup=False, soft_wrap=True)
-    for name in outcome.behind:
-        console.print(f"{name} has not received all messages: see `fantwin status`", markup=False, soft_wrap=True)
+    with local_copies():
+        playback = RecordingPlayback(files, _chosen_topics(topics, from_topic), start, end)
+        replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
+        stop = threading.Event()
+        stop_on_signals(stop)
+        console = Console(stderr=True, highlight=False)
+        with keys, _status_line(console, playback.end_s(), playback.seconds_at) as show:
+            outcome = publish(
+                playback,
+                pace,
+                replay_config,
+                stop,
+                loop=loop,
+                keys=keys.pressed,
+                show=show,
+                report=lambda line: console.print(line, markup=False, soft_wrap=True),
+            )
+        for line in outcome.damage:
+            console.print(line, markup=False, soft_wrap=True)
+        for name in outcome.behind:
+            console.print(f"{name} has not received all messages: see `fantwin status`", markup=False, soft_wrap=True)
     if json_output:
         typer.echo(json.dumps({"files": [str(file) for file in playback.files], **asdict(outcome)}))
     else:
