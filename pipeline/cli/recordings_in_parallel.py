@@ -90,6 +90,7 @@ class RecordingsInParallel:
         self._resources = ExitStack()
         self._client: Client | None = None
         self._copies: Path | None = None
+        self._has_processes = False
         self._bad: dict[Path | tuple[Path, ...], UserError] = {}
 
     def __enter__(self) -> RecordingsInParallel:
@@ -101,7 +102,7 @@ class RecordingsInParallel:
         return self
 
     def __exit__(self, *_error: object) -> None:
-        if self._client is None and self._jobs > 1:
+        if self._has_processes:
             running: Any = {"reuse": True}
             get_reusable_executor(**running).shutdown(kill_workers=True)  # a fit that follows needs their memory
         self._resources.close()
@@ -132,6 +133,7 @@ class RecordingsInParallel:
     def _here(self, attempt: Callable[[Recording], Any], recordings: Sequence[Recording]) -> Generator[Any]:
         """The outcomes in the order of the recordings. When it is closed early, the processes are ended."""
         jobs = min(self._jobs, max(len(recordings), 1))
+        self._has_processes |= jobs > 1
         with parallel_config("loky", initializer=_leave_ctrl_c_to_the_command):
             options: Any = {"batch_size": 1, "return_as": "generator"}
             parallel: Any = Parallel(jobs, **options)
